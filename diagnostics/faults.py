@@ -1,0 +1,149 @@
+"""What can be wrong with a tactile array: kinds of fault, one root cause (Fault), and the paper's F (FaultSet)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Set
+from dataclasses import asdict, dataclass, field
+from enum import Enum
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.layout import Line
+
+
+class FaultKind(str, Enum):
+    """How a cell misbehaves. Members are strings (a StrEnum also on Python 3.10)."""
+
+    OPEN = "open"
+    """Reads 0: no current flows (a broken wire)."""
+    SHORT = "short"
+    """Reads full scale (Section I of the paper: 5 N)."""
+    STUCK = "stuck"
+    """Reads one value in between, whatever touches it."""
+    ALIAS = "alias"
+    """Reads another cell: a stuck address bit."""
+    INTERMITTENT = "intermittent"
+    """Blinks between its value and a rail: a loose crimp."""
+    NOISY = "noisy"
+    """Reads its value plus excess noise."""
+    DRIFT = "drift"
+    """Its offset wanders away."""
+
+    __str__ = str.__str__
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One root cause: a cell, or every cell behind one broken wire.
+
+    Attributes:
+        kind: how the cells misbehave.
+        cells: their indices, ascending and unique.
+        line: the wire at fault; None for single cells.
+        value: in the layout's unit. OPEN, SHORT, STUCK: what the cells read (None: 0 for OPEN, full scale for SHORT).
+            INTERMITTENT: the value they blink to (None: 0). NOISY: standard deviation of the added noise. DRIFT: how
+            much the offset moves in one second. ALIAS: the level (0 or 1) of the stuck address bit in ``line``; with
+            a row or column line, the index of the row or column read instead; without a line, the cell read instead.
+        onset: first faulty frame; None: from the first frame on.
+        probability: P(this fault is there), 0..1; None: known, not inferred.
+        reason: one plain sentence.
+    """
+
+    kind: FaultKind
+    cells: tuple[int, ...]
+    line: Line | None = field(default=None, kw_only=True)
+    value: float | None = field(default=None, kw_only=True)
+    onset: int | None = field(default=None, kw_only=True)
+    probability: float | None = field(default=None, kw_only=True)
+    reason: str = field(default="", kw_only=True)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kind", FaultKind(self.kind))
+        cells = np.unique(np.atleast_1d(np.asarray(self.cells)))
+        if cells.size == 0 or not np.issubdtype(cells.dtype, np.integer) or cells[0] < 0:
+            raise ValueError(f"a fault needs at least one cell index, whole and >= 0; got {self.cells!r}")
+        object.__setattr__(self, "cells", tuple(cells.tolist()))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict that :meth:`from_dict` reads."""
+        return {**asdict(self), "kind": str(self.kind), "cells": list(self.cells)}
+
+    @classmethod
+    def from_dict(cls, d: Mapping[str, Any]) -> Fault:
+        """Rebuild a fault from :meth:`to_dict`."""
+        line = Line(**d["line"]) if d.get("line") else None
+        return cls(**{**d, "kind": FaultKind(d["kind"]), "cells": tuple(d["cells"]), "line": line})
+
+
+@dataclass(frozen=True, eq=False)
+class FaultSet(Set[int]):
+    """The paper's F (Section IV): the cells whose values must not be used, out of ``n_cells``.
+
+    Behaves as a set (``in``, ``len``, iteration in ascending order, ``| & - ==``).
+
+    Raises:
+        ValueError: a cell that is not a whole number from 0 to ``n_cells - 1``; sets over different arrays combined.
+    """
+
+    cells: tuple[int, ...]
+    n_cells: int
+
+    def __post_init__(self) -> None:
+        cells = np.unique(np.asarray(list(self.cells)))
+        if cells.size and not np.issubdtype(cells.dtype, np.integer):
+            raise ValueError(f"F holds cell indices, whole numbers; got {self.cells!r}")
+        if cells.size and (cells[0] < 0 or cells[-1] >= self.n_cells):
+            stray = cells[0] if cells[0] < 0 else cells[-1]
+            raise ValueError(f"F names cell {stray}, but there are {self.n_cells} cells, numbered 0 to {self.n_cells - 1}")
+        object.__setattr__(self, "cells", tuple(cells.tolist()))
+        object.__setattr__(self, "n_cells", int(self.n_cells))
+
+    @cached_property
+    def mask(self) -> NDArray[np.bool_]:
+        """bool ``[D]``, True on the faulty cells."""
+        mask = np.zeros(self.n_cells, bool)
+        mask[list(self.cells)] = True
+        mask.setflags(write=False)
+        return mask
+
+    @cached_property
+    def healthy(self) -> NDArray[np.intp]:
+        """The other cells, int ``[D - k]``, ascending: what the selector phi of Section IV keeps."""
+        return np.flatnonzero(~self.mask)
+
+    def __contains__(self, cell: object) -> bool:
+        return isinstance(cell, int | np.integer) and 0 <= cell < self.n_cells and bool(self.mask[cell])
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.cells)
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, FaultSet):
+            return self.n_cells == other.n_cells and self.cells == other.cells
+        return Set.__eq__(self, other) if isinstance(other, Set) else NotImplemented
+
+    def __hash__(self) -> int:
+        return self._hash()
+
+    def _from_iterable(self, cells: Iterable[int]) -> FaultSet:  # type: ignore[override]  # how Set builds | & - ^
+        return FaultSet(tuple(cells), self.n_cells)
+
+    def __or__(self, other: Iterable[int]) -> FaultSet:  # type: ignore[override]
+        return self._from_iterable({*self, *self._same_array(other)})
+
+    def __and__(self, other: Iterable[int]) -> FaultSet:
+        return self._from_iterable(set(self).intersection(self._same_array(other)))
+
+    def __sub__(self, other: Iterable[int]) -> FaultSet:  # type: ignore[override]
+        return self._from_iterable(set(self).difference(self._same_array(other)))
+
+    def _same_array(self, other: Iterable[int]) -> Iterable[int]:
+        if isinstance(other, FaultSet) and other.n_cells != self.n_cells:
+            raise ValueError(f"fault sets of arrays with {self.n_cells} and {other.n_cells} cells cannot be combined")
+        return other

@@ -1,0 +1,242 @@
+"""The shape of a tactile array and the wires that serve its cells."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+LineKind = Literal["row", "column", "row_address", "column_address", "converter"]
+
+SCHEMA = "adaptfault.layout/1"
+
+
+@dataclass(frozen=True, order=True)
+class Line:
+    """One wire of a pad.
+
+    ``kind`` is ``"row"`` or ``"column"`` (``index`` counts the wires), ``"row_address"`` or ``"column_address"``
+    (``index`` is the bit, 0 the least significant) or ``"converter"`` (``index`` 0: each pad has one channel).
+    """
+
+    pad: int
+    kind: LineKind
+    index: int
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(LineKind):
+            raise ValueError(f"unknown kind of line {self.kind!r}: use one of {', '.join(get_args(LineKind))}")
+
+    def __str__(self) -> str:
+        match self.kind:
+            case "row_address":
+                return f"pad {self.pad}, row address bit {self.index}"
+            case "column_address":
+                return f"pad {self.pad}, column address bit {self.index}"
+            case "converter":
+                return f"pad {self.pad}, converter channel"
+            case kind:
+                return f"pad {self.pad}, {kind} {self.index}"
+
+
+@dataclass(frozen=True, eq=False)
+class SensorLayout:
+    """A tactile skin: ``pads`` arrays of ``rows`` x ``cols`` cells behind row and column multiplexers.
+
+    A cell's index runs pad, then row, then column (C order of ``[pads, rows, cols]``). Positions where ``present``
+    is False hold no sensing element (a masked corner); they keep their index, so that D is always
+    ``pads * rows * cols``, but nothing is ever said or learned about them.
+
+    Args:
+        pads, rows, cols: size, each at least 1. The paper's 11 x 10 pad has 11 rows here (Section III-A, H = 11).
+        full_scale: the largest value a cell can report, in ``unit``; the smallest is 0.
+        unit: name of the unit of recordings.
+        rate: frames per second.
+        present: bool ``[pads, rows, cols]`` (or flat ``[D]``); None means every position is a cell.
+
+    Raises:
+        ValueError: a size below 1, a full scale or rate that is not positive, ``present`` of another shape.
+    """
+
+    pads: int
+    rows: int
+    cols: int
+    full_scale: float = field(default=5.0, kw_only=True)
+    unit: str = field(default="N", kw_only=True)
+    rate: float = field(default=10.0, kw_only=True)
+    present: NDArray[np.bool_] = field(default=None, kw_only=True, repr=False)  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        for name in ("pads", "rows", "cols"):
+            size = getattr(self, name)
+            if not isinstance(size, int | np.integer) or isinstance(size, bool) or size < 1:
+                raise ValueError(f"a layout needs {name} >= 1, a whole number; got {size!r}")
+            object.__setattr__(self, name, int(size))
+        for name in ("full_scale", "rate"):
+            number = float(getattr(self, name))
+            if not (np.isfinite(number) and number > 0):
+                raise ValueError(f"a layout needs {name} > 0; got {getattr(self, name)!r}")
+            object.__setattr__(self, name, number)
+        present = np.ones(self.shape, bool) if self.present is None else np.array(self.present, bool)
+        if present.size != self.n_cells:
+            raise ValueError(f"present has shape {present.shape}, the layout {self.shape}: give one bool for each position")
+        present = present.reshape(self.shape)
+        if not present.any():
+            raise ValueError("present is False everywhere: a layout needs at least one cell")
+        present.setflags(write=False)
+        object.__setattr__(self, "present", present)
+
+    @classmethod
+    def paper(cls) -> SensorLayout:
+        """The paper's sensor: 2 pads of 11 x 10 cells, 0..5 N, 10 Hz (Section II)."""
+        return cls(2, 11, 10)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """``(pads, rows, cols)``."""
+        return self.pads, self.rows, self.cols
+
+    @property
+    def n_cells(self) -> int:
+        """D, the number of positions: ``pads * rows * cols``."""
+        return self.pads * self.rows * self.cols
+
+    def cell(self, pad: int, row: int, col: int) -> int:
+        """Return the index of the cell at a position; IndexError names what is out of range."""
+        for name, value, size in zip(("pad", "row", "col"), (pad, row, col), self.shape, strict=True):
+            if not 0 <= value < size:
+                raise IndexError(f"{name} {value} is outside this layout: use 0 to {size - 1}")
+        return int((pad * self.rows + row) * self.cols + col)
+
+    def position(self, cell: int) -> tuple[int, int, int]:
+        """Return ``(pad, row, col)`` of a cell; IndexError if the layout has no such cell."""
+        if not 0 <= cell < self.n_cells:
+            raise IndexError(f"cell {cell} is outside this layout: it has {self.n_cells} cells, numbered from 0")
+        pad, rest = divmod(int(cell), self.rows * self.cols)
+        return (pad, *divmod(rest, self.cols))
+
+    @cached_property
+    def lines(self) -> tuple[Line, ...]:
+        """Every wire a fault can sit on: rows, columns, address bits of both, one converter channel a pad."""
+        counts: dict[LineKind, int] = {
+            "row": self.rows,
+            "column": self.cols,
+            "row_address": _address_bits(self.rows),
+            "column_address": _address_bits(self.cols),
+            "converter": 1,
+        }
+        return tuple(Line(pad, kind, i) for pad in range(self.pads) for kind, n in counts.items() for i in range(n))
+
+    @cached_property
+    def _grid(self) -> NDArray[np.intp]:
+        return np.arange(self.n_cells).reshape(self.shape)
+
+    def cells_on(self, line: Line) -> NDArray[np.intp]:
+        """Return the present cells that ``line`` serves, ascending.
+
+        An address bit and a converter channel serve their whole pad: every cell is selected and read through them.
+        Which cells a *stuck* bit misreads is told by :meth:`misaddressed`.
+
+        Raises:
+            IndexError: the layout has no such line.
+        """
+        if line not in self.lines:
+            raise IndexError(f"{line} is not a wire of {self}")
+        pad = self._grid[line.pad]
+        cells = pad[line.index] if line.kind == "row" else pad[:, line.index] if line.kind == "column" else pad.ravel()
+        return cells[self.present.ravel()[cells]]
+
+    def misaddressed(self, line: Line, level: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return which cells an address bit stuck at ``level`` misreads, and what is read instead.
+
+        Returns ``(cells, sources)``, int arrays of the same length. A source of -1 is an address with nothing
+        connected to it.
+        """
+        if line not in self.lines or line.kind not in ("row_address", "column_address"):
+            raise IndexError(f"{line} is not an address bit of {self}")
+        bit, by_row = 1 << line.index, line.kind == "row_address"
+        wires = np.arange(self.rows if by_row else self.cols)
+        selected = (wires | bit) if level else (wires & ~bit)
+        pad = self._grid[line.pad] if by_row else self._grid[line.pad].T  # [wire, across]
+        moved = wires != selected
+        sources = np.where((selected < len(wires))[:, None], pad[np.minimum(selected, len(wires) - 1)], -1)
+        present = self.present.ravel()
+        cells, sources = pad[moved].ravel(), sources[moved].ravel()
+        sources = np.where((sources >= 0) & present[np.maximum(sources, 0)], sources, -1)
+        return cells[present[cells]], sources[present[cells]]
+
+    def grid(self, values: ArrayLike) -> NDArray[Any]:
+        """View values ``[..., D]`` as ``[..., pads, rows, cols]``."""
+        values = np.asarray(values)
+        return values.reshape(*values.shape[:-1], *self.shape)
+
+    def check_recording(self, recording: ArrayLike, name: str = "recording") -> NDArray[np.float64]:
+        """Return a recording as float64 ``[T, D]``; ``[T, pads, rows, cols]`` is flattened.
+
+        Raises:
+            ValueError: not numbers, or the shape does not fit this layout.
+        """
+        try:
+            frames = np.asarray(recording, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name}: expected numbers [T, {self.n_cells}] ({error})") from None
+        if frames.ndim == 4 and frames.shape[1:] == self.shape:
+            frames = frames.reshape(len(frames), -1)
+        if frames.ndim != 2 or frames.shape[1] != self.n_cells:
+            raise ValueError(
+                f"{name}: expected [T, {self.n_cells}] or [T, {self.pads}, {self.rows}, {self.cols}], got {list(frames.shape)};"
+                " check the layout, and that masked positions are kept in the columns"
+            )
+        return frames
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe description that :meth:`from_dict` reads."""
+        d: dict[str, Any] = {"schema": SCHEMA, "pads": self.pads, "rows": self.rows, "cols": self.cols}
+        d |= {"full_scale": self.full_scale, "unit": self.unit, "rate": self.rate}
+        if not self.present.all():
+            d["present"] = self.present.tolist()
+        return d
+
+    @classmethod
+    def from_dict(cls, d: Mapping[str, Any]) -> SensorLayout:
+        """Build a layout from a dict with ``pads``, ``rows``, ``cols`` and the optional other fields.
+
+        Raises:
+            ValueError: a field is missing, unknown, or of a wrong kind; another schema.
+        """
+        if d.get("schema", SCHEMA) != SCHEMA:
+            raise ValueError(f"expected schema {SCHEMA!r}, got {d['schema']!r}")
+        known = ("pads", "rows", "cols", "full_scale", "unit", "rate", "present")
+        if unknown := set(d) - set(known) - {"schema"}:
+            raise ValueError(f"a layout has no field {sorted(unknown)[0]!r}: it knows {', '.join(known)}")
+        if missing := [name for name in known[:3] if name not in d]:
+            raise ValueError(f"a layout needs the field {missing[0]!r}")
+        try:
+            return cls(**{name: d[name] for name in known if name in d})
+        except TypeError as error:
+            raise ValueError(f"a field of the layout is of a wrong kind: {error}") from None
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, SensorLayout):
+            return NotImplemented
+        return self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def __str__(self) -> str:
+        masked = self.n_cells - int(self.present.sum())
+        text = f"{self.pads} x {self.rows} x {self.cols} cells, 0..{self.full_scale:g} {self.unit}, {self.rate:g} Hz"
+        return f"{text}, {masked} positions masked" if masked else text
+
+    def _key(self) -> tuple[Any, ...]:
+        return (*self.shape, self.full_scale, self.unit, self.rate, self.present.tobytes())
+
+
+def _address_bits(wires: int) -> int:
+    """Return how many bits select one of ``wires``: 4 for the paper's 11 rows and 10 columns (Section II)."""
+    return (wires - 1).bit_length()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -79,9 +80,7 @@ class SelfDiagnosis:
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
         runs = last_runs(frames, tolerance)
         expectation: Expectation = self.expectation_ or PooledNeighbourhood(self.layout, frames)
-        ratio = stuck_evidence(
-            frames, lengths, runs, expectation, present & ~silent, self.layout.full_scale, tolerance
-        )
+        ratio = stuck_evidence(frames, lengths, runs, expectation, present & ~silent, self.layout.full_scale, tolerance)
         probability = np.where(silent, 1.0, self.weights_.probability(ratio, present & ~silent))
         faulty = faulty_at(probability, self.false_discovery_rate) | silent
         alive = present & ~faulty & runs.moved
@@ -135,11 +134,9 @@ class SelfDiagnosis:
 
 def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> list[Recording]:
     """Return recordings as a list of ``[T, D]``, T >= 1."""
-    single = isinstance(recordings, np.ndarray) and recordings.ndim in (2, 4) and recordings.dtype != object
-    given = [recordings] if single else list(recordings)  # type: ignore[arg-type]
-    if given and not single and np.ndim(given[0]) == 1:  # nested lists of numbers: one recording
-        given = [np.asarray(recordings)]
-    checked = [layout.check_recording(r, f"recording {i}") for i, r in enumerate(given)]
+    given: Any = recordings
+    single = isinstance(given, np.ndarray) and (given.shape[1:] == layout.shape or given.ndim <= 2)
+    checked = [layout.check_recording(r, f"recording {i}") for i, r in enumerate([given] if single else given)]
     checked = [r for r in checked if len(r)]
     if not checked:
         raise ValueError("no frames: expected recordings [T, D] with T >= 1")
@@ -203,4 +200,6 @@ def _with_reason(fault: Fault, cause: Cause, layout: SensorLayout, silent: bool)
 
 
 def _wire(line: Line) -> str:
-    return "the converter channel and its cable" if line.kind == "converter" else f"the {line.kind} wire and its address"
+    return (
+        "the converter channel and its cable" if line.kind == "converter" else f"the {line.kind} wire and its address"
+    )

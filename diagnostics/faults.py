@@ -97,7 +97,9 @@ class FaultSet(Set[int]):
             raise ValueError(f"F holds cell indices, whole numbers; got {self.cells!r}")
         if cells.size and (cells[0] < 0 or cells[-1] >= self.n_cells):
             stray = cells[0] if cells[0] < 0 else cells[-1]
-            raise ValueError(f"F names cell {stray}, but there are {self.n_cells} cells, numbered 0 to {self.n_cells - 1}")
+            raise ValueError(
+                f"F names cell {stray}, but there are {self.n_cells} cells, numbered 0 to {self.n_cells - 1}"
+            )
         object.__setattr__(self, "cells", tuple(cells.tolist()))
         object.__setattr__(self, "n_cells", int(self.n_cells))
 
@@ -115,7 +117,7 @@ class FaultSet(Set[int]):
         return np.flatnonzero(~self.mask)
 
     def __contains__(self, cell: object) -> bool:
-        return isinstance(cell, int | np.integer) and 0 <= cell < self.n_cells and bool(self.mask[cell])
+        return isinstance(cell, int | np.integer) and 0 <= cell < self.n_cells and bool(self.mask[int(cell)])
 
     def __iter__(self) -> Iterator[int]:
         return iter(self.cells)

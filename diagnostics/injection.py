@@ -119,9 +119,15 @@ def _blinking(frames: int, rng: np.random.Generator) -> NDArray[np.bool_]:
     return closed
 
 
-def line_fault(layout: SensorLayout, line: Line, kind: FaultKind, *, value: float | None = None, onset: int | None = None) -> Fault:
+def line_fault(
+    layout: SensorLayout, line: Line, kind: FaultKind, *, value: float | None = None, onset: int | None = None
+) -> Fault:
     """Return the fault of a whole wire: every cell it serves, or for a stuck address bit those that it misreads."""
     if kind is FaultKind.ALIAS and line.kind in ("row_address", "column_address"):
         cells, _ = layout.misaddressed(line, int(value or 0))
-        return Fault(kind, tuple(cells.tolist()), line=line, value=int(value or 0), onset=onset, reason=f"{line} is stuck")
-    return Fault(kind, tuple(layout.cells_on(line).tolist()), line=line, value=value, onset=onset, reason=f"{line} is {kind}")
+        return Fault(
+            kind, tuple(cells.tolist()), line=line, value=int(value or 0), onset=onset, reason=f"{line} is stuck"
+        )
+    return Fault(
+        kind, tuple(layout.cells_on(line).tolist()), line=line, value=value, onset=onset, reason=f"{line} is {kind}"
+    )

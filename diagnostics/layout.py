@@ -68,7 +68,7 @@ class SensorLayout:
     full_scale: float = field(default=5.0, kw_only=True)
     unit: str = field(default="N", kw_only=True)
     rate: float = field(default=10.0, kw_only=True)
-    present: NDArray[np.bool_] = field(default=None, kw_only=True, repr=False)  # type: ignore[assignment]
+    present: NDArray[np.bool_] = field(default=None, kw_only=True, repr=False)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         for name in ("pads", "rows", "cols"):
@@ -83,7 +83,9 @@ class SensorLayout:
             object.__setattr__(self, name, number)
         present = np.ones(self.shape, bool) if self.present is None else np.array(self.present, bool)
         if present.size != self.n_cells:
-            raise ValueError(f"present has shape {present.shape}, the layout {self.shape}: give one bool for each position")
+            raise ValueError(
+                f"present has shape {present.shape}, the layout {self.shape}: give one bool for each position"
+            )
         present = present.reshape(self.shape)
         if not present.any():
             raise ValueError("present is False everywhere: a layout needs at least one cell")
@@ -148,7 +150,8 @@ class SensorLayout:
             raise IndexError(f"{line} is not a wire of {self}")
         pad = self._grid[line.pad]
         cells = pad[line.index] if line.kind == "row" else pad[:, line.index] if line.kind == "column" else pad.ravel()
-        return cells[self.present.ravel()[cells]]
+        on_line: NDArray[np.intp] = cells[self.present.ravel()[cells]]
+        return on_line
 
     def misaddressed(self, line: Line, level: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return which cells an address bit stuck at ``level`` misreads, and what is read instead.
@@ -187,8 +190,9 @@ class SensorLayout:
         if frames.ndim == 4 and frames.shape[1:] == self.shape:
             frames = frames.reshape(len(frames), -1)
         if frames.ndim != 2 or frames.shape[1] != self.n_cells:
+            grid = f"{self.pads}, {self.rows}, {self.cols}"
             raise ValueError(
-                f"{name}: expected [T, {self.n_cells}] or [T, {self.pads}, {self.rows}, {self.cols}], got {list(frames.shape)};"
+                f"{name}: expected [T, {self.n_cells}] or [T, {grid}], got {list(frames.shape)};"
                 " check the layout, and that masked positions are kept in the columns"
             )
         return frames

@@ -39,7 +39,9 @@ def draw(diagnosis: Diagnosis) -> Figure:
             pad, row, col = layout.position(cell)
             axes[0, pad].text(col, row, _LETTERS[fault.kind], ha="center", va="center", color="white", fontsize=8)
     legend = {"alive": _ALIVE, "faulty": _FAULTY, "untested": _UNTESTED}
-    figure.legend(handles=[Patch(color=c, label=name) for name, c in legend.items()], loc="outside lower center", ncols=3)
+    figure.legend(
+        handles=[Patch(color=c, label=name) for name, c in legend.items()], loc="outside lower center", ncols=3
+    )
     return figure
 
 

@@ -73,7 +73,10 @@ class NearestFrames:
         values: NDArray[np.float64],
         tolerance: float,
     ) -> NDArray[np.float64]:
-        """See :class:`Expectation`. Where no cell can be trusted, the frame is taken for an untouched one."""
+        """See :class:`Expectation`. Where no cell can be trusted, any healthy frame is as near as any other."""
+        overall = _overall_share(self.frames[:, cells], values, tolerance, self.full_scale)
+        if not trusted.any():
+            return np.broadcast_to(overall, (len(frames), len(cells)))
         near = (np.abs(self.frames[:, cells] - values) <= tolerance).astype(np.float32)  # (R, C)
         reference = _stabilised(self.frames)[:, trusted]
         energy = (reference**2).sum(axis=1)
@@ -85,7 +88,6 @@ class NearestFrames:
             distance = energy - 2 * batch @ reference.T  # (B, R), up to a constant for each frame
             nearest = np.argpartition(distance, neighbours - 1, axis=1)[:, :neighbours]
             shares[first : first + _BATCH] = near[nearest].mean(axis=1)
-        overall = _overall_share(self.frames[:, cells], values, tolerance, self.full_scale)
         return _shrunk(shares, neighbours, overall)
 
 
@@ -102,6 +104,7 @@ def _overall_share(
     A cell held under a constant load reads some value that it may never have read before, and is no stranger for it:
     around a value in mid-range the count goes over a wide band, in proportion.
     """
+
     def share(width: float) -> NDArray[np.float64]:
         return ((np.abs(readings - values) <= width).sum(axis=0) + 0.5) / (len(readings) + 1)
 
@@ -110,15 +113,18 @@ def _overall_share(
 
 
 def _stabilised(frames: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.sqrt(np.maximum(frames, 0))
+    root: NDArray[np.float32] = np.sqrt(np.maximum(frames, 0))
+    return root
 
 
 @dataclass(frozen=True)
 class PooledNeighbourhood:
     """A cold start's expectation: what cells of this skin read when the cells around them look like this.
 
-    Without a fault-free reference each cell is judged by all trusted cells together: from the mean of its four
-    nearest trusted neighbours, of the four diagonal ones, and the largest of both. Built from the log itself.
+    Without a fault-free reference each cell is judged by all trusted cells together: from the mean of its four nearest
+    trusted neighbours, of the four diagonal ones, and from how well they enclose it: the smaller reading of two
+    opposite neighbours, the best pair counting. Built from the log itself. It interpolates and never extrapolates: a cell
+    at the rim of the contact is rightly still, however loaded its neighbours on one side are.
     """
 
     layout: SensorLayout
@@ -132,7 +138,7 @@ class PooledNeighbourhood:
         values: NDArray[np.float64],
         tolerance: float,
     ) -> NDArray[np.float64]:
-        """See :class:`Expectation`. A cell with no trusted neighbour is not judged: its share is 1."""
+        """See :class:`Expectation`. A cell between no two trusted neighbours is not judged: its share is 1."""
         from scipy.spatial import cKDTree
 
         present = self.layout.present.ravel()
@@ -143,11 +149,11 @@ class PooledNeighbourhood:
         if not len(usable):
             return shares
         samples, readings = known[:, usable].reshape(-1, known.shape[2]), np.nan_to_num(self.log[:, usable]).ravel()
-        kept = rng.choice(len(samples), min(len(samples), 20 * _KEPT_FRAMES), replace=False)
+        kept = rng.choice(len(samples), min(len(samples), 4 * _KEPT_FRAMES), replace=False)
         tree, readings = cKDTree(samples[kept]), readings[kept]
         asked = _surroundings(frames, trusted, self.layout)[:, cells]  # (T, C, 3)
         judged = np.isfinite(asked).all(axis=(0, 2))
-        neighbours = min(2 * _NEIGHBOURS, len(readings))
+        neighbours = min(_NEIGHBOURS, len(readings))
         _, nearest = tree.query(asked[:, judged], k=neighbours)  # (T, C', neighbours)
         nearest = nearest.reshape(len(frames), int(judged.sum()), -1)
         share = (np.abs(readings[nearest] - values[judged][:, None]) <= tolerance).mean(axis=2)
@@ -157,21 +163,22 @@ class PooledNeighbourhood:
 
 
 def _surroundings(frames: NDArray[np.float64], trusted: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.float64]:
-    """Return for each frame and cell what surrounds it, ``[T, D, 3]``; NaN where no neighbour can be trusted."""
+    """Return for each frame and cell what surrounds it, ``[T, D, 3]``; NaN where no two opposite cells can be trusted."""
     grid = layout.grid(np.where(trusted & layout.present.ravel(), np.sqrt(np.maximum(frames, 0)), np.nan))
     padded = np.pad(grid, ((0, 0), (0, 0), (1, 1), (1, 1)), constant_values=np.nan)
     rows, cols = layout.rows, layout.cols
 
-    def shifted(offsets: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+    def shifted(*offsets: tuple[int, int]) -> NDArray[np.float64]:
         return np.stack([padded[:, :, 1 + r : 1 + r + rows, 1 + c : 1 + c + cols] for r, c in offsets])
 
-    beside = shifted([(-1, 0), (1, 0), (0, -1), (0, 1)])
-    diagonal = shifted([(-1, -1), (-1, 1), (1, -1), (1, 1)])
-    near, far = _mean(beside), _mean(diagonal)
-    largest = np.fmax.reduce(np.concatenate([beside, diagonal]))
-    # A cell between two kinds of neighbour, one of them gone, is described by the other kind alone.
+    beside, opposite = shifted((-1, 0), (0, -1)), shifted((1, 0), (0, 1))
+    diagonal, across = shifted((-1, -1), (-1, 1)), shifted((1, 1), (1, -1))
+    near, far = _mean(np.concatenate([beside, opposite])), _mean(np.concatenate([diagonal, across]))
+    # A cell that has one kind of neighbour only is described by that kind.
     near, far = np.where(np.isnan(near), far, near), np.where(np.isnan(far), near, far)
-    return np.stack([near, far, largest], axis=-1).reshape(len(frames), layout.n_cells, 3)
+    pairs = np.minimum(np.concatenate([beside, diagonal]), np.concatenate([opposite, across]))
+    enclosed = np.fmax.reduce(pairs)
+    return np.stack([near, far, enclosed], axis=-1).reshape(len(frames), layout.n_cells, 3)
 
 
 def _mean(values: NDArray[np.float64]) -> NDArray[np.float64]:

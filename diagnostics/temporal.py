@@ -42,5 +42,6 @@ def last_runs(log: NDArray[np.float64], tolerance: float) -> LastRuns:
     start = len(log) - length
     last = np.maximum(length - 1, 0)[None, :]
     high, low = np.take_along_axis(highest, last, 0)[0], np.take_along_axis(lowest, last, 0)[0]
-    value = np.where(np.isfinite(high) & np.isfinite(low), (high + low) / 2, np.nan)
+    heard = np.isfinite(high)
+    value = np.where(heard, (np.where(heard, high, 0.0) + np.where(heard, low, 0.0)) / 2, np.nan)
     return LastRuns(start=start, value=value, moved=start > 0)

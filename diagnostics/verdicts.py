@@ -70,10 +70,10 @@ class Diagnosis:
     @cached_property
     def verdicts(self) -> NDArray[np.object_]:
         """Array ``[D]`` of :class:`Verdict`. A position without a cell is UNTESTED."""
-        verdicts = np.full(self.layout.n_cells, Verdict.UNTESTED, dtype=object)
-        verdicts[self.tested & self.layout.present.ravel()] = Verdict.ALIVE
-        verdicts[self.fault_set.mask] = Verdict.FAULTY
-        return verdicts
+        code = np.where(self.tested & self.layout.present.ravel(), Verdict.ALIVE, Verdict.UNTESTED)
+        code[self.fault_set.mask] = Verdict.FAULTY
+        # Members, not the integers that numpy would make of them.
+        return np.array(list(Verdict), dtype=object)[code]
 
     @cached_property
     def coverage(self) -> Coverage:

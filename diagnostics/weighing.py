@@ -26,6 +26,7 @@ _LOGS = 24  # drawn to fit the weights
 _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
 _DEAD_SHARE = 0.08
 _FEWEST_RECORDINGS = 8  # below that the reference cannot be split
+_PIECE = 100  # frames; longer recordings are cut, so that a single long one can be split too
 _CLIP = 12.0  # log ratios beyond this say "certain"; they must not steer the fit
 _EXPECTED_SHARE, _EXPECTED_CELLS = 0.02, 25.0  # faults expected before a log is seen: 2 %, worth 25 cells
 
@@ -34,17 +35,18 @@ _EXPECTED_SHARE, _EXPECTED_CELLS = 0.02, 25.0  # faults expected before a log is
 class Weights:
     """What a raw log likelihood ratio is worth: ``offset + slope * ratio``.
 
-    The defaults serve a cold start; they were fitted in the same way on simulated grasps.
+    The defaults serve a cold start; they were fitted in the same way, on 16 logs of simulated grasps.
     """
 
-    offset: float = -2.0
-    slope: float = 0.8
+    offset: float = 0.0
+    slope: float = 0.9
 
     @classmethod
     def fit(
         cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, tolerance: float, *, seed: int = 0
     ) -> Weights:
         """Fit on fault-free recordings, ``[T, D]`` each; too few of them give the defaults."""
+        recordings = [piece for r in recordings for piece in np.array_split(r, max(1, len(r) // _PIECE))]
         if len(recordings) < _FEWEST_RECORDINGS:
             return cls()
         from sklearn.linear_model import LogisticRegression

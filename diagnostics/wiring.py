@@ -19,7 +19,8 @@ from diagnostics.layout import Line, SensorLayout
 _LINE_COST = np.log(200.0)
 _CONTRADICTION_COST = np.log(1000.0)
 _RAREST, _MOST_COMMON = 0.005, 0.5  # bounds on the share of single faults, which few cells cannot tell exactly
-_FEWEST_WITNESSES = 3  # faulty cells that were seen on a line before it is blamed
+# Faulty cells that must have been seen on a line before it is blamed: so many, and this share of its cells.
+_FEWEST_WITNESSES, _WITNESS_SHARE = 3, 1 / 3
 _ROUNDS = 5
 
 
@@ -56,30 +57,27 @@ def explain(faulty: NDArray[np.intp], alive: NDArray[np.bool_], layout: SensorLa
     return tuple(causes)
 
 
-def _explain_pad(
-    pad: int, faulty: NDArray[np.intp], alive: NDArray[np.bool_], layout: SensorLayout
-) -> list[Cause]:
+def _explain_pad(pad: int, faulty: NDArray[np.intp], alive: NDArray[np.bool_], layout: SensorLayout) -> list[Cause]:
     served = {
         line: layout.cells_on(line)
         for line in layout.lines
         if line.pad == pad and line.kind in ("row", "column", "converter")
     }
     candidates = {
-        line: cells for line, cells in served.items() if np.isin(faulty, cells).sum() >= min(_FEWEST_WITNESSES, len(cells))
+        line: cells
+        for line, cells in served.items()
+        if np.isin(faulty, cells).sum() >= max(min(_FEWEST_WITNESSES, len(cells)), _WITNESS_SHARE * len(cells))
     }
     tested = int(alive[served[Line(pad, "converter", 0)]].sum()) + len(faulty)
     blamed: set[Line] = set()
-    rarity = _RAREST
+    singles = 0
     for _ in range(_ROUNDS):
-        singles = faulty[~np.isin(faulty, [c for line in blamed for c in candidates[line].tolist()])]
-        if blamed or rarity != _RAREST:
-            rarity = float(np.clip(len(singles) / tested, _RAREST, _MOST_COMMON))
-        cell_cost = -np.log(rarity)
-        chosen = _cheapest_cover(candidates, faulty, alive, cell_cost)
-        if chosen == blamed and rarity != _RAREST:
+        cell_cost = -np.log(np.clip(singles / tested, _RAREST, _MOST_COMMON))
+        blamed = _cheapest_cover(candidates, faulty, alive, cell_cost)
+        behind = [cell for line in blamed for cell in candidates[line].tolist()]
+        singles, before = int((~np.isin(faulty, behind)).sum()), singles
+        if singles == before:
             break
-        blamed = chosen
-        rarity = float(np.clip(rarity, _RAREST + 1e-12, _MOST_COMMON))
     causes: list[Cause] = []
     explained: set[int] = set()
     for line in sorted(blamed):
@@ -103,8 +101,14 @@ def _cheapest_cover(
     lines = list(candidates)
     contradictions = np.array([alive[candidates[line]].sum() for line in lines])
     cost = np.concatenate([_LINE_COST + _CONTRADICTION_COST * contradictions, np.full(len(faulty), cell_cost)])
-    covers = np.column_stack([np.isin(faulty, candidates[line]) for line in lines] + [np.eye(len(faulty))])
+    by_line = [np.isin(faulty, candidates[line]).astype(float) for line in lines]
+    covers = np.column_stack([*by_line, np.eye(len(faulty))])
     solution = milp(
-        cost, constraints=LinearConstraint(covers, lb=1), integrality=np.ones(len(cost)), bounds=Bounds(0, 1)
+        cost,
+        constraints=LinearConstraint(covers, lb=1),
+        integrality=np.ones(len(cost), dtype=int),
+        bounds=Bounds(0, 1),
     )
-    return {line for line, x in zip(lines, solution.x, strict=False) if x > 0.5}
+    # Feasible by construction: every cell can explain itself.
+    chosen = np.asarray(solution.x)[: len(lines)] > 0.5
+    return {line for line, taken in zip(lines, chosen, strict=True) if taken}

@@ -1,0 +1,75 @@
+"""Keeps a tactile classifier working when cells of the skin die.
+
+Names are loaded when first used, so that ``import adaptfault`` is quick and torch comes only with a model.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from adaptfault.adaptation import Adaptation, Adapter
+    from adaptfault.calibration import Calibration
+    from adaptfault.evaluation import Scores, evaluate
+    from adaptfault.grasps import simulate
+    from adaptfault.network import TactileTransformer
+    from adaptfault.recordings import Recordings, load, save_npz
+    from adaptfault.reduction import ReducedModel
+    from adaptfault.store import load_model, save_model
+    from adaptfault.training import History, train
+    from adaptfault.windows import Windows, make_windows, split
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Adaptation",
+    "Adapter",
+    "Calibration",
+    "History",
+    "Recordings",
+    "ReducedModel",
+    "Scores",
+    "TactileTransformer",
+    "Windows",
+    "evaluate",
+    "load",
+    "load_model",
+    "make_windows",
+    "save_model",
+    "save_npz",
+    "simulate",
+    "split",
+    "train",
+]
+
+_HOMES = {
+    "Adaptation": "adaptation",
+    "Adapter": "adaptation",
+    "Calibration": "calibration",
+    "History": "training",
+    "Recordings": "recordings",
+    "ReducedModel": "reduction",
+    "Scores": "evaluation",
+    "TactileTransformer": "network",
+    "Windows": "windows",
+    "evaluate": "evaluation",
+    "load": "recordings",
+    "load_model": "store",
+    "make_windows": "windows",
+    "save_model": "store",
+    "save_npz": "recordings",
+    "simulate": "grasps",
+    "split": "windows",
+    "train": "training",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'adaptfault' has no attribute {name!r}")
+    return getattr(import_module(f"adaptfault.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,70 @@
+"""adaptfault demo: the main job, on simulated grasps or on the user's own recordings."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from adaptfault.cli.inject_option import INJECT_HELP, parse_faults
+from adaptfault.cli.options import Commands, add_recordings, command, load_recordings, progress, say
+
+_EXAMPLE = """  adaptfault demo
+  adaptfault demo --recordings grasps.npz --epochs 20 --inject random:5=short"""
+
+_SIMULATED_PER_CLASS = 60
+_EPOCHS = 6
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    parser = command(commands, "demo", "train, break the sensor, diagnose, repair, write a report", _EXAMPLE)
+    add_recordings(parser, option=True)
+    parser.add_argument("--out", default="adaptfault-demo", metavar="FOLDER", help="default adaptfault-demo")
+    parser.add_argument("--epochs", type=int, help="of training (default: 6 simulated, 20 on recordings)")
+    parser.add_argument("--seed", type=int, default=0, help="of everything (default 0)")
+    parser.add_argument("--inject", action="append", metavar="FAULT", help=INJECT_HELP)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the main job and write the report."""
+    import json
+
+    import numpy as np
+
+    if args.recordings:
+        recordings = load_recordings(args, args.recordings, labelled=True)
+    else:
+        from adaptfault.grasps import simulate
+
+        recordings = simulate(_SIMULATED_PER_CLASS, seed=args.seed)
+    faults = None
+    if args.inject:
+        faults = parse_faults(args.inject, recordings.layout, np.random.default_rng(args.seed))
+    say(args, "loading torch")
+
+    from adaptfault.demo import run_demo
+    from adaptfault.report import write_report
+
+    out = Path(args.out)
+    out.mkdir(parents=True, exist_ok=True)
+    checkpoint = out / "training.safetensors"
+    if checkpoint.exists():
+        say(args, f"continuing the training in {checkpoint}")
+    result = run_demo(
+        recordings,
+        faults,
+        epochs=args.epochs or (20 if args.recordings else _EPOCHS),
+        seed=args.seed,
+        checkpoint=checkpoint,
+        progress=progress(args),
+        say=(lambda text: say(args, text)) if args.json else lambda text: print(text, flush=True),
+    )
+    report = write_report(out / "report.html", result)
+    checkpoint.unlink(missing_ok=True)
+    (out / "result.json").write_text(json.dumps(result.to_dict(), allow_nan=False))
+    if args.json:
+        print(json.dumps(result.to_dict(), indent=1, allow_nan=False))
+    else:
+        print(f"report       {report}")
+    return 0

@@ -1,0 +1,59 @@
+"""adaptfault evaluate: how good a model is, fault-free or with injected faults, adapted or not."""
+
+from __future__ import annotations
+
+import argparse
+
+from adaptfault.cli.inject_option import INJECT_HELP, parse_faults
+from adaptfault.cli.options import Commands, add_recordings, command, emit, load_recordings
+
+_EXAMPLE = """  adaptfault evaluate model grasps/ --inject random:5=short
+  adaptfault evaluate model grasps/ --inject row:0:3=open --adapted adapted"""
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    parser = command(commands, "evaluate", "score a model on the test recordings", _EXAMPLE)
+    parser.add_argument("model", metavar="MODEL", help="folder written by adaptfault train")
+    add_recordings(parser)
+    parser.add_argument("--adapted", metavar="FOLDER", help="score this adaptation of the model instead")
+    parser.add_argument("--inject", action="append", default=[], metavar="FAULT", help=INJECT_HELP)
+    parser.add_argument("--seed", type=int, default=0, help="of random faults (default 0)")
+    parser.add_argument("--all", action="store_true", help="score on all recordings, not only on the test share")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Score."""
+    import numpy as np
+
+    from adaptfault.adaptation import Adaptation
+    from adaptfault.cli.data import open_model, parts_of, windows_of
+    from adaptfault.evaluation import evaluate
+    from diagnostics import inject
+
+    model, manifest = open_model(args.model)
+    recordings = load_recordings(args, args.recordings, labelled=True)
+    classifier = Adaptation.load(args.adapted) if args.adapted else model
+    if isinstance(classifier, Adaptation) and classifier.fault_set.n_cells != model.layout.n_cells:
+        raise ValueError(f"{args.adapted}: an adaptation over {classifier.fault_set.n_cells} cells, not of this model")
+    windows = windows_of(recordings, model, manifest)
+    if not args.all:
+        windows = parts_of(recordings, model, manifest)[2]
+    rng = np.random.default_rng(args.seed)
+    faults = parse_faults(args.inject, recordings.layout, rng)
+    if faults:
+        which = np.unique(windows.recording)
+        broken = [
+            inject(r, faults, recordings.layout, seed=args.seed + i) if i in which else r
+            for i, r in enumerate(recordings.frames)
+        ]
+        from adaptfault.windows import make_windows
+
+        every = make_windows(broken, recordings.labels, recordings.layout, length=model.length)
+        windows = every.select(np.isin(every.recording, which))
+    scores = evaluate(classifier, windows)
+    cells = sorted({c for fault in faults for c in fault.cells})
+    result = {"schema": "adaptfault.evaluate/1", "scores": scores.to_dict(), "injected": [f.to_dict() for f in faults]}
+    emit(args, result, f"{len(cells)} cells faulty: {scores}" if cells else str(scores))
+    return 0

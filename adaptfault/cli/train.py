@@ -1,0 +1,62 @@
+"""adaptfault train: recordings in, a model folder out."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from adaptfault.cli.options import Commands, add_recordings, command, emit, load_recordings, progress, say
+
+_EXAMPLE = """  adaptfault train grasps/ --out model --epochs 20
+      grasps/<class>/<recording>.csv; run it again after a crash and it goes on where it was"""
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    parser = command(commands, "train", "train the paper's network on fault-free recordings", _EXAMPLE)
+    add_recordings(parser)
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="where the model goes")
+    parser.add_argument("--epochs", type=int, default=50, help="at most so many (default 50)")
+    parser.add_argument("--seed", type=int, default=0, help="of split, weights and training (default 0)")
+    parser.add_argument("--length", type=int, default=10, help="frames in a window (default 10)")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train, evaluate on the test recordings, save."""
+    recordings = load_recordings(args, args.recordings, labelled=True)
+
+    from adaptfault.evaluation import evaluate
+    from adaptfault.network import TactileTransformer
+    from adaptfault.store import save_model
+    from adaptfault.training import train
+    from adaptfault.windows import make_windows, split
+
+    windows = make_windows(recordings.frames, recordings.labels, recordings.layout, length=args.length)
+    parts = split(windows, seed=args.seed)
+    say(args, f"{recordings.layout}; {windows}")
+    model = TactileTransformer(recordings.layout, len(recordings.class_names), length=args.length, seed=args.seed)
+    out = Path(args.out)
+    out.mkdir(parents=True, exist_ok=True)
+    checkpoint = out / "training.safetensors"
+    if checkpoint.exists():
+        say(args, f"continuing from {checkpoint}")
+    history = train(
+        model,
+        parts[0],
+        parts[1],
+        epochs=args.epochs,
+        seed=args.seed,
+        checkpoint=checkpoint,
+        progress=progress(args),
+    )
+    scores = evaluate(model, parts[2])
+    extra = {"split_seed": args.seed, "test_scores": scores.to_dict(), "history": history.to_dict()}
+    save_model(out, model, class_names=recordings.class_names, extra=extra)
+    checkpoint.unlink()  # the run is complete: what it left to resume from is the model itself
+    emit(
+        args,
+        {"schema": "adaptfault.train/1", "model": str(out), **extra},
+        f"test: {scores}\ntraining: {history}\nmodel: {out}",
+    )
+    return 0

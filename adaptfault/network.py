@@ -1,0 +1,220 @@
+"""The paper's network (Section III-A): convolutions over each frame, a transformer over time, for any tactile array."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from diagnostics import SensorLayout
+
+FILTERS = (16, 32)  # of the two 3 x 3 convolutions
+BLOCKS = 2
+HEADS, HEAD_DIM = 4, 64  # 256 wide inside the attention, whatever d is
+HIDDEN = 128  # of the feed-forward blocks and of the head
+
+Batch = Tensor | NDArray[Any]
+
+
+class Dropout(nn.Module):
+    """Drop a share ``p`` of the values while training and scale up the rest.
+
+    As torch's own, whose generator took a sixth of a training step on a CPU: here one 64-bit draw decides four values.
+    """
+
+    def __init__(self, p: float) -> None:
+        super().__init__()
+        if not 0 <= p < 1:
+            raise ValueError(f"dropout must lie in [0, 1), got {p}")
+        self.cut = round(p * 2**16)  # of the 2^16 values of a 16-bit draw, so many drop
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map a tensor to one of the same shape; in eval mode to itself."""
+        if not (self.training and self.cut):
+            return x
+        draws = torch.empty((x.numel() + 3) // 4, dtype=torch.int64, device=x.device).random_(-(2**63), None)
+        kept = draws.view(torch.int16)[: x.numel()].view(x.shape) >= self.cut - 2**15
+        return x * (kept * (2**16 / (2**16 - self.cut)))
+
+
+class EncoderBlock(nn.Module):
+    """Post-norm transformer block of width d: attention, then d -> 128 -> d, a residual and LayerNorm after each."""
+
+    def __init__(self, d: int, dropout: float) -> None:
+        super().__init__()
+        self.qkv = nn.Linear(d, 3 * HEADS * HEAD_DIM)
+        self.out = nn.Linear(HEADS * HEAD_DIM, d)  # W^O
+        self.norm1 = nn.LayerNorm(d)
+        # The paper prints Dense_128(ReLU(Dense_d(x))), whose 128 values could not be added to the d of the residual.
+        self.up = nn.Linear(d, HIDDEN)
+        self.down = nn.Linear(HIDDEN, d)
+        self.norm2 = nn.LayerNorm(d)
+        self.dropout = Dropout(dropout)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map ``[N, T, d]`` to ``[N, T, d]``."""
+        q, k, v = self.qkv(x).unflatten(-1, (3, HEADS, HEAD_DIM)).permute(2, 0, 3, 1, 4)  # each (N, heads, T, 64)
+        attended = F.scaled_dot_product_attention(q, k, v)  # (N, heads, T, 64)
+        attended = attended.transpose(1, 2).flatten(2)  # (N, T, 256)
+        x = self.norm1(x + self.dropout(self.out(attended)))
+        fed: Tensor = self.norm2(x + self.dropout(self.down(F.relu(self.up(x)))))
+        return fed
+
+
+class TactileTransformer(nn.Module):
+    """Classifier of tactile windows, Section III-A, for any layout.
+
+    The pads are the channels of the convolutions, which see each frame alone; attention runs over the frames. There is
+    no positional encoding: the paper has none, so the order of the frames does not matter. The paper's
+    formulas write out every ReLU and put none after the convolutions, nor does Keras, so they are linear here. Their
+    padding is not stated: "same" also fits pads of fewer than 5 rows. The dropout of 0.1 is stated for the head only;
+    the blocks use the same.
+
+    Positions that the layout lacks cannot influence the output, whatever they hold, NaN included.
+
+    Args:
+        layout: the array; its D columns are the network's input.
+        n_classes: number of outputs.
+        length: T, frames in a window.
+        padding: "same" or "valid" (no padding, needs 5 x 5 cells).
+        dropout: share of values dropped while training.
+        seed: of the initial weights; the global generator is left alone.
+
+    Attributes:
+        head: the last linear layer, 128 -> n_classes; :meth:`features` is its input.
+
+    Raises:
+        ValueError: a size below 1, an unknown padding, a pad too small for "valid".
+    """
+
+    present: Tensor
+
+    def __init__(
+        self,
+        layout: SensorLayout,
+        n_classes: int,
+        *,
+        length: int = 10,
+        padding: Literal["same", "valid"] = "same",
+        dropout: float = 0.1,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        if n_classes < 1 or length < 1:
+            raise ValueError(f"the network needs n_classes >= 1 and length >= 1, got {n_classes} and {length}")
+        if padding not in ("same", "valid"):
+            raise ValueError(f"unknown padding {padding!r}: use 'same' or 'valid'")
+        lost = 0 if padding == "same" else 2 * len(FILTERS)  # each unpadded 3 x 3 takes one cell from every edge
+        if min(layout.rows, layout.cols) <= lost:
+            raise ValueError(
+                f"padding 'valid' needs pads of 5 x 5, these have {layout.rows} x {layout.cols}: use 'same'"
+            )
+        self.layout, self.n_classes, self.length = layout, n_classes, length
+        self.padding, self.p_dropout, self.seed = padding, dropout, seed
+        self.register_buffer("present", torch.from_numpy(layout.present.ravel().copy()), persistent=False)
+        d = FILTERS[-1] * (layout.rows - lost) * (layout.cols - lost)
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(seed)
+            self.conv1 = nn.Conv2d(layout.pads, FILTERS[0], 3, padding=padding)
+            self.conv2 = nn.Conv2d(FILTERS[0], FILTERS[1], 3, padding=padding)
+            self.blocks = nn.ModuleList(EncoderBlock(d, dropout) for _ in range(BLOCKS))
+            self.dense = nn.Linear(d, HIDDEN)
+            self.dropout = Dropout(dropout)
+            self.head = nn.Linear(HIDDEN, n_classes)
+            self.apply(_initialise)
+
+    def features(self, x: Tensor) -> Tensor:
+        """Map windows ``[N, T, D]`` to the 128 values ``[N, 128]`` that the head weighs."""
+        n_cells = self.layout.n_cells
+        if x.dim() != 3 or x.shape[1] != self.length or x.shape[2] != n_cells:
+            raise ValueError(f"expected windows [N, {self.length}, {n_cells}], got {list(x.shape)}")
+        if not self.layout.present.all():
+            x = torch.where(self.present, x, 0.0)  # not a product: NaN * 0 is NaN
+        x = x.reshape(-1, *self.layout.shape)  # (N * T, pads, rows, cols)
+        x = self.conv1(x)  # (N * T, 16, rows, cols)
+        x = self.conv2(x)  # (N * T, 32, rows, cols)
+        x = x.flatten(1)  # (N * T, d)
+        x = x.reshape(-1, self.length, x.shape[1])  # (N, T, d)
+        for block in self.blocks:
+            x = block(x)  # (N, T, d)
+        x = x.mean(1)  # (N, d)
+        return F.relu(self.dense(x))  # (N, 128)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map windows ``[N, T, D]`` on the 0..1 scale to logits ``[N, n_classes]``.
+
+        Raises:
+            ValueError: windows of another shape.
+        """
+        logits: Tensor = self.head(self.dropout(self.features(x)))
+        return logits
+
+    def predict(self, x: Batch) -> NDArray[np.int64]:
+        """Return the class of each window ``[N, T, D]``, int64 ``[N]``."""
+        classes: NDArray[np.int64] = logits_of(self, x).argmax(1).numpy()
+        return classes
+
+    def predict_proba(self, x: Batch) -> NDArray[np.float32]:
+        """Return the probability of each class for windows ``[N, T, D]``, float32 ``[N, n_classes]``."""
+        probabilities: NDArray[np.float32] = logits_of(self, x).softmax(1).numpy()
+        return probabilities
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What :meth:`from_config` needs to build this network again (without its weights); JSON-safe."""
+        return {
+            "layout": self.layout.to_dict(),
+            "n_classes": self.n_classes,
+            "length": self.length,
+            "padding": self.padding,
+            "dropout": self.p_dropout,
+            "seed": self.seed,
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> TactileTransformer:
+        """Build an untrained network from a :attr:`config`."""
+        rest = {name: value for name, value in config.items() if name != "layout"}
+        return cls(SensorLayout.from_dict(config["layout"]), **rest)
+
+
+def as_tensor(array: NDArray[Any]) -> Tensor:
+    """View an array as a tensor; one that is read-only or not contiguous is copied, which torch would warn about."""
+    return torch.from_numpy(np.require(array, requirements=("C", "W")))
+
+
+def logits_of(model: nn.Module, x: Batch, *, batch_size: int = 256) -> Tensor:
+    """Return the logits ``[N, n]`` of any module for ``x [N, ...]``: in eval mode, in batches, without gradients.
+
+    The result is on the CPU; every module of ``model`` gets the mode back that it had.
+    """
+    windows = x if isinstance(x, Tensor) else as_tensor(np.asarray(x, dtype=np.float32))
+    device = next((p.device for p in model.parameters()), windows.device)
+    modes = [(module, module.training) for module in model.modules()]
+    model.eval()
+    try:
+        with torch.no_grad():
+            batches = torch.split(windows, batch_size) if len(windows) else (windows,)
+            return torch.cat([model(batch.to(device, torch.float32)).cpu() for batch in batches])
+    finally:
+        for module, mode in modes:
+            module.training = mode
+
+
+@torch.no_grad()
+def _initialise(module: nn.Module) -> None:
+    """Glorot uniform weights and zero biases, the defaults of Keras, which Section III-A's names come from."""
+    if isinstance(module, nn.Linear | nn.Conv2d):
+        nn.init.xavier_uniform_(module.weight)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
+    elif isinstance(
+        module, EncoderBlock
+    ):  # comes after its layers: queries, keys, values are drawn each at its own size
+        for weight in torch.split(module.qkv.weight, HEADS * HEAD_DIM):
+            nn.init.xavier_uniform_(weight)

@@ -1,0 +1,102 @@
+"""Reads the paper's CSV files: one recording a file, one frame a line, one cell a column."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.recordings.content import Content
+from adaptfault.recordings.errors import InputError
+from adaptfault.recordings.text import numbered_lines, read_text, shown
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+def read_csv(path: Path) -> Content:
+    """Read a CSV file of T lines x D readings, comma separated, with or without a header line.
+
+    An empty cell and ``nan`` are missing readings and become NaN. Blank lines are passed over.
+
+    Raises:
+        InputError: not text, no readings, lines of different lengths, a cell that is no number.
+    """
+    rows, numbers = numbered_lines(read_text(path))
+    if rows and _is_header(rows[0]):
+        rows, numbers = rows[1:], numbers[1:]
+    if not rows:
+        raise InputError.at(path, "holds no readings; record it again or remove it")
+    try:
+        values = np.loadtxt(rows, dtype=np.float32, delimiter=",", comments=None, ndmin=2)
+    except ValueError:  # numpy's parser is fast, and does not say what is wrong
+        values = _read_by_cell(path, rows, numbers)
+    with np.errstate(invalid="ignore"):
+        counts = bool(np.all((values == np.rint(values)) | np.isnan(values)))
+    return Content(path, (values,), counts, lines=np.array(numbers, dtype=np.intp))
+
+
+def _is_header(line: str) -> bool:
+    """Tell column names from a frame: most of them are no numbers, or they count the columns (0, 1, 2, ...)."""
+    cells = [_bare(cell) for cell in re.split("[,;\t]", line)]
+    if len(cells) == 1:
+        cells = line.split()  # numbers with a wrong separator are a frame too, which the parser refuses
+    first = _number(cells[0])
+    if first not in (None, 0.0, 1.0) and _number(cells[-1]) is not None:
+        return False  # quickly: this is nearly every frame
+    numbers = [_number(cell) for cell in cells if cell]
+    if None in numbers:
+        return 2 * numbers.count(None) > len(numbers)
+    # pandas writes such a header of its own accord; no array reads exactly that
+    return len(numbers) > 3 and any(numbers == list(range(start, start + len(numbers))) for start in (0, 1))
+
+
+def _read_by_cell(path: Path, rows: Sequence[str], numbers: Sequence[int]) -> NDArray[np.float32]:
+    """Parse cell by cell: takes missing readings, and names the line and column of what it cannot take."""
+    for separator, name in ((";", "';'"), ("\t", "tabs")):
+        if separator in rows[0]:
+            raise InputError.at(path, f"separated by {name}? use commas, and a point in decimals", f"line {numbers[0]}")
+    table = [row.split(",") for row in rows]
+    if len(table[0]) == 1 and " " in rows[0].strip():
+        raise InputError.at(path, "separated by spaces? use commas", f"line {numbers[0]}")
+    width = Counter(len(cells) for cells in table).most_common(1)[0][0]
+    for number, cells in zip(numbers, table, strict=True):
+        if len(cells) != width:
+            mend = "leave a missing reading as an empty cell, between its commas"
+            if number == numbers[-1] and len(cells) < width:
+                mend = "the recording was cut off here: remove the line"
+            what = f"{_values(len(cells))} where the other lines have {width}; {mend}"
+            raise InputError.at(path, what, f"line {number}")
+    values = np.empty((len(table), width), dtype=np.float32)
+    for frame, (number, cells) in enumerate(zip(numbers, table, strict=True)):
+        for column, cell in enumerate(cells):
+            reading = _number(_bare(cell)) if cell.strip() else np.nan
+            if reading is None:
+                what = f"{shown(cell)} is not a number; write the reading, or leave the cell empty if it is missing"
+                if column == 0 and len(cells) > 1:
+                    what += " (a column of times does not belong here: remove it)"
+                raise InputError.at(path, what, f"line {number}, column {column + 1}")
+            values[frame, column] = reading
+    return values
+
+
+def _values(count: int) -> str:
+    return "1 value" if count == 1 else f"{count} values"
+
+
+def _bare(cell: str) -> str:
+    return cell.strip().strip('"').strip()
+
+
+def _number(cell: str) -> float | None:
+    """Return the number in a cell, or None; readings that float32 cannot hold become infinite, as in numpy's parser."""
+    try:
+        number = float(cell)
+    except ValueError:
+        return None
+    if "_" in cell:  # Python's float takes 1_000, no CSV means it
+        return None
+    return number if abs(number) <= _LARGEST or number != number else float("inf")

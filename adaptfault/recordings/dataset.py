@@ -1,0 +1,65 @@
+"""A set of recordings with their layout and labels: what every reader returns and every routine takes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics import SensorLayout
+
+
+@dataclass(frozen=True, eq=False)
+class Recordings:
+    """Recordings of one array.
+
+    Attributes:
+        frames: one float32 array ``[T, D]`` a recording, in the layout's unit, lengths may differ; NaN = missing reading.
+        layout: the array they come from.
+        labels: int ``[n]``, the class of each recording (an index into ``class_names``); None where there are none.
+        class_names: one name a class.
+        names: where each recording came from ("normal/0001.csv"), for messages.
+
+    Raises:
+        ValueError: a recording that does not fit the layout; labels, class names or names of another number.
+    """
+
+    frames: tuple[NDArray[np.float32], ...]
+    layout: SensorLayout
+    labels: NDArray[np.int64] | None = None
+    class_names: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        names = tuple(self.names) or tuple(f"recording {i}" for i in range(len(self.frames)))
+        frames = tuple(
+            self.layout.check_recording(f, name).astype(np.float32) for f, name in zip(self.frames, names, strict=True)
+        )
+        object.__setattr__(self, "names", names)
+        object.__setattr__(self, "frames", frames)
+        if self.labels is None:
+            return
+        labels = np.asarray(self.labels, dtype=np.int64)
+        if labels.shape != (len(frames),):
+            raise ValueError(f"{len(frames)} recordings need as many labels, got an array of shape {labels.shape}")
+        class_names = tuple(self.class_names) or tuple(str(i) for i in range(int(labels.max(initial=-1)) + 1))
+        if labels.size and not (0 <= labels.min() and labels.max() < len(class_names)):
+            raise ValueError(
+                f"labels run from {labels.min()} to {labels.max()}, but there are {len(class_names)} class names"
+            )
+        object.__setattr__(self, "labels", labels)
+        object.__setattr__(self, "class_names", class_names)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __iter__(self) -> Iterator[NDArray[np.float32]]:
+        return iter(self.frames)
+
+    def select(self, which: Sequence[int] | NDArray[np.integer]) -> Recordings:
+        """Return the recordings with these indices, in this order."""
+        labels = None if self.labels is None else self.labels[np.asarray(which, dtype=np.intp)]
+        frames, names = tuple(self.frames[i] for i in which), tuple(self.names[i] for i in which)
+        return Recordings(frames, self.layout, labels, self.class_names, names)

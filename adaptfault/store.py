@@ -1,0 +1,134 @@
+"""Models on disk: a folder with weights (safetensors) and what they mean (JSON), hashed, never pickle."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from adaptfault.atomic import atomic_write
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from adaptfault.network import TactileTransformer
+
+SCHEMA = "adaptfault.model/1"
+MANIFEST = "manifest.json"
+
+
+def save_tensors(folder: str | Path, schema: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    """Write tensors and what they mean into a folder, which is made if need be; what it held before is replaced.
+
+    The tensors go to a file named by their hash and ``manifest.json`` then names that file, so that replacing one small
+    file switches from the old content to the new.
+
+    Raises:
+        ValueError: ``about`` does not fit into JSON.
+    """
+    from safetensors.torch import save
+
+    # Copies: safetensors refuses tensors that share memory or are not contiguous.
+    data = save({name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()})
+    digest = hashlib.sha256(data).hexdigest()
+    name = f"weights-{digest[:12]}.safetensors"
+    manifest = {"schema": schema, **about, "weights": {"file": name, "sha256": digest}}
+    try:
+        text = json.dumps(manifest, indent=1, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"what is to be saved does not fit into JSON: {error}") from None
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    atomic_write(folder / name, data)
+    atomic_write(folder / MANIFEST, text.encode())
+    for old in folder.glob("weights-*.safetensors"):
+        if old.name != name:
+            old.unlink(missing_ok=True)
+
+
+def read_manifest(folder: str | Path, schema: str) -> dict[str, Any]:
+    """Return what ``manifest.json`` says. Needs no torch.
+
+    Raises:
+        FileNotFoundError: there is none in the folder.
+        ValueError: it is not JSON, or of another schema.
+    """
+    path = Path(folder) / MANIFEST
+    if not path.is_file():
+        raise FileNotFoundError(f"{folder}: expected a folder with a {MANIFEST}, found none")
+    try:
+        manifest = json.loads(path.read_bytes())
+        found = manifest["schema"]
+    except (ValueError, TypeError, KeyError):
+        raise ValueError(f"{path} is damaged or of another program: no JSON with a schema") from None
+    if found != schema:
+        raise ValueError(f"{path} has schema {found!r}, expected {schema!r}")
+    return dict(manifest)
+
+
+def load_tensors(folder: str | Path, schema: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Read what :func:`save_tensors` wrote.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is damaged, or of another schema.
+    """
+    from safetensors.torch import load
+
+    folder = Path(folder)
+    manifest = read_manifest(folder, schema)
+    try:
+        name, digest = manifest["weights"]["file"], manifest["weights"]["sha256"]
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{folder / MANIFEST} is damaged: {error}") from None
+    path = folder / Path(name).name  # a manifest cannot point outside its folder
+    if not path.is_file():
+        raise FileNotFoundError(f"the weights of {folder / MANIFEST} are missing: {name}")
+    data = path.read_bytes()
+    if hashlib.sha256(data).hexdigest() != digest:
+        raise ValueError(f"{path} is damaged: its hash is not the one in {MANIFEST}")
+    return manifest, load(data)
+
+
+def save_model(
+    folder: str | Path,
+    model: TactileTransformer,
+    *,
+    class_names: Sequence[str] = (),
+    extra: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a model into a folder; an earlier model there is replaced in one step.
+
+    Args:
+        folder: where to.
+        model: its weights and :attr:`~adaptfault.network.TactileTransformer.config`.
+        class_names: one name a class, or none.
+        extra: anything JSON-safe to keep with it.
+
+    Raises:
+        ValueError: another number of class names than classes, or ``extra`` does not fit into JSON.
+    """
+    if class_names and len(class_names) != model.n_classes:
+        raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
+    about = {"config": model.config, "class_names": list(class_names), "extra": dict(extra or {})}
+    save_tensors(folder, SCHEMA, about, model.state_dict())
+
+
+def load_model(folder: str | Path) -> TactileTransformer:
+    """Read the model that :func:`save_model` wrote; it comes in eval mode.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is damaged, or the weights do not fit the network.
+    """
+    from adaptfault.network import TactileTransformer
+
+    manifest, tensors = load_tensors(folder, SCHEMA)
+    try:
+        model = TactileTransformer.from_config(manifest["config"])
+        model.load_state_dict(tensors)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"the model in {folder} is damaged: {str(error).splitlines()[0]}") from None
+    return model.eval()

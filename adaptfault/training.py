@@ -1,0 +1,333 @@
+"""The one training loop: Adam, early stopping, a time budget, and checkpoints that survive kill -9 (Section III-B)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from adaptfault.checkpoint import fingerprint_weights, fingerprint_windows, read_checkpoint, write_checkpoint
+from adaptfault.network import as_tensor, logits_of
+from adaptfault.windows import Windows
+
+Stopped = Literal["epochs", "patience", "budget"]
+Augment = Callable[[Tensor, torch.Generator], Tensor]
+
+
+@dataclass(frozen=True)
+class History:
+    """What a training run did.
+
+    Attributes:
+        train_loss, validation_loss, validation_accuracy, seconds: one number an epoch (mean cross entropy; wall clock).
+        best_epoch: the epoch whose weights were kept, counted from 1; 0 = the starting weights.
+        stopped: "epochs" (all done), "patience" (no better for long), "budget" (out of time, also within an epoch).
+        start: validation loss and accuracy of the starting weights, where they were evaluated.
+    """
+
+    train_loss: tuple[float, ...] = ()
+    validation_loss: tuple[float, ...] = ()
+    validation_accuracy: tuple[float, ...] = ()
+    seconds: tuple[float, ...] = ()
+    best_epoch: int = 0
+    stopped: Stopped = "epochs"
+    start: tuple[float, float] | None = None
+
+    @property
+    def epochs(self) -> int:
+        """Number of epochs trained, the last one perhaps cut short by the budget."""
+        return len(self.train_loss)
+
+    @property
+    def best_accuracy(self) -> float:
+        """Validation accuracy of the weights that were kept; NaN if nothing was evaluated."""
+        if self.best_epoch:
+            return self.validation_accuracy[self.best_epoch - 1]
+        return self.start[1] if self.start else math.nan
+
+    def __str__(self) -> str:
+        return (
+            f"{self.epochs} epochs in {sum(self.seconds):.1f} s, stopped by {self.stopped}; "
+            f"best is epoch {self.best_epoch}, validation accuracy {self.best_accuracy:.3f}"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict that :meth:`from_dict` reads."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, d: dict[str, Any]) -> History:
+        """Build a history from :meth:`to_dict`'s dict, also after a trip through JSON."""
+        fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in d.items()}
+        return cls(**fields)
+
+
+def train(
+    model: nn.Module,
+    train: Windows,
+    validation: Windows,
+    *,
+    epochs: int = 50,
+    learning_rate: float = 1e-4,
+    batch_size: int = 32,
+    seed: int = 0,
+    patience: int | None = 10,
+    budget: float | None = None,
+    evaluate_start: bool = False,
+    augment: Augment | None = None,
+    checkpoint: str | Path | None = None,
+    on_epoch: Callable[[History], None] | None = None,
+    progress: bool | None = None,
+) -> History:
+    """Train ``model`` in place and leave it in eval mode with the weights that did best on ``validation``.
+
+    Best is the highest validation accuracy, of equals the lowest loss. (The loss alone turns upwards while the accuracy
+    still climbs; over five runs on real grasps it chose weights of 0.681 on the test, the accuracy of 0.702.)
+    Parameters with ``requires_grad`` False stay as they are. The best weights are also in the model when an exception
+    (Ctrl-C too) ends the run. For one seed the result is the same bit for bit on one machine with as many threads; the
+    global random state is left alone.
+
+    Args:
+        model: maps windows float32 ``[B, T, D]`` to logits ``[B, n]``.
+        train, validation: fault-free windows, labels 0 to n - 1.
+        epochs, learning_rate, batch_size: of Adam; Section III-B has 50 at most, 1e-4 and 32.
+        seed: of the order of the windows, of dropout and of ``augment``.
+        patience: epochs without a better validation before stopping; None trains all epochs.
+        budget: seconds, validation included; also ends the run within an epoch, or before the first. The time before a
+            resume counts.
+        evaluate_start: let the starting weights compete, so that fine-tuning never ends worse than it began.
+        augment: ``(x [B, T, D], generator) -> x``, applied to each training batch, a copy that it may change.
+        checkpoint: file written after each epoch. If it exists, training continues from it, and ends as it would have
+            ended without the interruption; ``epochs``, ``patience`` and ``budget`` may differ from the earlier run's.
+        on_epoch: called with the history so far after each epoch, once its checkpoint is on disk.
+        progress: True or False shows or hides the bar on stderr; None shows it on a terminal.
+
+    Raises:
+        ValueError: windows that are empty, not finite or have labels the model lacks; a checkpoint of another run; a
+            loss that is no longer finite.
+    """
+    if epochs < 1 or batch_size < 1 or not learning_rate > 0:
+        raise ValueError(
+            f"training needs epochs, batch_size, learning_rate > 0, got {epochs}, {batch_size}, {learning_rate}"
+        )
+    clock = _Clock(budget)
+    _check(model, train, validation)
+    run = _Run(model, learning_rate, Path(checkpoint) if checkpoint is not None else None)
+    if run.path is not None:
+        run.settings = {
+            "learning_rate": learning_rate,
+            "batch_size": batch_size,
+            "seed": seed,
+            "evaluate_start": evaluate_start,
+            "augment": None if augment is None else getattr(augment, "__qualname__", type(augment).__qualname__),
+            "data": fingerprint_windows(train, validation),
+            "starting weights": fingerprint_weights(model),
+        }
+        run.resume()
+        clock.spent = sum(run.history.seconds)
+    inputs, labels, device = as_tensor(train.x), as_tensor(train.y), next(model.parameters()).device
+    hide = None if progress is None else not progress
+    try:
+        if evaluate_start and run.history.start is None:
+            with clock.closing():
+                run.record(replace(run.history, start=_validate(model, validation)))
+        elif budget is not None:  # the first epoch, too, has to leave time for its validation
+            sample = validation.select(slice(0, 32))
+            with clock.closing(len(sample) / len(validation)):
+                _validate(model, sample)
+        with tqdm(total=epochs, initial=run.history.epochs, unit="epoch", disable=hide) as bar:
+            while (stopped := _stop(run.history, epochs, patience, clock)) is None:
+                began = time.perf_counter()
+                model.train()
+                with _seeded(seed, run.history.epochs, device) as generator:
+                    order = torch.split(torch.randperm(len(labels), generator=generator), batch_size)
+                    loss, seen = _pass(run, inputs, labels, order, augment, generator, clock)
+                with clock.closing():
+                    scores = _validate(model, validation)
+                    history = _append(run.history, loss, scores, time.perf_counter() - began)
+                    run.record(history, save=seen == len(labels))  # a cut epoch is no place to resume from
+                bar.update()
+                bar.set_postfix(loss=f"{loss:.4f}", accuracy=f"{scores[1]:.4f}", best=history.best_epoch)
+                if on_epoch is not None:
+                    on_epoch(history)
+    finally:
+        run.restore_best()
+        model.eval()
+    return replace(run.history, stopped=stopped)
+
+
+def _pass(
+    run: _Run,
+    inputs: Tensor,
+    labels: Tensor,
+    order: Sequence[Tensor],
+    augment: Augment | None,
+    generator: torch.Generator,
+    clock: _Clock,
+) -> tuple[float, int]:
+    """Train on batches until they or the time run out; return the mean loss and how many windows were seen."""
+    device, total, seen, began = next(run.model.parameters()).device, 0.0, 0, time.perf_counter()
+    for index in order:
+        if seen and clock.late(len(index)):
+            clock.over = True
+            break
+        x, y = inputs[index], labels[index]  # copies
+        x = x if augment is None else augment(x, generator)
+        loss = F.cross_entropy(run.model(x.to(device)), y.to(device))
+        run.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        run.optimizer.step()
+        total, seen = total + loss.item() * len(index), seen + len(index)
+        if not math.isfinite(total):
+            raise ValueError(f"the loss became {loss.item()} in epoch {run.history.epochs + 1}: lower learning_rate")
+        clock.pace = (time.perf_counter() - began) / seen
+    return total / seen, seen
+
+
+class _Clock:
+    """Tells when to stop a run, so that the next batch and the validation after it still fit into the budget."""
+
+    def __init__(self, budget: float | None) -> None:
+        self.began, self.budget, self.spent = time.perf_counter(), math.inf if budget is None else budget, 0.0
+        self.pace = 0.0  # seconds that training takes a window
+        self.close = 0.0  # seconds that the last validation and checkpoint took
+        self.over = False  # an epoch was cut short
+
+    @contextmanager
+    def closing(self, share: float = 1.0) -> Iterator[None]:
+        """Time the end of an epoch, or this share of one."""
+        began = time.perf_counter()
+        yield
+        self.close = (time.perf_counter() - began) / share
+
+    def late(self, batch: int) -> bool:
+        """Say whether another batch would be too much."""
+        return time.perf_counter() - self.began + self.spent + self.close + self.pace * batch > self.budget
+
+
+class _Run:
+    """A run's moving parts: model, best weights, Adam's moments and history, on disk too where there is a path."""
+
+    def __init__(self, model: nn.Module, learning_rate: float, path: Path | None) -> None:
+        self.model, self.path, self.history = model, path, History()
+        frozen = {name for name, p in model.named_parameters() if not p.requires_grad}
+        self.names = [name for name in model.state_dict() if name not in frozen]  # what training changes
+        self.trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
+        if not self.trained:
+            raise ValueError("nothing to train: every parameter of the model has requires_grad False")
+        # Fused: one pass over weights, gradients and moments. The default took 2 to 5 times as long, a sixth of a step.
+        self.optimizer = torch.optim.Adam(self.trained.values(), lr=learning_rate, fused=True)
+        self.best = self._weights()
+        self.settings: dict[str, Any] = {}
+
+    def _weights(self) -> dict[str, Tensor]:
+        state = self.model.state_dict()
+        return {name: state[name].detach().clone(memory_format=torch.contiguous_format) for name in self.names}
+
+    def restore_best(self) -> None:
+        self.model.load_state_dict(self.best, strict=False)
+
+    def record(self, history: History, *, save: bool = True) -> None:
+        """Take a longer history, keep the weights if they are its best, write the checkpoint."""
+        if history.best_epoch == history.epochs:
+            self.best = self._weights()
+        self.history = history
+        if not save or self.path is None:
+            return
+        tensors = {f"model.{name}": tensor for name, tensor in self._weights().items()}
+        if history.best_epoch != history.epochs:
+            tensors |= {f"best.{name}": tensor for name, tensor in self.best.items()}
+        for name, parameter in self.trained.items():
+            tensors |= {f"adam.{key}.{name}": value for key, value in self.optimizer.state[parameter].items()}
+        write_checkpoint(self.path, tensors, settings=self.settings, state=history.to_dict())
+
+    def resume(self) -> None:
+        """Continue from the checkpoint where there is one."""
+        if self.path is None or not self.path.exists():
+            return
+        tensors, state = read_checkpoint(self.path, self.settings)
+        self.history = History.from_dict(state)
+        self.model.load_state_dict(_under("model.", tensors), strict=False)
+        self.best = _under("best.", tensors) or self._weights()
+        for key in ("step", "exp_avg", "exp_avg_sq"):
+            for name, value in _under(f"adam.{key}.", tensors).items():
+                self.optimizer.state[self.trained[name]][key] = value.to(self.trained[name].device)
+
+
+def _check(model: nn.Module, train: Windows, validation: Windows) -> None:
+    """Refuse windows that would train nonsense, before any time is spent."""
+    for name, windows in (("training", train), ("validation", validation)):
+        if not len(windows):
+            raise ValueError(f"no {name} windows")
+        if bad := int((~np.isfinite(windows.x)).any(axis=(1, 2)).sum()):
+            raise ValueError(
+                f"{bad} of {len(windows)} {name} windows hold NaN or infinite readings: make_windows holds them"
+            )
+        n = logits_of(model, windows.x[:1]).shape[1]
+        if windows.y.min() < 0 or windows.y.max() >= n:
+            raise ValueError(
+                f"{name} labels run from {windows.y.min()} to {windows.y.max()}, the model has {n} classes"
+            )
+
+
+def _validate(model: nn.Module, windows: Windows) -> tuple[float, float]:
+    """Return loss and accuracy."""
+    logits, labels = logits_of(model, windows.x), as_tensor(windows.y)
+    loss = F.cross_entropy(logits, labels).item()
+    if not math.isfinite(loss):
+        raise ValueError(f"the validation loss became {loss}: lower learning_rate")
+    return loss, (logits.argmax(1) == labels).double().mean().item()
+
+
+def _append(history: History, train_loss: float, scores: tuple[float, float], seconds: float) -> History:
+    """Return the history with one more epoch, the best so far if its accuracy is, or ties at a lower loss."""
+    loss, accuracy = scores
+    earlier = list(zip(history.validation_accuracy, (-v for v in history.validation_loss), strict=True))
+    if history.start is not None:
+        earlier.append((history.start[1], -history.start[0]))
+    return replace(
+        history,
+        train_loss=(*history.train_loss, train_loss),
+        validation_loss=(*history.validation_loss, loss),
+        validation_accuracy=(*history.validation_accuracy, accuracy),
+        seconds=(*history.seconds, seconds),
+        best_epoch=history.epochs + 1 if all((accuracy, -loss) > e for e in earlier) else history.best_epoch,
+    )
+
+
+def _stop(history: History, epochs: int, patience: int | None, clock: _Clock) -> Stopped | None:
+    """Say why the run is over; None while it is not."""
+    if clock.over:
+        return "budget"
+    if patience is not None and history.epochs - history.best_epoch >= patience:
+        return "patience"
+    if history.epochs >= epochs:
+        return "epochs"
+    return "budget" if clock.late(1) else None
+
+
+@contextmanager
+def _seeded(seed: int, epoch: int, device: torch.device) -> Iterator[torch.Generator]:
+    """Give an epoch its own random numbers, dropout's too, so that a resumed run draws what an unbroken one would."""
+    state = int(np.random.SeedSequence([seed, epoch]).generate_state(1, np.uint64)[0] >> np.uint64(1))
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        torch.default_generator.manual_seed(state)
+        if device.type == "cuda":
+            with torch.cuda.device(device):
+                torch.cuda.manual_seed(state)
+        yield torch.Generator().manual_seed(state)
+
+
+def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors below a prefix, without it."""
+    return {name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)}

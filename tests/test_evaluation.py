@@ -1,0 +1,90 @@
+"""Scores are the paper's, whatever the model is."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from adaptfault.evaluation import Scores, evaluate
+from adaptfault.windows import Windows
+
+TRUE, PREDICTED = [0, 0, 0, 1, 1, 2], [0, 0, 1, 1, 0, 0]
+
+
+class Says:
+    """Predicts what it was told, as a list."""
+
+    def __init__(self, classes: list[int]) -> None:
+        self.classes = classes
+
+    def predict(self, x: np.ndarray) -> list[int]:
+        assert x.shape == (len(self.classes), 1, 2)
+        return self.classes
+
+
+def windows(y: list[int]) -> Windows:
+    return Windows(np.zeros((len(y), 1, 2)), np.array(y), np.arange(len(y)))
+
+
+def test_the_scores_are_those_computed_by_hand():
+    scores = evaluate(Says(PREDICTED), windows(TRUE))
+    assert scores.n == 6
+    assert scores.accuracy == pytest.approx(3 / 6)
+    assert scores.precision == pytest.approx((2 / 4 + 1 / 2 + 0) / 3)
+    assert scores.recall == pytest.approx((2 / 3 + 1 / 2 + 0) / 3)
+    assert scores.f1 == pytest.approx((4 / 7 + 1 / 2 + 0) / 3)
+    assert scores.confusion.tolist() == [[2, 1, 0], [1, 1, 0], [1, 0, 0]]
+
+
+def test_the_confusion_has_a_row_for_every_class_the_model_knows():
+    model = Says([0, 0])
+    model.n_classes = 4  # type: ignore[attr-defined]
+    scores = evaluate(model, windows([0, 0]))
+    assert scores.confusion.shape == (4, 4)
+    assert (scores.accuracy, scores.f1) == (1, 1)
+
+
+def test_a_module_without_predict_is_scored_by_its_logits():
+    class Bias(nn.Module):
+        def forward(self, x: torch.Tensor) -> torch.Tensor:
+            return torch.tensor([0.0, 2.0, 1.0]).expand(len(x), 3)
+
+    scores = evaluate(Bias(), windows([1, 1, 0, 1]))
+    assert scores.accuracy == 0.75
+    assert scores.confusion.shape == (3, 3)
+
+
+def test_scores_print_in_a_line_and_survive_json():
+    scores = Scores.of(TRUE, PREDICTED)
+    assert str(scores) == "accuracy 0.500, precision 0.333, recall 0.389, F1 0.357 on 6 windows"
+    again = Scores.from_dict(json.loads(json.dumps(scores.to_dict(), allow_nan=False)))
+    assert again == scores
+    assert again != Scores.of(TRUE, TRUE)
+    with pytest.raises(ValueError, match="expected schema"):
+        Scores.from_dict({"schema": "other"})
+
+
+def test_what_cannot_be_scored_is_refused():
+    with pytest.raises(ValueError, match="no windows"):
+        Scores.of([], [])
+    with pytest.raises(ValueError, match="1 of 2 windows have no label"):
+        Scores.of([0, -1], [0, 0])
+    with pytest.raises(ValueError, match="one predicted class for each of 2 windows"):
+        Scores.of([0, 1], [0])
+    with pytest.raises(TypeError, match="got str"):
+        evaluate("model", windows([0]))
+
+
+def test_the_confusion_can_be_drawn():
+    ax = Scores.of(TRUE, PREDICTED).plot(class_names=["a", "b", "c"])
+    assert ax.get_title().startswith("accuracy 0.500")
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["a", "b", "c"]
+
+
+def test_scoring_a_plain_classifier_needs_no_torch():
+    code = "import sys, adaptfault.evaluation, adaptfault.windows, adaptfault.store; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

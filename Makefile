@@ -23,13 +23,14 @@ format: .venv/installed-dev
 	$(BIN)/ruff format .
 
 .venv/installed: pyproject.toml constraints.txt
+	@echo 'installing into .venv (torch is large: a minute or more)'
 	@test -n "$(PYTHON)" || { echo "make: no working python3 (3.10 to 3.13) with venv found; name one: make PYTHON=/path/to/python3 ..."; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e .
 	@touch $@
 
 .venv/installed-dev: .venv/installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $@
 
 clean:

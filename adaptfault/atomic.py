@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 
-def atomic_write(path: str | Path, data: bytes) -> None:
+def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
     """Write a file so that after any crash, power loss included, it holds the old content or the new, never a part.
 
     Raises:

@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.adaptation import Adaptation, Adapter
-from adaptfault.evaluation import Scores, evaluate
+from adaptfault.evaluation import Scores, accuracy_interval
 from adaptfault.network import TactileTransformer
 from adaptfault.recordings import Recordings
 from adaptfault.training import History, train
 from adaptfault.windows import Windows, make_windows, scale, split
-from diagnostics import Diagnosis, Fault, FaultKind, FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault
+from diagnostics import Diagnosis, Fault, FaultKind, FaultSet, SelfDiagnosis, SensorLayout, inject, line_fault
 
 _LOG_RECORDINGS = 20  # of the broken sensor, that the diagnosis gets to see
+_BUDGET = 30.0  # seconds of fine-tuning, where the stages before it are not enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,7 @@ class DemoResult:
         injected: the known faults.
         fault_free, broken, repaired: scores of the test windows: healthy sensor; broken sensor and the fault-free
             model; broken sensor and the adapted model.
+        intervals: 95 % of the accuracy of these three, clustered by recording.
         history: of training.
         diagnosis: of a log of the broken sensor.
         adaptation: what was done about it.
@@ -46,6 +48,7 @@ class DemoResult:
     fault_free: Scores
     broken: Scores
     repaired: Scores
+    intervals: tuple[tuple[float, float], ...]
     history: History
     diagnosis: Diagnosis
     adaptation: Adaptation
@@ -86,6 +89,7 @@ class DemoResult:
             "fault_free": self.fault_free.to_dict(),
             "broken": self.broken.to_dict(),
             "repaired": self.repaired.to_dict(),
+            "intervals": [list(interval) for interval in self.intervals],
             "recovered": self.recovered,
             "diagnosis": self.diagnosis.to_dict(),
             "false_alarms": list(self.false_alarms),
@@ -134,14 +138,14 @@ def run_demo(
     with clock("training"):
         history = train(model, training, validation, epochs=epochs, seed=seed, checkpoint=checkpoint, progress=progress)
     say(f"training     {history}")
-    fault_free = evaluate(model, test)
+    fault_free, fault_free_interval = _score(model, test)
     say(f"fault-free   {fault_free}")
 
     rng = np.random.default_rng(seed)
     injected = tuple(default_faults(healthy, layout, rng) if faults is None else faults)
     broken = [inject(recordings.frames[i], injected, layout, seed=seed + int(i)) for i in tested]
     broken_windows = _labelled(make_windows(broken, None, layout), tested, recordings)
-    collapsed = evaluate(model, broken_windows)
+    collapsed, collapsed_interval = _score(model, broken_windows)
     n_broken = len({c for fault in injected for c in fault.cells})
     say(f"broken       {n_broken} cells: {'; '.join(f.reason for f in injected[:6])}{' ...' * (len(injected) > 6)}")
     say(f"             {collapsed}")
@@ -162,10 +166,10 @@ def run_demo(
 
     adapter = Adapter(model, training, validation)
     with clock("adaptation"):
-        adaptation = adapter.adapt(diagnosis.fault_set, seed=seed, progress=progress)
+        adaptation = adapter.adapt(diagnosis.fault_set, budget=_BUDGET, seed=seed, progress=progress)
     for stage in adaptation.stages:
         say(f"adaptation   {stage}")
-    repaired = evaluate(adaptation, broken_windows)
+    repaired, repaired_interval = _score(adaptation, broken_windows)
     result = DemoResult(
         recordings=recordings,
         seed=seed,
@@ -173,6 +177,7 @@ def run_demo(
         fault_free=fault_free,
         broken=collapsed,
         repaired=repaired,
+        intervals=(fault_free_interval, collapsed_interval, repaired_interval),
         history=history,
         diagnosis=diagnosis,
         adaptation=adaptation,
@@ -206,6 +211,12 @@ def default_faults(recordings: Sequence[NDArray[Any]], layout: SensorLayout, rng
         reason = f"pad {pad}, row {row}, column {column} is {kind}"
         faults.append(Fault(kind, (int(cell),), value=value, reason=reason))
     return faults
+
+
+def _score(model: TactileTransformer | Adaptation, windows: Windows) -> tuple[Scores, tuple[float, float]]:
+    """Return scores and the 95 % interval of the accuracy."""
+    predicted = model.predict(windows.x)
+    return Scores.of(windows.y, predicted), accuracy_interval(predicted == windows.y, windows.recording)
 
 
 def _labelled(windows: Windows, which: NDArray[np.int64], recordings: Recordings) -> Windows:

@@ -107,6 +107,32 @@ class Scores:
         return ax
 
 
+def accuracy_interval(right: ArrayLike, recording: ArrayLike, *, level: float = 0.95) -> tuple[float, float]:
+    """Return the confidence interval of an accuracy, clustered by recording.
+
+    The windows of one recording stand and fall together, so the recordings are what is counted: a cluster-robust
+    t interval, or where no window (or each) is wrong, the exact binomial one over recordings.
+
+    Args:
+        right: bool ``[N]``, which windows were classified rightly.
+        recording: int ``[N]``, the recording that each window came from.
+        level: of confidence.
+    """
+    from statsmodels.regression.linear_model import OLS
+    from statsmodels.stats.proportion import proportion_confint
+
+    right, recording = np.asarray(right, dtype=bool), np.asarray(recording)
+    count = len(np.unique(recording))
+    if right.all() or not right.any() or count < 2:
+        low, high = proportion_confint(count * int(right.all()), count, 1 - level, method="beta")
+        return float(low), float(high)
+    fit = OLS(right.astype(float), np.ones((len(right), 1))).fit(
+        cov_type="cluster", cov_kwds={"groups": recording}, use_t=True
+    )
+    low, high = fit.conf_int(1 - level)[0]
+    return max(0.0, float(low)), min(1.0, float(high))
+
+
 def evaluate(model: Classifier | Any, windows: Windows) -> Scores:
     """Score ``model`` on labelled windows.
 

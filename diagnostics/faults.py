@@ -117,7 +117,7 @@ class FaultSet(Set[int]):
         return np.flatnonzero(~self.mask)
 
     def __contains__(self, cell: object) -> bool:
-        return isinstance(cell, int | np.integer) and 0 <= cell < self.n_cells and bool(self.mask[int(cell)])
+        return isinstance(cell, int | np.integer) and 0 <= int(cell) < self.n_cells and bool(self.mask[int(cell)])
 
     def __iter__(self) -> Iterator[int]:
         return iter(self.cells)
@@ -139,13 +139,13 @@ class FaultSet(Set[int]):
     def __or__(self, other: Iterable[int]) -> FaultSet:  # type: ignore[override]
         return self._from_iterable({*self, *self._same_array(other)})
 
-    def __and__(self, other: Iterable[int]) -> FaultSet:
+    def __and__(self, other: Iterable[object]) -> FaultSet:
         return self._from_iterable(set(self).intersection(self._same_array(other)))
 
-    def __sub__(self, other: Iterable[int]) -> FaultSet:  # type: ignore[override]
+    def __sub__(self, other: Iterable[Any]) -> FaultSet:
         return self._from_iterable(set(self).difference(self._same_array(other)))
 
-    def _same_array(self, other: Iterable[int]) -> Iterable[int]:
+    def _same_array(self, other: Iterable[Any]) -> Iterable[Any]:
         if isinstance(other, FaultSet) and other.n_cells != self.n_cells:
             raise ValueError(f"fault sets of arrays with {self.n_cells} and {other.n_cells} cells cannot be combined")
         return other

@@ -106,7 +106,8 @@ def _overall_share(
     """
 
     def share(width: float) -> NDArray[np.float64]:
-        return ((np.abs(readings - values) <= width).sum(axis=0) + 0.5) / (len(readings) + 1)
+        near: NDArray[np.intp] = (np.abs(readings - values) <= width).sum(axis=0)
+        return (near + 0.5) / (len(readings) + 1)
 
     band = max(_BAND * full_scale, tolerance)
     return np.maximum(share(tolerance), share(band) * tolerance / band)
@@ -123,7 +124,7 @@ class PooledNeighbourhood:
 
     Without a fault-free reference each cell is judged by all trusted cells together: from the mean of its four nearest
     trusted neighbours, of the four diagonal ones, and from how well they enclose it: the smaller reading of two
-    opposite neighbours, the best pair counting. Built from the log itself. It interpolates and never extrapolates: a cell
+    opposite neighbours, the best pair counting. Built from the log itself. It interpolates, never extrapolates: a cell
     at the rim of the contact is rightly still, however loaded its neighbours on one side are.
     """
 
@@ -163,7 +164,7 @@ class PooledNeighbourhood:
 
 
 def _surroundings(frames: NDArray[np.float64], trusted: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.float64]:
-    """Return for each frame and cell what surrounds it, ``[T, D, 3]``; NaN where no two opposite cells can be trusted."""
+    """Return what surrounds each cell in each frame, ``[T, D, 3]``; NaN where no two opposite cells are trusted."""
     grid = layout.grid(np.where(trusted & layout.present.ravel(), np.sqrt(np.maximum(frames, 0)), np.nan))
     padded = np.pad(grid, ((0, 0), (0, 0), (1, 1), (1, 1)), constant_values=np.nan)
     rows, cols = layout.rows, layout.cols

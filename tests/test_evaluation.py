@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from adaptfault.evaluation import Scores, evaluate
+from adaptfault.evaluation import Scores, accuracy_interval, evaluate
 from adaptfault.windows import Windows
 
 TRUE, PREDICTED = [0, 0, 0, 1, 1, 2], [0, 0, 1, 1, 0, 0]
@@ -88,3 +88,22 @@ def test_the_confusion_can_be_drawn():
 def test_scoring_a_plain_classifier_needs_no_torch():
     code = "import sys, adaptfault.evaluation, adaptfault.windows, adaptfault.store; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_interval_counts_recordings_not_windows():
+    rng = np.random.default_rng(0)
+    right = np.repeat(rng.random(40) < 0.8, 10)  # each recording stands or falls as a whole
+    low, high = accuracy_interval(right, np.repeat(np.arange(40), 10))
+    p = right.mean()
+    assert low < p < high
+    assert (high - low) / 2 == pytest.approx(2.02 * np.sqrt(p * (1 - p) / 40), rel=0.05)
+    low1, high1 = accuracy_interval(right, np.arange(400))
+    assert (high - low) > 2.5 * (high1 - low1)
+
+
+def test_without_an_error_the_interval_is_the_exact_binomial_one_over_recordings():
+    recording = np.repeat(np.arange(10), 10)
+    low, high = accuracy_interval(np.ones(100), recording)
+    assert (low, high) == pytest.approx((0.025 ** (1 / 10), 1.0))
+    low, high = accuracy_interval(np.zeros(100), recording)
+    assert (low, high) == pytest.approx((0.0, 1 - 0.025 ** (1 / 10)))

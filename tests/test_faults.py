@@ -35,7 +35,7 @@ def test_mask_and_healthy_part_the_array():
 
 @pytest.mark.parametrize("cells", [(220,), (-1,), (0.5,)])
 def test_a_cell_that_the_array_lacks_is_named(cells):
-    with pytest.raises(ValueError, match="numbered 0 to 219|whole numbers"):
+    with pytest.raises(ValueError, match=r"numbered 0 to 219|whole numbers"):
         FaultSet(cells, 220)
 
 

@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
 
     from adaptfault.adaptation import Adaptation
     from adaptfault.cli.data import open_model, parts_of, windows_of
-    from adaptfault.evaluation import evaluate
+    from adaptfault.evaluation import Scores, accuracy_interval
     from diagnostics import inject
 
     model, manifest = open_model(args.model)
@@ -52,8 +52,16 @@ def run(args: argparse.Namespace) -> int:
 
         every = make_windows(broken, recordings.labels, recordings.layout, length=model.length)
         windows = every.select(np.isin(every.recording, which))
-    scores = evaluate(classifier, windows)
+    predicted = classifier.predict(windows.x)
+    scores = Scores.of(windows.y, predicted, n_classes=model.n_classes)
+    interval = accuracy_interval(predicted == windows.y, windows.recording)
     cells = sorted({c for fault in faults for c in fault.cells})
-    result = {"schema": "adaptfault.evaluate/1", "scores": scores.to_dict(), "injected": [f.to_dict() for f in faults]}
-    emit(args, result, f"{len(cells)} cells faulty: {scores}" if cells else str(scores))
+    result = {
+        "schema": "adaptfault.evaluate/1",
+        "scores": scores.to_dict(),
+        "accuracy_interval": list(interval),
+        "injected": [fault.to_dict() for fault in faults],
+    }
+    clustered = f"95 % interval of the accuracy, clustered by recording: {interval[0]:.3f} to {interval[1]:.3f}"
+    emit(args, result, f"{len(cells)} cells faulty: {scores}\n{clustered}" if cells else f"{scores}\n{clustered}")
     return 0

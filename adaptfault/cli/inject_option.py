@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
-from diagnostics import Fault, FaultKind, Line, SensorLayout, line_fault
+    from diagnostics import Fault, FaultKind, SensorLayout
 
 INJECT_HELP = (
     "break the sensor, WHERE=HOW: cell:PAD:ROW:COL, row:PAD:ROW, column:PAD:COL or random:COUNT;"
@@ -22,6 +24,10 @@ def parse_faults(texts: Sequence[str], layout: SensorLayout, rng: np.random.Gene
     Raises:
         ValueError: a text of another form, or a place or value that the layout does not have.
     """
+    import numpy as np
+
+    from diagnostics import Fault, Line, line_fault
+
     faults: list[Fault] = []
     free = rng.permutation(np.flatnonzero(layout.present)).tolist()
     for text in texts:
@@ -45,6 +51,8 @@ def parse_faults(texts: Sequence[str], layout: SensorLayout, rng: np.random.Gene
 
 
 def _kind(how: str, layout: SensorLayout) -> tuple[FaultKind, float | None]:
+    from diagnostics import FaultKind
+
     name, _, number = how.partition(":")
     kind = FaultKind(name)
     if kind not in (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK):

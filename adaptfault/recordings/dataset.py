@@ -16,7 +16,7 @@ class Recordings:
     """Recordings of one array.
 
     Attributes:
-        frames: one float32 array ``[T, D]`` a recording, in the layout's unit, lengths may differ; NaN = missing reading.
+        frames: float32 ``[T, D]`` each, in the layout's unit; lengths may differ; NaN = missing reading.
         layout: the array they come from.
         labels: int ``[n]``, the class of each recording (an index into ``class_names``); None where there are none.
         class_names: one name a class.
@@ -45,7 +45,7 @@ class Recordings:
         if labels.shape != (len(frames),):
             raise ValueError(f"{len(frames)} recordings need as many labels, got an array of shape {labels.shape}")
         class_names = tuple(self.class_names) or tuple(str(i) for i in range(int(labels.max(initial=-1)) + 1))
-        if labels.size and not (0 <= labels.min() and labels.max() < len(class_names)):
+        if labels.size and (labels.min() < 0 or labels.max() >= len(class_names)):
             raise ValueError(
                 f"labels run from {labels.min()} to {labels.max()}, but there are {len(class_names)} class names"
             )

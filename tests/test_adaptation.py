@@ -1,0 +1,191 @@
+import numpy as np
+import pytest
+import torch
+
+from adaptfault.adaptation import Adaptation, Adapter
+from adaptfault.evaluation import evaluate
+from adaptfault.network import TactileTransformer
+from adaptfault.reduction import AffineFill, CellStatistics, ReducedModel, phi
+from adaptfault.windows import Windows
+from diagnostics import FaultSet, SensorLayout
+
+LAYOUT = SensorLayout(2, 4, 4)
+D = LAYOUT.n_cells
+
+
+def blobs(n: int, seed: int) -> Windows:
+    """Three classes of contact, told apart by where they press; neighbours say nearly all about a cell."""
+    rng = np.random.default_rng(seed)
+    y = rng.integers(0, 3, n)
+    centre = np.stack([y * 1.2 + rng.normal(0.3, 0.25, n), rng.normal(1.5, 0.5, n)], axis=1)
+    rows, cols = np.mgrid[:4, :4]
+    distance = (rows - centre[:, :1, None]) ** 2 + (cols - centre[:, 1:, None]) ** 2  # (n, 4, 4)
+    press = rng.uniform(0.2, 0.5, (n, 1, 1, 1, 1)) * np.exp(-distance / 2)[:, None, None]
+    x = press * np.linspace(0.5, 1, 10)[:, None, None, None] * np.ones((1, 1, 2, 1, 1))
+    x = np.maximum(x + rng.normal(0, 0.004, x.shape), 0).reshape(n, 10, D)
+    return Windows(x.astype(np.float32), y, np.arange(n))
+
+
+@pytest.fixture(scope="module")
+def adapter() -> Adapter:
+    from adaptfault.training import train
+
+    training, validation = blobs(300, 0), blobs(120, 1)
+    model = TactileTransformer(LAYOUT, 3)
+    train(model, training, validation, epochs=8, learning_rate=1e-3, progress=False)
+    assert evaluate(model, validation).accuracy > 0.85
+    return Adapter(model, training, validation)
+
+
+F = FaultSet((0, 5, 6, 7, 21), D)
+
+
+# phi and the front end
+
+
+def test_phi_drops_exactly_the_faulty_cells():
+    x = np.arange(2 * 3 * D).reshape(2, 3, D)
+    np.testing.assert_array_equal(phi(x, F), np.delete(x, list(F), axis=2))
+    with pytest.raises(ValueError, match="F is over 32 cells, the windows have 31"):
+        phi(x[..., :-1], F)
+
+
+def test_with_f_empty_the_logits_are_bit_identical(adapter):
+    x = torch.from_numpy(adapter.validation.x)
+    for method in ("auto", "fill", "head", "finetune"):
+        adapted = adapter.adapt(FaultSet((), D), method=method)
+        with torch.no_grad():
+            assert torch.equal(adapted.model(x), adapter.model(x))
+
+
+@pytest.mark.parametrize("method", ["fill", "head", "finetune"])
+@pytest.mark.parametrize("value", [0.0, 1.0, np.nan, np.inf, -1e30])
+def test_the_value_of_a_dropped_cell_never_reaches_the_output(adapter, method, value):
+    adapted = adapter.adapt(F, method=method, budget=0.3, progress=False)
+    x = adapter.validation.x[:20].copy()
+    before = adapted.predict_proba(x)
+    x[:, :, list(F)] = value
+    np.testing.assert_array_equal(adapted.predict_proba(x), before)
+    assert np.isfinite(before).all()
+
+
+def test_healthy_cells_pass_the_front_end_unchanged_and_in_place():
+    rng = np.random.default_rng(0)
+    fill = AffineFill(F, rng.normal(size=(5, D - 5)), rng.normal(size=5))
+    x = torch.rand(2, 3, D - 5)
+    whole = fill(x)
+    assert torch.equal(whole[..., F.healthy], x)
+    assert (whole >= 0).all()
+    assert (whole <= 1).all()
+
+
+def test_the_fill_is_the_gaussian_conditional_mean():
+    rng = np.random.default_rng(0)
+    mixing = rng.normal(size=(D, D))
+    statistics = CellStatistics(rng.normal(size=D), mixing @ mixing.T + np.eye(D))
+    weight, bias = statistics.conditional_mean(F)
+    s, m, h = statistics.covariance, list(F), F.healthy
+    np.testing.assert_allclose(weight, s[np.ix_(m, h)] @ np.linalg.inv(s[np.ix_(h, h)]), atol=1e-8)
+    np.testing.assert_allclose(weight @ statistics.mean[h] + bias, statistics.mean[m], atol=1e-10)
+
+
+def test_cells_that_never_moved_are_filled_with_their_value():
+    still = Windows(np.full((4, 10, D), 0.25, np.float32), np.zeros(4), np.arange(4))
+    weight, bias = CellStatistics.fit(still).conditional_mean(F)
+    np.testing.assert_allclose(weight @ np.full(D - 5, 0.25) + bias, 0.25, atol=1e-6)
+
+
+def test_the_reduced_model_refuses_windows_with_the_faulty_cells_still_in(adapter):
+    reduced = ReducedModel(adapter.model, F, AffineFill(F, np.zeros((5, D - 5)), np.zeros(5)))
+    with pytest.raises(ValueError, match="27 healthy cells"):
+        reduced(torch.zeros(2, 10, D))
+
+
+# Stages
+
+
+def test_each_stage_repairs_and_none_is_worse_than_the_one_before(adapter):
+    broken = adapter.validation.x.copy()
+    broken[:, :, list(F)] = 1.0
+    collapsed = (adapter.model.predict(broken) == adapter.validation.y).mean()
+    reached = [adapter.adapt(F, method=m, progress=False).scores.accuracy for m in ("fill", "head", "finetune")]
+    assert collapsed < 0.7
+    assert reached[0] > 0.75
+    assert reached == sorted(reached)
+
+
+def test_auto_stops_at_the_first_stage_that_is_enough(adapter):
+    assert [stage.name for stage in adapter.adapt(FaultSet((3,), D)).stages] == ["fill"]
+    stages = adapter.adapt(FaultSet(range(26), D), progress=False).stages
+    assert [stage.name for stage in stages] == ["fill", "head", "finetune"]
+    assert all(stage.accuracy is not None for stage in stages)
+
+
+def test_scratch_learns_a_new_network_on_the_healthy_cells(adapter):
+    scratch = adapter.adapt(F, method="scratch", budget=4.0, progress=False)
+    assert [stage.name for stage in scratch.stages] == ["scratch"]
+    assert scratch.scores.accuracy > 0.5
+    assert not torch.equal(scratch.model.network.head.weight, adapter.model.head.weight)
+
+
+def test_adapting_never_changes_the_fault_free_model_so_order_does_not_matter(adapter):
+    before = {name: tensor.clone() for name, tensor in adapter.model.state_dict().items()}
+    first = adapter.adapt(F, method="finetune", progress=False)
+    adapter.adapt(FaultSet(range(10), D), method="finetune", progress=False)
+    again = adapter.adapt(F, method="finetune", progress=False)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in adapter.model.state_dict().items())
+    np.testing.assert_array_equal(first.predict_proba(adapter.validation.x), again.predict_proba(adapter.validation.x))
+
+
+def test_a_class_without_training_windows_does_not_break_the_head(adapter):
+    two = adapter.train.select(adapter.train.y != 1)
+    adapted = Adapter(adapter.model, two, adapter.validation).adapt(F, method="head")
+    assert adapted.scores.n == 120
+    np.testing.assert_allclose(adapted.predict_proba(adapter.validation.x).sum(axis=1), 1, atol=1e-5)
+
+
+# On disk
+
+
+@pytest.mark.parametrize("fault_set", [F, FaultSet((), D)])
+def test_an_adaptation_comes_back_bit_for_bit(adapter, tmp_path, fault_set):
+    adapted = adapter.adapt(fault_set, method="head")
+    adapted.save(tmp_path / "adapted")
+    again = Adaptation.load(tmp_path / "adapted")
+    np.testing.assert_array_equal(
+        again.predict_proba(adapter.validation.x), adapted.predict_proba(adapter.validation.x)
+    )
+    assert again.fault_set == fault_set
+    assert again.stages == adapted.stages
+    assert again.scores == adapted.scores
+
+
+def test_a_damaged_adaptation_is_refused_in_one_line(adapter, tmp_path):
+    with pytest.raises(FileNotFoundError):
+        Adaptation.load(tmp_path)
+    adapter.adapt(F, method="fill").save(tmp_path)
+    manifest = tmp_path / "manifest.json"
+    whole = manifest.read_text()
+    manifest.write_text(whole.replace('"fault_set"', '"faulty_set"'))
+    with pytest.raises(ValueError, match="is damaged") as error:
+        Adaptation.load(tmp_path)
+    assert "\n" not in str(error.value)
+    manifest.write_text(whole)
+    weights = next(tmp_path.glob("*.safetensors"))
+    weights.write_bytes(weights.read_bytes()[:-1])
+    with pytest.raises(ValueError, match="is damaged: its hash"):
+        Adaptation.load(tmp_path)
+
+
+# Bad input
+
+
+def test_what_cannot_be_adapted_is_said(adapter):
+    with pytest.raises(ValueError, match="F is over 220 cells, the model over 32"):
+        adapter.adapt(FaultSet((1,), 220))
+    with pytest.raises(ValueError, match="holds all 32 cells"):
+        adapter.adapt(FaultSet(range(D), D))
+    with pytest.raises(ValueError, match="unknown method 'magic'"):
+        adapter.adapt(F, method="magic")
+    with pytest.raises(ValueError, match="one set is empty"):
+        Adapter(adapter.model, adapter.train.select([]), adapter.validation)

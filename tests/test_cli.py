@@ -1,0 +1,213 @@
+"""The routines end to end, through the command line."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adaptfault.cli import main
+from adaptfault.grasps import simulate
+from adaptfault.recordings import Recordings, save_npz
+from diagnostics import Diagnosis, Line, SensorLayout, inject, line_fault
+
+SMALL = SensorLayout(2, 6, 5)
+
+
+@pytest.fixture(scope="module")
+def small() -> Recordings:
+    return simulate(16, SMALL, n_frames=60, seed=1, classes=("nothing", "softer", "harder"))
+
+
+@pytest.fixture(scope="module")
+def home(small: Recordings, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with recordings, and a model trained on them by the command line."""
+    home = tmp_path_factory.mktemp("home")
+    save_npz(home / "grasps.npz", small)
+    assert main(["train", str(home / "grasps.npz"), "--out", str(home / "model"), "--epochs", "10", "--quiet"]) == 0
+    return home
+
+
+def write_csv(path: Path, frames: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savetxt(path, frames, delimiter=",", fmt="%.4f")
+
+
+def test_a_broken_row_is_diagnosed_adapted_to_and_the_repair_measured(home, small, capsys):
+    broken = line_fault(SMALL, Line(1, "row", 2), "short")
+    log = small.select([i for i in range(len(small)) if small.labels[i] > 0][:12])
+    frames = tuple(inject(r, [broken], SMALL) for r in log.frames)
+    save_npz(home / "log.npz", Recordings(frames, SMALL))
+    grasps, model, diagnosis = (str(home / name) for name in ("grasps.npz", "model", "diagnosis.json"))
+
+    picture = str(home / "map.png")
+    found = ["diagnose", str(home / "log.npz"), "--reference", grasps, "--out", diagnosis, "--picture", picture]
+    assert main([*found, "--quiet"]) == 2
+    assert "pad 1, row 2 is short" in capsys.readouterr().out
+    assert Diagnosis.from_dict(json.loads(Path(diagnosis).read_text())).fault_set == set(broken.cells)
+    assert Path(picture).read_bytes().startswith(b"\x89PNG")
+
+    adapted = str(home / "adapted")
+    assert main(["adapt", model, grasps, "--faults", diagnosis, "--out", adapted, "--quiet", "--json"]) == 0
+    adaptation = json.loads(capsys.readouterr().out)
+    assert adaptation["fault_set"] == list(broken.cells)
+
+    accuracy = {}
+    for name, extra in {
+        "healthy": [],
+        "broken": ["--inject", "row:1:2=short"],
+        "repaired": ["--inject", "row:1:2=short", "--adapted", adapted],
+    }.items():
+        assert main(["evaluate", model, grasps, "--json", *extra]) == 0
+        accuracy[name] = json.loads(capsys.readouterr().out)["scores"]["accuracy"]
+    assert accuracy["healthy"] > 0.6
+    assert accuracy["broken"] < accuracy["healthy"] - 0.15
+    assert accuracy["repaired"] > accuracy["healthy"] - 0.1
+
+
+def test_the_demo_runs_on_the_users_recordings_and_writes_a_report_that_needs_nothing_else(home, capsys):
+    out = home / "demo"
+    run = ["demo", "--recordings", str(home / "grasps.npz"), "--epochs", "3", "--out", str(out), "--quiet"]
+    assert main(run) == 0
+    printed = capsys.readouterr().out
+    for step in ("recordings", "training", "fault-free", "broken", "diagnosis", "adaptation", "repaired", "report"):
+        assert re.search(rf"^{step}", printed, re.MULTILINE), step
+    html = (out / "report.html").read_text()
+    assert html.count('src="data:image/png;base64,') == 2
+    assert not re.search(r"(src|href)=.?(http|//|file)", html)
+    result = json.loads((out / "result.json").read_text())
+    assert f"{100 * result['repaired']['accuracy']:.1f} %" in html
+    assert sum(len(f["cells"]) for f in result["injected"]) == SMALL.cols + 3
+    assert {f["kind"] for f in result["injected"]} == {"open", "short", "stuck"}
+    assert not (out / "training.safetensors").exists()
+
+
+def test_training_again_gives_the_same_model(home, tmp_path):
+    again = ["train", str(home / "grasps.npz"), "--out", str(tmp_path / "again"), "--epochs", "10", "--quiet"]
+    assert main(again) == 0
+    weights = [next(folder.glob("*.safetensors")).name for folder in (home / "model", tmp_path / "again")]
+    assert weights[0] == weights[1]  # named by their hash
+
+
+# Bad input: one line that names what is wrong, exit code 3, never a traceback
+
+
+def errors_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    assert main([str(a) for a in arguments]) == 3
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "Traceback" not in said.err
+    lines = [line for line in said.err.splitlines() if line.startswith("adaptfault")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda text: "\n".join(line.rpartition(",")[0] for line in text.splitlines()), "59"),
+        (lambda text: text.replace("\n", "\nabc,", 1).replace("abc,0.0000,", "abc,", 1), "line 2.*abc"),
+        (lambda text: "", "empty"),
+        (lambda text: text.replace("\n", ",1\n", 1), "line 1|line 2"),
+        (lambda text: text.replace("0.0000", "inf", 1), "inf"),
+        (lambda text: "\x00\x01\x02", "not a text file"),
+    ],
+)
+def test_a_bad_csv_is_named_with_its_line_and_the_others_go_on(spoil, message, tmp_path, small, capsys):
+    frames = small.frames[20].copy()
+    frames[:, 0] = 0
+    write_csv(tmp_path / "bad.csv", frames)
+    (tmp_path / "bad.csv").write_text(spoil((tmp_path / "bad.csv").read_text()))
+    assert re.search(message, errors_of(capsys, "diagnose", tmp_path / "bad.csv", "--shape", "2x6x5"))
+    for i in range(3):
+        write_csv(tmp_path / f"good{i}.csv", small.frames[20 + i])
+    assert main(["diagnose", str(tmp_path), "--shape", "2x6x5"]) in (0, 1, 2)
+    said = capsys.readouterr()
+    assert "in 3 recordings" in said.out
+    assert re.search(rf"error: .*bad\.csv.*({message})", said.err)
+
+
+def test_short_recordings_and_missing_readings_are_told_and_kept(tmp_path, small, capsys):
+    for i in range(12):
+        write_csv(tmp_path / f"r{i}.csv", small.frames[20 + i][: 39 if i == 1 else 40])
+    text = (tmp_path / "r2.csv").read_text().splitlines()
+    text[6] = "nan" + text[6][text[6].index(",") :]
+    (tmp_path / "r2.csv").write_text("\n".join(text))
+    main(["diagnose", str(tmp_path), "--shape", "2x6x5"])
+    said = capsys.readouterr()
+    assert "in 12 recordings (479 frames)" in said.out
+    assert re.search(r"warning: .*r1\.csv.*39", said.err)
+    assert re.search(r"warning: .*r2\.csv.*line 7", said.err)
+    main(["diagnose", str(tmp_path), "--shape", "2x6x5", "--frames", "40"])
+    assert "in 11 recordings" in capsys.readouterr().out
+
+
+def test_a_label_table_that_names_a_missing_file_is_told_and_the_rest_is_used(tmp_path, small, capsys):
+    names = [f"r{i}.csv" for i in range(len(small))]
+    for name, frames in zip(names, small.frames, strict=True):
+        write_csv(tmp_path / name, frames)
+    rows = [f"{name},{small.class_names[y]}" for name, y in zip(names, small.labels, strict=True)]
+    (tmp_path / "labels.csv").write_text("\n".join(["file,label", "gone.csv,normal", *rows]))
+    train = ["train", str(tmp_path), "--shape", "2x6x5", "--out", str(tmp_path / "model"), "--epochs", "1", "--quiet"]
+    assert main(train) == 0
+    assert re.search(r"error: .*labels\.csv, line 2.*gone\.csv", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["diagnose", "{home}/gone.npz"], "gone.npz"),
+        (["diagnose", "{home}/grasps.npz", "--shape", "2x11x10"], "2 x 6 x 5"),
+        (["diagnose", "{home}/grasps.npz", "--shape", "2x6"], "2x6"),
+        (["diagnose", "{home}/grasps.npz", "--layout", "{home}/gone.json"], "gone.json"),
+        (["train", "{home}/log_only.npz", "--out", "{home}/m"], "no labels"),
+        (["adapt", "{home}/model", "{home}/grasps.npz", "--faults", "60", "--out", "{home}/a"], "F names cell 60"),
+        (["adapt", "{home}/model", "{home}/grasps.npz", "--faults", "what", "--out", "{home}/a"], "no such file"),
+        (["adapt", "{home}/model", "{home}/grasps.npz", "--faults", "{all}", "--out", "{home}/a"], "all 60 cells"),
+        (["adapt", "{home}", "{home}/grasps.npz", "--faults", "1", "--out", "{home}/a"], "manifest.json"),
+        (["evaluate", "{home}/model", "{home}/grasps.npz", "--inject", "row:9:9=open"], "row:9:9=open"),
+        (["evaluate", "{home}/model", "{home}/grasps.npz", "--inject", "cell:0:0:0=stuck:9"], "outside 0..5"),
+        (["evaluate", "{home}/model", "{home}/grasps.npz", "--inject", "melted"], "expected break the sensor"),
+        (["evaluate", "{home}/model", "{home}/grasps.npz", "--adapted", "{home}/gone"], "gone"),
+    ],
+)
+def test_unusable_input_is_one_line_and_exit_code_3(home, small, arguments, message, capsys):
+    save_npz(home / "log_only.npz", Recordings(small.frames[:3], SMALL))
+    every = ",".join(map(str, range(60)))
+    assert message in errors_of(capsys, *(a.format(home=home, all=every) for a in arguments))
+
+
+def test_f_empty_leaves_the_model_as_it_was(home, capsys):
+    empty = ["adapt", str(home / "model"), str(home / "grasps.npz"), "--faults", "", "--out", str(home / "same")]
+    assert main([*empty, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["scores"]["accuracy"] == result["fault_free_accuracy"]
+
+
+@pytest.mark.parametrize("command", ["train", "diagnose", "adapt", "evaluate", "demo"])
+def test_help_shows_an_example(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    assert f"example:\n  adaptfault {command}" in capsys.readouterr().out
+
+
+def test_wrong_usage_is_exit_code_3(capsys):
+    for arguments in ([], ["repair"], ["train"], ["demo", "--epochs", "many"]):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 3
+    assert "usage: adaptfault" in capsys.readouterr().err
+
+
+def test_help_comes_without_loading_torch_or_scikit_learn():
+    code = (
+        "import sys; from adaptfault.cli import main\n"
+        "try: main(['demo', '--help'])\n"
+        "except SystemExit: pass\n"
+        "sys.exit(any(m in sys.modules for m in ('torch', 'sklearn', 'numpy')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).returncode == 0

@@ -15,7 +15,7 @@ _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.
 def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "diagnose", "find the faulty cells and wires in a log of recordings", _EXAMPLE)
-    add_recordings(parser)
+    add_recordings(parser, labels=False)
     parser.add_argument("--reference", nargs="+", metavar="FILE", help="fault-free recordings of the same array")
     parser.add_argument("--out", metavar="FILE", help="write the diagnosis as JSON")
     parser.add_argument("--picture", metavar="FILE", help="write the verdict map as PNG")

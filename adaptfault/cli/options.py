@@ -30,7 +30,7 @@ def command(commands: Commands, name: str, summary: str, example: str) -> argpar
     return parser
 
 
-def add_recordings(parser: argparse.ArgumentParser, *, option: bool = False) -> None:
+def add_recordings(parser: argparse.ArgumentParser, *, option: bool = False, labels: bool = True) -> None:
     """Add where recordings come from: as arguments, or for a command that can do without as ``--recordings``."""
     help_ = "file or folder of recordings (.csv, .npz, .npy)"
     if option:
@@ -38,7 +38,8 @@ def add_recordings(parser: argparse.ArgumentParser, *, option: bool = False) -> 
     else:
         parser.add_argument("recordings", nargs="+", metavar="RECORDINGS", help=help_)
     group = parser.add_argument_group("how recordings are read")
-    group.add_argument("--labels", metavar="TABLE", help="CSV table with the columns file,label")
+    if labels:
+        group.add_argument("--labels", metavar="TABLE", help="CSV table with the columns file,label")
     group.add_argument("--layout", metavar="FILE", help="layout of the array, a JSON file")
     group.add_argument("--shape", metavar="PxRxC", help="layout from a shape: pads x rows x columns, as 2x13x6")
     group.add_argument("--full-scale", type=float, metavar="X", help="largest value a cell can report")
@@ -61,7 +62,7 @@ def load_recordings(args: argparse.Namespace, paths: Sequence[str], *, labelled:
     loaded = load(
         paths,
         layout=args.layout or args.shape,
-        labels=args.labels,
+        labels=getattr(args, "labels", None),
         frames=args.frames,
         calibration=args.calibration,
         full_scale=args.full_scale,

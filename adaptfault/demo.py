@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -104,6 +104,8 @@ def run_demo(
     faults: Sequence[Fault] | None = None,
     *,
     epochs: int = 20,
+    learning_rate: float = 1e-4,
+    network: Mapping[str, Any] | None = None,
     seed: int = 0,
     checkpoint: Path | None = None,
     progress: bool | None = None,
@@ -114,7 +116,8 @@ def run_demo(
     Args:
         recordings: labelled and fault-free.
         faults: what to break; None: a row, a short, an open and a cell stuck in mid-range.
-        epochs: of training, at most.
+        epochs, learning_rate: of training; epochs at most.
+        network: other options of the network, as ``padding``.
         seed: of the split, the weights, training and the faults.
         checkpoint: where training leaves what it needs to go on after a crash.
         progress: show or hide progress on stderr; None shows it on a terminal.
@@ -134,9 +137,18 @@ def run_demo(
     tested = np.unique(test.recording)
     say(f"recordings   {len(recordings)} of {layout}; {len(recordings.class_names)} classes, {len(windows)} windows")
 
-    model = TactileTransformer(layout, len(recordings.class_names), seed=seed)
+    model = TactileTransformer(layout, len(recordings.class_names), seed=seed, **(network or {}))
     with clock("training"):
-        history = train(model, training, validation, epochs=epochs, seed=seed, checkpoint=checkpoint, progress=progress)
+        history = train(
+            model,
+            training,
+            validation,
+            epochs=epochs,
+            learning_rate=learning_rate,
+            seed=seed,
+            checkpoint=checkpoint,
+            progress=progress,
+        )
     say(f"training     {history}")
     fault_free, fault_free_interval = _score(model, test)
     say(f"fault-free   {fault_free}")

@@ -17,6 +17,7 @@ FILTERS = (16, 32)  # of the two 3 x 3 convolutions
 BLOCKS = 2
 HEADS, HEAD_DIM = 4, 64  # 256 wide inside the attention, whatever d is
 HIDDEN = 128  # of the feed-forward blocks and of the head
+NORM_EPS = 1e-3  # Keras's default: frames with hardly any contact are not blown up to full size
 
 Batch = Tensor | NDArray[Any]
 
@@ -49,11 +50,11 @@ class EncoderBlock(nn.Module):
         super().__init__()
         self.qkv = nn.Linear(d, 3 * HEADS * HEAD_DIM)
         self.out = nn.Linear(HEADS * HEAD_DIM, d)  # W^O
-        self.norm1 = nn.LayerNorm(d)
+        self.norm1 = nn.LayerNorm(d, eps=NORM_EPS)
         # The paper prints Dense_128(ReLU(Dense_d(x))), whose 128 values could not be added to the d of the residual.
         self.up = nn.Linear(d, HIDDEN)
         self.down = nn.Linear(HIDDEN, d)
-        self.norm2 = nn.LayerNorm(d)
+        self.norm2 = nn.LayerNorm(d, eps=NORM_EPS)
         self.dropout = Dropout(dropout)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -70,10 +71,11 @@ class TactileTransformer(nn.Module):
     """Classifier of tactile windows, Section III-A, for any layout.
 
     The pads are the channels of the convolutions, which see each frame alone; attention runs over the frames. There is
-    no positional encoding: the paper has none, so the order of the frames does not matter. The paper's
-    formulas write out every ReLU and put none after the convolutions, nor does Keras, so they are linear here. Their
-    padding is not stated: "same" also fits pads of fewer than 5 rows. The dropout of 0.1 is stated for the head only;
-    the blocks use the same.
+    no positional encoding: the paper has none, so the order of the frames does not matter. The paper's formulas write
+    out every ReLU and put none after the convolutions, nor does Keras, so they are linear here. Their padding is not
+    stated: "same" also fits pads of fewer than 5 rows. The dropout of 0.1 is stated for the head only; the blocks use
+    the same. The initial weights are not stated either. Those of Keras ("glorot") are larger: they learn several times
+    faster, and on real grasps they end 0.05 to 0.1 lower in accuracy than torch's, the default here.
 
     Positions that the layout lacks cannot influence the output, whatever they hold, NaN included.
 
@@ -82,6 +84,7 @@ class TactileTransformer(nn.Module):
         n_classes: number of outputs.
         length: T, frames in a window.
         padding: "same" or "valid" (no padding, needs 5 x 5 cells).
+        init: "torch" (uniform, by the number of inputs) or "glorot" (uniform, by inputs and outputs).
         dropout: share of values dropped while training.
         seed: of the initial weights; the global generator is left alone.
 
@@ -89,7 +92,7 @@ class TactileTransformer(nn.Module):
         head: the last linear layer, 128 -> n_classes; :meth:`features` is its input.
 
     Raises:
-        ValueError: a size below 1, an unknown padding, a pad too small for "valid".
+        ValueError: a size below 1, an unknown padding or init, a pad too small for "valid".
     """
 
     present: Tensor
@@ -101,6 +104,7 @@ class TactileTransformer(nn.Module):
         *,
         length: int = 10,
         padding: Literal["same", "valid"] = "same",
+        init: Literal["torch", "glorot"] = "torch",
         dropout: float = 0.1,
         seed: int = 0,
     ) -> None:
@@ -109,13 +113,15 @@ class TactileTransformer(nn.Module):
             raise ValueError(f"the network needs n_classes >= 1 and length >= 1, got {n_classes} and {length}")
         if padding not in ("same", "valid"):
             raise ValueError(f"unknown padding {padding!r}: use 'same' or 'valid'")
+        if init not in ("torch", "glorot"):
+            raise ValueError(f"unknown init {init!r}: use 'torch' or 'glorot'")
         lost = 0 if padding == "same" else 2 * len(FILTERS)  # each unpadded 3 x 3 takes one cell from every edge
         if min(layout.rows, layout.cols) <= lost:
             raise ValueError(
                 f"padding 'valid' needs pads of 5 x 5, these have {layout.rows} x {layout.cols}: use 'same'"
             )
         self.layout, self.n_classes, self.length = layout, n_classes, length
-        self.padding, self.p_dropout, self.seed = padding, dropout, seed
+        self.padding, self.init, self.p_dropout, self.seed = padding, init, dropout, seed
         self.register_buffer("present", torch.from_numpy(layout.present.ravel().copy()), persistent=False)
         d = FILTERS[-1] * (layout.rows - lost) * (layout.cols - lost)
         with torch.random.fork_rng(devices=[]):
@@ -126,7 +132,8 @@ class TactileTransformer(nn.Module):
             self.dense = nn.Linear(d, HIDDEN)
             self.dropout = Dropout(dropout)
             self.head = nn.Linear(HIDDEN, n_classes)
-            self.apply(_initialise)
+            if init == "glorot":
+                self.apply(_glorot)
 
     def features(self, x: Tensor) -> Tensor:
         """Map windows ``[N, T, D]`` to the 128 values ``[N, 128]`` that the head weighs."""
@@ -172,6 +179,7 @@ class TactileTransformer(nn.Module):
             "n_classes": self.n_classes,
             "length": self.length,
             "padding": self.padding,
+            "init": self.init,
             "dropout": self.p_dropout,
             "seed": self.seed,
         }
@@ -207,14 +215,12 @@ def logits_of(model: nn.Module, x: Batch, *, batch_size: int = 256) -> Tensor:
 
 
 @torch.no_grad()
-def _initialise(module: nn.Module) -> None:
-    """Glorot uniform weights and zero biases, the defaults of Keras, which Section III-A's names come from."""
+def _glorot(module: nn.Module) -> None:
+    """Draw a layer's weights as Keras does (Glorot and Bengio 2010), its biases 0."""
     if isinstance(module, nn.Linear | nn.Conv2d):
         nn.init.xavier_uniform_(module.weight)
         if module.bias is not None:
             nn.init.zeros_(module.bias)
-    elif isinstance(
-        module, EncoderBlock
-    ):  # comes after its layers: queries, keys, values are drawn each at its own size
+    elif isinstance(module, EncoderBlock):  # after its layers: queries, keys and values are drawn each at its own size
         for weight in torch.split(module.qkv.weight, HEADS * HEAD_DIM):
             nn.init.xavier_uniform_(weight)

@@ -82,6 +82,7 @@ def train(
     batch_size: int = 32,
     seed: int = 0,
     patience: int | None = 10,
+    averaging: float = 0.995,
     budget: float | None = None,
     evaluate_start: bool = False,
     augment: Augment | None = None,
@@ -103,6 +104,9 @@ def train(
         epochs, learning_rate, batch_size: of Adam; Section III-B has 50 at most, 1e-4 and 32.
         seed: of the order of the windows, of dropout and of ``augment``.
         patience: epochs without a better validation before stopping; None trains all epochs.
+        averaging: what is validated and kept is the exponential average of the weights over the last
+            1 / (1 - averaging) steps (over fewer at first), which is steadier than any single step's; 0 keeps those of
+            the last step, as Section III-B does.
         budget: seconds, validation included; also ends the run within an epoch, or before the first. The time before a
             resume counts.
         evaluate_start: let the starting weights compete, so that fine-tuning never ends worse than it began.
@@ -120,14 +124,17 @@ def train(
         raise ValueError(
             f"training needs epochs, batch_size, learning_rate > 0, got {epochs}, {batch_size}, {learning_rate}"
         )
+    if not 0 <= averaging < 1:
+        raise ValueError(f"averaging must lie in [0, 1), got {averaging}")
     clock = _Clock(budget)
     _check(model, train, validation)
-    run = _Run(model, learning_rate, Path(checkpoint) if checkpoint is not None else None)
+    run = _Run(model, learning_rate, averaging, Path(checkpoint) if checkpoint is not None else None)
     if run.path is not None:
         run.settings = {
             "learning_rate": learning_rate,
             "batch_size": batch_size,
             "seed": seed,
+            "averaging": averaging,
             "evaluate_start": evaluate_start,
             "augment": None if augment is None else getattr(augment, "__qualname__", type(augment).__qualname__),
             "data": fingerprint_windows(train, validation),
@@ -153,7 +160,8 @@ def train(
                     order = torch.split(torch.randperm(len(labels), generator=generator), batch_size)
                     loss, seen = _pass(run, inputs, labels, order, augment, generator, clock)
                 with clock.closing():
-                    scores = _validate(model, validation)
+                    with run.averaged():
+                        scores = _validate(model, validation)
                     history = _append(run.history, loss, scores, time.perf_counter() - began)
                     run.record(history, save=seen == len(labels))  # a cut epoch is no place to resume from
                 bar.update()
@@ -187,6 +195,7 @@ def _pass(
         run.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         run.optimizer.step()
+        run.follow()
         total, seen = total + loss.item() * len(index), seen + len(index)
         if not math.isfinite(total):
             raise ValueError(f"the loss became {loss.item()} in epoch {run.history.epochs + 1}: lower learning_rate")
@@ -218,8 +227,8 @@ class _Clock:
 class _Run:
     """A run's moving parts: model, best weights, Adam's moments and history, on disk too where there is a path."""
 
-    def __init__(self, model: nn.Module, learning_rate: float, path: Path | None) -> None:
-        self.model, self.path, self.history = model, path, History()
+    def __init__(self, model: nn.Module, learning_rate: float, averaging: float, path: Path | None) -> None:
+        self.model, self.averaging, self.path, self.history = model, averaging, path, History()
         frozen = {name for name, p in model.named_parameters() if not p.requires_grad}
         self.names = [name for name in model.state_dict() if name not in frozen]  # what training changes
         self.trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
@@ -227,6 +236,8 @@ class _Run:
             raise ValueError("nothing to train: every parameter of the model has requires_grad False")
         # Fused: one pass over weights, gradients and moments. The default took 2 to 5 times as long, a sixth of a step.
         self.optimizer = torch.optim.Adam(self.trained.values(), lr=learning_rate, fused=True)
+        self.average = {name: p.detach().clone() for name, p in self.trained.items()}
+        self.steps = 0
         self.best = self._weights()
         self.settings: dict[str, Any] = {}
 
@@ -234,20 +245,41 @@ class _Run:
         state = self.model.state_dict()
         return {name: state[name].detach().clone(memory_format=torch.contiguous_format) for name in self.names}
 
+    @torch.no_grad()
+    def follow(self) -> None:
+        """Let the average follow the weights after a step."""
+        self.steps += 1
+        kept = min(self.averaging, self.steps / (self.steps + 10))  # at first over the last tenth of few steps
+        torch._foreach_lerp_(list(self.average.values()), list(self.trained.values()), 1 - kept)
+
+    @contextmanager
+    def averaged(self) -> Iterator[None]:
+        """Put the averaged weights into the model for a while."""
+        self._swap()
+        try:
+            yield
+        finally:
+            self._swap()
+
+    def _swap(self) -> None:
+        for name, parameter in self.trained.items():
+            parameter.data, self.average[name] = self.average[name], parameter.data
+
     def restore_best(self) -> None:
         self.model.load_state_dict(self.best, strict=False)
 
     def record(self, history: History, *, save: bool = True) -> None:
         """Take a longer history, keep the weights if they are its best, write the checkpoint."""
         if history.best_epoch == history.epochs:
-            self.best = self._weights()
+            with self.averaged():
+                self.best = self._weights()
         self.history = history
         if not save or self.path is None:
             return
         tensors = {f"model.{name}": tensor for name, tensor in self._weights().items()}
-        if history.best_epoch != history.epochs:
-            tensors |= {f"best.{name}": tensor for name, tensor in self.best.items()}
+        tensors |= {f"best.{name}": tensor for name, tensor in self.best.items()}
         for name, parameter in self.trained.items():
+            tensors[f"average.{name}"] = self.average[name]
             tensors |= {f"adam.{key}.{name}": value for key, value in self.optimizer.state[parameter].items()}
         write_checkpoint(self.path, tensors, settings=self.settings, state=history.to_dict())
 
@@ -258,10 +290,14 @@ class _Run:
         tensors, state = read_checkpoint(self.path, self.settings)
         self.history = History.from_dict(state)
         self.model.load_state_dict(_under("model.", tensors), strict=False)
-        self.best = _under("best.", tensors) or self._weights()
+        self.best = _under("best.", tensors)
+        average = _under("average.", tensors)
+        self.average = {name: average[name].to(p.device) for name, p in self.trained.items()}
         for key in ("step", "exp_avg", "exp_avg_sq"):
             for name, value in _under(f"adam.{key}.", tensors).items():
                 self.optimizer.state[self.trained[name]][key] = value.to(self.trained[name].device)
+                if key == "step":
+                    self.steps = int(value)
 
 
 def _check(model: nn.Module, train: Windows, validation: Windows) -> None:

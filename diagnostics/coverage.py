@@ -28,7 +28,9 @@ class Coverage:
     advice: tuple[str, ...]
 
     def __str__(self) -> str:
-        return f"{self.test_coverage:.0%} of the cells tested, {self.fault_coverage:.0%} of the faults expected found"
+        return (
+            f"{self.test_coverage:.0%} of the cells tested, an estimated {self.fault_coverage:.0%} of the faults found"
+        )
 
 
 def coverage(

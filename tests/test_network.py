@@ -115,8 +115,8 @@ def test_the_seed_decides_the_weights_and_the_global_generator_is_left_alone():
     assert not torch.equal(a["head.weight"], c["head.weight"])
 
 
-def test_weights_start_as_in_keras():
-    model = TactileTransformer(SMALL, 3)
+def test_glorot_weights_start_as_in_keras():
+    model = TactileTransformer(SMALL, 3, init="glorot")
     d = 32 * 16
     for weight in model.blocks[1].qkv.weight.split(256):
         limit = (6 / (d + 256)) ** 0.5

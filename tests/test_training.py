@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from adaptfault.network import TactileTransformer
+from adaptfault.network import TactileTransformer, logits_of
 from adaptfault.training import History, train
 from adaptfault.windows import Windows
 from diagnostics import SensorLayout
@@ -81,11 +81,29 @@ def test_the_weights_of_the_best_validation_are_kept():
     model, seen = small(), []
     validation = grasps(30, 1)
     noisy = Windows(validation.x, np.random.default_rng(0).integers(0, 3, 30), validation.recording)
-    options = {"epochs": 12, "learning_rate": 0.05, "patience": None}
+    options = {"epochs": 12, "learning_rate": 0.05, "patience": None, "averaging": 0.0}
     history = train(model, grasps(), noisy, on_epoch=lambda h: seen.append(weights(model)), **options)
     keys = list(zip(history.validation_accuracy, (-v for v in history.validation_loss), strict=True))
     assert history.best_epoch == keys.index(max(keys)) + 1 < 12
     assert same(weights(model), seen[history.best_epoch - 1])
+
+
+def test_the_weights_kept_score_what_the_history_says():
+    for averaging in (0.0, 0.9, 0.995):
+        model, validation = small(), grasps(30, 1)
+        history = train(model, grasps(), validation, epochs=4, learning_rate=0.01, averaging=averaging)
+        assert (logits_of(model, validation.x).argmax(1).numpy() == validation.y).mean() == history.best_accuracy
+
+
+def test_the_average_is_exponential_and_over_few_steps_at_first():
+    start, plain, averaged = small(), small(), small()
+    one_step = {"epochs": 1, "batch_size": 1000, "learning_rate": 0.01}
+    train(plain, grasps(), grasps(30, 1), averaging=0.0, **one_step)
+    train(averaged, grasps(), grasps(30, 1), averaging=0.9, **one_step)
+    for w0, w1, mean in zip(weights(start), weights(plain), weights(averaged), strict=True):
+        torch.testing.assert_close(mean, w0 / 11 + w1 * 10 / 11)
+    with pytest.raises(ValueError, match=r"averaging must lie in \[0, 1\)"):
+        train(small(), grasps(), grasps(30, 1), averaging=1.0)
 
 
 def test_training_stops_when_validation_no_longer_improves():
@@ -203,7 +221,7 @@ def test_an_interrupted_run_leaves_the_best_weights_in_the_model():
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(model, grasps(), grasps(30, 1), learning_rate=0.01, on_epoch=stop)
+        train(model, grasps(), grasps(30, 1), learning_rate=0.01, averaging=0.0, on_epoch=stop)
     assert any(same(weights(model), w) for w in seen)
     assert not model.training
 

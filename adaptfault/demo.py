@@ -20,6 +20,7 @@ from adaptfault.windows import Windows, make_windows, scale, split
 from diagnostics import Diagnosis, Fault, FaultKind, FaultSet, SelfDiagnosis, SensorLayout, inject, line_fault
 
 _LOG_RECORDINGS = 20  # of the broken sensor, that the diagnosis gets to see
+_SHOWN = 8  # faults listed, of each kind of list; the report has all
 _BUDGET = 30.0  # seconds of fine-tuning, where the stages before it are not enough
 
 
@@ -159,8 +160,9 @@ def run_demo(
     broken_windows = _labelled(make_windows(broken, None, layout), tested, recordings)
     collapsed, collapsed_interval = _score(model, broken_windows)
     n_broken = len({c for fault in injected for c in fault.cells})
-    say(f"broken       {n_broken} cells: {'; '.join(f.reason for f in injected[:6])}{' ...' * (len(injected) > 6)}")
-    say(f"             {collapsed}")
+    say(f"broken       {n_broken} cells; {collapsed}")
+    for fault in injected[:_SHOWN]:
+        say(f"             {fault.describe(layout)}")
 
     with clock("learning what healthy looks like"):
         diagnoser = SelfDiagnosis(layout).fit(healthy)
@@ -173,7 +175,7 @@ def run_demo(
         f" {len(diagnosis.fault_set - injected_cells)} false alarms, from {len(log)} recordings"
         f" in {seconds['diagnosis']:.2f} s; {diagnosis.coverage}"
     )
-    for fault in diagnosis.faults[:8]:
+    for fault in diagnosis.faults[:_SHOWN]:
         say(f"             {fault.reason}")
 
     adapter = Adapter(model, training, validation)
@@ -219,9 +221,7 @@ def default_faults(recordings: Sequence[NDArray[Any]], layout: SensorLayout, rng
     busiest = rng.permutation(others[np.argsort(-touched[others])][: max(3, len(others) // 2)])
     for cell, kind in zip(busiest, (FaultKind.SHORT, FaultKind.OPEN, FaultKind.STUCK), strict=False):
         value = layout.full_scale / 2 if kind is FaultKind.STUCK else None
-        pad, row, column = layout.position(int(cell))
-        reason = f"pad {pad}, row {row}, column {column} is {kind}"
-        faults.append(Fault(kind, (int(cell),), value=value, reason=reason))
+        faults.append(Fault(kind, (int(cell),), value=value))
     return faults
 
 

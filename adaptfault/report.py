@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from adaptfault.atomic import atomic_write
-from diagnostics import Fault, FaultSet, SensorLayout
+from diagnostics import FaultSet
 from diagnostics.picture import draw_forces, pads_figure
 
 if TYPE_CHECKING:
@@ -63,17 +63,8 @@ def _rows(result: DemoResult) -> list[_Row]:
     for fault in result.injected:
         causes = tuple(f.reason for f in result.diagnosis.faults if set(f.cells) & set(fault.cells))
         found = sum(cell in faulty for cell in fault.cells)
-        rows.append(_Row(_name(fault, result.recordings.layout), len(fault.cells), found, causes))
+        rows.append(_Row(fault.describe(result.recordings.layout), len(fault.cells), found, causes))
     return rows
-
-
-def _name(fault: Fault, layout: SensorLayout) -> str:
-    if fault.line is not None:
-        where = str(fault.line)
-    else:
-        where = "; ".join("pad {}, row {}, column {}".format(*layout.position(c)) for c in fault.cells[:4])
-    value = f" at {fault.value:.4g} {layout.unit}" if fault.value is not None else ""
-    return f"{where}: {fault.kind}{value}"
 
 
 def _false_alarm_texts(result: DemoResult) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.layout import Line
+from diagnostics.layout import Line, SensorLayout
 
 
 class FaultKind(str, Enum):
@@ -66,6 +66,15 @@ class Fault:
         if cells.size == 0 or not np.issubdtype(cells.dtype, np.integer) or cells[0] < 0:
             raise ValueError(f"a fault needs at least one cell index, whole and >= 0; got {self.cells!r}")
         object.__setattr__(self, "cells", tuple(cells.tolist()))
+
+    def describe(self, layout: SensorLayout) -> str:
+        """Return kind and place in a few words: "pad 0, row 4, column 5: stuck at 2.5 N"."""
+        if self.line is not None:
+            where = str(self.line)
+        else:
+            where = "; ".join("pad {}, row {}, column {}".format(*layout.position(cell)) for cell in self.cells)
+        at = "" if self.value is None or self.kind is FaultKind.ALIAS else f" at {self.value:.4g} {layout.unit}"
+        return f"{where}: {self.kind}{at}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict that :meth:`from_dict` reads."""

@@ -176,7 +176,7 @@ def test_a_label_table_that_names_a_missing_file_is_told_and_the_rest_is_used(tm
 )
 def test_unusable_input_is_one_line_and_exit_code_3(home, small, arguments, message, capsys):
     save_npz(home / "log_only.npz", Recordings(small.frames[:3], SMALL))
-    every = ",".join(map(str, range(60)))
+    every = ",".join(f"{cell:04d}" for cell in range(60))  # longer than any file's name can be
     assert message in errors_of(capsys, *(a.format(home=home, all=every) for a in arguments))
 
 

@@ -85,22 +85,27 @@ def fault_set(text: str, layout: SensorLayout) -> FaultSet:
     Raises:
         ValueError: neither, or F is over another array.
     """
-    from diagnostics import Diagnosis, FaultSet
+    from diagnostics import FaultSet
 
-    path = Path(text)
-    if text and path.is_file():
-        try:
-            diagnosis = Diagnosis.from_dict(json.loads(path.read_text()))
-        except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}: not a diagnosis ({error}); write one with adaptfault diagnose --out") from None
-        if diagnosis.layout.shape != layout.shape:
-            raise ValueError(f"{path}: a diagnosis of {diagnosis.layout}, but the model is for {layout}")
-        return diagnosis.fault_set
     try:
-        cells = [int(part) for part in text.replace(",", " ").split()]
+        cells = tuple(int(part) for part in text.replace(",", " ").split())
     except ValueError:
-        raise ValueError(f"--faults {text}: no such file, and not cell indices as 3,17,200") from None
-    return FaultSet(tuple(cells), layout.n_cells)
+        return _diagnosed(Path(text), layout)
+    return FaultSet(cells, layout.n_cells)
+
+
+def _diagnosed(path: Path, layout: SensorLayout) -> FaultSet:
+    from diagnostics import Diagnosis
+
+    if not path.is_file():
+        raise ValueError(f"--faults {path}: no such file, and not cell indices as 3,17,200")
+    try:
+        diagnosis = Diagnosis.from_dict(json.loads(path.read_text()))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not a diagnosis ({error}); write one with adaptfault diagnose --out") from None
+    if diagnosis.layout.shape != layout.shape:
+        raise ValueError(f"{path}: a diagnosis of {diagnosis.layout}, but the model is for {layout}")
+    return diagnosis.fault_set
 
 
 def progress(args: argparse.Namespace) -> bool | None:

@@ -13,11 +13,12 @@ if TYPE_CHECKING:
     from adaptfault.calibration import Calibration
     from adaptfault.evaluation import Scores, evaluate
     from adaptfault.grasps import simulate
+    from adaptfault.history import History
     from adaptfault.network import TactileTransformer
     from adaptfault.recordings import Recordings, load, save_npz
     from adaptfault.reduction import ReducedModel
     from adaptfault.store import load_model, save_model
-    from adaptfault.training import History, train
+    from adaptfault.training import train
     from adaptfault.windows import Windows, make_windows, split
 
 __version__ = "0.1.0"
@@ -47,7 +48,7 @@ _HOMES = {
     "Adaptation": "adaptation",
     "Adapter": "adaptation",
     "Calibration": "calibration",
-    "History": "training",
+    "History": "history",
     "Recordings": "recordings",
     "ReducedModel": "reduction",
     "Scores": "evaluation",

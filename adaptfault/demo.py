@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from adaptfault.adaptation import Adaptation, Adapter
 from adaptfault.evaluation import Scores, accuracy_interval
+from adaptfault.history import History
 from adaptfault.network import TactileTransformer
 from adaptfault.recordings import Recordings
-from adaptfault.training import History, train
+from adaptfault.training import train
 from adaptfault.windows import Windows, make_windows, scale, split
 from diagnostics import Diagnosis, Fault, FaultKind, FaultSet, SelfDiagnosis, SensorLayout, inject, line_fault
 
@@ -130,8 +131,7 @@ def run_demo(
     layout = recordings.layout
     if recordings.labels is None:
         raise ValueError("the recordings have no labels: the demo trains a classifier")
-    seconds: dict[str, float] = {}
-    clock = _Clock(seconds)
+    clock = _Clock({})
     windows = make_windows(recordings.frames, recordings.labels, layout)
     training, validation, test = split(windows, seed=seed)
     healthy = [recordings.frames[i] for i in np.unique(training.recording)]
@@ -159,28 +159,21 @@ def run_demo(
     broken = [inject(recordings.frames[i], injected, layout, seed=seed + int(i)) for i in tested]
     broken_windows = _labelled(make_windows(broken, None, layout), tested, recordings)
     collapsed, collapsed_interval = _score(model, broken_windows)
-    n_broken = len({c for fault in injected for c in fault.cells})
-    say(f"broken       {n_broken} cells; {collapsed}")
-    for fault in injected[:_SHOWN]:
-        say(f"             {fault.describe(layout)}")
+    say(f"broken       {len({c for fault in injected for c in fault.cells})} cells; {collapsed}")
+    _list(say, [fault.describe(layout) for fault in injected])
 
     with clock("learning what healthy looks like"):
         diagnoser = SelfDiagnosis(layout).fit(healthy)
     log = [broken[i] for i in rng.permutation(len(broken))[:_LOG_RECORDINGS]]
     with clock("diagnosis"):
         diagnosis = diagnoser.diagnose(log)
-    injected_cells = FaultSet(tuple({c for fault in injected for c in fault.cells}), layout.n_cells)
-    say(
-        f"diagnosis    found {len(diagnosis.fault_set & injected_cells)} of {n_broken} broken cells,"
-        f" {len(diagnosis.fault_set - injected_cells)} false alarms, from {len(log)} recordings"
-        f" in {seconds['diagnosis']:.2f} s; {diagnosis.coverage}"
-    )
-    for fault in diagnosis.faults[:_SHOWN]:
-        say(f"             {fault.reason}")
+    say(_found(diagnosis, injected, len(log), clock.seconds["diagnosis"]))
+    _list(say, [fault.reason for fault in diagnosis.faults])
 
-    adapter = Adapter(model, training, validation)
     with clock("adaptation"):
-        adaptation = adapter.adapt(diagnosis.fault_set, budget=_BUDGET, seed=seed, progress=progress)
+        adaptation = Adapter(model, training, validation).adapt(
+            diagnosis.fault_set, budget=_BUDGET, seed=seed, progress=progress
+        )
     for stage in adaptation.stages:
         say(f"adaptation   {stage}")
     repaired, repaired_interval = _score(adaptation, broken_windows)
@@ -196,15 +189,32 @@ def run_demo(
         diagnosis=diagnosis,
         adaptation=adaptation,
         n_log=len(log),
-        seconds=seconds,
+        seconds=clock.seconds,
         maps=_force_maps([recordings.frames[i] for i in tested], broken, adaptation, layout),
     )
-    say(
-        f"repaired     {repaired}\n"
-        f"accuracy     {fault_free.accuracy:.3f} fault-free -> {collapsed.accuracy:.3f} broken ->"
-        f" {repaired.accuracy:.3f} repaired ({result.recovered:.0%} of fault-free) in {seconds['adaptation']:.1f} s"
+    say(f"repaired     {repaired}")
+    steps = (
+        f"{fault_free.accuracy:.3f} fault-free -> {collapsed.accuracy:.3f} broken -> {repaired.accuracy:.3f} repaired"
     )
+    say(f"accuracy     {steps} ({result.recovered:.0%} of fault-free) in {clock.seconds['adaptation']:.1f} s")
     return result
+
+
+def _list(say: Callable[[str], None], lines: Sequence[str]) -> None:
+    for line in lines[:_SHOWN]:
+        say(f"             {line}")
+    if len(lines) > _SHOWN:
+        say(f"             and {len(lines) - _SHOWN} more")
+
+
+def _found(diagnosis: Diagnosis, injected: Sequence[Fault], n_log: int, seconds: float) -> str:
+    """Say what was found against what was injected."""
+    true = {cell for fault in injected for cell in fault.cells}
+    return (
+        f"diagnosis    found {len(diagnosis.fault_set & true)} of {len(true)} broken cells,"
+        f" {len(diagnosis.fault_set - true)} false alarms, from {n_log} recordings in {seconds:.2f} s;"
+        f" {diagnosis.coverage}"
+    )
 
 
 def default_faults(recordings: Sequence[NDArray[Any]], layout: SensorLayout, rng: np.random.Generator) -> list[Fault]:

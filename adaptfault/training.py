@@ -6,9 +6,9 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,59 +17,12 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from adaptfault.checkpoint import fingerprint_weights, fingerprint_windows, read_checkpoint, write_checkpoint
+from adaptfault.clock import Clock
+from adaptfault.history import History, Stopped
 from adaptfault.network import as_tensor, logits_of
 from adaptfault.windows import Windows
 
-Stopped = Literal["epochs", "patience", "budget"]
 Augment = Callable[[Tensor, torch.Generator], Tensor]
-
-
-@dataclass(frozen=True)
-class History:
-    """What a training run did.
-
-    Attributes:
-        train_loss, validation_loss, validation_accuracy, seconds: one number an epoch (mean cross entropy; wall clock).
-        best_epoch: the epoch whose weights were kept, counted from 1; 0 = the starting weights.
-        stopped: "epochs" (all done), "patience" (no better for long), "budget" (out of time, also within an epoch).
-        start: validation loss and accuracy of the starting weights, where they were evaluated.
-    """
-
-    train_loss: tuple[float, ...] = ()
-    validation_loss: tuple[float, ...] = ()
-    validation_accuracy: tuple[float, ...] = ()
-    seconds: tuple[float, ...] = ()
-    best_epoch: int = 0
-    stopped: Stopped = "epochs"
-    start: tuple[float, float] | None = None
-
-    @property
-    def epochs(self) -> int:
-        """Number of epochs trained, the last one perhaps cut short by the budget."""
-        return len(self.train_loss)
-
-    @property
-    def best_accuracy(self) -> float:
-        """Validation accuracy of the weights that were kept; NaN if nothing was evaluated."""
-        if self.best_epoch:
-            return self.validation_accuracy[self.best_epoch - 1]
-        return self.start[1] if self.start else math.nan
-
-    def __str__(self) -> str:
-        return (
-            f"{self.epochs} epochs in {sum(self.seconds):.1f} s, stopped by {self.stopped}; "
-            f"best is epoch {self.best_epoch}, validation accuracy {self.best_accuracy:.3f}"
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-safe dict that :meth:`from_dict` reads."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, d: dict[str, Any]) -> History:
-        """Build a history from :meth:`to_dict`'s dict, also after a trip through JSON."""
-        fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in d.items()}
-        return cls(**fields)
 
 
 def train(
@@ -126,7 +79,7 @@ def train(
         )
     if not 0 <= averaging < 1:
         raise ValueError(f"averaging must lie in [0, 1), got {averaging}")
-    clock = _Clock(budget)
+    clock = Clock(budget)
     _check(model, train, validation)
     run = _Run(model, learning_rate, averaging, Path(checkpoint) if checkpoint is not None else None)
     if run.path is not None:
@@ -162,7 +115,7 @@ def train(
                 with clock.closing():
                     with run.averaged():
                         scores = _validate(model, validation)
-                    history = _append(run.history, loss, scores, time.perf_counter() - began)
+                    history = run.history.longer(loss, scores, time.perf_counter() - began)
                     run.record(history, save=seen == len(labels))  # a cut epoch is no place to resume from
                 bar.update()
                 bar.set_postfix(loss=f"{loss:.4f}", accuracy=f"{scores[1]:.4f}", best=history.best_epoch)
@@ -181,7 +134,7 @@ def _pass(
     order: Sequence[Tensor],
     augment: Augment | None,
     generator: torch.Generator,
-    clock: _Clock,
+    clock: Clock,
 ) -> tuple[float, int]:
     """Train on batches until they or the time run out; return the mean loss and how many windows were seen."""
     device, total, seen, began = next(run.model.parameters()).device, 0.0, 0, time.perf_counter()
@@ -201,27 +154,6 @@ def _pass(
             raise ValueError(f"the loss became {loss.item()} in epoch {run.history.epochs + 1}: lower learning_rate")
         clock.pace = (time.perf_counter() - began) / seen
     return total / seen, seen
-
-
-class _Clock:
-    """Tells when to stop a run, so that the next batch and the validation after it still fit into the budget."""
-
-    def __init__(self, budget: float | None) -> None:
-        self.began, self.budget, self.spent = time.perf_counter(), math.inf if budget is None else budget, 0.0
-        self.pace = 0.0  # seconds that training takes a window
-        self.close = 0.0  # seconds that the last validation and checkpoint took
-        self.over = False  # an epoch was cut short
-
-    @contextmanager
-    def closing(self, share: float = 1.0) -> Iterator[None]:
-        """Time the end of an epoch, or this share of one."""
-        began = time.perf_counter()
-        yield
-        self.close = (time.perf_counter() - began) / share
-
-    def late(self, batch: int) -> bool:
-        """Say whether another batch would be too much."""
-        return time.perf_counter() - self.began + self.spent + self.close + self.pace * batch > self.budget
 
 
 class _Run:
@@ -325,23 +257,7 @@ def _validate(model: nn.Module, windows: Windows) -> tuple[float, float]:
     return loss, (logits.argmax(1) == labels).double().mean().item()
 
 
-def _append(history: History, train_loss: float, scores: tuple[float, float], seconds: float) -> History:
-    """Return the history with one more epoch, the best so far if its accuracy is, or ties at a lower loss."""
-    loss, accuracy = scores
-    earlier = list(zip(history.validation_accuracy, (-v for v in history.validation_loss), strict=True))
-    if history.start is not None:
-        earlier.append((history.start[1], -history.start[0]))
-    return replace(
-        history,
-        train_loss=(*history.train_loss, train_loss),
-        validation_loss=(*history.validation_loss, loss),
-        validation_accuracy=(*history.validation_accuracy, accuracy),
-        seconds=(*history.seconds, seconds),
-        best_epoch=history.epochs + 1 if all((accuracy, -loss) > e for e in earlier) else history.best_epoch,
-    )
-
-
-def _stop(history: History, epochs: int, patience: int | None, clock: _Clock) -> Stopped | None:
+def _stop(history: History, epochs: int, patience: int | None, clock: Clock) -> Stopped | None:
     """Say why the run is over; None while it is not."""
     if clock.over:
         return "budget"

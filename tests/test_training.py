@@ -13,8 +13,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from adaptfault.history import History
 from adaptfault.network import TactileTransformer, logits_of
-from adaptfault.training import History, train
+from adaptfault.training import train
 from adaptfault.windows import Windows
 from diagnostics import SensorLayout
 

@@ -1,0 +1,78 @@
+"""What a training run did, epoch by epoch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+Stopped = Literal["epochs", "patience", "budget"]
+
+
+@dataclass(frozen=True)
+class History:
+    """What a training run did.
+
+    Attributes:
+        train_loss, validation_loss, validation_accuracy, seconds: one number an epoch (mean cross entropy; wall clock).
+        best_epoch: the epoch whose weights were kept, counted from 1; 0 = the starting weights.
+        stopped: "epochs" (all done), "patience" (no better for long), "budget" (out of time, also within an epoch).
+        start: validation loss and accuracy of the starting weights, where they were evaluated.
+    """
+
+    train_loss: tuple[float, ...] = ()
+    validation_loss: tuple[float, ...] = ()
+    validation_accuracy: tuple[float, ...] = ()
+    seconds: tuple[float, ...] = ()
+    best_epoch: int = 0
+    stopped: Stopped = "epochs"
+    start: tuple[float, float] | None = None
+
+    @property
+    def epochs(self) -> int:
+        """Number of epochs trained, the last one perhaps cut short by the budget."""
+        return len(self.train_loss)
+
+    @property
+    def best_accuracy(self) -> float:
+        """Validation accuracy of the weights that were kept; NaN if nothing was evaluated."""
+        if self.best_epoch:
+            return self.validation_accuracy[self.best_epoch - 1]
+        return self.start[1] if self.start else math.nan
+
+    def __str__(self) -> str:
+        return (
+            f"{self.epochs} epochs in {sum(self.seconds):.1f} s, stopped by {self.stopped}; "
+            f"best is epoch {self.best_epoch}, validation accuracy {self.best_accuracy:.3f}"
+        )
+
+    def longer(self, train_loss: float, scores: tuple[float, float], seconds: float) -> History:
+        """Return the history with one more epoch, the best so far if its accuracy is, or ties at a lower loss.
+
+        Args:
+            train_loss: mean cross entropy of the epoch.
+            scores: validation loss and accuracy after it.
+            seconds: that it took.
+        """
+        loss, accuracy = scores
+        earlier = list(zip(self.validation_accuracy, (-v for v in self.validation_loss), strict=True))
+        if self.start is not None:
+            earlier.append((self.start[1], -self.start[0]))
+        return replace(
+            self,
+            train_loss=(*self.train_loss, train_loss),
+            validation_loss=(*self.validation_loss, loss),
+            validation_accuracy=(*self.validation_accuracy, accuracy),
+            seconds=(*self.seconds, seconds),
+            best_epoch=self.epochs + 1 if all((accuracy, -loss) > e for e in earlier) else self.best_epoch,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict that :meth:`from_dict` reads."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, d: dict[str, Any]) -> History:
+        """Build a history from :meth:`to_dict`'s dict, also after a trip through JSON."""
+        fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in d.items()}
+        return cls(**fields)

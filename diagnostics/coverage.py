@@ -15,8 +15,9 @@ class Coverage:
     """How much of the array a log has put to the test, in the words of chip testing.
 
     Attributes:
-        fault_coverage: expected share of the faulty cells that were found: what P(faulty) sums to over the cells in
-            F, out of what it sums to over all. 1 where nothing is likely to be faulty.
+        fault_coverage: estimated share of the faulty cells that were found: what P(faulty) sums to over the cells in
+            F, out of what it sums to over all. One imaginary fault that may sit anywhere counts with them, found if
+            its cell was tested: so a log that tests nothing has 0, and one that tests all and finds nothing has 1.
         test_coverage: share of the cells with a verdict other than UNTESTED.
         untested: int ``[u]``, the cells that neither proved alive nor faulty.
         advice: touches that would test them, one sentence a region, the largest first.
@@ -45,11 +46,12 @@ def coverage(
         layout: the array; positions without a cell count nowhere.
     """
     present = layout.present.ravel()
+    tested = 1.0 - float(untested[present].mean())
     expected = float(probability[present].sum())
     found = float(probability[present & faulty].sum())
     return Coverage(
-        fault_coverage=found / expected if expected > 0.5 else 1.0,
-        test_coverage=1.0 - float(untested[present].mean()),
+        fault_coverage=(found + tested) / (expected + 1.0),
+        test_coverage=tested,
         untested=np.flatnonzero(untested & present),
         advice=_touches(untested & present, layout),
     )

@@ -53,7 +53,7 @@ class SelfDiagnosis:
         """
         healthy = _recordings(recordings, self.layout)
         self.tolerance_ = _tolerance(healthy, self.layout)
-        self.expectation_ = NearestFrames.fit(healthy, self.layout.full_scale)
+        self.expectation_ = NearestFrames.fit(healthy, self.layout.full_scale, 2 * self.tolerance_)
         self.weights_ = Weights.fit(healthy, self.layout, self.tolerance_)
         return self
 

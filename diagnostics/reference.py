@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.idle import IdleModel
 from diagnostics.layout import SensorLayout
 
 # Healthy frames kept: enough to hold every kind of touch, few enough that a search is one small matrix product.
@@ -16,6 +17,8 @@ _KEPT_FRAMES = 6000
 _NEIGHBOURS = 20
 _PRIOR_WEIGHT = 1.0  # neighbours that the share over all frames counts for: few neighbours prove little
 _BAND = 0.05  # of full scale: how far around a value its frequency is smoothed
+_IDLE_COUNTS = 0.5  # of the model of idleness, against the nearest frames, where all cells are heard
+_MOST_CELLS = 320  # for which the model of idleness is fitted
 _BATCH = 2048  # frames searched at once: bounds the memory of a long log
 
 
@@ -46,24 +49,29 @@ class NearestFrames:
     """A cell's readings in the healthy frames that most resemble the present one on the trusted cells.
 
     Contact is thresholded and objects have edges, so a linear model errs where it matters; real frames do not. The
-    distance is Euclidean after a square root, because noise grows with load.
+    distance is Euclidean after a square root, because noise grows with load. Where a cell rests, the sharper question
+    is whether anything touches it, and ``idle`` answers that.
 
     Attributes:
         frames: float32 ``[R, D]`` healthy frames, thinned evenly.
+        idle: P(a cell is idle | the others); None for arrays of more than 320 cells, which take minutes to fit.
         full_scale: of the layout.
     """
 
     frames: NDArray[np.float32]
+    idle: IdleModel | None
     full_scale: float
 
     @classmethod
-    def fit(cls, recordings: Sequence[NDArray[np.float64]], full_scale: float) -> NearestFrames:
+    def fit(cls, recordings: Sequence[NDArray[np.float64]], full_scale: float, tolerance: float) -> NearestFrames:
         """Keep the frames of fault-free recordings, ``[T, D]`` each; frames with missing readings are left out."""
         frames = np.concatenate([r[~np.isnan(r).any(axis=1)] for r in recordings])
         if not len(frames):
             raise ValueError("the fault-free recordings hold no complete frame: every one has missing readings")
         thin = np.linspace(0, len(frames) - 1, min(len(frames), _KEPT_FRAMES)).astype(int)
-        return cls(frames[thin].astype(np.float32), full_scale)
+        kept = frames[thin].astype(np.float32)
+        idle = IdleModel.fit(kept, tolerance) if kept.shape[1] <= _MOST_CELLS else None
+        return cls(kept, idle, full_scale)
 
     def share_at(
         self,
@@ -81,14 +89,24 @@ class NearestFrames:
         reference = _stabilised(self.frames)[:, trusted]
         energy = (reference**2).sum(axis=1)
         neighbours = min(_NEIGHBOURS, len(self.frames))
+        counts = _IDLE_COUNTS * self.idle.heard(trusted) ** 2 if self.idle is not None else 0.0
         shares = np.empty((len(frames), len(cells)))
         for first in range(0, len(frames), _BATCH):
             # A missing reading is taken for an untouched cell.
-            batch = _stabilised(np.nan_to_num(frames[first : first + _BATCH, trusted]).astype(np.float32))
-            distance = energy - 2 * batch @ reference.T  # (B, R), up to a constant for each frame
+            batch = np.nan_to_num(frames[first : first + _BATCH]).astype(np.float32)
+            distance = energy - 2 * _stabilised(batch[:, trusted]) @ reference.T  # (B, R), up to a constant
             nearest = np.argpartition(distance, neighbours - 1, axis=1)[:, :neighbours]
-            shares[first : first + _BATCH] = near[nearest].mean(axis=1)
-        return _shrunk(shares, neighbours, overall)
+            share = _shrunk(near[nearest].mean(axis=1), neighbours, overall)
+            if self.idle is not None:
+                # Cells that cannot be trusted count as what they read in the nearest frames.
+                batch[:, ~trusted] = self.frames[:, ~trusted][nearest].mean(axis=1)
+                resting = np.abs(values - self.idle.resting[cells]) <= tolerance
+                # Both know something that the other does not: a geometric mean. The model wants to hear every cell,
+                # so it counts for less the fewer there are.
+                likely = self.idle.probability(batch, cells[resting])
+                share[:, resting] = share[:, resting] ** (1 - counts) * likely**counts
+            shares[first : first + _BATCH] = share
+        return shares
 
 
 def _shrunk(share: NDArray[np.float64], neighbours: int, overall: NDArray[np.float64]) -> NDArray[np.float64]:

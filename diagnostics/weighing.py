@@ -54,7 +54,7 @@ class Weights:
         rng = np.random.default_rng(seed)
         order = rng.permutation(len(recordings))
         half = len(order) // 2
-        expectation = NearestFrames.fit([recordings[i] for i in order[:half]], layout.full_scale)
+        expectation = NearestFrames.fit([recordings[i] for i in order[:half]], layout.full_scale, 2 * tolerance)
         ratios, dead = [], []
         for i in range(_LOGS):
             size = min(_LOG_SIZES[i % len(_LOG_SIZES)], len(order) - half)

@@ -91,11 +91,8 @@ class Adaptation:
 
     def save(self, path: str | Path) -> None:
         """Write to a folder: weights as safetensors, the rest as JSON, no pickle."""
-        network = self.model.network
-        if not isinstance(network, TactileTransformer):
-            raise ValueError(f"only a TactileTransformer can be saved, this network is a {type(network).__name__}")
         about = {
-            "network": network.config,
+            "network": self.model.network.config,
             "fault_set": list(self.fault_set),
             "stages": [vars(stage) for stage in self.stages],
             "scores": self.scores.to_dict(),
@@ -133,10 +130,13 @@ class Adapter:
         train, validation: fault-free windows, ``[N, T, D]``.
 
     Raises:
+        TypeError: ``model`` is another module.
         ValueError: there are no windows.
     """
 
     def __init__(self, model: TactileTransformer, train: Windows, validation: Windows) -> None:
+        if not isinstance(model, TactileTransformer):
+            raise TypeError(f"an adapter repairs a TactileTransformer, got {type(model).__name__}")
         if not len(train) or not len(validation):
             raise ValueError("an adapter needs fault-free windows to learn from and to validate on; one set is empty")
         self.model, self.train, self.validation = model, train, validation
@@ -216,7 +216,7 @@ class _Run:
                     stage()
         return self.done()
 
-    def filled(self, network: nn.Module) -> ReducedModel:
+    def filled(self, network: TactileTransformer) -> ReducedModel:
         began = time.perf_counter()
         front = AffineFill(self.fault_set, *self.adapter.statistics.conditional_mean(self.fault_set))
         reduced = ReducedModel(network, self.fault_set, front).eval()
@@ -232,7 +232,6 @@ class _Run:
         windows = reduce_windows(self.adapter.train, self.fault_set)
         reduced, before = self.reduced, self.accuracy()
         network = reduced.network
-        assert isinstance(network, TactileTransformer)
         features = logits_of(_Features(reduced), windows.x).double().numpy()
         scaler = StandardScaler().fit(features)
         classifier = LogisticRegression(C=_HEAD_C, max_iter=300).fit(scaler.transform(features), windows.y)
@@ -298,13 +297,11 @@ class _Run:
 
 
 class _Features(nn.Module):
-    """The reduced model without its head."""
+    """The reduced model up to its head, as a module that can be run in batches."""
 
     def __init__(self, reduced: ReducedModel) -> None:
         super().__init__()
         self.reduced = reduced
 
     def forward(self, x: Tensor) -> Tensor:
-        network = self.reduced.network
-        assert isinstance(network, TactileTransformer)
-        return network.features(self.reduced.complete(x))
+        return self.reduced.features(x)

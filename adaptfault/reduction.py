@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from adaptfault.network import TactileTransformer
 from adaptfault.windows import Windows
 from diagnostics import FaultSet
 
@@ -91,12 +92,12 @@ class ReducedModel(nn.Module):
     With F empty it is the fault-free model, bit for bit: there is no front end.
 
     Args:
-        network: takes windows ``[N, T, D]``.
+        network: the classifier of windows ``[N, T, D]``.
         fault_set: F, the cells that no longer enter.
         front: from ``[N, T, D-k]`` to ``[N, T, D]``; None where F is empty.
     """
 
-    def __init__(self, network: nn.Module, fault_set: FaultSet, front: nn.Module | None) -> None:
+    def __init__(self, network: TactileTransformer, fault_set: FaultSet, front: nn.Module | None) -> None:
         super().__init__()
         self.network, self.fault_set = network, fault_set
         self.front = front if len(fault_set) else None
@@ -111,6 +112,10 @@ class ReducedModel(nn.Module):
         if x.dim() != 3 or x.shape[2] != width:
             raise ValueError(f"expected windows of the {width} healthy cells [N, T, {width}], got {list(x.shape)}")
         return x if self.front is None else self.front(x)
+
+    def features(self, x: Tensor) -> Tensor:
+        """Map windows of the healthy cells ``[N, T, D-k]`` to what the network's head weighs, ``[N, 128]``."""
+        return self.network.features(self.complete(x))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map windows of the healthy cells ``[N, T, D-k]``, scaled to 0..1, to logits ``[N, n_classes]``."""

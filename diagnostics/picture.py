@@ -24,7 +24,7 @@ def draw(diagnosis: Diagnosis) -> Figure:
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    from diagnostics.verdicts import _LETTERS
+    from diagnostics.verdicts import LETTERS
 
     layout = diagnosis.layout
     figure, axes = pads_figure(layout, n_rows=1)
@@ -37,7 +37,7 @@ def draw(diagnosis: Diagnosis) -> Figure:
     for fault in diagnosis.faults:
         for cell in fault.cells:
             pad, row, col = layout.position(cell)
-            axes[0, pad].text(col, row, _LETTERS[fault.kind], ha="center", va="center", color="white", fontsize=8)
+            axes[0, pad].text(col, row, LETTERS[fault.kind], ha="center", va="center", color="white", fontsize=8)
     legend = {"alive": _ALIVE, "faulty": _FAULTY, "untested": _UNTESTED}
     figure.legend(
         handles=[Patch(color=c, label=name) for name, c in legend.items()], loc="outside lower center", ncols=3

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "adaptfault.diagnosis/1"
 
-_LETTERS = {
+LETTERS = {
     FaultKind.OPEN: "O",
     FaultKind.SHORT: "S",
     FaultKind.STUCK: "K",
@@ -93,7 +93,7 @@ class Diagnosis:
         """
         signs = np.where(self.verdicts == Verdict.UNTESTED, "?", ".")
         for fault in self.faults:
-            signs[list(fault.cells)] = _LETTERS[fault.kind]
+            signs[list(fault.cells)] = LETTERS[fault.kind]
         grid = self.layout.grid(np.where(self.layout.present.ravel(), signs, " "))
         width = max(2 * self.layout.cols - 1, len(f"pad {self.layout.pads - 1}"))
         lines = ["   ".join(["    ", *(f"pad {p}".ljust(width) for p in range(self.layout.pads))]).rstrip()]

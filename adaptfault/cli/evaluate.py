@@ -37,9 +37,7 @@ def run(args: argparse.Namespace) -> int:
     classifier = Adaptation.load(args.adapted) if args.adapted else model
     if isinstance(classifier, Adaptation) and classifier.fault_set.n_cells != model.layout.n_cells:
         raise ValueError(f"{args.adapted}: an adaptation over {classifier.fault_set.n_cells} cells, not of this model")
-    windows = windows_of(recordings, model, manifest)
-    if not args.all:
-        windows = parts_of(recordings, model, manifest)[2]
+    windows = windows_of(recordings, model, manifest) if args.all else parts_of(recordings, model, manifest)[2]
     rng = np.random.default_rng(args.seed)
     faults = parse_faults(args.inject, recordings.layout, rng)
     if faults:

@@ -45,8 +45,10 @@ class Fault:
         line: the wire at fault; None for single cells.
         value: in the layout's unit. OPEN, SHORT, STUCK: what the cells read (None: 0 for OPEN, full scale for SHORT).
             INTERMITTENT: the value they blink to (None: 0). NOISY: standard deviation of the added noise. DRIFT: how
-            much the offset moves in one second. ALIAS: the level (0 or 1) of the stuck address bit in ``line``; with
-            a row or column line, the index of the row or column read instead; without a line, the cell read instead.
+            much the offset moves in one second (a drift of the gain is given to ``inject``, as a share per second).
+            ALIAS: the level (0 or 1) of the stuck address bit in ``line``; with a row or column line, the index of the
+            row or column read instead, or, where ``cells`` holds the cells of both lines, of the one that ``line``
+            touches (a bridge: both read the sum); without a line, the cell read instead.
         onset: first faulty frame; None: from the first frame on.
         probability: P(this fault is there), 0..1; None: known, not inferred.
         reason: one plain sentence.

@@ -1,8 +1,13 @@
-"""Injects faults into recordings, as the converter would report them."""
+"""Injects faults into recordings, as the converter would report them.
+
+The readings themselves are changed, one law for each kind of fault. ``diagnostics/circuit.py`` says where these laws
+hold and where a real array reads something else.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +24,14 @@ _OPENS, _CLOSES = 0.2, 0.4
 
 
 def inject(
-    recording: ArrayLike, faults: Iterable[Fault], layout: SensorLayout, *, seed: int | None = None, dither: float = 0.0
+    recording: ArrayLike,
+    faults: Iterable[Fault],
+    layout: SensorLayout,
+    *,
+    seed: int | None = None,
+    dither: float = 0.0,
+    until: int | None = None,
+    gain: float = 0.0,
 ) -> NDArray[np.float64]:
     """Return a copy of ``recording`` in which ``faults`` happen, each from its onset on.
 
@@ -32,14 +44,19 @@ def inject(
         layout: the array.
         seed: for the kinds that draw (INTERMITTENT, NOISY) and for dither; None draws anew each time.
         dither: the converter's unrest on OPEN, SHORT and STUCK cells: uniform within +- this share of full scale.
+        until: the faults end before this frame, and the cells read as before; None: they stay.
+        gain: what a DRIFT cell gains each second on top of its offset, as a share of its reading (negative: loses).
 
     Returns:
         float64 ``[T, D]``; faulty readings lie within 0..full_scale, all others are untouched, bit for bit. Missing
         readings (NaN) stay missing.
 
     Raises:
-        ValueError: a fault names a cell that the layout does not have, or a STUCK fault has no value.
+        ValueError: a fault names a cell that the layout does not have, or a STUCK fault has no value; ``until`` is
+            negative.
     """
+    if until is not None and until < 0:
+        raise ValueError(f"until is the first frame after the faults, 0 or more; got {until}")
     healthy = layout.check_recording(recording)
     out = healthy.copy()
     rng = np.random.default_rng(seed)
@@ -48,20 +65,21 @@ def inject(
             raise ValueError(
                 f"the fault names cell {fault.cells[-1]}, but the layout has {layout.n_cells} cells, numbered from 0"
             )
-        start = fault.onset or 0
-        cells = np.array(fault.cells)
-        faulty = np.clip(_faulty_readings(fault, cells, healthy[start:], layout, rng, dither), 0.0, layout.full_scale)
-        out[start:, cells] = np.where(np.isnan(healthy[start:, cells]), np.nan, faulty)
+        while_faulty = slice(fault.onset or 0, until)
+        cells, seen = np.array(fault.cells), healthy[while_faulty]
+        faulty = np.clip(_faulty_readings(fault, cells, seen, layout, rng, dither, gain), 0.0, layout.full_scale)
+        out[while_faulty, cells] = np.where(np.isnan(seen[:, cells]), np.nan, faulty)
     return out
 
 
 def _faulty_readings(
     fault: Fault,
     cells: NDArray[np.intp],
-    healthy: NDArray[np.float64],  # [t, D], from the onset on
+    healthy: NDArray[np.float64],  # [t, D], while the fault lasts
     layout: SensorLayout,
     rng: np.random.Generator,
     dither: float,
+    gain: float,
 ) -> NDArray[np.float64]:
     """Return what ``cells`` read under ``fault``, ``[t, len(cells)]``."""
     own = healthy[:, cells]
@@ -75,6 +93,11 @@ def _faulty_readings(
                 value = full_scale if fault.kind is FaultKind.SHORT else 0.0
             return value + dither * full_scale * rng.uniform(-1.0, 1.0, own.shape)
         case FaultKind.ALIAS:
+            partners = _bridge_partners(fault, cells, layout)
+            if partners is not None:
+                # Two cells in parallel: their conductances add, and so do their forces.
+                bridged: NDArray[np.float64] = np.where(partners >= 0, healthy[:, np.maximum(partners, 0)], 0.0)
+                return own + bridged
             sources = _alias_sources(fault, cells, layout)
             # Nothing is connected to that address: no current flows.
             return np.where(sources >= 0, healthy[:, np.maximum(sources, 0)], 0.0)
@@ -87,7 +110,9 @@ def _faulty_readings(
             return own + rng.normal(0.0, sigma, own.shape)
         case FaultKind.DRIFT:
             rate = _DRIFT * full_scale if fault.value is None else fault.value
-            return own + rate / layout.rate * np.arange(1, len(own) + 1)[:, None]
+            frames = np.arange(1, len(own) + 1)[:, None]
+            drifted: NDArray[np.float64] = own * (1.0 + gain / layout.rate * frames) + rate / layout.rate * frames
+            return drifted
 
 
 def _alias_sources(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) -> NDArray[np.intp]:
@@ -108,6 +133,25 @@ def _alias_sources(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) 
     return np.array([layout.cell(pad, row, value) for pad, row, _ in positions])
 
 
+def _bridge_partners(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) -> NDArray[np.intp] | None:
+    """Return which cell each of ``cells`` is bridged with; -1: an absent one. None: the alias is not a bridge.
+
+    It is one where it names the cells of both lines, for a line that reads another leaves that other one alone.
+    """
+    line = fault.line
+    if line is None or line.kind not in ("row", "column") or fault.value is None:
+        return None
+    index, size = int(fault.value), layout.rows if line.kind == "row" else layout.cols
+    if index == line.index or not 0 <= index < size:
+        return None
+    ours, theirs = set(layout.cells_on(line).tolist()), set(layout.cells_on(Line(line.pad, line.kind, index)).tolist())
+    if not theirs or not theirs <= set(fault.cells) <= ours | theirs:
+        return None
+    step = (index - line.index) * (layout.cols if line.kind == "row" else 1)
+    partners = np.where(np.isin(cells, list(theirs)), cells - step, cells + step)
+    return np.where(layout.present.ravel()[partners], partners, -1)
+
+
 def _blinking(frames: int, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Return ``[frames]`` bool, True while a loose contact is closed: a two-state Markov chain, closed at first."""
     draws = rng.random(frames)
@@ -120,9 +164,35 @@ def _blinking(frames: int, rng: np.random.Generator) -> NDArray[np.bool_]:
 
 
 def line_fault(
-    layout: SensorLayout, line: Line, kind: FaultKind, *, value: float | None = None, onset: int | None = None
+    layout: SensorLayout,
+    line: Line,
+    kind: FaultKind,
+    *,
+    value: float | None = None,
+    onset: int | None = None,
+    break_at: int | None = None,
+    driven_from: Literal["first", "last"] = "first",
 ) -> Fault:
-    """Return the fault of a whole wire: every cell it serves, or for a stuck address bit those that it misreads."""
+    """Return the fault of a wire: every cell it serves, or for a stuck address bit those that it misreads.
+
+    Args:
+        layout: the array.
+        line: the wire.
+        kind: how its cells misbehave.
+        value: as in :class:`~diagnostics.faults.Fault`.
+        onset: first faulty frame; None: from the first frame on.
+        break_at: a row or column is broken between positions ``break_at - 1`` and ``break_at`` along it (a row's
+            positions are column numbers, a column's are row numbers): the cells beyond are faulty, the others live.
+            None: the whole wire.
+        driven_from: the end at which the wire is connected, position 0 or the last one.
+
+    Raises:
+        ValueError: ``break_at`` out of range or on a wire that is no row or column, an alias of part of a wire, no cell
+            behind the break.
+        IndexError: the layout has no such wire.
+    """
+    if break_at is not None:
+        return _broken_line(layout, line, FaultKind(kind), value, onset, break_at, driven_from)
     if kind is FaultKind.ALIAS and line.kind in ("row_address", "column_address"):
         cells, _ = layout.misaddressed(line, int(value or 0))
         return Fault(
@@ -131,3 +201,94 @@ def line_fault(
     return Fault(
         kind, tuple(layout.cells_on(line).tolist()), line=line, value=value, onset=onset, reason=f"{line} is {kind}"
     )
+
+
+def _broken_line(
+    layout: SensorLayout,
+    line: Line,
+    kind: FaultKind,
+    value: float | None,
+    onset: int | None,
+    break_at: int,
+    driven_from: str,
+) -> Fault:
+    """Return the fault of the cells behind a break."""
+    if line.kind not in ("row", "column"):
+        raise ValueError(f"break_at says where a row or column is broken; {line} has no positions")
+    if kind is FaultKind.ALIAS:
+        raise ValueError("break_at goes with a fault of the cells behind the break, not with an alias of a whole wire")
+    along, positions = ("column", layout.cols) if line.kind == "row" else ("row", layout.rows)
+    if not 0 <= break_at <= positions:
+        raise ValueError(f"break_at {break_at} is outside {line}: use 0 to {positions}, counted in {along}s")
+    if driven_from not in ("first", "last"):
+        raise ValueError(f"driven_from must be 'first' or 'last', the connected end; got {driven_from!r}")
+    cells = layout.cells_on(line)
+    place = cells % layout.cols if line.kind == "row" else cells // layout.cols % layout.rows
+    beyond = place >= break_at if driven_from == "first" else place < break_at
+    if not beyond.any():
+        raise ValueError(
+            f"{line} has no cell behind a break at {break_at} when driven from its {driven_from} position:"
+            " move the break, or drive the wire from the other end"
+        )
+    side = f"from {along} {break_at} on" if driven_from == "first" else f"up to {along} {break_at - 1}"
+    return Fault(
+        kind, tuple(cells[beyond].tolist()), line=line, value=value, onset=onset, reason=f"{line} is {kind} {side}"
+    )
+
+
+def bridge(layout: SensorLayout, line: Line, *, onset: int | None = None) -> Fault:
+    """Return the fault of a row or column that touches the next one: an ALIAS with the cells of both.
+
+    In :func:`inject` both cells of a pair read the sum of their forces, clipped at full scale: their conductances are
+    in parallel. That holds where lines float while they are not selected. Where a switch like the driver's holds the
+    other line at ground, a real array reads their mean (``diagnostics/circuit.py``).
+
+    Raises:
+        ValueError: the wire is no row or column, or there is no next one.
+        IndexError: the layout has no such wire.
+    """
+    if line.kind not in ("row", "column"):
+        raise ValueError(f"rows and columns have neighbours that they can touch; {line} has none")
+    cells = layout.cells_on(line)
+    if line.index + 1 >= (layout.rows if line.kind == "row" else layout.cols):
+        raise ValueError(f"{line} is the last {line.kind}: name the one before it, to bridge the two")
+    cells = np.concatenate([cells, layout.cells_on(Line(line.pad, line.kind, line.index + 1))])
+    return Fault(
+        FaultKind.ALIAS,
+        tuple(cells.tolist()),
+        line=line,
+        value=line.index + 1,
+        onset=onset,
+        reason=f"{line} touches {line.kind} {line.index + 1}",
+    )
+
+
+def freeze_stream(recording: ArrayLike, onset: int, until: int | None = None) -> NDArray[np.float64]:
+    """Return a copy of ``recording`` ``[T, ...]`` that repeats frame ``onset`` to its end, or before frame ``until``.
+
+    A transport fault: the same frame is sent again and again, and no cell is broken.
+
+    Raises:
+        ValueError: ``onset`` or ``until`` is negative.
+    """
+    if onset < 0 or (until is not None and until < 0):
+        raise ValueError(f"frames are numbered from 0; got onset {onset} and until {until}")
+    out = np.array(recording, dtype=np.float64)
+    out[onset:until] = out[onset : onset + 1]
+    return out
+
+
+def lose_frames(recording: ArrayLike, share: float, *, seed: int | None = None) -> NDArray[np.float64]:
+    """Return a copy of ``recording`` ``[T, ...]`` in which randomly chosen frames are missing: all NaN.
+
+    A transport fault: lost packets. ``share`` of the frames are lost, 0..1, rounded to whole frames; ``seed`` chooses
+    them, None draws anew each time.
+
+    Raises:
+        ValueError: ``share`` is outside 0..1.
+    """
+    if not 0 <= share <= 1:
+        raise ValueError(f"share is the part of the frames that is lost, 0..1; got {share!r}")
+    out = np.array(recording, dtype=np.float64)
+    out[np.random.default_rng(seed).permutation(len(out))[: round(share * len(out))]] = np.nan
+    return out

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from diagnostics import Fault, FaultKind, Line, SensorLayout, inject, line_fault
+from diagnostics.injection import bridge, freeze_stream, lose_frames
 
 LAYOUT = SensorLayout(2, 11, 10)
 
@@ -98,3 +99,129 @@ def test_what_cannot_be_injected_is_said():
 
 def test_a_fault_that_starts_after_the_end_changes_nothing(recording):
     np.testing.assert_array_equal(inject(recording, [Fault("short", (2,), onset=99)], LAYOUT), recording)
+
+
+@pytest.mark.parametrize("kind", ["open", "stuck", "alias", "intermittent", "noisy", "drift"])
+def test_faults_end_before_the_frame_until_and_the_cells_recover(recording, kind):
+    fault = Fault(kind, (3, 150), value=1.0, onset=20)
+    broken = inject(recording, [fault], LAYOUT, seed=0, until=30)
+    np.testing.assert_array_equal(broken[30:], recording[30:])
+    np.testing.assert_array_equal(broken[:20], recording[:20])
+    assert (broken[20:30] != recording[20:30]).any()
+    np.testing.assert_array_equal(inject(recording, [fault], LAYOUT, seed=0, until=10), recording)
+
+
+def test_drift_gains_or_loses_a_share_of_the_reading_each_second(recording):
+    recording[:] = 2.0
+    drift = Fault("drift", (0,), value=0.0)
+    loses = inject(recording, [drift], LAYOUT, gain=-0.1)
+    np.testing.assert_allclose(loses[:, 0], 2.0 * (1 - 0.1 * np.arange(1, 51) / LAYOUT.rate))
+    both = inject(recording, [Fault("drift", (0,), value=0.5)], LAYOUT, gain=-0.1)
+    np.testing.assert_allclose(both - loses, (both - loses)[:, :1] * (np.arange(220) == 0))
+    assert both[-1, 0] - loses[-1, 0] == pytest.approx(0.5 * 50 / LAYOUT.rate)
+    np.testing.assert_array_equal(inject(recording, [Fault("open", (0,))], LAYOUT, gain=-0.1)[:, 1:], recording[:, 1:])
+
+
+@pytest.mark.parametrize(
+    ("line", "driven_from", "dead"),
+    [
+        (Line(1, "row", 3), "first", [(1, 3, col) for col in range(6, 10)]),
+        (Line(1, "row", 3), "last", [(1, 3, col) for col in range(6)]),
+        (Line(0, "column", 9), "first", [(0, row, 9) for row in range(6, 11)]),
+        (Line(0, "column", 9), "last", [(0, row, 9) for row in range(6)]),
+    ],
+)
+def test_a_broken_line_loses_the_cells_beyond_the_break_seen_from_its_driven_end(recording, line, driven_from, dead):
+    fault = line_fault(LAYOUT, line, FaultKind.OPEN, break_at=6, driven_from=driven_from, onset=4)
+    assert [LAYOUT.position(cell) for cell in fault.cells] == dead
+    assert (fault.line, fault.onset) == (line, 4)
+    assert (inject(recording, [fault], LAYOUT)[4:] == 0).any(0).sum() == len(dead)
+
+
+def test_a_break_says_where_it_is():
+    first = line_fault(LAYOUT, Line(0, "row", 3), FaultKind.OPEN, break_at=5)
+    last = line_fault(LAYOUT, Line(0, "column", 3), FaultKind.SHORT, break_at=5, driven_from="last")
+    assert first.reason == "pad 0, row 3 is open from column 5 on"
+    assert last.reason == "pad 0, column 3 is short up to row 4"
+
+
+def test_a_break_at_the_driven_end_takes_the_whole_line():
+    row = Line(0, "row", 3)
+    assert line_fault(LAYOUT, row, FaultKind.OPEN, break_at=0).cells == line_fault(LAYOUT, row, FaultKind.OPEN).cells
+
+
+def test_a_break_that_cannot_be_is_refused():
+    present = np.ones(LAYOUT.shape, bool)
+    present[0, 3, 8:] = False
+    masked = SensorLayout(2, 11, 10, present=present)
+    row = Line(0, "row", 3)
+    with pytest.raises(ValueError, match="outside pad 0, row 3: use 0 to 10"):
+        line_fault(LAYOUT, row, FaultKind.OPEN, break_at=11)
+    with pytest.raises(ValueError, match="has no positions"):
+        line_fault(LAYOUT, Line(0, "converter", 0), FaultKind.OPEN, break_at=1)
+    with pytest.raises(ValueError, match="no cell behind a break at 10"):
+        line_fault(LAYOUT, row, FaultKind.OPEN, break_at=10)
+    with pytest.raises(ValueError, match="no cell behind a break at 8"):
+        line_fault(masked, row, FaultKind.OPEN, break_at=8)
+    with pytest.raises(ValueError, match="not with an alias"):
+        line_fault(LAYOUT, row, FaultKind.ALIAS, value=2, break_at=5)
+    with pytest.raises(ValueError, match="'first' or 'last'"):
+        line_fault(LAYOUT, row, FaultKind.OPEN, break_at=5, driven_from="left")
+    with pytest.raises(IndexError, match="not a wire"):
+        line_fault(LAYOUT, Line(2, "row", 0), FaultKind.OPEN, break_at=5)
+
+
+@pytest.mark.parametrize("kind", ["row", "column"])
+def test_bridged_lines_both_read_the_sum_of_the_two_up_to_full_scale(recording, kind):
+    fault = bridge(LAYOUT, Line(1, kind, 4), onset=10)
+    pad = LAYOUT.grid(recording)[:, 1].swapaxes(1, 2 if kind == "column" else 1)
+    read = LAYOUT.grid(inject(recording, [fault], LAYOUT))[:, 1].swapaxes(1, 2 if kind == "column" else 1)
+    np.testing.assert_array_equal(read[10:, 4], np.minimum(pad[10:, 4] + pad[10:, 5], 5))
+    np.testing.assert_array_equal(read[:, 4][10:], read[:, 5][10:])
+    np.testing.assert_array_equal(np.delete(read, [4, 5], 1), np.delete(pad, [4, 5], 1))
+    np.testing.assert_array_equal(read[:10], pad[:10])
+    assert (read[10:, 4] == 5).any()
+
+
+def test_a_cell_bridged_with_an_absent_one_reads_itself(recording):
+    present = np.ones(LAYOUT.shape, bool)
+    present[0, 4, 0] = present[0, 5, 1] = False
+    masked = SensorLayout(2, 11, 10, present=present)
+    read = masked.grid(inject(recording, [bridge(masked, Line(0, "row", 4))], masked))[:, 0]
+    given = masked.grid(recording)[:, 0]
+    np.testing.assert_array_equal(read[:, 5, 0], given[:, 5, 0])
+    np.testing.assert_array_equal(read[:, 4, 1], given[:, 4, 1])
+
+
+def test_a_bridge_that_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="last row"):
+        bridge(LAYOUT, Line(0, "row", 10))
+    with pytest.raises(ValueError, match="has none"):
+        bridge(LAYOUT, Line(0, "row_address", 0))
+
+
+def test_a_frozen_stream_repeats_one_frame_until_it_runs_again(recording):
+    frozen = freeze_stream(recording, 20, until=30)
+    assert (frozen[20:30] == recording[20]).all()
+    np.testing.assert_array_equal(np.delete(frozen, range(20, 30), 0), np.delete(recording, range(20, 30), 0))
+    assert (freeze_stream(recording, 20)[20:] == recording[20]).all()
+    np.testing.assert_array_equal(freeze_stream(recording, 99), recording)
+
+
+def test_lost_frames_are_missing_as_a_whole_and_the_seed_chooses_them(recording):
+    lost = lose_frames(recording, 0.3, seed=0)
+    missing = np.isnan(lost)
+    assert missing.all(1).sum() == missing.any(1).sum() == 15
+    np.testing.assert_array_equal(lost[~missing], recording[~missing])
+    np.testing.assert_array_equal(lost, lose_frames(recording, 0.3, seed=0))
+    assert (np.isnan(lose_frames(recording, 0.3, seed=1)) != missing).any()
+    np.testing.assert_array_equal(lose_frames(recording, 0.0), recording)
+
+
+def test_times_and_shares_out_of_range_are_refused(recording):
+    with pytest.raises(ValueError, match="until"):
+        inject(recording, [], LAYOUT, until=-1)
+    with pytest.raises(ValueError, match="numbered from 0"):
+        freeze_stream(recording, -1)
+    with pytest.raises(ValueError, match="part of the frames"):
+        lose_frames(recording, 1.5)

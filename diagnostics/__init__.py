@@ -6,8 +6,10 @@ Needs numpy, scipy, statsmodels and scikit-learn; never torch, so that a robot c
 from diagnostics.coverage import Coverage
 from diagnostics.diagnosis import SelfDiagnosis
 from diagnostics.faults import Fault, FaultKind, FaultSet
-from diagnostics.injection import inject, line_fault
+from diagnostics.injection import bridge, freeze_stream, inject, line_fault, lose_frames
 from diagnostics.layout import Line, SensorLayout
+from diagnostics.monitor import Monitor
+from diagnostics.transport import TransportFault
 from diagnostics.verdicts import Diagnosis, Verdict
 
 __all__ = [
@@ -17,9 +19,14 @@ __all__ = [
     "FaultKind",
     "FaultSet",
     "Line",
+    "Monitor",
     "SelfDiagnosis",
     "SensorLayout",
+    "TransportFault",
     "Verdict",
+    "bridge",
+    "freeze_stream",
     "inject",
     "line_fault",
+    "lose_frames",
 ]

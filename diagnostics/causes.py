@@ -2,97 +2,249 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.addresses import Aliasing
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, SensorLayout
-from diagnostics.temporal import LastRuns
 from diagnostics.wiring import Cause, explain
 
 _SAME_VALUE = 0.02  # of full scale: stuck cells this near to each other may share a cause
 
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What is known of the cells, arrays ``[D]`` all.
+
+    Attributes:
+        faulty: those beyond doubt.
+        alive: those that proved to work.
+        silent: those that never delivered a reading.
+        rests: those that read what an untouched cell reads, and are still; full: the same with full scale.
+        intermittent, noisy, drifting: those that move, but wrongly.
+        value: what still cells read; NaN: nothing.
+        since: number of the first frame of what speaks for a fault.
+        probability: P(faulty).
+        weight: log likelihood ratio faulty : healthy.
+        touches: how many touches tested the cell, or how often it blinked.
+    """
+
+    faulty: Mask
+    alive: Mask
+    silent: Mask
+    rests: Mask
+    full: Mask
+    intermittent: Mask
+    noisy: Mask
+    drifting: Mask
+    value: Floats
+    since: NDArray[np.intp]
+    probability: Floats
+    weight: Floats
+    touches: NDArray[np.intp]
+
 
 def root_causes(
-    faulty: NDArray[np.bool_],
-    alive: NDArray[np.bool_],
-    silent: NDArray[np.bool_],
-    probability: NDArray[np.float64],
-    runs: LastRuns,
-    frame_numbers: NDArray[np.intp],
-    layout: SensorLayout,
-    tolerance: float,
-) -> tuple[Fault, ...]:
+    found: Findings, aliasings: Sequence[Aliasing], layout: SensorLayout
+) -> Generator[None, None, tuple[Fault, ...]]:
     """Name the root causes of faulty cells, one fault each, the biggest first: that is where a technician starts.
 
-    Args:
-        faulty: bool ``[D]``, the cells to explain.
-        alive: bool ``[D]``, the cells that proved to work.
-        silent: bool ``[D]``, cells that never delivered a reading.
-        probability: float ``[D]``, P(faulty).
-        runs: the still stretch that ends each cell's log.
-        frame_numbers: int ``[T]``, the number in the user's log of each frame that ``runs`` counts.
-        layout: the array.
-        tolerance: how near to a rail counts as the rail.
+    A generator that pauses between groups of cells, for those who cannot wait (a monitor); it returns the faults.
     """
-    faults: list[Fault] = []
-    for kind, cells, value in _alike(faulty, silent, runs.value, layout.full_scale, tolerance):
-        # A live cell contradicts a broken wire; so does one that is faulty in another way.
-        others = alive.copy()
-        others[np.setdiff1d(np.flatnonzero(faulty), cells)] = True
-        for cause in explain(cells, others, layout):
-            start = int(np.median(runs.start[list(cause.seen)]))
-            first = cause.cells[0]
-            if kind is FaultKind.STUCK and cause.line is None:
-                value = float(runs.value[first])
-            fault = Fault(
-                kind,
-                cause.cells,
-                line=cause.line,
-                value=value,
-                onset=int(frame_numbers[start]) if start > 0 else None,
-                probability=float(probability[first]) if cause.line is None else cause.probability,
-            )
-            faults.append(replace(fault, reason=_reason(fault, cause, layout)))
+    aliased = np.zeros(layout.n_cells, bool)
+    for aliasing in aliasings:
+        aliased[list(aliasing.cells)] = True
+    faults = [_aliased(aliasing, layout) for aliasing in aliasings]
+    for kind, faulty, alike, value in _alike(found, layout.full_scale):
+        # A live cell contradicts a broken wire; so does one that is faulty in another way, or reads another value.
+        against = found.alive | (found.faulty & ~alike) | aliased
+        if kind in (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK):
+            # What a cell did before the others broke says nothing of the wire.
+            begun = int(np.median(found.since[faulty])) if faulty.any() else 0
+            against &= ~(alike & ~faulty & (found.since <= begun) & (begun > 0))
+            against |= ~alike & ~found.silent
+        for cause in explain(faulty & ~aliased, alike & ~aliased, against, found.weight, layout):
+            faults.append(_fault(kind, value, cause, found, layout))
+        yield
+    faults = _addresses_of_dead_rows(faults, found, layout)
     return tuple(sorted(faults, key=lambda fault: (-len(fault.cells), fault.cells)))
 
 
-def _alike(
-    faulty: NDArray[np.bool_],
-    silent: NDArray[np.bool_],
-    value: NDArray[np.float64],
-    full_scale: float,
-    tolerance: float,
-) -> list[tuple[FaultKind, NDArray[np.intp], float | None]]:
-    """Group faulty cells that could share a cause: the same kind and nearly the same value (None: no reading)."""
-    heard = faulty & ~silent
-    low, high = heard & (value <= tolerance), heard & (value >= full_scale - tolerance)
-    rails = ((FaultKind.OPEN, silent, None), (FaultKind.OPEN, low, 0.0), (FaultKind.SHORT, high, full_scale))
-    groups = [(kind, np.flatnonzero(cells), at) for kind, cells, at in rails if cells.any()]
-    between = np.flatnonzero(heard & ~low & ~high)
+def _alike(found: Findings, full_scale: float) -> list[tuple[FaultKind, Mask, Mask, float | None]]:
+    """Return (kind, faulty, all that could be faulty alike, value) of each group that could share a cause."""
+    faulty, value = found.faulty, found.value
+    moving = found.intermittent | found.noisy | found.drifting
+    still = faulty & ~found.silent & ~moving
+    groups: list[tuple[FaultKind, Mask, Mask, float | None]] = [
+        (FaultKind.OPEN, faulty & found.silent, found.silent, None),
+        (FaultKind.OPEN, still & found.rests, found.rests, None),
+        (FaultKind.SHORT, still & found.full, found.full, full_scale),
+        (FaultKind.INTERMITTENT, faulty & found.intermittent, found.intermittent, None),
+        (FaultKind.NOISY, faulty & found.noisy, found.noisy, None),
+        (FaultKind.DRIFT, faulty & found.drifting, found.drifting, None),
+    ]
+    between = np.flatnonzero(still & ~found.rests & ~found.full)
     between = between[np.argsort(value[between])]
     for cells in np.split(between, np.flatnonzero(np.diff(value[between]) > _SAME_VALUE * full_scale) + 1):
         if len(cells):
-            groups.append((FaultKind.STUCK, np.sort(cells), float(np.median(value[cells]))))
-    return groups
+            mask = np.zeros(len(faulty), bool)
+            mask[cells] = True
+            groups.append((FaultKind.STUCK, mask, mask, float(np.median(value[cells]))))
+    return [group for group in groups if group[2].any()]
 
 
-def _reason(fault: Fault, cause: Cause, layout: SensorLayout) -> str:
+def _fault(kind: FaultKind, value: float | None, cause: Cause, found: Findings, layout: SensorLayout) -> Fault:
+    seen = list(cause.seen)
+    if kind in (FaultKind.STUCK, FaultKind.OPEN) and len(seen) and not found.silent[seen[0]]:
+        value = float(np.median(found.value[seen]))
+    start = int(np.median(found.since[seen]))
+    fault = Fault(
+        kind,
+        cause.cells,
+        line=cause.line,
+        value=value,
+        onset=start if start > 0 else None,
+        probability=float(found.probability[cause.cells[0]]) if cause.line is None else cause.probability,
+        evidence=int(found.touches[seen].sum()),
+    )
+    fault = replace(fault, reason=_reason(fault, cause, found, layout))
+    if cause.line is not None and cause.line.kind in ("row", "column"):
+        fault = replace(fault, alternatives=_alternatives(fault, cause, found, layout))
+    return fault
+
+
+def _aliased(a: Aliasing, layout: SensorLayout) -> Fault:
+    across = "row" if a.line.kind in ("row", "row_address") else "column"
+    if a.line.kind in ("row", "column"):
+        other = Line(a.line.pad, a.line.kind, a.value)
+        text = f"{a.line} and {across} {a.value} are bridged: both always read the same"
+        check = f"the solder and the flex cable between {across}s {a.line.index} and {other.index}"
+    else:
+        copies = ", ".join(f"{across} {i} reads {f'{across} {j}' if j >= 0 else 'nothing'}" for i, j in a.copies)
+        text = f"{a.line} is stuck at {a.value}: {copies}"
+        check = f"the {across} multiplexer and its address wires"
+    since = "" if a.onset == 0 else f" from frame {a.onset} on ({a.onset / layout.rate:.1f} s)"
+    reason = f"{text}{since}; {a.witnesses} times they agreed on a moving load; check {check}"
+    return Fault(
+        FaultKind.ALIAS,
+        a.cells,
+        line=a.line,
+        value=a.value,
+        onset=a.onset or None,
+        probability=1.0 - 0.5 ** min(a.witnesses, 30),
+        reason=reason,
+        evidence=a.witnesses,
+        alternatives=a.alternatives,
+    )
+
+
+_DOING = {
+    FaultKind.INTERMITTENT: "blinks between its load and {rail}",
+    FaultKind.NOISY: "is far noisier than a healthy cell under the same load",
+    FaultKind.DRIFT: "moves, but never comes back to rest",
+}
+
+
+def _does(fault: Fault, found: Findings, layout: SensorLayout) -> str:
+    if fault.kind in _DOING:
+        return _DOING[fault.kind].format(rail="a rail")
+    if found.silent[fault.cells[0]]:
+        return "delivers no reading"
+    return f"reads {fault.value or 0.0:.4g} {layout.unit}"
+
+
+def _reason(fault: Fault, cause: Cause, found: Findings, layout: SensorLayout) -> str:
     """Say what was seen and what to check."""
-    reads = "delivers no reading" if fault.value is None else f"reads {fault.value:.4g} {layout.unit}"
+    does = _does(fault, found, layout)
     since = "" if fault.onset is None else f" from frame {fault.onset} on ({fault.onset / layout.rate:.1f} s)"
     if fault.line is None:
         pad, row, column = layout.position(fault.cells[0])
-        return f"pad {pad}, row {row}, column {column} is {fault.kind}: it {reads}{since}, whatever touches it"
+        whatever = "" if fault.kind in _DOING else ", whatever touches it"
+        return f"pad {pad}, row {row}, column {column} is {fault.kind}: it {does}{since}{whatever}"
     inferred = len(cause.cells) - len(cause.seen)
-    also = f"; {inferred} more, not touched, are inferred" if inferred else ""
-    seen = f"each of {len(cause.seen)} cells on it {reads}{since}{also}"
-    return f"{fault.line} is {fault.kind}: {seen}; check {_wire(fault.line)}"
+    also = f"; {inferred} more, not tested, are inferred from the wire" if inferred else ""
+    where = "" if cause.whole else _span(fault, layout)
+    seen = f"each of {len(cause.seen)} cells on it {does}{since}{also}"
+    return f"{fault.line} is {fault.kind}{where}: {seen}; check {_wire(fault.line)}"
+
+
+def _span(fault: Fault, layout: SensorLayout) -> str:
+    """Say behind which point of its line a fault lies: " from column 5 on" or " up to column 4"."""
+    assert fault.line is not None
+    across, name = (2, "column") if fault.line.kind == "row" else (1, "row")
+    dead = [layout.position(cell)[across] for cell in fault.cells]
+    on_line = [layout.position(cell)[across] for cell in layout.cells_on(fault.line).tolist()]
+    return f" from {name} {min(dead)} on" if max(dead) == max(on_line) else f" up to {name} {max(dead)}"
+
+
+def _alternatives(fault: Fault, cause: Cause, found: Findings, layout: SensorLayout) -> tuple[str, ...]:
+    """Say what else would look the same: the address of a dead line, or a break a little elsewhere."""
+    assert fault.line is not None
+    others = []
+    cells = layout.cells_on(fault.line)
+    if cause.whole and fault.kind in (FaultKind.OPEN, FaultKind.SHORT):
+        others.append(f"the address or the multiplexer output of {fault.line}, not its wire")
+    untested = ~found.alive & ~found.faulty
+    unseen = np.setdiff1d(cells, np.array(cause.seen))
+    if cause.whole and fault.kind is FaultKind.OPEN and untested[unseen].any():
+        others.append(f"a break in {fault.line} that leaves the untested cells on it alive")
+    if not cause.whole and untested[cells].any():
+        edge = fault.cells[0] if fault.cells[-1] == cells[-1] else fault.cells[-1]
+        i = int(np.searchsorted(cells, edge))
+        beside = cells[i - 1] if edge == fault.cells[0] else cells[min(i + 1, len(cells) - 1)]
+        if untested[beside]:
+            others.append("a break one or more untested cells nearer to the live end")
+    return tuple(others)
 
 
 def _wire(line: Line) -> str:
     return (
         "the converter channel and its cable" if line.kind == "converter" else f"the {line.kind} wire and its address"
     )
+
+
+def _addresses_of_dead_rows(faults: list[Fault], found: Findings, layout: SensorLayout) -> list[Fault]:
+    """Put dead lines together that one stuck address bit would explain: it then reads lines that nothing touched."""
+    if sum(f.line is not None and f.kind is FaultKind.OPEN for f in faults) < 2:
+        return faults
+    for line in layout.lines:
+        if line.kind not in ("row_address", "column_address"):
+            continue
+        kind = "row" if line.kind == "row_address" else "column"
+        for level in (0, 1):
+            cells, sources = layout.misaddressed(line, level)
+            across = 1 if kind == "row" else 2
+            moved = {layout.position(c)[across] for c in cells.tolist()}
+            dead = [
+                f for f in faults
+                if f.kind is FaultKind.OPEN and f.line is not None and (f.line.pad, f.line.kind) == (line.pad, kind)
+                and set(layout.cells_on(f.line).tolist()) == set(f.cells)
+            ]  # fmt: skip
+            # One broken bit is likelier than two broken wires, and moves just these lines.
+            idle = ~found.alive[sources[sources >= 0]]
+            if len(moved) < 2 or {f.line.index for f in dead if f.line} != moved or not idle.all():
+                continue
+            reads = sorted({layout.position(s)[across] for s in sources[sources >= 0].tolist()})
+            instead = f"untouched {kind}s {', '.join(map(str, reads))}" if reads else f"addresses without a {kind}"
+            named = ", ".join(str(i) for i in sorted(moved))
+            text = f"{line} is stuck at {level}: {kind}s {named} read nothing, as {instead} would"
+            merged = Fault(
+                FaultKind.ALIAS,
+                tuple(cells.tolist()),
+                line=line,
+                value=level,
+                onset=max((f.onset or 0) for f in dead) or None,
+                probability=min(f.probability or 0.0 for f in dead),
+                reason=f"{text}; check the {kind} multiplexer and its address wires",
+                evidence=sum(f.evidence or 0 for f in dead),
+                alternatives=(f"the wires of {kind}s {named} are open, each for itself",),
+            )
+            faults = [f for f in faults if f not in dead] + [merged]
+    return faults

@@ -2,46 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.causes import root_causes
+from diagnostics.addresses import aliasings
+from diagnostics.causes import Findings, root_causes
 from diagnostics.layout import SensorLayout
-from diagnostics.reference import Expectation, NearestFrames, PooledNeighbourhood
-from diagnostics.spatial import stuck_evidence
-from diagnostics.temporal import last_runs
+from diagnostics.memory import Memory, finished
+from diagnostics.reference import Reference
 from diagnostics.verdicts import Diagnosis
-from diagnostics.weighing import Weights, faulty_at
+from diagnostics.weighing import Weights, faulty_at, kinds
 
 Recording = NDArray[np.float64]
 
-_TOLERANCE = 0.005  # of full scale: how far a stuck cell's reading may wander, a converter's dither
-_STEPS = 1.5  # and at least so many converter steps
+_SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
+_OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is faulty: four touches
+_DOUBTED = 0.1  # P(faulty) from which on a cell that moved before is no longer called alive
 
 
 class SelfDiagnosis:
-    """Finds the cells that hold one value whatever touches them, and the wires behind them.
-
-    Not detected yet: cells that move but wrongly (aliased addresses, intermittent contacts, excess noise, drift).
+    """Finds faulty cells and the wires behind them, from what a robot recorded in passing.
 
     Args:
         layout: the array.
         false_discovery_rate: expected share of healthy cells in F; at most this is accepted.
 
     Attributes:
-        expectation_: what healthy looks like, after :meth:`fit`.
+        reference_: what healthy looks like, after :meth:`fit`.
         weights_: what evidence is worth, after :meth:`fit`.
-        tolerance_: how near to a value counts as that value, in the layout's unit.
     """
 
-    expectation_: NearestFrames | None = None
+    reference_: Reference | None = None
     weights_: Weights = Weights()
-    tolerance_: float | None = None
 
-    def __init__(self, layout: SensorLayout, *, false_discovery_rate: float = 0.01) -> None:
+    def __init__(self, layout: SensorLayout, *, false_discovery_rate: float = 0.005) -> None:
         self.layout = layout
         self.false_discovery_rate = false_discovery_rate
 
@@ -52,9 +49,8 @@ class SelfDiagnosis:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
         healthy = _recordings(recordings, self.layout)
-        self.tolerance_ = _tolerance(healthy, self.layout)
-        self.expectation_ = NearestFrames.fit(healthy, self.layout.full_scale, 2 * self.tolerance_)
-        self.weights_ = Weights.fit(healthy, self.layout, self.tolerance_)
+        self.reference_ = Reference.fit(healthy, self.layout)
+        self.weights_ = Weights.fit(healthy, self.layout)
         return self
 
     def diagnose(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Diagnosis:
@@ -66,33 +62,83 @@ class SelfDiagnosis:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
         log = _recordings(recordings, self.layout)
-        tolerance = self.tolerance_ or _tolerance(log, self.layout)
-        present = self.layout.present.ravel()
-        frames = np.concatenate(log)
-        silent = present & np.isnan(frames).all(axis=0)  # never delivered a reading
-        arrived = ~np.isnan(frames[:, present & ~silent]).all(axis=1)  # a lost frame is evidence of nothing
-        kept = np.flatnonzero(arrived)
-        lengths = [int(n.sum()) for n in np.split(arrived, np.cumsum([len(r) for r in log])[:-1])]
-        frames = frames[arrived]
-        if not len(frames):
+        memory = self.memory()
+        for recording in log:
+            memory.extend(recording)
+        return finished(self.judge(memory, n_recordings=len(log)))
+
+    def memory(self) -> Memory:
+        """Return an empty memory, to be fed with a log and judged."""
+        return Memory(self.layout, self.reference_ or Reference.unknown(self.layout))
+
+    def judge(self, memory: Memory, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
+        """Judge every cell from what is remembered of a log.
+
+        A generator that pauses every few milliseconds, for those who cannot wait; it returns the diagnosis.
+
+        Raises:
+            ValueError: no frame with a reading has come yet.
+        """
+        memory = memory.complete()
+        if not memory.heard.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
-        runs = last_runs(frames, tolerance)
-        expectation: Expectation = self.expectation_ or PooledNeighbourhood(self.layout, frames)
-        ratio = stuck_evidence(frames, lengths, runs, expectation, present & ~silent, self.layout.full_scale, tolerance)
-        probability = np.where(silent, 1.0, self.weights_.probability(ratio, present & ~silent))
-        faulty = faulty_at(probability, self.false_discovery_rate) | silent
-        alive = present & ~faulty & runs.moved
-        causes = root_causes(faulty, alive, silent, probability, runs, kept, self.layout, tolerance)
+        reference, layout, runs, unrest = memory.reference, self.layout, memory.runs, memory.unrest
+        present, silent = memory.present, memory.present & ~memory.heard
+
+        aliased = aliasings(memory)
+        yield
+        wrong = np.zeros(layout.n_cells, bool)
+        wrong[[cell for aliasing in aliased for cell in (*aliasing.cells, *aliasing.doubtful)]] = True
+        spatial = yield from memory.spatial(wrong)
+        jump = memory.jump()
+        kind = kinds(memory)
+        worth = self.weights_.worth(spatial.evidence, jump, kind)
+        still = self.weights_.probability(worth, kind, spatial.asked)
+        intermittent, noisy = unrest.intermittent & present & ~wrong, unrest.excess & present & ~wrong
+        drifting = present & ~wrong & ~intermittent & ~noisy & (spatial.offset >= _OFFSET)
+        moving = intermittent | noisy | drifting
+        probability = np.where(present, np.where(silent | moving, _SURE, still), 0.0)
+        faulty = faulty_at(np.where(silent | moving, 0.0, probability), self.false_discovery_rate)
+        faulty = (faulty | silent | moving) & present & ~wrong
+        # A cell that moved works, unless something speaks against what it does since.
+        alive = present & ~wrong & ~faulty & runs.moved & (probability < _DOUBTED)
+        value = runs.value
+        rests = spatial.asked & memory.rests()
+        found = Findings(
+            faulty=faulty,
+            alive=alive,
+            silent=silent,
+            rests=rests,
+            full=spatial.asked & ~rests & (value >= layout.full_scale - 2 * reference.tolerance),
+            intermittent=intermittent,
+            noisy=noisy,
+            drifting=drifting,
+            value=value,
+            since=np.select([intermittent, noisy, drifting], [unrest.blinks_since, unrest.noisy_since, 0], runs.start),
+            probability=probability,
+            # What the line hypothesis asks of a cell at rest is only whether touches speak against it.
+            weight=self.weights_.worth(spatial.surprise, jump, kind),
+            touches=np.where(intermittent, unrest.blinks, spatial.touches),
+        )
+        yield
+        causes = yield from root_causes(found, aliased, layout)
+        inferred = np.zeros(layout.n_cells, bool)
         for fault in causes:
             cells = list(fault.cells)
             probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
+            inferred[cells] = True
+        temporal = np.where(spatial.asked, jump, unrest.blinking + unrest.noisy)
+        tested = spatial.touches.astype(np.float64)
+        loaded_from = reference.scale.resting + reference.scale.near
         return Diagnosis(
-            layout=self.layout,
+            layout=layout,
             faults=causes,
             probability=probability,
-            tested=alive | faulty,
-            n_frames=sum(len(r) for r in log),
-            n_recordings=len(log),
+            tested=alive | inferred,
+            transport=memory.stream.faults(loaded_from, alive & ~inferred, layout.rate),
+            evidence={"spatial": spatial.evidence + spatial.offset, "temporal": temporal, "touches": tested},
+            n_frames=memory.stream.seen,
+            n_recordings=n_recordings,
         )
 
 
@@ -105,12 +151,3 @@ def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayou
     if not checked:
         raise ValueError("no frames: expected recordings [T, D] with T >= 1")
     return checked
-
-
-def _tolerance(recordings: Sequence[Recording], layout: SensorLayout) -> float:
-    """Return how near to a value counts as that value: what a converter's dither needs, whatever its step."""
-    sample = np.concatenate([r[:: max(1, len(r) // 20)].ravel() for r in recordings])
-    steps = np.diff(np.unique(sample[np.isfinite(sample)]))
-    steps = steps[steps > 1e-6 * layout.full_scale]  # what is finer is rounding
-    step = float(steps.min()) if len(steps) else 0.0
-    return max(_TOLERANCE * layout.full_scale, min(_STEPS * step, 2 * _TOLERANCE * layout.full_scale))

@@ -52,6 +52,9 @@ class Fault:
         onset: first faulty frame; None: from the first frame on.
         probability: P(this fault is there), 0..1; None: known, not inferred.
         reason: one plain sentence.
+        evidence: how many independent observations speak for it (touches that tested its cells, blinks, agreements of
+            two lines); None: known, not inferred.
+        alternatives: what else the data allow, one plain sentence each.
     """
 
     kind: FaultKind
@@ -61,6 +64,8 @@ class Fault:
     onset: int | None = field(default=None, kw_only=True)
     probability: float | None = field(default=None, kw_only=True)
     reason: str = field(default="", kw_only=True)
+    evidence: int | None = field(default=None, kw_only=True)
+    alternatives: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kind", FaultKind(self.kind))
@@ -80,13 +85,23 @@ class Fault:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict that :meth:`from_dict` reads."""
-        return {**asdict(self), "kind": str(self.kind), "cells": list(self.cells)}
+        lists = {"cells": list(self.cells), "alternatives": list(self.alternatives)}
+        return {**asdict(self), "kind": str(self.kind), **lists}
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Fault:
         """Rebuild a fault from :meth:`to_dict`."""
         line = Line(**d["line"]) if d.get("line") else None
-        return cls(**{**d, "kind": FaultKind(d["kind"]), "cells": tuple(d["cells"]), "line": line})
+        alternatives = tuple(d.get("alternatives", ()))
+        return cls(
+            **{
+                **d,
+                "kind": FaultKind(d["kind"]),
+                "cells": tuple(d["cells"]),
+                "line": line,
+                "alternatives": alternatives,
+            }
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -146,12 +146,21 @@ class SensorLayout:
         Raises:
             IndexError: the layout has no such line.
         """
-        if line not in self.lines:
-            raise IndexError(f"{line} is not a wire of {self}")
-        pad = self._grid[line.pad]
-        cells = pad[line.index] if line.kind == "row" else pad[:, line.index] if line.kind == "column" else pad.ravel()
-        on_line: NDArray[np.intp] = cells[self.present.ravel()[cells]]
-        return on_line
+        try:
+            return self._served[line]
+        except KeyError:
+            raise IndexError(f"{line} is not a wire of {self}") from None
+
+    @cached_property
+    def _served(self) -> dict[Line, NDArray[np.intp]]:
+        present = self.present.ravel()
+        served = {}
+        for line in self.lines:
+            pad = self._grid[line.pad]
+            cells = pad[line.index] if line.kind == "row" else pad[:, line.index] if line.kind == "column" else pad
+            served[line] = cells.ravel()[present[cells.ravel()]]
+            served[line].setflags(write=False)
+        return served
 
     def misaddressed(self, line: Line, level: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return which cells an address bit stuck at ``level`` misreads, and what is read instead.
@@ -159,7 +168,7 @@ class SensorLayout:
         Returns ``(cells, sources)``, int arrays of the same length. A source of -1 is an address with nothing
         connected to it.
         """
-        if line not in self.lines or line.kind not in ("row_address", "column_address"):
+        if line not in self._served or line.kind not in ("row_address", "column_address"):
             raise IndexError(f"{line} is not an address bit of {self}")
         bit, by_row = 1 << line.index, line.kind == "row_address"
         wires = np.arange(self.rows if by_row else self.cols)

@@ -1,120 +1,146 @@
 """Spatial evidence: would a healthy cell hold this value while the other cells do what they do?
 
 For each cell that ends the log still, at value v from frame s on, two explanations compete. Stuck: it reads v whatever
-happens. Healthy: it reads v as often as healthy cells do when the others look as they do now. Every touch adds
+happens. Healthy: it reads v throughout a touch as often as healthy cells do when the others are touched like that.
+Every touch after s adds
 
-    log 1 / P(v | healthy, others)
+    log 1 / P(v throughout the touch | healthy, others)
 
-averaged over the least likely half of its frames, because the frames of one touch are not independent: evidence adds up
-over touches, hardly over the frames of one. However long a static hold lasts, it is one touch. How likely a stuck cell
-is to be stuck at just this v is charged once: a cell held still under a constant load also reads one value, but an
-arbitrary one, while the rails are where broken cells go.
+How likely a stuck cell is to be stuck at just this v is charged once: a cell held still under a constant load also
+reads one value, but an arbitrary one, while the rails are where broken cells go.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.reference import Expectation
-from diagnostics.temporal import LastRuns
+from diagnostics.contact import Expected
+from diagnostics.temporal import SHORTEST_RUN, StillRuns
+from diagnostics.touches import Array, Scale, Touch
 
-_SHORTEST_RUN = 5  # frames; shorter stillness is not worth a question
-_BLOCK = 100  # frames; a longer recording may hold several touches
-_FRAMES_PER_BLOCK = 32  # looked at, evenly spread: the frames between say the same
-_SAME_TOUCH = 0.25  # blocks whose mean frames differ by less than this share of their size are one touch
 _RAIL_SHARE = 0.4  # of broken cells stick to the low rail, as many to the high one, the rest anywhere
 _SUSPICIOUS = 2.0  # log evidence from which on a cell is left out when others are judged
+_LEAST = 1e-4  # no touch is less likely than this: models err
+_SUDDEN = 1.0  # log ratio of a jump from which on a cell is no witness
+_TELLING = 0.5  # log evidence from which on a touch counts as one that tested the cell
+_LEAST_OFFSET = 0.02  # of full scale, at the mean: a smaller one does no harm
+_MOST_OFFSET = 3.0  # log evidence of one touch that a moving cell does not come to rest
+_ROUNDS = 3  # of judging, leaving suspects out and putting others back
+
+
+class Model(Protocol):
+    """Knows what healthy cells would do in a touch."""
+
+    def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Expected:
+        """See ``ContactModel.expect``."""
+
+
+@dataclass(frozen=True)
+class Spatial:
+    """What the other cells say.
+
+    Attributes:
+        evidence: float ``[D]``, log likelihood ratio stuck : healthy; 0 where there is nothing to ask.
+        surprise: float ``[D]``, the part of it that touches brought.
+        asked: bool ``[D]``, the cells that are still now.
+        touches: int ``[D]``, how many touches each was judged by that said more than nothing.
+        offset: float ``[D]``, log likelihood ratio of a cell that moves, but is loaded all through the last touches,
+            however little the others are; 0 for the others.
+    """
+
+    evidence: NDArray[np.float64]
+    surprise: NDArray[np.float64]
+    asked: NDArray[np.bool_]
+    touches: NDArray[np.intp]
+    offset: NDArray[np.float64]
 
 
 def stuck_evidence(
-    log: NDArray[np.float64],
-    lengths: Sequence[int],
-    runs: LastRuns,
-    expectation: Expectation,
+    touches: Sequence[Touch],
+    settled: NDArray[np.float64],
+    runs: StillRuns,
+    jump: NDArray[np.float64],
+    sudden: NDArray[np.float64],
+    model: Model,
+    scale: Scale,
     present: NDArray[np.bool_],
-    full_scale: float,
+    wrong: NDArray[np.bool_],
     tolerance: float,
-) -> NDArray[np.float64]:
-    """Return the log likelihood ratio stuck : healthy for each cell, ``[D]``; 0 where there is nothing to ask.
+) -> Generator[None, None, Spatial]:
+    """Weigh stuck against healthy for each cell that is still now. A generator that pauses between rounds.
 
     Cells that moved answer first; still cells whose value proved normal are then put back, and those that look
     stuck are left out, before the final judgement.
 
     Args:
-        log: ``[T, D]``, the recordings one after the other.
-        lengths: of each recording, in frames; they sum to T.
-        runs: the still stretch that ends each cell's log.
-        expectation: what healthy looks like.
-        present: bool ``[D]``: where there is a cell.
-        full_scale: of the layout.
+        touches: what happened.
+        settled: float ``[D]``, evidence from earlier touches, of the stretches that still go on.
+        runs: the still stretch of each cell.
+        jump: float ``[D]``, log likelihood ratio of the jump into it, where the cell jumped alone.
+        sudden: float ``[D]``, the same wherever it jumped.
+        model: what healthy looks like.
+        scale: what a reading means.
+        present: bool ``[D]``: where there is a cell to judge.
+        wrong: bool ``[D]``: cells that move but are known to be faulty.
         tolerance: how near to v counts as v.
     """
-    asked = np.flatnonzero(present & (runs.start <= len(log) - _SHORTEST_RUN) & np.isfinite(runs.value))
-    evidence = np.zeros(log.shape[1])
-    if not len(asked):
-        return evidence
-    trusted = present & runs.moved
-    for _ in range(2):
-        evidence[asked] = _judge(log, lengths, runs, asked, trusted, expectation, full_scale, tolerance)
-        trusted = present & (evidence < _SUSPICIOUS)
-    return evidence
+    asked = present & ~wrong & (runs.length >= SHORTEST_RUN)
+    askable = present & ~wrong
+    brought, told = np.where(asked, settled, 0.0), np.zeros(len(present), np.intp)
+    if not touches:
+        return Spatial(brought, brought, asked, told, np.zeros(len(present)))
+    value = np.where(asked, np.nan_to_num(runs.value), 0.0)
+    root = scale.root_load(value)
+    rests = root <= scale.root_near
+    # A load that came all of a sudden, and is still held: a quick grasp, or many cells broken at once. While this touch
+    # lasts nobody can tell, so such cells are neither judged by it nor asked about the others.
+    fresh = runs.start >= touches[-1].first
+    unsure = asked & ~rests & runs.moved & fresh & (sudden >= _SUDDEN) & (jump < _SUDDEN)
+    asked, askable = asked & ~unsure, askable & ~unsure
+    held = np.flatnonzero(asked & ~rests)
+    full = value >= scale.full_scale - 2 * tolerance
+    low = scale.root_load(value - 2 * tolerance).astype(np.float64)
+    high = np.where(full, np.inf, scale.root_load(value + 2 * tolerance))
+    anywhere = (1 - 2 * _RAIL_SHARE) * 4 * tolerance / scale.full_scale
+    prior = np.log(np.where(rests | full, _RAIL_SHARE, anywhere))
+
+    suffixes = [touch.suffixes() for touch in touches]
+    features = np.stack([s.features() for of_touch in suffixes for s in of_touch])  # (n, 4, D)
+    first = np.array([s.first for of_touch in suffixes for s in of_touch])
+    begins = np.array([i == 0 for of_touch in suffixes for i in range(len(of_touch))])
+    # Of each touch, the longest part that lies within the still stretch.
+    within = first[:, None] >= runs.start
+    earlier = np.concatenate([np.zeros((1, len(value)), bool), within[:-1]]) & ~begins[:, None]
+    counted = within & ~earlier & asked
+    # At first those are asked that moved, unless their load has outlived a touch, or jumped alone. Of the cells at rest
+    # few are broken.
+    trusted = askable & runs.moved & (rests | (fresh & (jump < _SUDDEN)))
+    evidence = brought
+    for _ in range(_ROUNDS):
+        expected = model.expect(features, trusted)
+        likely = expected.never.copy()
+        likely[:, held] = expected.always[:, held] * expected.within(low[held], high[held], held)
+        surprise = np.where(counted, -np.log(np.maximum(likely, _LEAST)), 0.0)
+        brought = np.where(asked, settled + surprise.sum(axis=0), 0.0)
+        evidence = np.where(asked, prior + brought, 0.0)
+        told = (surprise > _TELLING).sum(axis=0)
+        trusted = askable & (evidence + jump < _SUSPICIOUS)
+        yield
+    return Spatial(evidence, brought, asked, told, _offset(features, begins, expected, present & runs.moved & fresh))
 
 
-def _judge(
-    log: NDArray[np.float64],
-    lengths: Sequence[int],
-    runs: LastRuns,
-    asked: NDArray[np.intp],
-    trusted: NDArray[np.bool_],
-    expectation: Expectation,
-    full_scale: float,
-    tolerance: float,
+def _offset(
+    features: Array, begins: NDArray[np.bool_], expected: Expected, moving: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    value, start = runs.value[asked], runs.start[asked]
-    at_rail = (value <= tolerance) | (value >= full_scale - tolerance)
-    elsewhere = (1 - 2 * _RAIL_SHARE) * 2 * tolerance / full_scale
-    evidence = np.log(np.where(at_rail, _RAIL_SHARE, elsewhere))
-    touches = _touches(log, lengths, trusted)
-    frames = np.concatenate(touches)
-    share = expectation.share_at(log[frames], trusted, asked, value, 2 * tolerance)  # (F, asked)
-    counted = (frames[:, None] >= start) & ~np.isnan(log[np.ix_(frames, asked)])  # frames of the still stretch
-    share = np.where(counted, share, np.inf)
-    for of_touch in np.split(share, np.cumsum([len(touch) for touch in touches])[:-1]):
-        ranked = np.sort(of_touch, axis=0)
-        half = (np.isfinite(ranked).sum(axis=0) + 1) // 2
-        mean = np.where(np.arange(len(ranked))[:, None] < half, ranked, 0.0).sum(axis=0) / np.maximum(half, 1)
-        evidence -= np.log(np.where(half > 0, mean, 1.0))
-    return evidence
-
-
-def _touches(log: NDArray[np.float64], lengths: Sequence[int], trusted: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
-    """Return the frames of each touch: blocks of a recording, consecutive ones that look alike put together."""
-    touches: list[list[NDArray[np.intp]]] = []
-    last = None
-    for first, end in _blocks(lengths):
-        frames = np.unique(np.linspace(first, end - 1, min(end - first, _FRAMES_PER_BLOCK)).astype(np.intp))
-        mean = np.sqrt(np.maximum(np.nan_to_num(log[np.ix_(frames, trusted)]), 0)).mean(axis=0)
-        alike = last is not None and (
-            np.linalg.norm(mean - last) <= _SAME_TOUCH * max(np.linalg.norm(mean), np.linalg.norm(last))
-        )
-        if alike:
-            touches[-1].append(frames)
-        else:
-            touches.append([frames])
-            last = mean
-    return [np.concatenate(blocks) for blocks in touches]
-
-
-def _blocks(lengths: Sequence[int]) -> list[tuple[int, int]]:
-    """Return (first, last + 1) frame of each recording, long ones in parts of nearly equal length."""
-    blocks: list[tuple[int, int]] = []
-    first = 0
-    for length in lengths:
-        cuts = np.linspace(first, first + length, max(1, round(length / _BLOCK)) + 1).astype(int)
-        blocks += [(int(a), int(b)) for a, b in pairwise(cuts) if b > a]
-        first += length
-    return blocks
+    """Return the log likelihood ratio that a moving cell never comes back to rest, ``[D]``, over the last touches."""
+    whole = features[begins]  # (touches, 4, D)
+    loaded = (whole[:, 3] == 1) & (whole[:, 1] ** 2 >= _LEAST_OFFSET)
+    lasting = np.logical_and.accumulate(loaded[::-1])[::-1]  # unbroken up to the end
+    # One surprise may be a residue of the last load: no touch says much alone.
+    surprise = np.minimum(-np.log(np.maximum(expected.always[begins], _LEAST)), _MOST_OFFSET)
+    return np.where(moving, np.where(lasting, surprise, 0.0).sum(axis=0), 0.0)

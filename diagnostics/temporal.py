@@ -1,4 +1,4 @@
-"""Temporal evidence: since when has a cell held one value?
+"""Temporal evidence: since when has a cell held one value, and how abruptly did it get there?
 
 A stuck cell holds its value from its onset to the end of the log, up to the converter's dither. So does a healthy one
 that nothing touches: stillness raises the question, and the other cells answer it (see ``spatial``).
@@ -6,42 +6,150 @@ that nothing touches: stillness raises the question, and the other cells answer 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
+
+SHORTEST_RUN = 5  # frames; shorter stillness is not worth a question
+_JUMPS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 1.0])  # of full scale, edges of bins
+_LATELY = 64  # frames
+_MOST = 4.0  # log ratio: jumps alone prove nothing
+_COMPANY = 0.2  # share of the loaded cells: when so many jump at once, a grasp was released
+
 
 @dataclass(frozen=True)
-class LastRuns:
-    """The longest still stretch at the end of a log, for each cell.
+class StillRuns:
+    """The still stretch that ends the log so far, for each cell. Knows nothing of frames before the last.
 
     Attributes:
-        start: int ``[D]``, first frame of the stretch; 0 where the cell never moved.
-        value: float ``[D]``, what the cell reads during it; NaN for a cell that never delivered a reading.
-        moved: bool ``[D]``, True where the cell read something else before.
+        start: int ``[D]``, number of the first frame of the stretch; 0 where the cell never moved.
+        length: int ``[D]``, its frames with a reading.
+        low, high: float ``[D]``, the lowest and highest reading of it; inf and -inf before the first reading.
+        jump: float ``[D]``, by how much the reading changed in the step before it; 0 where it never moved.
+        company: float ``[D]``, share of the loaded cells that changed as drastically in that very step.
+        last: float ``[D]``, the last reading.
     """
 
     start: NDArray[np.intp]
-    value: NDArray[np.float64]
-    moved: NDArray[np.bool_]
+    length: NDArray[np.intp]
+    low: Floats
+    high: Floats
+    jump: Floats
+    company: Floats
+    last: Floats
+
+    @classmethod
+    def begin(cls, n_cells: int) -> StillRuns:
+        """Nothing seen yet."""
+        zero, nothing = np.zeros(n_cells, np.intp), np.full(n_cells, np.inf)
+        return cls(zero, zero, nothing, -nothing, np.zeros(n_cells), np.zeros(n_cells), np.full(n_cells, np.nan))
+
+    def extend(self, frames: Floats, numbers: NDArray[np.intp], tolerance: float) -> StillRuns:
+        """Return the runs after more frames. A cell is still while it stays within +- ``tolerance`` of one value.
+
+        Args:
+            frames: ``[t, D]``, t >= 1; NaN = missing, which neither breaks nor proves a run.
+            numbers: int ``[t]``, of the frames, ascending.
+            tolerance: as far as a converter's dither goes.
+        """
+        missing = np.isnan(frames)
+        any_missing = bool(missing.any())
+        top = np.where(missing, -np.inf, frames) if any_missing else frames
+        bottom = np.where(missing, np.inf, frames) if any_missing else frames
+        low, high = np.minimum(self.low, bottom.min(axis=0)), np.maximum(self.high, top.max(axis=0))
+        heard = (~missing).sum(axis=0) if any_missing else np.full(len(self.low), len(frames))
+        start, length, jump, company = self.start, self.length + heard, self.jump, self.company
+        broke = np.flatnonzero(high - low > 2 * tolerance)
+        if len(broke):
+            start, length, jump, company = start.copy(), length.copy(), jump.copy(), company.copy()
+            # Among these frames lies the first of the stretch that ends here: look for it from the end.
+            highest = np.maximum.accumulate(top[::-1, broke], axis=0)
+            lowest = np.minimum.accumulate(bottom[::-1, broke], axis=0)
+            count = (highest - lowest <= 2 * tolerance).sum(axis=0)  # the spread only grows: a prefix of True
+            at = np.arange(len(broke))
+            first = len(frames) - count
+            start[broke] = numbers[first]
+            length[broke] = np.minimum(count, heard[broke])
+            before = np.concatenate([self.last[None], frames[:-1]])
+            step = frames - before
+            size = np.fmax(frames, before)
+            drastic = np.abs(step) > np.maximum(size / 2, 4 * tolerance)
+            # Broken cells hold their value all along: only cells that moved lately could have jumped too.
+            lately = high - low > 2 * tolerance
+            lately |= self.length < _LATELY
+            share = drastic.sum(axis=1) / np.maximum(((size > 4 * tolerance) & lately).sum(axis=1), 1)
+            low[broke], high[broke] = lowest[count - 1, at], highest[count - 1, at]
+            jump[broke], company[broke] = np.nan_to_num(step[first, broke]), share[first]
+        last = frames[-1].copy()
+        if any_missing:
+            backwards = (~missing[::-1]).argmax(axis=0)
+            last = np.where(heard > 0, frames[len(frames) - 1 - backwards, np.arange(len(last))], self.last)
+        return StillRuns(start, length, low, high, jump, company, last)
+
+    @property
+    def value(self) -> Floats:
+        """float ``[D]``, what each cell reads during its stretch; NaN for one that never delivered a reading."""
+        return np.where(np.isfinite(self.high), (np.nan_to_num(self.high) + np.nan_to_num(self.low)) / 2, np.nan)
+
+    @property
+    def moved(self) -> NDArray[np.bool_]:
+        """bool ``[D]``, True where the cell read something else before."""
+        moved: NDArray[np.bool_] = self.start > 0
+        return moved
+
+    @property
+    def alone(self) -> NDArray[np.bool_]:
+        """bool ``[D]``, False where a cell jumped into its stretch together with many others, as when a grasp ends."""
+        alone: NDArray[np.bool_] = self.company < _COMPANY
+        return alone
 
 
-def last_runs(log: NDArray[np.float64], tolerance: float) -> LastRuns:
-    """Find the still stretch that ends each cell's log.
+@dataclass(frozen=True)
+class Onsets:
+    """How abruptly healthy cells become still: what the jump into a still stretch says of a fault.
 
-    Args:
-        log: ``[T, D]``, T >= 1; NaN = missing, which neither breaks nor proves stillness.
-        tolerance: a cell is still while it stays within +- this of one value.
+    A broken cell jumps by whatever lies between its load and the value it sticks to; a healthy one is mostly let go
+    little by little, and when a whole grasp is released its neighbours fall with it. Few healthy ones rise in one step
+    to a load that they then hold.
+
+    Attributes:
+        log_ratio: ``[2, bins]``, log likelihood ratio fault : healthy of a fall and of a rise of each size.
     """
-    backwards = log[::-1]
-    # Missing readings must not show in the running extremes.
-    highest = np.maximum.accumulate(np.where(np.isnan(backwards), -np.inf, backwards))
-    lowest = np.minimum.accumulate(np.where(np.isnan(backwards), np.inf, backwards))
-    length = (highest - lowest <= 2 * tolerance).sum(axis=0)  # the spread only grows: a prefix of True
-    start = len(log) - length
-    last = np.maximum(length - 1, 0)[None, :]
-    high, low = np.take_along_axis(highest, last, 0)[0], np.take_along_axis(lowest, last, 0)[0]
-    heard = np.isfinite(high)
-    value = np.where(heard, (np.where(heard, high, 0.0) + np.where(heard, low, 0.0)) / 2, np.nan)
-    return LastRuns(start=start, value=value, moved=start > 0)
+
+    log_ratio: Floats
+
+    @classmethod
+    def fit(cls, recordings: Sequence[Floats], tolerance: float, full_scale: float) -> Onsets:
+        """Count the jumps of healthy cells, recordings ``[T, D]`` each."""
+        healthy = np.ones((2, len(_JUMPS) - 1))
+        for recording in recordings:
+            runs = StillRuns.begin(recording.shape[1])
+            for first in range(0, len(recording), SHORTEST_RUN):
+                frames = recording[first : first + SHORTEST_RUN]
+                runs = runs.extend(frames, np.arange(first, first + len(frames)), tolerance)
+                fresh = runs.moved & (runs.length >= SHORTEST_RUN) & (runs.length < 2 * SHORTEST_RUN) & runs.alone
+                for up in (0, 1):
+                    jumps = runs.jump[fresh & ((runs.jump > 0) == up)]
+                    healthy[up] += np.histogram(np.abs(jumps) / full_scale, _JUMPS)[0]
+        ratio = np.diff(_JUMPS) / (healthy / healthy.sum(axis=1, keepdims=True))
+        # A cell that rested when it broke did not jump: half of the faults look like anything healthy.
+        return cls(np.minimum(np.log(0.5 + 0.5 * ratio), _MOST))
+
+    @classmethod
+    def silent(cls) -> Onsets:
+        """Without a reference jumps say nothing."""
+        return cls(np.zeros((2, len(_JUMPS) - 1)))
+
+    def evidence(self, runs: StillRuns, full_scale: float) -> Floats:
+        """Return the log likelihood ratio ``[D]``, 0 where a cell never moved or jumped in company."""
+        return np.where(runs.alone, self.size(runs, full_scale), 0.0)
+
+    def size(self, runs: StillRuns, full_scale: float) -> Floats:
+        """Return what the size of each jump would say of a cell that jumped alone, ``[D]``; 0 where it never moved."""
+        share = np.clip(np.abs(runs.jump) / full_scale, 0, 1)
+        which = np.clip(np.searchsorted(_JUMPS, share, side="right") - 1, 0, len(_JUMPS) - 2)
+        return np.where(runs.moved, self.log_ratio[(runs.jump > 0).astype(np.intp), which], 0.0)

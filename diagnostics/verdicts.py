@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from diagnostics.coverage import Coverage, coverage
 from diagnostics.faults import Fault, FaultKind, FaultSet
 from diagnostics.layout import SensorLayout
+from diagnostics.transport import TransportFault
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -51,6 +52,10 @@ class Diagnosis:
         faults: one for each root cause: a broken row is one fault with many cells.
         probability: float ``[D]``, P(cell is faulty); 0 where the layout has no cell.
         tested: bool ``[D]``: the log could tell whether the cell works.
+        evidence: what each kind of evidence says of each cell, ``[D]``: ``"spatial"`` and ``"temporal"``, log
+            likelihood ratios faulty : healthy (0: nothing), and ``"touches"``, how many put the cell to the test. What
+            the wiring says is in ``faults``.
+        transport: lost frames and frozen streams: faults on the way of the frames, not of cells.
         n_frames: length of the log.
         n_recordings: recordings in the log.
     """
@@ -61,6 +66,8 @@ class Diagnosis:
     tested: NDArray[np.bool_]
     n_frames: int
     n_recordings: int
+    transport: tuple[TransportFault, ...] = ()
+    evidence: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     @cached_property
     def fault_set(self) -> FaultSet:
@@ -104,8 +111,10 @@ class Diagnosis:
 
     def __str__(self) -> str:
         found = f"{len(self.fault_set)} faulty cells" if len(self.fault_set) != 1 else "1 faulty cell"
+        reasons = [line for fault in self.faults for line in (fault.reason, *(f"  or {a}" for a in fault.alternatives))]
+        reasons += [fault.reason for fault in self.transport]
         head = f"{found} in {self.n_recordings} recordings ({self.n_frames} frames); {self.coverage}"
-        return "\n".join([head, self.map(), *(fault.reason for fault in self.faults)])
+        return "\n".join([head, self.map(), *reasons])
 
     def plot(self) -> Figure:
         """Draw the verdict map; returns a matplotlib Figure."""
@@ -122,6 +131,8 @@ class Diagnosis:
             "faults": [fault.to_dict() for fault in self.faults],
             "verdicts": [v.name for v in self.verdicts],
             "probability": self.probability.tolist(),
+            "evidence": {kind: values.tolist() for kind, values in self.evidence.items()},
+            "transport": [fault.to_dict() for fault in self.transport],
             "n_frames": self.n_frames,
             "n_recordings": self.n_recordings,
             "coverage": {
@@ -148,4 +159,6 @@ class Diagnosis:
             tested=np.asarray([v != Verdict.UNTESTED.name for v in d["verdicts"]]),
             n_frames=d["n_frames"],
             n_recordings=d["n_recordings"],
+            evidence={kind: np.asarray(values, dtype=np.float64) for kind, values in d.get("evidence", {}).items()},
+            transport=tuple(TransportFault.from_dict(f) for f in d.get("transport", ())),
         )

@@ -1,9 +1,10 @@
 """Turns evidence into probability: fitted on faults of our own making, injected into the fault-free recordings.
 
-The raw log likelihood ratio of ``spatial`` is too sure of itself: neighbours are few, frames are alike, and an object's
-edge surprises everyone. So the reference is split, one half explains logs made of the other half, with known
-faults in them, and a logistic regression learns what a ratio is worth. How common faults are is not learned there: it
-is estimated from the log at hand (empirical Bayes), because it differs from one robot to the next.
+A raw log likelihood ratio is too sure of itself: touches are few and alike, and an object's edge surprises everyone. So
+the reference is split, one part explains logs made of the other, with known faults in them, and a logistic
+regression learns what a ratio is worth: for cells that never moved in the log, that came to rest, and that came to hold
+a load. How common faults are is not learned there: it is estimated from the log at hand (empirical Bayes), because it
+differs from one robot to the next.
 """
 
 from __future__ import annotations
@@ -18,33 +19,43 @@ from scipy.special import expit, logit
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.injection import inject
 from diagnostics.layout import SensorLayout
-from diagnostics.reference import NearestFrames
-from diagnostics.spatial import stuck_evidence
-from diagnostics.temporal import last_runs
+from diagnostics.memory import Memory, finished
+from diagnostics.reference import Reference
 
-_LOGS = 24  # drawn to fit the weights
+_LOGS = 96  # drawn to fit the weights
 _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
-_DEAD_SHARE = 0.08
+_DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
 _FEWEST_RECORDINGS = 8  # below that the reference cannot be split
 _PIECE = 100  # frames; longer recordings are cut, so that a single long one can be split too
-_CLIP = 12.0  # log ratios beyond this say "certain"; they must not steer the fit
-_EXPECTED_SHARE, _EXPECTED_CELLS = 0.02, 25.0  # faults expected before a log is seen: 2 %, worth 25 cells
+_LEARNED_SHARE = 0.75  # of the recordings teach what healthy looks like, the others make the logs
+_MOST_JUMP = 1.0  # what a jump may be worth, whatever the logs say: alone it proves nothing
+_KINDS = 3
+_CLIP = 6.0  # log ratios beyond this say "certain"; they must not steer the fit
+_SURE = 24.0  # and beyond this, not even more certain
+_EXPECTED, _EXPECTED_LATE = 0.02, 0.005  # share of faulty cells before a log is seen: from the start, and in it
+_EXPECTED_CELLS = 25.0  # worth so many cells
+_MOVING_ODDS = -10.0  # log odds of a fault that holds one value, for a cell that moves
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Weights:
-    """What a raw log likelihood ratio is worth: ``offset + slope * ratio``.
+    """What raw log likelihood ratios are worth, for each kind of still cell.
 
-    The defaults serve a cold start; they were fitted in the same way, on 16 logs of simulated grasps.
+    Kind 0 never moved in the log, kind 1 came to rest, kind 2 came to hold a load. The defaults serve a cold start.
+
+    Attributes:
+        offset, slope, jump: log odds = ``offset + slope * ratio + jump * ratio of the jump``, before how common faults
+            are; of each kind.
     """
 
-    offset: float = 0.0
-    slope: float = 0.9
+    offset: tuple[float, ...] = (0.0, -2.0, -2.0)
+    slope: tuple[float, ...] = (0.6, 0.6, 0.6)
+    jump: tuple[float, ...] = (0.0, 0.5, 0.5)
 
     @classmethod
-    def fit(
-        cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, tolerance: float, *, seed: int = 0
-    ) -> Weights:
+    def fit(cls, recordings: Sequence[Floats], layout: SensorLayout, *, seed: int = 0) -> Weights:
         """Fit on fault-free recordings, ``[T, D]`` each; too few of them give the defaults."""
         recordings = [piece for r in recordings for piece in np.array_split(r, max(1, len(r) // _PIECE))]
         if len(recordings) < _FEWEST_RECORDINGS:
@@ -52,55 +63,80 @@ class Weights:
         from sklearn.linear_model import LogisticRegression
 
         rng = np.random.default_rng(seed)
+        trials = []
         order = rng.permutation(len(recordings))
-        half = len(order) // 2
-        expectation = NearestFrames.fit([recordings[i] for i in order[:half]], layout.full_scale, 2 * tolerance)
-        ratios, dead = [], []
+        learned = round(_LEARNED_SHARE * len(order))
+        reference = Reference.fit([recordings[i] for i in order[:learned]], layout)
         for i in range(_LOGS):
-            size = min(_LOG_SIZES[i % len(_LOG_SIZES)], len(order) - half)
-            chosen = rng.choice(order[half:], size, replace=False)
-            faults = _random_faults(layout, rng)
-            parts = [inject(recordings[j], faults, layout) for j in chosen]
-            log = np.nan_to_num(np.concatenate(parts))
-            runs = last_runs(log, tolerance)
-            present = layout.present.ravel()
-            ratio = stuck_evidence(
-                log, [len(p) for p in parts], runs, expectation, present, layout.full_scale, tolerance
-            )
-            judged = ratio != 0
-            truth = np.zeros(layout.n_cells, bool)
-            truth[[c for fault in faults for c in fault.cells]] = True
-            ratios.append(ratio[judged])
-            dead.append(truth[judged])
-        x, y = np.clip(np.concatenate(ratios), -_CLIP, _CLIP), np.concatenate(dead)
-        if y.all() or not y.any():
-            return cls()
-        model = LogisticRegression(C=10.0).fit(x[:, None], y)
-        slope = float(model.coef_[0, 0])
-        # The regression's offset holds how common faults were in its own logs: take that out again.
-        offset = float(model.intercept_[0] - logit(y.mean()))
-        return cls(offset, slope) if slope > 0 else cls()
+            size = min(_LOG_SIZES[i % len(_LOG_SIZES)], len(order) - learned)
+            log = np.concatenate([recordings[j] for j in rng.choice(order[learned:], size, replace=False)])
+            share = _DEAD_SHARES[i // len(_LOG_SIZES) % len(_DEAD_SHARES)]
+            onset = int(rng.uniform(0, 0.8) * len(log)) if i % 2 else None
+            trials.append(_trial(log, _random_faults(layout, share, onset, rng), layout, reference))
+        kind, ratio, jump, dead = (np.concatenate(column) for column in zip(*trials, strict=True))
+        evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), jump])
+        found = []
+        for k in range(_KINDS):
+            of, alike = kind == k, (kind > 0) == (k > 0)
+            if not 0 < dead[of].mean() < 1:
+                return cls()
+            model = LogisticRegression(C=10.0).fit(evidence[of], dead[of])
+            slope, of_jump = model.coef_[0].tolist()
+            # The regression's offset holds how common faults were in its own logs: take that out again.
+            offset = float(model.intercept_[0] - logit(dead[alike].mean()))
+            found.append((offset, slope, float(np.clip(of_jump, 0.0, _MOST_JUMP))))
+        offsets, slopes, jumps = zip(*found, strict=True)
+        return cls(offsets, slopes, jumps) if min(slopes) > 0 else cls()
 
-    def probability(self, ratio: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return P(faulty) ``[D]`` for raw ratios ``[D]``, 0 where no cell is present.
+    def worth(self, ratio: Floats, jump: Floats, kind: NDArray[np.intp]) -> Floats:
+        """Return the calibrated log likelihood ratio faulty : healthy, ``[D]``.
 
-        A ratio of exactly 0 means that the cell moved until the end: it is as good as alive.
+        Args:
+            ratio: float ``[D]``, spatial log likelihood ratio stuck : healthy.
+            jump: float ``[D]``, temporal log likelihood ratio.
+            kind: int ``[D]``, see the class.
         """
-        weighed = np.where(ratio == 0, -_CLIP, self.offset + self.slope * ratio)[present]
-        share = _EXPECTED_SHARE
-        posterior = np.zeros(0)
-        for _ in range(100):
-            posterior = expit(weighed + logit(share))
-            expected = posterior.sum() + _EXPECTED_SHARE * _EXPECTED_CELLS
-            share, previous = expected / (len(posterior) + _EXPECTED_CELLS), share
-            if abs(share - previous) < 1e-6:
-                break
-        probability = np.zeros(len(ratio))
-        probability[present] = posterior
+        offset, slope, of_jump = (np.array(of)[kind] for of in (self.offset, self.slope, self.jump))
+        worth: Floats = offset + slope * np.clip(ratio, -_SURE, _SURE) + of_jump * jump
+        return worth
+
+    def probability(self, worth: Floats, kind: NDArray[np.intp], asked: NDArray[np.bool_]) -> Floats:
+        """Return P(holds one value for ever) ``[D]``, from what the evidence is worth.
+
+        Only the cells that were ``asked`` (bool ``[D]``) are still; the others move, and are as good as alive.
+        """
+        probability = np.full(len(worth), float(expit(_MOVING_ODDS)))
+        for which, expected in ((asked & (kind == 0), _EXPECTED), (asked & (kind > 0), _EXPECTED_LATE)):
+            share = expected
+            for _ in range(100):
+                posterior = expit(worth[which] + logit(share))
+                share, before = (posterior.sum() + expected * _EXPECTED_CELLS) / (which.sum() + _EXPECTED_CELLS), share
+                if abs(share - before) < 1e-6:
+                    break
+            probability[which] = expit(worth[which] + logit(share))
         return probability
 
 
-def faulty_at(probability: NDArray[np.float64], false_discovery_rate: float) -> NDArray[np.bool_]:
+def kinds(memory: Memory) -> NDArray[np.intp]:
+    """Return the kind of each cell, ``[D]``, see :class:`Weights`."""
+    return np.where(memory.runs.moved, np.where(memory.rests(), 1, 2), 0)
+
+
+def _trial(
+    log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference
+) -> tuple[NDArray[np.intp], Floats, Floats, NDArray[np.bool_]]:
+    """Return kind, ratio and jump of each still cell ``[n]`` when ``faults`` are in a log, and which are broken."""
+    memory = Memory(layout, reference)
+    memory.extend(inject(log, faults, layout))
+    memory = memory.complete()
+    spatial = finished(memory.spatial())
+    broken = np.zeros(layout.n_cells, bool)
+    broken[[c for fault in faults for c in fault.cells]] = True
+    asked = spatial.asked
+    return kinds(memory)[asked], spatial.evidence[asked], memory.jump()[asked], broken[asked]
+
+
+def faulty_at(probability: Floats, false_discovery_rate: float) -> NDArray[np.bool_]:
     """Return the largest set of cells whose expected share of false alarms stays within the rate, bool ``[D]``.
 
     No cell that is rather alive than faulty is in it, however good the others look.
@@ -112,12 +148,13 @@ def faulty_at(probability: NDArray[np.float64], false_discovery_rate: float) -> 
     return chosen & (probability > 0.5)
 
 
-def _random_faults(layout: SensorLayout, rng: np.random.Generator) -> list[Fault]:
+def _random_faults(layout: SensorLayout, share: float, onset: int | None, rng: np.random.Generator) -> list[Fault]:
     """Draw stuck cells: a third open, a third short, a third at any value."""
     cells = np.flatnonzero(layout.present)
-    count = max(1, round(_DEAD_SHARE * len(cells)))
+    count = max(1, round(share * len(cells)))
     kinds = rng.choice([FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK], count)
+    values = rng.uniform(0, layout.full_scale, count)
     return [
-        Fault(kind, (int(cell),), value=float(rng.uniform(0, layout.full_scale)) if kind == FaultKind.STUCK else None)
-        for cell, kind in zip(rng.choice(cells, count, replace=False), kinds, strict=True)
+        Fault(kind, (int(cell),), value=float(value) if kind == FaultKind.STUCK else None, onset=onset)
+        for cell, kind, value in zip(rng.choice(cells, count, replace=False), kinds, values, strict=True)
     ]

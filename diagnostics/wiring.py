@@ -1,14 +1,15 @@
-"""Wiring evidence: the cheapest set of wires and cells that explains which cells are faulty.
+"""Wiring evidence: the cheapest set of wires and cells that explains what is seen.
 
-Costs are negative log probabilities. A broken line costs ``log 200`` (one wire in two hundred), a single cell the
-log of how rare single faults are on this pad, and each live cell that a line says is dead costs ``log 1000``. The
-set of least cost is found by integer programming; how rare single faults are is then read off the solution, and the
-programme solved again until it no longer changes.
+Costs are negative log probabilities. A broken wire costs ``log 200`` (one wire in two hundred), one broken in its
+middle ``log 2`` more, a single cell the log of how rare single faults are on this pad, and each cell behind a wire that
+contradicts it ``log 1000``. Cells that are not faulty beyond doubt count with the evidence that there is: many doubtful
+cells on one wire may convict it together. The set of least cost is found by integer programming; how rare single faults
+are is then read off the solution, and the programme solved again until it no longer changes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,10 +18,19 @@ from numpy.typing import NDArray
 from diagnostics.layout import Line, SensorLayout
 
 _LINE_COST = np.log(200.0)
+_CUT_COST = np.log(2.0)
 _CONTRADICTION_COST = np.log(1000.0)
+_MOST_CONTRADICTIONS = 1  # of a wire that is still suspected
 _RAREST, _MOST_COMMON = 0.005, 0.5  # bounds on the share of single faults, which few cells cannot tell exactly
-# Faulty cells that must have been seen on a line before it is blamed: so many, and this share of its cells.
+# Cells with evidence against them that a wire must serve before it is blamed: so many, and this share of those on it
+# that were put to the test at all.
 _FEWEST_WITNESSES, _WITNESS_SHARE = 3, 1 / 3
+_WITNESS = 2.5  # log ratio of a cell that counts as one
+_TRIED = 0.3  # log ratio of a cell that was put to the test
+_DOUBTFUL_SHARE = 0.7  # of the evidence of doubtful cells counts: neighbours are wrong together
+_MOST = 4.0  # log ratio that one doubtful cell can bring
+_CLEAR = np.log(100.0)  # by so much a wire must beat all its cells by themselves, if any of them is doubtful
+_PROVEN = np.log(9.0)  # log odds from which on a wire is named: single cells are the safer guess
 _ROUNDS = 5
 
 
@@ -31,84 +41,164 @@ class Cause:
     Attributes:
         line: the wire; None for a single cell.
         cells: the cells it makes faulty, ascending.
-        seen: those of them that were found faulty; the others are inferred.
+        seen: those of them with evidence of their own; the others are inferred.
         probability: of the wire being at fault rather than all of ``seen`` by chance; 1 for single cells.
+        whole: False where the wire is broken in its middle.
     """
 
     line: Line | None
     cells: tuple[int, ...]
     seen: tuple[int, ...]
     probability: float
+    whole: bool = True
 
 
-def explain(faulty: NDArray[np.intp], alive: NDArray[np.bool_], layout: SensorLayout) -> tuple[Cause, ...]:
-    """Explain cells that are faulty *in the same way* (same kind, same value).
+@dataclass(frozen=True)
+class _Candidate:
+    line: Line
+    cells: NDArray[np.intp]  # behind the break
+    cost: float
+    whole: bool
+
+
+def explain(
+    faulty: NDArray[np.bool_],
+    alike: NDArray[np.bool_],
+    against: NDArray[np.bool_],
+    weight: NDArray[np.float64],
+    layout: SensorLayout,
+) -> tuple[Cause, ...]:
+    """Explain cells that misbehave *in the same way* (same kind, same value).
 
     Args:
-        faulty: int ``[n]``, their indices.
-        alive: bool ``[D]``: the cells that contradict a broken wire. Cells that are neither may be inferred faulty.
+        faulty: bool ``[D]``, those that are faulty beyond doubt.
+        alike: bool ``[D]``, all that could be faulty in that way; holds ``faulty``.
+        against: bool ``[D]``, the cells that contradict a broken wire. Cells that are neither may be inferred faulty.
+        weight: float ``[D]``, log likelihood ratio faulty : healthy of each cell that is alike.
         layout: the array.
     """
+    if alike.sum() < 2:  # no wire serves so few
+        return tuple(Cause(None, (cell,), (cell,), 1.0) for cell in np.flatnonzero(faulty).tolist())
     causes: list[Cause] = []
-    for pad in range(layout.pads):
-        on_pad = faulty[(faulty // (layout.rows * layout.cols)) == pad]
-        if len(on_pad):
-            causes += _explain_pad(pad, on_pad, alive, layout)
+    pads = layout.grid(alike).any(axis=(1, 2))
+    for pad in np.flatnonzero(pads).tolist():
+        causes += _explain_pad(pad, faulty, alike, against, weight, layout)
     return tuple(causes)
 
 
-def _explain_pad(pad: int, faulty: NDArray[np.intp], alive: NDArray[np.bool_], layout: SensorLayout) -> list[Cause]:
-    served = {
-        line: layout.cells_on(line)
-        for line in layout.lines
-        if line.pad == pad and line.kind in ("row", "column", "converter")
-    }
-    candidates = {
-        line: cells
-        for line, cells in served.items()
-        if np.isin(faulty, cells).sum() >= max(min(_FEWEST_WITNESSES, len(cells)), _WITNESS_SHARE * len(cells))
-    }
-    tested = int(alive[served[Line(pad, "converter", 0)]].sum()) + len(faulty)
-    blamed: set[Line] = set()
+def _explain_pad(
+    pad: int,
+    faulty: NDArray[np.bool_],
+    alike: NDArray[np.bool_],
+    against: NDArray[np.bool_],
+    weight: NDArray[np.float64],
+    layout: SensorLayout,
+) -> list[Cause]:
+    support = np.where(alike, np.clip(weight, -1.0, _MOST), 0.0)
+    witness = alike & (faulty | (support >= _WITNESS))
+    tried = alike & (faulty | (support > _TRIED))
+    candidates = []
+    lines = layout.lines if witness.sum() >= 2 else ()
+    for line in lines:
+        if line.pad == pad and line.kind in ("row", "column", "converter"):
+            candidates += _candidates(line, layout.cells_on(line), against, witness, tried)
+    on_pad = np.zeros(layout.n_cells, bool)
+    on_pad[layout.cells_on(Line(pad, "converter", 0))] = True
+    found = np.flatnonzero(faulty & on_pad)
+    tested = int((against & on_pad).sum()) + len(found)
+    blamed: list[_Candidate] = []
+    cell_cost = float(-np.log(_RAREST))
     singles = 0
-    for _ in range(_ROUNDS):
-        cell_cost = -np.log(np.clip(singles / tested, _RAREST, _MOST_COMMON))
-        blamed = _cheapest_cover(candidates, faulty, alive, cell_cost)
-        behind = [cell for line in blamed for cell in candidates[line].tolist()]
-        singles, before = int((~np.isin(faulty, behind)).sum()), singles
+    for _ in range(_ROUNDS if candidates else 0):
+        cell_cost = float(-np.log(np.clip(singles / max(tested, 1), _RAREST, _MOST_COMMON)))
+        blamed = _cheapest(candidates, found, faulty, support, cell_cost)
+        behind = np.zeros(layout.n_cells, bool)
+        for candidate in blamed:
+            behind[candidate.cells] = True
+        singles, before = int((~behind[found]).sum()), singles
         if singles == before:
             break
     causes: list[Cause] = []
-    explained: set[int] = set()
-    for line in sorted(blamed):
-        seen = np.intersect1d(candidates[line], faulty)
-        gain = len(seen) * cell_cost - _LINE_COST - alive[candidates[line]].sum() * _CONTRADICTION_COST
-        cells = candidates[line][~alive[candidates[line]]]
-        causes.append(Cause(line, tuple(cells.tolist()), tuple(seen.tolist()), float(1 / (1 + np.exp(-gain)))))
-        explained |= set(cells.tolist())
-    causes += [Cause(None, (c,), (c,), 1.0) for c in faulty.tolist() if c not in explained]
+    explained = np.zeros(layout.n_cells, bool)
+    for c in blamed:
+        cells = c.cells[~against[c.cells]]
+        gain = _gain(c, faulty, support, cell_cost)
+        seen = cells[witness[cells]]
+        probability = float(1 / (1 + np.exp(-gain)))
+        causes.append(Cause(c.line, tuple(cells.tolist()), tuple(seen.tolist()), probability, c.whole))
+        explained[cells] = True
+    causes += [Cause(None, (cell,), (cell,), 1.0) for cell in found.tolist() if not explained[cell]]
     return causes
 
 
-def _cheapest_cover(
-    candidates: Mapping[Line, NDArray[np.intp]], faulty: NDArray[np.intp], alive: NDArray[np.bool_], cell_cost: float
-) -> set[Line]:
-    """Return the lines of the cheapest set of lines and single cells that covers every faulty cell."""
+def _candidates(
+    line: Line,
+    cells: NDArray[np.intp],
+    against: NDArray[np.bool_],
+    witness: NDArray[np.bool_],
+    tried: NDArray[np.bool_],
+) -> list[_Candidate]:
+    """Return the wire as a whole, and broken in its middle with either end alive, as far as cells bear witness."""
+
+    def convicted(behind: NDArray[np.intp]) -> bool:
+        needed = max(min(_FEWEST_WITNESSES, len(behind)), _WITNESS_SHARE * float(tried[behind].sum()), 2)
+        return bool(witness[behind].sum() >= needed)
+
+    contradictions = np.flatnonzero(against[cells])
+    found = []
+    if len(contradictions) <= _MOST_CONTRADICTIONS and convicted(cells):
+        found.append(_Candidate(line, cells, _LINE_COST + _CONTRADICTION_COST * len(contradictions), True))
+    if line.kind == "converter" or not len(contradictions):
+        return found
+    # Beyond the last live cell seen from either end, from the first cell with evidence on.
+    for behind in (cells[contradictions[-1] + 1 :], cells[: contradictions[0]][::-1]):
+        seen = np.flatnonzero(witness[behind])
+        if len(seen):
+            dead = np.sort(behind[seen[0] :])
+            if convicted(dead):
+                found.append(_Candidate(line, dead, float(_LINE_COST + _CUT_COST), False))
+    return found
+
+
+def _gain(c: _Candidate, faulty: NDArray[np.bool_], support: NDArray[np.float64], cell_cost: float) -> float:
+    doubtful = c.cells[~faulty[c.cells]]
+    margin = _CLEAR if (support[doubtful] > 0).any() else 0.0
+    return float(faulty[c.cells].sum() * cell_cost + _DOUBTFUL_SHARE * support[doubtful].sum() - c.cost - margin)
+
+
+def _cheapest(
+    candidates: Sequence[_Candidate],
+    found: NDArray[np.intp],
+    faulty: NDArray[np.bool_],
+    support: NDArray[np.float64],
+    cell_cost: float,
+) -> list[_Candidate]:
+    """Return the wires of the cheapest set of wires and single cells that covers every faulty cell."""
     from scipy.optimize import Bounds, LinearConstraint, milp
 
-    if not candidates:
-        return set()
-    lines = list(candidates)
-    contradictions = np.array([alive[candidates[line]].sum() for line in lines])
-    cost = np.concatenate([_LINE_COST + _CONTRADICTION_COST * contradictions, np.full(len(faulty), cell_cost)])
-    by_line = [np.isin(faulty, candidates[line]).astype(float) for line in lines]
-    covers = np.column_stack([*by_line, np.eye(len(faulty))])
-    solution = milp(
-        cost,
-        constraints=LinearConstraint(covers, lb=1),
-        integrality=np.ones(len(cost), dtype=int),
-        bounds=Bounds(0, 1),
-    )
+    # A wire that costs more than it could save is in no cheapest set.
+    candidates = [c for c in candidates if _gain(c, faulty, np.maximum(support, 0), cell_cost) > _PROVEN]
+    if len(candidates) <= 1:
+        return [c for c in candidates if _gain(c, faulty, support, cell_cost) > _PROVEN]
+    doubtful = np.unique(np.concatenate([c.cells[~faulty[c.cells]] for c in candidates]))
+    n, f, d = len(candidates), len(found), len(doubtful)
+    cost = np.concatenate([[c.cost for c in candidates], np.full(f, cell_cost), -_DOUBTFUL_SHARE * support[doubtful]])
+    by_line = np.column_stack([np.isin(found, c.cells) for c in candidates]).astype(float)
+    covers = np.hstack([by_line, np.eye(f), np.zeros((f, d))])
+    constraints = [LinearConstraint(covers, lb=1)] if f else []
+    if d:
+        # A doubtful cell counts if, and only if, a wire through it is blamed.
+        through = np.column_stack([np.isin(doubtful, c.cells) for c in candidates]).astype(float)
+        constraints.append(LinearConstraint(np.hstack([through, np.zeros((d, f)), -np.eye(d)]), lb=0))
+        for i in range(n):
+            with_it = np.flatnonzero(through[:, i])
+            rows = np.zeros((len(with_it), n + f + d))
+            rows[:, i] = -1
+            rows[np.arange(len(with_it)), n + f + with_it] = 1
+            if len(with_it):
+                constraints.append(LinearConstraint(rows, lb=0))
+    solution = milp(cost, constraints=constraints, integrality=np.ones(len(cost), dtype=int), bounds=Bounds(0, 1))
     # Feasible by construction: every cell can explain itself.
-    chosen = np.asarray(solution.x)[: len(lines)] > 0.5
-    return {line for line, taken in zip(lines, chosen, strict=True) if taken}
+    chosen = np.asarray(solution.x)[:n] > 0.5
+    taken = [c for c, is_chosen in zip(candidates, chosen, strict=True) if is_chosen]
+    return [c for c in taken if _gain(c, faulty, support, cell_cost) > _PROVEN]

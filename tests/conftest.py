@@ -9,6 +9,7 @@ import pytest
 
 from adaptfault.grasps import simulate
 from adaptfault.recordings import Recordings, load
+from diagnostics import SelfDiagnosis
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "sdh2x13x6_grasps36.npz"
 
@@ -17,6 +18,12 @@ REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "sdh2x13x6_gras
 def grasps() -> Recordings:
     """140 simulated grasps of the paper's task, 20 a class."""
     return simulate(20, seed=3)
+
+
+@pytest.fixture(scope="session")
+def fitted(grasps: Recordings) -> SelfDiagnosis:
+    """Fitted on every other of the simulated grasps."""
+    return SelfDiagnosis(grasps.layout).fit(grasps.frames[::2])
 
 
 @pytest.fixture(scope="session")

@@ -2,56 +2,132 @@ import numpy as np
 import pytest
 
 from diagnostics import Line, SensorLayout
-from diagnostics.wiring import explain
+from diagnostics.wiring import Cause, explain
 
 LAYOUT = SensorLayout(2, 11, 10)
+SURE, DOUBTFUL, NOTHING = 8.0, 3.0, 0.0
 
 
-def untested() -> np.ndarray:
-    return np.zeros(LAYOUT.n_cells, bool)
+def mask(*cells: np.ndarray | list[int]) -> np.ndarray:
+    return np.isin(np.arange(220), np.concatenate([np.asarray(c, int) for c in cells] or [np.zeros(0, int)]))
+
+
+def explained(
+    faulty: np.ndarray, against: np.ndarray, alike: np.ndarray | None = None, weight: np.ndarray | None = None
+) -> tuple[Cause, ...]:
+    """Explain ``faulty`` cells (bool); those that could be faulty too are the untested ones."""
+    alike = ~against if alike is None else alike
+    return explain(
+        faulty, alike | faulty, against, np.where(faulty, SURE, NOTHING) if weight is None else weight, LAYOUT
+    )
 
 
 def test_a_row_whose_cells_are_faulty_is_one_cause():
     row = LAYOUT.cells_on(Line(1, "row", 4))
-    alive = ~np.isin(np.arange(220), row)
-    (cause,) = explain(row, alive, LAYOUT)
+    (cause,) = explained(mask(row), ~mask(row))
     assert cause.line == Line(1, "row", 4)
     assert cause.cells == cause.seen == tuple(row)
     assert cause.probability > 0.99
+    assert cause.whole
 
 
-def test_an_untested_cell_on_a_broken_wire_is_inferred_and_a_live_one_is_not():
+def test_an_untested_cell_on_a_broken_wire_is_inferred():
     column = LAYOUT.cells_on(Line(0, "column", 2))
-    alive = untested()
-    alive[column[10]] = True
-    (cause,) = explain(column[:8], alive, LAYOUT)
+    (cause,) = explained(mask(column[:8]), ~mask(column))
     assert cause.line == Line(0, "column", 2)
     assert cause.seen == tuple(column[:8])
-    assert cause.cells == tuple(column[:10])
+    assert cause.cells == tuple(column)
+
+
+@pytest.mark.parametrize("live", [0, 5, 10])
+def test_a_live_cell_on_a_broken_wire_is_never_inferred_to_be_faulty(live: int):
+    column = LAYOUT.cells_on(Line(0, "column", 2))
+    faulty = mask(np.delete(column, live))
+    causes = explained(faulty, ~faulty)
+    assert {c for cause in causes for c in cause.cells} == set(np.flatnonzero(faulty).tolist())
 
 
 def test_scattered_cells_have_a_cause_each():
     cells = np.array([3, 47, 81, 160, 219])
-    causes = explain(cells, untested(), LAYOUT)
+    causes = explained(mask(cells), ~mask(cells))
     assert [cause.line for cause in causes] == [None] * 5
     assert sorted(c for cause in causes for c in cause.cells) == cells.tolist()
 
 
-def test_two_faulty_cells_on_a_line_are_no_broken_line():
-    assert all(cause.line is None for cause in explain(np.array([0, 5]), untested(), LAYOUT))
+def test_two_faulty_cells_on_a_line_of_live_ones_are_no_broken_line():
+    assert all(cause.line is None for cause in explained(mask([0, 5]), ~mask([0, 5])))
 
 
 def test_a_row_among_many_live_cells_of_it_is_not_blamed():
     row = LAYOUT.cells_on(Line(0, "row", 3))
-    alive = untested()
-    alive[row[4:]] = True
-    assert all(cause.line is None for cause in explain(row[:4], alive, LAYOUT))
+    faulty = mask(row[[0, 3, 6, 8]])
+    assert all(cause.line is None for cause in explained(faulty, ~faulty))
 
 
 def test_a_whole_pad_is_blamed_on_its_converter():
-    pad = np.arange(110, 220)
-    (cause,) = explain(pad, np.arange(220) < 110, LAYOUT)
+    pad = mask(range(110, 220))
+    (cause,) = explained(pad, ~pad)
     assert cause.line == Line(1, "converter", 0)
+
+
+def test_no_faulty_cell_has_no_cause():
+    assert explained(mask(), ~mask()) == ()
+    assert explained(mask(), mask()) == ()
+
+
+@pytest.mark.parametrize("cut", range(1, 7))
+@pytest.mark.parametrize("from_the_end", [False, True])
+def test_a_wire_cut_at_a_position_is_blamed_for_the_cells_behind_it_only(cut: int, from_the_end: bool):
+    line = Line(1, "row", 7)
+    row = LAYOUT.cells_on(line)
+    dead = row[:-cut] if from_the_end else row[cut:]
+    (cause,) = explained(mask(dead), ~mask(dead))
+    assert cause.line == line
+    assert cause.cells == tuple(dead)
+    assert not cause.whole
+
+
+def test_untested_cells_behind_a_cut_are_inferred_and_those_before_it_are_not():
+    line = Line(0, "column", 6)
+    column = LAYOUT.cells_on(line)
+    faulty, untested = mask(column[[4, 5, 6, 8, 9]]), mask(column[[3, 7, 10]])
+    (cause,) = explained(faulty, ~faulty & ~untested)
+    assert (cause.line, cause.whole) == (line, False)
+    assert cause.cells == tuple(column[4:])
+
+
+def test_doubtful_cells_on_one_wire_convict_it_together():
+    row = LAYOUT.cells_on(Line(0, "row", 3))
+    alike = mask(row)
+    (cause,) = explained(mask(), ~alike, alike, np.where(alike, DOUBTFUL, NOTHING))
+    assert cause.line == Line(0, "row", 3)
+    assert cause.cells == tuple(row)
+    assert 0.5 < cause.probability <= 1
+
+
+def test_as_many_doubtful_cells_here_and_there_convict_nothing():
+    alike = mask(np.random.default_rng(0).choice(220, 10, replace=False))
+    assert explained(mask(), ~alike, alike, np.where(alike, DOUBTFUL, NOTHING)) == ()
+
+
+def test_a_few_doubtful_cells_do_not_convict_a_wire():
+    row = LAYOUT.cells_on(Line(0, "row", 3))
+    alike = mask(row[:2])
+    assert explained(mask(), ~alike, alike, np.where(alike, DOUBTFUL, NOTHING)) == ()
+
+
+def test_cells_at_rest_that_nothing_was_asked_of_convict_nothing():
+    assert explained(mask(), mask(), np.ones(220, bool), np.full(220, NOTHING)) == ()
+
+
+@pytest.mark.parametrize("weight", [DOUBTFUL, SURE])
+def test_live_cells_on_it_do_not_let_a_wire_be_blamed_whatever_is_said_of_the_others(weight: float):
+    row = LAYOUT.cells_on(Line(0, "row", 3))
+    live = row[[1, 4, 7]]
+    alike = mask(np.setdiff1d(row, live))
+    causes = explained(mask(), ~alike, alike, np.where(alike, weight, NOTHING))
+    assert not {c for cause in causes for c in cause.cells} & set(live.tolist())
+    assert all(cause.line != Line(0, "row", 3) or not cause.whole for cause in causes)
 
 
 @pytest.mark.parametrize("seed", range(25))
@@ -65,7 +141,31 @@ def test_broken_lines_are_found_exactly_among_single_faults_and_untested_cells(s
     broken = np.unique(np.concatenate([LAYOUT.cells_on(line) for line in lines]))
     single = rng.choice(np.setdiff1d(np.arange(220), broken), 8, replace=False)
     tested = rng.random(220) > 0.3
-    faulty = np.zeros(220, bool)
-    faulty[broken] = faulty[single] = True
-    causes = explain(np.flatnonzero(faulty & tested), ~faulty & tested, LAYOUT)
-    assert {cause.line for cause in causes} - {None} == set(lines)
+    faulty = mask(broken, single)
+    causes = explained(faulty & tested, ~faulty & tested)
+    assert {cause.line for cause in causes if cause.line and cause.whole} == set(lines)
+    found = {c for cause in causes for c in cause.cells}
+    assert found >= set(broken.tolist()) | set(single[tested[single]].tolist())
+    assert not found & set(np.flatnonzero(~faulty & tested).tolist())
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_every_faulty_cell_has_a_cause_and_no_cell_that_speaks_against_it_is_in_one(seed: int):
+    rng = np.random.default_rng(seed)
+    faulty = rng.random(220) < rng.choice([0.05, 0.3, 0.7])
+    against = ~faulty & (rng.random(220) < 0.5)
+    causes = explained(faulty, against, weight=np.where(faulty, SURE, rng.normal(0, 1, 220)))
+    found = {c for cause in causes for c in cause.cells}
+    assert set(np.flatnonzero(faulty).tolist()) <= found
+    assert not found & set(np.flatnonzero(against).tolist())
+
+
+def test_positions_without_a_cell_are_never_blamed():
+    present = np.ones(LAYOUT.shape, bool)
+    present[0, 3, :4] = False
+    layout = SensorLayout(2, 11, 10, present=present)
+    row = layout.cells_on(Line(0, "row", 3))
+    faulty = mask(row)
+    against = ~faulty & present.ravel()
+    (cause,) = explain(faulty, faulty, against, np.where(faulty, SURE, NOTHING), layout)
+    assert (cause.line, cause.cells) == (Line(0, "row", 3), tuple(row))

@@ -1,0 +1,267 @@
+"""What healthy looks like: how a touch loads a cell, given how it loads the others.
+
+Two logistic regressions for each cell, fitted on the touches of fault-free recordings, say whether it stays unloaded
+throughout a touch and whether it stays loaded throughout, and a linear one how hard it is loaded. An open cell looks
+unloaded, and so does a healthy one beside the contact: everything turns on how sharply the two can be told apart.
+Models of single frames, nearest frames, trees, a neural network and one model shared by all cells were each worse on
+real grasps than these regressions on whole touches.
+
+Which cells can be trusted differs from log to log. What the others would have read is filled in from the trusted ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+from scipy.special import expit, logit, stdtr
+
+from diagnostics.layout import SensorLayout
+from diagnostics.temporal import StillRuns
+from diagnostics.touches import SEGMENT, Array, Scale, Touch, Touches
+
+_SAMPLES = 3000  # stretches of touches that the model is fitted on, about
+_MOST_DRAWS = 8  # stretches of one touch: more of them say the same
+_SHORTEST = 6  # frames of a stretch
+_RIDGE = 0.03  # on standardised inputs, per sample
+_STEPS = 200  # of accelerated gradient descent; the ridge makes it converge
+_RESTING_QUANTILE = 0.05  # of a cell's readings: where it rests
+_SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
+_LEAST_SPREAD = 0.02  # of the root load: nothing is predicted more exactly
+_TAILS = 4  # degrees of freedom: objects have edges, and edges surprise
+_NOVEL = 0.1  # share of touches that resemble nothing known
+_TILE, _HALO = 8, 4  # cells: large pads are modelled in tiles, each with what surrounds it
+_MOST_CELLS = 400  # in one model; beyond that, tiles
+_FEATURES = 4  # of a cell in a touch, see Summary.features
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What healthy cells would do in each of n stretches, given the trusted cells.
+
+    Attributes:
+        never: float ``[n, D]``, P(unloaded throughout).
+        always: float ``[n, D]``, P(loaded throughout).
+        mean: float ``[n, D]``, expected mean root load.
+        spread: float ``[D]``, scale of the error of ``mean``; NaN: cells of which nothing is known.
+    """
+
+    never: NDArray[np.float64]
+    always: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    spread: NDArray[np.float64]
+
+    def within(
+        self, low: NDArray[np.float64], high: NDArray[np.float64], cells: NDArray[np.intp]
+    ) -> NDArray[np.float64]:
+        """Return P(mean root load from ``low`` to ``high``), ``[n, k]``, of k ``cells``; the bounds are ``[k]``."""
+        mean, spread = self.mean[:, cells], self.spread[cells]
+        likely = stdtr(_TAILS, (high - mean) / spread) - stdtr(_TAILS, (low - mean) / spread)
+        # Now and then a touch is like none before: then any load is as likely as any other.
+        p = (1 - _NOVEL) * likely + _NOVEL * (np.minimum(high, 1.0) - low)
+        return np.where(np.isnan(spread), 1.0, p)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """The model of some cells (``outputs``) from those around them (``inputs``, which hold the outputs too).
+
+    Attributes:
+        inputs, outputs: int, cell indices; ``place``: where the outputs lie among the inputs.
+        mean, scale: of the features of the inputs, ``[4, inputs]``.
+        weight: ``[4 inputs, 2 outputs]``, never loaded and always loaded; no cell speaks for itself.
+        bias: ``[2 outputs]``.
+        covariance, precision: of the mean root loads, standardised, ``[inputs, inputs]``.
+        spread: ``[outputs]``.
+        surest: no probability is nearer to 0 or 1.
+    """
+
+    inputs: NDArray[np.intp]
+    outputs: NDArray[np.intp]
+    place: NDArray[np.intp]
+    mean: Array
+    scale: Array
+    weight: Array
+    bias: Array
+    covariance: NDArray[np.float64]
+    precision: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    surest: float
+
+    @classmethod
+    def fit(cls, features: Array, inputs: NDArray[np.intp], outputs: NDArray[np.intp], surest: float) -> Tile:
+        """Fit on ``[n, 4, D]``; no probability is taken for nearer to 0 or 1 than ``surest``."""
+        from sklearn.covariance import LedoitWolf
+
+        x = features[:, :, inputs]
+        mean, scale = x.mean(axis=0), x.std(axis=0)
+        scale[scale < 1e-4] = np.inf  # what never changes tells nothing
+        z = (x - mean) / scale
+        place = np.searchsorted(inputs, outputs)
+        targets = np.concatenate([x[:, 2, place] == 0, x[:, 3, place] == 1], axis=1).astype(np.float32)
+        own = np.zeros((_FEATURES, len(inputs), 2, len(outputs)), bool)
+        own[:, place, :, np.arange(len(outputs))] = True
+        weight, bias = _logistic(z.reshape(len(z), -1), targets, own.reshape(_FEATURES * len(inputs), -1))
+        estimate = LedoitWolf().fit(z[:, 1].astype(np.float64))
+        precision = estimate.precision_
+        z1 = z[:, 1].astype(np.float64)
+        error = (z1 @ precision / np.diag(precision))[:, place] * np.where(np.isfinite(scale[1]), scale[1], 0)[place]
+        # Where nothing is loaded nothing errs: the spread is that of the loaded stretches.
+        told = x[:, 2, place] > 0
+        spread = np.sqrt((error**2 * told).sum(axis=0) / np.maximum(told.sum(axis=0), 1))
+        usual = float(np.sqrt(np.mean(spread**2)))
+        spread = np.where(told.sum(axis=0) < _SHORTEST, 2 * usual, spread)
+        return cls(
+            inputs, outputs, place, mean, scale, weight, bias,
+            estimate.covariance_, precision, np.maximum(spread, _LEAST_SPREAD), surest,
+        )  # fmt: skip
+
+    def expect(
+        self, features: Array, trusted: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return P(never loaded), P(always loaded) and the mean root load of the outputs, ``[n, outputs]`` each."""
+        z = (features[:, :, self.inputs] - self.mean) / self.scale
+        known = trusted[self.inputs]
+        self._fill(z, known)
+        odds = z.reshape(len(z), -1) @ self.weight + self.bias
+        p = np.clip(expit(odds.astype(np.float64)), self.surest, 1 - self.surest)
+        never, always = p[:, : len(self.outputs)], p[:, len(self.outputs) :]
+        # What all the other cells say of a cell: for those filled in, just what they were filled with.
+        mean = z[:, 1].astype(np.float64)
+        mean = mean[:, self.place] - mean @ self.precision[:, self.place] / np.diag(self.precision)[self.place]
+        scale = np.where(np.isfinite(self.scale[1]), self.scale[1], 0)[self.place]
+        return never, always, mean * scale + self.mean[1][self.place]
+
+    def _fill(self, z: Array, known: NDArray[np.bool_]) -> None:
+        """Write into ``z`` ``[n, 4, inputs]`` what the unknown cells would say, as the linear regression has it."""
+        unknown = ~known
+        if not unknown.any():
+            return
+        if not known.any():
+            z[:] = 0
+            return
+        if unknown.sum() <= known.sum():
+            among, between = self.precision[np.ix_(unknown, unknown)], self.precision[np.ix_(unknown, known)]
+            regression = -linalg.solve(among, between, assume_a="pos")
+        else:
+            among, between = self.covariance[np.ix_(known, known)], self.covariance[np.ix_(known, unknown)]
+            regression = linalg.solve(among, between, assume_a="pos").T
+        z[:, :, unknown] = z[:, :, known] @ regression.T.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class ContactModel:
+    """See the module. ``scale`` says what a reading means; ``tiles`` cover the array."""
+
+    scale: Scale
+    tiles: tuple[Tile, ...]
+
+    @classmethod
+    def fit(
+        cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale, seed: int = 0
+    ) -> ContactModel:
+        """Fit on fault-free recordings, ``[T, D]`` each."""
+        features, n_touches = stretches(recordings, scale, np.random.default_rng(seed))
+        # What never happened in n touches may happen in the next with a chance of about 1 in n (rule of succession).
+        surest = max(_SUREST, 1 / (n_touches + 2))
+        return cls(scale, tuple(Tile.fit(features, *cells, surest) for cells in _tiles(layout)))
+
+    def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Expected:
+        """Say what healthy cells would do.
+
+        Args:
+            features: ``[n, 4, D]``, of n stretches (see ``Summary.features``).
+            trusted: bool ``[D]``, the cells that may be asked.
+        """
+        shape = (len(features), features.shape[2])
+        never, always, mean = np.ones(shape), np.ones(shape), np.zeros(shape)
+        spread = np.ones(shape[1])
+        for tile in self.tiles:
+            never[:, tile.outputs], always[:, tile.outputs], mean[:, tile.outputs] = tile.expect(features, trusted)
+            spread[tile.outputs] = tile.spread
+        return Expected(never, always, mean, spread)
+
+
+def resting(recordings: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return where each cell rests, ``[D]``: a low quantile of its readings; 0 for a cell without any."""
+    frames = np.concatenate(recordings)
+    heard = ~np.isnan(frames).all(axis=0)
+    rest = np.zeros(frames.shape[1])
+    rest[heard] = np.nanquantile(frames[:, heard], _RESTING_QUANTILE, axis=0)
+    return rest
+
+
+def stretches(recordings: Sequence[NDArray[np.float64]], scale: Scale, rng: np.random.Generator) -> tuple[Array, int]:
+    """Return features ``[n, 4, D]`` of random stretches of touches in fault-free recordings, and how many touches."""
+    ranges = []
+    for i, recording in enumerate(recordings):
+        for touch in _touches(recording, scale):
+            ranges.append((i, touch.first, sum(part.n for part in touch.parts)))
+    n_touches = len(ranges)
+    draws = int(np.clip(round(_SAMPLES / n_touches), 1, _MOST_DRAWS))
+    if len(ranges) > _SAMPLES:
+        ranges = [ranges[i] for i in np.sort(rng.choice(len(ranges), _SAMPLES, replace=False))]
+    features = []
+    for i, first, n in ranges:
+        root = scale.root_load(recordings[i][first : first + n])
+        for draw in range(draws):
+            length = int(rng.integers(min(_SHORTEST, n), n + 1)) if draw else n
+            at = int(rng.integers(0, n - length + 1))
+            part = root[at : at + length]
+            loaded = part > scale.root_near
+            features.append(np.stack([part.max(0), part.mean(0), loaded.any(0), loaded.mean(0)]))
+    return np.stack(features).astype(np.float32), n_touches
+
+
+def _touches(recording: NDArray[np.float64], scale: Scale) -> tuple[Touch, ...]:
+    touches, runs = Touches(), StillRuns.begin(recording.shape[1])
+    for first in range(0, len(recording), SEGMENT):
+        frames = recording[first : first + SEGMENT]
+        numbers = np.arange(first, first + len(frames))
+        runs = runs.extend(frames, numbers, scale.near / 2)
+        touches = touches.extend(frames, numbers, scale, runs.start <= first)
+    return touches.kept
+
+
+def _tiles(layout: SensorLayout) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Return (inputs, outputs) of each model: all cells if they are few, else tiles of the pads."""
+    cells = layout.grid(np.arange(layout.n_cells))
+    present = np.flatnonzero(layout.present)
+    if len(present) <= _MOST_CELLS:
+        return [(present, present)]
+    tiles = []
+    for pad in cells:
+        for r in range(0, layout.rows, _TILE):
+            for c in range(0, layout.cols, _TILE):
+                core = pad[r : r + _TILE, c : c + _TILE]
+                around = pad[max(0, r - _HALO) : r + _TILE + _HALO, max(0, c - _HALO) : c + _TILE + _HALO]
+                outputs, inputs = np.intersect1d(core, present), np.intersect1d(around, present)
+                if len(outputs):
+                    tiles.append((inputs, outputs))
+    return tiles
+
+
+def _logistic(x: Array, y: Array, forbidden: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Fit one ridge logistic regression for each column of ``y`` ``[n, k]``; weights that are forbidden stay 0."""
+    n = len(x)
+    bias = logit((y.sum(axis=0) + 1) / (n + 2)).astype(np.float32)  # an imaginary sample of each kind keeps it finite
+    weight = np.zeros((x.shape[1], y.shape[1]), np.float32)
+    vector = np.ones(x.shape[1], np.float32)
+    for _ in range(20):  # the steepest direction, by power iteration
+        vector = x.T @ (x @ vector)
+        vector /= np.linalg.norm(vector) + 1e-12
+    steepest = float(np.linalg.norm(x @ vector) ** 2 / n)
+    step = np.float32(1 / (0.25 * (1.1 * steepest + 1) + _RIDGE))
+    ahead_w, ahead_b = weight, bias
+    for k in range(_STEPS):  # Nesterov's method: each step from a point ahead of the last
+        error = (expit(x @ ahead_w + ahead_b) - y) / np.float32(n)
+        next_w = ahead_w - step * (x.T @ error + np.float32(_RIDGE) * ahead_w)
+        next_w[forbidden] = 0
+        next_b = ahead_b - step * error.sum(axis=0)
+        momentum = np.float32(k / (k + 3))
+        ahead_w, ahead_b = next_w + momentum * (next_w - weight), next_b + momentum * (next_b - bias)
+        weight, bias = next_w, next_b
+    return weight, bias

@@ -1,0 +1,143 @@
+"""What is remembered of a log: fed frame by frame, of constant size, and the same however the frames come in.
+
+Frames are looked at in segments of 32. Of each cell the still stretch that it is in is kept, of the log its last
+touches. Older touches are weighed, and only their evidence stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from copy import copy
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.layout import SensorLayout
+from diagnostics.reference import Reference
+from diagnostics.spatial import Model, Spatial, stuck_evidence
+from diagnostics.surroundings import Surroundings
+from diagnostics.temporal import StillRuns
+from diagnostics.touches import SEGMENT, Touches
+from diagnostics.transport import Stream
+from diagnostics.twins import Twins, telling
+from diagnostics.unrest import Unrest
+
+Result = TypeVar("Result")
+
+_MOST_TOUCHES, _KEPT_TOUCHES = 64, 48  # when there are more, all but the last so many are weighed and let go
+_PAUSE = SEGMENT // 2  # frames of a segment after which that happens: not all work falls into one frame
+
+
+class Memory:
+    """The state of a diagnosis after some frames.
+
+    Attributes:
+        layout, reference: as given.
+        stream: what is known of the transport.
+        runs: the still stretch of each cell.
+        touches: the last ones.
+        settled: float ``[D]``, evidence from touches that are gone, of the stretches that still go on.
+        unrest: blinks and noise.
+        twins: lines that read alike.
+    """
+
+    def __init__(self, layout: SensorLayout, reference: Reference) -> None:
+        self.layout, self.reference = layout, reference
+        self.present = layout.present.ravel()
+        self.stream = Stream()
+        self.runs = StillRuns.begin(layout.n_cells)
+        self.touches = Touches()
+        self.settled = np.zeros(layout.n_cells)
+        self.unrest = Unrest.begin(layout.n_cells)
+        self.twins = Twins.begin(layout)
+        self.heard = np.zeros(layout.n_cells, bool)
+        self._buffer = np.empty((SEGMENT, layout.n_cells))
+        self._numbers = np.empty(SEGMENT, np.intp)
+        self._filled = 0
+
+    def extend(self, frames: NDArray[np.float64]) -> bool:
+        """Take in frames ``[t, D]``; return whether a segment was completed."""
+        before = self.stream.seen
+        self.stream, told = self.stream.receive(frames, self.present, self.reference.patience)
+        completed = False
+        taken = 0
+        while taken < len(told):
+            if self._filled == _PAUSE and len(self.touches.kept) > _MOST_TOUCHES:
+                self._let_go()
+            n = min((_PAUSE if self._filled < _PAUSE else SEGMENT) - self._filled, len(told) - taken)
+            chosen = told[taken : taken + n]
+            self._buffer[self._filled : self._filled + n] = frames[chosen]
+            self._numbers[self._filled : self._filled + n] = chosen + before
+            self._filled += n
+            taken += n
+            if self._filled == SEGMENT:
+                self._close()
+                completed = True
+        return completed
+
+    def miss(self, frames: int) -> None:
+        """Count frames that never came, as the sender's clock tells."""
+        if frames > 0:
+            self.stream = self.stream.without(frames)
+
+    def complete(self) -> Memory:
+        """Return a memory in which the frames that wait for their segment have been looked at; this one stays."""
+        if not self._filled:
+            return self
+        other = copy(self)
+        other._close()  # reads the frames that wait, and changes none of them
+        return other
+
+    def rests(self) -> NDArray[np.bool_]:
+        """Where a cell reads now, or held still at, what an untouched one reads, bool ``[D]``."""
+        root = self.reference.scale.root_load(self.runs.value)
+        return np.isfinite(self.runs.value) & (root <= self.reference.scale.root_near)
+
+    def jump(self) -> NDArray[np.float64]:
+        """What the jump into each cell's still stretch says, a log likelihood ratio ``[D]``."""
+        return self.reference.onsets.evidence(self.runs, self.layout.full_scale)
+
+    def model(self) -> Model:
+        """What healthy cells would do; without a reference, as far as this log tells."""
+        return self.reference.model or Surroundings.of(self.touches.kept, self.layout)
+
+    def spatial(self, wrong: NDArray[np.bool_] | None = None) -> Generator[None, None, Spatial]:
+        """What the other cells say of each cell that is still; those that are known to be ``wrong`` are not asked."""
+        return self._spatial(self.touches, wrong)
+
+    def _spatial(self, touches: Touches, wrong: NDArray[np.bool_] | None = None) -> Generator[None, None, Spatial]:
+        wrong = self.unrest.intermittent | self.unrest.excess | (False if wrong is None else wrong)
+        sudden = self.reference.onsets.size(self.runs, self.layout.full_scale)
+        return stuck_evidence(
+            touches.kept, self.settled, self.runs, self.jump(), sudden, self.model(), self.reference.scale,
+            self.present & self.heard, wrong, self.reference.tolerance,
+        )  # fmt: skip
+
+    def _close(self) -> None:
+        frames, numbers = self._buffer[: self._filled], self._numbers[: self._filled]
+        self._filled = 0
+        start = self.runs.start
+        self.runs = self.runs.extend(frames, numbers, self.reference.tolerance)
+        self.heard = self.heard | np.isfinite(self.runs.last)
+        # Evidence belongs to a stretch, and ends with it.
+        self.settled = np.where(self.runs.start == start, self.settled, 0.0)
+        scale = self.reference.scale
+        still = self.runs.start <= numbers[0]
+        self.touches = self.touches.extend(frames, numbers, scale, still)
+        self.unrest = self.unrest.extend(frames, numbers, scale, self.reference.usual, still)
+        self.twins = self.twins.extend(frames, numbers, telling(frames, still, scale), scale.near)
+
+    def _let_go(self) -> None:
+        old, self.touches = self.touches.split(_KEPT_TOUCHES)
+        self.settled = finished(self._spatial(old)).surprise
+
+
+def finished(work: Generator[None, None, Result]) -> Result:
+    """Run work that pauses to its end, and return what it returns."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as end:
+            result: Result = end.value
+            return result

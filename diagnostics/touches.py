@@ -1,0 +1,217 @@
+"""Touches: a log boiled down to what touched the array, one summary for each touch.
+
+The frames of one touch are not independent: evidence adds up over touches, hardly over the frames of one. So a touch is
+all that is remembered: for each cell how hard and how long it was loaded. A touch ends when its load is released, or
+when the load has moved elsewhere; however long a static hold lasts, it is one touch. Each is kept in a few parts, so
+that a cell that fails in the middle of one can be judged by what came after.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+SEGMENT = 32  # frames that are looked at together
+_PARTS = 4  # of a touch at most; neighbours are put together beyond that
+_RELEASED = 0.3  # of its highest load: when less is left, a touch is over
+_LEAST = 0.1  # root load: what moved less in all has touched nothing
+_WEAKEST = 0.1  # of the strongest touch so far: less is unrest, not a touch that could end
+_MOVING = 0.25  # of a load must be going when a touch is said to be over
+_SAME_PLACE = 0.6  # cosine between loads of one touch; less alike, and it is another
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What a reading means: where a cell rests, and from where on it is loaded.
+
+    Attributes:
+        resting: float ``[D]``, reading of an untouched cell.
+        near: how far from that still counts as resting.
+        full_scale: of the layout.
+    """
+
+    resting: NDArray[np.float64]
+    near: float
+    full_scale: float
+
+    def root_load(self, frames: NDArray[np.float64]) -> Array:
+        """Return the square root of the load, 0..1, ``[..., D]``: noise grows with load, its root does not.
+
+        A missing reading counts as resting.
+        """
+        load = ((frames - self.resting) / self.full_scale).astype(np.float32)
+        root: Array = np.sqrt(np.fmax(load, 0))  # fmax: not a number counts as none
+        return root
+
+    def of(self, cells: NDArray[np.intp]) -> Scale:
+        """Return the scale of some cells."""
+        return replace(self, resting=self.resting[cells])
+
+    @property
+    def root_near(self) -> float:
+        """The root load from which on a cell counts as loaded."""
+        return float(np.sqrt(self.near / self.full_scale))
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Some consecutive frames of one touch.
+
+    Attributes:
+        first: number of the first frame; n: how many.
+        most: root load ``[D]``, the highest.
+        total: the sum of the root loads ``[D]``.
+        loaded: ``[D]``, in how many frames each cell was loaded.
+    """
+
+    first: int
+    n: int
+    most: Array
+    total: Array
+    loaded: Array
+
+    @classmethod
+    def of(cls, root_load: Array, first: int, root_near: float) -> Summary:
+        """Sum up frames, ``[t, D]`` root loads."""
+        loaded = (root_load > root_near).sum(axis=0, dtype=np.float32)
+        return cls(first, len(root_load), root_load.max(axis=0), root_load.sum(axis=0), loaded)
+
+    def __add__(self, other: Summary) -> Summary:
+        return Summary(
+            min(self.first, other.first),
+            self.n + other.n,
+            np.maximum(self.most, other.most),
+            self.total + other.total,
+            self.loaded + other.loaded,
+        )
+
+    def features(self) -> Array:
+        """Return ``[4, D]``: highest and mean root load, ever loaded, share of the frames loaded."""
+        return np.stack([self.most, self.total / self.n, (self.loaded > 0).astype(np.float32), self.loaded / self.n])
+
+
+@dataclass(frozen=True)
+class Touch:
+    """One touch: at most four parts, and the range of the root loads of each cell in it, ``[D]``.
+
+    How far a load has risen within the touch tells when it is released. A cell that holds one value has no part in
+    that, whatever it holds.
+    """
+
+    parts: tuple[Summary, ...]
+    lowest: Array
+    highest: Array
+
+    @property
+    def first(self) -> int:
+        """Number of its first frame."""
+        return self.parts[0].first
+
+    @property
+    def swing(self) -> float:
+        """How far its load has moved, summed over the cells."""
+        return float((self.highest - self.lowest).sum())
+
+    def suffixes(self) -> list[Summary]:
+        """Return the summary from each part on to the end, the whole touch first."""
+        ends = [self.parts[-1]]
+        for part in self.parts[-2::-1]:
+            ends.append(part + ends[-1])
+        return ends[::-1]
+
+    def grown(self, part: Summary, lowest: Array, highest: Array) -> Touch:
+        """Return the touch with one more part."""
+        parts = [*self.parts, part]
+        if len(parts) > _PARTS:
+            sizes = [a.n + b.n for a, b in pairwise(parts)]
+            i = int(np.argmin(sizes))
+            parts[i : i + 2] = [parts[i] + parts[i + 1]]
+        return Touch(tuple(parts), np.minimum(self.lowest, lowest), np.maximum(self.highest, highest))
+
+    def same_place(self, part: Summary, lowest: Array) -> bool:
+        """Whether ``part`` loads about the same cells; no load lies anywhere."""
+        floor = np.minimum(self.lowest, lowest)
+        n = sum(p.n for p in self.parts)
+        before = np.sum([p.total for p in self.parts], axis=0) / n - floor
+        now = part.total / part.n - floor
+        size = float(np.linalg.norm(before) * np.linalg.norm(now))
+        return size == 0 or float(before @ now) >= _SAME_PLACE * size
+
+
+@dataclass(frozen=True)
+class Touches:
+    """The touches of a log so far, in time order; the last one still goes on.
+
+    Attributes:
+        kept: the touches.
+        widest: the largest swing of one so far; what is under a tenth of it is no touch of its own.
+        fading: the load of the last touch is going; such frames belong to no touch.
+        last: root loads ``[D]`` of the last frame.
+    """
+
+    kept: tuple[Touch, ...] = ()
+    widest: float = 0.0
+    fading: bool = False
+    last: Array | None = None
+
+    def extend(
+        self, frames: NDArray[np.float64], numbers: NDArray[np.intp], scale: Scale, still: NDArray[np.bool_]
+    ) -> Touches:
+        """Return the touches after more frames.
+
+        Args:
+            frames: ``[t, D]``, t >= 1.
+            numbers: int ``[t]``, of the frames, ascending.
+            scale: what a reading means.
+            still: bool ``[D]``, cells that do not move in these frames. Whether a load is released is asked of the
+                others: broken cells hold their value for ever.
+        """
+        root = scale.root_load(frames)
+        kept, widest, fading, last = list(self.kept), self.widest, self.fading, self.last
+        going_on = bool(kept) and not fading  # the next part belongs to the last touch
+        begin = 0
+        while begin < len(root):
+            if fading:
+                # While the load is still going, frames say nothing new.
+                sums = root[begin:].sum(axis=1)
+                before = np.concatenate([[sums[0] if last is None else last.sum()], sums[:-1]])
+                still_going = int(np.logical_and.accumulate(sums < before).sum())
+                begin += still_going
+                if begin < len(root):
+                    fading = going_on = False
+                else:
+                    break
+            ahead = root[begin:]
+            lowest, highest = np.minimum.accumulate(ahead), np.maximum.accumulate(ahead)
+            if going_on:
+                lowest = np.minimum(lowest, kept[-1].lowest)
+                highest = np.maximum(highest, kept[-1].highest)
+            swing = highest - lowest
+            moving = swing[:, ~still].sum(axis=1)
+            left = (ahead - lowest)[:, ~still].sum(axis=1)
+            enough = np.maximum(_MOVING * swing.sum(axis=1), max(_WEAKEST * widest, _LEAST))
+            released = (left <= _RELEASED * moving) & (moving > enough)
+            end = int(released.argmax()) if released.any() else len(ahead)
+            if end:
+                part = Summary.of(ahead[:end], int(numbers[begin]), scale.root_near)
+                low, high = lowest[end - 1], highest[end - 1]
+                if going_on and kept[-1].same_place(part, low):
+                    kept[-1] = kept[-1].grown(part, low, high)
+                else:
+                    kept.append(Touch((part,), ahead[:end].min(axis=0), ahead[:end].max(axis=0)))
+                widest = max(widest, kept[-1].swing)
+                going_on = True
+            begin += end
+            if begin < len(root):
+                fading, last = True, root[begin]
+                begin += 1
+        return Touches(tuple(kept), widest, fading, root[-1])
+
+    def split(self, keep: int) -> tuple[Touches, Touches]:
+        """Return (all but the last ``keep`` touches, those)."""
+        return replace(self, kept=self.kept[:-keep]), replace(self, kept=self.kept[-keep:])

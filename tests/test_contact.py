@@ -1,0 +1,141 @@
+import numpy as np
+import pytest
+
+from diagnostics import SensorLayout, contact
+from diagnostics.contact import ContactModel, Expected, resting, stretches
+from diagnostics.touches import Scale
+
+LAYOUT = SensorLayout(1, 1, 12)
+SCALE = Scale(np.zeros(12), 0.05, 5.0)
+
+
+def blobs(seed: int, recordings: int = 150) -> list[np.ndarray]:
+    """Presses on a line of 12 cells; what they do not reach reads exactly 0; cell 11 is never reached."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(recordings):
+        centre, force = rng.uniform(1, 7.5), rng.uniform(0.8, 2) * np.sin(np.linspace(0, np.pi, 40))[:, None]
+        load = force * (1 - ((np.arange(12) - centre - np.linspace(0, 0.3, 40)[:, None]) / 2.5) ** 2)
+        found.append(np.where(load > 0.1, load, 0))
+    return found
+
+
+@pytest.fixture(scope="module")
+def model() -> ContactModel:
+    return ContactModel.fit(blobs(0), LAYOUT, SCALE)
+
+
+@pytest.fixture(scope="module")
+def unseen() -> np.ndarray:
+    """Features of presses that the model was not fitted on."""
+    return stretches(blobs(1, 100), SCALE, np.random.default_rng(1))[0]
+
+
+ALL = np.ones(12, bool)
+
+
+def all_but(*cells: int) -> np.ndarray:
+    return ~np.isin(np.arange(12), cells)
+
+
+def test_a_cell_between_loaded_ones_is_hardly_ever_unloaded_and_one_far_from_them_nearly_always(model, unseen):
+    never = model.expect(unseen, ALL).never
+    loaded = unseen[:, 2] > 0
+    assert np.median(never[:, 4][loaded[:, 3] & loaded[:, 5]]) < 0.05
+    assert never[:, 10][~loaded[:, 8:].any(axis=1)].min() > 0.9
+
+
+def test_it_tells_more_about_touches_not_seen_than_each_cells_own_share(model, unseen):
+    cells = np.arange(1, 9)
+    unloaded = unseen[:, 2, cells] == 0
+    seen = stretches(blobs(0), SCALE, np.random.default_rng(0))[0]
+
+    def log_loss(p: np.ndarray) -> float:
+        return float(-np.log(np.where(unloaded, p, 1 - p)).mean())
+
+    own_share = np.broadcast_to((seen[:, 2, cells] == 0).mean(axis=0), unloaded.shape)
+    assert log_loss(model.expect(unseen, ALL).never[:, cells]) < 0.5 * log_loss(own_share)
+
+
+@pytest.mark.parametrize("trusted", [ALL, all_but(4)])
+def test_what_a_cell_reads_itself_does_not_matter(model, unseen, trusted):
+    spoiled = unseen.copy()
+    spoiled[:, :, 4] = 1.0
+    for name in ("never", "always", "mean"):
+        said, of_spoiled = (getattr(model.expect(f, trusted), name)[:, 4] for f in (unseen, spoiled))
+        np.testing.assert_allclose(of_spoiled, said, atol=1e-5, err_msg=name)
+
+
+def test_what_an_untrusted_cell_reads_matters_to_no_cell(model, unseen):
+    trusted = all_but(3, 6)
+    spoiled = unseen.copy()
+    spoiled[:, :, [3, 6]] = 0.7
+    for name in ("never", "always", "mean"):
+        said, of_spoiled = (getattr(model.expect(f, trusted), name) for f in (unseen, spoiled))
+        np.testing.assert_allclose(of_spoiled, said, atol=1e-5, err_msg=name)
+
+
+def test_the_load_of_a_cell_is_foreseen_from_the_others_even_beside_untrusted_ones(model, unseen):
+    truth = unseen[:, 1, 4]
+    for trusted, share in ((ALL, 0.3), (all_but(4, 5), 0.5)):
+        error = model.expect(unseen, trusted).mean[:, 4] - truth
+        assert np.sqrt(np.mean(error**2)) < share * truth.std()
+
+
+def test_without_a_trusted_cell_the_usual_is_expected(model, unseen):
+    expected = model.expect(unseen, ~ALL)
+    assert np.ptp(expected.never, axis=0).max() < 1e-5
+    assert expected.mean[0] == pytest.approx(model.expect(unseen, ~ALL).mean[-1])
+    assert expected.never[0, 10] > expected.never[0, 4]
+
+
+def test_a_cell_that_was_never_loaded_is_expected_to_stay_so(model, unseen):
+    assert model.expect(unseen, ALL).never[:, 11].min() > 0.99
+
+
+def test_cells_may_rest_at_any_value():
+    offset = np.linspace(0, 2, 12)
+    shifted = [r + offset for r in blobs(0)]
+    rest = resting(shifted)
+    np.testing.assert_allclose(rest, offset)
+    moved = stretches(shifted, Scale(rest, 0.05, 5.0), np.random.default_rng(0))[0]
+    plain = stretches(blobs(0), SCALE, np.random.default_rng(0))[0]
+    np.testing.assert_allclose(moved, plain, atol=1e-3)
+
+
+def test_a_cell_that_was_never_heard_rests_at_0():
+    log = np.full((30, 3), 0.4)
+    log[:, 1] = np.nan
+    log[::2, 2] = np.nan
+    assert resting([log]).tolist() == pytest.approx([0.4, 0, 0.4])
+
+
+def test_a_wider_range_of_loads_is_likelier_and_that_of_an_unknown_cell_is_certain():
+    one = np.ones((1, 2))
+    expected = Expected(one, one, np.array([[0.5, 0.5]]), np.array([0.1, np.nan]))
+    cells = np.arange(2)
+    narrow = expected.within(np.array([0.45, 0.45]), np.array([0.55, 0.55]), cells)
+    wide = expected.within(np.array([0.3, 0.3]), np.array([0.7, 0.7]), cells)
+    far = expected.within(np.array([0.0, 0.0]), np.array([0.1, 0.1]), cells)
+    assert 0 < far[0, 0] < narrow[0, 0] < wide[0, 0] < 1
+    assert narrow[0, 1] == far[0, 1] == 1
+
+
+def test_large_arrays_are_modelled_in_tiles_that_know_every_cell(monkeypatch):
+    layout = SensorLayout(1, 2, 201)
+    rng = np.random.default_rng(0)
+    column = np.arange(402) % 201
+    recordings = []
+    for _ in range(300):
+        force = 2 * np.sin(np.linspace(0, np.pi, 8))[:, None]
+        recordings.append(np.maximum(0, force * (1 - ((column - rng.uniform(0, 200)) / 12) ** 2)))
+    scale = Scale(np.zeros(402), 0.05, 5.0)
+    # A tenth of the samples will do, and is quicker.
+    monkeypatch.setattr(contact, "stretches", lambda *of: (stretches(*of)[0][::10], 300))
+    model = ContactModel.fit(recordings, layout, scale)
+    features = stretches(recordings, scale, rng)[0]
+    expected = model.expect(features, np.ones(402, bool))
+    assert np.isfinite(expected.spread).all()
+    loaded = features[:, 2] > 0
+    assert expected.never[loaded].mean() < 0.3
+    assert expected.never[~loaded].mean() > 0.9

@@ -1,0 +1,153 @@
+import numpy as np
+import pytest
+
+from adaptfault.recordings import Recordings
+from diagnostics import FaultKind, Line, SensorLayout, bridge, freeze_stream, inject, line_fault, lose_frames
+from diagnostics.faults import Fault
+from diagnostics.memory import Memory, finished
+from diagnostics.reference import Reference
+
+LAYOUT = SensorLayout(2, 6, 5)
+ROW, COLUMN = np.divmod(np.arange(30), 5)
+UNKNOWN = Reference.unknown(LAYOUT)
+
+
+def pressed(presses: int, seed: int = 0) -> np.ndarray:
+    """Round presses here and there, 20 frames each, with pauses."""
+    rng = np.random.default_rng(seed)
+    force, log = np.sin(np.linspace(0, np.pi, 20))[:, None], []
+    for _ in range(presses):
+        at = [(rng.uniform(0, 5), rng.uniform(0, 4)) for _ in range(2)]
+        load = [np.maximum(0, 3 - ((ROW - r) ** 2 + (COLUMN - c) ** 2) / 1.5) for r, c in at]
+        log += [
+            force * np.concatenate(load) * (1 + rng.normal(0, 0.02, (20, 60))),
+            np.zeros((int(rng.integers(3, 9)), 60)),
+        ]
+    return np.concatenate(log)
+
+
+def remembered(log: np.ndarray, size: int | None = None, reference: Reference = UNKNOWN) -> Memory:
+    memory = Memory(LAYOUT, reference)
+    for first in range(0, len(log), size or len(log)):
+        memory.extend(log[first : first + (size or len(log))])
+    return memory.complete()
+
+
+def same(a: Memory, b: Memory) -> None:
+    """Assert that two memories hold the same."""
+    for part, names in {
+        "runs": ("start", "length", "low", "high", "jump", "company", "last"),
+        "unrest": ("blinking", "noisy", "blinks", "high", "blinks_since", "noisy_since"),
+        "stream": ("seen", "lost", "first_lost", "last", "repeats"),
+    }.items():
+        for name in names:
+            of_a, of_b = (getattr(getattr(m, part), name) for m in (a, b))
+            np.testing.assert_array_equal(of_a, of_b, err_msg=f"{part}.{name}")
+    np.testing.assert_array_equal(a.settled, b.settled)
+    np.testing.assert_array_equal(a.heard, b.heard)
+    for name in ("since", "told", "witnesses"):
+        for of_a, of_b in zip(getattr(a.twins, name), getattr(b.twins, name), strict=True):
+            np.testing.assert_array_equal(of_a, of_b)
+    assert [(r.onset, r.frames) for r in a.stream.repetitions] == [(r.onset, r.frames) for r in b.stream.repetitions]
+    assert len(a.touches.kept) == len(b.touches.kept)
+    for t, u in zip(a.touches.kept, b.touches.kept, strict=True):
+        assert [(p.first, p.n) for p in t.parts] == [(p.first, p.n) for p in u.parts]
+        np.testing.assert_array_equal(t.suffixes()[0].features(), u.suffixes()[0].features())
+
+
+def broken() -> np.ndarray:
+    """Faults of all kinds in one log, lost frames, and a frozen stream."""
+    faults = [
+        line_fault(LAYOUT, Line(0, "row", 2), FaultKind.OPEN, onset=700),
+        Fault("stuck", (45,), value=2.2, onset=300),
+        Fault("intermittent", (12,)),
+        Fault("noisy", (38,), onset=100),
+        bridge(LAYOUT, Line(1, "column", 0), onset=1000),
+    ]
+    log = inject(pressed(90), faults, LAYOUT, seed=0, dither=0.004)
+    return lose_frames(freeze_stream(log, 1500, 1600), 0.06, seed=0)
+
+
+@pytest.mark.parametrize("size", [1, 7, 32, 1000])
+def test_it_is_the_same_however_the_frames_come_in(size: int):
+    log = broken()
+    same(remembered(log, size), remembered(log))
+
+
+def test_looking_at_it_in_between_changes_nothing():
+    log = broken()[:900]
+    memory = Memory(LAYOUT, UNKNOWN)
+    for first in range(0, 900, 13):
+        memory.extend(log[first : first + 13])
+        finished(memory.complete().spatial())
+    same(memory.complete(), remembered(log))
+
+
+def test_a_completed_memory_leaves_the_first_one_as_it_was():
+    log = pressed(3)[:50]
+    memory = Memory(LAYOUT, UNKNOWN)
+    memory.extend(log)
+    before = memory.runs
+    assert memory.complete().runs.length.max() == 50
+    assert memory.runs is before
+    assert before.length.max() < 50
+
+
+def test_it_stays_of_constant_size_over_a_long_log():
+    log = pressed(40)
+    memory, most = Memory(LAYOUT, UNKNOWN), []
+    for _ in range(20):
+        memory.extend(log)
+        most.append(len(memory.touches.kept))
+    assert memory.stream.seen == 20 * len(log)
+    assert max(most) < 100
+    assert max(most[10:]) <= max(most[:10]) + 5
+    assert all(len(touch.parts) <= 4 for touch in memory.touches.kept)
+    assert len(memory.stream.repetitions) < 100
+
+
+def test_evidence_of_touches_that_were_let_go_still_counts():
+    cell = LAYOUT.cell(0, 2, 2)
+    log = inject(pressed(200), [Fault("open", (cell,))], LAYOUT)
+    memory = remembered(log)
+    assert memory.touches.kept[0].first > 1000
+    assert memory.settled[cell] > 10
+    few = remembered(log[memory.touches.kept[0].first :])
+    evidence, without = (finished(m.spatial()).surprise[cell] for m in (memory, few))
+    assert evidence > without + 5
+
+
+def test_settled_evidence_ends_with_the_stretch_that_it_belongs_to():
+    cell = LAYOUT.cell(0, 2, 2)
+    log = inject(pressed(250), [Fault("open", (cell,))], LAYOUT, until=5500)
+    memory = remembered(log[:5500])
+    assert memory.settled[cell] > 10
+    assert remembered(log).settled[cell] < 3
+
+
+def test_missed_frames_are_counted_and_say_nothing_of_cells():
+    log = pressed(10)
+    memory = Memory(LAYOUT, UNKNOWN)
+    memory.extend(log[:100])
+    memory.miss(5)
+    memory.miss(0)
+    memory.miss(-3)
+    memory.extend(log[100:])
+    assert memory.stream.lost == 5
+    np.testing.assert_array_equal(memory.complete().runs.start, remembered(log).runs.start)
+
+
+def test_a_cell_that_delivers_a_reading_now_and_then_was_heard():
+    log = pressed(20)[:320]
+    log[:, 7] = np.nan
+    log[:, 8] = np.where(np.arange(len(log)) % 32 < 30, log[:, 8], np.nan)  # silent at the end of each segment
+    assert remembered(log).heard.tolist() == [cell != 7 for cell in range(60)]
+
+
+def test_a_frozen_stream_makes_no_cell_still(grasps: Recordings):
+    layout = grasps.layout
+    log = np.concatenate([grasps.frames[i] for i in (30, 50, 70)]).astype(float)
+    memory = Memory(layout, Reference.unknown(layout))
+    frozen = np.concatenate([log, np.repeat(log[-1:], 3000, axis=0)])
+    memory.extend(frozen)
+    assert memory.complete().runs.length[log[-1] > 0.3].max() < 200

@@ -1,0 +1,71 @@
+import numpy as np
+import pytest
+
+from diagnostics import SensorLayout, freeze_stream
+from diagnostics.reference import Reference
+
+LAYOUT = SensorLayout(1, 4, 4)
+CELLS = 16
+
+
+def healthy(seed: int, recordings: int = 12, step: float = 0.0) -> list[np.ndarray]:
+    """Presses that come and go, harder on some cells; readings rounded to converter steps."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(recordings):
+        force = np.maximum(0, np.sin(np.arange(100) / rng.uniform(6, 12)))[:, None]
+        load = force * rng.uniform(0.5, 3, CELLS) + rng.normal(0, 0.005, (100, CELLS))
+        load = np.maximum(0, load)
+        found.append(np.round(load / step) * step if step else load)
+    return found
+
+
+@pytest.fixture(scope="module")
+def reference() -> Reference:
+    return Reference.fit(healthy(0), LAYOUT)
+
+
+def test_a_fitted_reference_has_a_model_and_one_that_is_not_has_none(reference):
+    unknown = Reference.unknown(LAYOUT)
+    assert unknown.model is None
+    assert (unknown.scale.resting == 0).all()
+    assert reference.model is not None
+    features = np.zeros((1, 4, CELLS), np.float32)
+    assert reference.model.expect(features, np.ones(CELLS, bool)).never.shape == (1, CELLS)
+
+
+def test_the_tolerance_grows_with_the_converters_step_up_to_a_bound():
+    fine, coarse, coarser = (Reference.fit(healthy(0, step=step), LAYOUT).tolerance for step in (0.001, 0.03, 0.5))
+    assert fine < coarse <= coarser <= 0.02 * LAYOUT.full_scale
+    assert coarse > 0.03
+    assert fine == Reference.unknown(LAYOUT).tolerance
+
+
+def test_cells_rest_where_they_rest_in_the_reference():
+    offset = np.linspace(0, 1, CELLS)
+    reference = Reference.fit([r + offset for r in healthy(0)], LAYOUT)
+    np.testing.assert_allclose(reference.scale.resting, offset, atol=0.02)
+
+
+def test_who_often_repeats_a_frame_is_given_more_patience(reference):
+    holds = [freeze_stream(r, 10, 80) for r in healthy(0)]
+    assert Reference.fit(holds, LAYOUT).patience > 70
+    assert reference.patience < 70
+
+
+def test_lines_that_often_agree_when_healthy_need_more_witnesses_to_be_joined(reference):
+    alike = [r.copy() for r in healthy(0)]
+    for r in alike:
+        r[:, 4:8] = r[:, 0:4]
+    assert Reference.fit(alike, LAYOUT).twins > reference.twins
+
+
+def test_missing_readings_and_lost_frames_in_the_reference_do_no_harm():
+    gappy = healthy(0)
+    for r in gappy:
+        r[::7, 3] = np.nan
+        r[20:22] = np.nan
+    reference = Reference.fit(gappy, LAYOUT)
+    assert np.isfinite(reference.scale.resting).all()
+    assert np.isfinite(reference.tolerance)
+    assert np.isfinite(reference.usual.noise).all()

@@ -1,0 +1,145 @@
+from collections.abc import Generator
+
+import numpy as np
+import pytest
+
+from diagnostics.contact import Expected
+from diagnostics.memory import finished
+from diagnostics.spatial import Spatial, stuck_evidence
+from diagnostics.temporal import StillRuns
+from diagnostics.touches import Array, Scale, Summary, Touch
+
+CELLS, FRAMES = 8, 20
+SCALE = Scale(np.zeros(CELLS), 0.05, 5.0)
+NONE = np.zeros(CELLS, bool)
+
+
+class Copycat:
+    """A skin on which all cells are always loaded alike: each does what the trusted ones do on average."""
+
+    def expect(self, features: Array, trusted: np.ndarray) -> Expected:
+        shape = features[:, 0].shape
+        known = trusted if trusted.any() else np.ones(CELLS, bool)
+        of_known = features[:, :, known]
+        loaded, always, mean = (
+            of.mean(axis=1, keepdims=True) for of in (of_known[:, 2], of_known[:, 3] == 1, of_known[:, 1])
+        )
+        p = np.clip(np.broadcast_to(np.stack([1 - loaded, always]), (2, *shape)), 0.02, 0.98)
+        return Expected(p[0], p[1], np.broadcast_to(mean, shape), np.full(CELLS, 0.05))
+
+
+def judged(log: np.ndarray, wrong: np.ndarray = NONE, settled: np.ndarray | None = None, jump: float = 0.0) -> Spatial:
+    """Judge a log that is made of touches of 20 frames each."""
+    runs, touches = StillRuns.begin(CELLS), []
+    for first in range(0, len(log), FRAMES):
+        frames = log[first : first + FRAMES]
+        runs = runs.extend(frames, np.arange(first, first + len(frames)), 0.025)
+        root = SCALE.root_load(frames)
+        halves = tuple(Summary.of(root[i : i + 10], first + i, SCALE.root_near) for i in (0, 10))
+        touches.append(Touch(halves, root.min(axis=0), root.max(axis=0)))
+    work: Generator[None, None, Spatial] = stuck_evidence(
+        touches, np.zeros(CELLS) if settled is None else settled, runs, np.full(CELLS, jump), np.full(CELLS, jump),
+        Copycat(), SCALE, np.ones(CELLS, bool), wrong, 0.025,
+    )  # fmt: skip
+    return finished(work)
+
+
+def pressed(touches: int) -> np.ndarray:
+    """All cells are loaded in each touch, from rest to 2 N and back."""
+    force = 2 * np.sin(np.linspace(0, np.pi, FRAMES))
+    return np.tile(np.repeat(force[:, None], CELLS, axis=1), (touches, 1))
+
+
+@pytest.mark.parametrize("value", [0.0, 5.0])
+def test_each_touch_adds_evidence_against_a_cell_that_holds_its_value_through_it(value: float):
+    said = []
+    for touches in (1, 2, 4, 8):
+        log = pressed(touches)
+        log[:, 3] = value
+        said.append(judged(log).evidence[3])
+    assert (np.diff(said) > 2).all()
+
+
+def test_how_seldom_cells_stick_to_a_value_in_between_is_charged_once():
+    charged = []
+    for touches in (3, 6):
+        log = pressed(touches)
+        log[:, 3], log[:, 4] = 0.0, 2.5
+        spatial = judged(log)
+        charged.append((spatial.surprise - spatial.evidence)[[3, 4]])
+    assert charged[0][1] > charged[0][0] + 2
+    assert charged[1] == pytest.approx(charged[0])
+
+
+def test_a_cell_at_rest_is_not_suspected_while_nothing_touches_the_array():
+    spatial = judged(np.zeros((100, CELLS)))
+    assert spatial.asked.all()
+    assert (spatial.evidence <= 0).all()
+
+
+def test_cells_that_move_are_not_asked_and_have_no_evidence():
+    log = pressed(4)
+    log[:, 3] = 0
+    spatial = judged(log)
+    assert spatial.asked.tolist() == [cell == 3 for cell in range(CELLS)]
+    assert (spatial.evidence[~spatial.asked] == 0).all()
+    assert spatial.touches[3] == 4
+    assert spatial.touches[~spatial.asked].sum() == 0
+
+
+def test_only_what_came_after_the_onset_speaks_against_a_cell():
+    early, late = pressed(6), pressed(6)
+    early[:, 3] = 0
+    late[80:, 3] = 0
+    assert judged(late).evidence[3] < judged(early).evidence[3] - 4
+    assert judged(late).touches[3] == 2
+
+
+def test_a_cell_that_fails_in_the_middle_of_a_touch_is_judged_by_what_came_after():
+    log = pressed(1)
+    log[8:, 3] = 0
+    assert judged(log).touches[3] == 1
+    assert judged(log).surprise[3] > 1
+
+
+def test_two_broken_cells_do_not_excuse_each_other():
+    one, two = pressed(4), pressed(4)
+    one[:, 3] = 0
+    two[:, [3, 4, 5]] = 0
+    assert judged(two).evidence[[3, 4, 5]].min() > 5
+    assert judged(two).evidence[3] == pytest.approx(judged(one).evidence[3], abs=2)
+
+
+def test_cells_known_to_be_wrong_are_neither_asked_nor_judged():
+    log = pressed(4)
+    log[:, 3] = 0
+    log[:, 6] = 4 - log[:, 6]
+    wrong = np.arange(CELLS) == 3
+    spatial = judged(log, wrong)
+    assert not spatial.asked[3]
+    assert spatial.evidence[3] == 0
+
+
+def test_evidence_of_earlier_touches_is_kept():
+    log = pressed(2)
+    log[:, 3] = 0
+    settled = np.full(CELLS, 7.0)
+    assert judged(log, settled=settled).evidence[3] == pytest.approx(judged(log).evidence[3] + 7)
+
+
+@pytest.mark.parametrize("one_is_still", [True, False])
+def test_a_cell_that_moves_but_never_comes_to_rest_has_an_offset(one_is_still: bool):
+    log = pressed(6)
+    log[:, 3] = 2 + 0.2 * log[:, 3] + np.linspace(0, 1, len(log))
+    if one_is_still:
+        log[:, 7] = 0
+    offset = judged(log).offset
+    assert offset[3] > 4
+    assert (np.delete(offset, 3) == 0).all()
+
+
+def test_an_offset_that_ended_is_forgotten():
+    log = pressed(6)
+    log[:100, 3] = 2 + 0.2 * log[:100, 3]
+    log[:, 7] = 0
+    assert judged(log).offset[3] == 0

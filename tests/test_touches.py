@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+
+from diagnostics.temporal import StillRuns
+from diagnostics.touches import Scale, Summary, Touches
+
+CELLS = 12
+SCALE = Scale(np.zeros(CELLS), 0.05, 5.0)
+HAND = np.array([0, 0, 1, 2, 3, 3, 2, 1, 0, 0, 0, 0], float)
+ELSEWHERE = HAND[::-1]
+SHAKY = np.random.default_rng(0).normal(0, 0.02, (5000, CELLS))
+
+
+def held(frames: int, load: np.ndarray = HAND) -> np.ndarray:
+    """A grasp: closes in 5 frames, holds with a little tremor, opens in 5."""
+    force = np.concatenate([np.linspace(0.2, 1, 5), np.ones(frames), np.linspace(1, 0.05, 5)])[:, None]
+    return np.maximum(0, force * (load + (load > 0) * SHAKY[: len(force)]))
+
+
+def idle(frames: int) -> np.ndarray:
+    return np.zeros((frames, CELLS))
+
+
+def touches_of(log: np.ndarray, size: int = 32) -> Touches:
+    touches, runs = Touches(), StillRuns.begin(log.shape[1])
+    for first in range(0, len(log), size):
+        frames = log[first : first + size]
+        numbers = np.arange(first, first + len(frames))
+        runs = runs.extend(frames, numbers, 0.025)
+        touches = touches.extend(frames, numbers, SCALE, runs.start <= first)
+    return touches
+
+
+def loaded(touches: Touches) -> list[set[int]]:
+    """The cells that each touch loaded."""
+    return [set(np.flatnonzero(t.suffixes()[0].loaded).tolist()) for t in touches.kept]
+
+
+@pytest.mark.parametrize("frames", [60, 300, 3000])
+def test_a_static_hold_is_one_touch_however_long(frames: int):
+    log = np.concatenate([idle(10), held(frames)])
+    assert loaded(touches_of(log)).count({2, 3, 4, 5, 6, 7}) == 1
+
+
+@pytest.mark.parametrize("times", [2, 3, 5])
+def test_release_and_grasp_again_are_two(times: int):
+    log = np.concatenate([part for _ in range(times) for part in (held(50), idle(20))])
+    assert loaded(touches_of(log)).count({2, 3, 4, 5, 6, 7}) == times
+
+
+def test_a_load_that_moves_elsewhere_without_a_release_is_another_touch():
+    log = np.concatenate([held(60, HAND * [1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0])[:64], held(60, ELSEWHERE)[4:]])
+    assert len(touches_of(log).kept) == 2
+
+
+@pytest.mark.parametrize("broken", [(0,), (0, 1), (0, 1, 9, 10)])
+def test_cells_stuck_at_full_scale_do_not_hide_a_release(broken: tuple[int, ...]):
+    log = np.concatenate([part for _ in range(4) for part in (held(50), idle(20))])
+    log[:, broken] = 5.0
+    grasped = [cells for cells in loaded(touches_of(log)) if {3, 4, 5} <= cells]
+    assert len(grasped) == 4
+
+
+def test_unrest_is_no_touch_beside_a_real_one():
+    log = np.concatenate([held(50), np.abs(SHAKY[:400]) * 0.1, held(50)])
+    assert loaded(touches_of(log)).count({2, 3, 4, 5, 6, 7}) == 2
+    assert len(touches_of(log).kept) <= 4
+
+
+def test_a_touch_keeps_at_most_4_parts_and_they_add_up_to_all_its_frames():
+    hold = held(490)[:-5]
+    (touch,) = touches_of(hold).kept
+    assert 1 < len(touch.parts) <= 4
+    assert sum(part.n for part in touch.parts) == 495
+    assert [part.first for part in touch.parts][1:] == np.cumsum([part.n for part in touch.parts])[:-1].tolist()
+    whole, at_once = touch.suffixes()[0], Summary.of(SCALE.root_load(hold), 0, SCALE.root_near)
+    np.testing.assert_allclose(whole.features(), at_once.features(), atol=1e-5)
+
+
+def test_each_suffix_of_a_touch_is_what_came_from_that_part_on():
+    hold = held(190)[:-5]
+    (touch,) = touches_of(hold).kept
+    for suffix in touch.suffixes():
+        later = Summary.of(SCALE.root_load(hold[suffix.first :]), suffix.first, SCALE.root_near)
+        assert suffix.n == later.n
+        np.testing.assert_allclose(suffix.features(), later.features(), atol=1e-5)
+
+
+def test_what_rests_is_unloaded_wherever_it_rests_and_a_missing_reading_rests():
+    scale = Scale(np.array([0.0, 2.0, 1.0]), 0.05, 5.0)
+    root = scale.root_load(np.array([[1.25, 2.0, np.nan], [5.0, 1.9, 1.02]]))
+    assert root[0].tolist() == pytest.approx([0.5, 0, 0])
+    assert ((root > scale.root_near) == [[True, False, False], [True, False, False]]).all()
+
+
+def test_splitting_parts_the_touches_in_time_order():
+    touches = touches_of(np.concatenate([part for _ in range(6) for part in (held(50), idle(20))]))
+    old, new = touches.split(2)
+    assert len(new.kept) == 2
+    assert [t.first for t in old.kept + new.kept] == [t.first for t in touches.kept]
+    assert old.kept[-1].first < new.kept[0].first

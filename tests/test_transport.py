@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+
+from diagnostics import TransportFault, freeze_stream, lose_frames
+from diagnostics.transport import Stream, longest_repetition
+
+CELLS = 10
+PRESENT = np.ones(CELLS, bool)
+LOADED_FROM = np.full(CELLS, 0.1)
+PATIENCE = 20
+
+
+@pytest.fixture
+def log() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.5, 3, (200, CELLS))
+
+
+def received(frames: np.ndarray, size: int = 1000, present: np.ndarray = PRESENT) -> tuple[Stream, list[int]]:
+    """Feed the frames in chunks; return the stream and the numbers of the frames that say something."""
+    stream, told = Stream(), []
+    for first in range(0, len(frames), size):
+        stream, some = stream.receive(frames[first : first + size], present, PATIENCE)
+        told += (some + first).tolist()
+    return stream, told
+
+
+def faults(stream: Stream, working: np.ndarray = PRESENT) -> tuple[TransportFault, ...]:
+    return stream.faults(LOADED_FROM, working, rate=10)
+
+
+def test_frames_that_all_arrive_all_say_something_and_there_is_no_fault(log):
+    stream, told = received(log)
+    assert told == list(range(200))
+    assert stream.seen == 200
+    assert faults(stream) == ()
+
+
+def test_a_frozen_stream_is_dated_and_counted_and_its_frames_say_nothing_new(log):
+    stream, told = received(freeze_stream(log, 60, 160))
+    (fault,) = faults(stream)
+    assert (fault.kind, fault.onset, fault.frames) == ("frozen", 60, 100)
+    assert "frozen" in fault.reason
+    assert told == [*range(60 + PATIENCE + 1), *range(160, 200)]
+
+
+def test_an_idle_pad_that_repeats_zeros_is_no_fault(log):
+    log[60:160] = 0
+    assert faults(received(log)[0]) == ()
+
+
+def test_full_scale_cells_that_are_themselves_broken_do_not_make_an_idle_pad_frozen(log):
+    log[60:160] = 0
+    log[:, :4] = 5
+    stream = received(log)[0]
+    assert faults(stream, np.arange(CELLS) >= 4) == ()
+    assert [fault.kind for fault in faults(stream)] == ["frozen"]
+
+
+def test_a_frame_that_comes_again_a_few_times_is_no_fault(log):
+    stream, told = received(freeze_stream(log, 60, 60 + PATIENCE))
+    assert faults(stream) == ()
+    assert len(told) == 200
+
+
+def test_lost_frames_are_counted_and_the_first_is_named(log):
+    lossy = lose_frames(log, 0.1, seed=0)
+    stream, told = received(lossy)
+    lost = np.flatnonzero(np.isnan(lossy).all(axis=1))
+    (fault,) = faults(stream)
+    assert (fault.kind, fault.onset, fault.frames) == ("lost", lost[0], 20)
+    assert told == sorted(set(range(200)) - set(lost.tolist()))
+
+
+def test_a_position_without_a_cell_does_not_make_a_lost_frame_arrive(log):
+    log[50:60, 1:] = np.nan
+    stream, _ = received(log, present=np.arange(CELLS) > 0)
+    assert [(fault.kind, fault.frames) for fault in faults(stream)] == [("lost", 10)]
+    assert faults(received(log)[0]) == ()
+
+
+def test_frames_that_never_came_count_as_lost(log):
+    stream, _ = received(log[:50])
+    stream, _ = stream.without(3).receive(log[50:], PRESENT, PATIENCE)
+    (fault,) = faults(stream.without(2))
+    assert (fault.kind, fault.onset, fault.frames) == ("lost", 50, 5)
+
+
+@pytest.mark.parametrize("size", [1, 7, 32, 100])
+def test_the_stream_is_the_same_however_the_frames_come_in(log, size: int):
+    frames = lose_frames(freeze_stream(freeze_stream(log, 30, 80), 120, 190), 0.05, seed=1)
+    at_once, in_parts = received(frames), received(frames, size)
+    assert in_parts[1] == at_once[1]
+    assert faults(in_parts[0]) == faults(at_once[0])
+    assert len(faults(at_once[0])) == 3
+
+
+def test_a_transport_fault_survives_its_dict():
+    fault = TransportFault("lost", 3, 2, "why")
+    assert TransportFault.from_dict(fault.to_dict()) == fault
+
+
+def test_the_longest_repetition_counts_how_often_a_frame_came_again(log):
+    assert longest_repetition(log) == 0
+    assert longest_repetition(freeze_stream(freeze_stream(log, 10, 13), 40, 50)) == 9
+    assert longest_repetition(np.full((5, 3), np.nan)) == 4

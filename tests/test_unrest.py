@@ -1,0 +1,102 @@
+import numpy as np
+import pytest
+
+from diagnostics import Fault, SensorLayout, inject
+from diagnostics.touches import Scale
+from diagnostics.unrest import Unrest, Usual
+
+LAYOUT = SensorLayout(1, 4, 5)
+CELLS = 20
+SCALE = Scale(np.zeros(CELLS), 0.05, 5.0)
+STILL = np.zeros(CELLS, bool)
+
+
+def healthy(seed: int, frames: int = 640) -> np.ndarray:
+    """Loads that rise and fall slowly, each cell at its own pace, with a little noise."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(frames)[:, None]
+    load = 1.5 + np.sin(t / rng.uniform(15, 40, CELLS) + rng.uniform(0, 6, CELLS))
+    return np.maximum(0, load + rng.normal(0, 0.01, load.shape))
+
+
+@pytest.fixture(scope="module")
+def usual() -> Usual:
+    return Usual.fit([healthy(seed) for seed in range(10)], SCALE)
+
+
+def unrest_of(log: np.ndarray, usual: Usual, still: np.ndarray = STILL) -> Unrest:
+    unrest = Unrest.begin(CELLS)
+    for first in range(0, len(log), 32):
+        frames = log[first : first + 32]
+        unrest = unrest.extend(frames, np.arange(first, first + len(frames)), SCALE, usual, still)
+    return unrest
+
+
+def cells(mask: np.ndarray) -> list[int]:
+    return np.flatnonzero(mask).tolist()
+
+
+@pytest.mark.parametrize("seed", range(20, 25))
+def test_healthy_cells_neither_blink_nor_are_noisy(usual, seed: int):
+    for reference in (usual, Usual.unknown(SCALE)):
+        unrest = unrest_of(healthy(seed), reference)
+        assert cells(unrest.intermittent | unrest.excess) == []
+
+
+@pytest.mark.parametrize("value", [0.0, 5.0])
+def test_a_cell_that_blinks_to_a_rail_is_intermittent_and_dated(usual, value: float):
+    log = inject(healthy(30), [Fault("intermittent", (7,), value=value, onset=320)], LAYOUT, seed=0)
+    unrest = unrest_of(log, usual)
+    assert cells(unrest.intermittent) == [7]
+    assert cells(unrest.excess) == []
+    assert 288 <= unrest.blinks_since[7] <= 384
+    assert unrest.blinks[7] > 3
+    assert (unrest.high[7] > 0) == (value == 5)
+
+
+def test_a_cell_with_excess_noise_is_noisy_and_dated(usual):
+    log = inject(healthy(31), [Fault("noisy", (7,), value=0.5, onset=320)], LAYOUT, seed=0)
+    unrest = unrest_of(log, usual)
+    assert cells(unrest.excess) == [7]
+    assert cells(unrest.intermittent) == []
+    assert 288 <= unrest.noisy_since[7] <= 384
+
+
+def test_a_fault_that_has_gone_is_forgotten(usual):
+    faults = [Fault("intermittent", (7,)), Fault("noisy", (12,), value=0.5)]
+    log = inject(healthy(32, 1600), faults, LAYOUT, seed=0, until=480)
+    during, after = unrest_of(log[:480], usual), unrest_of(log, usual)
+    assert cells(during.intermittent) == [7]
+    assert cells(during.excess) == [12]
+    assert cells(after.intermittent | after.excess) == []
+
+
+def test_a_fast_grasp_that_shakes_many_cells_alike_is_no_fault(usual):
+    rng = np.random.default_rng(0)
+    shaken = healthy(33) * (1 + rng.normal(0, 0.3, (640, 1)))
+    unrest = unrest_of(shaken, usual)
+    assert cells(unrest.intermittent | unrest.excess) == []
+
+
+def test_a_load_that_is_let_go_does_not_blink(usual):
+    log = healthy(34)
+    log[::64, 7] = 0  # the last frame of each other segment, and then it stays away
+    log[300:, 7] = 0
+    for start in range(0, 300, 64):
+        log[start : start + 30, 7] = 0
+    assert cells(unrest_of(log, usual).intermittent) == []
+
+
+def test_still_cells_have_no_part_in_it(usual):
+    log = inject(healthy(35), [Fault("intermittent", (7,)), Fault("noisy", (12,), value=0.5)], LAYOUT, seed=0)
+    unrest = unrest_of(log, usual, np.isin(np.arange(CELLS), [7, 12]))
+    assert cells(unrest.intermittent | unrest.excess) == []
+
+
+def test_noise_under_load_is_learned_from_the_reference():
+    rng = np.random.default_rng(0)
+    restless = [healthy(seed) + rng.normal(0, 0.4, (640, CELLS)) for seed in range(10)]
+    log = healthy(36)
+    log[:, 7] += rng.normal(0, 0.4, 640)
+    assert cells(unrest_of(log, Usual.fit(restless, SCALE)).excess) == []
+    assert cells(unrest_of(log, Usual.fit([healthy(seed) for seed in range(10)], SCALE)).excess) == [7]

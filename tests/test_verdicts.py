@@ -1,0 +1,78 @@
+import json
+
+import numpy as np
+import pytest
+
+from diagnostics import Diagnosis, Fault, FaultKind, Line, SensorLayout, TransportFault, Verdict
+
+LAYOUT = SensorLayout(2, 4, 5)
+ROW = Fault("open", LAYOUT.cells_on(Line(0, "row", 1)), line=Line(0, "row", 1), alternatives=("its address",))
+CELL = Fault("short", (30,), value=5.0, onset=12, probability=0.97, reason="cell 30 is short", evidence=4)
+LOST = TransportFault("lost", 5, 3, "3 frames were lost")
+
+
+def diagnosed(*faults: Fault, layout: SensorLayout = LAYOUT, **more: object) -> Diagnosis:
+    tested = np.arange(40) % 7 != 0
+    return Diagnosis(layout, faults, np.full(40, 0.01), tested, n_frames=100, n_recordings=2, **more)
+
+
+def test_the_fault_set_holds_the_cells_of_all_faults():
+    assert diagnosed(ROW, CELL).fault_set == {5, 6, 7, 8, 9, 30}
+    assert len(diagnosed().fault_set) == 0
+
+
+def test_each_cell_is_alive_faulty_or_untested():
+    diagnosis = diagnosed(ROW, CELL)
+    assert np.flatnonzero(diagnosis.verdicts == Verdict.FAULTY).tolist() == [5, 6, 7, 8, 9, 30]
+    assert np.flatnonzero(diagnosis.verdicts == Verdict.UNTESTED).tolist() == [0, 14, 21, 28, 35]
+    assert (diagnosis.verdicts == Verdict.ALIVE).sum() == 29
+    assert isinstance(diagnosis.verdicts[0], Verdict)
+
+
+def test_a_position_without_a_cell_is_untested():
+    present = np.ones(LAYOUT.shape, bool)
+    present[0, 0, 1] = False
+    diagnosis = diagnosed(layout=SensorLayout(2, 4, 5, present=present))
+    assert diagnosis.verdicts[1] is Verdict.UNTESTED
+    assert 1 not in diagnosis.coverage.untested
+
+
+def test_the_exit_code_tells_nothing_single_cells_and_what_needs_a_technician_apart():
+    assert diagnosed().exit_code == 0
+    assert diagnosed(transport=(LOST,)).exit_code == 0
+    assert diagnosed(CELL).exit_code == 1
+    assert diagnosed(CELL, ROW).exit_code == 2
+    assert diagnosed(*(Fault("open", (c,)) for c in range(4))).exit_code == 2
+
+
+@pytest.mark.parametrize("faults", [(), (ROW,), (CELL, ROW)])
+def test_a_diagnosis_survives_json_with_transport_faults_and_alternatives(faults):
+    diagnosis = diagnosed(*faults, transport=(LOST, TransportFault("frozen", 50, 40, "it froze")))
+    d = json.loads(json.dumps(diagnosis.to_dict(), allow_nan=False))
+    again = Diagnosis.from_dict(d)
+    assert again.faults == faults
+    assert again.transport == diagnosis.transport
+    assert again.layout == LAYOUT
+    assert (again.n_frames, again.n_recordings) == (100, 2)
+    assert (again.verdicts == diagnosis.verdicts).all()
+    np.testing.assert_array_equal(again.probability, diagnosis.probability)
+    assert again.to_dict() == d
+
+
+def test_another_version_is_refused():
+    with pytest.raises(ValueError, match="expected a diagnosis with schema"):
+        Diagnosis.from_dict({**diagnosed().to_dict(), "schema": "adaptfault.diagnosis/99"})
+
+
+def test_it_prints_the_map_and_every_reason():
+    text = str(diagnosed(CELL, transport=(LOST,)))
+    assert "1 faulty cell in 2 recordings (100 frames)" in text
+    assert "cell 30 is short" in text
+    assert "3 frames were lost" in text
+    assert diagnosed(CELL).map() in text
+
+
+def test_the_map_has_a_letter_for_every_kind_of_fault():
+    letters = {diagnosed(Fault(kind, (1,))).map().splitlines()[1].split()[2] for kind in FaultKind}
+    assert len(letters) == len(FaultKind)
+    assert not letters & {".", "?"}

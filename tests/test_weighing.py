@@ -1,0 +1,106 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from adaptfault.recordings import Recordings
+from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
+from diagnostics.weighing import Weights, faulty_at
+
+ASKED = np.ones(100, bool)
+EARLY = np.zeros(100, int)  # of the kind that never moved
+LATE = np.ones(100, int)  # of the kind that came to rest
+NO_JUMP = np.zeros(100)
+
+
+def probability(
+    ratio: np.ndarray, jump: np.ndarray = NO_JUMP, asked: np.ndarray = ASKED, kind: np.ndarray = EARLY
+) -> np.ndarray:
+    weights = Weights()
+    return weights.probability(weights.worth(ratio, jump, kind), kind, asked)
+
+
+def test_the_stronger_the_evidence_the_likelier_the_fault():
+    p = probability(np.linspace(-5, 15, 100))
+    assert (np.diff(p) >= 0).all()
+    assert p[0] < 0.1
+    assert p[-1] > 0.99
+    assert ((p >= 0) & (p <= 1)).all()
+
+
+def test_a_jump_adds_to_the_evidence():
+    jump = np.where(np.arange(100) == 7, 4.0, 0.0)
+    p = probability(np.full(100, 2.0), jump, kind=LATE)
+    assert p[7] > p[8]
+
+
+def test_cells_that_move_are_as_good_as_alive_whatever_is_said_of_them():
+    asked = np.arange(100) < 50
+    p = probability(np.full(100, 20.0), asked=asked)
+    assert p[:50].min() > 0.99
+    assert p[50:].max() < 0.001
+
+
+def test_the_same_evidence_weighs_more_where_many_cells_are_broken():
+    alone, among = np.full(100, -3.0), np.full(100, -3.0)
+    alone[0] = among[0] = 4.0
+    among[1:40] = 12.0
+    assert probability(among)[0] > probability(alone)[0]
+
+
+def test_broken_cells_that_never_moved_do_not_make_those_that_did_suspect():
+    kind = np.where(np.arange(100) < 50, 0, 1)
+    many, few = np.full(100, 1.0), np.full(100, 1.0)
+    many[:40] = 15.0
+    assert (probability(many, kind=kind)[50:] == probability(few, kind=kind)[50:]).all()
+    assert (probability(many, kind=kind)[40:50] > probability(few, kind=kind)[40:50]).all()
+
+
+def test_no_cells_at_all_are_asked_without_harm():
+    assert probability(NO_JUMP, asked=~ASKED).max() < 0.001
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_expected_share_of_false_alarms_stays_within_the_rate(seed: int):
+    p = np.random.default_rng(seed).beta(0.3, 0.3, 200)
+    for rate in (0.001, 0.01, 0.2):
+        chosen = faulty_at(p, rate)
+        assert (1 - p[chosen]).sum() <= rate * chosen.sum()
+        rest = p[~chosen & (p > 0.5)]
+        if len(rest):  # one more would have been too many
+            assert (1 - p[chosen]).sum() + 1 - rest.max() > rate * (chosen.sum() + 1)
+
+
+def test_a_looser_rate_never_takes_a_cell_out_again():
+    p = np.random.default_rng(0).beta(0.3, 0.3, 200)
+    chosen = [faulty_at(p, rate) for rate in (0.001, 0.01, 0.1, 0.5)]
+    assert all((fewer <= more).all() for fewer, more in pairwise(chosen))
+
+
+def test_no_cell_that_is_rather_alive_is_faulty_however_good_the_others_look():
+    p = np.array([1.0] * 99 + [0.4])
+    assert faulty_at(p, 0.1).sum() == 99
+    assert not faulty_at(np.zeros(5), 0.5).any()
+
+
+def test_too_few_recordings_to_split_give_the_defaults():
+    layout = SensorLayout(1, 3, 3)
+    rng = np.random.default_rng(0)
+    assert Weights.fit([rng.uniform(0, 3, (50, 9))] * 3, layout) == Weights()
+
+
+def test_what_is_called_likely_is_as_often_true(fitted: SelfDiagnosis, grasps: Recordings):
+    rng = np.random.default_rng(0)
+    said, true = [], []
+    for _ in range(25):
+        log = np.concatenate([grasps.frames[i] for i in rng.choice(np.arange(21, 140, 2), 3, replace=False)])
+        cells = rng.choice(220, 22, replace=False)
+        faults = [Fault(kind, (int(c),)) for c, kind in zip(cells, ["open", "short"] * 11, strict=True)]
+        diagnosis = fitted.diagnose(inject(log, faults, grasps.layout))
+        said.append(diagnosis.probability)
+        true.append(np.isin(np.arange(220), cells))
+    p, broken = np.concatenate(said), np.concatenate(true)
+    for low, high in ((0.0, 0.02), (0.02, 0.2), (0.9, 1.01)):
+        of_bin = (p >= low) & (p < high)
+        assert abs(p[of_bin].mean() - broken[of_bin].mean()) < 0.08
+    assert p.sum() == pytest.approx(broken.sum(), rel=0.25)

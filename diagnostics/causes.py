@@ -29,7 +29,7 @@ class Findings:
         silent: those that never delivered a reading.
         rests: those that read what an untouched cell reads, and are still; full: the same with full scale.
         intermittent, noisy, drifting: those that move, but wrongly.
-        value: what still cells read; NaN: nothing.
+        value: what still cells read, and what blinking ones blink to; NaN: nothing.
         since: number of the first frame of what speaks for a fault.
         probability: P(faulty).
         weight: log likelihood ratio faulty : healthy.
@@ -102,7 +102,7 @@ def _alike(found: Findings, full_scale: float) -> list[tuple[FaultKind, Mask, Ma
 
 def _fault(kind: FaultKind, value: float | None, cause: Cause, found: Findings, layout: SensorLayout) -> Fault:
     seen = list(cause.seen)
-    if kind in (FaultKind.STUCK, FaultKind.OPEN) and len(seen) and not found.silent[seen[0]]:
+    if kind in (FaultKind.STUCK, FaultKind.OPEN, FaultKind.INTERMITTENT) and not found.silent[seen[0]]:
         value = float(np.median(found.value[seen]))
     start = int(np.median(found.since[seen]))
     fault = Fault(
@@ -146,7 +146,7 @@ def _aliased(a: Aliasing, layout: SensorLayout) -> Fault:
 
 
 _DOING = {
-    FaultKind.INTERMITTENT: "blinks between its load and {rail}",
+    FaultKind.INTERMITTENT: "blinks between its load and {value:.4g} {unit}",
     FaultKind.NOISY: "is far noisier than a healthy cell under the same load",
     FaultKind.DRIFT: "moves, but never comes back to rest",
 }
@@ -154,7 +154,7 @@ _DOING = {
 
 def _does(fault: Fault, found: Findings, layout: SensorLayout) -> str:
     if fault.kind in _DOING:
-        return _DOING[fault.kind].format(rail="a rail")
+        return _DOING[fault.kind].format(value=fault.value or 0.0, unit=layout.unit)
     if found.silent[fault.cells[0]]:
         return "delivers no reading"
     return f"reads {fault.value or 0.0:.4g} {layout.unit}"

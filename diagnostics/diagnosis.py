@@ -113,7 +113,7 @@ class SelfDiagnosis:
             intermittent=intermittent,
             noisy=noisy,
             drifting=drifting,
-            value=value,
+            value=np.where(intermittent, np.where(2 * unrest.high > unrest.blinks, layout.full_scale, 0.0), value),
             since=np.select([intermittent, noisy, drifting], [unrest.blinks_since, unrest.noisy_since, 0], runs.start),
             probability=probability,
             # What the line hypothesis asks of a cell at rest is only whether touches speak against it.

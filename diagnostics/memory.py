@@ -25,7 +25,7 @@ from diagnostics.unrest import Unrest
 
 Result = TypeVar("Result")
 
-_MOST_TOUCHES, _KEPT_TOUCHES = 64, 48  # when there are more, all but the last so many are weighed and let go
+_MOST_TOUCHES, _KEPT_TOUCHES = 40, 32  # when there are more, all but the last so many are weighed and let go
 _PAUSE = SEGMENT // 2  # frames of a segment after which that happens: not all work falls into one frame
 
 
@@ -75,6 +75,11 @@ class Memory:
                 self._close()
                 completed = True
         return completed
+
+    @property
+    def due(self) -> bool:
+        """Whether the next frame brings more work than being kept."""
+        return self._filled in (_PAUSE, SEGMENT - 1)
 
     def miss(self, frames: int) -> None:
         """Count frames that never came, as the sender's clock tells."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from contextlib import nullcontext
 from copy import copy
 from dataclasses import replace
 
@@ -61,7 +62,8 @@ class Monitor:
             if self._time is not None:
                 self._memory.miss(round((time - self._time) * layout.rate) - 1)
             self._time = time
-        completed = self._memory.extend(reading[None])
+        with self._threads.limit(limits=1) if self._memory.due else nullcontext():
+            completed = self._memory.extend(reading[None])
         if self._work is None and completed:
             self._work = self._diagnoser.judge(copy(self._memory))
         elif self._work is not None:

@@ -72,7 +72,7 @@ def stuck_evidence(
     wrong: NDArray[np.bool_],
     tolerance: float,
 ) -> Generator[None, None, Spatial]:
-    """Weigh stuck against healthy for each cell that is still now. A generator that pauses between rounds.
+    """Weigh stuck against healthy for each cell that is still now. A generator that pauses on its way.
 
     Cells that moved answer first; still cells whose value proved normal are then put back, and those that look
     stuck are left out, before the final judgement.
@@ -109,20 +109,24 @@ def stuck_evidence(
     anywhere = (1 - 2 * _RAIL_SHARE) * 4 * tolerance / scale.full_scale
     prior = np.log(np.where(rests | full, _RAIL_SHARE, anywhere))
 
-    suffixes = [touch.suffixes() for touch in touches]
-    features = np.stack([s.features() for of_touch in suffixes for s in of_touch])  # (n, 4, D)
-    first = np.array([s.first for of_touch in suffixes for s in of_touch])
-    begins = np.array([i == 0 for of_touch in suffixes for i in range(len(of_touch))])
+    suffixes = [suffix for touch in touches for suffix in touch.suffixes()]
+    first = np.array([suffix.first for suffix in suffixes])
+    begins = np.array([i == 0 for touch in touches for i in range(len(touch.parts))])
     # Of each touch, the longest part that lies within the still stretch.
     within = first[:, None] >= runs.start
     earlier = np.concatenate([np.zeros((1, len(value)), bool), within[:-1]]) & ~begins[:, None]
     counted = within & ~earlier & asked
+    needed = begins | counted.any(axis=1)
+    counted, begins = counted[needed], begins[needed]
+    features = np.stack([suffixes[i].features() for i in np.flatnonzero(needed)])  # (n, 4, D)
     # At first those are asked that moved, unless their load has outlived a touch, or jumped alone. Of the cells at rest
     # few are broken.
     trusted = askable & runs.moved & (rests | (fresh & (jump < _SUDDEN)))
     evidence = brought
     for _ in range(_ROUNDS):
+        yield
         expected = model.expect(features, trusted)
+        yield
         likely = expected.never.copy()
         likely[:, held] = expected.always[:, held] * expected.within(low[held], high[held], held)
         surprise = np.where(counted, -np.log(np.maximum(likely, _LEAST)), 0.0)

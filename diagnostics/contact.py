@@ -20,7 +20,7 @@ from scipy import linalg
 from scipy.special import expit, logit
 
 from diagnostics.layout import SensorLayout
-from diagnostics.temporal import StillRuns
+from diagnostics.temporal import segments
 from diagnostics.touches import SEGMENT, Array, Scale, Touch, Touches
 
 _SAMPLES = 3000  # stretches of touches that the model is fitted on, about
@@ -226,12 +226,9 @@ def stretches(recordings: Sequence[NDArray[np.float64]], scale: Scale, rng: np.r
 
 
 def _touches(recording: NDArray[np.float64], scale: Scale) -> tuple[Touch, ...]:
-    touches, runs = Touches(), StillRuns.begin(recording.shape[1])
-    for first in range(0, len(recording), SEGMENT):
-        frames = recording[first : first + SEGMENT]
-        numbers = np.arange(first, first + len(frames))
-        runs = runs.extend(frames, numbers, scale.near / 2)
-        touches = touches.extend(frames, numbers, scale, runs.start <= first)
+    touches = Touches()
+    for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
+        touches = touches.extend(frames, numbers, scale, still)
     return touches.kept
 
 

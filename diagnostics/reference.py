@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from diagnostics.contact import ContactModel, resting
 from diagnostics.layout import SensorLayout
-from diagnostics.temporal import Onsets, StillRuns
+from diagnostics.temporal import Onsets, segments
 from diagnostics.touches import SEGMENT, Scale
 from diagnostics.transport import longest_repetition
 from diagnostics.twins import Twins, telling
@@ -83,11 +83,8 @@ def _most_twins(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout,
     """Return how many witnesses two healthy lines ever had of being one."""
     most = 0
     for recording in recordings:
-        twins, runs = Twins.begin(layout), StillRuns.begin(layout.n_cells)
-        for first in range(0, len(recording), SEGMENT):
-            frames = recording[first : first + SEGMENT]
-            numbers = np.arange(first, first + len(frames))
-            runs = runs.extend(frames, numbers, scale.near / 2)
-            twins = twins.extend(frames, numbers, telling(frames, runs.start <= first, scale), scale.near)
+        twins = Twins.begin(layout)
+        for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
+            twins = twins.extend(frames, numbers, telling(frames, still, scale), scale.near)
         most = max(most, twins.most)
     return most

@@ -6,7 +6,7 @@ that nothing touches: stillness raises the question, and the other cells answer 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,6 +106,18 @@ class StillRuns:
         """bool ``[D]``, False where a cell jumped into its stretch together with many others, as when a grasp ends."""
         alone: NDArray[np.bool_] = self.company < _COMPANY
         return alone
+
+
+def segments(
+    recording: Floats, length: int, tolerance: float
+) -> Iterator[tuple[Floats, NDArray[np.intp], NDArray[np.bool_]]]:
+    """Yield a recording ``[T, D]`` in pieces: frames, their numbers, and which cells ``[D]`` are still all through."""
+    runs = StillRuns.begin(recording.shape[1])
+    for first in range(0, len(recording), length):
+        frames = recording[first : first + length]
+        numbers = np.arange(first, first + len(frames))
+        runs = runs.extend(frames, numbers, tolerance)
+        yield frames, numbers, runs.start <= first
 
 
 @dataclass(frozen=True)

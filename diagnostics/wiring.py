@@ -29,7 +29,7 @@ _WITNESS = 2.5  # log ratio of a cell that counts as one
 _TRIED = 0.3  # log ratio of a cell that was put to the test
 _DOUBTFUL_SHARE = 0.7  # of the evidence of doubtful cells counts: neighbours are wrong together
 _MOST = 4.0  # log ratio that one doubtful cell can bring
-_CLEAR = np.log(100.0)  # by so much a wire must beat all its cells by themselves, if any of them is doubtful
+_CLEAR = float(np.log(100.0))  # so much of the evidence of doubtful cells does not count
 _PROVEN = np.log(9.0)  # log odds from which on a wire is named: single cells are the safer guess
 _ROUNDS = 5
 
@@ -162,8 +162,9 @@ def _candidates(
 
 def _gain(c: _Candidate, faulty: NDArray[np.bool_], support: NDArray[np.float64], cell_cost: float) -> float:
     doubtful = c.cells[~faulty[c.cells]]
-    margin = _CLEAR if (support[doubtful] > 0).any() else 0.0
-    return float(faulty[c.cells].sum() * cell_cost + _DOUBTFUL_SHARE * support[doubtful].sum() - c.cost - margin)
+    doubt = _DOUBTFUL_SHARE * float(support[doubtful].sum())
+    # Doubtful cells speak for a wire only as far as they go beyond reasonable doubt, and against it in full.
+    return float(faulty[c.cells].sum() * cell_cost + max(doubt - _CLEAR, min(doubt, 0.0)) - c.cost)
 
 
 def _cheapest(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.contact import Expected
-from diagnostics.layout import Line, LineKind
+from diagnostics.layout import Line, LineKind, address_bits
 from diagnostics.memory import Memory
 from diagnostics.twins import Joined
 
@@ -54,7 +54,7 @@ def _on_pad(joined: list[Joined], memory: Memory) -> list[Aliasing]:
     count = layout.rows if kind == "row" else layout.cols
     found = []
     left = list(joined)
-    for bit in range(max(1, (count - 1).bit_length())):
+    for bit in range(address_bits(count)):
         by_bit = [j for j in left if j.second - j.first == 1 << bit and not j.first & 1 << bit]
         if not by_bit:
             continue

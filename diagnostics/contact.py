@@ -21,7 +21,7 @@ from scipy.special import expit, logit
 
 from diagnostics.layout import SensorLayout
 from diagnostics.temporal import segments
-from diagnostics.touches import SEGMENT, Array, Scale, Touch, Touches
+from diagnostics.touches import SEGMENT, Array, Scale, Summary, Touch, Touches
 
 _SAMPLES = 3000  # stretches of touches that the model is fitted on, about
 _MOST_DRAWS = 8  # stretches of one touch: more of them say the same
@@ -153,9 +153,8 @@ class Tile:
 
 @dataclass(frozen=True)
 class ContactModel:
-    """See the module. ``scale`` says what a reading means; ``tiles`` cover the array."""
+    """See the module; ``tiles`` cover the array."""
 
-    scale: Scale
     tiles: tuple[Tile, ...]
 
     @classmethod
@@ -166,7 +165,7 @@ class ContactModel:
         features, n_touches = stretches(recordings, scale, np.random.default_rng(seed))
         # What never happened in n touches may happen in the next with a chance of about 1 in n (rule of succession).
         surest = max(_SUREST, 1 / (n_touches + 2))
-        return cls(scale, tuple(Tile.fit(features, *cells, surest) for cells in _tiles(layout)))
+        return cls(tuple(Tile.fit(features, *cells, surest) for cells in _tiles(layout)))
 
     def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Expected:
         """Say what healthy cells would do.
@@ -219,10 +218,8 @@ def stretches(recordings: Sequence[NDArray[np.float64]], scale: Scale, rng: np.r
         for draw in range(draws):
             length = int(rng.integers(min(_SHORTEST, n), n + 1)) if draw else n
             at = int(rng.integers(0, n - length + 1))
-            part = root[at : at + length]
-            loaded = part > scale.root_near
-            features.append(np.stack([part.max(0), part.mean(0), loaded.any(0), loaded.mean(0)]))
-    return np.stack(features).astype(np.float32), n_touches
+            features.append(Summary.of(root[at : at + length], first + at, scale.root_near).features())
+    return np.stack(features), n_touches
 
 
 def _touches(recording: NDArray[np.float64], scale: Scale) -> tuple[Touch, ...]:

@@ -127,8 +127,8 @@ class SensorLayout:
         counts: dict[LineKind, int] = {
             "row": self.rows,
             "column": self.cols,
-            "row_address": _address_bits(self.rows),
-            "column_address": _address_bits(self.cols),
+            "row_address": address_bits(self.rows),
+            "column_address": address_bits(self.cols),
             "converter": 1,
         }
         return tuple(Line(pad, kind, i) for pad in range(self.pads) for kind, n in counts.items() for i in range(n))
@@ -250,6 +250,6 @@ class SensorLayout:
         return (*self.shape, self.full_scale, self.unit, self.rate, self.present.tobytes())
 
 
-def _address_bits(wires: int) -> int:
+def address_bits(wires: int) -> int:
     """Return how many bits select one of ``wires``: 4 for the paper's 11 rows and 10 columns (Section II)."""
     return (wires - 1).bit_length()

@@ -107,11 +107,14 @@ class Memory:
         """What healthy cells would do; without a reference, as far as this log tells."""
         return self.reference.model or Surroundings.of(self.touches.kept, self.layout)
 
-    def spatial(self, wrong: NDArray[np.bool_] | None = None) -> Generator[None, None, Spatial]:
-        """What the other cells say of each cell that is still; those that are known to be ``wrong`` are not asked."""
-        return self._spatial(self.touches, wrong)
+    def spatial(
+        self, wrong: NDArray[np.bool_] | None = None, touches: Touches | None = None
+    ) -> Generator[None, None, Spatial]:
+        """What the other cells say of each cell that is still, over all touches or those given.
 
-    def _spatial(self, touches: Touches, wrong: NDArray[np.bool_] | None = None) -> Generator[None, None, Spatial]:
+        Cells that are known to be ``wrong`` (bool ``[D]``) are not asked.
+        """
+        touches = self.touches if touches is None else touches
         wrong = self.unrest.intermittent | self.unrest.excess | (False if wrong is None else wrong)
         sudden = self.reference.onsets.size(self.runs, self.layout.full_scale)
         return stuck_evidence(
@@ -135,7 +138,7 @@ class Memory:
 
     def _let_go(self) -> None:
         old, self.touches = self.touches.split(_KEPT_TOUCHES)
-        self.settled = finished(self._spatial(old)).surprise
+        self.settled = finished(self.spatial(touches=old)).surprise
 
 
 def finished(work: Generator[None, None, Result]) -> Result:

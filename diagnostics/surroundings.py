@@ -21,6 +21,7 @@ from diagnostics.touches import Array, Touch
 _NEIGHBOURS = 20
 _PRIOR_WEIGHT = 1.0  # neighbours that the share over all samples counts for: few neighbours prove little
 _MOST_SAMPLES = 20_000
+_LEAST_SPREAD = 0.05  # of the root load
 
 
 @dataclass(frozen=True)
@@ -69,9 +70,6 @@ class Surroundings:
         mean[:, judged] = near[..., 1].mean(axis=2)
         spread[judged] = max(float(near[..., 1].std(axis=2).mean()), _LEAST_SPREAD)
         return Expected(never, always, mean, spread)
-
-
-_LEAST_SPREAD = 0.05  # of the root load
 
 
 def _surroundings(features: Array, trusted: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.float64]:

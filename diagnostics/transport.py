@@ -95,7 +95,7 @@ class Stream:
         same = np.zeros(len(came), bool)
         if self.last is not None:
             same[0] = np.array_equal(came[0], self.last, equal_nan=True)
-        same[1:] = ((came[1:] == came[:-1]) | (np.isnan(came[1:]) & np.isnan(came[:-1]))).all(axis=1)
+        same[1:] = _as_before(came)
         counts = np.arange(1, len(came) + 1)
         fresh = np.maximum.accumulate(np.where(same, 0, counts))
         repeats = np.where(fresh > 0, counts - fresh, self.repeats + counts)
@@ -155,6 +155,12 @@ class Stream:
 
 def longest_repetition(frames: NDArray[np.float64]) -> int:
     """Return how often in a row a frame of ``[T, D]`` came again at most."""
-    same = ((frames[1:] == frames[:-1]) | (np.isnan(frames[1:]) & np.isnan(frames[:-1]))).all(axis=1)
+    same = _as_before(frames)
     counts = np.arange(1, len(same) + 1)
     return int((counts - np.maximum.accumulate(np.where(same, 0, counts))).max(initial=0))
+
+
+def _as_before(frames: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return for each frame but the first, ``[T - 1]``, whether it equals the one before, missing readings included."""
+    same: NDArray[np.bool_] = ((frames[1:] == frames[:-1]) | np.isnan(frames[1:]) & np.isnan(frames[:-1])).all(axis=1)
+    return same

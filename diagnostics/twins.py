@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.layout import LineKind, SensorLayout
+from diagnostics.layout import LineKind, SensorLayout, address_bits
 from diagnostics.touches import Scale
 
 _EVERY = 4  # frames; a lasting fault does not hide between them
@@ -46,7 +46,7 @@ class Joined:
 @cache
 def pairs(count: int) -> tuple[tuple[int, int], ...]:
     """Return the pairs out of ``count`` lines that one address bit or one bridge can join, each once."""
-    bits = [1 << b for b in range(max(1, (count - 1).bit_length()))]
+    bits = [1 << b for b in range(address_bits(count))]
     by_bit = {(i, i | bit) for bit in bits for i in range(count) if not i & bit and (i | bit) < count}
     return tuple(sorted(by_bit | set(pairwise(range(count)))))
 

@@ -19,6 +19,7 @@ Floats = NDArray[np.float64]
 _LOADED = 0.05  # of full scale: a load that a contact could lose
 _BLINK_RATE = 0.05  # blinks in a loaded frame of a loose contact
 _LONGEST_BLINK = 6  # frames
+_SHORTEST = 8  # frames of a segment in which noise can be told
 _ALIKE = 0.3  # of a load: as far as it may have moved on during a blink
 _RAREST = 2e-4  # healthy blinks in a loaded frame, at least
 _RESTLESS = 0.8  # of the segments of a noisy cell are noisier than healthy ones
@@ -68,9 +69,6 @@ class Usual:
     def unknown(cls, scale: Scale) -> Usual:
         """Stand in for a reference: rather calm, so that only gross unrest counts."""
         return cls(10 * _RAREST, np.full(len(_LEVELS), 0.05))
-
-
-_SHORTEST = 8  # frames of a segment in which noise can be told
 
 
 @dataclass(frozen=True)

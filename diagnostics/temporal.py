@@ -30,7 +30,7 @@ class StillRuns:
         length: int ``[D]``, its frames with a reading.
         low, high: float ``[D]``, the lowest and highest reading of it; inf and -inf before the first reading.
         jump: float ``[D]``, by how much the reading changed in the step before it; 0 where it never moved.
-        company: float ``[D]``, share of the loaded cells that changed as drastically in that very step.
+        company: float ``[D]``, share of the loaded cells that fell, or rose, as drastically in that very step.
         last: float ``[D]``, the last reading.
     """
 
@@ -77,13 +77,17 @@ class StillRuns:
             before = np.concatenate([self.last[None], frames[:-1]])
             step = frames - before
             size = np.fmax(frames, before)
-            drastic = np.abs(step) > np.maximum(size / 2, 4 * tolerance)
+            drastic = np.maximum(size / 2, 4 * tolerance)
             # Broken cells hold their value all along: only cells that moved lately could have jumped too.
             lately = high - low > 2 * tolerance
             lately |= self.length < _LATELY
-            share = drastic.sum(axis=1) / np.maximum(((size > 4 * tolerance) & lately).sum(axis=1), 1)
+            loaded = np.maximum(((size > 4 * tolerance) & lately).sum(axis=1), 1)
+            # A release lets cells fall together and none rise, a grasp the other way round: only cells that go the same
+            # way are company. When many break at once, some fall and some rise.
+            share = np.stack([(-step > drastic).sum(axis=1), (step > drastic).sum(axis=1)]) / loaded
             low[broke], high[broke] = lowest[count - 1, at], highest[count - 1, at]
-            jump[broke], company[broke] = np.nan_to_num(step[first, broke]), share[first]
+            jump[broke] = np.nan_to_num(step[first, broke])
+            company[broke] = share[(jump[broke] > 0).astype(np.intp), first]
         last = frames[-1].copy()
         if any_missing:
             backwards = (~missing[::-1]).argmax(axis=0)
@@ -103,7 +107,7 @@ class StillRuns:
 
     @property
     def alone(self) -> NDArray[np.bool_]:
-        """bool ``[D]``, False where a cell jumped into its stretch together with many others, as when a grasp ends."""
+        """bool ``[D]``, False where a cell jumped into its stretch as many others did, as when a grasp ends."""
         alone: NDArray[np.bool_] = self.company < _COMPANY
         return alone
 

@@ -85,6 +85,13 @@ def test_a_jump_alone_has_no_company_and_the_release_of_a_grasp_has():
     assert runs_of(released).company.min() > 0.8
 
 
+def test_cells_that_rise_are_no_company_for_one_that_falls():
+    log = np.tile(np.linspace(1, 2, 20)[:, None], 10)
+    log[12:, 0], log[12:, 1:6] = 0.0, FULL_SCALE  # many break at once
+    company = runs_of(log).company
+    assert company[:6] == pytest.approx([0.1] + [0.5] * 5)
+
+
 @pytest.fixture(scope="module")
 def gentle() -> list[np.ndarray]:
     """Loads that come and go little by little, at another time in each cell."""

@@ -13,6 +13,7 @@ from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, SensorLayout
 from diagnostics.wiring import Cause, explain
 
+_LEADING = 2.5  # log ratio of cells that tell when a wire broke, where none is faulty beyond doubt
 _SAME_VALUE = 0.02  # of full scale: stuck cells this near to each other may share a cause
 
 Floats = NDArray[np.float64]
@@ -67,7 +68,8 @@ def root_causes(
         against = found.alive | (found.faulty & ~alike) | aliased
         if kind in (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK):
             # What a cell did before the others broke says nothing of the wire.
-            begun = int(np.median(found.since[faulty])) if faulty.any() else 0
+            leading = faulty if faulty.any() else alike & (found.weight >= _LEADING)
+            begun = int(np.median(found.since[leading])) if leading.any() else 0
             against &= ~(alike & ~faulty & (found.since <= begun) & (begun > 0))
             against |= ~alike & ~found.silent
         for cause in explain(faulty & ~aliased, alike & ~aliased, against, found.weight, layout):

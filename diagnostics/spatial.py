@@ -6,6 +6,9 @@ Every touch after s adds
 
     log 1 / P(v throughout the touch | healthy, others)
 
+Now and then a touch is like none before, and then the model errs about many cells at once. The cells that move give
+that away, and the model is believed the less in that touch.
+
 How likely a stuck cell is to be stuck at just this v is charged once: a cell held still under a constant load also
 reads one value, but an arbitrary one, while the rails are where broken cells go.
 """
@@ -18,6 +21,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit, logit, softmax
 
 from diagnostics.contact import Expected
 from diagnostics.temporal import SHORTEST_RUN, StillRuns
@@ -30,7 +34,12 @@ _SUDDEN = 1.0  # log ratio of a jump from which on a cell is no witness
 _TELLING = 0.5  # log evidence from which on a touch counts as one that tested the cell
 _LEAST_OFFSET = 0.02  # of full scale, at the mean: a smaller one does no harm
 _MOST_OFFSET = 3.0  # log evidence of one touch that a moving cell does not come to rest
+_WORTHS = (0.25, 0.5, 0.75, 1.0)  # of the log odds of the model, in one touch or another
+_WITNESS_SHARE = 0.5  # of what the moving cells say of that counts: neighbours err together
 _ROUNDS = 3  # of judging, leaving suspects out and putting others back
+
+
+Floats = NDArray[np.float64]
 
 
 class Model(Protocol):
@@ -127,7 +136,7 @@ def stuck_evidence(
         yield
         expected = model.expect(features, trusted)
         yield
-        likely = expected.never.copy()
+        likely = _believed(expected.never, features[:, 2] == 0, trusted & runs.moved)
         likely[:, held] = expected.always[:, held] * expected.within(low[held], high[held], held)
         surprise = np.where(counted, -np.log(np.maximum(likely, _LEAST)), 0.0)
         brought = np.where(asked, settled + surprise.sum(axis=0), 0.0)
@@ -136,6 +145,25 @@ def stuck_evidence(
         trusted = askable & (evidence + jump < _SUSPICIOUS)
         yield
     return Spatial(evidence, brought, asked, told, _offset(features, begins, expected, present & runs.moved & fresh))
+
+
+def _believed(never: Floats, unloaded: NDArray[np.bool_], witness: NDArray[np.bool_]) -> Floats:
+    """Return P(unloaded throughout) ``[n, D]``, nearer to even in the touches in which the model errs.
+
+    A touch like none before surprises many cells at once, and those that move tell so: how well their own loads were
+    foreseen decides what the log odds are worth for all the others.
+
+    Args:
+        never: ``[n, D]``, what the model says.
+        unloaded: bool ``[n, D]``, what the cells did.
+        witness: bool ``[D]``, those that are known to work.
+    """
+    odds = logit(np.maximum(never, _LEAST))
+    right = np.where(unloaded | np.isinf(odds), odds, -odds)[:, witness]  # where nothing is known, nothing is wrong
+    likelihood = -np.stack([np.log1p(np.exp(-worth * right)).sum(axis=1) for worth in _WORTHS])
+    share = softmax(_WITNESS_SHARE * likelihood, axis=0)  # (worths, n)
+    believed: Floats = np.sum([p[:, None] * expit(w * odds) for p, w in zip(share, _WORTHS, strict=True)], axis=0)
+    return believed
 
 
 def _offset(

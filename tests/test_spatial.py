@@ -5,7 +5,7 @@ import pytest
 
 from diagnostics.contact import Expected
 from diagnostics.memory import finished
-from diagnostics.spatial import Spatial, stuck_evidence
+from diagnostics.spatial import Model, Spatial, stuck_evidence
 from diagnostics.temporal import StillRuns
 from diagnostics.touches import Array, Scale, Summary, Touch
 
@@ -28,7 +28,21 @@ class Copycat:
         return Expected(p[0], p[1], np.broadcast_to(mean, shape), np.full(CELLS, 0.05))
 
 
-def judged(log: np.ndarray, wrong: np.ndarray = NONE, settled: np.ndarray | None = None, jump: float = 0.0) -> Spatial:
+class Presser:
+    """Is sure that every touch loads all cells."""
+
+    def expect(self, features: Array, trusted: np.ndarray) -> Expected:
+        even = np.ones(features[:, 0].shape)
+        return Expected(0.02 * even, 0.02 * even, 0.5 * even, np.full(CELLS, 0.05))
+
+
+def judged(
+    log: np.ndarray,
+    wrong: np.ndarray = NONE,
+    settled: np.ndarray | None = None,
+    jump: float = 0.0,
+    model: Model | None = None,
+) -> Spatial:
     """Judge a log that is made of touches of 20 frames each."""
     runs, touches = StillRuns.begin(CELLS), []
     for first in range(0, len(log), FRAMES):
@@ -39,7 +53,7 @@ def judged(log: np.ndarray, wrong: np.ndarray = NONE, settled: np.ndarray | None
         touches.append(Touch(halves, root.min(axis=0), root.max(axis=0)))
     work: Generator[None, None, Spatial] = stuck_evidence(
         touches, np.zeros(CELLS) if settled is None else settled, runs, np.full(CELLS, jump), np.full(CELLS, jump),
-        Copycat(), SCALE, np.ones(CELLS, bool), wrong, 0.025,
+        model or Copycat(), SCALE, np.ones(CELLS, bool), wrong, 0.025,
     )  # fmt: skip
     return finished(work)
 
@@ -125,6 +139,16 @@ def test_evidence_of_earlier_touches_is_kept():
     log[:, 3] = 0
     settled = np.full(CELLS, 7.0)
     assert judged(log, settled=settled).evidence[3] == pytest.approx(judged(log).evidence[3] + 7)
+
+
+def test_a_touch_that_surprises_the_cells_that_move_says_little_about_the_others():
+    said = []
+    for surprised in (0, 2, 4):
+        log = pressed(2)
+        log[:, 3] = 0.0
+        log[FRAMES:, 4 : 4 + surprised] = 0.0
+        said.append(judged(log, model=Presser()).surprise[3])
+    assert said[0] > said[1] + 0.4 > said[2] + 0.6
 
 
 @pytest.mark.parametrize("one_is_still", [True, False])

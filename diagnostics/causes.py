@@ -13,8 +13,9 @@ from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, SensorLayout
 from diagnostics.wiring import Cause, explain
 
-_LEADING = 2.5  # log ratio of cells that tell when a wire broke, where none is faulty beyond doubt
 _SAME_VALUE = 0.02  # of full scale: stuck cells this near to each other may share a cause
+_SAME_KIND = 1 / 3  # of the single faults: open, short or stuck
+_LEADING = 2.5  # log ratio of cells that tell when a wire broke, where none is faulty beyond doubt
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -63,6 +64,22 @@ def root_causes(
     for aliasing in aliasings:
         aliased[list(aliasing.cells)] = True
     faults = [_aliased(aliasing, layout) for aliasing in aliasings]
+    causes = yield from _causes(found, aliased, layout, 0.0)
+    singles = sum(cause.line is None for _, _, cause in causes)
+    if 0 < singles < len(causes):
+        # Where many cells fail one by one, some will be neighbours at the end of a wire: look at the wires once more.
+        common = _SAME_KIND * singles / int((found.alive | found.faulty).sum())
+        causes = yield from _causes(found, aliased, layout, common)
+    faults += [_fault(kind, value, cause, found, layout) for kind, value, cause in causes]
+    faults = _addresses_of_dead_rows(faults, found, layout)
+    return tuple(sorted(faults, key=lambda fault: (-len(fault.cells), fault.cells)))
+
+
+def _causes(
+    found: Findings, aliased: Mask, layout: SensorLayout, common: float
+) -> Generator[None, None, list[tuple[FaultKind, float | None, Cause]]]:
+    """Return kind, value and cause of each fault; ``common``: the share of single faults of one kind, at least."""
+    causes = []
     for kind, faulty, alike, value in _alike(found, layout.full_scale):
         # A live cell contradicts a broken wire; so does one that is faulty in another way, or reads another value.
         against = found.alive | (found.faulty & ~alike) | aliased
@@ -72,11 +89,10 @@ def root_causes(
             begun = int(np.median(found.since[leading])) if leading.any() else 0
             against &= ~(alike & ~faulty & (found.since <= begun) & (begun > 0))
             against |= ~alike & ~found.silent
-        for cause in explain(faulty & ~aliased, alike & ~aliased, against, found.weight, layout):
-            faults.append(_fault(kind, value, cause, found, layout))
+        explained = explain(faulty & ~aliased, alike & ~aliased, against, found.weight, layout, common)
+        causes += [(kind, value, cause) for cause in explained]
         yield
-    faults = _addresses_of_dead_rows(faults, found, layout)
-    return tuple(sorted(faults, key=lambda fault: (-len(fault.cells), fault.cells)))
+    return causes
 
 
 def _alike(found: Findings, full_scale: float) -> list[tuple[FaultKind, Mask, Mask, float | None]]:

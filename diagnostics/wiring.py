@@ -2,9 +2,13 @@
 
 Costs are negative log probabilities. A broken wire costs ``log 200`` (one wire in two hundred), one broken in its
 middle ``log 2`` more, a single cell the log of how rare single faults are on this pad, and each cell behind a wire that
-contradicts it ``log 1000``. Cells that are not faulty beyond doubt count with the evidence that there is: many doubtful
-cells on one wire may convict it together. The set of least cost is found by integer programming; how rare single faults
-are is then read off the solution, and the programme solved again until it no longer changes.
+contradicts it ``log 1000``. A cell that is not faulty beyond doubt counts with
+
+    w - log(1 - q + q exp w)
+
+what a broken wire explains better than a single fault of chance q, or none; w is its log likelihood ratio. Many
+doubtful cells on one wire may convict it together. The set of least cost is found by integer programming; how rare
+single faults are is then read off the solution, and the programme solved again until it no longer changes.
 """
 
 from __future__ import annotations
@@ -24,12 +28,12 @@ _MOST_CONTRADICTIONS = 1  # of a wire that is still suspected
 _RAREST, _MOST_COMMON = 0.005, 0.5  # bounds on the share of single faults, which few cells cannot tell exactly
 # Cells with evidence against them that a wire must serve before it is blamed: so many, and this share of those on it
 # that were put to the test at all.
-_FEWEST_WITNESSES, _WITNESS_SHARE = 3, 1 / 3
+_FEWEST_WITNESSES, _WITNESS_SHARE = 2, 1 / 3
 _WITNESS = 2.5  # log ratio of a cell that counts as one
 _TRIED = 0.3  # log ratio of a cell that was put to the test
 _DOUBTFUL_SHARE = 0.7  # of the evidence of doubtful cells counts: neighbours are wrong together
-_MOST = 4.0  # log ratio that one doubtful cell can bring
-_CLEAR = float(np.log(100.0))  # so much of the evidence of doubtful cells does not count
+_LEAST = -1.0  # log ratio that one doubtful cell can bring
+_CLEAR = float(np.log(100.0))  # so much of their evidence does not count where no cell is faulty beyond doubt
 _PROVEN = np.log(9.0)  # log odds from which on a wire is named: single cells are the safer guess
 _ROUNDS = 5
 
@@ -67,6 +71,7 @@ def explain(
     against: NDArray[np.bool_],
     weight: NDArray[np.float64],
     layout: SensorLayout,
+    common: float = 0.0,
 ) -> tuple[Cause, ...]:
     """Explain cells that misbehave *in the same way* (same kind, same value).
 
@@ -76,13 +81,14 @@ def explain(
         against: bool ``[D]``, the cells that contradict a broken wire. Cells that are neither may be inferred faulty.
         weight: float ``[D]``, log likelihood ratio faulty : healthy of each cell that is alike.
         layout: the array.
+        common: how common single faults of one kind are at least.
     """
     if alike.sum() < 2:  # no wire serves so few
         return tuple(Cause(None, (cell,), (cell,), 1.0) for cell in np.flatnonzero(faulty).tolist())
     causes: list[Cause] = []
     pads = layout.grid(alike).any(axis=(1, 2))
     for pad in np.flatnonzero(pads).tolist():
-        causes += _explain_pad(pad, faulty, alike, against, weight, layout)
+        causes += _explain_pad(pad, faulty, alike, against, weight, layout, common)
     return tuple(causes)
 
 
@@ -93,10 +99,11 @@ def _explain_pad(
     against: NDArray[np.bool_],
     weight: NDArray[np.float64],
     layout: SensorLayout,
+    common: float,
 ) -> list[Cause]:
-    support = np.where(alike, np.clip(weight, -1.0, _MOST), 0.0)
-    witness = alike & (faulty | (support >= _WITNESS))
-    tried = alike & (faulty | (support > _TRIED))
+    weight = np.where(alike, np.maximum(weight, _LEAST), 0.0)
+    witness = alike & (faulty | (weight >= _WITNESS))
+    tried = alike & (faulty | (weight > _TRIED))
     candidates = []
     lines = layout.lines if witness.sum() >= 2 else ()
     for line in lines:
@@ -107,10 +114,11 @@ def _explain_pad(
     found = np.flatnonzero(faulty & on_pad)
     tested = int((against & on_pad).sum()) + len(found)
     blamed: list[_Candidate] = []
-    cell_cost = float(-np.log(_RAREST))
+    support, cell_cost = weight, float(-np.log(_RAREST))
     singles = 0
     for _ in range(_ROUNDS if candidates else 0):
-        cell_cost = float(-np.log(np.clip(singles / max(tested, 1), _RAREST, _MOST_COMMON)))
+        cell_cost = float(-np.log(np.clip(max(singles / max(tested, 1), common), _RAREST, _MOST_COMMON)))
+        support = weight - np.logaddexp(np.log1p(-np.exp(-cell_cost)), weight - cell_cost)
         blamed = _cheapest(candidates, found, faulty, support, cell_cost)
         behind = np.zeros(layout.n_cells, bool)
         for candidate in blamed:
@@ -141,8 +149,7 @@ def _candidates(
     """Return the wire as a whole, and broken in its middle with either end alive, as far as cells bear witness."""
 
     def convicted(behind: NDArray[np.intp]) -> bool:
-        needed = max(min(_FEWEST_WITNESSES, len(behind)), _WITNESS_SHARE * float(tried[behind].sum()), 2)
-        return bool(witness[behind].sum() >= needed)
+        return bool(witness[behind].sum() >= max(_FEWEST_WITNESSES, _WITNESS_SHARE * float(tried[behind].sum())))
 
     contradictions = np.flatnonzero(against[cells])
     found = []
@@ -162,9 +169,10 @@ def _candidates(
 
 def _gain(c: _Candidate, faulty: NDArray[np.bool_], support: NDArray[np.float64], cell_cost: float) -> float:
     doubtful = c.cells[~faulty[c.cells]]
-    doubt = _DOUBTFUL_SHARE * float(support[doubtful].sum())
-    # Doubtful cells speak for a wire only as far as they go beyond reasonable doubt, and against it in full.
-    return float(faulty[c.cells].sum() * cell_cost + max(doubt - _CLEAR, min(doubt, 0.0)) - c.cost)
+    certain, doubt = int(faulty[c.cells].sum()), _DOUBTFUL_SHARE * float(support[doubtful].sum())
+    if not certain:  # at the edge of an object all cells of a line may be wrongly suspected
+        doubt = max(doubt - _CLEAR, min(doubt, 0.0))
+    return certain * cell_cost + doubt - c.cost
 
 
 def _cheapest(

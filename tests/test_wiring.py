@@ -169,3 +169,31 @@ def test_positions_without_a_cell_are_never_blamed():
     against = ~faulty & present.ravel()
     (cause,) = explain(faulty, faulty, against, np.where(faulty, SURE, NOTHING), layout)
     assert (cause.line, cause.cells) == (Line(0, "row", 3), tuple(row))
+
+
+def test_one_certain_cell_and_a_strong_suspect_behind_the_last_live_one_are_a_cut():
+    row = LAYOUT.cells_on(Line(1, "row", 4))
+    faulty, suspect = mask(row[9:]), mask(row[8:9])
+    for strength, cut in ((6.0, True), (2.6, False)):
+        weight = np.where(faulty, SURE, np.where(suspect, strength, NOTHING))
+        cause = explained(faulty, ~(faulty | suspect), weight=weight)[0]
+        assert cause.cells == (tuple(row[8:]) if cut else tuple(row[9:]))
+        assert (cause.line is not None) == cut
+
+
+def test_where_single_faults_are_common_two_neighbours_at_the_end_of_a_line_are_no_cut():
+    row = LAYOUT.cells_on(Line(1, "row", 4))
+    faulty = mask(row[8:])
+    for common, cut in ((0.0, True), (0.1, False)):
+        causes = explain(faulty, faulty, ~faulty, np.where(faulty, SURE, NOTHING), LAYOUT, common)
+        assert any(cause.line is not None for cause in causes) == cut
+
+
+def test_suspects_alone_need_more_than_a_certain_cell_does():
+    row = LAYOUT.cells_on(Line(1, "row", 4))
+    for certain in (0, 1):
+        faulty = mask(row[9:][:certain])
+        against = ~mask(row[6:])
+        weight = np.where(mask(row[6:]), 4.0, NOTHING)
+        causes = explained(faulty, against, weight=weight)
+        assert any(cause.line is not None for cause in causes) == bool(certain)

@@ -33,7 +33,8 @@ _WITNESS = 2.5  # log ratio of a cell that counts as one
 _TRIED = 0.3  # log ratio of a cell that was put to the test
 _DOUBTFUL_SHARE = 0.7  # of the evidence of doubtful cells counts: neighbours are wrong together
 _LEAST = -1.0  # log ratio that one doubtful cell can bring
-_CLEAR = float(np.log(100.0))  # so much of their evidence does not count where no cell is faulty beyond doubt
+_STRONGEST = np.log(1000.0)  # log ratio that one of the cells should have, if none is faulty beyond doubt
+_LEADERLESS_COST = np.log(100.0)  # if none has it: at an edge all cells of a line may be wrongly suspected
 _PROVEN = np.log(9.0)  # log odds from which on a wire is named: single cells are the safer guess
 _ROUNDS = 5
 
@@ -104,11 +105,12 @@ def _explain_pad(
     weight = np.where(alike, np.maximum(weight, _LEAST), 0.0)
     witness = alike & (faulty | (weight >= _WITNESS))
     tried = alike & (faulty | (weight > _TRIED))
+    leading = faulty | (weight >= _STRONGEST)
     candidates = []
     lines = layout.lines if witness.sum() >= 2 else ()
     for line in lines:
         if line.pad == pad and line.kind in ("row", "column", "converter"):
-            candidates += _candidates(line, layout.cells_on(line), against, witness, tried)
+            candidates += _candidates(line, layout.cells_on(line), against, witness, tried, leading)
     on_pad = np.zeros(layout.n_cells, bool)
     on_pad[layout.cells_on(Line(pad, "converter", 0))] = True
     found = np.flatnonzero(faulty & on_pad)
@@ -145,16 +147,20 @@ def _candidates(
     against: NDArray[np.bool_],
     witness: NDArray[np.bool_],
     tried: NDArray[np.bool_],
+    leading: NDArray[np.bool_],
 ) -> list[_Candidate]:
     """Return the wire as a whole, and broken in its middle with either end alive, as far as cells bear witness."""
 
     def convicted(behind: NDArray[np.intp]) -> bool:
         return bool(witness[behind].sum() >= max(_FEWEST_WITNESSES, _WITNESS_SHARE * float(tried[behind].sum())))
 
+    def cost(behind: NDArray[np.intp]) -> float:
+        return float(_LINE_COST if leading[behind].any() else _LINE_COST + _LEADERLESS_COST)
+
     contradictions = np.flatnonzero(against[cells])
     found = []
     if len(contradictions) <= _MOST_CONTRADICTIONS and convicted(cells):
-        found.append(_Candidate(line, cells, _LINE_COST + _CONTRADICTION_COST * len(contradictions), True))
+        found.append(_Candidate(line, cells, cost(cells) + _CONTRADICTION_COST * len(contradictions), True))
     if line.kind == "converter" or not len(contradictions):
         return found
     # Beyond the last live cell seen from either end, from the first cell with evidence on.
@@ -163,16 +169,14 @@ def _candidates(
         if len(seen):
             dead = np.sort(behind[seen[0] :])
             if convicted(dead):
-                found.append(_Candidate(line, dead, float(_LINE_COST + _CUT_COST), False))
+                found.append(_Candidate(line, dead, cost(dead) + _CUT_COST, False))
     return found
 
 
 def _gain(c: _Candidate, faulty: NDArray[np.bool_], support: NDArray[np.float64], cell_cost: float) -> float:
     doubtful = c.cells[~faulty[c.cells]]
-    certain, doubt = int(faulty[c.cells].sum()), _DOUBTFUL_SHARE * float(support[doubtful].sum())
-    if not certain:  # at the edge of an object all cells of a line may be wrongly suspected
-        doubt = max(doubt - _CLEAR, min(doubt, 0.0))
-    return certain * cell_cost + doubt - c.cost
+    doubt = _DOUBTFUL_SHARE * float(support[doubtful].sum())
+    return float(faulty[c.cells].sum()) * cell_cost + doubt - c.cost
 
 
 def _cheapest(

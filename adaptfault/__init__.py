@@ -12,11 +12,13 @@ if TYPE_CHECKING:
     from adaptfault.adaptation import Adaptation, Adapter
     from adaptfault.calibration import Calibration
     from adaptfault.evaluation import Scores, evaluate
+    from adaptfault.forecast import Forecast
     from adaptfault.grasps import simulate
     from adaptfault.history import History
     from adaptfault.network import TactileTransformer
     from adaptfault.recordings import Recordings, load, save_npz
     from adaptfault.reduction import ReducedModel
+    from adaptfault.replay import load_adapter, save_adapter
     from adaptfault.store import load_model, save_model
     from adaptfault.training import train
     from adaptfault.windows import Windows, make_windows, split
@@ -27,6 +29,7 @@ __all__ = [
     "Adaptation",
     "Adapter",
     "Calibration",
+    "Forecast",
     "History",
     "Recordings",
     "ReducedModel",
@@ -35,8 +38,10 @@ __all__ = [
     "Windows",
     "evaluate",
     "load",
+    "load_adapter",
     "load_model",
     "make_windows",
+    "save_adapter",
     "save_model",
     "save_npz",
     "simulate",
@@ -48,6 +53,7 @@ _HOMES = {
     "Adaptation": "adaptation",
     "Adapter": "adaptation",
     "Calibration": "calibration",
+    "Forecast": "forecast",
     "History": "history",
     "Recordings": "recordings",
     "ReducedModel": "reduction",
@@ -56,8 +62,10 @@ _HOMES = {
     "Windows": "windows",
     "evaluate": "evaluation",
     "load": "recordings",
+    "load_adapter": "replay",
     "load_model": "store",
     "make_windows": "windows",
+    "save_adapter": "replay",
     "save_model": "store",
     "save_npz": "recordings",
     "simulate": "grasps",

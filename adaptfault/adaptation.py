@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -12,11 +13,15 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from adaptfault.evaluation import Scores, evaluate
+from adaptfault.fills import AffineFill, CellStatistics, NearestFill
+from adaptfault.forecast import Forecast
+from adaptfault.heads import MOST_WINDOWS, KernelFit, KernelHead, calibrated, linear_head
+from adaptfault.history import History
 from adaptfault.network import TactileTransformer, as_tensor, logits_of
-from adaptfault.reduction import AffineFill, CellStatistics, ReducedModel, phi, reduce_windows
+from adaptfault.reduction import ReducedModel, phi, reduce_windows
 from adaptfault.store import load_tensors, save_tensors
 from adaptfault.training import train
 from adaptfault.windows import Windows
@@ -26,9 +31,11 @@ Method = Literal["auto", "fill", "head", "finetune", "scratch"]
 
 SCHEMA = "adaptfault.adaptation/1"
 
-_HEAD_C = 0.3  # inverse strength of the refitted head's ridge penalty
 _ENOUGH = 0.99  # auto stops at the first stage that keeps this share of the fault-free validation accuracy
-_FINETUNE_EPOCHS, _FINETUNE_PATIENCE = 12, 3
+_SHARES = ((0.5, 0.5), (1.0, 0.0), (0.0, 1.0))  # of features and healthy cells in the head's kernel; the first if equal
+_ROUND_EPOCHS, _ROUNDS, _ROUND_PATIENCE = 2, 6, 1  # of fine-tuning
+_FOLDS = 5  # of validation recordings, each held out of a head in turn
+_BATCH, _PILOT = 256, 500  # windows run at once; of a head made to see how long a whole one takes
 _SCRATCH_EPOCHS, _SCRATCH_PATIENCE = 50, 10  # Section III-B: 50 at most
 
 
@@ -65,6 +72,7 @@ class Adaptation:
     fault_set: FaultSet
     stages: tuple[Stage, ...]
     _validation: Windows | None = field(default=None, repr=False)
+    _held_out: NDArray[np.int64] | None = field(default=None, repr=False)
     _scores: Scores | None = field(default=None, repr=False)
 
     def predict(self, x: NDArray[Any] | Tensor) -> NDArray[np.int64]:
@@ -82,22 +90,31 @@ class Adaptation:
 
     @cached_property
     def scores(self) -> Scores:
-        """Scores on the fault-free validation windows with F taken away; computed when first asked for."""
+        """Scores on the fault-free validation windows with F taken away; computed when first asked for.
+
+        A head learns from the validation windows too. They are scored by heads fitted without their fifth of the
+        recordings.
+        """
         if self._scores is not None:
             return self._scores
         if self._validation is None:
             raise ValueError("this adaptation was loaded without scores")
-        return evaluate(self, self._validation)
+        if self._held_out is None:
+            return evaluate(self, self._validation)
+        return Scores.of(self._validation.y, self._held_out, n_classes=self.model.network.n_classes)
 
     def save(self, path: str | Path) -> None:
         """Write to a folder: weights as safetensors, the rest as JSON, no pickle."""
+        model = self.model
         about = {
-            "network": self.model.network.config,
+            "network": model.network.config,
             "fault_set": list(self.fault_set),
+            "reference_frames": len(model.front.roots) if isinstance(model.front, NearestFill) else None,
+            "head": None if model.head is None else model.head.shapes,
             "stages": [vars(stage) for stage in self.stages],
             "scores": self.scores.to_dict(),
         }
-        save_tensors(path, SCHEMA, about, self.model.state_dict())
+        save_tensors(path, SCHEMA, about, model.state_dict())
 
     @classmethod
     def load(cls, path: str | Path) -> Adaptation:
@@ -111,9 +128,11 @@ class Adaptation:
         try:
             network = TactileTransformer.from_config(about["network"])
             fault_set = FaultSet(tuple(about["fault_set"]), network.layout.n_cells)
-            k = len(fault_set)
-            front = AffineFill(fault_set, np.zeros((k, fault_set.n_cells - k)), np.zeros(k)) if k else None
-            model = ReducedModel(network, fault_set, front)
+            linear = AffineFill.empty(fault_set)
+            nearest, frames = about["reference_frames"] is not None, about["reference_frames"] or 0
+            front = NearestFill(fault_set, linear, np.zeros((frames, fault_set.n_cells), "f4")) if nearest else linear
+            head = None if about["head"] is None else KernelHead.empty(about["head"], network.n_classes)
+            model = ReducedModel(network, fault_set, front, head)
             model.load_state_dict(tensors)
             stages = tuple(Stage(**stage) for stage in about["stages"])
             scores = Scores.from_dict(about["scores"])
@@ -125,9 +144,11 @@ class Adaptation:
 class Adapter:
     """Repairs a fault-free model for any F.
 
+    Windows without a label (y = -1) take the fault-free model's word for it: the heads learn its probabilities.
+
     Args:
         model: the fault-free model; it is copied, never changed.
-        train, validation: fault-free windows, ``[N, T, D]``.
+        train, validation: fault-free windows, ``[N, T, D]``; more than 2500 for validation are thinned evenly.
 
     Raises:
         TypeError: ``model`` is another module.
@@ -139,11 +160,14 @@ class Adapter:
             raise TypeError(f"an adapter repairs a TactileTransformer, got {type(model).__name__}")
         if not len(train) or not len(validation):
             raise ValueError("an adapter needs fault-free windows to learn from and to validate on; one set is empty")
-        self.model, self.train, self.validation = model, train, validation
+        self.model = model
+        self.train, self.targets = _labelled(model, train)
+        most = MOST_WINDOWS // 2  # tell accuracies well enough apart
+        self.validation, self.validation_targets = _labelled(model, validation.select(_even(len(validation), most)))
 
     @cached_property
     def statistics(self) -> CellStatistics:
-        """Mean and covariance of the fault-free frames; estimated once, used for every F."""
+        """What the fills know of the fault-free frames; estimated once, used for every F."""
         return CellStatistics.fit(self.train)
 
     @cached_property
@@ -160,15 +184,18 @@ class Adapter:
         seed: int = 0,
         progress: bool | None = None,
     ) -> Adaptation:
-        """Return the model adapted to ``fault_set``.
+        """Return the model adapted to ``fault_set``, always from the fault-free weights: earlier F leave no trace.
 
         Args:
             fault_set: F, over the D cells of the model's layout.
             method: how far to go. "fill": the missing cells are expected from the healthy ones, no training. "head":
-                then the last layer is refitted in closed form. "finetune": then everything is trained on, the front
-                end too. "scratch": a new network is trained on the healthy cells, the paper's protocol. "auto": fill,
-                head, finetune, stopping at the first that keeps 99 % of the fault-free validation accuracy.
-            budget: seconds of training allowed; None trains until validation stops improving.
+                then a new head is fitted in closed form, on the network's features and the healthy cells. "finetune":
+                then everything is trained on, the front end too, in rounds that each end with a new head. "scratch":
+                a new network is trained on the healthy cells, the paper's protocol. "auto": fill, then head, stopping
+                if the fill keeps 99 % of the fault-free validation accuracy; then finetune if a budget is given and
+                the head does not keep as much.
+            budget: seconds that the stages after the fill may take; what does not fit is left out. None: until
+                validation stops improving.
             seed: of training.
             progress: show or hide progress on stderr; None shows it on a terminal.
 
@@ -177,24 +204,56 @@ class Adapter:
         """
         if method not in get_args(Method):
             raise ValueError(f"unknown method {method!r}: use one of {', '.join(get_args(Method))}")
+        self._check(fault_set)
+        return _Run(self, fault_set, budget, seed, progress).go(method)
+
+    def forecast(self, fault_set: FaultSet) -> Forecast:
+        """Say what accuracy to expect of each stage, from validation windows with F taken away.
+
+        Nothing is deployed or trained; it takes as long as ``method="head"``.
+
+        Raises:
+            ValueError: F over another number of cells, or no healthy cell left.
+        """
+        self._check(fault_set)
+        windows = self.validation
+        predicted = {"fault-free": self.model.predict(windows.x)}
+        if len(fault_set):
+            run = _Run(self, fault_set, None, 0, False)
+            predicted["fill"] = run.held_out()
+            run.head()
+            predicted["head"] = run.held_out()
+        return Forecast.of(fault_set, windows.y, windows.recording, predicted)
+
+    def _check(self, fault_set: FaultSet) -> None:
         d = self.train.x.shape[2]
         if fault_set.n_cells != d:
             raise ValueError(f"F is over {fault_set.n_cells} cells, the model over {d}")
-        if not len(fault_set.healthy):
-            raise ValueError(f"F holds all {d} cells: no healthy one is left to predict from; replace the sensor")
-        return _Run(self, fault_set, budget, seed, progress).go(method)
+        if not self.model.layout.present.ravel()[fault_set.healthy].any():
+            raise ValueError(
+                f"F holds all {int(self.model.layout.present.sum())} cells: no healthy one is left to predict from;"
+                " replace the sensor"
+            )
 
 
 class _Run:
-    """One adaptation under way."""
+    """One adaptation under way. ``reduced`` is the best model so far, ``predicted`` its classes of validation windows
+    that its head did not learn from."""
 
     def __init__(
         self, adapter: Adapter, fault_set: FaultSet, budget: float | None, seed: int, progress: bool | None
     ) -> None:
-        self.adapter, self.fault_set, self.budget = adapter, fault_set, budget
-        self.seed, self.progress = seed, progress
-        self.stages: list[Stage] = []
-        self.reduced = self.filled(copy.deepcopy(adapter.model))
+        self.adapter, self.fault_set, self.seed, self.progress = adapter, fault_set, seed, progress
+        self.began, self.budget = time.perf_counter(), budget
+        self.training = reduce_windows(adapter.train, fault_set)
+        self.validation = reduce_windows(adapter.validation, fault_set)
+        self.predicted: NDArray[np.int64] | None = None
+        self.head_seconds = 0.0
+        statistics = adapter.statistics  # estimated once, not a cost of this F
+        began = time.perf_counter()
+        front = statistics.nearest(fault_set) if len(fault_set) else None
+        self.stages = [Stage("fill", time.perf_counter() - began)]
+        self.reduced = ReducedModel(copy.deepcopy(adapter.model), fault_set, front).eval()
 
     def go(self, method: Method) -> Adaptation:
         if not len(self.fault_set) and method != "scratch":
@@ -210,98 +269,166 @@ class _Run:
                 self.head()
                 self.finetune()
             case "auto":
-                for stage in (self.head, self.finetune):
+                for stage in (self.head, self.finetune) if self.budget is not None else (self.head,):
                     if self.accuracy() >= _ENOUGH * self.adapter.fault_free_accuracy:
                         break
                     stage()
         return self.done()
 
-    def filled(self, network: TactileTransformer) -> ReducedModel:
-        began = time.perf_counter()
-        front = AffineFill(self.fault_set, *self.adapter.statistics.conditional_mean(self.fault_set))
-        reduced = ReducedModel(network, self.fault_set, front).eval()
-        self.stages.append(Stage("fill", time.perf_counter() - began))
-        return reduced
-
     def head(self) -> None:
-        """Refit the last layer as a multinomial logistic regression on the features of the filled windows."""
-        from sklearn.linear_model import LogisticRegression
-        from sklearn.preprocessing import StandardScaler
-
-        began = time.perf_counter()
-        windows = reduce_windows(self.adapter.train, self.fault_set)
-        reduced, before = self.reduced, self.accuracy()
-        network = reduced.network
-        features = logits_of(_Features(reduced), windows.x).double().numpy()
-        scaler = StandardScaler().fit(features)
-        classifier = LogisticRegression(C=_HEAD_C, max_iter=300).fit(scaler.transform(features), windows.y)
-        coefficients, intercept = classifier.coef_, classifier.intercept_
-        if len(classifier.classes_) == 2:  # scikit-learn keeps one row then
-            coefficients, intercept = np.vstack([-coefficients, coefficients]) / 2, np.array([-1, 1]) * intercept / 2
-        weight = coefficients / scaler.scale_
-        bias = intercept - weight @ scaler.mean_
-        kept = copy.deepcopy(network.head.state_dict())
-        with torch.no_grad():
-            # A class that the training windows lack is never the answer.
-            network.head.weight.zero_()
-            network.head.bias.fill_(-1e4)
-            network.head.weight[classifier.classes_] = as_tensor(weight.astype(np.float32))
-            network.head.bias[classifier.classes_] = as_tensor(bias.astype(np.float32))
-        seconds = time.perf_counter() - began
-        reached = self._score()
-        if reached < before:  # a stage may cost time, never accuracy
-            network.head.load_state_dict(kept)
-            reached = before
-        self.stages.append(Stage("head", seconds, reached))
+        """Fit a new head in closed form; kept if validation agrees that it is better."""
+        linear = self.adapter.statistics.linear(self.fault_set)
+        self._keep_better("head", ReducedModel(self.reduced.network, self.fault_set, linear).eval())
 
     def finetune(self) -> None:
-        """Train on, front end included, starting where the head left off; never ends worse."""
-        self._train("finetune", _FINETUNE_EPOCHS, _FINETUNE_PATIENCE, start=True)
+        """Train on, front end included, in rounds that each end with a new head; stop when a round brings nothing.
+
+        A larger budget only allows more of the same rounds, so it never ends worse.
+        """
+        network = copy.deepcopy(self.adapter.model)
+        reduced = ReducedModel(network, self.fault_set, self.adapter.statistics.linear(self.fault_set)).eval()
+        features = self._views(reduced, self.training)[0].double().numpy()
+        weight, bias = linear_head(features, self.training.y, network.n_classes)
+        network.head.load_state_dict({"weight": weight, "bias": bias})
+        idle, took = 0, 0.0
+        for number in range(_ROUNDS):
+            if idle > _ROUND_PATIENCE or self.left() < took + self.head_seconds:
+                break
+            began = time.perf_counter()
+            history = self._train(
+                reduced, _ROUND_EPOCHS, seed=self.seed * _ROUNDS + number, reserve=self.head_seconds, patience=None
+            )
+            if history.stopped == "budget":
+                break
+            took = time.perf_counter() - began
+            better = self._keep_better("finetune", copy.deepcopy(reduced), began)
+            idle = 0 if better else idle + 1
 
     def scratch(self) -> None:
         """Train a new network behind the fill, as the paper does for each F."""
         model = self.adapter.model
         fresh = type(model).from_config({**model.config, "seed": self.seed + 1})
-        self.reduced = ReducedModel(fresh, self.fault_set, self.reduced.front)
+        self.reduced = ReducedModel(fresh, self.fault_set, self.adapter.statistics.linear(self.fault_set))
         self.stages.clear()
-        self._train("scratch", _SCRATCH_EPOCHS, _SCRATCH_PATIENCE, start=False)
-
-    def _train(self, name: str, epochs: int, patience: int, *, start: bool) -> None:
         began = time.perf_counter()
-        history = train(
-            self.reduced,
-            reduce_windows(self.adapter.train, self.fault_set),
-            reduce_windows(self.adapter.validation, self.fault_set),
-            epochs=epochs,
-            patience=patience,
-            budget=self.budget,
-            seed=self.seed,
-            evaluate_start=start,
-            progress=self.progress,
-        )
-        self.stages.append(Stage(name, time.perf_counter() - began, history.best_accuracy))
+        history = self._train(self.reduced, _SCRATCH_EPOCHS, seed=self.seed, patience=_SCRATCH_PATIENCE)
+        self.stages.append(Stage("scratch", time.perf_counter() - began, history.best_accuracy))
+        self.predicted = None
+
+    def held_out(self) -> NDArray[np.int64]:
+        """Return the classes of the validation windows, from what did not learn from them."""
+        if self.predicted is None:
+            self.predicted = logits_of(self.reduced, self.validation.x).argmax(1).numpy()
+        return self.predicted
 
     def accuracy(self) -> float:
-        """Validation accuracy as things stand, kept with the last stage."""
-        last = self.stages[-1]
-        if last.accuracy is None:
-            self.stages[-1] = last = Stage(last.name, last.seconds, self._score())
-        assert last.accuracy is not None
-        return last.accuracy
+        """Return the validation accuracy as things stand."""
+        accuracy = float((self.held_out() == self.validation.y).mean())
+        if self.stages[-1].accuracy is None:
+            self.stages[-1] = replace(self.stages[-1], accuracy=accuracy)
+        return accuracy
 
-    def _score(self) -> float:
-        return evaluate(self.reduced, reduce_windows(self.adapter.validation, self.fault_set)).accuracy
+    def left(self) -> float:
+        """Return the seconds that are left; infinite without a budget."""
+        return math.inf if self.budget is None else self.budget - (time.perf_counter() - self.began)
 
     def done(self) -> Adaptation:
-        return Adaptation(self.reduced, self.fault_set, tuple(self.stages), _validation=self.adapter.validation)
+        return Adaptation(
+            self.reduced.eval(),
+            self.fault_set,
+            tuple(self.stages),
+            _validation=self.adapter.validation,
+            _held_out=self.predicted,
+        )
+
+    def _keep_better(self, name: str, reduced: ReducedModel, began: float | None = None) -> bool:
+        """Give ``reduced`` a kernel head and keep it if that is better; False where it is not, or time is short."""
+        before = self.accuracy()
+        start = time.perf_counter()
+        began = start if began is None else began
+        fitted = self._kernel_head(reduced)
+        if fitted is None:
+            return False
+        head, logits = fitted
+        predicted = logits.argmax(1).numpy()
+        self.head_seconds = time.perf_counter() - start
+        reached = float((predicted == self.validation.y).mean())
+        better = reached > before
+        if better:
+            reduced.head = head
+            self.reduced, self.predicted = reduced, predicted
+        self.stages.append(Stage(name, time.perf_counter() - began, max(before, reached)))
+        return better
+
+    def _kernel_head(self, reduced: ReducedModel) -> tuple[KernelHead, Tensor] | None:
+        """Return a head, and the logits of validation windows that it did not learn from; None if time is short."""
+        adapter = self.adapter
+        if self._too_long(reduced, len(self.training) + len(self.validation)):
+            return None
+        learnt = _even(len(self.training), MOST_WINDOWS - len(self.validation))
+        views = [self._views(reduced, windows) for windows in (self.training.select(learnt), self.validation)]
+        folds = np.unique(self.validation.recording, return_inverse=True)[1] % _FOLDS
+        fit = KernelFit(
+            [torch.cat(pair) for pair in zip(*views, strict=True)],
+            np.concatenate([adapter.targets[learnt], adapter.validation_targets]),
+            folds,
+        )
+        best = math.inf
+        for shares in _SHARES:
+            head, logits = fit.fit(shares)
+            head, loss = calibrated(head, logits, self.validation.y)
+            if loss < best:  # steadier than the accuracy
+                best, chosen = loss, (head, logits)
+        return chosen
+
+    def _views(self, reduced: ReducedModel, windows: Windows) -> tuple[Tensor, Tensor]:
+        """Return both views of windows, computed in batches."""
+        reduced.eval()
+        with torch.no_grad():
+            views = [reduced.views(x) for x in torch.split(as_tensor(windows.x), _BATCH)]
+        return torch.cat([v[0] for v in views]), torch.cat([v[1] for v in views])
+
+    def _too_long(self, reduced: ReducedModel, n: int) -> bool:
+        """Say whether a head on n windows would not fit into the time left, going by what a few take."""
+        if self.budget is None:
+            return False
+        few = self.training.select(slice(0, _BATCH))
+        began = time.perf_counter()
+        views = self._views(reduced, few)
+        pace = (time.perf_counter() - began) / len(few)
+        m = min(n, _PILOT)
+        known = [view[torch.arange(m) % len(few)] for view in views]
+        began = time.perf_counter()
+        KernelFit(known, np.ones((m, self.adapter.targets.shape[1]), np.float32), np.arange(m // 5)).fit(_SHARES[0])
+        solve = (time.perf_counter() - began) * (n / m) ** 2.5 * (1 + len(_SHARES)) / 2
+        return bool(pace * n + solve > self.left())
+
+    def _train(
+        self, reduced: ReducedModel, epochs: int, *, seed: int, patience: int | None, reserve: float = 0.0
+    ) -> History:
+        return train(
+            reduced,
+            self.training,
+            self.validation,
+            epochs=epochs,
+            patience=patience,
+            budget=None if self.budget is None else max(0.0, self.left() - reserve),
+            seed=seed,
+            progress=self.progress,
+        )
 
 
-class _Features(nn.Module):
-    """The reduced model up to its head, as a module that can be run in batches."""
+def _labelled(model: TactileTransformer, windows: Windows) -> tuple[Windows, NDArray[np.float32]]:
+    """Return windows that all have a class, and their targets ``[N, n_classes]``: what has no label is distilled."""
+    if windows.y.max() >= model.n_classes:
+        raise ValueError(f"labels run to {windows.y.max()}, the model has {model.n_classes} classes")
+    targets = np.eye(model.n_classes, dtype=np.float32)[np.maximum(windows.y, 0)]
+    unknown = windows.y < 0
+    if unknown.any():
+        targets[unknown] = model.predict_proba(windows.x[unknown])
+    return replace(windows, y=np.where(unknown, targets.argmax(1), windows.y)), targets
 
-    def __init__(self, reduced: ReducedModel) -> None:
-        super().__init__()
-        self.reduced = reduced
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.reduced.features(x)
+def _even(n: int, most: int) -> NDArray[np.intp]:
+    """Return at most so many of n indices, evenly."""
+    return np.linspace(0, n - 1, min(n, most)).astype(np.intp)

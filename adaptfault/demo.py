@@ -22,7 +22,6 @@ from diagnostics import Diagnosis, Fault, FaultKind, FaultSet, SelfDiagnosis, Se
 
 _LOG_RECORDINGS = 20  # of the broken sensor, that the diagnosis gets to see
 _SHOWN = 8  # faults listed, of each kind of list; the report has all
-_BUDGET = 30.0  # seconds of fine-tuning, where the stages before it are not enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,9 +170,7 @@ def run_demo(
     _list(say, [fault.reason for fault in diagnosis.faults])
 
     with clock("adaptation"):
-        adaptation = Adapter(model, training, validation).adapt(
-            diagnosis.fault_set, budget=_BUDGET, seed=seed, progress=progress
-        )
+        adaptation = Adapter(model, training, validation).adapt(diagnosis.fault_set, seed=seed, progress=progress)
     for stage in adaptation.stages:
         say(f"adaptation   {stage}")
     repaired, repaired_interval = _score(adaptation, broken_windows)

@@ -18,9 +18,12 @@ from tqdm import tqdm
 
 from adaptfault.checkpoint import fingerprint_weights, fingerprint_windows, read_checkpoint, write_checkpoint
 from adaptfault.clock import Clock
+from adaptfault.fills import CellStatistics
 from adaptfault.history import History, Stopped
 from adaptfault.network import as_tensor, logits_of
+from adaptfault.repairable import RandomRepairs
 from adaptfault.windows import Windows
+from diagnostics import SensorLayout
 
 Augment = Callable[[Tensor, torch.Generator], Tensor]
 
@@ -39,6 +42,7 @@ def train(
     budget: float | None = None,
     evaluate_start: bool = False,
     augment: Augment | None = None,
+    repairable: bool = False,
     checkpoint: str | Path | None = None,
     on_epoch: Callable[[History], None] | None = None,
     progress: bool | None = None,
@@ -60,10 +64,13 @@ def train(
         averaging: what is validated and kept is the exponential average of the weights over the last
             1 / (1 - averaging) steps (over fewer at first), which is steadier than any single step's; 0 keeps those of
             the last step, as Section III-B does.
-        budget: seconds, validation included; also ends the run within an epoch, or before the first. The time before a
-            resume counts.
+        budget: seconds, validation included. An epoch that does not fit is left out, but for the first, which is cut
+            short; so a larger budget never ends worse. The time before a resume counts.
         evaluate_start: let the starting weights compete, so that fine-tuning never ends worse than it began.
         augment: ``(x [B, T, D], generator) -> x``, applied to each training batch, a copy that it may change.
+        repairable: make a base that is easy to repair: in parts of each batch random cells, lines, blocks or a pad go
+            missing and are filled in from the rest, as :class:`~adaptfault.adaptation.Adapter` will do. Validation
+            then looks at the windows twice, whole and repaired. Needs about twice the epochs.
         checkpoint: file written after each epoch. If it exists, training continues from it, and ends as it would have
             ended without the interruption; ``epochs``, ``patience`` and ``budget`` may differ from the earlier run's.
         on_epoch: called with the history so far after each epoch, once its checkpoint is on disk.
@@ -71,7 +78,8 @@ def train(
 
     Raises:
         ValueError: windows that are empty, not finite or have labels the model lacks; a checkpoint of another run; a
-            loss that is no longer finite.
+            loss that is no longer finite; ``repairable`` together with ``augment``.
+        TypeError: ``repairable`` for a model without a layout.
     """
     if epochs < 1 or batch_size < 1 or not learning_rate > 0:
         raise ValueError(
@@ -81,6 +89,10 @@ def train(
         raise ValueError(f"averaging must lie in [0, 1), got {averaging}")
     clock = Clock(budget)
     _check(model, train, validation)
+    if repairable:
+        if augment is not None:
+            raise ValueError("repairable is an augmentation itself: give augment or repairable, not both")
+        augment, validation = _random_repairs(model, train, validation, seed)
     run = _Run(model, learning_rate, averaging, Path(checkpoint) if checkpoint is not None else None)
     if run.path is not None:
         run.settings = {
@@ -95,6 +107,7 @@ def train(
         }
         run.resume()
         clock.spent = sum(run.history.seconds)
+    clock.whole = len(train)
     inputs, labels, device = as_tensor(train.x), as_tensor(train.y), next(model.parameters()).device
     hide = None if progress is None else not progress
     try:
@@ -112,6 +125,8 @@ def train(
                 with _seeded(seed, run.history.epochs, device) as generator:
                     order = torch.split(torch.randperm(len(labels), generator=generator), batch_size)
                     loss, seen = _pass(run, inputs, labels, order, augment, generator, clock)
+                if seen < len(labels) and run.history.epochs:
+                    continue  # out of time in the midst of a later epoch
                 with clock.closing():
                     with run.averaged():
                         scores = _validate(model, validation)
@@ -248,6 +263,14 @@ def _check(model: nn.Module, train: Windows, validation: Windows) -> None:
             )
 
 
+def _random_repairs(model: nn.Module, train: Windows, validation: Windows, seed: int) -> tuple[RandomRepairs, Windows]:
+    layout = getattr(model, "layout", None)
+    if not isinstance(layout, SensorLayout):
+        raise TypeError(f"repairable needs a network of a known layout, got {type(model).__name__}")
+    repairs = RandomRepairs(layout, CellStatistics.fit(train))
+    return repairs, repairs.beside(validation, seed)
+
+
 def _validate(model: nn.Module, windows: Windows) -> tuple[float, float]:
     """Return loss and accuracy."""
     logits, labels = logits_of(model, windows.x), as_tensor(windows.y)
@@ -265,7 +288,7 @@ def _stop(history: History, epochs: int, patience: int | None, clock: Clock) -> 
         return "patience"
     if history.epochs >= epochs:
         return "epochs"
-    return "budget" if clock.late(1) else None
+    return "budget" if clock.late(clock.whole if history.epochs else 1) else None
 
 
 @contextmanager

@@ -1,11 +1,17 @@
+import json
+import time
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from adaptfault.adaptation import Adaptation, Adapter
 from adaptfault.evaluation import evaluate
+from adaptfault.fills import AffineFill
+from adaptfault.forecast import Forecast
 from adaptfault.network import TactileTransformer
-from adaptfault.reduction import AffineFill, CellStatistics, ReducedModel, phi
+from adaptfault.reduction import ReducedModel, phi
 from adaptfault.windows import Windows
 from diagnostics import FaultSet, SensorLayout
 
@@ -17,7 +23,7 @@ def blobs(n: int, seed: int) -> Windows:
     """Three classes of contact, told apart by where they press; neighbours say nearly all about a cell."""
     rng = np.random.default_rng(seed)
     y = rng.integers(0, 3, n)
-    centre = np.stack([y * 1.2 + rng.normal(0.3, 0.25, n), rng.normal(1.5, 0.5, n)], axis=1)
+    centre = np.stack([y * 1.2 + rng.normal(0.3, 0.4, n), rng.normal(1.5, 0.5, n)], axis=1)
     rows, cols = np.mgrid[:4, :4]
     distance = (rows - centre[:, :1, None]) ** 2 + (cols - centre[:, 1:, None]) ** 2  # (n, 4, 4)
     press = rng.uniform(0.2, 0.5, (n, 1, 1, 1, 1)) * np.exp(-distance / 2)[:, None, None]
@@ -33,7 +39,7 @@ def adapter() -> Adapter:
     training, validation = blobs(300, 0), blobs(120, 1)
     model = TactileTransformer(LAYOUT, 3)
     train(model, training, validation, epochs=8, learning_rate=1e-3, progress=False)
-    assert evaluate(model, validation).accuracy > 0.85
+    assert evaluate(model, validation).accuracy > 0.8
     return Adapter(model, training, validation)
 
 
@@ -69,32 +75,6 @@ def test_the_value_of_a_dropped_cell_never_reaches_the_output(adapter, method, v
     assert np.isfinite(before).all()
 
 
-def test_healthy_cells_pass_the_front_end_unchanged_and_in_place():
-    rng = np.random.default_rng(0)
-    fill = AffineFill(F, rng.normal(size=(5, D - 5)), rng.normal(size=5))
-    x = torch.rand(2, 3, D - 5)
-    whole = fill(x)
-    assert torch.equal(whole[..., F.healthy], x)
-    assert (whole >= 0).all()
-    assert (whole <= 1).all()
-
-
-def test_the_fill_is_the_gaussian_conditional_mean():
-    rng = np.random.default_rng(0)
-    mixing = rng.normal(size=(D, D))
-    statistics = CellStatistics(rng.normal(size=D), mixing @ mixing.T + np.eye(D))
-    weight, bias = statistics.conditional_mean(F)
-    s, m, h = statistics.covariance, list(F), F.healthy
-    np.testing.assert_allclose(weight, s[np.ix_(m, h)] @ np.linalg.inv(s[np.ix_(h, h)]), atol=1e-8)
-    np.testing.assert_allclose(weight @ statistics.mean[h] + bias, statistics.mean[m], atol=1e-10)
-
-
-def test_cells_that_never_moved_are_filled_with_their_value():
-    still = Windows(np.full((4, 10, D), 0.25, np.float32), np.zeros(4), np.arange(4))
-    weight, bias = CellStatistics.fit(still).conditional_mean(F)
-    np.testing.assert_allclose(weight @ np.full(D - 5, 0.25) + bias, 0.25, atol=1e-6)
-
-
 def test_the_reduced_model_refuses_windows_with_the_faulty_cells_still_in(adapter):
     reduced = ReducedModel(adapter.model, F, AffineFill(F, np.zeros((5, D - 5)), np.zeros(5)))
     with pytest.raises(ValueError, match="27 healthy cells"):
@@ -116,9 +96,22 @@ def test_each_stage_repairs_and_none_is_worse_than_the_one_before(adapter):
 
 def test_auto_stops_at_the_first_stage_that_is_enough(adapter):
     assert [stage.name for stage in adapter.adapt(FaultSet((3,), D)).stages] == ["fill"]
-    stages = adapter.adapt(FaultSet(range(26), D), progress=False).stages
-    assert [stage.name for stage in stages] == ["fill", "head", "finetune"]
+    hard = FaultSet(range(30), D)
+    assert [stage.name for stage in adapter.adapt(hard).stages] == ["fill", "head"]
+    stages = adapter.adapt(hard, budget=30.0, progress=False).stages
+    assert [stage.name for stage in stages][:3] == ["fill", "head", "finetune"]
     assert all(stage.accuracy is not None for stage in stages)
+
+
+def test_a_larger_budget_never_ends_worse_and_none_is_overdrawn(adapter):
+    hard, reached = FaultSet(range(30), D), []
+    for budget in (0.0, 1.0, 4.0):
+        began = time.perf_counter()
+        adapted = adapter.adapt(hard, method="finetune", budget=budget, progress=False)
+        assert time.perf_counter() - began < budget + 1.0  # the fill, the scores, a busy machine
+        reached.append(adapted.scores.accuracy)
+    assert reached == sorted(reached)
+    assert reached[-1] > reached[0]
 
 
 def test_scratch_learns_a_new_network_on_the_healthy_cells(adapter):
@@ -138,18 +131,82 @@ def test_adapting_never_changes_the_fault_free_model_so_order_does_not_matter(ad
 
 
 def test_a_class_without_training_windows_does_not_break_the_head(adapter):
-    two = adapter.train.select(adapter.train.y != 1)
-    adapted = Adapter(adapter.model, two, adapter.validation).adapt(F, method="head")
-    assert adapted.scores.n == 120
+    two, two_validation = (w.select(w.y != 1) for w in (adapter.train, adapter.validation))
+    adapted = Adapter(adapter.model, two, two_validation).adapt(F, method="head")
+    assert adapted.scores.n == len(two_validation)
+    assert adapted.predict_proba(adapter.validation.x)[:, 1].max() < 1e-6
     np.testing.assert_allclose(adapted.predict_proba(adapter.validation.x).sum(axis=1), 1, atol=1e-5)
+
+
+def test_adapting_to_more_faults_later_is_adapting_to_all_at_once(adapter):
+    more = FaultSet((1, 2, 30), D)
+    adapter.adapt(F, method="head")
+    later = adapter.adapt(F | more, method="head")
+    at_once = Adapter(adapter.model, adapter.train, adapter.validation).adapt(F | more, method="head")
+    np.testing.assert_array_equal(
+        later.predict_proba(adapter.validation.x), at_once.predict_proba(adapter.validation.x)
+    )
+
+
+def test_without_labels_the_fault_free_model_teaches_the_head(adapter):
+    unlabelled = replace(adapter.train, y=np.full(len(adapter.train), -1))
+    lost = FaultSet(range(30), D)
+    taught = Adapter(adapter.model, unlabelled, adapter.validation)
+    assert taught.adapt(lost, method="head").scores.accuracy > adapter.adapt(lost, method="fill").scores.accuracy
+    np.testing.assert_allclose(taught.targets, adapter.model.predict_proba(adapter.train.x))
+
+
+# Forecast
+
+
+def test_the_forecast_is_what_the_stages_then_reach(adapter):
+    forecast = adapter.forecast(F)
+    for name in ("fill", "head"):
+        scores = adapter.adapt(F, method=name).scores
+        expected = forecast.stages[name]
+        assert expected.low < expected.accuracy < expected.high
+        assert scores.accuracy == pytest.approx(expected.accuracy)
+    assert forecast.stages["fault-free"].accuracy == adapter.fault_free_accuracy
+    assert list(forecast.stages) == ["fault-free", "fill", "head", "finetune", "scratch"]
+    json.dumps(forecast.to_dict(), allow_nan=False)
+    assert "without 5 cells, from 120 recordings" in str(forecast)
+
+
+def test_the_interval_covers_new_recordings(adapter):
+    covered, rng = 0, np.random.default_rng(0)
+    for i in range(20):
+        one = Adapter(adapter.model, adapter.train, blobs(120, 100 + i))
+        lost = FaultSet(rng.choice(D, int(rng.integers(1, 28)), replace=False).tolist(), D)
+        expected = one.forecast(lost).stages["head"]
+        covered += (
+            expected.low <= evaluate(one.adapt(lost, method="head"), blobs(120, 200 + i)).accuracy <= expected.high
+        )
+    assert covered >= 17  # of 20, at 95 % each
+
+
+def test_the_forecast_names_the_class_that_loses_most():
+    y = np.repeat([0, 1, 2], 20)
+    lost = np.where((y == 1) & (np.arange(60) % 2 == 0), 2, y)
+    predicted = {"fault-free": y, "fill": np.zeros_like(y), "head": lost}
+    forecast = Forecast.of(F, y, np.arange(60), predicted)
+    assert (forecast.worst_class, forecast.worst_loss) == (1, 0.5)
+    assert forecast.stages["scratch"].accuracy == forecast.stages["head"].accuracy
+    assert forecast.stages["scratch"].high >= forecast.stages["fault-free"].accuracy
+
+
+def test_with_f_empty_the_forecast_is_the_fault_free_accuracy_alone(adapter):
+    forecast = adapter.forecast(FaultSet((), D))
+    assert list(forecast.stages) == ["fault-free"]
+    assert forecast.worst_class is None
 
 
 # On disk
 
 
 @pytest.mark.parametrize("fault_set", [F, FaultSet((), D)])
-def test_an_adaptation_comes_back_bit_for_bit(adapter, tmp_path, fault_set):
-    adapted = adapter.adapt(fault_set, method="head")
+@pytest.mark.parametrize("method", ["fill", "head"])
+def test_an_adaptation_comes_back_bit_for_bit(adapter, tmp_path, fault_set, method):
+    adapted = adapter.adapt(fault_set, method=method)
     adapted.save(tmp_path / "adapted")
     again = Adaptation.load(tmp_path / "adapted")
     np.testing.assert_array_equal(

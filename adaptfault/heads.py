@@ -1,0 +1,181 @@
+"""Heads fitted in closed form, without a gradient, on what the network's features and the healthy cells say.
+
+The kernel head is a kernel ridge regression on the classes' indicators (as a classifier: Suykens and Vandewalle 1999).
+Its kernel is a weighted sum over two views of a window, each at its own width: the network's penultimate features,
+which know what the fault-free training learnt, and each healthy cell's mean and maximum, which no fill has touched. On
+real grasps either alone was the better one on some fault sets; their sum was about as good as the better one on all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+_WIDTH = 0.7  # of the Gaussian kernel, in units of the median squared distance
+_RIDGE = 0.05  # added to the kernel's diagonal, which is 1
+_LINEAR_C = 0.3  # inverse strength of the linear head's ridge penalty
+_NO_CLASS = -1e4  # logit of a class without training windows
+MOST_WINDOWS = 5_000  # a kernel head's cost grows with their cube
+
+
+def summarise(x: Tensor) -> Tensor:
+    """Map windows ``[N, T, H]`` on the 0..1 scale to ``[N, 2 H]``: the roots of each cell's mean and maximum.
+
+    The root makes a light touch beside an object's edge count beside a firm one.
+    """
+    return torch.cat([x.mean(1), x.amax(1)], dim=1).clamp_min(0.0).sqrt()
+
+
+class KernelHead(nn.Module):
+    """Weighs each known window by how alike it is.
+
+    Args:
+        views: of the M windows it was fitted on, each ``[M, p]``.
+        widths: of each view's kernel, a squared distance.
+        shares: of each view in the kernel, summing to 1.
+        weights: ``[M, n_classes]``.
+        bias: ``[n_classes]``.
+    """
+
+    widths: Tensor
+    shares: Tensor
+    weights: Tensor
+    bias: Tensor
+
+    def __init__(
+        self, views: Sequence[Tensor], widths: Sequence[float], shares: Sequence[float], weights: Tensor, bias: Tensor
+    ) -> None:
+        super().__init__()
+        for i, view in enumerate(views):
+            self.register_buffer(f"known{i}", view)
+        self.register_buffer("widths", torch.as_tensor(widths, dtype=torch.float32))
+        self.register_buffer("shares", torch.as_tensor(shares, dtype=torch.float32))
+        self.register_buffer("weights", weights)
+        self.register_buffer("bias", bias)
+
+    @classmethod
+    def empty(cls, shapes: Sequence[Sequence[int]], n_classes: int) -> KernelHead:
+        """Build a head to load a state into; ``shapes`` are those of the views."""
+        n = shapes[0][0]
+        none = [0.0] * len(shapes)
+        return cls([torch.zeros(*s) for s in shapes], none, none, torch.zeros(n, n_classes), torch.zeros(n_classes))
+
+    @property
+    def shapes(self) -> list[list[int]]:
+        """What :meth:`empty` needs."""
+        return [list(self.get_buffer(f"known{i}").shape) for i in range(len(self.shares))]
+
+    def forward(self, views: Sequence[Tensor]) -> Tensor:
+        """Map views of N windows, each ``[N, p]``, to logits ``[N, n_classes]``."""
+        known = (self.get_buffer(f"known{i}") for i in range(len(views)))
+        kernel = sum(
+            share * torch.exp(-_squared_distance(view, other) / width)
+            for view, other, width, share in zip(views, known, self.widths, self.shares, strict=True)
+        )
+        logits: Tensor = kernel @ self.weights + self.bias
+        return logits
+
+
+class KernelFit:
+    """Kernel heads for known windows, with several shares of the views, each tried on windows held out of it.
+
+    Args:
+        views: of the M known windows, each ``[M, p]``.
+        targets: ``[M, n_classes]``, 1 at each window's class, or probabilities; a class with none is never the answer.
+        folds: int ``[n]``; the last n windows are held out in turn, those of one fold together.
+    """
+
+    def __init__(self, views: Sequence[Tensor], targets: NDArray[np.float32], folds: NDArray[np.int64]) -> None:
+        self.views, self.targets, self.folds = views, targets, folds
+        distances = [_squared_distance(view, view) for view in views]
+        self.widths = [_WIDTH * (float(d.median()) or 1.0) for d in distances]
+        self.kernels = [torch.exp(-d / width).numpy() for d, width in zip(distances, self.widths, strict=True)]
+
+    def fit(self, shares: Sequence[float]) -> tuple[KernelHead, Tensor]:
+        """Fit a head on all windows.
+
+        The windows that are never held out are eliminated first, which leaves a small system (the Schur complement) to
+        solve for each fold.
+
+        Returns:
+            The head, whose logits have no scale yet (:func:`calibrated`), and ``[n, n_classes]``, the logits that each
+            held-out window gets from a head fitted without its fold.
+        """
+        from scipy.linalg import cho_factor, cho_solve
+
+        kernel = np.zeros_like(self.kernels[0])
+        for share, of_view in zip(shares, self.kernels, strict=True):
+            kernel += np.float32(share) * of_view
+        kernel[np.diag_indices_from(kernel)] += _RIDGE
+        n_classes = self.targets.shape[1]
+        targets = self.targets - np.float32(1 / n_classes)
+        m = len(targets) - len(self.folds)  # never held out
+        between = kernel[:m, m:]
+        solved = cho_solve(cho_factor(kernel[:m, :m], check_finite=False), np.hstack([between, targets[:m]]))
+        from_others, first = solved[:, : len(self.folds)], solved[:, len(self.folds) :]
+        expected = between.T @ first  # of the held-out windows by the others
+        rest, surprise = kernel[m:, m:] - between.T @ from_others, targets[m:] - expected
+
+        held_out = np.empty_like(surprise)
+        for fold in np.unique(self.folds):
+            out, known = self.folds == fold, self.folds != fold
+            within = cho_factor(rest[np.ix_(known, known)], check_finite=False)
+            held_out[out] = expected[out] + rest[np.ix_(out, known)] @ cho_solve(within, surprise[known])
+        last = cho_solve(cho_factor(rest, check_finite=False), surprise)
+        weights = np.vstack([first - from_others @ last, last])
+
+        lacking = torch.from_numpy(self.targets.max(axis=0) == 0)
+        bias = torch.zeros(n_classes).masked_fill(lacking, _NO_CLASS)
+        logits = torch.from_numpy(held_out.astype(np.float32)).masked_fill(lacking, _NO_CLASS)
+        weights_ = torch.from_numpy(weights.astype(np.float32)).masked_fill(lacking, 0.0)
+        return KernelHead(self.views, self.widths, shares, weights_, bias), logits
+
+
+def calibrated(head: KernelHead, logits: Tensor, y: NDArray[np.int64]) -> tuple[KernelHead, float]:
+    """Scale a head's logits so that their softmax gives probabilities (Guo et al. 2017).
+
+    Args:
+        head: to scale.
+        logits: ``[N, n_classes]``, of windows that it did not learn from.
+        y: int ``[N]``, the classes of those.
+
+    Returns:
+        The scaled head, and the mean cross entropy of the scaled logits.
+    """
+    from scipy.optimize import minimize_scalar
+
+    labels = torch.from_numpy(y)
+    found = minimize_scalar(
+        lambda log_scale: float(nn.functional.cross_entropy(logits * float(np.exp(log_scale)), labels)),
+        bounds=(-3.0, 6.0),
+        method="bounded",
+    )
+    known = [head.get_buffer(f"known{i}") for i in range(len(head.shares))]
+    scaled = head.weights * float(np.exp(found.x))
+    return KernelHead(known, head.widths.tolist(), head.shares.tolist(), scaled, head.bias), float(found.fun)
+
+
+def linear_head(features: NDArray[np.float64], y: NDArray[np.int64], n_classes: int) -> tuple[Tensor, Tensor]:
+    """Return weight ``[n_classes, p]`` and bias ``[n_classes]`` of a multinomial logistic regression on ``[N, p]``."""
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.preprocessing import StandardScaler
+
+    scaler = StandardScaler().fit(features)
+    classifier = LogisticRegression(C=_LINEAR_C, max_iter=300).fit(scaler.transform(features), y)
+    coefficients, intercept = classifier.coef_, classifier.intercept_
+    if len(classifier.classes_) == 2:  # scikit-learn keeps one row then
+        coefficients, intercept = np.vstack([-coefficients, coefficients]) / 2, np.array([-1, 1]) * intercept / 2
+    slopes = coefficients / scaler.scale_
+    weight, bias = torch.zeros(n_classes, features.shape[1]), torch.full((n_classes,), _NO_CLASS)
+    weight[classifier.classes_] = torch.from_numpy(slopes.astype(np.float32))
+    bias[classifier.classes_] = torch.from_numpy((intercept - slopes @ scaler.mean_).astype(np.float32))
+    return weight, bias
+
+
+def _squared_distance(a: Tensor, b: Tensor) -> Tensor:
+    """Return the squared distances ``[N, M]`` of the rows of ``a [N, p]`` and ``b [M, p]``."""
+    return (a.square().sum(1)[:, None] + b.square().sum(1) - 2 * a @ b.T).clamp_min(0.0)

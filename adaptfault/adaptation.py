@@ -18,7 +18,7 @@ from torch import Tensor
 from adaptfault.evaluation import Scores, evaluate
 from adaptfault.fills import AffineFill, CellStatistics, NearestFill
 from adaptfault.forecast import Forecast
-from adaptfault.heads import MOST_WINDOWS, KernelFit, KernelHead, calibrated, linear_head
+from adaptfault.heads import MOST_WINDOWS, KernelFit, KernelHead, calibrate, linear_head
 from adaptfault.history import History
 from adaptfault.network import TactileTransformer, as_tensor, logits_of
 from adaptfault.reduction import ReducedModel, phi, reduce_windows
@@ -220,9 +220,9 @@ class Adapter:
         predicted = {"fault-free": self.model.predict(windows.x)}
         if len(fault_set):
             run = _Run(self, fault_set, None, 0, False)
-            predicted["fill"] = run.held_out()
+            predicted["fill"] = run.held_out().argmax(1).numpy()
             run.head()
-            predicted["head"] = run.held_out()
+            predicted["head"] = run.held_out().argmax(1).numpy()
         return Forecast.of(fault_set, windows.y, windows.recording, predicted)
 
     def _check(self, fault_set: FaultSet) -> None:
@@ -237,8 +237,10 @@ class Adapter:
 
 
 class _Run:
-    """One adaptation under way. ``reduced`` is the best model so far, ``predicted`` its classes of validation windows
-    that its head did not learn from."""
+    """One adaptation under way: ``reduced`` is the best model so far, ``logits`` its answers to the validation windows.
+
+    Each answer is by a head that did not learn from that window.
+    """
 
     def __init__(
         self, adapter: Adapter, fault_set: FaultSet, budget: float | None, seed: int, progress: bool | None
@@ -247,7 +249,7 @@ class _Run:
         self.began, self.budget = time.perf_counter(), budget
         self.training = reduce_windows(adapter.train, fault_set)
         self.validation = reduce_windows(adapter.validation, fault_set)
-        self.predicted: NDArray[np.int64] | None = None
+        self.logits: Tensor | None = None
         self.head_seconds = 0.0
         statistics = adapter.statistics  # estimated once, not a cost of this F
         began = time.perf_counter()
@@ -313,20 +315,23 @@ class _Run:
         began = time.perf_counter()
         history = self._train(self.reduced, _SCRATCH_EPOCHS, seed=self.seed, patience=_SCRATCH_PATIENCE)
         self.stages.append(Stage("scratch", time.perf_counter() - began, history.best_accuracy))
-        self.predicted = None
+        self.logits = None
 
-    def held_out(self) -> NDArray[np.int64]:
-        """Return the classes of the validation windows, from what did not learn from them."""
-        if self.predicted is None:
-            self.predicted = logits_of(self.reduced, self.validation.x).argmax(1).numpy()
-        return self.predicted
+    def held_out(self) -> Tensor:
+        """Return the logits ``[N, n_classes]`` of the validation windows, from what did not learn from them."""
+        if self.logits is None:
+            self.logits = logits_of(self.reduced, self.validation.x)
+        return self.logits
 
     def accuracy(self) -> float:
         """Return the validation accuracy as things stand."""
-        accuracy = float((self.held_out() == self.validation.y).mean())
+        accuracy = self._accuracy(self.held_out())
         if self.stages[-1].accuracy is None:
             self.stages[-1] = replace(self.stages[-1], accuracy=accuracy)
         return accuracy
+
+    def _accuracy(self, logits: Tensor) -> float:
+        return float((logits.argmax(1).numpy() == self.validation.y).mean())
 
     def left(self) -> float:
         """Return the seconds that are left; infinite without a budget."""
@@ -338,26 +343,28 @@ class _Run:
             self.fault_set,
             tuple(self.stages),
             _validation=self.adapter.validation,
-            _held_out=self.predicted,
+            _held_out=None if self.logits is None else self.logits.argmax(1).numpy(),
         )
 
     def _keep_better(self, name: str, reduced: ReducedModel, began: float | None = None) -> bool:
-        """Give ``reduced`` a kernel head and keep it if that is better; False where it is not, or time is short."""
-        before = self.accuracy()
+        """Give ``reduced`` a kernel head and keep it if that is better; False where it is not, or time is short.
+
+        Better is a higher validation accuracy, or the same at a lower cross entropy, each at its best scale.
+        """
+        before = self.accuracy(), -calibrate(self.held_out(), self.validation.y)[1]
         start = time.perf_counter()
         began = start if began is None else began
         fitted = self._kernel_head(reduced)
         if fitted is None:
             return False
         head, logits = fitted
-        predicted = logits.argmax(1).numpy()
         self.head_seconds = time.perf_counter() - start
-        reached = float((predicted == self.validation.y).mean())
+        reached = self._accuracy(logits), -calibrate(logits, self.validation.y)[1]
         better = reached > before
         if better:
             reduced.head = head
-            self.reduced, self.predicted = reduced, predicted
-        self.stages.append(Stage(name, time.perf_counter() - began, max(before, reached)))
+            self.reduced, self.logits = reduced, logits
+        self.stages.append(Stage(name, time.perf_counter() - began, max(before, reached)[0]))
         return better
 
     def _kernel_head(self, reduced: ReducedModel) -> tuple[KernelHead, Tensor] | None:
@@ -376,9 +383,9 @@ class _Run:
         best = math.inf
         for shares in _SHARES:
             head, logits = fit.fit(shares)
-            head, loss = calibrated(head, logits, self.validation.y)
+            scale, loss = calibrate(logits, self.validation.y)
             if loss < best:  # steadier than the accuracy
-                best, chosen = loss, (head, logits)
+                best, chosen = loss, (head.scaled(scale), logits)
         return chosen
 
     def _views(self, reduced: ReducedModel, windows: Windows) -> tuple[Tensor, Tensor]:

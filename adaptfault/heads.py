@@ -69,6 +69,11 @@ class KernelHead(nn.Module):
         """What :meth:`empty` needs."""
         return [list(self.get_buffer(f"known{i}").shape) for i in range(len(self.shares))]
 
+    def scaled(self, scale: float) -> KernelHead:
+        """Return the head with its logits multiplied; classes that it never answers stay so."""
+        known = [self.get_buffer(f"known{i}") for i in range(len(self.shares))]
+        return KernelHead(known, self.widths.tolist(), self.shares.tolist(), self.weights * scale, self.bias)
+
     def forward(self, views: Sequence[Tensor]) -> Tensor:
         """Map views of N windows, each ``[N, p]``, to logits ``[N, n_classes]``."""
         known = (self.get_buffer(f"known{i}") for i in range(len(views)))
@@ -102,7 +107,7 @@ class KernelFit:
         solve for each fold.
 
         Returns:
-            The head, whose logits have no scale yet (:func:`calibrated`), and ``[n, n_classes]``, the logits that each
+            The head, whose logits have no scale yet (:func:`calibrate`), and ``[n, n_classes]``, the logits that each
             held-out window gets from a head fitted without its fold.
         """
         from scipy.linalg import cho_factor, cho_solve
@@ -135,16 +140,10 @@ class KernelFit:
         return KernelHead(self.views, self.widths, shares, weights_, bias), logits
 
 
-def calibrated(head: KernelHead, logits: Tensor, y: NDArray[np.int64]) -> tuple[KernelHead, float]:
-    """Scale a head's logits so that their softmax gives probabilities (Guo et al. 2017).
+def calibrate(logits: Tensor, y: NDArray[np.int64]) -> tuple[float, float]:
+    """Return the scale of logits ``[N, n_classes]`` whose softmax fits the classes ``[N]`` best, and the cross entropy.
 
-    Args:
-        head: to scale.
-        logits: ``[N, n_classes]``, of windows that it did not learn from.
-        y: int ``[N]``, the classes of those.
-
-    Returns:
-        The scaled head, and the mean cross entropy of the scaled logits.
+    One scale does not change the order of the classes (temperature scaling, Guo et al. 2017).
     """
     from scipy.optimize import minimize_scalar
 
@@ -154,9 +153,7 @@ def calibrated(head: KernelHead, logits: Tensor, y: NDArray[np.int64]) -> tuple[
         bounds=(-3.0, 6.0),
         method="bounded",
     )
-    known = [head.get_buffer(f"known{i}") for i in range(len(head.shares))]
-    scaled = head.weights * float(np.exp(found.x))
-    return KernelHead(known, head.widths.tolist(), head.shares.tolist(), scaled, head.bias), float(found.fun)
+    return float(np.exp(found.x)), float(found.fun)
 
 
 def linear_head(features: NDArray[np.float64], y: NDArray[np.int64], n_classes: int) -> tuple[Tensor, Tensor]:

@@ -48,6 +48,16 @@ def save_tensors(folder: str | Path, schema: str, about: Mapping[str, Any], tens
             old.unlink(missing_ok=True)
 
 
+def schema_of(folder: str | Path) -> str:
+    """Return the schema of what is in a folder.
+
+    Raises:
+        FileNotFoundError: there is no ``manifest.json``.
+        ValueError: it is not JSON with a schema.
+    """
+    return str(_manifest(Path(folder))["schema"])
+
+
 def read_manifest(folder: str | Path, schema: str) -> dict[str, Any]:
     """Return what ``manifest.json`` says. Needs no torch.
 
@@ -55,16 +65,21 @@ def read_manifest(folder: str | Path, schema: str) -> dict[str, Any]:
         FileNotFoundError: there is none in the folder.
         ValueError: it is not JSON, or of another schema.
     """
-    path = Path(folder) / MANIFEST
+    manifest = _manifest(Path(folder))
+    if manifest["schema"] != schema:
+        raise ValueError(f"{Path(folder) / MANIFEST} has schema {manifest['schema']!r}, expected {schema!r}")
+    return manifest
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    path = folder / MANIFEST
     if not path.is_file():
         raise FileNotFoundError(f"{folder}: expected a folder with a {MANIFEST}, found none")
     try:
         manifest = json.loads(path.read_bytes())
-        found = manifest["schema"]
+        manifest["schema"]
     except (ValueError, TypeError, KeyError):
         raise ValueError(f"{path} is damaged or of another program: no JSON with a schema") from None
-    if found != schema:
-        raise ValueError(f"{path} has schema {found!r}, expected {schema!r}")
     return dict(manifest)
 
 

@@ -171,6 +171,9 @@ def test_a_label_table_that_names_a_missing_file_is_told_and_the_rest_is_used(tm
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--inject", "row:9:9=open"], "row:9:9=open"),
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--inject", "cell:0:0:0=stuck:9"], "outside 0..5"),
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--inject", "melted"], "expected break the sensor"),
+        (["adapt", "{home}/model", "{home}/grasps.npz", "--faults", "1"], "needs --out FOLDER or --forecast"),
+        (["adapt", "{home}/model", "{home}/grasps.npz", "--forecast"], "nothing to do"),
+        (["adapt", "{home}/model", "--faults", "1", "--forecast"], "give the fault-free recordings"),
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--adapted", "{home}/gone"], "gone"),
     ],
 )
@@ -185,6 +188,22 @@ def test_f_empty_leaves_the_model_as_it_was(home, capsys):
     assert main([*empty, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["scores"]["accuracy"] == result["fault_free_accuracy"]
+
+
+def test_a_robot_forecasts_and_adapts_without_the_recordings(home, capsys):
+    model, grasps, kept = (str(home / name) for name in ("model", "grasps.npz", "adapter"))
+    assert main(["adapt", model, grasps, "--keep", kept, "--quiet"]) == 0
+    assert main(["adapt", kept, "--faults", "3,17,20", "--forecast", "--quiet"]) == 0
+    said = capsys.readouterr().out
+    assert "expected accuracy without 3 cells" in said
+    assert "suffers most" in said
+    there, here = str(home / "there"), str(home / "here")
+    assert main(["adapt", kept, "--faults", "3,17,20", "--out", there, "--method", "head", "--quiet", "--json"]) == 0
+    on_robot = json.loads(capsys.readouterr().out)
+    assert main(["adapt", model, grasps, "--faults", "3,17,20", "--out", here, "--method", "head", "--json"]) == 0
+    assert on_robot["scores"] == json.loads(capsys.readouterr().out)["scores"]
+    assert main(["adapt", kept, grasps, "--faults", "3", "--forecast", "--quiet"]) == 3
+    assert "leave the recordings out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["train", "diagnose", "adapt", "evaluate", "demo"])

@@ -1,8 +1,9 @@
-"""adaptfault adapt: a model and F in, a repaired model out."""
+"""adaptfault adapt: a model and F in; a forecast or a repaired model out."""
 
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.options import (
     Commands,
@@ -15,17 +16,30 @@ from adaptfault.cli.options import (
     say,
 )
 
+if TYPE_CHECKING:
+    from adaptfault.adaptation import Adapter
+    from diagnostics import FaultSet
+
 _EXAMPLE = """  adaptfault adapt model grasps/ --faults diagnosis.json --out adapted
-      grasps/: the fault-free recordings that the model was trained on"""
+      grasps/: the fault-free recordings that the model was trained on
+  adaptfault adapt model grasps/ --keep adapter
+      what a robot needs to adapt without the recordings, in 20 MB; then, on the robot:
+  adaptfault adapt adapter --faults 3,17 --forecast"""
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "adapt", "repair a model for a set of faulty cells", _EXAMPLE)
-    parser.add_argument("model", metavar="MODEL", help="folder written by adaptfault train")
-    add_recordings(parser)
-    parser.add_argument("--faults", required=True, metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200")
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="where the adapted model goes")
+    parser.add_argument("model", metavar="MODEL", help="folder written by adaptfault train, or by --keep")
+    add_recordings(parser, least=0)
+    parser.add_argument("--faults", metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200")
+    parser.add_argument("--out", metavar="FOLDER", help="where the adapted model goes")
+    parser.add_argument(
+        "--forecast", action="store_true", help="say what accuracy to expect, and adapt only with --out"
+    )
+    parser.add_argument(
+        "--keep", metavar="FOLDER", help="where to keep all that later adaptations need, without recordings"
+    )
     parser.add_argument(
         "--method",
         default="auto",
@@ -38,32 +52,68 @@ def add(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Adapt and save."""
+    """Keep the adapter, forecast, adapt and save: what was asked for."""
+    if args.faults is None and args.keep is None:
+        raise ValueError("nothing to do: give --faults F with --out or --forecast, or --keep FOLDER")
+    if (args.faults is None) != (args.out is None and not args.forecast):
+        raise ValueError("--faults F needs --out FOLDER or --forecast, and either of them needs --faults F")
+    adapter = _adapter(args)
+    result: dict[str, Any] = {"schema": "adaptfault.adapt/1"}
+    lines: list[str] = []
+    if args.keep is not None:
+        from adaptfault.replay import save_adapter
+
+        save_adapter(args.keep, adapter)
+        result["kept"] = args.keep
+        lines.append(f"adapter kept: {args.keep}")
+    if args.faults is not None:
+        faults = fault_set(args.faults, adapter.model.layout)
+        if args.forecast:
+            say(args, f"{len(faults)} of {faults.n_cells} cells are faulty; forecasting")
+            forecast = adapter.forecast(faults)
+            result["forecast"] = forecast.to_dict()
+            lines.append(str(forecast))
+        if args.out is not None:
+            _adapt(args, adapter, faults, result, lines)
+    emit(args, result, "\n".join(lines))
+    return 0
+
+
+def _adapter(args: argparse.Namespace) -> Adapter:
+    """Return the adapter that was kept, or one for the model and its recordings."""
+    from adaptfault.replay import SCHEMA, load_adapter
+    from adaptfault.store import schema_of
+
+    if schema_of(args.model) == SCHEMA:
+        if args.recordings:
+            raise ValueError(f"{args.model} holds its own windows: leave the recordings out")
+        return load_adapter(args.model)
+    from adaptfault.adaptation import Adapter
     from adaptfault.cli.data import open_model, parts_of
 
     model, manifest = open_model(args.model)
-    faults = fault_set(args.faults, model.layout)
+    if not args.recordings:
+        raise ValueError(f"{args.model} is a model: give the fault-free recordings that it was trained on, too")
     train, validation, _ = parts_of(load_recordings(args, args.recordings, labelled=True), model, manifest)
+    return Adapter(model, train, validation)
 
-    from adaptfault.adaptation import Adapter
 
-    adapter = Adapter(model, train, validation)
+def _adapt(
+    args: argparse.Namespace, adapter: Adapter, faults: FaultSet, result: dict[str, Any], lines: list[str]
+) -> None:
     say(args, f"{len(faults)} of {faults.n_cells} cells are faulty; adapting")
     adaptation = adapter.adapt(faults, method=args.method, budget=args.budget, seed=args.seed, progress=progress(args))
     adaptation.save(args.out)
-    result = {
-        "schema": "adaptfault.adapt/1",
+    result |= {
         "adapted": args.out,
         "fault_set": list(faults),
         "fault_free_accuracy": adapter.fault_free_accuracy,
         "scores": adaptation.scores.to_dict(),
         "stages": [vars(stage) for stage in adaptation.stages],
     }
-    lines = [
+    lines += [
         f"validation, fault-free: accuracy {adapter.fault_free_accuracy:.3f}",
         f"validation, {len(faults)} cells removed: {adaptation.scores}",
         *(f"  {stage}" for stage in adaptation.stages),
         f"adapted model: {args.out}",
     ]
-    emit(args, result, "\n".join(lines))
-    return 0

@@ -30,13 +30,15 @@ def command(commands: Commands, name: str, summary: str, example: str) -> argpar
     return parser
 
 
-def add_recordings(parser: argparse.ArgumentParser, *, option: bool = False, labels: bool = True) -> None:
-    """Add where recordings come from: as arguments, or for a command that can do without as ``--recordings``."""
+def add_recordings(
+    parser: argparse.ArgumentParser, *, option: bool = False, labels: bool = True, least: int = 1
+) -> None:
+    """Add where recordings come from: arguments, at least so many, or ``--recordings`` for a command that can do without."""
     help_ = "file or folder of recordings (.csv, .npz, .npy)"
     if option:
         parser.add_argument("--recordings", nargs="+", metavar="FILE", help=help_)
     else:
-        parser.add_argument("recordings", nargs="+", metavar="RECORDINGS", help=help_)
+        parser.add_argument("recordings", nargs="+" if least else "*", metavar="RECORDINGS", help=help_)
     group = parser.add_argument_group("how recordings are read")
     if labels:
         group.add_argument("--labels", metavar="TABLE", help="CSV table with the columns file,label")

@@ -19,6 +19,11 @@ def add(commands: Commands) -> None:
     parser.add_argument("--epochs", type=int, default=50, help="at most so many (default 50)")
     parser.add_argument("--seed", type=int, default=0, help="of split, weights and training (default 0)")
     parser.add_argument("--length", type=int, default=10, help="frames in a window (default 10)")
+    parser.add_argument(
+        "--repairable",
+        action="store_true",
+        help="let random cells go missing while training: a fill alone then repairs more; needs about twice the epochs",
+    )
     parser.set_defaults(run=run)
 
 
@@ -47,6 +52,7 @@ def run(args: argparse.Namespace) -> int:
         parts[1],
         epochs=args.epochs,
         seed=args.seed,
+        repairable=args.repairable,
         checkpoint=checkpoint,
         progress=progress(args),
     )

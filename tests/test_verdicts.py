@@ -21,6 +21,14 @@ def test_the_fault_set_holds_the_cells_of_all_faults():
     assert len(diagnosed().fault_set) == 0
 
 
+def test_suspects_are_f_and_the_tested_cells_that_are_likely_enough():
+    diagnosis = diagnosed(CELL)
+    diagnosis.probability[[1, 2, 7]] = 0.1, 0.03, 0.9  # 7 was not tested
+    assert diagnosis.suspects() == {1, 2, 30}
+    assert diagnosis.suspects(0.05) == {1, 30}
+    assert diagnosis.suspects(1.0) == diagnosis.fault_set
+
+
 def test_each_cell_is_alive_faulty_or_untested():
     diagnosis = diagnosed(ROW, CELL)
     assert np.flatnonzero(diagnosis.verdicts == Verdict.FAULTY).tolist() == [5, 6, 7, 8, 9, 30]

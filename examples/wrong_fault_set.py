@@ -1,9 +1,9 @@
 """What a wrong F costs, a missed cell or a false one: python examples/wrong_fault_set.py [RECORDINGS [MODEL]]
 
 A tenth of the cells is faulty. The model is adapted to F with some of them forgotten, which then read 0 or full scale,
-and to F with healthy cells added. From the accuracy lost per cell follows the probability above which a doubtful cell is
-better dropped: cost of a false one / (cost of a false one + cost of a missed one). Without RECORDINGS simulated grasps
-must do; MODEL is a folder written by ``adaptfault train`` or by ``save_model``.
+and to F with healthy cells added. From the accuracy lost per cell follows the probability above which a doubtful cell
+is better dropped: cost of a false one / (cost of a false one + cost of a missed one). Without RECORDINGS simulated
+grasps must do; MODEL is a folder written by ``adaptfault train`` or by ``save_model``.
 """
 
 import argparse

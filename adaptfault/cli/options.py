@@ -33,7 +33,7 @@ def command(commands: Commands, name: str, summary: str, example: str) -> argpar
 def add_recordings(
     parser: argparse.ArgumentParser, *, option: bool = False, labels: bool = True, least: int = 1
 ) -> None:
-    """Add where recordings come from: ``least`` 0 or 1 arguments, or an ``option`` for a command that can do without."""
+    """Add where recordings come from: ``least`` arguments, or an ``option`` for a command that can do without."""
     help_ = "file or folder of recordings (.csv, .npz, .npy)"
     if option:
         parser.add_argument("--recordings", nargs="+", metavar="FILE", help=help_)

@@ -20,6 +20,7 @@ from diagnostics import FaultSet
 
 _MOST_FRAMES = 20_000  # a covariance needs no more; frames are thinned evenly
 _REFERENCE_FRAMES = 3_000  # that the nearest fill compares with
+_PROBES = 100  # of them, that tell how near neighbours lie
 _NEAR, _WIDTH = 0.01, 0.05  # of the kernel, in units of the typical squared distance within which 1 % of them lie
 
 
@@ -157,9 +158,9 @@ def _thin(frames: NDArray[Any], most: int) -> NDArray[Any]:
 
 def _near_distance(roots: NDArray[np.float32]) -> float:
     """Return the squared distance of a near neighbour, the typical one among frames ``[M, R]``; never 0."""
-    from sklearn.metrics import pairwise_distances
+    from sklearn.metrics.pairwise import euclidean_distances
 
-    distance = pairwise_distances(_thin(roots, 200), roots, metric="sqeuclidean")
+    distance = euclidean_distances(_thin(roots, _PROBES), roots, squared=True)
     rank = min(1 + round(_NEAR * len(roots)), len(roots) - 1)  # the nearest is the frame itself
     near = np.partition(distance, rank, axis=1)[:, rank]
     return float(np.median(near[near > 0])) if (near > 0).any() else 1.0

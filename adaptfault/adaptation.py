@@ -18,7 +18,8 @@ from torch import Tensor
 from adaptfault.evaluation import Scores, evaluate
 from adaptfault.fills import AffineFill, CellStatistics, NearestFill
 from adaptfault.forecast import Forecast
-from adaptfault.heads import MOST_WINDOWS, KernelFit, KernelHead, calibrate, linear_head
+from adaptfault.forest import Forest
+from adaptfault.heads import MOST_WINDOWS, Blend, KernelFit, blend, calibrate, linear_head
 from adaptfault.history import History
 from adaptfault.network import TactileTransformer, as_tensor, logits_of
 from adaptfault.reduction import ReducedModel, phi, reduce_windows
@@ -33,6 +34,7 @@ SCHEMA = "adaptfault.adaptation/1"
 
 _ENOUGH = 0.99  # auto stops at the first stage that keeps this share of the fault-free validation accuracy
 _SHARES = ((0.5, 0.5), (1.0, 0.0), (0.0, 1.0))  # of features and healthy cells in the head's kernel; the first if equal
+_KERNEL_SHARES = (1.0, 0.67, 0.5, 0.33, 0.0)  # of the kernel head beside the forest
 _ROUND_EPOCHS, _ROUNDS, _ROUND_PATIENCE = 2, 6, 1  # of fine-tuning
 _FOLDS = 5  # of validation recordings, each held out of a head in turn
 _BATCH, _PILOT = 256, 500  # windows run at once; of a head made to see how long a whole one takes
@@ -110,7 +112,7 @@ class Adaptation:
             "network": model.network.config,
             "fault_set": list(self.fault_set),
             "reference_frames": len(model.front.roots) if isinstance(model.front, NearestFill) else None,
-            "head": None if model.head is None else model.head.shapes,
+            "head": None if model.head is None else model.head.about,
             "stages": [vars(stage) for stage in self.stages],
             "scores": self.scores.to_dict(),
         }
@@ -131,7 +133,7 @@ class Adaptation:
             linear = AffineFill.empty(fault_set)
             nearest, frames = about["reference_frames"] is not None, about["reference_frames"] or 0
             front = NearestFill(fault_set, linear, np.zeros((frames, fault_set.n_cells), "f4")) if nearest else linear
-            head = None if about["head"] is None else KernelHead.empty(about["head"], network.n_classes)
+            head = None if about["head"] is None else Blend.empty(about["head"], network.n_classes)
             model = ReducedModel(network, fault_set, front, head)
             model.load_state_dict(tensors)
             stages = tuple(Stage(**stage) for stage in about["stages"])
@@ -347,14 +349,14 @@ class _Run:
         )
 
     def _keep_better(self, name: str, reduced: ReducedModel, began: float | None = None) -> bool:
-        """Give ``reduced`` a kernel head and keep it if that is better; False where it is not, or time is short.
+        """Give ``reduced`` a new head and keep it if that is better; False where it is not, or time is short.
 
         Better is a higher validation accuracy, or the same at a lower cross entropy, each at its best scale.
         """
         before = self.accuracy(), -calibrate(self.held_out(), self.validation.y)[1]
         start = time.perf_counter()
         began = start if began is None else began
-        fitted = self._kernel_head(reduced)
+        fitted = self._head(reduced)
         if fitted is None:
             return False
         head, logits = fitted
@@ -367,26 +369,40 @@ class _Run:
         self.stages.append(Stage(name, time.perf_counter() - began, max(before, reached)[0]))
         return better
 
-    def _kernel_head(self, reduced: ReducedModel) -> tuple[KernelHead, Tensor] | None:
-        """Return a head, and the logits of validation windows that it did not learn from; None if time is short."""
-        adapter = self.adapter
+    def _head(self, reduced: ReducedModel) -> tuple[Blend, Tensor] | None:
+        """Return a head, and the logits of validation windows that it did not learn from; None if time is short.
+
+        Of the choices that there are, the one with the lowest cross entropy on those: it is steadier than the accuracy.
+        """
+        adapter, y = self.adapter, self.validation.y
         if self._too_long(reduced, len(self.training) + len(self.validation)):
             return None
         learnt = _even(len(self.training), MOST_WINDOWS - len(self.validation))
-        views = [self._views(reduced, windows) for windows in (self.training.select(learnt), self.validation)]
+        training = self.training.select(learnt)
+        first, second = (self._views(reduced, windows) for windows in (training, self.validation))
+        both = [torch.cat(pair) for pair in zip(first, second, strict=True)]
         folds = np.unique(self.validation.recording, return_inverse=True)[1] % _FOLDS
-        fit = KernelFit(
-            [torch.cat(pair) for pair in zip(*views, strict=True)],
-            np.concatenate([adapter.targets[learnt], adapter.validation_targets]),
-            folds,
-        )
+        fit = KernelFit(both, np.concatenate([adapter.targets[learnt], adapter.validation_targets]), folds)
         best = math.inf
         for shares in _SHARES:
-            head, logits = fit.fit(shares)
-            scale, loss = calibrate(logits, self.validation.y)
-            if loss < best:  # steadier than the accuracy
-                best, chosen = loss, (head.scaled(scale), logits)
-        return chosen
+            candidate, held_out = fit.fit(shares)
+            scale, loss = calibrate(held_out, y)
+            if loss < best:
+                best, kernel, logits = loss, candidate.scaled(scale), scale * held_out
+
+        n_classes = logits.shape[1]
+        voted = torch.empty_like(logits)
+        for half in (0, 1):  # held out in turn
+            known, out = folds % 2 != half, folds % 2 == half
+            x = torch.cat([first[1], second[1][known]])
+            voted[out] = Forest.fit(x, np.concatenate([training.y, y[known]]), n_classes)(second[1][out])
+        scale, _ = calibrate(voted, y)
+        losses = [calibrate(blend(logits, scale * voted, share), y)[1] for share in _KERNEL_SHARES]
+        share = _KERNEL_SHARES[int(np.argmin(losses))]
+        if share == 1.0:
+            return Blend(kernel), logits
+        forest = Forest.fit(both[1], np.concatenate([training.y, y]), n_classes)
+        return Blend(kernel, forest, share, scale), blend(logits, scale * voted, share)
 
     def _views(self, reduced: ReducedModel, windows: Windows) -> tuple[Tensor, Tensor]:
         """Return both views of windows, computed in batches."""
@@ -408,7 +424,10 @@ class _Run:
         began = time.perf_counter()
         KernelFit(known, np.ones((m, self.adapter.targets.shape[1]), np.float32), np.arange(m // 5)).fit(_SHARES[0])
         solve = (time.perf_counter() - began) * (n / m) ** 2.5 * (1 + len(_SHARES)) / 2
-        return bool(pace * n + solve > self.left())
+        began = time.perf_counter()
+        Forest.fit(known[1], np.arange(m) % self.adapter.targets.shape[1], self.adapter.targets.shape[1])
+        grow = 3 * (time.perf_counter() - began) * n / m
+        return bool(pace * n + solve + grow > self.left())
 
     def _train(
         self, reduced: ReducedModel, epochs: int, *, seed: int, patience: int | None, reserve: float = 0.0

@@ -4,16 +4,20 @@ The kernel head is a kernel ridge regression on the classes' indicators (as a cl
 Its kernel is a weighted sum over two views of a window, each at its own width: the network's penultimate features,
 which know what the fault-free training learnt, and each healthy cell's mean and maximum, which no fill has touched. On
 real grasps either alone was the better one on some fault sets; their sum was about as good as the better one on all.
+A forest of randomised trees may have a say where it knows better, as on simulated grasps with a network trained little.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+
+from adaptfault.forest import Forest
 
 _WIDTH = 0.7  # of the Gaussian kernel, in units of the median squared distance
 _RIDGE = 0.05  # added to the kernel's diagonal, which is 1
@@ -83,6 +87,46 @@ class KernelHead(nn.Module):
         )
         logits: Tensor = kernel @ self.weights + self.bias
         return logits
+
+
+class Blend(nn.Module):
+    """The head of a reduced model: a kernel head, or its probabilities averaged with those of a forest.
+
+    Args:
+        kernel: weighs both views.
+        forest: votes on the second view, the healthy cells; None does without.
+        share: of the kernel head in the probabilities.
+        scale: of the forest's logits.
+    """
+
+    def __init__(
+        self, kernel: KernelHead, forest: Forest | None = None, share: float = 1.0, scale: float = 1.0
+    ) -> None:
+        super().__init__()
+        self.kernel, self.forest, self.share, self.scale = kernel, forest, share, scale
+
+    @classmethod
+    def empty(cls, about: Mapping[str, Any], n_classes: int) -> Blend:
+        """Build a head to load a state into, from :attr:`about`."""
+        forest = None if about["forest"] is None else Forest.empty(about["forest"])
+        return cls(KernelHead.empty(about["kernel"], n_classes), forest, about["share"], about["scale"])
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What :meth:`empty` needs; JSON-safe."""
+        forest = None if self.forest is None else self.forest.about
+        return {"kernel": self.kernel.shapes, "forest": forest, "share": self.share, "scale": self.scale}
+
+    def forward(self, views: Sequence[Tensor]) -> Tensor:
+        """Map views of N windows, each ``[N, p]``, to logits ``[N, n_classes]``."""
+        logits: Tensor = self.kernel(views)
+        return logits if self.forest is None else blend(logits, self.scale * self.forest(views[1]), self.share)
+
+
+def blend(one: Tensor, other: Tensor, share: float) -> Tensor:
+    """Return the logarithms of two logits' probabilities averaged, ``share`` of them ``one``'s."""
+    mixed = share * torch.softmax(one, 1) + (1 - share) * torch.softmax(other, 1)
+    return mixed.clamp_min(torch.finfo(mixed.dtype).tiny).log()
 
 
 class KernelFit:

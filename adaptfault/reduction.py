@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.heads import KernelHead, summarise
+from adaptfault.heads import Blend, summarise
 from adaptfault.network import TactileTransformer
 from adaptfault.windows import Windows
 from diagnostics import FaultSet
@@ -39,7 +39,7 @@ class ReducedModel(nn.Module):
         network: TactileTransformer,
         fault_set: FaultSet,
         front: nn.Module | None,
-        head: KernelHead | None = None,
+        head: Blend | None = None,
     ) -> None:
         super().__init__()
         self.network, self.fault_set, self.head = network, fault_set, head

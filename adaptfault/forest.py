@@ -1,0 +1,82 @@
+"""A forest of randomised trees as a torch module: on some arrays a classic classifier knows the healthy cells best."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+_TREES = 100
+
+
+class Forest(nn.Module):
+    """Extremely randomised trees (Geurts, Ernst and Wehenkel 2006), grown by scikit-learn, run by torch.
+
+    Args:
+        nodes: int64 ``[trees, nodes, 3]``: feature, and where to go if it is at most the threshold, or above. A leaf
+            goes to itself, and its feature is its class.
+        thresholds: float32 ``[trees, nodes]``; infinite at a leaf.
+        depth: of the deepest tree.
+        n_classes: number of logits.
+    """
+
+    nodes: Tensor
+    thresholds: Tensor
+
+    def __init__(self, nodes: Tensor, thresholds: Tensor, depth: int, n_classes: int) -> None:
+        super().__init__()
+        self.depth, self.n_classes = depth, n_classes
+        self.register_buffer("nodes", nodes.to(torch.int32))
+        self.register_buffer("thresholds", thresholds)
+
+    @classmethod
+    def fit(cls, x: Tensor, y: NDArray[np.int64], n_classes: int, *, seed: int = 0) -> Forest:
+        """Grow trees on ``x [M, p]`` and classes ``y [M]``."""
+        from sklearn.ensemble import ExtraTreesClassifier
+
+        grown = ExtraTreesClassifier(_TREES, random_state=seed).fit(x.numpy(), y)
+        trees = [estimator.tree_ for estimator in grown.estimators_]
+        most = max(tree.node_count for tree in trees)
+        nodes, thresholds = np.zeros((_TREES, most, 3), np.int64), np.full((_TREES, most), np.inf, np.float32)
+        for i, tree in enumerate(trees):
+            n, leaf = tree.node_count, tree.children_left < 0
+            itself, classes = np.arange(n), grown.classes_[tree.value[:, 0].argmax(axis=1)]
+            nodes[i, :n, 0] = np.where(leaf, classes, tree.feature)
+            nodes[i, :n, 1] = np.where(leaf, itself, tree.children_left)
+            nodes[i, :n, 2] = np.where(leaf, itself, tree.children_right)
+            thresholds[i, :n] = np.where(leaf, np.inf, _as_float32(tree.threshold))
+        depth = max(tree.max_depth for tree in trees)
+        return cls(torch.from_numpy(nodes), torch.from_numpy(thresholds), depth, n_classes)
+
+    @classmethod
+    def empty(cls, about: dict[str, Any]) -> Forest:
+        """Build a forest to load a state into, from :attr:`about`."""
+        trees, nodes = about["shape"]
+        return cls(torch.zeros(trees, nodes, 3), torch.zeros(trees, nodes), about["depth"], about["n_classes"])
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What :meth:`empty` needs; JSON-safe."""
+        return {"shape": list(self.thresholds.shape), "depth": self.depth, "n_classes": self.n_classes}
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map ``[N, p]`` to logits ``[N, n_classes]``: logarithms of shares of the votes, one being spread evenly."""
+        trees = torch.arange(self.nodes.shape[0], device=x.device)
+        at = torch.zeros(len(x), len(trees), dtype=torch.long, device=x.device)
+        feature, below, above = self.nodes.long().unbind(-1)
+        for _ in range(self.depth):
+            threshold = self.thresholds[trees, at]
+            leaf = torch.isinf(threshold)
+            value = torch.gather(x, 1, feature[trees, at].masked_fill(leaf, 0))
+            at = torch.where(value <= threshold, below[trees, at], above[trees, at])
+        votes = nn.functional.one_hot(feature[trees, at], self.n_classes).sum(1)
+        return ((votes + 1 / self.n_classes) / (len(trees) + 1)).log()
+
+
+def _as_float32(threshold: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the largest float32 that is not above each threshold, which decides as the double does."""
+    single = threshold.astype(np.float32)
+    return np.where(single > threshold, np.nextafter(single, np.float32(-np.inf)), single)

@@ -9,7 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from adaptfault.adaptation import Adaptation, Adapter
+    from adaptfault.adaptation import Adaptation
+    from adaptfault.adapter import Adapter
     from adaptfault.calibration import Calibration
     from adaptfault.evaluation import Scores, evaluate
     from adaptfault.forecast import Forecast
@@ -51,7 +52,7 @@ __all__ = [
 
 _HOMES = {
     "Adaptation": "adaptation",
-    "Adapter": "adaptation",
+    "Adapter": "adapter",
     "Calibration": "calibration",
     "Forecast": "forecast",
     "History": "history",

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.adaptation import Adaptation, Adapter
+from adaptfault.adaptation import Adaptation
+from adaptfault.adapter import Adapter
 from adaptfault.evaluation import Scores, accuracy_interval
 from adaptfault.history import History
 from adaptfault.network import TactileTransformer

@@ -22,6 +22,8 @@ from adaptfault.forest import Forest
 _WIDTH = 0.7  # of the Gaussian kernel, in units of the median squared distance
 _RIDGE = 0.05  # added to the kernel's diagonal, which is 1
 _LINEAR_C = 0.3  # inverse strength of the linear head's ridge penalty
+_VIEW_SHARES = ((0.5, 0.5), (1.0, 0.0), (0.0, 1.0))  # of features and healthy cells in the kernel
+_KERNEL_SHARES = (1.0, 0.67, 0.5, 0.33, 0.0)  # of the kernel head beside the forest
 _NO_CLASS = -1e4  # logit of a class without training windows
 MOST_WINDOWS = 5_000  # a kernel head's cost grows with their cube
 
@@ -182,6 +184,48 @@ class KernelFit:
         logits = torch.from_numpy(held_out.astype(np.float32)).masked_fill(lacking, _NO_CLASS)
         weights_ = torch.from_numpy(weights.astype(np.float32)).masked_fill(lacking, 0.0)
         return KernelHead(self.views, self.widths, shares, weights_, bias), logits
+
+
+def fit_head(
+    training: Sequence[Tensor],
+    held: Sequence[Tensor],
+    training_targets: NDArray[np.float32],
+    held_targets: NDArray[np.float32],
+    folds: NDArray[np.int64],
+) -> tuple[Blend, Tensor]:
+    """Fit a head on all windows; what it is made of is chosen on those that are held out in turn.
+
+    Of the choices, the one with the lowest cross entropy is taken: it is steadier than the accuracy.
+
+    Args:
+        training, held: both views of windows, each ``[M, p]`` and ``[n, p]``.
+        training_targets, held_targets: ``[M, n_classes]`` and ``[n, n_classes]``.
+        folds: int ``[n]``; the windows of a fold are held out together.
+
+    Returns:
+        The head, and the logits ``[n, n_classes]`` of the held windows, each by a head that did not learn from it.
+    """
+    both = [torch.cat(pair) for pair in zip(training, held, strict=True)]
+    classes, y = training_targets.argmax(axis=1), held_targets.argmax(axis=1)
+    fit = KernelFit(both, np.concatenate([training_targets, held_targets]), folds)
+    fitted = [fit.fit(shares) for shares in _VIEW_SHARES]
+    scales = [calibrate(logits, y) for _, logits in fitted]
+    best = int(np.argmin([loss for _, loss in scales]))
+    kernel, logits = fitted[best][0].scaled(scales[best][0]), scales[best][0] * fitted[best][1]
+
+    n_classes = logits.shape[1]
+    voted = torch.empty_like(logits)
+    for half in (0, 1):  # held out in turn
+        known, out = folds % 2 != half, folds % 2 == half
+        grown = Forest.fit(torch.cat([training[1], held[1][known]]), np.concatenate([classes, y[known]]), n_classes)
+        voted[out] = grown(held[1][out])
+    scale, _ = calibrate(voted, y)
+    losses = [calibrate(blend(logits, scale * voted, share), y)[1] for share in _KERNEL_SHARES]
+    share = _KERNEL_SHARES[int(np.argmin(losses))]
+    if share == 1.0:
+        return Blend(kernel), logits
+    forest = Forest.fit(both[1], np.concatenate([classes, y]), n_classes)
+    return Blend(kernel, forest, share, scale), blend(logits, scale * voted, share)
 
 
 def calibrate(logits: Tensor, y: NDArray[np.int64]) -> tuple[float, float]:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from adaptfault.adaptation import Adapter
+from adaptfault.adapter import Adapter
 from adaptfault.fills import CellStatistics
 from adaptfault.network import TactileTransformer
 from adaptfault.store import load_tensors, save_tensors

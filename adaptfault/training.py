@@ -69,7 +69,7 @@ def train(
         evaluate_start: let the starting weights compete, so that fine-tuning never ends worse than it began.
         augment: ``(x [B, T, D], generator) -> x``, applied to each training batch, a copy that it may change.
         repairable: make a base that is easy to repair: in parts of each batch random cells, lines, blocks or a pad go
-            missing and are filled in from the rest, as :class:`~adaptfault.adaptation.Adapter` will do. Validation
+            missing and are filled in from the rest, as :class:`~adaptfault.adapter.Adapter` will do. Validation
             then looks at the windows twice, whole and repaired. Needs about twice the epochs.
         checkpoint: file written after each epoch. If it exists, training continues from it, and ends as it would have
             ended without the interruption; ``epochs``, ``patience`` and ``budget`` may differ from the earlier run's.

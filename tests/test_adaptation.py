@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from adaptfault.adaptation import Adaptation, Adapter
+from adaptfault.adaptation import Adaptation
+from adaptfault.adapter import Adapter
 from adaptfault.evaluation import evaluate
 from adaptfault.fills import AffineFill
 from adaptfault.forecast import Forecast
@@ -136,6 +137,14 @@ def test_a_class_without_training_windows_does_not_break_the_head(adapter):
     assert adapted.scores.n == len(two_validation)
     assert adapted.predict_proba(adapter.validation.x)[:, 1].max() < 1e-6
     np.testing.assert_allclose(adapted.predict_proba(adapter.validation.x).sum(axis=1), 1, atol=1e-5)
+
+
+def test_one_validation_recording_or_one_window_is_enough(adapter):
+    for few in (np.zeros(30), np.arange(1)):
+        validation = adapter.validation.select(slice(0, len(few)))
+        validation = Windows(validation.x, validation.y, few)
+        adapted = Adapter(adapter.model, adapter.train, validation).adapt(FaultSet(range(30), D), method="head")
+        assert np.isfinite(adapted.predict_proba(adapter.validation.x)).all()
 
 
 def test_adapting_to_more_faults_later_is_adapting_to_all_at_once(adapter):

@@ -69,7 +69,7 @@ def test_validation_looks_at_whole_and_at_repaired_windows():
 
 
 def test_a_repairable_base_loses_less_under_the_fill():
-    from adaptfault.adaptation import Adapter
+    from adaptfault.adapter import Adapter
     from diagnostics import FaultSet
 
     data, held_out = windows(256), windows(100)

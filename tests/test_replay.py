@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from adaptfault.adaptation import Adapter
+from adaptfault.adapter import Adapter
 from adaptfault.network import TactileTransformer
 from adaptfault.replay import LIMIT, load_adapter, save_adapter
 from adaptfault.windows import Windows

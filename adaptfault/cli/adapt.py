@@ -17,7 +17,7 @@ from adaptfault.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from adaptfault.adaptation import Adapter
+    from adaptfault.adapter import Adapter
     from diagnostics import FaultSet
 
 _EXAMPLE = """  adaptfault adapt model grasps/ --faults diagnosis.json --out adapted
@@ -88,7 +88,7 @@ def _adapter(args: argparse.Namespace) -> Adapter:
         if args.recordings:
             raise ValueError(f"{args.model} holds its own windows: leave the recordings out")
         return load_adapter(args.model)
-    from adaptfault.adaptation import Adapter
+    from adaptfault.adapter import Adapter
     from adaptfault.cli.data import open_model, parts_of
 
     model, manifest = open_model(args.model)

@@ -270,7 +270,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, help="only the first fault sets")
     args = parser.parse_args()
     if quick := args.recordings is None and args.grasps is None:
-        args.grasps, args.cases, args.forecasts = 8, args.cases or 2, args.forecasts or 2
+        args.grasps, args.cases, args.forecasts = 8, args.cases or 1, args.forecasts or 1
     args.epochs = args.epochs or (2 if quick else 20)
     args.scratch_epochs = args.scratch_epochs or args.epochs
     args.only = args.only or (["full scale", "fill", "head", "scratch", "ExtraTrees retrained"] if quick else None)

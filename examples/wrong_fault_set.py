@@ -19,12 +19,12 @@ def main() -> None:
     parser.add_argument("recordings", nargs="?")
     parser.add_argument("model", nargs="?")
     parser.add_argument("--method", default="fill", choices=("fill", "head"))
-    parser.add_argument("--draws", type=int, default=3)
+    parser.add_argument("--draws", type=int, default=2)
     parser.add_argument("--wrong", type=int, default=5, help="cells that are wrong at once")
     parser.add_argument("--seed", type=int, default=0, help="of the split, as the model was trained on, and the draws")
     args = parser.parse_args()
 
-    recordings = af.load([args.recordings]).recordings if args.recordings else af.simulate(n_per_class=16)
+    recordings = af.load([args.recordings]).recordings if args.recordings else af.simulate(n_per_class=8)
     layout = recordings.layout
     train, validation, test = af.split(af.make_windows(recordings.frames, recordings.labels, layout), seed=args.seed)
     if args.model:

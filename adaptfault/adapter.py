@@ -23,7 +23,7 @@ from adaptfault.history import History
 from adaptfault.network import TactileTransformer, as_tensor, logits_of
 from adaptfault.reduction import ReducedModel, reduce_windows
 from adaptfault.training import train
-from adaptfault.windows import Windows
+from adaptfault.windows import Windows, evenly
 from diagnostics import FaultSet
 
 Method = Literal["auto", "fill", "head", "finetune", "scratch"]
@@ -57,7 +57,7 @@ class Adapter:
         self.model = model
         self.train, self.targets = _labelled(model, train)
         most = MOST_WINDOWS // 2  # tell accuracies well enough apart
-        self.validation, self.validation_targets = _labelled(model, validation.select(_even(len(validation), most)))
+        self.validation, self.validation_targets = _labelled(model, validation.select(evenly(len(validation), most)))
 
     @cached_property
     def statistics(self) -> CellStatistics:
@@ -152,6 +152,7 @@ class _Run:
         self.reduced = ReducedModel(copy.deepcopy(adapter.model), fault_set, front).eval()
 
     def go(self, method: Method) -> Adaptation:
+        """Run the stages of a method."""
         if not len(self.fault_set) and method != "scratch":
             return self.done()  # nothing to repair: the fault-free model, bit for bit
         match method:
@@ -266,7 +267,7 @@ class _Run:
         adapter = self.adapter
         if self._too_long(reduced, len(self.training) + len(self.validation)):
             return None
-        learnt = _even(len(self.training), MOST_WINDOWS - len(self.validation))
+        learnt = evenly(len(self.training), MOST_WINDOWS - len(self.validation))
         training = self.training.select(learnt)
         first, second = (self._views(reduced, windows) for windows in (training, self.validation))
         folds = np.unique(self.validation.recording, return_inverse=True)[1] % _FOLDS
@@ -321,8 +322,3 @@ def _labelled(model: TactileTransformer, windows: Windows) -> tuple[Windows, NDA
     if unknown.any():
         targets[unknown] = model.predict_proba(windows.x[unknown])
     return replace(windows, y=np.where(unknown, targets.argmax(1), windows.y)), targets
-
-
-def _even(n: int, most: int) -> NDArray[np.intp]:
-    """Return at most so many of n indices, evenly."""
-    return np.linspace(0, n - 1, min(n, most)).astype(np.intp)

@@ -15,7 +15,6 @@ class Clock:
         self.began, self.budget, self.spent = time.perf_counter(), math.inf if budget is None else budget, 0.0
         self.pace = 0.0  # seconds that training takes a window
         self.close = 0.0  # seconds that the last validation and checkpoint took
-        self.whole = 1  # windows of an epoch
         self.over = False  # an epoch was cut short
 
     @contextmanager

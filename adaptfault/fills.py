@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.windows import Windows
+from adaptfault.windows import Windows, evenly
 from diagnostics import FaultSet
 
 _MOST_FRAMES = 20_000  # a covariance needs no more; frames are thinned evenly
@@ -43,14 +43,16 @@ class CellStatistics:
         """Estimate from the frames of fault-free windows."""
         from sklearn.covariance import LedoitWolf
 
-        frames = _thin(windows.x.reshape(-1, windows.x.shape[2]), _MOST_FRAMES)
+        frames = windows.x.reshape(-1, windows.x.shape[2])
+        frames = frames[evenly(len(frames), _MOST_FRAMES)]
         estimate = LedoitWolf().fit(frames.astype(np.float64))
         return cls(estimate.location_, estimate.covariance_, cls.reference(windows))
 
     @staticmethod
     def reference(windows: Windows) -> NDArray[np.float32]:
         """Return the frames ``[M, D]`` that the nearest fill compares with."""
-        return _thin(windows.x.reshape(-1, windows.x.shape[2]), _REFERENCE_FRAMES)
+        frames = windows.x.reshape(-1, windows.x.shape[2])
+        return frames[evenly(len(frames), _REFERENCE_FRAMES)]
 
     def linear(self, fault_set: FaultSet) -> AffineFill:
         """Return the linear fill for F."""
@@ -150,17 +152,11 @@ class NearestFill(nn.Module):
         return self.linear.merge(x, self.linear.missing(x) + weights @ self.residuals)
 
 
-def _thin(frames: NDArray[Any], most: int) -> NDArray[Any]:
-    """Return at most so many frames, evenly chosen."""
-    thin: NDArray[Any] = frames[np.linspace(0, len(frames) - 1, min(len(frames), most)).astype(int)]
-    return thin
-
-
 def _near_distance(roots: NDArray[np.float32]) -> float:
     """Return the squared distance of a near neighbour, the typical one among frames ``[M, R]``; never 0."""
     from sklearn.metrics.pairwise import euclidean_distances
 
-    distance = euclidean_distances(_thin(roots, _PROBES), roots, squared=True)
+    distance = euclidean_distances(roots[evenly(len(roots), _PROBES)], roots, squared=True)
     rank = min(1 + round(_NEAR * len(roots)), len(roots) - 1)  # the nearest is the frame itself
     near = np.partition(distance, rank, axis=1)[:, rank]
     return float(np.median(near[near > 0])) if (near > 0).any() else 1.0

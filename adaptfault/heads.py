@@ -71,21 +71,24 @@ class KernelHead(nn.Module):
         return cls([torch.zeros(*s) for s in shapes], none, none, torch.zeros(n, n_classes), torch.zeros(n_classes))
 
     @property
+    def known(self) -> list[Tensor]:
+        """The views of the windows it was fitted on."""
+        return [self.get_buffer(f"known{i}") for i in range(len(self.shares))]
+
+    @property
     def shapes(self) -> list[list[int]]:
         """What :meth:`empty` needs."""
-        return [list(self.get_buffer(f"known{i}").shape) for i in range(len(self.shares))]
+        return [list(view.shape) for view in self.known]
 
     def scaled(self, scale: float) -> KernelHead:
         """Return the head with its logits multiplied; classes that it never answers stay so."""
-        known = [self.get_buffer(f"known{i}") for i in range(len(self.shares))]
-        return KernelHead(known, self.widths.tolist(), self.shares.tolist(), self.weights * scale, self.bias)
+        return KernelHead(self.known, self.widths.tolist(), self.shares.tolist(), self.weights * scale, self.bias)
 
     def forward(self, views: Sequence[Tensor]) -> Tensor:
         """Map views of N windows, each ``[N, p]``, to logits ``[N, n_classes]``."""
-        known = (self.get_buffer(f"known{i}") for i in range(len(views)))
         kernel = sum(
             share * torch.exp(-_squared_distance(view, other) / width)
-            for view, other, width, share in zip(views, known, self.widths, self.shares, strict=True)
+            for view, other, width, share in zip(views, self.known, self.widths, self.shares, strict=True)
         )
         logits: Tensor = kernel @ self.weights + self.bias
         return logits

@@ -15,7 +15,7 @@ from adaptfault.adapter import Adapter
 from adaptfault.fills import CellStatistics
 from adaptfault.network import TactileTransformer
 from adaptfault.store import load_tensors, save_tensors
-from adaptfault.windows import Windows
+from adaptfault.windows import Windows, evenly
 
 SCHEMA = "adaptfault.adapter/1"
 LIMIT = 20_000_000  # bytes: what the paper's layout must fit into
@@ -98,7 +98,7 @@ def _pack_thinned(windows: Windows, targets: NDArray[Any], room: int) -> tuple[d
     """Pack windows, as many as fit, and say how they are packed."""
     keep = len(windows)
     while True:
-        which = np.linspace(0, len(windows) - 1, keep).astype(int)
+        which = evenly(len(windows), keep)
         packed, told = _pack(windows.select(which), targets[which])
         if (size := _bytes(packed)) <= room or keep == 1:
             return packed, {**told, "of": len(windows)}

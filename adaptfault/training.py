@@ -107,7 +107,6 @@ def train(
         }
         run.resume()
         clock.spent = sum(run.history.seconds)
-    clock.whole = len(train)
     inputs, labels, device = as_tensor(train.x), as_tensor(train.y), next(model.parameters()).device
     hide = None if progress is None else not progress
     try:
@@ -119,7 +118,7 @@ def train(
             with clock.closing(len(sample) / len(validation)):
                 _validate(model, sample)
         with tqdm(total=epochs, initial=run.history.epochs, unit="epoch", disable=hide) as bar:
-            while (stopped := _stop(run.history, epochs, patience, clock)) is None:
+            while (stopped := _stop(run.history, epochs, patience, clock, len(labels))) is None:
                 began = time.perf_counter()
                 model.train()
                 with _seeded(seed, run.history.epochs, device) as generator:
@@ -280,15 +279,15 @@ def _validate(model: nn.Module, windows: Windows) -> tuple[float, float]:
     return loss, (logits.argmax(1) == labels).double().mean().item()
 
 
-def _stop(history: History, epochs: int, patience: int | None, clock: Clock) -> Stopped | None:
-    """Say why the run is over; None while it is not."""
+def _stop(history: History, epochs: int, patience: int | None, clock: Clock, whole: int) -> Stopped | None:
+    """Say why the run is over; None while it is not. After the first epoch, a whole one has to fit."""
     if clock.over:
         return "budget"
     if patience is not None and history.epochs - history.best_epoch >= patience:
         return "patience"
     if history.epochs >= epochs:
         return "epochs"
-    return "budget" if clock.late(clock.whole if history.epochs else 1) else None
+    return "budget" if clock.late(whole if history.epochs else 1) else None
 
 
 @contextmanager

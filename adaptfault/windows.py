@@ -56,6 +56,11 @@ class Windows:
         return Windows(self.x[which], self.y[which], self.recording[which])
 
 
+def evenly(n: int, most: int) -> NDArray[np.intp]:
+    """Return at most ``most`` of the indices 0 to n - 1, the first and the last among them where there are two."""
+    return np.linspace(0, n - 1, min(n, most)).astype(np.intp)
+
+
 def scale(frames: ArrayLike, layout: SensorLayout) -> NDArray[np.float32]:
     """Convert readings from the layout's unit to 0..1: the one place that does.
 

@@ -90,6 +90,12 @@ class Tile:
     spread: NDArray[np.float64]
     surest: float
 
+    def __post_init__(self) -> None:
+        # Matrix products round differently in another memory order: a stored and restored one must say the same.
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, name, np.ascontiguousarray(value))
+
     @classmethod
     def fit(cls, features: Array, inputs: NDArray[np.intp], outputs: NDArray[np.intp], surest: float) -> Tile:
         """Fit on ``[n, 4, D]``; no probability is taken for nearer to 0 or 1 than ``surest``."""

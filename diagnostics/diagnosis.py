@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,10 +13,13 @@ from diagnostics.causes import Findings, root_causes
 from diagnostics.layout import SensorLayout
 from diagnostics.memory import Memory, finished
 from diagnostics.reference import Reference
+from diagnostics.stored import Arrays, reference_from_state, reference_state, weights_from_state, weights_state
 from diagnostics.verdicts import Diagnosis
 from diagnostics.weighing import Weights, faulty_at, kinds
 
 Recording = NDArray[np.float64]
+
+SCHEMA = "adaptfault.diagnoser/1"
 
 _SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
 _OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is faulty: four touches
@@ -66,6 +69,40 @@ class SelfDiagnosis:
         for recording in log:
             memory.extend(recording)
         return finished(self.judge(memory, n_recordings=len(log)))
+
+    def state(self) -> tuple[dict[str, Any], Arrays]:
+        """Return all that it knows: a JSON-safe dict, and arrays by name, as :meth:`from_state` reads them."""
+        about = {
+            "schema": SCHEMA,
+            "layout": self.layout.to_dict(),
+            "false_discovery_rate": self.false_discovery_rate,
+            "weights": weights_state(self.weights_),
+        }
+        if self.reference_ is None:
+            return {**about, "reference": None}, {}
+        reference, arrays = reference_state(self.reference_)
+        return {**about, "reference": reference}, arrays
+
+    @classmethod
+    def from_state(cls, about: Mapping[str, Any], arrays: Mapping[str, ArrayLike]) -> SelfDiagnosis:
+        """Rebuild from :meth:`state` one that says the same of every log, to the last bit.
+
+        Raises:
+            ValueError: another schema; a field or an array is missing, or of a wrong kind or shape.
+        """
+        if about.get("schema") != SCHEMA:
+            raise ValueError(f"expected schema {SCHEMA!r}, got {about.get('schema')!r}")
+        try:
+            layout = SensorLayout.from_dict(about["layout"])
+            diagnoser = cls(layout, false_discovery_rate=float(about["false_discovery_rate"]))
+            diagnoser.weights_ = weights_from_state(about["weights"])
+            if about["reference"] is not None:
+                diagnoser.reference_ = reference_from_state(about["reference"], arrays, layout)
+        except KeyError as error:
+            raise ValueError(f"the stored diagnosis is damaged: {error} is missing") from None
+        except (TypeError, ValueError, AttributeError) as error:
+            raise ValueError(f"the stored diagnosis is damaged: {error}") from None
+        return diagnoser
 
     def memory(self) -> Memory:
         """Return an empty memory, to be fed with a log and judged."""

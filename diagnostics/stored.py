@@ -1,0 +1,132 @@
+"""What a fitted diagnosis knows, as JSON and plain arrays, and back, checked: no pickle, and not a bit lost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diagnostics.contact import ContactModel, Tile
+from diagnostics.layout import SensorLayout
+from diagnostics.reference import Reference
+from diagnostics.temporal import Onsets
+from diagnostics.touches import Scale
+from diagnostics.unrest import Usual
+from diagnostics.weighing import Weights
+
+Arrays = dict[str, NDArray[Any]]
+
+_TOLD = ("surest", "place")  # fields of a tile that are not stored as arrays: in the dict, or following from others
+_ENDLESS = ("scale",)  # arrays that may hold infinity: a feature that never changed is divided by it
+
+
+def weights_state(weights: Weights) -> dict[str, Any]:
+    """Return the weights, JSON-safe, as :func:`weights_from_state` reads them."""
+    return {name: list(values) for name, values in vars(weights).items()}
+
+
+def weights_from_state(about: Mapping[str, Any]) -> Weights:
+    """Rebuild the weights.
+
+    Raises:
+        KeyError, TypeError, ValueError: a field is missing or of a wrong kind.
+    """
+    usual = vars(Weights())
+    read = {name: tuple(float(value) for value in about[name]) for name in usual}
+    for name, values in read.items():
+        if len(values) != len(usual[name]) or not np.isfinite(values).all():
+            raise ValueError(f"expected {len(usual[name])} numbers for {name}, got {list(values)}")
+    return Weights(**read)
+
+
+def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
+    """Return a reference as a JSON-safe dict and its arrays by name, as :func:`reference_from_state` reads them."""
+    about = {
+        "tolerance": float(reference.tolerance),
+        "near": float(reference.scale.near),
+        "patience": int(reference.patience),
+        "blinks": float(reference.usual.blinks),
+        "twins": int(reference.twins),
+        "surest": None if reference.model is None else [float(tile.surest) for tile in reference.model.tiles],
+    }
+    arrays: Arrays = {
+        "resting": reference.scale.resting,
+        "onsets": reference.onsets.log_ratio,
+        "noise": reference.usual.noise,
+    }
+    for i, tile in enumerate(reference.model.tiles if reference.model else ()):
+        arrays |= {f"tile{i}.{name}": value for name, value in vars(tile).items() if name not in _TOLD}
+    return about, {name: np.array(value, order="C") for name, value in arrays.items()}
+
+
+def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLike], layout: SensorLayout) -> Reference:
+    """Rebuild a reference.
+
+    Raises:
+        KeyError, TypeError, ValueError: a field or array is missing, of a wrong kind or shape, or not finite.
+    """
+    unknown = Reference.unknown(layout)
+
+    def read(name: str, like: NDArray[Any]) -> NDArray[Any]:
+        return _checked(name, arrays[name], like.shape, like.dtype)
+
+    tiles = None
+    if about["surest"] is not None:
+        tiles = tuple(_tile(arrays, i, float(surest), layout) for i, surest in enumerate(about["surest"]))
+        outputs = np.sort(np.concatenate([tile.outputs for tile in tiles])) if tiles else np.zeros(0)
+        if not np.array_equal(outputs, np.flatnonzero(layout.present)):
+            raise ValueError(f"the models do not cover the cells of {layout}, each once")
+    scale = Scale(read("resting", unknown.scale.resting), float(about["near"]), layout.full_scale)
+    reference = Reference(
+        float(about["tolerance"]),
+        scale,
+        Onsets(read("onsets", unknown.onsets.log_ratio)),
+        int(about["patience"]),
+        Usual(float(about["blinks"]), read("noise", unknown.usual.noise)),
+        int(about["twins"]),
+        None if tiles is None else ContactModel(tiles),
+    )
+    positive = (reference.tolerance, scale.near, reference.patience, reference.usual.blinks)
+    if not (np.isfinite(positive).all() and min(positive) > 0):
+        raise ValueError(f"expected positive numbers for tolerance, near, patience and blinks, got {positive}")
+    return reference
+
+
+def _tile(arrays: Mapping[str, ArrayLike], i: int, surest: float, layout: SensorLayout) -> Tile:
+    if not 0 < surest < 1:
+        raise ValueError(f"expected surest between 0 and 1, got {surest}")
+    inputs, outputs = (_cells(f"tile{i}.{name}", arrays, layout) for name in ("inputs", "outputs"))
+    n_in, n_out = len(inputs), len(outputs)
+    if not np.isin(outputs, inputs).all():
+        raise ValueError(f"tile{i}.outputs holds cells that tile{i}.inputs lacks")
+    single, double = np.dtype(np.float32), np.dtype(np.float64)
+    shapes: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {
+        "mean": ((4, n_in), single),
+        "scale": ((4, n_in), single),
+        "weight": ((4 * n_in, 2 * n_out), single),
+        "bias": ((2 * n_out,), single),
+        "covariance": ((n_in, n_in), double),
+        "precision": ((n_in, n_in), double),
+        "spread": ((n_out,), double),
+    }
+    read = {name: _checked(f"tile{i}.{name}", arrays[f"tile{i}.{name}"], *like) for name, like in shapes.items()}
+    return Tile(inputs, outputs, np.searchsorted(inputs, outputs), **read, surest=surest)
+
+
+def _cells(name: str, arrays: Mapping[str, ArrayLike], layout: SensorLayout) -> NDArray[np.intp]:
+    cells = np.asarray(arrays[name])
+    if cells.dtype.kind != "i" or not np.array_equal(cells, np.unique(np.clip(cells, 0, layout.n_cells - 1))):
+        raise ValueError(f"expected indices of the {layout.n_cells} cells for {name}, ascending")
+    return cells.astype(np.intp)
+
+
+def _checked(name: str, value: ArrayLike, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return a copy of its own, as the fitted arrays are."""
+    array = np.asarray(value)
+    if array.shape != shape or array.dtype != dtype:
+        raise ValueError(f"expected {dtype} {list(shape)} for {name}, got {array.dtype} {list(array.shape)}")
+    if np.isnan(array).any() or (not name.endswith(_ENDLESS) and not np.isfinite(array).all()):
+        raise ValueError(f"{name} holds numbers that are not finite")
+    return np.array(array, order="C")

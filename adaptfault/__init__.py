@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from adaptfault.recordings import Recordings, load, save_npz
     from adaptfault.reduction import ReducedModel
     from adaptfault.replay import load_adapter, save_adapter
+    from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.maintenance import MaintenanceReport, maintain
     from adaptfault.store import load_model, save_model
     from adaptfault.training import train
     from adaptfault.windows import Windows, make_windows, split
@@ -29,9 +31,11 @@ __version__ = "0.1.0"
 __all__ = [
     "Adaptation",
     "Adapter",
+    "Bundle",
     "Calibration",
     "Forecast",
     "History",
+    "MaintenanceReport",
     "Recordings",
     "ReducedModel",
     "Scores",
@@ -41,6 +45,7 @@ __all__ = [
     "load",
     "load_adapter",
     "load_model",
+    "maintain",
     "make_windows",
     "save_adapter",
     "save_model",
@@ -53,9 +58,11 @@ __all__ = [
 _HOMES = {
     "Adaptation": "adaptation",
     "Adapter": "adapter",
+    "Bundle": "robot.bundle",
     "Calibration": "calibration",
     "Forecast": "forecast",
     "History": "history",
+    "MaintenanceReport": "robot.maintenance",
     "Recordings": "recordings",
     "ReducedModel": "reduction",
     "Scores": "evaluation",
@@ -65,6 +72,7 @@ _HOMES = {
     "load": "recordings",
     "load_adapter": "replay",
     "load_model": "store",
+    "maintain": "robot.maintenance",
     "make_windows": "windows",
     "save_adapter": "replay",
     "save_model": "store",

@@ -18,6 +18,7 @@ from adaptfault.store import load_tensors, save_tensors
 from adaptfault.windows import Windows, evenly
 
 SCHEMA = "adaptfault.adapter/1"
+WINDOWS_SCHEMA = "adaptfault.windows/1"
 LIMIT = 20_000_000  # bytes: what the paper's layout must fit into
 
 _SHARE = 0.5  # of the limit is the most that windows take if the weights then still fit
@@ -62,6 +63,21 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int = LIMIT) -> N
             " raise limit"
         )
     save_tensors(path, SCHEMA, about, {**tensors, **{f"model.{k}": v for k, v in weights.items()}})
+
+
+def save_windows(path: str | Path, windows: Windows, *, limit: int = LIMIT // 4) -> None:
+    """Write windows into a folder as :func:`save_adapter` does, thinned evenly to ``limit`` bytes."""
+    packed, told = _pack_thinned(windows, np.zeros((len(windows), 0), np.float32), limit)
+    save_tensors(path, WINDOWS_SCHEMA, {"windows": told}, {f"windows.{key}": value for key, value in packed.items()})
+
+
+def load_windows(path: str | Path) -> Windows:
+    """Read what :func:`save_windows` wrote; raises what :func:`load_adapter` raises."""
+    about, tensors = load_tensors(path, WINDOWS_SCHEMA)
+    try:
+        return _unpack(about["windows"], tensors, "windows")
+    except (KeyError, TypeError, ValueError, zlib.error) as error:
+        raise ValueError(f"the windows in {path} are damaged: {str(error).splitlines()[0]}") from None
 
 
 def load_adapter(path: str | Path) -> Adapter:

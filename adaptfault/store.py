@@ -8,9 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from adaptfault.atomic import atomic_write
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
     from torch import Tensor
 
     from adaptfault.network import TactileTransformer
@@ -31,7 +34,21 @@ def save_tensors(folder: str | Path, schema: str, about: Mapping[str, Any], tens
     from safetensors.torch import save
 
     # Copies: safetensors refuses tensors that share memory or are not contiguous.
-    data = save({name: tensor.detach().cpu().clone().contiguous() for name, tensor in tensors.items()})
+    _save(folder, schema, about, save({k: tensor.detach().cpu().clone().contiguous() for k, tensor in tensors.items()}))
+
+
+def save_arrays(folder: str | Path, schema: str, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays as :func:`save_tensors` writes tensors. Needs no torch.
+
+    Raises:
+        ValueError: ``about`` does not fit into JSON.
+    """
+    from safetensors.numpy import save
+
+    _save(folder, schema, about, save({name: np.ascontiguousarray(array) for name, array in arrays.items()}))
+
+
+def _save(folder: str | Path, schema: str, about: Mapping[str, Any], data: bytes) -> None:
     digest = hashlib.sha256(data).hexdigest()
     name = f"weights-{digest[:12]}.safetensors"
     manifest = {"schema": schema, **about, "weights": {"file": name, "sha256": digest}}
@@ -92,7 +109,19 @@ def load_tensors(folder: str | Path, schema: str) -> tuple[dict[str, Any], dict[
     """
     from safetensors.torch import load
 
-    folder = Path(folder)
+    manifest, data = _load(Path(folder), schema)
+    return manifest, load(data)
+
+
+def load_arrays(folder: str | Path, schema: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Read what :func:`save_arrays` wrote; raises what :func:`load_tensors` raises. Needs no torch."""
+    from safetensors.numpy import load
+
+    manifest, data = _load(Path(folder), schema)
+    return manifest, load(data)
+
+
+def _load(folder: Path, schema: str) -> tuple[dict[str, Any], bytes]:
     manifest = read_manifest(folder, schema)
     try:
         name, digest = manifest["weights"]["file"], manifest["weights"]["sha256"]
@@ -104,7 +133,7 @@ def load_tensors(folder: str | Path, schema: str) -> tuple[dict[str, Any], dict[
     data = path.read_bytes()
     if hashlib.sha256(data).hexdigest() != digest:
         raise ValueError(f"{path} is damaged: its hash is not the one in {MANIFEST}")
-    return manifest, load(data)
+    return manifest, data
 
 
 def save_model(

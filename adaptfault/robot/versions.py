@@ -1,0 +1,131 @@
+"""A version: one model for one fault set, in a folder written once and checked at every load. Needs no torch."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from adaptfault.robot.sealed import check_files, hash_files, read_sealed, sync, sync_tree, write_sealed
+from diagnostics import FaultSet, SensorLayout
+
+SCHEMA = "adaptfault.version/1"
+ABOUT = "version.json"
+
+_UNFINISHED = ".unfinished-"
+
+
+@dataclass(frozen=True)
+class Version:
+    """One version of what a robot runs.
+
+    Attributes:
+        number: 1 is the fault-free model.
+        folder: holds the weights, and ``model.onnx`` where it could be exported.
+        layout: the array.
+        class_names: one name a class.
+        length: frames in a window.
+        fault_set: F, the cells that it does without.
+        about: how it came about, JSON.
+    """
+
+    number: int
+    folder: Path
+    layout: SensorLayout
+    class_names: tuple[str, ...]
+    length: int
+    fault_set: FaultSet
+    about: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    def __str__(self) -> str:
+        return f"version {self.number}, without {len(self.fault_set)} of {self.layout.present.sum()} cells"
+
+    @classmethod
+    def read(cls, folder: Path) -> Version:
+        """Read a version and check each of its files.
+
+        Raises:
+            FileNotFoundError: there is none.
+            Damaged: a file is not what was written.
+        """
+        document = read_sealed(folder / ABOUT, SCHEMA)
+        check_files(folder, document["files"])
+        layout = SensorLayout.from_dict(document["layout"])
+        return cls(
+            number=document["number"],
+            folder=folder,
+            layout=layout,
+            class_names=tuple(document["class_names"]),
+            length=document["length"],
+            fault_set=FaultSet(tuple(document["fault_set"]), layout.n_cells),
+            about=document["about"],
+        )
+
+
+class Versions:
+    """The versions of a bundle, each in a folder named by its number."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __getitem__(self, number: int) -> Version:
+        """Read a version; raises FileNotFoundError or Damaged."""
+        return Version.read(self.path(number))
+
+    def path(self, number: int) -> Path:
+        """Return where a version lies."""
+        return self.folder / f"{number:04d}"
+
+    @property
+    def numbers(self) -> list[int]:
+        """All that are there, ascending; they may be damaged."""
+        return sorted(int(p.name) for p in self.folder.glob("[0-9]*") if p.name.isdecimal())
+
+    def write(
+        self,
+        fill: Callable[[Path], None],
+        *,
+        layout: SensorLayout,
+        class_names: tuple[str, ...],
+        length: int,
+        fault_set: FaultSet,
+        about: Mapping[str, Any],
+    ) -> Version:
+        """Write a version into a new folder, bring it to the disk, and only then give it its name.
+
+        Args:
+            fill: writes the model's files into the folder it is given.
+            layout, class_names, length, fault_set, about: see :class:`Version`.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.sweep()
+        number = max(self.numbers, default=0) + 1
+        new = self.folder / f"{_UNFINISHED}{number:04d}"
+        new.mkdir()
+        fill(new)
+        document = {
+            "schema": SCHEMA,
+            "number": number,
+            "layout": layout.to_dict(),
+            "class_names": list(class_names),
+            "length": length,
+            "fault_set": list(fault_set),
+            "about": dict(about),
+            "files": hash_files(new),
+        }
+        write_sealed(new / ABOUT, document)
+        sync_tree(new)
+        os.replace(new, self.path(number))
+        sync(self.folder)
+        return self[number]
+
+    def sweep(self, keep: Collection[int] | None = None) -> None:
+        """Remove what crashes left unfinished and, if ``keep`` is given, all versions but these."""
+        for unfinished in self.folder.glob(f"{_UNFINISHED}*"):
+            shutil.rmtree(unfinished)
+        if keep is not None:
+            for number in set(self.numbers) - set(keep):
+                shutil.rmtree(self.path(number))

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import platform
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adaptfault.atomic import atomic_write
+from adaptfault.page import embedded, render, version_of
 from diagnostics import FaultSet
 from diagnostics.picture import draw_forces, pads_figure
 
@@ -38,23 +35,18 @@ def write_report(path: str | Path, result: DemoResult) -> Path:
     Raises:
         OSError: the folder cannot be written.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(loader=PackageLoader("adaptfault"), autoescape=True, undefined=StrictUndefined)
-    html = environment.get_template("report.html").render(
+    return render(
+        path,
+        "report.html",
         result=result,
         layout=result.recordings.layout,
         rows=_rows(result),
         alarms=_false_alarm_texts(result),
-        forces=_embedded(_draw_maps(result)),
-        verdicts=_embedded(result.diagnosis.plot()),
-        versions=", ".join(f"{name} {_version(name)}" for name in ("adaptfault", "torch", "numpy", "scikit-learn")),
+        forces=embedded(_draw_maps(result)),
+        verdicts=embedded(result.diagnosis.plot()),
+        versions=", ".join(f"{name} {version_of(name)}" for name in ("adaptfault", "torch", "numpy", "scikit-learn")),
         python=platform.python_version(),
     )
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write(path, html.encode())
-    return path
 
 
 def _rows(result: DemoResult) -> list[_Row]:
@@ -89,16 +81,3 @@ def _draw_maps(result: DemoResult) -> Figure:
             ax.set_title(f"{name}, pad {pad}", fontsize=9)
         figure.colorbar(image, ax=row.tolist(), label=layout.unit, extend="max")
     return figure
-
-
-def _embedded(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "(not installed)"

@@ -111,17 +111,20 @@ class Tile:
         own[:, place, :, np.arange(len(outputs))] = True
         weight, bias = _logistic(z.reshape(len(z), -1), targets, own.reshape(_FEATURES * len(inputs), -1))
         estimate = LedoitWolf().fit(z[:, 1].astype(np.float64))
-        precision = estimate.precision_
+        # Cells of which none was ever touched say nothing of each other.
+        untouched = None if z[:, 1].any() else np.eye(len(inputs))
+        covariance, precision = (estimate.covariance_, estimate.precision_) if untouched is None else [untouched] * 2
         z1 = z[:, 1].astype(np.float64)
         error = (z1 @ precision / np.diag(precision))[:, place] * np.where(np.isfinite(scale[1]), scale[1], 0)[place]
         # Where nothing is loaded nothing errs: the spread is that of the loaded stretches.
         told = x[:, 2, place] > 0
         spread = np.sqrt((error**2 * told).sum(axis=0) / np.maximum(told.sum(axis=0), 1))
         usual = float(np.sqrt(np.mean(spread**2)))
-        spread = np.where(told.sum(axis=0) < _SHORTEST, 2 * usual, spread)
+        spread = np.maximum(np.where(told.sum(axis=0) < _SHORTEST, 2 * usual, spread), _LEAST_SPREAD)
+        spread[~told.any(axis=0)] = np.nan  # how a cell reads that was never loaded is unknown
         return cls(
             inputs, outputs, place, mean, scale, weight, bias,
-            estimate.covariance_, precision, np.maximum(spread, _LEAST_SPREAD), surest,
+            covariance, precision, spread, surest,
         )  # fmt: skip
 
     def expect(

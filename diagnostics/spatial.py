@@ -144,7 +144,8 @@ def stuck_evidence(
         told = (surprise > _TELLING).sum(axis=0)
         trusted = askable & (evidence + jump < _SUSPICIOUS)
         yield
-    return Spatial(evidence, brought, asked, told, _offset(features, begins, expected, present & runs.moved & fresh))
+    moving = present & runs.moved & fresh & ~np.isnan(expected.spread)
+    return Spatial(evidence, brought, asked, told, _offset(features, begins, expected, moving))
 
 
 def _believed(never: Floats, unloaded: NDArray[np.bool_], witness: NDArray[np.bool_]) -> Floats:

@@ -20,6 +20,7 @@ Arrays = dict[str, NDArray[Any]]
 
 _TOLD = ("surest", "place")  # fields of a tile that are not stored as arrays: in the dict, or following from others
 _ENDLESS = ("scale",)  # arrays that may hold infinity: a feature that never changed is divided by it
+_UNKNOWN = ("spread",)  # arrays that may hold NaN: of cells that were never loaded
 
 
 def weights_state(weights: Weights) -> dict[str, Any]:
@@ -127,6 +128,7 @@ def _checked(name: str, value: ArrayLike, shape: tuple[int, ...], dtype: np.dtyp
     array = np.asarray(value)
     if array.shape != shape or array.dtype != dtype:
         raise ValueError(f"expected {dtype} {list(shape)} for {name}, got {array.dtype} {list(array.shape)}")
-    if np.isnan(array).any() or (not name.endswith(_ENDLESS) and not np.isfinite(array).all()):
+    strange = (np.isnan(array) & (not name.endswith(_UNKNOWN))) | (np.isinf(array) & (not name.endswith(_ENDLESS)))
+    if strange.any():
         raise ValueError(f"{name} holds numbers that are not finite")
     return np.array(array, order="C")

@@ -22,6 +22,7 @@ _LONGEST_BLINK = 6  # frames
 _SHORTEST = 8  # frames of a segment in which noise can be told
 _ALIKE = 0.3  # of a load: as far as it may have moved on during a blink
 _RAREST = 2e-4  # healthy blinks in a loaded frame, at least
+_UNKNOWN_BLINKS = 2e-3  # where no reference tells
 _RESTLESS = 0.8  # of the segments of a noisy cell are noisier than healthy ones
 _NOISIER = 0.002  # of healthy segments are noisier than what is called noisy
 _LEVELS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8])  # of the mean root load: noise grows with load
@@ -63,12 +64,14 @@ class Usual:
             # Few samples do not tell what is rare: the next lower level is the least.
             limit[k] = np.quantile(values, 1 - _NOISIER) if len(values) > 1 / _NOISIER else 0.0
         limit = np.maximum.accumulate(np.maximum(limit, scale.near / scale.full_scale))
-        return cls(max(_RAREST, (blinks + 1) / (loaded + 1)), limit)
+        # With one more blink, in as many frames as an unknown array would need for it: where little was loaded, little
+        # is known.
+        return cls(max(_RAREST, (blinks + 1) / (loaded + 1 / _UNKNOWN_BLINKS)), limit)
 
     @classmethod
     def unknown(cls, scale: Scale) -> Usual:
         """Stand in for a reference: rather calm, so that only gross unrest counts."""
-        return cls(10 * _RAREST, np.full(len(_LEVELS), 0.05))
+        return cls(_UNKNOWN_BLINKS, np.full(len(_LEVELS), 0.05))
 
 
 @dataclass(frozen=True)

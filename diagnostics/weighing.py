@@ -78,7 +78,7 @@ class Weights:
         found = []
         for k in range(_KINDS):
             of, alike = kind == k, (kind > 0) == (k > 0)
-            if not 0 < dead[of].mean() < 1:
+            if not (dead[of].any() and (~dead[of]).any()):
                 return cls()
             model = LogisticRegression(C=10.0).fit(evidence[of], dead[of])
             slope, of_jump = model.coef_[0].tolist()

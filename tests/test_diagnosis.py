@@ -307,6 +307,15 @@ def test_without_a_reference_shorts_and_opens_in_the_contact_are_still_found(log
     assert len(SelfDiagnosis(LAYOUT).diagnose(log).faults) == 0
 
 
+def test_a_reference_that_touched_nothing_or_one_corner_only_is_no_evidence_of_faults(log):
+    for reference in ([np.zeros((50, 220))] * 3, [np.where(np.arange(220) < 6, r, 0.0) for r in log]):
+        fitted = SelfDiagnosis(LAYOUT).fit(reference)
+        assert fitted.diagnose(reference).fault_set == set()
+        diagnosis = fitted.diagnose(log)
+        assert len(diagnosis.fault_set) <= 0.05 * 220
+        assert np.isfinite(diagnosis.probability).all()
+
+
 def test_masked_positions_are_never_judged():
     present = np.ones((2, 6, 5), bool)
     present[:, 0] = False

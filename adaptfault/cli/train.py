@@ -1,21 +1,30 @@
-"""adaptfault train: recordings in, a model folder out."""
+"""adaptfault train: recordings in; a model folder, or the bundle that a robot carries, out."""
 
 from __future__ import annotations
 
 import argparse
+import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from adaptfault.cli.options import Commands, add_recordings, command, emit, load_recordings, progress, say
 
+if TYPE_CHECKING:
+    from adaptfault.network import TactileTransformer
+    from adaptfault.recordings import Recordings
+    from adaptfault.windows import Windows
+
 _EXAMPLE = """  adaptfault train grasps/ --out model --epochs 20
-      grasps/<class>/<recording>.csv; run it again after a crash and it goes on where it was"""
+      grasps/<class>/<recording>.csv; run it again after a crash and it goes on where it was
+  adaptfault train grasps/ --out robot.bundle
+      the folder that a robot carries: for adaptfault maintain and listen"""
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "train", "train the paper's network on fault-free recordings", _EXAMPLE)
     add_recordings(parser)
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="where the model goes")
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="where the model goes; X.bundle: a bundle")
     parser.add_argument("--epochs", type=int, default=50, help="at most so many (default 50)")
     parser.add_argument("--seed", type=int, default=0, help="of split, weights and training (default 0)")
     parser.add_argument("--length", type=int, default=10, help="frames in a window (default 10)")
@@ -42,8 +51,12 @@ def run(args: argparse.Namespace) -> int:
     say(args, f"{recordings.layout}; {windows}")
     model = TactileTransformer(recordings.layout, len(recordings.class_names), length=args.length, seed=args.seed)
     out = Path(args.out)
-    out.mkdir(parents=True, exist_ok=True)
-    checkpoint = out / "training.safetensors"
+    bundled = out.suffix == ".bundle"
+    if bundled and out.exists():
+        raise ValueError(f"{out} exists: choose another name, or remove it")
+    folder = out.with_name(f".{out.name}.training") if bundled else out
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoint = folder / "training.safetensors"
     if checkpoint.exists():
         say(args, f"continuing from {checkpoint}")
     history = train(
@@ -58,11 +71,45 @@ def run(args: argparse.Namespace) -> int:
     )
     scores = evaluate(model, parts[2])
     extra = {"split_seed": args.seed, "test_scores": scores.to_dict(), "history": history.to_dict()}
-    save_model(out, model, class_names=recordings.class_names, extra=extra)
-    checkpoint.unlink()  # the run is complete: what it left to resume from is the model itself
+    if bundled:
+        say(args, "learning what healthy looks like")
+        _bundle(args, out, recordings, model, parts)
+        shutil.rmtree(folder)
+    else:
+        save_model(out, model, class_names=recordings.class_names, extra=extra)
+        checkpoint.unlink()  # the run is complete: what it left to resume from is the model itself
+    kind = "bundle" if bundled else "model"
     emit(
         args,
-        {"schema": "adaptfault.train/1", "model": str(out), **extra},
-        f"test: {scores}\ntraining: {history}\nmodel: {out}",
+        {"schema": "adaptfault.train/1", kind: str(out), **extra},
+        f"test: {scores}\ntraining: {history}\n{kind}: {out}",
     )
     return 0
+
+
+def _bundle(
+    args: argparse.Namespace,
+    out: Path,
+    recordings: Recordings,
+    model: TactileTransformer,
+    parts: tuple[Windows, Windows, Windows],
+) -> None:
+    """Make the bundle: the test recordings become the windows that new versions are judged on."""
+    import numpy as np
+
+    from adaptfault.adapter import Adapter
+    from adaptfault.calibration import Calibration
+    from adaptfault.robot.bundle import Bundle
+    from diagnostics import SelfDiagnosis
+
+    training, validation, test = parts
+    healthy = [recordings.frames[i] for i in np.unique(training.recording)]
+    Bundle.create(
+        out,
+        model,
+        Adapter(model, training, validation),
+        SelfDiagnosis(recordings.layout).fit(healthy),
+        check=test,
+        class_names=recordings.class_names,
+        calibration=Calibration.read(args.calibration) if args.calibration else None,
+    )

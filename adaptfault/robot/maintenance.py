@@ -211,10 +211,19 @@ class _Maintenance:
         known = self.before.merged(diagnosis)
         faulty = known.fault_set
         found: dict[str, Any] = {"diagnosis": diagnosis, "used": tuple(r.name for r in usable)}
+        frames = [r.frames for r in usable if r.frames is not None]
+        adapter = self.bundle.adapter()
         present = FaultSet(tuple(np.flatnonzero(self.bundle.layout.present).tolist()), faulty.n_cells)
         if not present - faulty:
             reason = "no healthy cell is left to predict from: replace the sensor"
             return self._report("refused", 2, reason, known, **found)
+        strange = contradiction(frames, faulty, adapter.statistics, self.bundle.layout)
+        if strange > _CONTRADICTORY:
+            reason = (
+                f"the cells that seem healthy contradict each other ({strange:.1f} of what moves in them is not"
+                " explained by the others; 1 is as if they had nothing in common): not this sensor, or wired otherwise"
+            )
+            return self._report("refused", 2, reason, self.before, **found)
         if faulty == self.version.fault_set:
             reason = f"version {self.version.number} does without these cells already" if faulty else "no faulty cell"
             return self._report("unchanged", self._code(faulty), reason, known, **found)
@@ -224,15 +233,6 @@ class _Maintenance:
         if faulty.cells in Pointer.read(self.bundle.path).rejected:
             reason = "a version for these faults was rolled back before"
             return self._report("kept", max(1, self._code(faulty)), reason, known, **found)
-        adapter = self.bundle.adapter()
-        frames = [r.frames for r in usable if r.frames is not None]
-        strange = contradiction(frames, faulty, adapter.statistics, self.bundle.layout)
-        if strange > _CONTRADICTORY:
-            reason = (
-                f"the cells that seem healthy contradict each other ({strange:.1f} of what they read is not explained"
-                " by the others, 1 is as if they had nothing in common): not this sensor, or wired otherwise"
-            )
-            return self._report("refused", 2, reason, self.before, **found)
         return self._adapt(adapter, known, found)
 
     def _adapt(self, adapter: Adapter, known: Knowledge, found: dict[str, Any]) -> MaintenanceReport:

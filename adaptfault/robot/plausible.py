@@ -20,7 +20,7 @@ _RIDGE = 1e-6  # of the mean variance: covariances are stored in single precisio
 def implausible(recording: NDArray[Any], layout: SensorLayout) -> str | None:
     """Say what is wrong with a recording ``[T, D]`` by itself; None if nothing is."""
     frames = recording[:, layout.present.ravel()]
-    heard = np.isfinite(frames)
+    heard = ~np.isnan(frames)
     if not heard.any():
         return "it holds no reading"
     margin = _BEYOND * layout.full_scale
@@ -38,10 +38,10 @@ def contradiction(
 ) -> float:
     """Return how much of what the healthy cells read the other healthy cells do not explain.
 
-    Of each recording, the sum of squared errors when each healthy cell is predicted from the others (linear conditional
-    mean), divided by the sum of squares about the cells' means; then the median over recordings. On a sensor like the
-    one that the statistics are of it is far below 1. Above 1 the others predict a cell worse than its mean does: cells
-    in another order, another sensor, noise, or faults that were not found.
+    Of each recording that has movement, the variance of the error when each healthy cell is predicted from the others
+    (linear conditional mean), divided by the variance of the cells; then the median over recordings. On a sensor like
+    the one that the statistics are of it is far below 1. Above 1 the others predict a cell worse than its own mean
+    does: cells in another order, another sensor, noise, or faults that were not found. 0 if nothing moved.
     """
     healthy = np.array(sorted(set(fault_set.healthy.tolist()) & set(np.flatnonzero(layout.present.ravel()).tolist())))
     covariance = statistics.covariance[np.ix_(healthy, healthy)]
@@ -53,5 +53,6 @@ def contradiction(
     for recording in recordings:
         off = hold_missing(scale(recording, layout))[:, healthy].astype(np.float64) - statistics.mean[healthy]
         error = off @ precision / np.diag(precision)  # of each cell, predicted from all others
-        ratios.append(float((error**2).sum() / max((off**2).sum(), 1e-12)))
-    return float(np.median(ratios))
+        if moved := float(off.var(axis=0).sum()):
+            ratios.append(float(error.var(axis=0).sum()) / moved)
+    return float(np.median(ratios)) if ratios else 0.0

@@ -1,0 +1,51 @@
+"""adaptfault maintain: a bundle and what the robot recorded in; diagnosed, adapted, deployed or kept."""
+
+from __future__ import annotations
+
+import argparse
+
+from adaptfault.cli.options import Commands, command, emit, say
+
+_EXAMPLE = """  adaptfault maintain robot.bundle today/
+      recordings seen before are skipped; exit code 0 fine, 1 degraded but handled, 2 needs a technician, 3 unusable
+  adaptfault maintain robot.bundle today/ --dry-run --report report.html"""
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    parser = command(commands, "maintain", "diagnose new recordings and bring what the robot runs up to date", _EXAMPLE)
+    parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
+    parser.add_argument("recordings", nargs="+", metavar="RECORDINGS", help="file or folder of recordings")
+    parser.add_argument("--dry-run", action="store_true", help="report only, change nothing")
+    parser.add_argument("--budget", type=float, metavar="S", help="seconds that an adaptation may take")
+    parser.add_argument("--report", metavar="FILE", help="write the technician's report (HTML)")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Maintain; the exit code says how the sensor is."""
+    import sys
+
+    from adaptfault.recordings import load
+    from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.maintenance import maintain
+
+    bundle = Bundle.open(args.bundle)
+    loaded = load(args.recordings, layout=bundle.layout, calibration=bundle.calibration)
+    for problem in loaded.problems:
+        print(problem, file=sys.stderr)
+    recordings = loaded.recordings
+    report = maintain(
+        bundle,
+        recordings.frames,
+        names=recordings.names,
+        dry_run=args.dry_run,
+        budget=args.budget,
+        say=lambda text: say(args, text),
+    )
+    if args.report:
+        from adaptfault.robot.technician import write_report
+
+        write_report(args.report, bundle, report.diagnosis)
+    emit(args, report.to_dict(), str(report))
+    return report.exit_code

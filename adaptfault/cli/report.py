@@ -1,0 +1,26 @@
+"""adaptfault report: the technician's page about a robot's skin."""
+
+from __future__ import annotations
+
+import argparse
+
+from adaptfault.cli.options import Commands, command, emit
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    example = "  adaptfault report robot.bundle --out report.html"
+    parser = command(commands, "report", "write the technician's report: what is broken, what to check", example)
+    parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
+    parser.add_argument("--out", default="report.html", metavar="FILE", help="default report.html")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write it."""
+    from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.technician import write_report
+
+    path = write_report(args.out, Bundle.open(args.bundle))
+    emit(args, {"schema": "adaptfault.report/1", "report": str(path)}, f"report: {path}")
+    return 0

@@ -1,0 +1,175 @@
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from adaptfault.adaptation import Adaptation
+from adaptfault.adapter import Adapter
+from adaptfault.network import TactileTransformer
+from adaptfault.robot.bundle import Bundle
+from adaptfault.robot.lock import Busy
+from adaptfault.robot.sealed import Damaged
+from adaptfault.windows import make_windows
+from diagnostics import FaultSet, SelfDiagnosis
+
+
+def deploy(bundle: Bundle, *cells: int) -> int:
+    """Deploy a version that does without these cells."""
+    adaptation = bundle.adapter().adapt(FaultSet(cells, bundle.layout.n_cells), method="fill")
+    number = bundle.write_version(adaptation, {"reason": "test"}).number
+    bundle.deploy(number)
+    return number
+
+
+def test_a_bundle_holds_all_that_a_robot_needs(bundle, small_grasps, later_grasps):
+    assert bundle.class_names == small_grasps.class_names
+    version = bundle.active()
+    assert (version.number, len(version.fault_set), version.length) == (1, 0, 10)
+    x = make_windows(later_grasps, None, bundle.layout).x
+    model = Adaptation.load(version.folder)
+    np.testing.assert_array_equal(model.predict(x), model.model.network.predict(x))
+    assert bundle.diagnoser().diagnose(later_grasps).fault_set == set()
+    assert len(bundle.check_windows()) > 0
+    assert bundle.calibration is None
+    assert bundle.problems() == []
+
+
+def test_what_new_versions_are_judged_on_was_never_learned_from(bundle):
+    adapter, check = bundle.adapter(), bundle.check_windows()
+    learned = set(adapter.train.recording) | set(adapter.validation.recording)
+    assert not learned & set(check.recording)
+
+
+def test_without_windows_to_judge_on_the_adapter_gives_up_half_of_its_validation(small_grasps, tmp_path):
+    windows = make_windows(small_grasps.frames[::3], small_grasps.labels[::3], small_grasps.layout)
+    validation = windows.select(windows.recording % 2 == 0)
+    model = TactileTransformer(small_grasps.layout, 3)
+    adapter = Adapter(model, windows.select(windows.recording % 2 == 1), validation)
+    diagnoser = SelfDiagnosis(small_grasps.layout).fit(small_grasps.frames[:20])
+    bundle = Bundle.create(tmp_path / "a", model, adapter, diagnoser)
+    kept, given = bundle.adapter().validation, bundle.check_windows()
+    assert set(kept.recording) | set(given.recording) == set(validation.recording)
+    assert not set(kept.recording) & set(given.recording)
+    assert set(given.y) == set(kept.y) == {0, 1, 2}
+
+
+def test_what_does_not_belong_together_is_refused_and_leaves_nothing(bundle, small_grasps, tmp_path):
+    adapter, model = bundle.adapter(), bundle.adapter().model
+    with pytest.raises(FileExistsError, match="choose another name"):
+        Bundle.create(bundle.path, model, adapter, bundle.diagnoser())
+    with pytest.raises(ValueError, match="fit first"):
+        Bundle.create(tmp_path / "a", model, adapter, SelfDiagnosis(bundle.layout))
+    with pytest.raises(ValueError, match="class names"):
+        Bundle.create(tmp_path / "a", model, adapter, bundle.diagnoser(), class_names=["one"])
+    assert not (tmp_path / "a").exists()
+    with pytest.raises(FileNotFoundError, match="make"):
+        Bundle.open(tmp_path / "a")
+
+
+def test_opening_and_monitoring_need_no_torch(made_bundle):
+    code = (
+        "import sys\n"
+        "from adaptfault.robot.bundle import Bundle\n"
+        f"bundle = Bundle.open({str(made_bundle)!r})\n"
+        "bundle.active(), bundle.diagnoser(), bundle.knowledge()\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_version_never_confirmed_gives_way_after_two_starts(bundle):
+    assert deploy(bundle, 3) == 2
+    assert [bundle.begin().number for _ in range(4)] == [2, 2, 1, 1]
+    assert bundle.journal.runs()[-1]["what"] == "rollback"
+
+
+def test_a_confirmed_version_stays(bundle):
+    deploy(bundle, 3)
+    bundle.begin()
+    bundle.confirm()
+    assert [bundle.begin().number for _ in range(4)] == [2, 2, 2, 2]
+    bundle.confirm()  # again: nothing to say
+    assert [run["what"] for run in bundle.journal.runs()] == ["confirmed"]
+
+
+def test_rolling_back_returns_to_the_last_confirmed_version(bundle):
+    deploy(bundle, 3)
+    bundle.confirm()
+    deploy(bundle, 3, 4)  # never confirmed
+    deploy(bundle, 3, 4, 5)
+    assert bundle.rollback().number == 2
+    assert bundle.rollback().number == 1
+    with pytest.raises(ValueError, match="the first"):
+        bundle.rollback()
+
+
+def test_old_versions_are_removed_but_none_that_may_run(bundle):
+    for cell in range(9):
+        deploy(bundle, cell)
+        if cell == 1:
+            bundle.confirm()
+    assert {1, 3, 10} <= set(bundle.versions.numbers)
+    assert len(bundle.versions.numbers) <= 8
+    assert bundle.rollback().number == 3
+
+
+def test_a_flipped_bit_in_any_file_is_noticed_and_a_good_version_runs(bundle, tmp_path, rng):
+    deploy(bundle, 3)
+    bundle.confirm()
+    files = [p for p in sorted(bundle.path.rglob("*")) if p.is_file() and p.suffix != ".lock"]
+    assert len(files) > 12
+    for path in files:
+        whole = path.read_bytes()
+        broken = bytearray(whole)
+        broken[rng.integers(len(broken))] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bytes(broken))
+        again = Bundle.open(bundle.path)
+        assert again.problems(mend=False), path
+        assert again.active().number == (1 if path.parent.name == "0002" else 2), path
+        path.write_bytes(whole)
+    assert Bundle.open(bundle.path).problems(mend=False) == []
+
+
+def test_a_missing_or_truncated_file_is_noticed(bundle):
+    deploy(bundle, 3)
+    (bundle.versions.path(2) / "manifest.json").unlink()
+    assert bundle.active().number == 1
+    assert "missing" in bundle.problems()[0]
+    part = next((bundle.path / "parts" / "adapter").glob("*.safetensors"))
+    part.write_bytes(part.read_bytes()[:1000])
+    with pytest.raises(Damaged):
+        Bundle.open(bundle.path).adapter()
+
+
+def test_with_no_good_version_left_the_error_says_so(bundle):
+    shutil.rmtree(bundle.versions.path(1))
+    with pytest.raises(Damaged, match="no version that can be read"):
+        bundle.active()
+
+
+def test_one_maintenance_at_a_time_even_between_processes(bundle):
+    code = (
+        "import sys\n"
+        "from adaptfault.robot.bundle import Bundle\n"
+        "from adaptfault.robot.lock import Busy\n"
+        "try:\n"
+        f"    with Bundle.open({str(bundle.path)!r}).maintenance(): sys.exit(1)\n"
+        "except Busy: sys.exit(0)"
+    )
+    with bundle.maintenance():
+        assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+        with pytest.raises(Busy), bundle.maintenance():
+            pass
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 1  # it is free again
+
+
+def test_a_bundle_that_cannot_be_written_runs_all_the_same(bundle, monkeypatch):
+    deploy(bundle, 3)
+
+    def refuse(*args, **kwargs):
+        raise PermissionError(13, "read-only")
+
+    monkeypatch.setattr("adaptfault.robot.bundle.locked", refuse)
+    assert bundle.begin().number == 2

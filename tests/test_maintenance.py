@@ -1,0 +1,163 @@
+import json
+
+import numpy as np
+import pytest
+
+from adaptfault.robot.bundle import Bundle
+from adaptfault.robot.judgement import Judgement
+from adaptfault.robot.lock import Busy
+from adaptfault.robot.maintenance import maintain
+from diagnostics import FaultKind, Line, SensorLayout, inject, line_fault
+
+LAYOUT = SensorLayout(2, 6, 5)
+
+
+def broken(recordings, *faults):
+    return [inject(r, faults, LAYOUT) for r in recordings]
+
+
+def files(bundle: Bundle) -> dict[str, bytes]:
+    return {str(p): p.read_bytes() for p in sorted(bundle.path.rglob("*")) if p.is_file() and p.suffix != ".lock"}
+
+
+def test_a_broken_row_is_found_repaired_and_deployed_on_probation(bundle, later_grasps, broken_row):
+    report = maintain(bundle, broken(later_grasps, broken_row))
+    assert (report.decision, report.version) == ("deployed", 2)
+    assert report.fault_set == set(broken_row.cells)
+    assert report.judgement.better
+    assert report.judgement.candidate > report.judgement.running + 0.1
+    assert report.exit_code == (1 if report.accuracy >= 0.9 * report.fault_free_accuracy else 2)
+    assert str(report).startswith(f"ADAPTFAULT {('WARNING', 'CRITICAL')[report.exit_code - 1]} - deployed: accuracy")
+    assert bundle.active().fault_set == report.fault_set
+    assert [bundle.begin().number for _ in range(3)] == [2, 2, 1]
+    json.dumps(report.to_dict(), allow_nan=False)
+
+
+def test_the_same_recordings_twice_change_nothing(bundle, later_grasps, broken_row):
+    log = broken(later_grasps, broken_row)
+    maintain(bundle, log)
+    before = files(bundle)
+    report = maintain(bundle, log)
+    assert (report.decision, report.version) == ("unchanged", 2)
+    assert "not seen before" in report.reason
+    assert files(bundle) == before
+
+
+def test_healthy_recordings_change_nothing_but_the_journal(bundle, later_grasps):
+    report = maintain(bundle, later_grasps)
+    assert (report.decision, report.exit_code, report.version) == ("unchanged", 0, 1)
+    assert str(report).startswith("ADAPTFAULT OK - unchanged: no faulty cell | faulty=0;;;0;60")
+    assert bundle.active().number == 1
+
+
+def test_a_dry_run_changes_no_file(bundle, later_grasps, broken_row):
+    before = files(bundle)
+    report = maintain(bundle, broken(later_grasps, broken_row), dry_run=True)
+    assert (report.decision, report.version, report.dry_run) == ("deployed", 1, True)
+    assert files(bundle) == before
+
+
+def test_known_faults_in_new_recordings_deploy_nothing_again(bundle, later_grasps, broken_row):
+    maintain(bundle, broken(later_grasps[:12], broken_row))
+    report = maintain(bundle, broken(later_grasps[12:], broken_row))
+    assert (report.decision, report.version) == ("unchanged", 2)
+    assert "does without these cells already" in report.reason
+
+
+def test_faults_add_up_over_runs(bundle, later_grasps, broken_row):
+    second = line_fault(bundle.layout, Line(0, "column", 1), FaultKind.SHORT)
+    maintain(bundle, broken(later_grasps[:12], broken_row))
+    report = maintain(bundle, broken(later_grasps[12:], broken_row, second))
+    assert report.fault_set == set(broken_row.cells) | set(second.cells)
+    assert report.version == 3
+
+
+def test_after_a_rollback_the_same_faults_deploy_nothing(bundle, later_grasps, broken_row):
+    maintain(bundle, broken(later_grasps[:12], broken_row))
+    bundle.rollback()
+    report = maintain(bundle, broken(later_grasps[12:], broken_row))
+    assert (report.decision, report.version) == ("kept", 1)
+    assert "rolled back" in report.reason
+
+
+@pytest.mark.parametrize(
+    ("poison", "reason", "code"),
+    [
+        (lambda r, rng: np.full_like(r, 5.0), "no healthy cell", 2),
+        (lambda r, rng: 5 * rng.random(r.shape), "no healthy cell|contradict", 2),
+        (lambda r, rng: r * 800, "no recording is usable", 3),
+        (lambda r, rng: np.full_like(r, np.nan), "no recording is usable", 3),
+        (lambda r, rng: r[:, :59], "no recording is usable", 3),
+        (lambda r, rng: r[:0], "no recording is usable", 3),
+    ],
+)
+def test_poisoned_recordings_never_deploy(bundle, later_grasps, rng, poison, reason, code):
+    report = maintain(bundle, [poison(r, rng) for r in later_grasps])
+    assert report.decision == "refused"
+    assert any(part in report.reason for part in reason.split("|"))
+    assert report.exit_code == code
+    assert bundle.active().number == 1
+    assert bundle.versions.numbers == [1]
+
+
+def test_cells_in_another_order_never_deploy(bundle, later_grasps, rng):
+    order = rng.permutation(bundle.layout.n_cells)
+    report = maintain(bundle, [r[:, order] for r in later_grasps])
+    assert report.decision == "refused"
+    assert bundle.versions.numbers == [1]
+
+
+def test_one_bad_recording_does_not_stop_the_others(bundle, later_grasps, broken_row):
+    log = [later_grasps[0][:, :7], *broken(later_grasps, broken_row)]
+    report = maintain(bundle, log, names=["short.csv"])
+    assert report.decision == "deployed"
+    assert report.left_out[0].startswith("short.csv: ")
+
+
+def test_a_single_recording_may_come_as_an_array(bundle, later_grasps):
+    assert maintain(bundle, later_grasps[0]).used == ("recording 0",)
+    assert maintain(bundle, later_grasps[1].reshape(-1, 2, 6, 5)).used == ("recording 0",)
+
+
+def test_maintenance_is_refused_while_another_runs(bundle, later_grasps):
+    with bundle.maintenance(), pytest.raises(Busy, match="another process"):
+        maintain(bundle, later_grasps)
+
+
+def test_a_damaged_version_is_replaced_by_a_new_one(bundle, later_grasps, broken_row):
+    maintain(bundle, broken(later_grasps[:12], broken_row))
+    weights = next(bundle.versions.path(2).glob("*.safetensors"))
+    weights.write_bytes(weights.read_bytes()[:-1])
+    report = maintain(bundle, broken(later_grasps[12:], broken_row))
+    assert (report.decision, report.version) == ("deployed", 3)
+    assert any("0002" in warning for warning in report.warnings)
+
+
+def test_what_was_kept_once_is_not_judged_again(bundle, later_grasps, broken_row, monkeypatch):
+    import adaptfault.robot.maintenance as module
+
+    def no_gain(running, candidate, windows):
+        return Judgement(running=0.5, candidate=0.5, gain=0.0, low=-0.1, high=0.1, collapsed=())
+
+    monkeypatch.setattr(module, "judge", no_gain)
+    first = maintain(bundle, broken(later_grasps[:8], broken_row))
+    assert (first.decision, first.version) == ("kept", 1)
+    assert "within chance" in first.reason
+    monkeypatch.setattr(module, "judge", None)  # would fail if it were asked
+    for log in (later_grasps[8:16], later_grasps[16:]):
+        again = maintain(bundle, broken(log, broken_row))
+        assert (again.decision, again.exit_code) == ("kept", first.exit_code)
+        assert again.reason == f"judged before: {first.reason}"
+
+
+def test_a_candidate_in_which_a_class_collapses_is_refused(bundle, later_grasps, broken_row, monkeypatch):
+    import adaptfault.robot.maintenance as module
+
+    def collapse(running, candidate, windows):
+        return Judgement(running=0.5, candidate=0.6, gain=0.1, low=0.05, high=0.15, collapsed=(1,))
+
+    monkeypatch.setattr(module, "judge", collapse)
+    report = maintain(bundle, broken(later_grasps, broken_row))
+    assert (report.decision, report.version) == ("refused", 1)
+    assert bundle.class_names[1] in report.reason
+    assert bundle.versions.numbers == [1]

@@ -95,7 +95,9 @@ def main() -> None:
         told = process.communicate()[0].decode()
         assert told.startswith("ADAPTFAULT"), told
         check(bundle, confirmed)
-    print(f"{args.kills} kills within the {whole:.1f} s of a run: every time the bundle opened, predicted, and kept what")
+    print(
+        f"{args.kills} kills within the {whole:.1f} s of a run: every time the bundle opened, predicted, and kept what"
+    )
     print(f"was confirmed. States after a kill: {dict(states)}")
 
 

@@ -25,6 +25,7 @@ def small() -> Recordings:
 @pytest.fixture(scope="module")
 def home(small: Recordings, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with recordings, and a model trained on them by the command line."""
+    pytest.importorskip("torch")
     home = tmp_path_factory.mktemp("home")
     save_npz(home / "grasps.npz", small)
     assert main(["train", str(home / "grasps.npz"), "--out", str(home / "model"), "--epochs", "10", "--quiet"]) == 0

@@ -27,14 +27,15 @@ def write_report(path: str | Path, bundle: Bundle, diagnosis: Diagnosis | None =
     if diagnosis is None:
         told = [run["diagnosis"] for run in runs if run.get("diagnosis")]
         diagnosis = Diagnosis.from_dict(told[-1]) if told else None
-    judged = [run for run in runs if run.get("accuracy") is not None]
+    active = bundle.active()
+    judged = [run for run in runs if run.get("accuracy") is not None and run["version"] == active.number]
     return render(
         path,
         "technician.html",
         bundle=bundle,
         name=bundle.path.name,
         layout=bundle.layout,
-        active=bundle.active(),
+        active=active,
         pointer=Pointer.read(bundle.path),
         knowledge=bundle.knowledge(),
         diagnosis=diagnosis,
@@ -49,4 +50,9 @@ def write_report(path: str | Path, bundle: Bundle, diagnosis: Diagnosis | None =
 
 def _shown(run: dict[str, Any]) -> dict[str, Any]:
     number = run.get("version", run.get("to"))
-    return {"time": run["time"], "what": run["what"], "version": number, "reason": run.get("reason", "")}
+    return {
+        "time": run["time"][:16].replace("T", " "),
+        "what": run["what"],
+        "version": number,
+        "reason": run.get("reason", ""),
+    }

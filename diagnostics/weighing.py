@@ -30,6 +30,7 @@ _PIECE = 100  # frames; longer recordings are cut, so that a single long one can
 _LEARNED_SHARE = 0.75  # of the recordings teach what healthy looks like, the others make the logs
 _MOST_JUMP = 1.0  # what a jump may be worth, whatever the logs say: alone it proves nothing
 _KINDS = 3
+_LOOSE = 10.0  # variance of the weights before any log is seen
 _CLIP = 6.0  # log ratios beyond this say "certain"; they must not steer the fit
 _SURE = 24.0  # and beyond this, not even more certain
 _EXPECTED, _EXPECTED_LATE = 0.02, 0.005  # share of faulty cells before a log is seen: from the start, and in it
@@ -60,8 +61,6 @@ class Weights:
         recordings = [piece for r in recordings for piece in np.array_split(r, max(1, len(r) // _PIECE))]
         if len(recordings) < _FEWEST_RECORDINGS:
             return cls()
-        from sklearn.linear_model import LogisticRegression
-
         rng = np.random.default_rng(seed)
         trials = []
         order = rng.permutation(len(recordings))
@@ -80,11 +79,7 @@ class Weights:
             of, alike = kind == k, (kind > 0) == (k > 0)
             if not (dead[of].any() and (~dead[of]).any()):
                 return cls()
-            model = LogisticRegression(C=10.0).fit(evidence[of], dead[of])
-            slope, of_jump = model.coef_[0].tolist()
-            # The regression's offset holds how common faults were in its own logs: take that out again.
-            offset = float(model.intercept_[0] - logit(dead[alike].mean()))
-            found.append((offset, slope, float(np.clip(of_jump, 0.0, _MOST_JUMP))))
+            found.append(_bounded_logistic(evidence[of], dead[of], float(logit(dead[alike].mean()))))
         offsets, slopes, jumps = zip(*found, strict=True)
         return cls(offsets, slopes, jumps) if min(slopes) > 0 else cls()
 
@@ -115,6 +110,32 @@ class Weights:
                     break
             probability[which] = expit(worth[which] + logit(share))
         return probability
+
+
+def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) -> tuple[float, float, float]:
+    """Return offset, slope and the jump's weight of a logistic regression, within bounds.
+
+    Evidence ``[n, 2]`` never speaks for what it speaks against, and none at all never speaks for a fault, however few
+    healthy cells a small reference shows in this state.
+
+    Args:
+        evidence: ratio and jump.
+        dead: bool ``[n]``.
+        base: log odds of a fault, before the evidence; how common faults were in these logs.
+    """
+    from scipy.optimize import minimize
+
+    x = np.column_stack([np.ones(len(evidence)), evidence])
+
+    def loss(weights: Floats) -> tuple[float, Floats]:
+        odds = base + x @ weights
+        slack = expit(odds) - dead
+        value = np.logaddexp(0, odds).sum() - odds[dead].sum() + 0.5 * (weights[1:] @ weights[1:]) / _LOOSE
+        return float(value), x.T @ slack + np.array([0, *weights[1:]]) / _LOOSE
+
+    bounds = [(None, 0.0), (0.0, None), (0.0, _MOST_JUMP)]
+    offset, slope, jump = minimize(loss, np.array([0.0, 1.0, 0.5]), jac=True, bounds=bounds).x.tolist()
+    return offset, slope, jump
 
 
 def kinds(memory: Memory) -> NDArray[np.intp]:

@@ -2,10 +2,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.special import expit
+from sklearn.linear_model import LogisticRegression
 
 from adaptfault.recordings import Recordings
 from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
-from diagnostics.weighing import Weights, faulty_at
+from diagnostics.weighing import Weights, _bounded_logistic, faulty_at
 
 ASKED = np.ones(100, bool)
 EARLY = np.zeros(100, int)  # of the kind that never moved
@@ -104,3 +106,25 @@ def test_what_is_called_likely_is_as_often_true(fitted: SelfDiagnosis, grasps: R
         of_bin = (p >= low) & (p < high)
         assert abs(p[of_bin].mean() - broken[of_bin].mean()) < 0.08
     assert p.sum() == pytest.approx(broken.sum(), rel=0.25)
+
+
+def test_no_evidence_never_speaks_for_a_fault_however_few_healthy_cells_were_seen():
+    rng = np.random.default_rng(0)
+    dead = np.arange(200) >= 6  # healthy cells that hold a load are rare in a small reference
+    evidence = np.column_stack([np.where(dead, 4, -4) + rng.normal(0, 3, 200), rng.normal(0, 1, 200) + 2 * dead])
+    offset, slope, jump = _bounded_logistic(evidence, dead, base=-1.0)  # as if faults were rarer elsewhere
+    assert offset <= 0
+    assert slope > 0
+    assert 0 <= jump <= 1
+    # Without the bounds, the same data would call a cell faulty that nothing speaks against.
+    free = LogisticRegression(C=10.0).fit(evidence, dead)
+    assert free.intercept_[0] + 1.0 > 2
+
+
+def test_within_the_bounds_it_is_a_logistic_regression():
+    rng = np.random.default_rng(1)
+    evidence = rng.normal(0, 2, (5000, 2))
+    dead = rng.random(5000) < expit(-1.5 + 1.2 * evidence[:, 0] + 0.4 * evidence[:, 1] - 0.5)
+    free = LogisticRegression(C=10.0).fit(evidence, dead)
+    expected = (free.intercept_[0] + 0.5, *free.coef_[0])
+    assert _bounded_logistic(evidence, dead, base=-0.5) == pytest.approx(expected, abs=2e-3)

@@ -9,7 +9,7 @@ import pytest
 
 from adaptfault.grasps import simulate
 from adaptfault.recordings import Recordings, load
-from diagnostics import SelfDiagnosis
+from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "sdh2x13x6_grasps36.npz"
 
@@ -32,6 +32,53 @@ def real_grasps() -> Recordings:
     if not REAL.exists():
         pytest.skip("the real recordings are not here")
     return load(REAL).recordings
+
+
+SMALL = SensorLayout(2, 3, 3, full_scale=4.0, present=np.arange(18) != 4)
+DROPPED = {"whole": (), "fill": (0, 12), "head": (1, 9, 17)}
+
+
+def small_windows(n: int, seed: int = 0) -> np.ndarray:
+    """Windows of 5 frames of the small array, half of the cells untouched; nothing where there is no cell."""
+    rng = np.random.default_rng(seed)
+    touched = (rng.random((n, 1, 18)) < 0.5) & SMALL.present.ravel()
+    return np.where(touched, rng.random((n, 5, 18)), 0).astype(np.float32)
+
+
+@pytest.fixture(scope="session")
+def versions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Folders of three adaptations of one small network, with ONNX files: F empty, the linear fill, and all parts."""
+    import torch
+
+    from adaptfault.adaptation import Adaptation, Stage
+    from adaptfault.export import add_onnx
+    from adaptfault.fills import CellStatistics
+    from adaptfault.forest import Forest
+    from adaptfault.heads import Blend, KernelHead
+    from adaptfault.network import TactileTransformer
+    from adaptfault.reduction import ReducedModel, phi
+    from adaptfault.windows import Windows
+
+    network = TactileTransformer(SMALL, 3, length=5).eval()
+    windows = Windows(small_windows(60), np.arange(60) % 3, np.arange(60))
+    statistics = CellStatistics.fit(windows)
+    folders = {}
+    for name, cells in DROPPED.items():
+        fault_set, head = FaultSet(cells, 18), None
+        front = None if name == "whole" else statistics.linear(fault_set)
+        if name == "head":
+            front = statistics.nearest(fault_set)
+            with torch.no_grad():
+                views = ReducedModel(network, fault_set, front).views(torch.from_numpy(phi(windows.x, fault_set)))
+            weights = torch.from_numpy(np.random.default_rng(1).normal(0, 30, (60, 3)).astype("f4"))
+            kernel = KernelHead(views, (0.01, 2.0), (0.5, 0.5), weights, torch.zeros(3))
+            forest = Forest.fit(views[1][:9], windows.y[:9], 3)  # shallow: each level takes time to export
+            head = Blend(kernel, forest, 0.5, 2.0)
+        model = ReducedModel(network, fault_set, front, head).eval()
+        folders[name] = tmp_path_factory.mktemp(name)
+        Adaptation(model, fault_set, (Stage("fill", 0.1),), _validation=windows).save(folders[name])
+        add_onnx(folders[name])
+    return folders
 
 
 @pytest.fixture

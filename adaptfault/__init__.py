@@ -13,10 +13,13 @@ if TYPE_CHECKING:
     from adaptfault.adapter import Adapter
     from adaptfault.calibration import Calibration
     from adaptfault.evaluation import Scores, evaluate
+    from adaptfault.export import add_onnx
     from adaptfault.forecast import Forecast
     from adaptfault.grasps import simulate
     from adaptfault.history import History
+    from adaptfault.inference import Inference
     from adaptfault.network import TactileTransformer
+    from adaptfault.predictor import Predictor, Reading
     from adaptfault.recordings import Recordings, load, save_npz
     from adaptfault.reduction import ReducedModel
     from adaptfault.replay import load_adapter, save_adapter
@@ -32,11 +35,15 @@ __all__ = [
     "Calibration",
     "Forecast",
     "History",
+    "Inference",
+    "Predictor",
+    "Reading",
     "Recordings",
     "ReducedModel",
     "Scores",
     "TactileTransformer",
     "Windows",
+    "add_onnx",
     "evaluate",
     "load",
     "load_adapter",
@@ -56,11 +63,15 @@ _HOMES = {
     "Calibration": "calibration",
     "Forecast": "forecast",
     "History": "history",
+    "Inference": "inference",
+    "Predictor": "predictor",
+    "Reading": "predictor",
     "Recordings": "recordings",
     "ReducedModel": "reduction",
     "Scores": "evaluation",
     "TactileTransformer": "network",
     "Windows": "windows",
+    "add_onnx": "export",
     "evaluate": "evaluation",
     "load": "recordings",
     "load_adapter": "replay",

@@ -36,7 +36,7 @@ assert model.predict(np.load(sys.argv[2])).tolist() == np.load(sys.argv[3]).toli
 
 @pytest.fixture
 def copied(versions: dict[str, Path], tmp_path: Path) -> Path:
-    return Path(shutil.copytree(versions["fill"], tmp_path / "version"))
+    return Path(shutil.copytree(versions["whole"], tmp_path / "version"))
 
 
 @pytest.mark.parametrize("name", DROPPED)
@@ -74,7 +74,7 @@ def test_without_an_onnx_file_it_runs_on_torch(copied):
 
 
 def test_one_thread_runs_it_and_sleeps_in_between(versions):
-    options = open_session((versions["fill"] / "model.onnx").read_bytes()).get_session_options()
+    options = open_session((versions["whole"] / "model.onnx").read_bytes()).get_session_options()
     assert options.intra_op_num_threads == options.inter_op_num_threads == 1
     assert options.get_session_config_entry("session.intra_op.allow_spinning") == "0"
 
@@ -115,7 +115,7 @@ def test_a_damaged_manifest_is_refused(copied, wrong):
 
 @pytest.mark.parametrize("runtime", ["onnx", "torch"])
 def test_windows_of_another_shape_are_refused(versions, runtime):
-    model = Inference.load(versions["fill"], runtime=runtime)
+    model = Inference.load(versions["whole"], runtime=runtime)
     for x in (small_windows(1)[0], small_windows(1)[:, :4], small_windows(1)[..., :17]):
         with pytest.raises(ValueError, match=r"expected windows \[N, 5, 18\]"):
             model.predict_proba(x)
@@ -123,6 +123,6 @@ def test_windows_of_another_shape_are_refused(versions, runtime):
 
 def test_an_unknown_runtime_is_refused_and_it_prints_what_it_is(versions):
     with pytest.raises(ValueError, match="unknown runtime 'tpu': use one of onnx, torch"):
-        Inference.load(versions["fill"], runtime="tpu")
-    text = str(Inference.load(versions["fill"]))
-    assert text == f"3 classes from 5 frames of {SMALL}, 2 cells dropped, on ONNX Runtime"
+        Inference.load(versions["whole"], runtime="tpu")
+    text = str(Inference.load(versions["head"]))
+    assert text == f"3 classes from 5 frames of {SMALL}, 3 cells dropped, on ONNX Runtime"

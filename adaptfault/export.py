@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from adaptfault.adaptation import Adaptation
+from adaptfault.compact import CompactNetwork
 from adaptfault.inference import ONNX_FILE, open_session, run_session
 from adaptfault.reduction import ReducedModel
 from adaptfault.store import attach
@@ -63,17 +64,26 @@ def to_onnx(model: ReducedModel) -> bytes:
     """Return a model as the content of an ONNX file.
 
     Its input ``x`` are whole windows, float32 ``[N, T, D]`` on the 0..1 scale, N at will; its output are
-    ``probabilities``, float32 ``[N, n_classes]``. It was run on batches of 1 and 7 windows, and said what the model
-    says to within 1e-5.
+    ``probabilities``, float32 ``[N, n_classes]``. It holds the network on fewer numbers (:mod:`adaptfault.compact`).
+    It was run on batches of 1 and 7 windows, and said what the model says to within 1e-5.
 
     Raises:
         ExportError: the export failed, or says something else.
         ImportError: the packages for it are not installed.
     """
-    whole = _WholeWindows(copy.deepcopy(model).cpu()).eval()
-    data = _translate(whole, torch.from_numpy(_probes(model, _EXAMPLE)))
-    _verify(data, model, whole)
+    model = copy.deepcopy(model).cpu().eval()
+    data = _translate(_WholeWindows(_compacted(model)).eval(), torch.from_numpy(_probes(model, _EXAMPLE)))
+    _verify(data, model)
     return data
+
+
+def _compacted(model: ReducedModel) -> ReducedModel:
+    """Return the model on fewer numbers; a very large one as it is."""
+    if not CompactNetwork.suits(model.network):
+        return model
+    compact = copy.deepcopy(model)
+    compact.add_module("network", CompactNetwork(model.network))
+    return compact
 
 
 def _translate(whole: _WholeWindows, example: Tensor) -> bytes:
@@ -99,9 +109,9 @@ def _translate(whole: _WholeWindows, example: Tensor) -> bytes:
     return data
 
 
-def _verify(data: bytes, model: ReducedModel, whole: _WholeWindows) -> None:
+def _verify(data: bytes, model: ReducedModel) -> None:
     """Run the file on batches of other sizes than the example's, and compare it with the model."""
-    session = open_session(data)
+    session, whole = open_session(data), _WholeWindows(model).eval()
     for n in _BATCHES:
         x = _probes(model, n)
         with torch.no_grad():

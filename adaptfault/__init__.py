@@ -13,15 +13,18 @@ if TYPE_CHECKING:
     from adaptfault.adapter import Adapter
     from adaptfault.calibration import Calibration
     from adaptfault.evaluation import Scores, evaluate
+    from adaptfault.export import add_onnx
     from adaptfault.forecast import Forecast
     from adaptfault.grasps import simulate
     from adaptfault.history import History
+    from adaptfault.inference import Inference
     from adaptfault.network import TactileTransformer
     from adaptfault.recordings import Recordings, load, save_npz
     from adaptfault.reduction import ReducedModel
     from adaptfault.replay import load_adapter, save_adapter
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.maintenance import MaintenanceReport, maintain
+    from adaptfault.robot.predictor import Predictor, Reading
     from adaptfault.store import load_model, save_model
     from adaptfault.training import train
     from adaptfault.windows import Windows, make_windows, split
@@ -35,12 +38,16 @@ __all__ = [
     "Calibration",
     "Forecast",
     "History",
+    "Inference",
     "MaintenanceReport",
+    "Predictor",
+    "Reading",
     "Recordings",
     "ReducedModel",
     "Scores",
     "TactileTransformer",
     "Windows",
+    "add_onnx",
     "evaluate",
     "load",
     "load_adapter",
@@ -62,12 +69,16 @@ _HOMES = {
     "Calibration": "calibration",
     "Forecast": "forecast",
     "History": "history",
+    "Inference": "inference",
     "MaintenanceReport": "robot.maintenance",
+    "Predictor": "robot.predictor",
+    "Reading": "robot.predictor",
     "Recordings": "recordings",
     "ReducedModel": "reduction",
     "Scores": "evaluation",
     "TactileTransformer": "network",
     "Windows": "windows",
+    "add_onnx": "export",
     "evaluate": "evaluation",
     "load": "recordings",
     "load_adapter": "replay",

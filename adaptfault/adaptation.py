@@ -16,11 +16,9 @@ from adaptfault.fills import AffineFill, NearestFill
 from adaptfault.heads import Blend
 from adaptfault.network import TactileTransformer, logits_of
 from adaptfault.reduction import ReducedModel, phi
-from adaptfault.store import load_tensors, save_tensors
+from adaptfault.store import ADAPTATION, load_tensors, save_tensors
 from adaptfault.windows import Windows
 from diagnostics import FaultSet
-
-SCHEMA = "adaptfault.adaptation/1"
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ class Adaptation:
             "stages": [vars(stage) for stage in self.stages],
             "scores": self.scores.to_dict(),
         }
-        save_tensors(path, SCHEMA, about, model.state_dict())
+        save_tensors(path, ADAPTATION, about, model.state_dict())
 
     @classmethod
     def load(cls, path: str | Path) -> Adaptation:
@@ -108,7 +106,7 @@ class Adaptation:
             FileNotFoundError: there is nothing, or a file is missing.
             ValueError: a file is damaged or of another kind.
         """
-        about, tensors = load_tensors(path, SCHEMA)
+        about, tensors = load_tensors(path, ADAPTATION)
         try:
             network = TactileTransformer.from_config(about["network"])
             fault_set = FaultSet(tuple(about["fault_set"]), network.layout.n_cells)

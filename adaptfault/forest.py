@@ -64,16 +64,18 @@ class Forest(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map ``[N, p]`` to logits ``[N, n_classes]``: logarithms of shares of the votes, one being spread evenly."""
-        trees = torch.arange(self.nodes.shape[0], device=x.device)
-        at = torch.zeros(len(x), len(trees), dtype=torch.long, device=x.device)
+        trees, nodes = self.thresholds.shape
+        first = nodes * torch.arange(trees, device=x.device)  # of each tree's nodes, all being in one row
         feature, below, above = self.nodes.long().unbind(-1)
+        asked = feature.masked_fill(torch.isinf(self.thresholds), 0).flatten()
+        thresholds, below, above = (
+            of.flatten() for of in (self.thresholds, below + first[:, None], above + first[:, None])
+        )
+        at = first.expand(x.shape[0], trees)
         for _ in range(self.depth):
-            threshold = self.thresholds[trees, at]
-            leaf = torch.isinf(threshold)
-            value = torch.gather(x, 1, feature[trees, at].masked_fill(leaf, 0))
-            at = torch.where(value <= threshold, below[trees, at], above[trees, at])
-        votes = nn.functional.one_hot(feature[trees, at], self.n_classes).sum(1)
-        return ((votes + 1 / self.n_classes) / (len(trees) + 1)).log()
+            at = torch.where(torch.gather(x, 1, asked[at]) <= thresholds[at], below[at], above[at])
+        votes = nn.functional.one_hot(feature.flatten()[at], self.n_classes).sum(1)
+        return ((votes + 1 / self.n_classes) / (trees + 1)).log()
 
 
 def _as_float32(threshold: NDArray[np.float64]) -> NDArray[np.float32]:

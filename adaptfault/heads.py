@@ -86,11 +86,12 @@ class KernelHead(nn.Module):
 
     def forward(self, views: Sequence[Tensor]) -> Tensor:
         """Map views of N windows, each ``[N, p]``, to logits ``[N, n_classes]``."""
+        # In double precision: large weights of both signs nearly cancel, in single a probability was off by up to 4e-4.
         kernel = sum(
-            share * torch.exp(-_squared_distance(view, other) / width)
+            share * torch.exp(-_squared_distance(view.double(), other.double()) / width)
             for view, other, width, share in zip(views, self.known, self.widths, self.shares, strict=True)
         )
-        logits: Tensor = kernel @ self.weights + self.bias
+        logits: Tensor = (kernel @ self.weights.double() + self.bias).float()
         return logits
 
 

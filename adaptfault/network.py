@@ -59,12 +59,16 @@ class EncoderBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map ``[N, T, d]`` to ``[N, T, d]``."""
-        q, k, v = self.qkv(x).unflatten(-1, (3, HEADS, HEAD_DIM)).permute(2, 0, 3, 1, 4)  # each (N, heads, T, 64)
-        attended = F.scaled_dot_product_attention(q, k, v)  # (N, heads, T, 64)
-        attended = attended.transpose(1, 2).flatten(2)  # (N, T, 256)
-        x = self.norm1(x + self.dropout(self.out(attended)))
+        x = self.norm1(x + self.dropout(self.out(attend(self.qkv(x)))))
         fed: Tensor = self.norm2(x + self.dropout(self.down(F.relu(self.up(x)))))
         return fed
+
+
+def attend(qkv: Tensor) -> Tensor:
+    """Map queries, keys and values ``[N, T, 768]`` to what each frame draws from all of them, ``[N, T, 256]``."""
+    q, k, v = torch.unflatten(qkv, -1, (3, HEADS, HEAD_DIM)).permute(2, 0, 3, 1, 4)  # each (N, heads, T, 64)
+    attended = F.scaled_dot_product_attention(q, k, v)  # (N, heads, T, 64)
+    return attended.transpose(1, 2).flatten(2)
 
 
 class TactileTransformer(nn.Module):

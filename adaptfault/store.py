@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from adaptfault.network import TactileTransformer
 
 SCHEMA = "adaptfault.model/1"
+ADAPTATION = "adaptfault.adaptation/1"  # schema of an adapted model
 MANIFEST = "manifest.json"
 
 
@@ -123,17 +124,42 @@ def load_arrays(folder: str | Path, schema: str) -> tuple[dict[str, Any], dict[s
 
 def _load(folder: Path, schema: str) -> tuple[dict[str, Any], bytes]:
     manifest = read_manifest(folder, schema)
+    return manifest, read_attached(folder, manifest, "weights")
+
+
+def attach(folder: str | Path, key: str, name: str, data: bytes) -> Path:
+    """Write one more file into a folder that has a manifest, which then states its hash as ``key``; return its path.
+
+    Raises:
+        FileNotFoundError: there is no ``manifest.json``.
+        ValueError: it is damaged.
+    """
+    folder = Path(folder)
+    manifest = {**_manifest(folder), key: {"file": name, "sha256": hashlib.sha256(data).hexdigest()}}
+    atomic_write(folder / name, data)
+    atomic_write(folder / MANIFEST, json.dumps(manifest, indent=1, allow_nan=False).encode())
+    return folder / name
+
+
+def read_attached(folder: str | Path, manifest: Mapping[str, Any], key: str) -> bytes:
+    """Return the content of the file that a manifest states as ``key``. Needs no torch.
+
+    Raises:
+        FileNotFoundError: it is missing.
+        ValueError: its hash is not the stated one, or none is stated.
+    """
+    folder = Path(folder)
     try:
-        name, digest = manifest["weights"]["file"], manifest["weights"]["sha256"]
+        name, digest = manifest[key]["file"], manifest[key]["sha256"]
+        path = folder / Path(name).name  # a manifest cannot point outside its folder
     except (KeyError, TypeError) as error:
         raise ValueError(f"{folder / MANIFEST} is damaged: {error}") from None
-    path = folder / Path(name).name  # a manifest cannot point outside its folder
     if not path.is_file():
-        raise FileNotFoundError(f"the weights of {folder / MANIFEST} are missing: {name}")
+        raise FileNotFoundError(f"{folder / MANIFEST} names a file that is missing: {name}")
     data = path.read_bytes()
     if hashlib.sha256(data).hexdigest() != digest:
         raise ValueError(f"{path} is damaged: its hash is not the one in {MANIFEST}")
-    return manifest, data
+    return data
 
 
 def save_model(

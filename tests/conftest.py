@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import importlib.util
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,7 @@ from adaptfault.cli import main
 from adaptfault.grasps import simulate
 from adaptfault.recordings import Recordings, load, save_npz
 from adaptfault.robot.bundle import Bundle
-from diagnostics import Fault, Line, SelfDiagnosis, SensorLayout, line_fault
+from diagnostics import Fault, FaultSet, Line, SelfDiagnosis, SensorLayout, line_fault
 
 
 def without_torch(path: Path) -> bool:
@@ -57,46 +59,105 @@ def real_grasps() -> Recordings:
     return load(REAL).recordings
 
 
+SMALL = SensorLayout(2, 3, 3, full_scale=4.0, present=np.arange(18) != 4)
+DROPPED = {"whole": (), "head": (1, 9, 17)}
+
+
+def small_windows(n: int, seed: int = 0) -> np.ndarray:
+    """Windows of 5 frames of the small array, half of the cells untouched; nothing where there is no cell."""
+    rng = np.random.default_rng(seed)
+    touched = (rng.random((n, 1, 18)) < 0.5) & SMALL.present.ravel()
+    return np.where(touched, rng.random((n, 5, 18)), 0).astype(np.float32)
+
+
+@pytest.fixture(scope="session")
+def versions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Folders of two adaptations of one small network, with ONNX files: F empty, and one with all parts."""
+    import torch
+
+    from adaptfault.adaptation import Adaptation, Stage
+    from adaptfault.export import add_onnx
+    from adaptfault.fills import CellStatistics
+    from adaptfault.forest import Forest
+    from adaptfault.heads import Blend, KernelHead
+    from adaptfault.network import TactileTransformer
+    from adaptfault.reduction import ReducedModel, phi
+    from adaptfault.windows import Windows
+
+    network = TactileTransformer(SMALL, 3, length=5).eval()
+    windows = Windows(small_windows(60), np.arange(60) % 3, np.arange(60))
+    folders = {}
+    for name, cells in DROPPED.items():
+        fault_set, front, head = FaultSet(cells, 18), None, None
+        if name == "head":
+            front = CellStatistics.fit(windows).nearest(fault_set)
+            with torch.no_grad():
+                views = ReducedModel(network, fault_set, front).views(torch.from_numpy(phi(windows.x, fault_set)))
+            weights = torch.from_numpy(np.random.default_rng(1).normal(0, 30, (60, 3)).astype("f4"))
+            kernel = KernelHead(views, (0.01, 2.0), (0.5, 0.5), weights, torch.zeros(3))
+            forest = Forest.fit(views[1][:9], windows.y[:9], 3)  # shallow: each level takes time to export
+            head = Blend(kernel, forest, 0.5, 2.0)
+        model = ReducedModel(network, fault_set, front, head).eval()
+        folders[name] = tmp_path_factory.mktemp(name)
+        Adaptation(model, fault_set, (Stage("fill", 0.1),), _validation=windows).save(folders[name])
+        add_onnx(folders[name])
+    return folders
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-SMALL = SensorLayout(2, 6, 5)
+SIMULATED = SensorLayout(2, 6, 5)
 SMALL_CLASSES = ("nothing", "softer", "harder")
 
 
 @pytest.fixture(scope="session")
 def small_grasps() -> Recordings:
     """90 simulated grasps of a small array, 30 a class."""
-    return simulate(30, SMALL, n_frames=60, seed=1, classes=SMALL_CLASSES)
+    return simulate(30, SIMULATED, n_frames=60, seed=1, classes=SMALL_CLASSES)
+
+
+@contextmanager
+def without_export() -> Iterator[None]:
+    """As where the export's packages are missing: it takes seconds, and has tests of its own."""
+    pytest.importorskip("torch")
+
+    def missing(folder: Path) -> None:
+        raise ImportError("left out in this test")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("adaptfault.export.add_onnx", missing)
+        yield
 
 
 @pytest.fixture(scope="session")
 def made_bundle(small_grasps: Recordings, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bundle made by the command line; not to be changed."""
-    pytest.importorskip("torch")
     home = tmp_path_factory.mktemp("bundle")
     save_npz(home / "grasps.npz", small_grasps)
     out = home / "robot.bundle"
-    assert main(["train", str(home / "grasps.npz"), "--out", str(out), "--epochs", "8", "--quiet"]) == 0
+    with without_export():
+        assert main(["train", str(home / "grasps.npz"), "--out", str(out), "--epochs", "8", "--quiet"]) == 0
     return out
 
 
 @pytest.fixture
-def bundle(made_bundle: Path, tmp_path: Path) -> Bundle:
+def bundle(made_bundle: Path, tmp_path: Path) -> Iterator[Bundle]:
     """A copy of it, to be changed."""
     shutil.copytree(made_bundle, tmp_path / "robot.bundle")
-    return Bundle.open(tmp_path / "robot.bundle")
+    with without_export():
+        yield Bundle.open(tmp_path / "robot.bundle")
 
 
 @pytest.fixture(scope="session")
 def later_grasps() -> list[np.ndarray]:
     """24 grasps of the same small sensor, healthy, on a later day."""
-    grasps = simulate(12, SMALL, n_frames=60, seed=99, classes=SMALL_CLASSES)
+    grasps = simulate(12, SIMULATED, n_frames=60, seed=99, classes=SMALL_CLASSES)
     return [frames for frames, label in zip(grasps.frames, grasps.labels, strict=True) if label > 0]
 
 
 @pytest.fixture(scope="session")
 def broken_row() -> Fault:
-    return line_fault(SMALL, Line(1, "row", 2), "short")
+    return line_fault(SIMULATED, Line(1, "row", 2), "short")

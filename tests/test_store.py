@@ -78,7 +78,7 @@ def test_missing_files_are_named(tmp_path: Path, model: TactileTransformer):
         load_model(tmp_path)
     save_model(tmp_path, model)
     next(tmp_path.glob("weights-*")).unlink()
-    with pytest.raises(FileNotFoundError, match=r"the weights of .* are missing"):
+    with pytest.raises(FileNotFoundError, match="names a file that is missing: weights-"):
         load_model(tmp_path)
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import shutil
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from datetime import datetime, timezone
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,6 +46,8 @@ _REFERENCE_SCHEMA = "adaptfault.reference/1"
 _ABOUT, _PARTS = "bundle.json", "parts"
 _ADAPTER, _REFERENCE, _CHECK, _CALIBRATION = "adapter", "reference", "check", "calibration.csv"
 _MAINTENANCE_LOCK, _STATE_LOCK = "maintenance.lock", "state.lock"
+
+_log = logging.getLogger(__name__)
 _KEPT = 5  # versions, besides the fault-free one
 
 
@@ -300,7 +303,7 @@ class Bundle:
     def write_version(self, adaptation: Adaptation, about: dict[str, Any]) -> Version:
         """Write an adaptation as a new version. Nothing is switched."""
         version = self.versions.write(
-            adaptation.save,
+            partial(_save, adaptation),
             layout=self.layout,
             class_names=self.class_names,
             length=adaptation.model.network.length,
@@ -316,6 +319,17 @@ class Bundle:
 def now() -> str:
     """Return the time, UTC, as ISO 8601."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def _save(adaptation: Adaptation, folder: Path) -> None:
+    """Write an adaptation, and beside it the ONNX file: where that cannot be made, it runs on torch."""
+    from adaptfault.export import ExportError, add_onnx
+
+    adaptation.save(folder)
+    try:
+        add_onnx(folder)
+    except (ImportError, ExportError) as error:
+        _log.warning("without ONNX, this version runs on torch: %s", error)
 
 
 def _fault_free(model: TactileTransformer, validation: Windows) -> Adaptation:

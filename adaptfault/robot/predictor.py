@@ -1,0 +1,251 @@
+"""What robot software calls in its loop: a class, the faults, and each newly deployed version between two frames."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from adaptfault.inference import Inference
+from adaptfault.windows import scale
+from diagnostics import Fault, FaultSet, Monitor, SensorLayout
+
+if TYPE_CHECKING:
+    from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.versions import Version
+
+_POLL = 1.0  # seconds between two looks at the bundle's pointer
+_RETRY = 60.0  # after one at which the bundle could not be read
+_STARTS = 3  # of versions that fail to load, before giving up: the bundle goes back to an earlier one after two
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What one frame brought.
+
+    Attributes:
+        label: the class of the window that ends with this frame; None until a window is full.
+        probabilities: float32 ``[n_classes]``; None until a window is full.
+        fault_set: F, the cells that were not used.
+        events: faults that the monitor newly found, that changed, or that are gone (probability 0).
+        version: number of the deployed version that answered.
+    """
+
+    label: int | None
+    probabilities: NDArray[np.float32] | None
+    fault_set: FaultSet
+    events: tuple[Fault, ...]
+    version: int
+
+    def __str__(self) -> str:
+        sure = "" if self.probabilities is None else f" ({self.probabilities.max():.2f})"
+        said = "window not full yet" if self.label is None else f"class {self.label}{sure}"
+        news = "".join(f"; {event.reason}" for event in self.events)
+        return f"{said}, {len(self.fault_set)} cells dropped, version {self.version}{news}"
+
+
+@dataclass(frozen=True, eq=False)
+class _Running:
+    """A version that is loaded, and the bundle as it was opened for it."""
+
+    version: Version
+    model: Inference
+    bundle: Bundle
+
+
+class Predictor:
+    """Predicts, monitors, and keeps up with what maintenance deploys, without torch where ONNX Runtime is installed.
+
+    A new version is loaded in the background and takes over between two frames. One that cannot be loaded is reported
+    in the log, and the old one goes on. One thread may use a predictor at a time.
+
+    Args:
+        open_bundle: opens the bundle anew, as it is now on disk; see :meth:`load`.
+
+    Raises:
+        FileNotFoundError, ValueError: no version of the bundle can be loaded.
+    """
+
+    def __init__(self, open_bundle: Callable[[], Bundle]) -> None:
+        self._open = open_bundle
+        bundle = open_bundle()
+        self._pointer = bundle.pointer
+        self._stamp = _stamp(self._pointer)
+        self._running = _start_any(bundle)
+        self._next_look = monotonic() + _POLL
+        self._loading: threading.Thread | None = None
+        self._ready: _Running | None = None
+        self._failed: int | None = None  # number of the version that could not be loaded
+        self._monitor = Monitor(bundle.diagnoser())
+        self.layout = bundle.layout
+        self.class_names = tuple(bundle.class_names)
+        self._last: NDArray[np.float32]  # of each cell, the last reading that was none of the missing ones
+        self._frames: NDArray[np.float32]  # the last ones, scaled
+        self.reset()
+
+    @classmethod
+    def load(cls, path: str | Path) -> Predictor:
+        """Open the bundle in a folder and start its active version.
+
+        Raises:
+            FileNotFoundError: there is none, or a file is missing.
+            ValueError: it is damaged, and no earlier version is whole.
+        """
+        from adaptfault.robot.bundle import Bundle
+
+        return cls(lambda: Bundle.open(path))
+
+    @property
+    def fault_set(self) -> FaultSet:
+        """F, the cells that are not used."""
+        return self._running.model.fault_set
+
+    @property
+    def version(self) -> int:
+        """Number of the version that answers."""
+        return self._running.version.number
+
+    @property
+    def runtime(self) -> str:
+        """What it runs on, "onnx" or "torch"."""
+        return self._running.model.runtime
+
+    def predict(self, x: NDArray[Any]) -> NDArray[np.int64]:
+        """Return the class of each window ``[N, T, D]`` on the 0..1 scale, int64 ``[N]``."""
+        self._keep_up()
+        return self._running.model.predict(x)
+
+    def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
+        """Return class probabilities ``[N, n_classes]`` of windows ``[N, T, D]``; F's cells may hold anything."""
+        self._keep_up()
+        return self._running.model.predict_proba(x)
+
+    def stream(self, frame: ArrayLike, time: float | None = None) -> Reading:
+        """Take in one frame, and say what the last ones show.
+
+        A missing reading (NaN, or infinite) is held from the frame before, 0 before a cell's first, as ``make_windows``
+        does.
+
+        Args:
+            frame: ``[D]`` or ``[pads, rows, cols]`` in the layout's unit.
+            time: when it was taken, in seconds; frames that the clock says are missing are reported as lost.
+
+        Raises:
+            ValueError: a frame of another shape.
+        """
+        reading = np.asarray(frame, dtype=np.float64).reshape(-1)
+        reading = np.where(np.isfinite(reading), reading, np.nan)
+        events = self._monitor.update(reading, time)
+        self._keep_up()
+        model = self._running.model
+        scaled = scale(reading, self.layout)
+        self._last = np.where(np.isnan(scaled), self._last, scaled)
+        # All cells are kept, the dropped ones too: the next version may use them.
+        self._frames = np.concatenate([self._frames, self._last[None]])[-model.length :]
+        label = probabilities = None
+        if len(self._frames) == model.length:
+            probabilities = model.predict_proba(self._frames[None])[0]
+            label = int(probabilities.argmax())
+        return Reading(label, probabilities, model.fault_set, events, self.version)
+
+    def reset(self) -> None:
+        """Begin a new recording: no window reaches back over it. The monitor goes on."""
+        self._frames = np.zeros((0, self.layout.n_cells), np.float32)
+        self._last = np.zeros(self.layout.n_cells, np.float32)
+
+    def confirm(self) -> bool:
+        """Confirm the running version's health, which ends its probation; the robot decides when it has seen enough.
+
+        Returns:
+            False, and nothing is confirmed, where another version has been deployed that does not run here yet.
+        """
+        bundle = self._running.bundle
+        if bundle.active().number != self.version:
+            return False
+        bundle.confirm()
+        return True
+
+    def __str__(self) -> str:
+        return f"version {self.version}: {self._running.model}"
+
+    def _keep_up(self) -> None:
+        """Switch to a new version once it is loaded; now and then look whether there is one."""
+        if self._loading is not None:
+            if self._loading.is_alive():
+                return
+            self._loading = None
+            if self._ready is not None:
+                self._running, self._ready = self._ready, None
+                _log.info("version %d runs now", self.version)
+        now = monotonic()
+        if now < self._next_look:
+            return
+        self._next_look = now + _POLL
+        stamp = _stamp(self._pointer)
+        if stamp is not None and stamp != self._stamp:
+            self._stamp = stamp
+            self._loading = threading.Thread(target=self._load_new, name="adaptfault-load", daemon=True)
+            self._loading.start()
+
+    def _load_new(self) -> None:
+        """Load the version that is active now, if it is another; runs in the background, and never raises."""
+        number = None
+        try:
+            bundle = self._open()
+            if bundle.active().number in (self.version, self._failed):
+                return
+            version = bundle.begin()
+            number = version.number
+            if number != self.version:
+                self._ready = _start(bundle, version, self.layout)
+        except Exception as error:  # whatever it is, the robot's loop must go on with what it has
+            if number is None:  # perhaps it is only busy
+                self._stamp, self._next_look = None, monotonic() + _RETRY
+            self._failed = number
+            what = "the bundle could not be read" if number is None else f"version {number} could not be loaded"
+            _log.warning("%s, version %d goes on: %s", what, self.version, error)
+
+
+def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
+    """Load a version and run it once: what cannot run shows now, and no frame waits for the first run's preparations.
+
+    Raises:
+        FileNotFoundError, ImportError, ValueError: it cannot be loaded.
+    """
+    model = Inference.load(version.folder)
+    if model.layout != layout:
+        raise ValueError(f"it is for {model.layout}, the robot has {layout}")
+    model.predict_proba(np.zeros((1, model.length, layout.n_cells), np.float32))
+    return _Running(version, model, bundle)
+
+
+def _start_any(bundle: Bundle) -> _Running:
+    """Start the active version; if it cannot be loaded, start again: after failed starts an earlier one comes back."""
+    for left in reversed(range(_STARTS)):
+        version = bundle.begin()
+        try:
+            return _start(bundle, version, bundle.layout)
+        except (OSError, ImportError, ValueError) as error:
+            if not left:
+                raise
+            _log.warning("version %d could not be loaded: %s", version.number, error)
+    raise AssertionError("unreachable")
+
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    """Return what changes when a file is replaced; None while there is none."""
+    try:
+        stat = os.stat(path)
+    except OSError:
+        return None
+    return stat.st_ino, stat.st_mtime_ns, stat.st_size

@@ -1,0 +1,129 @@
+"""What prediction costs on a robot, on ONNX Runtime and on torch: latency of one window, share of a core in a 10 Hz
+loop with the monitor, resident memory. The paper's network, one thread; bare, and with fill and head for 20 dead cells.
+Needs Linux and pip install 'adaptfault[deploy]'. Run: python examples/deploy_speed.py [--seconds 20]
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+from safetensors.numpy import load_file, save_file
+
+from adaptfault import Inference, Predictor
+from diagnostics import FaultSet, SelfDiagnosis
+
+RUNS = 100
+
+
+@dataclass
+class OneVersion:
+    """A bundle of a single version, as far as the predictor looks at it."""
+
+    folder: Path
+    fitted: SelfDiagnosis
+    class_names = ()
+
+    def __post_init__(self) -> None:
+        self.layout, self.pointer = self.fitted.layout, self.folder / "manifest.json"
+
+    def active(self) -> SimpleNamespace:
+        """Return the version."""
+        return SimpleNamespace(number=1, folder=self.folder)
+
+    begin = active
+
+    def diagnoser(self) -> SelfDiagnosis:
+        """Return the fitted diagnosis."""
+        return self.fitted
+
+
+def prepare(folder: Path) -> None:
+    """Write two versions, a fitted diagnosis and a recording; the weights are untrained, which costs the same."""
+    import adaptfault as af
+
+    grasps = af.simulate(n_per_class=10, seed=0)
+    windows = af.make_windows(grasps.frames, grasps.labels, grasps.layout)
+    training, validation, _ = af.split(windows)
+    adapter = af.Adapter(af.TactileTransformer(grasps.layout, 7).eval(), training, validation)
+    dead = FaultSet(tuple(range(0, 220, 11)), 220)
+    for name, method, fault_set in (("bare", "fill", dead - dead), ("adapted", "head", dead)):
+        adapter.adapt(fault_set, method=method, progress=False).save(folder / name)
+        af.add_onnx(folder / name)
+    about, arrays = SelfDiagnosis(grasps.layout).fit(grasps.frames).state()
+    (folder / "diagnosis.json").write_text(json.dumps(about))
+    save_file(arrays, folder / "diagnosis.safetensors")
+    np.save(folder / "frames.npy", np.concatenate(grasps.frames[:20]))
+
+
+def latency(folder: Path) -> None:
+    """Run both in turn on single windows, and print the medians."""
+    import torch
+
+    torch.set_num_threads(1)
+    models = {runtime: Inference.load(folder, runtime=runtime) for runtime in ("onnx", "torch")}
+    x = np.random.default_rng(0).random((1, 10, 220), np.float32)
+    seconds: dict[str, list[float]] = {runtime: [] for runtime in models}
+    for _ in range(RUNS):
+        for runtime, model in models.items():
+            began = time.perf_counter()
+            model.predict_proba(x)
+            seconds[runtime].append(time.perf_counter() - began)
+    onnx, eager = (1000 * float(np.median(seconds[runtime][10:])) for runtime in ("onnx", "torch"))
+    print(
+        f"{folder.name:8} one window: {onnx:.2f} ms on ONNX Runtime, {eager:.2f} ms on torch: {onnx / eager:.2f} of it"
+    )
+
+
+def loop(folder: Path, runtime: str, seconds: float) -> None:
+    """Stream at 10 Hz in this process alone, and print what it takes."""
+    if runtime == "torch":
+        sys.modules["onnxruntime"] = None  # type: ignore[assignment]  # as if it were not installed
+    arrays = load_file(folder.parent / "diagnosis.safetensors")
+    fitted = SelfDiagnosis.from_state(json.loads((folder.parent / "diagnosis.json").read_text()), arrays)
+    predictor = Predictor(lambda: OneVersion(folder, fitted))
+    if runtime == "torch":
+        sys.modules["torch"].set_num_threads(1)
+    assert predictor.runtime == runtime
+    frames = np.load(folder.parent / "frames.npy")
+    longest, n = 0.0, round(10 * seconds)
+    used, began = time.process_time(), time.perf_counter()
+    for i in range(n):
+        tick = time.perf_counter()
+        predictor.stream(frames[i % len(frames)], time=i / 10)
+        longest = max(longest, time.perf_counter() - tick)
+        time.sleep(max(0.0, began + (i + 1) / 10 - time.perf_counter()))
+    share = (time.process_time() - used) / (time.perf_counter() - began)
+    resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    print(
+        f"{folder.name:8} 10 Hz on {runtime:5} for {seconds:g} s: {100 * share:.1f} % of a core, longest frame"
+        f" {1000 * longest:.0f} ms, {resident / 1e6:.0f} MB resident"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=2, help="length of each 10 Hz loop")
+    parser.add_argument("--measure", nargs=2, metavar=("FOLDER", "WHAT"), help="in a process of its own")
+    arguments = parser.parse_args()
+    if arguments.measure:
+        folder, what = Path(arguments.measure[0]), arguments.measure[1]
+        return latency(folder) if what == "latency" else loop(folder, what, arguments.seconds)
+    with tempfile.TemporaryDirectory() as temporary:
+        prepare(Path(temporary))
+        for name in ("bare", "adapted"):
+            for what in ("latency", "onnx", "torch"):
+                command = [sys.executable, __file__, "--seconds", str(arguments.seconds)]
+                environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+                subprocess.run([*command, "--measure", f"{temporary}/{name}", what], check=True, env=environment)
+
+
+if __name__ == "__main__":
+    main()

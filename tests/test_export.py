@@ -1,0 +1,85 @@
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import DROPPED, small_windows
+
+from adaptfault import export
+from adaptfault.adaptation import Adaptation
+from adaptfault.export import ExportError, add_onnx, to_onnx
+from adaptfault.inference import open_session, run_session
+
+
+@pytest.mark.parametrize("name", DROPPED)
+def test_the_file_says_what_the_model_says_for_any_number_of_windows(versions, name):
+    adaptation = Adaptation.load(versions[name])
+    session = open_session((versions[name] / "model.onnx").read_bytes())
+    (given,) = session.get_inputs()
+    assert isinstance(given.shape[0], str)  # a name, not a number
+    assert given.shape[1:] == [5, 18]
+    for n in (1, 3, 64):
+        x = small_windows(n, seed=n)
+        said = run_session(session, x)
+        assert said.dtype == np.float32
+        np.testing.assert_allclose(said, adaptation.predict_proba(x), rtol=0, atol=1e-5)
+        np.testing.assert_allclose(said.sum(axis=1), 1, atol=1e-5)
+        assert n == 1 or np.ptp(said, axis=0).max() > 1e-3
+
+
+def test_what_a_dropped_cell_reads_changes_not_a_bit(versions):
+    session = open_session((versions["head"] / "model.onnx").read_bytes())
+    x = small_windows(6)
+    usual = run_session(session, x)
+    for anything in (np.nan, np.inf, -np.inf, 1e30, 0.0):
+        x[..., list(DROPPED["head"])] = anything
+        np.testing.assert_array_equal(run_session(session, x), usual)
+
+
+def test_a_file_that_is_fixed_at_one_size_of_batch_is_refused_and_the_model_is_left_as_it_was(versions, monkeypatch):
+    model = Adaptation.load(versions["whole"]).model.train()
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    whole = torch.onnx.export
+
+    def fixed(*args, dynamic_shapes, **named):
+        return whole(*args, **named)
+
+    monkeypatch.setattr(torch.onnx, "export", fixed)
+    with pytest.raises(ExportError, match="does not run on 1 windows"):
+        to_onnx(model)
+    assert all(module.training for module in model.modules())
+    assert all(torch.equal(tensor, before[name]) for name, tensor in model.state_dict().items())
+
+
+def test_a_file_that_says_something_else_is_refused(versions, monkeypatch):
+    other = (versions["whole"] / "model.onnx").read_bytes()
+    monkeypatch.setattr(export, "_translate", lambda *_: other)
+    with pytest.raises(ExportError, match="something else"):
+        to_onnx(Adaptation.load(versions["head"]).model)
+
+
+def test_the_manifest_states_the_file_and_keeps_all_else(versions, tmp_path, monkeypatch):
+    adaptation = Adaptation.load(versions["whole"])
+    adaptation.save(tmp_path)
+    before = json.loads((tmp_path / "manifest.json").read_text())
+    monkeypatch.setattr(export, "to_onnx", lambda model: b"a file")
+    path = add_onnx(tmp_path)
+    assert (path, path.read_bytes()) == (tmp_path / "model.onnx", b"a file")
+    after = json.loads((tmp_path / "manifest.json").read_text())
+    assert after.pop("onnx").keys() == {"file", "sha256"}
+    assert after == before
+    x = small_windows(4)
+    np.testing.assert_array_equal(Adaptation.load(tmp_path).predict_proba(x), adaptation.predict_proba(x))
+
+
+def test_a_folder_without_an_adaptation_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"manifest\.json"):
+        add_onnx(Path(tmp_path))
+
+
+def test_it_says_what_to_install(versions, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxscript", None)
+    with pytest.raises(ImportError, match=r"pip install 'adaptfault\[deploy\]'"):
+        to_onnx(Adaptation.load(versions["whole"]).model)

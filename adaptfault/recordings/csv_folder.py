@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.recordings.content import Content
-from adaptfault.recordings.errors import InputError
-from adaptfault.recordings.text import numbered_lines, read_text, shown
+from adaptfault.recordings.errors import InputError, Problem, located
+from adaptfault.recordings.text import decoded, numbered_lines, read_bytes, shown
 
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -20,12 +20,23 @@ _LARGEST = float(np.finfo(np.float32).max)
 def read_csv(path: Path) -> Content:
     """Read a CSV file of T lines x D readings, comma separated, with or without a header line.
 
-    An empty cell and ``nan`` are missing readings and become NaN. Blank lines are passed over.
+    An empty cell and ``nan`` are missing readings and become NaN. Blank lines are passed over. A last line without an
+    end, cut off when the power went, is left out with a warning, and so are the zero bytes that may follow it; if the
+    cut went through its last number, nobody can tell.
 
     Raises:
         InputError: not text, no readings, lines of different lengths, a cell that is no number.
     """
-    rows, numbers = numbered_lines(read_text(path))
+    data = read_bytes(path)
+    written = data.rstrip(b"\0") or data
+    written = written if written.isascii() else data  # then it was no CSV from the start
+    text = decoded(path, written)
+    rows, numbers = numbered_lines(text)
+    problems: tuple[Problem, ...] = ()
+    if not text.endswith("\n") and len(rows) > 1 and (len(written) < len(data) or _is_cut(rows[-1], rows[-2])):
+        what = f"cut off in this line: the {len(rows) - 1} lines before it are kept"
+        problems = (Problem("warning", located(path, what, f"line {numbers[-1]}")),)
+        rows, numbers = rows[:-1], numbers[:-1]
     if rows and _is_header(rows[0]):
         rows, numbers = rows[1:], numbers[1:]
     if not rows:
@@ -36,7 +47,14 @@ def read_csv(path: Path) -> Content:
         values = _read_by_cell(path, rows, numbers)
     with np.errstate(invalid="ignore"):
         counts = bool(np.all((values == np.rint(values)) | np.isnan(values)))
-    return Content(path, (values,), counts, lines=np.array(numbers, dtype=np.intp))
+    return Content(path, (values,), counts, lines=np.array(numbers, dtype=np.intp), problems=problems)
+
+
+def _is_cut(line: str, before: str) -> bool:
+    """Tell a line that stops short from one that is complete, as the line before it is."""
+    last, last_before = (_bare(row.rpartition(",")[2]) for row in (line, before))
+    stops = line.count(",") < before.count(",") or (last != "" and _number(last) is None)
+    return stops and (last_before == "" or _number(last_before) is not None)
 
 
 def _is_header(line: str) -> bool:

@@ -4,6 +4,8 @@ from adaptfault.acquisition.ordering import Arrivals, Frame, Ordering
 from adaptfault.acquisition.packet import Packet, PacketError, format_packet, parse_packet
 from adaptfault.acquisition.receiver import Counters, Receiver
 from adaptfault.acquisition.recorder import Recorded, Recorder
+from adaptfault.acquisition.session import Event, Session
+from adaptfault.acquisition.station import Station
 from adaptfault.acquisition.switch import Contact, Daily, Switch, parse_when
 
 __all__ = [
@@ -11,6 +13,7 @@ __all__ = [
     "Contact",
     "Counters",
     "Daily",
+    "Event",
     "Frame",
     "Ordering",
     "Packet",
@@ -18,6 +21,8 @@ __all__ = [
     "Receiver",
     "Recorded",
     "Recorder",
+    "Session",
+    "Station",
     "Switch",
     "format_packet",
     "parse_packet",

@@ -12,11 +12,6 @@ from numpy.typing import NDArray
 
 from diagnostics import SensorLayout
 
-WHEN_HELP = (
-    "always | command (record and stop on stdin) | contact or contact:X (cells above X in the array's unit, default"
-    " 5 %% of full scale) | HH:MM-HH:MM (local time)"
-)
-
 Rule = Callable[[NDArray[np.float64], NDArray[np.bool_], datetime], bool]
 """Says of a frame ``[D]``, the cells not to be trusted (bool ``[D]``) and the local time whether to record it."""
 
@@ -85,7 +80,7 @@ def parse_when(text: str, layout: SensorLayout) -> Rule:
     if match := _HOURS.fullmatch(text):
         first, second, third, fourth = (int(part) for part in match.groups())
         return Daily(time(first, second), time(third, fourth))
-    raise ValueError(f"--when {text}: expected {WHEN_HELP}".replace("%%", "%"))
+    raise ValueError(f"--when {text}: expected always, command, contact, contact:X or HH:MM-HH:MM")
 
 
 class Switch:

@@ -39,16 +39,22 @@ def add_recordings(
         parser.add_argument("--recordings", nargs="+", metavar="FILE", help=help_)
     else:
         parser.add_argument("recordings", nargs="+" if least else "*", metavar="RECORDINGS", help=help_)
-    group = parser.add_argument_group("how recordings are read")
+    group = add_array(parser)
     if labels:
         group.add_argument("--labels", metavar="TABLE", help="CSV table with the columns file,label")
+    group.add_argument("--frames", type=int, metavar="T", help="refuse recordings of another length")
+
+
+def add_array(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """Add what describes the array; returns the group of options."""
+    group = parser.add_argument_group("how recordings are read")
     group.add_argument("--layout", metavar="FILE", help="layout of the array, a JSON file")
     group.add_argument("--shape", metavar="PxRxC", help="layout from a shape: pads x rows x columns, as 2x13x6")
     group.add_argument("--full-scale", type=float, metavar="X", help="largest value a cell can report")
     group.add_argument("--unit", metavar="U", help="unit of the recordings, as N or count")
     group.add_argument("--rate", type=float, metavar="HZ", help="frames per second")
     group.add_argument("--calibration", metavar="TABLE", help="CSV table cell,raw,force: raw counts to newtons")
-    group.add_argument("--frames", type=int, metavar="T", help="refuse recordings of another length")
+    return group
 
 
 def load_recordings(args: argparse.Namespace, paths: Sequence[str], *, labelled: bool = False) -> Recordings:

@@ -329,7 +329,7 @@ def test_a_path_that_is_not_there_is_refused(tmp_path):
 def test_a_folder_without_recordings_and_an_unknown_kind_of_file_are_refused(tmp_path):
     (tmp_path / "x.csv").mkdir()
     message = refusal(tmp_path / "x.csv")
-    assert "x.csv: the folder holds no recordings; expected files that end in .csv, .npy, .npz" in message
+    assert "x.csv: the folder holds no recordings; expected files that end in .csv, .db3, .mcap, .npy, .npz" in message
     assert "notes.txt: is no recording" in refusal(write(tmp_path / "notes.txt", "hello"))
 
 

@@ -34,7 +34,7 @@ def add_recordings(
     parser: argparse.ArgumentParser, *, option: bool = False, labels: bool = True, least: int = 1
 ) -> None:
     """Add where recordings come from: ``least`` arguments, or an ``option`` for a command that can do without."""
-    help_ = "file or folder of recordings (.csv, .npz, .npy)"
+    help_ = "file or folder of recordings (.csv, .npz, .npy; ROS 2 bags: folder, .mcap, .db3)"
     if option:
         parser.add_argument("--recordings", nargs="+", metavar="FILE", help=help_)
     else:
@@ -42,6 +42,10 @@ def add_recordings(
     group = add_array(parser)
     if labels:
         group.add_argument("--labels", metavar="TABLE", help="CSV table with the columns file,label")
+    group.add_argument("--topic", metavar="NAME", help="topic of a bag that holds the readings")
+    group.add_argument(
+        "--field", metavar="PATH", help="array in its messages that holds them, as data or sensors.values"
+    )
     group.add_argument("--frames", type=int, metavar="T", help="refuse recordings of another length")
 
 
@@ -76,6 +80,8 @@ def load_recordings(args: argparse.Namespace, paths: Sequence[str], *, labelled:
         full_scale=args.full_scale,
         unit=args.unit,
         rate=args.rate,
+        topic=args.topic,
+        field=args.field,
     )
     for problem in loaded.problems:
         print(problem, file=sys.stderr)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from adaptfault.recordings import Recordings
+    from adaptfault.recordings.blocks import Stream
     from diagnostics import FaultSet, SensorLayout
 
 Commands = Any  # argparse's private type of subparsers
@@ -69,8 +70,7 @@ def load_recordings(args: argparse.Namespace, paths: Sequence[str], *, labelled:
     """
     from adaptfault.recordings import load
 
-    if args.layout and args.shape:
-        raise ValueError("--layout and --shape both given: one of them is enough")
+    _one_layout(args)
     loaded = load(
         paths,
         layout=args.layout or args.shape,
@@ -91,6 +91,32 @@ def load_recordings(args: argparse.Namespace, paths: Sequence[str], *, labelled:
             " or labels in the .npz"
         )
     return loaded.recordings
+
+
+def stream_recordings(args: argparse.Namespace, paths: Sequence[str]) -> Stream:
+    """Open recordings that are too large to be loaded, as the options say; problems are known after an iteration.
+
+    Raises:
+        ValueError: nothing could be read.
+    """
+    from adaptfault.recordings.blocks import Stream
+
+    _one_layout(args)
+    return Stream(
+        paths,
+        layout=args.layout or args.shape,
+        calibration=args.calibration,
+        full_scale=args.full_scale,
+        unit=args.unit,
+        rate=args.rate,
+        topic=args.topic,
+        field=args.field,
+    )
+
+
+def _one_layout(args: argparse.Namespace) -> None:
+    if args.layout and args.shape:
+        raise ValueError("--layout and --shape both given: one of them is enough")
 
 
 def fault_set(text: str, layout: SensorLayout) -> FaultSet:

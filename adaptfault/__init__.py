@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from adaptfault.acquisition import Receiver, Recorder, Station
     from adaptfault.adaptation import Adaptation
     from adaptfault.adapter import Adapter
     from adaptfault.calibration import Calibration
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from adaptfault.recordings import Recordings, load, save_npz
     from adaptfault.reduction import ReducedModel
     from adaptfault.replay import load_adapter, save_adapter
+    from adaptfault.ros import diagnostic_array, write_diagnostics
     from adaptfault.store import load_model, save_model
     from adaptfault.training import train
     from adaptfault.windows import Windows, make_windows, split
@@ -32,11 +34,15 @@ __all__ = [
     "Calibration",
     "Forecast",
     "History",
+    "Receiver",
+    "Recorder",
     "Recordings",
     "ReducedModel",
     "Scores",
+    "Station",
     "TactileTransformer",
     "Windows",
+    "diagnostic_array",
     "evaluate",
     "load",
     "load_adapter",
@@ -48,6 +54,7 @@ __all__ = [
     "simulate",
     "split",
     "train",
+    "write_diagnostics",
 ]
 
 _HOMES = {
@@ -56,11 +63,15 @@ _HOMES = {
     "Calibration": "calibration",
     "Forecast": "forecast",
     "History": "history",
+    "Receiver": "acquisition",
+    "Recorder": "acquisition",
     "Recordings": "recordings",
     "ReducedModel": "reduction",
+    "Station": "acquisition",
     "Scores": "evaluation",
     "TactileTransformer": "network",
     "Windows": "windows",
+    "diagnostic_array": "ros",
     "evaluate": "evaluation",
     "load": "recordings",
     "load_adapter": "replay",
@@ -72,6 +83,7 @@ _HOMES = {
     "simulate": "grasps",
     "split": "windows",
     "train": "training",
+    "write_diagnostics": "ros",
 }
 
 

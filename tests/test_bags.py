@@ -171,7 +171,7 @@ def test_messages_of_another_width_are_left_out_and_counted(tmp_path):
 @pytest.mark.parametrize(("storage", "compressed"), [("MCAP", None), ("MCAP", "STORAGE"), ("SQLITE3", None)])
 @pytest.mark.parametrize("as_folder", [True, False])
 def test_a_bag_that_was_cut_off_gives_what_it_has_and_says_how_much(tmp_path, storage, compressed, as_folder):
-    values = newtons(3000)
+    values = newtons(2000)
     bag = write_bag(tmp_path / "t", tactile(values), storage=storage, compressed=compressed)
     file = next(bag.glob("t.*"))
     data = file.read_bytes()
@@ -179,7 +179,7 @@ def test_a_bag_that_was_cut_off_gives_what_it_has_and_says_how_much(tmp_path, st
         file.write_bytes(data[: int(share * len(data))])
         loaded = load(bag if as_folder else file)
         (frames,) = loaded.recordings.frames
-        assert (share - 0.17) * 3000 < len(frames) < 3000
+        assert (share - 0.17) * 2000 < len(frames) < 2000
         np.testing.assert_array_equal(frames, values[: len(frames)])
         (problem,) = loaded.problems
         assert f"{len(frames)} messages of /tactile, {(len(frames) - 1) / 10:.1f} s, could be read" in problem.message
@@ -188,7 +188,7 @@ def test_a_bag_that_was_cut_off_gives_what_it_has_and_says_how_much(tmp_path, st
 
 
 def test_a_damaged_chunk_in_the_middle_costs_only_itself(tmp_path):
-    values = newtons(3000)
+    values = newtons(2000)
     bag = write_bag(tmp_path / "t", tactile(values))
     file = next(bag.glob("*.mcap"))
     data = bytearray(file.read_bytes())
@@ -198,7 +198,7 @@ def test_a_damaged_chunk_in_the_middle_costs_only_itself(tmp_path):
     file.write_bytes(data)
     loaded = load(file)
     kept = np.concatenate(loaded.recordings.frames)
-    assert 1500 < len(kept) < 3000
+    assert 500 < len(kept) < 2000
     assert {tuple(frame[:5]) for frame in kept} <= {tuple(frame[:5]) for frame in values}
     assert "; 1 damaged " in loaded.problems[0].message
 
@@ -208,7 +208,7 @@ def test_no_cut_or_flipped_bag_raises_anything_but_an_input_error(tmp_path, stor
     bag = write_bag(tmp_path / "t", tactile(newtons(30, 6)), storage=storage)
     file = next(bag.glob("t.*"))
     data = file.read_bytes()
-    for i in range(0, len(data), max(1, len(data) // 25)):
+    for i in range(0, len(data), max(1, len(data) // 12)):
         for content in (data[:i], data[:i] + bytes([data[i] ^ 0x55]) + data[i + 1 :]):
             file.write_bytes(content)
             try:

@@ -214,7 +214,8 @@ def test_a_row_that_breaks_is_told_without_any_bundle(grasps, capsys):
     values = np.concatenate(grasps.frames[::7]).copy()[:600]
     values.reshape(-1, 2, 11, 10)[:, 1, 5] = 5.0
     port = free_port()
-    station = Station(grasps.layout, port, frames=len(values), seconds=60, quiet=True)
+    events = []
+    station = Station(grasps.layout, port, frames=len(values), seconds=60, quiet=True, on_event=events.append)
     sending = threading.Thread(target=send, args=(port, packets(values), 0.002))
 
     async def run():
@@ -223,7 +224,8 @@ def test_a_row_that_breaks_is_told_without_any_bundle(grasps, capsys):
 
     asyncio.run(run())
     sending.join()
-    assert re.search(r"fault: pad 1, row 5 is short", capsys.readouterr().out)
+    assert any(event.kind == "fault" and "pad 1, row 5 is short" in event.text for event in events)
+    assert capsys.readouterr().out.startswith("end: 600 received")
 
 
 def wait_for(child, line, count):

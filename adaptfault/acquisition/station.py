@@ -47,6 +47,7 @@ class Station:
         when: when to record, see :func:`parse_when`.
         seconds, frames: when to end; None: never.
         calibration: turns the values that come into the layout's unit.
+        on_event: called with each event, from the loop, instead of a line on stdout.
         as_json: one JSON object a line.
         quiet: nothing on stderr.
 
@@ -68,11 +69,13 @@ class Station:
         seconds: float | None = None,
         frames: int | None = None,
         calibration: Calibration | None = None,
+        on_event: Callable[[Event], None] | None = None,
         as_json: bool = False,
         quiet: bool = False,
     ) -> None:
         self.bundle, self.record, self.calibration = bundle, record, calibration
         self.seconds, self.frames, self.as_json, self.quiet = seconds, frames, as_json, quiet
+        self.on_event = self._print if on_event is None else on_event
         self._ready: list[Streaming | Monitor] = []
         if bundle is not None:
             predictor = self._predictor()
@@ -172,7 +175,10 @@ class Station:
 
     def _tell(self, events: list[Event]) -> None:
         for event in events:
-            print(json.dumps(event.to_dict(), allow_nan=False) if self.as_json else event, flush=True)
+            self.on_event(event)
+
+    def _print(self, event: Event) -> None:
+        print(json.dumps(event.to_dict(), allow_nan=False) if self.as_json else event, flush=True)
 
     def _say(self, text: str) -> None:
         if not self.quiet:

@@ -11,6 +11,7 @@ import pytest
 from adaptfault.cli import main
 from adaptfault.recordings import InputError, Recordings, blocks, load, save_npz
 from adaptfault.recordings.blocks import Stream, is_large
+from adaptfault.recordings.csv_folder import csv_pieces, read_csv
 from diagnostics import SensorLayout
 
 LAYOUT = SensorLayout.paper()
@@ -57,6 +58,7 @@ def test_a_log_in_blocks_is_diagnosed_as_one_that_is_loaded(tmp_path, log, kind,
     for limit in (blocks.LARGE, 0):
         monkeypatch.setattr(blocks, "LARGE", limit)
         monkeypatch.setattr(blocks, "_BLOCK", 700)
+        monkeypatch.setattr(blocks, "_CSV", 100_000)
         assert is_large([folder]) == (limit == 0)
         shape = [] if kind in ("npz", "bag") else ["--shape", "2x11x10"]
         assert main(["diagnose", folder, "--json", *shape]) == 2
@@ -80,6 +82,28 @@ def test_what_is_odd_is_counted_over_all_blocks(tmp_path, log, monkeypatch):
         "20 missing readings: kept as missing",
         "2 readings outside 0..5 N: kept",
     ]
+
+
+@pytest.mark.parametrize("size", [1, 7, 30, 31, 32, 1000])
+@pytest.mark.parametrize("end", [b"", b"3,4", b"3,4,", b"3,4,5,6,7,8", b"3,4,5\0\0\0"])
+def test_a_csv_in_pieces_of_any_size_is_what_is_read_at_once(tmp_path, size, end):
+    head = ",".join(f"cell_{i}" for i in range(6))
+    text = f"{head}\n0,1,2,3,4,5\n\n1,1,2,3,,5\r\n2,1,2,3,4,nan\n".encode()
+    (tmp_path / "a.csv").write_bytes(text + end)
+    whole = read_csv(tmp_path / "a.csv")
+    pieces = list(csv_pieces(tmp_path / "a.csv", size))
+    values = np.concatenate([piece.values for piece in pieces if piece.values is not None])
+    np.testing.assert_array_equal(values, whole.frames[0])
+    assert [line for piece in pieces for line in piece.lines] == whole.lines.tolist()
+    assert tuple(problem for piece in pieces for problem in piece.problems) == whole.problems
+
+
+@pytest.mark.parametrize(("bad", "expected"), [("1,2", "line 5: 2 values where"), ("1,x,3", "line 5, column 2: 'x'")])
+def test_a_bad_line_of_a_csv_in_pieces_is_named(tmp_path, bad, expected):
+    (tmp_path / "a.csv").write_text("1,2,3\n" * 4 + bad + "\n" + "1,2,3\n" * 4)
+    for size in (1, 1000):
+        with pytest.raises(InputError, match=expected):
+            list(csv_pieces(tmp_path / "a.csv", size))
 
 
 def test_layouts_are_settled_as_when_loading(tmp_path):

@@ -199,6 +199,12 @@ def test_with_a_bundle_classes_are_told(tmp_path, capsys, monkeypatch):
     assert (path, len(predictor.frames)) == ("robot.bundle", 3)
 
 
+def test_without_what_a_bundle_needs_the_user_is_told_so(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "adaptfault.predictor", None)
+    assert main(["listen", "robot.bundle", "--port", "0"]) == 3
+    assert "robot.bundle: classifying needs adaptfault.predictor" in capsys.readouterr().err
+
+
 def test_counts_are_turned_into_newtons_by_a_calibration(tmp_path, capsys):
     table = tmp_path / "tables.csv"
     table.write_text("cell,raw,force\n" + "".join(f"{cell},0,0\n{cell},1000,4\n" for cell in range(6)))

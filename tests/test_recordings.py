@@ -189,7 +189,7 @@ def test_a_csv_that_was_cut_off_anywhere_gives_every_line_before_the_cut_and_say
                 assert cut > ends[complete] - 6 and not zeros  # noqa: PT018
             elif cut not in ends:
                 (warning,) = messages(loaded, "warning")
-                assert f"line {complete + 1}: cut off in this line: the {complete} lines before it" in warning
+                assert f"line {complete + 1}: cut off in this line: the lines before it are kept" in warning
 
 
 def test_one_bad_file_does_not_lose_the_others(tmp_path):

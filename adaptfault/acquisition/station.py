@@ -156,8 +156,11 @@ class Station:
         return Monitor(SelfDiagnosis(self.layout))
 
     def _predictor(self) -> Streaming:
-        loaded = import_module("adaptfault.predictor").Predictor.load(self.bundle)  # here: watching needs no model
-        return cast(Streaming, loaded)
+        try:
+            predictor = import_module("adaptfault.predictor").Predictor  # here: watching needs no model
+        except ImportError as error:
+            raise ValueError(f"{self.bundle}: classifying needs {error.name}; install it, or give no bundle") from None
+        return cast(Streaming, predictor.load(self.bundle))
 
     def _obey(self, line: str) -> None:
         word = line.strip().lower()

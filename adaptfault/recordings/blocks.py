@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from adaptfault.recordings.bag import STORAGES, bag_messages
 from adaptfault.recordings.check import check_width
 from adaptfault.recordings.content import Content, Shape
+from adaptfault.recordings.csv_folder import csv_pieces
 from adaptfault.recordings.errors import InputError, Problem, located
 from adaptfault.recordings.files import Found, find
 from adaptfault.recordings.guess import SLACK
@@ -29,6 +30,7 @@ LARGE = 200_000_000
 """Bytes of files, from which on they are better read in blocks: loaded, they take up to ten times that."""
 
 _BLOCK = 4096  # frames
+_CSV = 16_000_000  # bytes of text
 _RATED = 1000  # messages of a bag from which its rate is taken
 
 Blocks = Callable[[], Iterator[NDArray[Any]]]
@@ -52,8 +54,8 @@ def is_large(paths: Sequence[PathName]) -> bool:
 class Stream:
     """Recordings as one stream of blocks, float64 ``[t, D]`` in the layout's unit, in constant memory.
 
-    .npy files and bags are read piece by piece; other files whole, one after the other. A missing reading is NaN, and
-    so is one that is infinite. May be iterated more than once.
+    CSV and .npy files and bags are read piece by piece, archives (.npz) whole, one after the other. A missing reading
+    is NaN, and so is one that is infinite. May be iterated more than once.
 
     Args:
         paths, layout, calibration, full_scale, unit, rate, topic, field: as for :func:`adaptfault.load`.
@@ -134,6 +136,8 @@ def _open(file: Found, topic: str | None, field: str | None, problems: list[Prob
     suffix = file.path.suffix.lower()
     if file.path.is_dir() or suffix in STORAGES:
         return _bag(file.path, topic, field, problems, largest)
+    if suffix == ".csv":
+        return _csv(file.path, problems, largest)
     if suffix == ".npy" and (pieces := _npy(file.path, largest)) is not None:
         return pieces
     content = READERS[suffix](file.path)
@@ -166,6 +170,24 @@ def _bag(path: Path, topic: str | None, field: str | None, problems: list[Proble
     rate = float(f"{1 / period:.3g}") if period > 0 else None
     head = Content(path, (sample,), counts=first[0].counts, shape=first[0].shape, rate=rate)
     return Source(head, lambda: blocks(problems), 1)
+
+
+def _csv(path: Path, problems: list[Problem], largest: bool) -> Source:
+    def blocks(noticed: list[Problem]) -> Iterator[NDArray[Any]]:
+        for piece in csv_pieces(path, _CSV):
+            noticed += piece.problems
+            if piece.values is not None:
+                yield piece.values
+
+    first = next((piece for piece in csv_pieces(path, _CSV) if piece.values is not None), None)
+    if first is None or first.values is None:
+        raise InputError.at(path, "holds no readings; record it again or remove it")
+    sample, counts = first.values[:1], False
+    if largest:
+        whole = [np.array_equal(block, np.rint(block), equal_nan=True) for block in blocks([])]
+        sample, counts = _sample(blocks([])), all(whole)
+    lines = np.resize(first.lines, len(sample))
+    return Source(Content(path, (sample,), counts, lines=lines), lambda: blocks(problems), 1)
 
 
 def _npy(path: Path, largest: bool) -> Source | None:

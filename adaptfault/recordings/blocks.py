@@ -30,7 +30,7 @@ LARGE = 200_000_000
 """Bytes of files, from which on they are better read in blocks: loaded, they take up to ten times that."""
 
 _BLOCK = 4096  # frames
-_CSV = 16_000_000  # bytes of text
+_CSV = 2_000_000  # bytes of text
 _RATED = 1000  # messages of a bag from which its rate is taken
 
 Blocks = Callable[[], Iterator[NDArray[Any]]]
@@ -184,8 +184,8 @@ def _csv(path: Path, problems: list[Problem], largest: bool) -> Source:
         raise InputError.at(path, "holds no readings; record it again or remove it")
     sample, counts = first.values[:1], False
     if largest:
-        whole = [np.array_equal(block, np.rint(block), equal_nan=True) for block in blocks([])]
-        sample, counts = _sample(blocks([])), all(whole)
+        pairs = [(_sample([block]), np.array_equal(block, np.rint(block), equal_nan=True)) for block in blocks([])]
+        sample, counts = np.concatenate([one for one, _ in pairs]), all(whole for _, whole in pairs)
     lines = np.resize(first.lines, len(sample))
     return Source(Content(path, (sample,), counts, lines=lines), lambda: blocks(problems), 1)
 

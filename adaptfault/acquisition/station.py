@@ -88,7 +88,8 @@ class Station:
         self.layout = layout
         self._rule: Rule | None = None if record is None else parse_when(when, layout)
         if record is not None:
-            Recorder(record, layout).__exit__(None, None, None)  # a folder that cannot be used is told now
+            with Recorder(record, layout):  # a folder that cannot be used is told now
+                pass
         if not self._ready:
             self._ready.append(self._monitor())  # now, not when the first frame comes: it takes a second
         self.receiver = Receiver(layout, port, host=host, devices=devices, ticks=ticks)

@@ -17,6 +17,7 @@ from diagnostics import SensorLayout
 MOST_DEVICES = 16
 QUEUE = 1024
 _KERNEL_BUFFER = 4 << 20  # bytes asked for: what arrives while this process has no turn; the system may give less
+_TURNS = 8  # of the event loop for each frame fetched; each reads one datagram: the queue counts what it drops
 _TICK = 0.05  # seconds between looks at packets that wait
 
 
@@ -185,7 +186,8 @@ class Receiver(asyncio.DatagramProtocol):
         return self
 
     async def __anext__(self) -> Frame:
-        await asyncio.sleep(0)  # a turn for the socket, however many frames wait here
+        for _ in range(_TURNS):  # for the socket, however many frames wait here
+            await asyncio.sleep(0)
         while not self._queue:
             if self._closed:
                 raise StopAsyncIteration

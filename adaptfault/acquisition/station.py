@@ -30,6 +30,7 @@ SCHEMA = "adaptfault.listen/1"
 _COMMANDS = {"record": True, "stop": False, "auto": None}
 _ANSWERS = {True: "recording from now on", False: "not recording", None: "recording as the rule says"}
 _LOOK = 0.5  # seconds between looks at devices that are silent
+_WAITING = 16_000_000  # bytes of frames that may wait: what comes in a burst is dealt with later
 _LINE = 1000  # bytes; a longer command is none
 
 
@@ -92,7 +93,8 @@ class Station:
                 pass
         if not self._ready:
             self._ready.append(self._monitor())  # now, not when the first frame comes: it takes a second
-        self.receiver = Receiver(layout, port, host=host, devices=devices, ticks=ticks)
+        queue = max(64, _WAITING // (8 * layout.n_cells))
+        self.receiver = Receiver(layout, port, host=host, devices=devices, ticks=ticks, queue=queue)
         self._sessions: dict[str, Session] = {}
         self._command: bool | None = None  # the last that came; holds for devices that come later
 

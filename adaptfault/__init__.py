@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from adaptfault.acquisition import Receiver, Recorder, Station
     from adaptfault.adaptation import Adaptation
     from adaptfault.adapter import Adapter
     from adaptfault.calibration import Calibration
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.maintenance import MaintenanceReport, maintain
     from adaptfault.robot.predictor import Predictor, Reading
+    from adaptfault.ros import diagnostic_array, write_diagnostics
     from adaptfault.store import load_model, save_model
     from adaptfault.training import train
     from adaptfault.windows import Windows, make_windows, split
@@ -42,12 +44,16 @@ __all__ = [
     "MaintenanceReport",
     "Predictor",
     "Reading",
+    "Receiver",
+    "Recorder",
     "Recordings",
     "ReducedModel",
     "Scores",
+    "Station",
     "TactileTransformer",
     "Windows",
     "add_onnx",
+    "diagnostic_array",
     "evaluate",
     "load",
     "load_adapter",
@@ -60,6 +66,7 @@ __all__ = [
     "simulate",
     "split",
     "train",
+    "write_diagnostics",
 ]
 
 _HOMES = {
@@ -73,12 +80,16 @@ _HOMES = {
     "MaintenanceReport": "robot.maintenance",
     "Predictor": "robot.predictor",
     "Reading": "robot.predictor",
+    "Receiver": "acquisition",
+    "Recorder": "acquisition",
     "Recordings": "recordings",
     "ReducedModel": "reduction",
+    "Station": "acquisition",
     "Scores": "evaluation",
     "TactileTransformer": "network",
     "Windows": "windows",
     "add_onnx": "export",
+    "diagnostic_array": "ros",
     "evaluate": "evaluation",
     "load": "recordings",
     "load_adapter": "replay",
@@ -91,6 +102,7 @@ _HOMES = {
     "simulate": "grasps",
     "split": "windows",
     "train": "training",
+    "write_diagnostics": "ros",
 }
 
 

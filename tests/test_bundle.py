@@ -81,15 +81,22 @@ def test_opening_and_monitoring_need_no_torch(made_bundle):
 
 def test_a_version_never_confirmed_gives_way_after_two_starts(bundle):
     assert deploy(bundle, 3) == 2
-    assert [bundle.begin().number for _ in range(4)] == [2, 2, 1, 1]
+    assert [bundle.begin(f"start {i}").number for i in range(4)] == [2, 2, 1, 1]
     assert bundle.journal.runs()[-1]["what"] == "rollback"
+
+
+def test_a_process_that_serves_many_devices_starts_once(bundle):
+    deploy(bundle, 3)
+    assert [bundle.begin().number for _ in range(5)] == [2] * 5
+    assert bundle.begin("the next process").number == 2
+    assert bundle.begin("and the one after").number == 1
 
 
 def test_a_confirmed_version_stays(bundle):
     deploy(bundle, 3)
     bundle.begin()
     bundle.confirm()
-    assert [bundle.begin().number for _ in range(4)] == [2, 2, 2, 2]
+    assert [bundle.begin(f"start {i}").number for i in range(4)] == [2, 2, 2, 2]
     bundle.confirm()  # again: nothing to say
     assert [run["what"] for run in bundle.journal.runs()] == ["confirmed"]
 

@@ -29,7 +29,7 @@ def test_a_broken_row_is_found_repaired_and_deployed_on_probation(bundle, later_
     assert report.exit_code == (1 if report.accuracy >= 0.9 * report.fault_free_accuracy else 2)
     assert str(report).startswith(f"ADAPTFAULT {('WARNING', 'CRITICAL')[report.exit_code - 1]} - deployed: accuracy")
     assert bundle.active().fault_set == report.fault_set
-    assert [bundle.begin().number for _ in range(3)] == [2, 2, 1]
+    assert [bundle.begin(f"start {i}").number for i in range(3)] == [2, 2, 1]
     json.dumps(report.to_dict(), allow_nan=False)
 
 

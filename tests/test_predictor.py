@@ -47,7 +47,7 @@ class Carried:
         number = int(self.pointer.read_text())
         return Version(number, self.folders[number], SMALL, (), 5, FaultSet((), D))
 
-    def begin(self) -> Version:
+    def begin(self, starter: str = "") -> Version:
         number = self.active().number
         if self.begun.count(number) == 2 and number not in self.confirmed and number - 1 in self.folders:
             self.deploy(number - 1)
@@ -318,7 +318,7 @@ folder = Path(sys.argv[1])
 layout = SensorLayout.from_dict(read_manifest(folder, ADAPTATION)["network"]["layout"])
 version = SimpleNamespace(number=1, folder=folder)
 predictor = Predictor(lambda: SimpleNamespace(
-    layout=layout, class_names=(), pointer=folder, active=lambda: version, begin=lambda: version,
+    layout=layout, class_names=(), pointer=folder, active=lambda: version, begin=lambda starter: version,
     diagnoser=lambda: SelfDiagnosis(layout),
 ))
 for frame in np.random.default_rng(0).uniform(0, 4, (200, layout.n_cells)):

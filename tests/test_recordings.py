@@ -174,6 +174,24 @@ def test_a_binary_csv_is_refused(tmp_path, content, expected):
     assert expected in refusal(tmp_path / "a.csv")
 
 
+def test_a_csv_that_was_cut_off_anywhere_gives_every_line_before_the_cut_and_says_so(tmp_path):
+    values = newtons(4)
+    data = text(values).encode()
+    ends = [i + 1 for i, byte in enumerate(data) if byte == ord("\n")]
+    for cut in range(ends[0] + 1, len(data) + 1, 7):
+        for zeros in (b"", b"\0" * 100):
+            (tmp_path / "a.csv").write_bytes(data[:cut] + zeros)
+            loaded = load(tmp_path / "a.csv")
+            (frames,) = loaded.recordings.frames
+            complete = sum(end <= cut for end in ends)
+            np.testing.assert_array_equal(frames[:complete], values[:complete].astype(np.float32))
+            if len(frames) > complete:  # the cut lies in the line's last number, or at its end
+                assert cut > ends[complete] - 6 and not zeros  # noqa: PT018
+            elif cut not in ends:
+                (warning,) = messages(loaded, "warning")
+                assert f"line {complete + 1}: cut off in this line: the lines before it are kept" in warning
+
+
 def test_one_bad_file_does_not_lose_the_others(tmp_path):
     for i in range(4):
         write(tmp_path / f"{i}.csv", newtons(10))
@@ -311,7 +329,7 @@ def test_a_path_that_is_not_there_is_refused(tmp_path):
 def test_a_folder_without_recordings_and_an_unknown_kind_of_file_are_refused(tmp_path):
     (tmp_path / "x.csv").mkdir()
     message = refusal(tmp_path / "x.csv")
-    assert "x.csv: the folder holds no recordings; expected files that end in .csv, .npy, .npz" in message
+    assert "x.csv: the folder holds no recordings; expected files that end in .csv, .db3, .mcap, .npy, .npz" in message
     assert "notes.txt: is no recording" in refusal(write(tmp_path / "notes.txt", "hello"))
 
 

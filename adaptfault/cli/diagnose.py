@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from adaptfault.cli.options import Commands, add_recordings, command, emit, load_recordings, say
+from adaptfault.cli.options import Commands, add_recordings, command, emit, load_recordings, say, stream_recordings
+
+if TYPE_CHECKING:
+    from adaptfault.recordings import Recordings
+    from adaptfault.recordings.blocks import Stream
+    from diagnostics import Diagnosis, SelfDiagnosis
 
 _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.json --picture diagnosis.png
       without --reference the cells are judged by the cells around them"""
@@ -24,7 +31,10 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Diagnose; the exit code says how bad it is."""
-    log = load_recordings(args, args.recordings)
+    from adaptfault.recordings.blocks import is_large
+
+    large = args.frames is None and is_large(args.recordings)
+    log = stream_recordings(args, args.recordings) if large else load_recordings(args, args.recordings)
 
     from diagnostics import SelfDiagnosis
 
@@ -35,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
             raise ValueError(f"the reference is of {reference.layout}, the log of {log.layout}")
         say(args, f"learning what healthy looks like from {len(reference)} recordings")
         diagnoser.fit(reference.frames)
-    diagnosis = diagnoser.diagnose(log.frames)
+    diagnosis = _judged(diagnoser, log)
     if args.out:
         Path(args.out).write_text(json.dumps(diagnosis.to_dict(), allow_nan=False))
     if args.picture:
@@ -43,3 +53,19 @@ def run(args: argparse.Namespace) -> int:
     advice = [f"to test more: {touch}" for touch in diagnosis.coverage.advice[:5]]
     emit(args, diagnosis.to_dict(), "\n".join([str(diagnosis), *advice]))
     return diagnosis.exit_code
+
+
+def _judged(diagnoser: SelfDiagnosis, log: Recordings | Stream) -> Diagnosis:
+    """Look at one piece of the log after another: what is remembered of them does not grow."""
+    import numpy as np
+
+    from adaptfault.recordings import Recordings
+    from diagnostics.memory import finished
+
+    memory = diagnoser.memory()
+    for frames in log:
+        memory.extend(np.asarray(frames, dtype=np.float64))
+    if not isinstance(log, Recordings):
+        for problem in log.problems:
+            print(problem, file=sys.stderr)
+    return finished(diagnoser.judge(memory, n_recordings=len(log)))

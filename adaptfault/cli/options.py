@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from adaptfault.recordings import Recordings
+    from adaptfault.recordings.blocks import Stream
     from diagnostics import FaultSet, SensorLayout
 
 Commands = Any  # argparse's private type of subparsers
@@ -34,21 +35,31 @@ def add_recordings(
     parser: argparse.ArgumentParser, *, option: bool = False, labels: bool = True, least: int = 1
 ) -> None:
     """Add where recordings come from: ``least`` arguments, or an ``option`` for a command that can do without."""
-    help_ = "file or folder of recordings (.csv, .npz, .npy)"
+    help_ = "file or folder of recordings (.csv, .npz, .npy; ROS 2 bags: folder, .mcap, .db3)"
     if option:
         parser.add_argument("--recordings", nargs="+", metavar="FILE", help=help_)
     else:
         parser.add_argument("recordings", nargs="+" if least else "*", metavar="RECORDINGS", help=help_)
-    group = parser.add_argument_group("how recordings are read")
+    group = add_array(parser)
     if labels:
         group.add_argument("--labels", metavar="TABLE", help="CSV table with the columns file,label")
+    group.add_argument("--topic", metavar="NAME", help="topic of a bag that holds the readings")
+    group.add_argument(
+        "--field", metavar="PATH", help="array in its messages that holds them, as data or sensors.values"
+    )
+    group.add_argument("--frames", type=int, metavar="T", help="refuse recordings of another length")
+
+
+def add_array(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """Add what describes the array; returns the group of options."""
+    group = parser.add_argument_group("how recordings are read")
     group.add_argument("--layout", metavar="FILE", help="layout of the array, a JSON file")
     group.add_argument("--shape", metavar="PxRxC", help="layout from a shape: pads x rows x columns, as 2x13x6")
     group.add_argument("--full-scale", type=float, metavar="X", help="largest value a cell can report")
     group.add_argument("--unit", metavar="U", help="unit of the recordings, as N or count")
     group.add_argument("--rate", type=float, metavar="HZ", help="frames per second")
     group.add_argument("--calibration", metavar="TABLE", help="CSV table cell,raw,force: raw counts to newtons")
-    group.add_argument("--frames", type=int, metavar="T", help="refuse recordings of another length")
+    return group
 
 
 def load_recordings(args: argparse.Namespace, paths: Sequence[str], *, labelled: bool = False) -> Recordings:
@@ -59,8 +70,7 @@ def load_recordings(args: argparse.Namespace, paths: Sequence[str], *, labelled:
     """
     from adaptfault.recordings import load
 
-    if args.layout and args.shape:
-        raise ValueError("--layout and --shape both given: one of them is enough")
+    _one_layout(args)
     loaded = load(
         paths,
         layout=args.layout or args.shape,
@@ -70,6 +80,8 @@ def load_recordings(args: argparse.Namespace, paths: Sequence[str], *, labelled:
         full_scale=args.full_scale,
         unit=args.unit,
         rate=args.rate,
+        topic=args.topic,
+        field=args.field,
     )
     for problem in loaded.problems:
         print(problem, file=sys.stderr)
@@ -79,6 +91,32 @@ def load_recordings(args: argparse.Namespace, paths: Sequence[str], *, labelled:
             " or labels in the .npz"
         )
     return loaded.recordings
+
+
+def stream_recordings(args: argparse.Namespace, paths: Sequence[str]) -> Stream:
+    """Open recordings that are too large to be loaded, as the options say; problems are known after an iteration.
+
+    Raises:
+        ValueError: nothing could be read.
+    """
+    from adaptfault.recordings.blocks import Stream
+
+    _one_layout(args)
+    return Stream(
+        paths,
+        layout=args.layout or args.shape,
+        calibration=args.calibration,
+        full_scale=args.full_scale,
+        unit=args.unit,
+        rate=args.rate,
+        topic=args.topic,
+        field=args.field,
+    )
+
+
+def _one_layout(args: argparse.Namespace) -> None:
+    if args.layout and args.shape:
+        raise ValueError("--layout and --shape both given: one of them is enough")
 
 
 def fault_set(text: str, layout: SensorLayout) -> FaultSet:

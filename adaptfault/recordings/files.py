@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from adaptfault.recordings.bag import is_bag
 from adaptfault.recordings.errors import InputError, Problem, located
 from adaptfault.recordings.labels import TABLE, natural_key
 
@@ -36,7 +37,7 @@ class Found:
 def find(
     paths: Sequence[Path], suffixes: Collection[str], aside: Collection[Path]
 ) -> tuple[list[Found], list[Problem]]:
-    """Return the files with one of the suffixes, folders searched to the bottom in natural order, each file once.
+    """Return the files with one of the suffixes and the bags, each once; folders in natural order, to the bottom.
 
     Args:
         paths: files and folders, in the order wanted.
@@ -55,7 +56,9 @@ def find(
             raise InputError.at(repr(str(path)), f"is not a path ({error}); check it") from None
         if not exists:
             raise InputError.at(path, "is not there; check the path")
-        if is_folder:
+        if is_folder and is_bag(path):
+            found.setdefault(path.resolve(), Found(path, str(path), path.parent))
+        elif is_folder:
             candidates: Iterator[Found] = _below(path, suffixes, problems)
             before = len(found)
             found |= {c.path.resolve(): c for c in candidates if c.path.resolve() not in aside | found.keys()}
@@ -85,7 +88,11 @@ def _below(root: Path, suffixes: Collection[str], problems: list[Problem]) -> It
         folders[:] = [
             name for name in folders if not name.startswith(".") and os.path.realpath(Path(folder, name)) not in seen
         ]
-        files += (Path(folder, name) for name in names if not name.startswith("."))
-    recordings = [f for f in files if f.suffix.lower() in suffixes and f != table and f.is_file()]
+        if "metadata.yaml" in names and is_bag(Path(folder)):
+            files.append(Path(folder))
+            folders[:] = []
+        else:
+            files += (Path(folder, name) for name in names if not name.startswith("."))
+    recordings = [f for f in files if f != table and (is_bag(f) or (f.suffix.lower() in suffixes and f.is_file()))]
     for file in sorted(recordings, key=lambda f: [natural_key(part) for part in f.relative_to(root).parts]):
         yield Found(file, file.relative_to(root).as_posix(), root, table if table.is_file() else None)

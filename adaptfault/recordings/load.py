@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.recordings.bag import STORAGES, read_bag
 from adaptfault.recordings.check import check_range, check_readings, check_width, odd_lengths
 from adaptfault.recordings.classes import class_indices, label_files
 from adaptfault.recordings.content import Content, Shape
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 PathName = str | PathLike[str]
 
 READERS: Mapping[str, Callable[[Path], Content]] = {".csv": read_csv, ".npz": read_npz, ".npy": read_npy}
-"""The reader of each format by the end of the file's name. A further format adds its line here."""
+"""The reader of each format by the end of the file's name; bags, which may be folders, have their own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +56,8 @@ def load(
     full_scale: float | None = None,
     unit: str | None = None,
     rate: float | None = None,
+    topic: str | None = None,
+    field: str | None = None,
 ) -> Loaded:
     """Read recordings; one bad file is listed and left out, the others go on.
 
@@ -68,6 +71,7 @@ def load(
         frames: the number of frames that each recording must have; None = any.
         calibration: tables that turn the counts read into newtons (or the file that holds them).
         full_scale, unit, rate: override what the layout and the files say.
+        topic, field: where the readings are in bags, see :func:`adaptfault.recordings.bag.read_bag`.
 
     Raises:
         InputError: a path does not exist, no recording survives, or the layout, the table or the calibration is
@@ -86,12 +90,13 @@ def load(
     array = given_array(layout)
     tables = _calibration(calibration)
     aside = {Path(p).resolve() for p in (layout, labels, calibration) if isinstance(p, str | PathLike)}
-    found, problems = find(given, READERS.keys(), aside)
+    found, problems = find(given, (*READERS, *STORAGES), aside)
 
     contents: list[tuple[Found, Content]] = []
     for file in found:
         try:
-            content = READERS[file.path.suffix.lower()](file.path)
+            reader = READERS.get(file.path.suffix.lower()) if file.path.is_file() else None
+            content = reader(file.path) if reader else read_bag(file.path, topic=topic, field=field)
         except InputError as error:
             problems.append(Problem("error", str(error)))
         else:

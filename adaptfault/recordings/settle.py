@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from adaptfault.calibration import Calibration
 
 
+_SAME_RATE = 0.05
+"""Rates that differ by less are the same: those of bags are measured."""
+
+
 def given_array(layout: SensorLayout | Shape | str | PathLike[str] | None) -> SensorLayout | Shape | None:
     """Return a layout or at least its shape, from any way to give it."""
     if layout is None or isinstance(layout, SensorLayout):
@@ -95,7 +99,10 @@ def check_agreement(content: Content, contents: Sequence[Content], calibrated: b
     """
     for name in ("rate",) if calibrated else ("full_scale", "unit", "rate"):
         value = getattr(content, name)
-        if value is not None and value != (reference := _first(getattr(other, name) for other in contents)):
+        reference = _first(getattr(other, name) for other in contents)
+        if name == "rate" and value is not None and abs(value - reference) < _SAME_RATE * reference:
+            continue
+        if value is not None and value != reference:
             what = f"{name.replace('_', ' ')} {value} where the files before it have {reference}; load them apart"
             raise InputError.at(content.path, what)
     if content.present is None:

@@ -29,7 +29,11 @@ def read_text(path: Path) -> str:
     Raises:
         InputError: the file cannot be read, is empty, binary, or encoded in another way.
     """
-    data = read_bytes(path)
+    return decoded(path, read_bytes(path))
+
+
+def decoded(path: Path, data: bytes) -> str:
+    """Return the content ``data`` of a file as :func:`read_text` does."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError.at(path, "is UTF-16 text; save it as UTF-8")
     if b"\0" in data:

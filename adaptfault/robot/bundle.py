@@ -12,6 +12,7 @@ from datetime import datetime, timezone
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from uuid import uuid4
 
 from adaptfault.robot.journal import Journal
 from adaptfault.robot.knowledge import Knowledge
@@ -47,6 +48,7 @@ _ABOUT, _PARTS = "bundle.json", "parts"
 _ADAPTER, _REFERENCE, _CHECK, _CALIBRATION = "adapter", "reference", "check", "calibration.csv"
 _MAINTENANCE_LOCK, _STATE_LOCK = "maintenance.lock", "state.lock"
 
+PROCESS = uuid4().hex  # this one, among those that start versions
 _log = logging.getLogger(__name__)
 _KEPT = 5  # versions, besides the fault-free one
 
@@ -186,18 +188,22 @@ class Bundle:
                 problems.append(str(error))
         raise Damaged(f"{self.path} holds no version that can be read: {problems[0]}")
 
-    def begin(self) -> Version:
+    def begin(self, starter: str = PROCESS) -> Version:
         """Return the version to run, from the one that starts to run it: counts starts while it is on probation.
 
         One that was started twice without :meth:`confirm` gives way to the one before.
+
+        Args:
+            starter: who starts it. The same one in a row counts once: a process may serve several devices.
         """
         try:
             with locked(self.path / _STATE_LOCK, wait=True):
                 pointer = Pointer.read(self.path)
-                if pointer.probation and pointer.starts >= STARTS and pointer.fallbacks:
+                after = pointer.started(starter)
+                if after.starts > STARTS and pointer.fallbacks:
                     self._fall_back(pointer, f"version {pointer.active} was started {STARTS} times and never confirmed")
-                elif pointer.probation:
-                    pointer.started().write(self.path)
+                elif after != pointer:
+                    after.write(self.path)
         except OSError as error:
             if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
                 raise  # a bundle that cannot be written runs all the same

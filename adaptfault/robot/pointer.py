@@ -22,6 +22,7 @@ class Pointer:
         fallbacks: confirmed versions before it, the latest first.
         probation: its health was not yet confirmed.
         starts: how often it was started while on probation.
+        starter: who started it last.
         rejected: the fault sets of versions that failed or were rolled back: not to be deployed for again.
     """
 
@@ -29,6 +30,7 @@ class Pointer:
     fallbacks: tuple[int, ...] = ()
     probation: bool = False
     starts: int = 0
+    starter: str = ""
     rejected: tuple[tuple[int, ...], ...] = ()
 
     @classmethod
@@ -36,7 +38,7 @@ class Pointer:
         """Read it, or its copy where it is damaged; raises Damaged where both are."""
         d = read_either(bundle / NAME, SCHEMA)
         rejected = tuple(tuple(cells) for cells in d["rejected"])
-        return cls(d["active"], tuple(d["fallbacks"]), d["probation"], d["starts"], rejected)
+        return cls(d["active"], tuple(d["fallbacks"]), d["probation"], d["starts"], d["starter"], rejected)
 
     def write(self, bundle: Path) -> None:
         """Write it: the moment the file is replaced is the moment the version is switched."""
@@ -45,15 +47,16 @@ class Pointer:
     def deployed(self, number: int) -> Pointer:
         """Return the pointer to a new version, on probation. One that was never confirmed is no fallback."""
         kept = self.fallbacks if self.probation else (self.active, *self.fallbacks)
-        return replace(self, active=number, fallbacks=kept, probation=True, starts=0)
+        return replace(self, active=number, fallbacks=kept, probation=True, starts=0, starter="")
 
-    def started(self) -> Pointer:
-        """Return the pointer after one more start, without the question whether that is one too many."""
-        return replace(self, starts=self.starts + 1) if self.probation else self
+    def started(self, starter: str) -> Pointer:
+        """Return the pointer after one more start, by somebody who was not the last to start it."""
+        new = self.probation and starter != self.starter
+        return replace(self, starts=self.starts + 1, starter=starter) if new else self
 
     def confirmed(self) -> Pointer:
         """Return the pointer with the probation over."""
-        return replace(self, probation=False, starts=0)
+        return replace(self, probation=False, starts=0, starter="")
 
     def fallen_back(self, rejected: tuple[int, ...]) -> Pointer:
         """Return the pointer to the version before; the fault set of the one that is left is not tried again.

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptfault.inference import Inference
+from adaptfault.robot.bundle import PROCESS
 from adaptfault.windows import scale
 from diagnostics import Fault, FaultSet, Monitor, SensorLayout
 
@@ -232,7 +233,7 @@ def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
 def _start_any(bundle: Bundle) -> _Running:
     """Start the active version; if it cannot be loaded, start again: after failed starts an earlier one comes back."""
     for left in reversed(range(_STARTS)):
-        version = bundle.begin()
+        version = bundle.begin(f"{PROCESS}, {left} tries left")
         try:
             return _start(bundle, version, bundle.layout)
         except (OSError, ImportError, ValueError) as error:

@@ -1,0 +1,30 @@
+"""Acquisition: frames as they come from the sensor, put in order and recorded."""
+
+from adaptfault.acquisition.ordering import Arrivals, Frame, Ordering
+from adaptfault.acquisition.packet import Packet, PacketError, format_packet, parse_packet
+from adaptfault.acquisition.receiver import Counters, Receiver
+from adaptfault.acquisition.recorder import Recorded, Recorder
+from adaptfault.acquisition.session import Event, Session
+from adaptfault.acquisition.station import Station
+from adaptfault.acquisition.switch import Contact, Daily, Switch, parse_when
+
+__all__ = [
+    "Arrivals",
+    "Contact",
+    "Counters",
+    "Daily",
+    "Event",
+    "Frame",
+    "Ordering",
+    "Packet",
+    "PacketError",
+    "Receiver",
+    "Recorded",
+    "Recorder",
+    "Session",
+    "Station",
+    "Switch",
+    "format_packet",
+    "parse_packet",
+    "parse_when",
+]

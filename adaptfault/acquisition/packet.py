@@ -1,0 +1,101 @@
+"""The paper's UDP packets, ``device_id,timestamp,220 values`` as CSV text (Section II): read and written."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+TICKS = 1000.0
+"""Time stamps count milliseconds, as the ESP32's ``millis()`` does."""
+
+DEVICE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:-]{0,63}")
+"""What a device may be called: the name becomes part of file names, so nothing that leads out of a folder."""
+
+_LARGEST = float(np.finfo(np.float32).max)
+_LATEST = 1e19  # ticks; nanoseconds since 1970 fit
+_VALUE_BYTES = 32  # a double written in full, and its comma
+
+
+class PacketError(ValueError):
+    """A datagram that is no packet of this array. One line: what came, what was expected."""
+
+
+@dataclass(frozen=True, eq=False)
+class Packet:
+    """One scan of the array.
+
+    Attributes:
+        device: the sender's name.
+        time: when it was taken, in seconds of the sender's clock.
+        values: float64 ``[D]``, in the unit that the sender uses; NaN = missing reading.
+    """
+
+    device: str
+    time: float
+    values: NDArray[np.float64]
+
+
+def longest_packet(n_cells: int) -> int:
+    """Return how many bytes a packet of so many cells can have."""
+    return 128 + _VALUE_BYTES * n_cells
+
+
+def parse_packet(data: bytes, n_cells: int, *, ticks: float = TICKS) -> Packet:
+    """Read a packet. An empty value and ``nan`` are missing readings; a line end or a last comma does no harm.
+
+    Args:
+        data: the datagram.
+        n_cells: D, how many values there must be.
+        ticks: time stamps count so many in a second.
+
+    Raises:
+        PacketError: anything else.
+    """
+    if len(data) > longest_packet(n_cells):
+        raise PacketError(f"{len(data)} bytes; {n_cells} values take {longest_packet(n_cells)} at most")
+    try:
+        text = data.decode("ascii").rstrip("\r\n\0 ")
+    except UnicodeDecodeError:
+        raise PacketError("not ASCII text; expected device_id,timestamp,values") from None
+    device, stamp, *values = [*text.split(","), ""] if "," not in text else text.split(",")
+    if len(values) == n_cells + 1 and not values[-1]:
+        values.pop()
+    if len(values) != n_cells:
+        raise PacketError(f"{len(values)} values behind device and time stamp, expected {n_cells}")
+    if DEVICE.fullmatch(device) is None:
+        raise PacketError(f"device {device[:20]!r}; expected letters, digits and . _ : - (64 at most)")
+    time = _number(stamp)
+    if not 0 <= time < _LATEST:
+        raise PacketError(f"time stamp {stamp[:20]!r}; expected a number of ticks, 0 or more")
+    frame = np.array([_number(value) if value else math.nan for value in values])
+    if (np.abs(frame) > _LARGEST).any():
+        raise PacketError("a value is infinite or too large")
+    return Packet(device, time / ticks, frame)
+
+
+def format_packet(device: str, time: float, values: ArrayLike, *, ticks: float = TICKS) -> bytes:
+    """Write the packet that :func:`parse_packet` reads; values keep 6 digits, the time stamp is a whole number.
+
+    Raises:
+        ValueError: the device's name could not be read back.
+    """
+    if DEVICE.fullmatch(device) is None:
+        raise ValueError(f"device {device!r}; expected letters, digits and . _ : - (64 at most)")
+    numbers = np.asarray(values, dtype=np.float64).ravel().tolist()
+    cells = ",".join("" if value != value else f"{value:.6g}" for value in numbers)
+    return f"{device},{round(time * ticks)},{cells}".encode()
+
+
+def _number(text: str) -> float:
+    """Return the number; PacketError where Python's float is more generous than a sender can mean ("1_000")."""
+    try:
+        number = float(text)
+    except ValueError:
+        raise PacketError(f"{text[:20]!r} is not a number") from None
+    if "_" in text:
+        raise PacketError(f"{text[:20]!r} is not a number")
+    return number

@@ -1,0 +1,214 @@
+"""Receives the packets of several devices over UDP, whatever else comes with them, in bounded memory."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from collections import deque
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, fields
+from types import TracebackType
+
+from adaptfault.acquisition.ordering import WINDOW, Arrivals, Frame, Ordering
+from adaptfault.acquisition.packet import TICKS, PacketError, longest_packet, parse_packet
+from diagnostics import SensorLayout
+
+MOST_DEVICES = 16
+QUEUE = 1024
+_KERNEL_BUFFER = 4 << 20  # bytes asked for: what arrives while this process has no turn; the system may give less
+_TURNS = 8  # of the event loop for each frame fetched; each reads one datagram: the queue counts what it drops
+_TICK = 0.05  # seconds between looks at packets that wait
+
+
+@dataclass(frozen=True)
+class Counters:
+    """What became of every datagram.
+
+    ``received`` is the sum of ``kept``, ``malformed``, ``oversized``, ``refused``, ``duplicates``, ``late``, ``strays``
+    and ``held``.
+
+    Attributes:
+        received: datagrams.
+        kept: frames, in order.
+        dropped: frames of these that nobody fetched in time.
+        malformed, oversized: no packets of this array.
+        refused: of devices that are not wanted or too many.
+        devices: how many sent packets.
+        duplicates, late, strays, held, lost, restarts: as in :class:`Arrivals`, all devices together.
+    """
+
+    received: int = 0
+    kept: int = 0
+    dropped: int = 0
+    malformed: int = 0
+    oversized: int = 0
+    refused: int = 0
+    devices: int = 0
+    duplicates: int = 0
+    late: int = 0
+    strays: int = 0
+    held: int = 0
+    lost: int = 0
+    restarts: int = 0
+
+    def __str__(self) -> str:
+        named = {f.name: getattr(self, f.name) for f in fields(self)}
+        head = f"{named.pop('received')} received, {named.pop('kept')} kept"
+        return ", ".join([head, *(f"{count} {name}" for name, count in named.items() if count)])
+
+    def to_dict(self) -> dict[str, int]:
+        """Return a JSON-safe dict."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+class Receiver(asyncio.DatagramProtocol):
+    """Frames of one kind of array from the network: ``async with Receiver(layout, port) as r: async for frame in r:``.
+
+    Nothing a datagram holds can stop it or make it grow: datagrams that are no packets are counted and forgotten,
+    devices and frames that wait are limited. When the queue is full, the oldest frame goes: a loop wants the newest.
+
+    Args:
+        layout: the array; its rate tells which packets are missing.
+        port: where to listen, 0 for any that is free.
+        host: address to listen on; the default hears this machine only, "0.0.0.0" all of the network.
+        ticks: time stamps count so many in a second.
+        devices: names of those to listen to; None: any.
+        most_devices: so many at most; packets of others are refused.
+        queue: frames that may wait to be fetched.
+        window: packets of a device held back for one that is late.
+    """
+
+    def __init__(
+        self,
+        layout: SensorLayout,
+        port: int = 0,
+        *,
+        host: str = "127.0.0.1",
+        ticks: float = TICKS,
+        devices: Collection[str] | None = None,
+        most_devices: int = MOST_DEVICES,
+        queue: int = QUEUE,
+        window: int = WINDOW,
+    ) -> None:
+        self.layout, self.port, self.host, self.ticks = layout, port, host, ticks
+        self.devices, self.most_devices, self.window = devices, most_devices, window
+        self._queue: deque[Frame] = deque(maxlen=queue)
+        self._longest = longest_packet(layout.n_cells)
+        self._streams: dict[str, Ordering] = {}
+        self._received = self._dropped = self._malformed = self._oversized = self._refused = 0
+        self._transport: asyncio.BaseTransport | None = None
+        self._news = asyncio.Event()
+        self._closed = False
+        self._ticker: asyncio.Task[None] | None = None
+
+    @property
+    def counters(self) -> Counters:
+        """What became of every datagram so far."""
+        each = [stream.arrivals for stream in self._streams.values()]
+        total = {f.name: sum(getattr(one, f.name) for one in each) for f in fields(Arrivals) if f.name != "received"}
+        return Counters(
+            received=self._received,
+            dropped=self._dropped,
+            malformed=self._malformed,
+            oversized=self._oversized,
+            refused=self._refused,
+            devices=len(each),
+            **total,
+        )
+
+    @property
+    def arrivals(self) -> dict[str, Arrivals]:
+        """What became of the packets of each device."""
+        return {name: stream.arrivals for name, stream in self._streams.items()}
+
+    def take(self, data: bytes, now: float) -> None:
+        """Deal with one datagram that came at ``now``, in seconds of a clock that never jumps."""
+        self._received += 1
+        if len(data) > self._longest:
+            self._oversized += 1
+            return
+        try:
+            packet = parse_packet(data, self.layout.n_cells, ticks=self.ticks)
+        except PacketError:
+            self._malformed += 1
+            return
+        stream = self._streams.get(packet.device)
+        if stream is None:
+            unwanted = self.devices is not None and packet.device not in self.devices
+            if unwanted or len(self._streams) >= self.most_devices:
+                self._refused += 1
+                return
+            stream = self._streams[packet.device] = Ordering(packet.device, self.layout.rate, window=self.window)
+        self._put(stream.push(packet, now))
+
+    def poll(self, now: float) -> None:
+        """Let go of packets that have waited long enough for one before them."""
+        for stream in self._streams.values():
+            self._put(stream.overdue(now))
+
+    def close(self) -> None:
+        """Stop listening. Frames that are here already can still be fetched; then the iteration ends."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._ticker is not None:
+            self._ticker.cancel()
+        if self._transport is not None:
+            self._transport.close()
+        for stream in self._streams.values():
+            self._put(stream.flush())
+        self._news.set()
+
+    async def __aenter__(self) -> Receiver:
+        loop = asyncio.get_running_loop()
+        family, kind, protocol, _, address = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_DGRAM)[0]
+        listening = socket.socket(family, kind, protocol)
+        try:
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KERNEL_BUFFER)
+            listening.bind(address)
+            listening.setblocking(False)
+            self._transport, _ = await loop.create_datagram_endpoint(lambda: self, sock=listening)
+        except BaseException:
+            listening.close()
+            raise
+        self.port = listening.getsockname()[1]
+        self._ticker = asyncio.create_task(self._tick())
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+        await asyncio.sleep(0)  # the transport closes its socket in the next turn
+
+    def __aiter__(self) -> Receiver:
+        return self
+
+    async def __anext__(self) -> Frame:
+        for _ in range(_TURNS):  # for the socket, however many frames wait here
+            await asyncio.sleep(0)
+        while not self._queue:
+            if self._closed:
+                raise StopAsyncIteration
+            self._news.clear()
+            await self._news.wait()
+        return self._queue.popleft()
+
+    def datagram_received(self, data: bytes, addr: object) -> None:
+        """Called by asyncio."""
+        self.take(data, time.monotonic())
+
+    def error_received(self, exc: Exception) -> None:
+        """Called by asyncio: some host could not be reached, which is no concern of a listener."""
+
+    async def _tick(self) -> None:
+        while True:
+            await asyncio.sleep(_TICK)
+            self.poll(time.monotonic())
+
+    def _put(self, frames: Iterable[Frame]) -> None:
+        for frame in frames:
+            self._dropped += len(self._queue) == self._queue.maxlen
+            self._queue.append(frame)
+            self._news.set()

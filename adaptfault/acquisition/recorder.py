@@ -1,0 +1,198 @@
+"""Records frames so that a power cut costs the last moment at most."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from adaptfault.atomic import atomic_write
+from adaptfault.recordings.layout_file import read_layout
+from diagnostics import SensorLayout
+
+INTERVAL = 1.0
+"""Seconds after which what was recorded is on the disk: the most that a power cut can cost."""
+
+LONGEST = 3600.0
+"""Seconds after which a recording goes on in a new file."""
+
+_GAP = 1.0  # seconds; lost frames up to that are written as missing readings, a longer pause begins a new recording
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recording that is complete and on the disk."""
+
+    path: Path
+    frames: int
+    seconds: float
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.frames} frames, {self.seconds:.1f} s"
+
+
+class Recorder:
+    """Writes the frames of one device as CSV recordings into a folder, which :func:`adaptfault.load` reads.
+
+    One frame a line, one cell a column, no header; lost frames become lines of missing readings. Each line is handed to
+    the system at once, and to the disk every ``interval`` seconds, by a thread: the caller never waits for a disk.
+    A file that was cut off in its last line is read up to there. The folder also gets the layout, as ``layout.json``.
+
+    Args:
+        folder: made if it is not there.
+        layout: the array.
+        device: begins the files' names.
+        longest: seconds after which a new file begins.
+        interval: seconds between two writes to the disk.
+
+    Raises:
+        ValueError: the folder holds recordings of another layout.
+        OSError: the folder cannot be made or written to.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        layout: SensorLayout,
+        device: str = "frames",
+        *,
+        longest: float = LONGEST,
+        interval: float = INTERVAL,
+    ) -> None:
+        self.folder, self.layout, self.device = Path(folder), layout, device
+        self.longest, self.interval = longest, interval
+        self.folder.mkdir(parents=True, exist_ok=True)
+        _keep_layout(self.folder / "layout.json", layout)
+        self._file: TextIO | None = None
+        self._path = self.folder
+        self._first = self._last = 0.0
+        self._frames = 0
+        self._disk = ThreadPoolExecutor(1, thread_name_prefix="recorder")
+        self._syncing: Future[None] | None = None
+        self._synced = 0.0
+
+    @property
+    def path(self) -> Path | None:
+        """The file that is being written, if any."""
+        return None if self._file is None else self._path
+
+    def write(self, values: ArrayLike, at: float) -> Recorded | None:
+        """Append a frame ``[D]`` taken at ``at`` (seconds, rising); begins a file where none is open.
+
+        Returns:
+            The recording that ended before it: there was a pause, or the file was long enough.
+
+        Raises:
+            ValueError: a frame of another size.
+            OSError: the disk is full or gone; what was written is closed.
+        """
+        frame = np.asarray(values, dtype=np.float64).ravel()
+        if frame.size != self.layout.n_cells:
+            raise ValueError(f"expected a frame of {self.layout.n_cells} readings ({self.layout}), got {frame.size}")
+        ended = None
+        if self._file is not None and (
+            at - self._last > _GAP + 1 / self.layout.rate or at - self._first > self.longest
+        ):
+            ended = self.close()
+        try:
+            file = self._file or self._open(at)
+            lost = max(0, round((at - self._last) * self.layout.rate) - 1)
+            file.write((",".join(["nan"] * frame.size) + "\n") * lost + _line(frame))
+            file.flush()
+            self._sync(file)
+        except OSError:
+            self._abandon()
+            raise
+        self._frames += lost + 1
+        self._last = at
+        return ended
+
+    def close(self) -> Recorded | None:
+        """End the recording: it is on the disk when this returns. None where nothing is being recorded."""
+        file, self._file = self._file, None
+        if file is None:
+            return None
+        with file:
+            self._settle()
+            os.fsync(file.fileno())
+        return Recorded(self._path, self._frames, self._last - self._first + 1 / self.layout.rate)
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.close()
+        finally:
+            self._disk.shutdown()
+
+    def _open(self, at: float) -> TextIO:
+        began = datetime.now(timezone.utc)
+        number = 0
+        while True:  # a clock that was set back must not lead to a file that is there
+            number += 1
+            name = f"{self.device.replace(':', '-')}_{began:%Y%m%dT%H%M%S}_{number}.csv"
+            try:
+                self._file = open(self.folder / name, "x", encoding="ascii", newline="\n")  # noqa: SIM115
+                break
+            except FileExistsError:
+                continue
+        self._path = self.folder / name
+        self._first, self._last, self._frames = at, at, 0
+        self._synced = time.monotonic()
+        self._syncing = self._disk.submit(_sync_folder, self.folder)
+        return self._file
+
+    def _sync(self, file: TextIO) -> None:
+        now = time.monotonic()
+        if now - self._synced >= self.interval and (self._syncing is None or self._syncing.done()):
+            self._settle()
+            self._synced = now
+            self._syncing = self._disk.submit(os.fsync, file.fileno())
+
+    def _settle(self) -> None:
+        """Wait for the disk, whose errors are raised here."""
+        waiting, self._syncing = self._syncing, None
+        if waiting is not None:
+            waiting.result()
+
+    def _abandon(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            with contextlib.suppress(OSError):  # it tries to write the rest once more
+                file.close()
+
+
+def _line(frame: NDArray[np.float64]) -> str:
+    return ",".join([f"{value:.9g}" for value in frame.tolist()]) + "\n"
+
+
+def _keep_layout(path: Path, layout: SensorLayout) -> None:
+    if path.exists():
+        if (there := read_layout(path)) != layout:
+            raise ValueError(f"{path.parent} holds recordings of {there}, not of {layout}; record into another folder")
+        return
+    atomic_write(path, json.dumps(layout.to_dict(), allow_nan=False).encode())
+
+
+def _sync_folder(folder: Path) -> None:
+    """Put the name of a new file on the disk."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

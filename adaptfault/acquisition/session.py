@@ -1,0 +1,197 @@
+"""What is done with the frames of one device: watched, classified, recorded, and told as events."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.acquisition.ordering import Frame
+from adaptfault.acquisition.recorder import Recorded, Recorder
+from adaptfault.acquisition.switch import Contact, Rule, Switch
+from diagnostics import Fault, FaultSet, Monitor, SensorLayout
+
+CONFIRMED_AFTER = 100
+"""Windows classified, after which a predictor that is on probation is confirmed."""
+
+SILENCE = 2.0
+"""Seconds without a frame, after which a device is told to be silent and its recording is closed."""
+
+_BEFORE = 0.5  # seconds before a touch that are recorded with it
+
+
+class Reading(Protocol):
+    """What a predictor says of a frame; ``label`` is None until a window is full."""
+
+    @property
+    def label(self) -> Any: ...  # noqa: D102
+    @property
+    def probabilities(self) -> Any: ...  # noqa: D102
+    @property
+    def fault_set(self) -> FaultSet: ...  # noqa: D102
+    @property
+    def events(self) -> tuple[Fault, ...]: ...  # noqa: D102
+
+
+class Streaming(Protocol):
+    """A predictor, as far as it is used here: it also watches the cells."""
+
+    @property
+    def layout(self) -> SensorLayout: ...  # noqa: D102
+    def stream(self, frame: NDArray[np.float64], time: float | None = None) -> Reading: ...  # noqa: D102
+    def confirm(self) -> object: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something worth a line.
+
+    Attributes:
+        kind: "fault" (new or changed), "gone", "class", "recording", "recorded", "restart", "silent", "confirmed" or
+            "trouble".
+        device: whose.
+        time: seconds, as in :class:`Frame`.
+        text: one plain sentence.
+        data: the same for programs, JSON-safe.
+    """
+
+    kind: str
+    device: str
+    time: float
+    text: str
+    data: dict[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.time:.1f} {self.device} {self.kind}: {self.text}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict."""
+        head = {"schema": "adaptfault.event/1", "kind": self.kind, "device": self.device, "time": self.time}
+        return {**head, "text": self.text, **self.data}
+
+
+class Session:
+    """One device.
+
+    Args:
+        device: its name.
+        watcher: a predictor, or a monitor where there is none.
+        recorder: where its frames are recorded; None: nowhere.
+        rule: when, see :func:`parse_when`.
+        clock: gives the local time.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        watcher: Streaming | Monitor,
+        *,
+        recorder: Recorder | None = None,
+        rule: Rule | None = None,
+        clock: Callable[[], datetime] = datetime.now,
+    ) -> None:
+        self.device, self.watcher, self.recorder, self.clock = device, watcher, recorder, clock
+        self.switch = None if rule is None else Switch(rule)
+        self.label: Any = None
+        self._classified = 0
+        self._faulty: NDArray[np.bool_] | None = None
+        self._time = 0.0
+        self._arrived: float | None = None
+        before = round(_BEFORE * recorder.layout.rate) if recorder and isinstance(rule, Contact) else 0
+        self._before: deque[Frame] = deque(maxlen=before)
+
+    def take(self, frame: Frame, now: float) -> list[Event]:
+        """Deal with a frame that arrived at ``now`` (seconds of the receiver's clock); return what there is to tell."""
+        self._time, self._arrived = frame.time, now
+        events = [self._event("restart", "the device started anew")] if frame.restarted else []
+        if isinstance(self.watcher, Monitor):
+            news = self.watcher.update(frame.values, frame.time)
+        else:
+            reading = self.watcher.stream(frame.values, frame.time)
+            news = tuple(reading.events)
+            events += self._classify(reading)
+        events += [self._told(fault) for fault in news]
+        faulty = np.zeros(frame.values.size, bool) if self._faulty is None else self._faulty
+        for fault in news:
+            faulty[list(fault.cells)] = fault.probability != 0
+        self._faulty = faulty
+        return events + self._record(frame)
+
+    def idle(self, now: float) -> list[Event]:
+        """Say that no frame has come until ``now``: a recording that waits in vain is closed."""
+        if self._arrived is None or now - self._arrived < SILENCE:
+            return []
+        self._arrived = None
+        return [self._event("silent", f"no frame for {SILENCE:g} s"), *self.close()]
+
+    def command(self, record: bool | None) -> list[Event]:
+        """Record from now on (True), do not (False), or go by the rule (None)."""
+        if self.switch is not None:
+            self.switch.command = record
+        return [] if record else self.close()
+
+    def close(self) -> list[Event]:
+        """End the recording, if there is one."""
+        if self.recorder is None:
+            return []
+        try:
+            recorded = self.recorder.close()
+        except OSError as error:
+            return [self._trouble(error)]
+        return [] if recorded is None else [self._recorded(recorded)]
+
+    def _classify(self, reading: Reading) -> list[Event]:
+        if reading.label is None:
+            return []
+        events = []
+        self._classified += 1
+        if self._classified == CONFIRMED_AFTER and not isinstance(self.watcher, Monitor):
+            self.watcher.confirm()
+            events.append(self._event("confirmed", f"{CONFIRMED_AFTER} windows classified"))
+        if reading.label == self.label:
+            return events
+        self.label = reading.label
+        share = float(np.max(reading.probabilities))
+        label = self.label.item() if isinstance(self.label, np.generic) else self.label
+        names = getattr(self.watcher, "class_names", ())
+        text = f"{names[label] if names else label} ({share:.0%})"
+        return [*events, self._event("class", text, label=label, probability=share, dropped=len(reading.fault_set))]
+
+    def _record(self, frame: Frame) -> list[Event]:
+        recorder = self.recorder
+        if recorder is None or self.switch is None or self._faulty is None:
+            return []
+        if not self.switch(frame.values, self._faulty, frame.time, self.clock()):
+            self._before.append(frame)
+            return self.close()
+        events: list[Event] = []
+        for one in (*self._before, frame):
+            before = recorder.path
+            try:
+                ended = recorder.write(one.values, one.time)
+            except OSError as error:
+                self.switch.command = False  # until told otherwise: a full disk does not get emptier by trying
+                return [*events, self._trouble(error)]
+            events += [] if ended is None else [self._recorded(ended)]
+            if recorder.path != before:
+                events.append(self._event("recording", str(recorder.path), path=str(recorder.path)))
+        self._before.clear()
+        return events
+
+    def _told(self, fault: Fault) -> Event:
+        return self._event("gone" if fault.probability == 0 else "fault", fault.reason, fault=fault.to_dict())
+
+    def _recorded(self, recorded: Recorded) -> Event:
+        data = {"path": str(recorded.path), "frames": recorded.frames, "seconds": recorded.seconds}
+        return self._event("recorded", str(recorded), **data)
+
+    def _trouble(self, error: OSError) -> Event:
+        return self._event("trouble", f"recording stopped: {error}")
+
+    def _event(self, kind: str, text: str, **data: Any) -> Event:
+        return Event(kind, self.device, self._time, text, data)

@@ -1,0 +1,219 @@
+"""A station: receives, and deals with every device's frames until it is told to end."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from adaptfault.acquisition.ordering import Frame
+from adaptfault.acquisition.packet import TICKS
+from adaptfault.acquisition.receiver import Receiver
+from adaptfault.acquisition.recorder import Recorder
+from adaptfault.acquisition.session import Event, Session, Streaming
+from adaptfault.acquisition.switch import Rule, parse_when
+from diagnostics import Monitor, SelfDiagnosis, SensorLayout
+
+if TYPE_CHECKING:
+    from adaptfault.calibration import Calibration
+
+SCHEMA = "adaptfault.listen/1"
+
+_COMMANDS = {"record": True, "stop": False, "auto": None}
+_ANSWERS = {True: "recording from now on", False: "not recording", None: "recording as the rule says"}
+_LOOK = 0.5  # seconds between looks at devices that are silent
+_WAITING = 16_000_000  # bytes of frames that may wait: what comes in a burst is dealt with later
+_LINE = 1000  # bytes; a longer command is none
+
+
+class Station:
+    """Listens to sensors: each device is watched, classified where there is a bundle, and recorded.
+
+    Events go to stdout, a line each; the counters of all datagrams are the last line. It ends after ``seconds`` or
+    ``frames``, on SIGINT or SIGTERM, and on "quit" from stdin ("record", "stop" and "auto" switch the recording).
+
+    Args:
+        layout: the array; None: the bundle's.
+        port, host, devices, ticks: as for :class:`Receiver`.
+        bundle: folder of a predictor; None: only watch.
+        record: folder for recordings; None: none.
+        when: when to record, see :func:`parse_when`.
+        seconds, frames: when to end; None: never.
+        calibration: turns the values that come into the layout's unit.
+        on_event: called with each event, from the loop, instead of a line on stdout.
+        as_json: one JSON object a line.
+        quiet: nothing on stderr.
+
+    Raises:
+        ValueError: neither layout nor bundle, a rule that is none, tables that do not fit the layout.
+    """
+
+    def __init__(
+        self,
+        layout: SensorLayout | None,
+        port: int = 0,
+        *,
+        bundle: str | None = None,
+        host: str = "127.0.0.1",
+        devices: Collection[str] | None = None,
+        ticks: float = TICKS,
+        record: str | os.PathLike[str] | None = None,
+        when: str = "contact",
+        seconds: float | None = None,
+        frames: int | None = None,
+        calibration: Calibration | None = None,
+        on_event: Callable[[Event], None] | None = None,
+        as_json: bool = False,
+        quiet: bool = False,
+    ) -> None:
+        self.bundle, self.record, self.calibration = bundle, record, calibration
+        self.seconds, self.frames, self.as_json, self.quiet = seconds, frames, as_json, quiet
+        self.on_event = self._print if on_event is None else on_event
+        self._ready: list[Streaming | Monitor] = []
+        if bundle is not None:
+            predictor = self._predictor()
+            layout = predictor.layout
+            self._ready.append(predictor)
+        if layout is None:
+            raise ValueError("which array? give a layout or a bundle")
+        if calibration is not None:
+            calibration.check(layout)
+        self.layout = layout
+        self._rule: Rule | None = None if record is None else parse_when(when, layout)
+        if record is not None:
+            with Recorder(record, layout):  # a folder that cannot be used is told now
+                pass
+        if not self._ready:
+            self._ready.append(self._monitor())  # now, not when the first frame comes: it takes a second
+        queue = max(64, _WAITING // (8 * layout.n_cells))
+        self.receiver = Receiver(layout, port, host=host, devices=devices, ticks=ticks, queue=queue)
+        self._sessions: dict[str, Session] = {}
+        self._command: bool | None = None  # the last that came; holds for devices that come later
+
+    async def listen(self) -> None:
+        """Listen until told to end.
+
+        Raises:
+            OSError: the port is taken, or the address not this machine's.
+        """
+        loop = asyncio.get_running_loop()
+        try:
+            async with self.receiver as receiver:
+                self._say(f"listening on {receiver.host}, port {receiver.port}, for {self.layout}")
+                for number in (signal.SIGINT, signal.SIGTERM):
+                    with suppress(NotImplementedError, RuntimeError, ValueError):  # not in the main thread; Windows
+                        loop.add_signal_handler(number, receiver.close)
+                if self.seconds is not None:
+                    loop.call_later(self.seconds, receiver.close)
+                _read_commands(loop, self._obey)
+                looking = asyncio.create_task(self._look())
+                try:
+                    await self._take_all()
+                finally:
+                    looking.cancel()
+        finally:
+            for session in self._sessions.values():
+                self._tell(session.close())
+        self._end()
+
+    async def _take_all(self) -> None:
+        taken = 0
+        async for frame in self.receiver:
+            self._take(frame)
+            taken += 1
+            if self.frames is not None and taken >= self.frames:
+                return
+
+    async def _look(self) -> None:
+        while True:
+            await asyncio.sleep(_LOOK)
+            now = time.monotonic()
+            for session in self._sessions.values():
+                self._tell(session.idle(now))
+
+    def _take(self, frame: Frame) -> None:
+        session = self._sessions.get(frame.device)
+        if session is None:
+            session = self._sessions[frame.device] = self._begin(frame.device)
+        if self.calibration is not None:
+            newtons = self.calibration.apply(frame.values)[0].astype(float)
+            frame = Frame(frame.device, frame.time, newtons, frame.lost, frame.restarted)
+        self._tell(session.take(frame, time.monotonic()))
+
+    def _begin(self, device: str) -> Session:
+        watcher = self._ready.pop() if self._ready else self._monitor() if self.bundle is None else self._predictor()
+        recorder = None if self.record is None else Recorder(self.record, self.layout, device)
+        session = Session(device, watcher, recorder=recorder, rule=self._rule)
+        session.command(self._command)
+        return session
+
+    def _monitor(self) -> Monitor:
+        return Monitor(SelfDiagnosis(self.layout))
+
+    def _predictor(self) -> Streaming:
+        from adaptfault.robot.predictor import Predictor  # here: watching needs no model
+
+        assert self.bundle is not None
+        try:
+            return Predictor.load(self.bundle)
+        except ImportError as error:
+            raise ValueError(f"{self.bundle}: classifying needs {error.name}; install it, or give no bundle") from None
+
+    def _obey(self, line: str) -> None:
+        word = line.strip().lower()
+        if word == "quit":
+            self.receiver.close()
+        elif word in _COMMANDS and self.record is not None:
+            self._command = _COMMANDS[word]
+            for session in self._sessions.values():
+                self._tell(session.command(self._command))
+            self._say(f"{word}: {_ANSWERS[self._command]}")
+        elif word in _COMMANDS:
+            self._say(f"{word}: there is no folder to record into; start with --record FOLDER")
+        elif word:
+            self._say(f"{word[:20]!r} is no command; expected {', '.join(_COMMANDS)} or quit")
+
+    def _tell(self, events: list[Event]) -> None:
+        for event in events:
+            self.on_event(event)
+
+    def _print(self, event: Event) -> None:
+        print(json.dumps(event.to_dict(), allow_nan=False) if self.as_json else event, flush=True)
+
+    def _say(self, text: str) -> None:
+        if not self.quiet:
+            print(text, file=sys.stderr, flush=True)
+
+    def _end(self) -> None:
+        counters = self.receiver.counters
+        result = {"schema": SCHEMA, "layout": self.layout.to_dict(), "counters": counters.to_dict()}
+        print(json.dumps(result, allow_nan=False) if self.as_json else f"end: {counters}", flush=True)
+
+
+def _read_commands(loop: asyncio.AbstractEventLoop, obey: Callable[[str], None]) -> None:
+    """Hand each line of stdin to ``obey``, from a thread that may wait forever."""
+    try:
+        descriptor = sys.stdin.fileno()
+        if os.isatty(descriptor) and os.tcgetpgrp(descriptor) != os.getpgrp():
+            return  # in the background, reading from the terminal would stop the process
+    except (AttributeError, OSError, ValueError):  # there is no stdin
+        return
+
+    def read() -> None:
+        rest = b""
+        # Not through sys.stdin: a thread that holds its lock would break the interpreter's end.
+        with suppress(OSError, RuntimeError):  # closed, or the loop has ended
+            while data := os.read(descriptor, 4096):
+                *lines, rest = (rest + data).split(b"\n")
+                rest = rest[-_LINE:]
+                for line in lines:
+                    loop.call_soon_threadsafe(obey, line.decode("utf-8", "replace"))
+
+    threading.Thread(target=read, name="commands", daemon=True).start()

@@ -1,0 +1,97 @@
+"""adaptfault listen: watches, classifies and records what sensors send over UDP."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from adaptfault.cli.options import Commands, add_array, command
+
+if TYPE_CHECKING:
+    from adaptfault.acquisition import Station
+    from diagnostics import SensorLayout
+
+_EXAMPLE = """  adaptfault listen robot.bundle --port 5005 --record today/ --when contact
+      packets: device_id,timestamp,one value a cell; without a bundle cells are watched, nothing is classified
+      on stdin: record, stop, auto (as --when says), quit"""
+
+_WHEN = (
+    "always | command (on stdin) | contact or contact:X (cells above X in the array's unit, default 5 %% of full scale)"
+    " | HH:MM-HH:MM (local time); default contact"
+)
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    parser = command(commands, "listen", "watch, classify and record what sensors send over UDP", _EXAMPLE)
+    parser.add_argument("bundle", nargs="?", metavar="BUNDLE", help="what the robot carries, to classify as well")
+    parser.add_argument("--port", type=int, required=True, help="UDP port; 0 takes a free one and says which")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this machine only)")
+    parser.add_argument("--device", action="append", metavar="ID", help="listen to this one only; may be repeated")
+    parser.add_argument(
+        "--ticks", type=float, default=1000.0, help="time stamps count so many a second (default 1000: milliseconds)"
+    )
+    parser.add_argument("--record", metavar="FOLDER", help="record into this folder, CSV")
+    parser.add_argument("--when", metavar="WHEN", help=_WHEN)
+    parser.add_argument("--seconds", type=float, metavar="S", help="end after so long")
+    parser.add_argument("--frames", type=int, metavar="N", help="end after so many frames")
+    add_array(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Listen until told to end; files are closed whatever happens."""
+    import asyncio
+
+    asyncio.run(_station(args).listen())
+    return 0
+
+
+def _station(args: argparse.Namespace) -> Station:
+    from adaptfault.acquisition import Station
+    from adaptfault.calibration import Calibration
+
+    if args.when and not args.record:
+        raise ValueError("--when says when to record: give --record FOLDER, too")
+    if not 0 <= args.port < 65536:
+        raise ValueError(f"--port {args.port}: expected 0 to 65535")
+    if not args.ticks > 0:
+        raise ValueError(f"--ticks {args.ticks:g}: expected a number above 0")
+    table = args.calibration
+    if args.bundle and not table:
+        from adaptfault.robot.bundle import Bundle
+
+        table = Bundle.open(args.bundle).calibration
+    tables = Calibration.read(table) if table else None
+    return Station(
+        None if args.bundle else _layout(args, None if tables is None else tables.full_scale),
+        args.port,
+        bundle=args.bundle,
+        host=args.host,
+        devices=args.device,
+        ticks=args.ticks,
+        record=args.record,
+        when=args.when or "contact",
+        seconds=args.seconds,
+        frames=args.frames,
+        calibration=tables,
+        as_json=args.json,
+        quiet=args.quiet,
+    )
+
+
+def _layout(args: argparse.Namespace, newtons: float | None) -> SensorLayout:
+    """Return the array that the options describe: the paper's where they say nothing."""
+    from dataclasses import replace
+
+    from adaptfault.recordings.settle import given_array
+    from diagnostics import SensorLayout
+
+    if args.layout and args.shape:
+        raise ValueError("--layout and --shape both given: one of them is enough")
+    array = given_array(args.layout or args.shape) or SensorLayout.paper()
+    layout = array if isinstance(array, SensorLayout) else SensorLayout(*array)
+    full_scale = newtons if args.full_scale is None else args.full_scale
+    unit = "N" if args.unit is None and newtons is not None else args.unit
+    said = {"full_scale": full_scale, "unit": unit, "rate": args.rate}
+    return replace(layout, **{name: value for name, value in said.items() if value is not None})

@@ -1,0 +1,149 @@
+"""Diagnoses as ROS diagnostics: levels, names that stay, and bags that hold them."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adaptfault.ros import Level, diagnostic_array, stale_array, write_diagnostics
+from diagnostics import Fault, FaultKind, Line, SelfDiagnosis, SensorLayout, inject, line_fault, lose_frames
+
+LAYOUT = SensorLayout.paper()
+
+
+@pytest.fixture(scope="module")
+def log(grasps):
+    return np.concatenate([grasps.frames[i] for i in range(1, 140, 7)]).astype(float)
+
+
+@pytest.fixture(scope="module")
+def busy(log):
+    """The cell of pad 0 that is loaded most."""
+    return int(log[:, :110].mean(axis=0).argmax())
+
+
+def statuses(array) -> dict[str, dict]:
+    return {status["name"]: status for status in array["status"]}
+
+
+def levels(array) -> dict[str, int]:
+    return {name.removeprefix("tactile: "): status["level"] for name, status in statuses(array).items()}
+
+
+def test_a_healthy_sensor_is_ok_everywhere(fitted, log):
+    array = diagnostic_array(fitted.diagnose(log), stamp=12.25, hardware_id="glove-7")
+    assert set(levels(array).values()) == {Level.OK}
+    assert array["header"]["stamp"] == {"sec": 12, "nanosec": 250_000_000}
+    assert {status["hardware_id"] for status in array["status"]} == {"glove-7"}
+
+
+def test_single_cells_warn_and_wires_are_errors_on_their_pad_and_group_only(fitted, log, busy):
+    one = levels(diagnostic_array(fitted.diagnose(inject(log, [Fault("short", (busy,))], LAYOUT))))
+    assert {name for name, level in one.items() if level} == {"pad 0"}
+    assert one["pad 0"] == Level.WARN
+    row = line_fault(LAYOUT, Line(1, "row", 5), FaultKind.SHORT)
+    array = diagnostic_array(fitted.diagnose(inject(log, [row], LAYOUT)))
+    two = levels(array)
+    assert {name: level for name, level in two.items() if level} == {"pad 1": Level.ERROR, "pad 1 rows": Level.ERROR}
+    wires = statuses(array)["tactile: pad 1 rows"]
+    assert wires["message"] == "row 5"
+    assert {"key": "faulty", "value": "1"} in wires["values"]
+
+
+def test_a_tenth_of_a_pad_is_an_error_without_any_wire(fitted, log):
+    loaded = np.argsort(-log[:, :110].mean(axis=0))[:24:2]
+    diagnosis = fitted.diagnose(inject(log, [Fault("stuck", (int(c),), value=2.5) for c in loaded], LAYOUT))
+    if not any(fault.line for fault in diagnosis.faults):
+        assert levels(diagnostic_array(diagnosis))["pad 0"] == Level.ERROR
+    assert len(diagnosis.fault_set) >= 11
+
+
+def test_lost_frames_are_a_warning_of_the_stream_and_of_nothing_else(fitted, log):
+    found = levels(diagnostic_array(fitted.diagnose(lose_frames(log, 0.1, seed=0))))
+    assert {name for name, level in found.items() if level} == {"stream"}
+
+
+def test_the_names_are_the_same_whatever_is_wrong_and_no_cell_has_one(fitted, log, busy):
+    arrays = [
+        diagnostic_array(fitted.diagnose(log)),
+        diagnostic_array(fitted.diagnose(inject(log, [Fault("open", (busy,))], LAYOUT))),
+        diagnostic_array(SelfDiagnosis(LAYOUT).diagnose(np.zeros((50, 220)))),
+        stale_array(LAYOUT),
+    ]
+    names = [[status["name"] for status in array["status"]] for array in arrays]
+    assert all(one == names[0] for one in names)
+    assert len(set(names[0])) == len(names[0]) == 2 * 5 + 1
+    assert set(levels(arrays[2]).values()) == {Level.OK}  # nothing was tested: no alarm
+    assert set(levels(arrays[3]).values()) == {Level.STALE}
+
+
+def test_masked_positions_and_other_shapes_do_no_harm():
+    layout = SensorLayout(3, 2, 2, present=[[[1, 1], [1, 0]]] * 3)
+    frames = np.zeros((64, 12))
+    frames[10:40] = 3.0
+    array = diagnostic_array(SelfDiagnosis(layout).diagnose(frames))
+    assert {"key": "cells", "value": "3"} in statuses(array)["tactile: pad 2"]["values"]
+    assert len(array["status"]) == 3 * 5 + 1
+
+
+def test_everything_is_plain_json_and_all_values_are_text(fitted, log, busy):
+    array = diagnostic_array(fitted.diagnose(inject(log, [Fault("short", (busy,))], LAYOUT)))
+    assert json.loads(json.dumps(array, allow_nan=False)) == array
+    assert all(isinstance(pair["value"], str) for status in array["status"] for pair in status["values"])
+    values = {pair["key"]: pair["value"] for pair in statuses(array)["tactile: pad 0"]["values"]}
+    assert values["faulty cells"] == "{1}.{2}".format(*LAYOUT.position(busy))
+
+
+def test_what_is_written_into_a_bag_is_read_back(fitted, log, tmp_path):
+    rosbag2, typesys = pytest.importorskip("rosbags.rosbag2"), pytest.importorskip("rosbags.typesys")
+    row = line_fault(LAYOUT, Line(1, "row", 5), FaultKind.SHORT)
+    arrays = [
+        diagnostic_array(fitted.diagnose(inject(log, [row], LAYOUT)), stamp=100.0),
+        stale_array(LAYOUT, stamp=101.5),
+    ]
+    write_diagnostics(tmp_path / "bag", arrays)
+    assert "version: 8" in (tmp_path / "bag" / "metadata.yaml").read_text()
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    with rosbag2.Reader(tmp_path / "bag") as reader:
+        read = [(c.topic, at, store.deserialize_cdr(data, c.msgtype)) for c, at, data in reader.messages()]
+    assert [(topic, at) for topic, at, _ in read] == [("/diagnostics", 100 * 10**9), ("/diagnostics", 1015 * 10**8)]
+    for (_, _, message), array in zip(read, arrays, strict=True):
+        for status, expected in zip(message.status, array["status"], strict=True):
+            assert (status.level, status.name, status.message) == (
+                expected["level"],
+                expected["name"],
+                expected["message"],
+            )
+            assert [{"key": p.key, "value": p.value} for p in status.values] == expected["values"]
+    with pytest.raises(ValueError, match="exists already"):
+        write_diagnostics(tmp_path / "bag", arrays)
+
+
+def test_writing_without_rosbags_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    with pytest.raises(ValueError, match="adaptfault\\[ros\\]"):
+        write_diagnostics(tmp_path / "bag", [stale_array(LAYOUT)])
+
+
+def test_the_node_goes_stale_without_frames_and_comes_back(log):
+    path = Path(__file__).parents[1] / "examples" / "ros2_node.py"
+    spec = importlib.util.spec_from_file_location("ros2_node", path)
+    node = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(node)
+    now = [1000.0]
+    watch = node.Watch(LAYOUT, clock=lambda: now[0])
+    assert set(levels(watch.diagnostics()).values()) == {Level.STALE}
+    for frame in log[:40]:
+        watch.take(frame)
+        now[0] += 0.1
+    assert set(levels(watch.diagnostics()).values()) == {Level.OK}
+    assert watch.diagnostics()["header"]["stamp"]["sec"] == 1004
+    now[0] += 5
+    stale = watch.diagnostics()
+    assert set(levels(stale).values()) == {Level.STALE}
+    assert stale["status"][0]["message"] == "no frame for 5 s"
+    watch.take(log[40])
+    assert set(levels(watch.diagnostics()).values()) == {Level.OK}

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from adaptfault.adaptation import Adaptation
     from adaptfault.adapter import Adapter
+    from adaptfault.baselines.correction import CausalCorrection, correct
     from adaptfault.calibration import Calibration
     from adaptfault.evaluation import Scores, evaluate
     from adaptfault.forecast import Forecast
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from adaptfault.recordings import Recordings, load, save_npz
     from adaptfault.reduction import ReducedModel
     from adaptfault.replay import load_adapter, save_adapter
+    from adaptfault.single_faults import Sensitivity, analyse, sensitivity
     from adaptfault.store import load_model, save_model
     from adaptfault.training import train
     from adaptfault.windows import Windows, make_windows, split
@@ -30,13 +32,17 @@ __all__ = [
     "Adaptation",
     "Adapter",
     "Calibration",
+    "CausalCorrection",
     "Forecast",
     "History",
     "Recordings",
     "ReducedModel",
     "Scores",
+    "Sensitivity",
     "TactileTransformer",
     "Windows",
+    "analyse",
+    "correct",
     "evaluate",
     "load",
     "load_adapter",
@@ -45,6 +51,7 @@ __all__ = [
     "save_adapter",
     "save_model",
     "save_npz",
+    "sensitivity",
     "simulate",
     "split",
     "train",
@@ -54,13 +61,17 @@ _HOMES = {
     "Adaptation": "adaptation",
     "Adapter": "adapter",
     "Calibration": "calibration",
+    "CausalCorrection": "baselines.correction",
     "Forecast": "forecast",
     "History": "history",
     "Recordings": "recordings",
     "ReducedModel": "reduction",
     "Scores": "evaluation",
+    "Sensitivity": "single_faults",
     "TactileTransformer": "network",
     "Windows": "windows",
+    "analyse": "single_faults",
+    "correct": "baselines.correction",
     "evaluate": "evaluation",
     "load": "recordings",
     "load_adapter": "replay",
@@ -69,6 +80,7 @@ _HOMES = {
     "save_adapter": "replay",
     "save_model": "store",
     "save_npz": "recordings",
+    "sensitivity": "single_faults",
     "simulate": "grasps",
     "split": "windows",
     "train": "training",

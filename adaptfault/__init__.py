@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from adaptfault.adaptation import Adaptation
     from adaptfault.adapter import Adapter
     from adaptfault.baselines.correction import CausalCorrection, correct
+    from adaptfault.baselines.fault_aware import train_fault_aware
     from adaptfault.calibration import Calibration
     from adaptfault.evaluation import Scores, evaluate
     from adaptfault.forecast import Forecast
@@ -55,6 +56,7 @@ __all__ = [
     "simulate",
     "split",
     "train",
+    "train_fault_aware",
 ]
 
 _HOMES = {
@@ -84,6 +86,7 @@ _HOMES = {
     "simulate": "grasps",
     "split": "windows",
     "train": "training",
+    "train_fault_aware": "baselines.fault_aware",
 }
 
 

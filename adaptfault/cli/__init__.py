@@ -7,9 +7,9 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from adaptfault.cli import adapt, demo, diagnose, evaluate, train
+from adaptfault.cli import adapt, demo, diagnose, evaluate, reproduce, train
 
-_COMMANDS = (train, diagnose, adapt, evaluate, demo)
+_COMMANDS = (train, diagnose, adapt, evaluate, demo, reproduce)
 
 BAD_INPUT = 3  # exit code for unusable input or usage, as monitoring tools understand it ("unknown")
 

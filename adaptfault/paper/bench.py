@@ -63,7 +63,8 @@ class Bench:
         self.train, self.validation, self.whole = split(setup.windows, seed=seed)
         starts = np.unique(self.whole.recording, return_index=True)[1]
         sizes = np.diff([*starts, len(self.whole)])
-        few = [s + evenly(n, setup.settings.windows) for s, n in zip(starts, sizes, strict=True)]
+        rng = np.random.default_rng(seed)
+        few = [s + np.sort(rng.permutation(n)[: setup.settings.windows]) for s, n in zip(starts, sizes, strict=True)]
         self.kept = np.concatenate(few)  # which windows of each recording are tested
         self.test = self.whole.select(self.kept)
         self.present = np.flatnonzero(self.layout.present)

@@ -38,13 +38,13 @@ _ERRATA = """\
 - Correcting short cells to 0 gives the very input that open cells give, so that Figure 6 equals the open half of Figure
   2 by construction, unless healthy cells press to the rail: then it costs accuracy. Full scale replaced by what the
   other cells say does better.
-- Its other neutral value, 2.5 N for 0 *and* 5 N, ruins a healthy sensor: cells that nothing touches read exactly 0. Here
-  2.5 N stands for full scale alone.
+- Its other neutral value, 2.5 N for 0 *and* 5 N, ruins a healthy sensor: cells that nothing touches read exactly 0.
+  Here 2.5 N stands for full scale alone.
 - "Equal to 5.0" is 1.0 after its own scaling, and no equality survives calibration: a tolerance of 1.5 converter steps.
 - More fault-aware samples also mean more training steps; the paper does not separate the two, nor is it done here.
 - The D - k inputs of its reduced model do not fill the grid of its convolutions: a front end fills in what is missing.
-- The feed-forward block must return to width d for the residual sum. Text and tensors disagree on rows and columns: here
-  the first axis has 11. Padding, initial weights and |F| of Figures 2 and 6 are not stated.
+- The feed-forward block must return to width d for the residual sum. Text and tensors disagree on rows and columns:
+  here the first axis has 11. Padding, initial weights and |F| of Figures 2 and 6 are not stated.
 """
 
 

@@ -118,12 +118,12 @@ class Sensitivity:
 
         figure, axes = pads_figure(self.layout, n_rows=len(self.values))
         shown = np.where(self.layout.present.ravel(), self.accuracy_lost, np.nan)
-        top = max(float(np.nanmax(shown)), 1e-3)
         for value, losses, row in zip(self.values, shown, axes, strict=True):
+            top = max(float(np.nanmax(losses)), 1 / self.n)  # each value on its own scale: a short costs far more
             for pad, ax in enumerate(row):
                 image = draw_forces(ax, self.layout.grid(losses)[pad], self.layout, vmin=0, vmax=top, cmap="Reds")
                 ax.set_title(f"stuck at {value:g}, pad {pad}", fontsize=9)
-        figure.colorbar(image, ax=axes.ravel().tolist(), label="accuracy lost")
+            figure.colorbar(image, ax=row.tolist(), label="accuracy lost")
         for rank, (cell, value, lost) in enumerate(self.worst(), start=1):
             pad, at, col = self.layout.position(cell)
             if lost > 0:

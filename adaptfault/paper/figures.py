@@ -66,9 +66,9 @@ def draw(ledger: Ledger, figure: int) -> Figure:
             for strategy in ("adapted", "trained anew"):
                 _line(ax, [(t.k, m) for t, m in found if t.strategy == strategy], strategy)
         case 6:
-            for kind in ("open", "short"):
+            for kind, dashes in (("open", ":"), ("short", "-.")):
                 others = [(t.k, m) for t, m in rows(ledger, 2) if t.faults == kind]
-                _line(ax, others, f"{_NAMES[kind]}, not corrected", linestyle=":", color="0.4")
+                _line(ax, others, f"{_NAMES[kind]}, not corrected", linestyle=dashes, color="0.4")
             for strategy in dict.fromkeys(t.strategy for t, _ in found):
                 _line(ax, [(t.k, m) for t, m in found if t.strategy == strategy and t.k], strategy)
         case _:
@@ -79,6 +79,7 @@ def draw(ledger: Ledger, figure: int) -> Figure:
     ax.set(ylabel="test accuracy", ylim=(0, 1), title=TITLES[figure])
     if figure in (2, 5, 6):
         ax.set_xlabel("faulty cells")
+        ax.set_xticks(sorted({t.k for t, _ in found}))
     picture.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return picture
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.atomic import atomic_write
 from adaptfault.evaluation import Scores, accuracy_interval
 from adaptfault.paper.settings import Task
 from adaptfault.windows import Windows
@@ -114,7 +115,7 @@ class Ledger:
             return
         whole, _, part = path.read_bytes().rpartition(b"\n")
         if part:
-            path.write_bytes(whole + b"\n" if whole else b"")
+            atomic_write(path, whole + b"\n" if whole else b"")
         for line in whole.splitlines():
             result = Result.from_dict(json.loads(line))
             self.results[result.task] = result

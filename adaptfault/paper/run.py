@@ -89,11 +89,13 @@ def _measure(setup: Setup, ledger: Ledger, figures: tuple[int, ...]) -> None:
     left = [task for task in tasks if task not in ledger.results]
     if len(left) < len(tasks):
         setup.say(f"{len(tasks) - len(left)} of {len(tasks)} results are there already")
-    hide, bench = None if setup.progress is None else not setup.progress, None
+    hide = None if setup.progress is None else not setup.progress
+    benches: dict[int, Bench] = {}
     with tqdm(total=len(tasks), initial=len(tasks) - len(left), unit="result", disable=hide) as bar:
         for task in left:
-            if bench is None or bench.seed != task.seed:
-                bench = Bench(setup, task.seed)
+            if task.seed not in benches:
+                benches[task.seed] = Bench(setup, task.seed)
+            bench = benches[task.seed]
             began = time.perf_counter()
             predicted = bench.predict(task)
             result = Result.of(task, bench.test, predicted, time.perf_counter() - began)

@@ -103,14 +103,18 @@ class Settings:
         return tuple(sorted({k for k in scaled if k < present}))
 
     def tasks(self, present: int, figures: tuple[int, ...]) -> Iterator[Task]:
-        """Yield the work for these figures on an array of ``present`` cells: what costs most training comes last."""
-        for part in (self._base_only, self._fault_aware, self._trained_anew):
+        """Yield the work for these figures on an array of ``present`` cells: what costs most training comes last.
+
+        Figure 6 is drawn beside what Figure 2 shows, and so needs that too.
+        """
+        figures = (*figures, 2) if 6 in figures else figures
+        for part in (self._stuck, self._adapted, self._future, self._fault_aware, self._trained_anew):
             for seed in self.seeds:
                 for task in part(seed, present):
                     if task.figure in figures:
                         yield task
 
-    def _base_only(self, seed: int, present: int) -> Iterator[Task]:
+    def _stuck(self, seed: int, present: int) -> Iterator[Task]:
         counts = self.sizes(self.counts, present)
         yield Task(2, seed, "none", 0, "nothing")
         for kind in ("open", "short"):
@@ -120,8 +124,12 @@ class Settings:
             yield Task(6, seed, "none", 0, strategy)
             for k in counts:
                 yield Task(6, seed, "short", k, strategy)
+
+    def _adapted(self, seed: int, present: int) -> Iterator[Task]:
         for k in self.sizes(self.adapted, present):
             yield Task(5, seed, "mixed", k, "adapted")
+
+    def _future(self, seed: int, present: int) -> Iterator[Task]:
         for kind in FUTURE:
             for strategy in ("nothing", "correct to 0", "correct to the mean", "adapted", "combined"):
                 yield Task(7, seed, kind, self.future, strategy)

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from adaptfault.acquisition import Receiver, Recorder, Station
     from adaptfault.adaptation import Adaptation
     from adaptfault.adapter import Adapter
+    from adaptfault.baselines.correction import CausalCorrection, correct
+    from adaptfault.baselines.fault_aware import train_fault_aware
     from adaptfault.calibration import Calibration
     from adaptfault.evaluation import Scores, evaluate
     from adaptfault.export import add_onnx
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from adaptfault.robot.maintenance import MaintenanceReport, maintain
     from adaptfault.robot.predictor import Predictor, Reading
     from adaptfault.ros import diagnostic_array, write_diagnostics
+    from adaptfault.single_faults import Sensitivity, analyse, sensitivity
     from adaptfault.store import load_model, save_model
     from adaptfault.training import train
     from adaptfault.windows import Windows, make_windows, split
@@ -38,6 +41,7 @@ __all__ = [
     "Adapter",
     "Bundle",
     "Calibration",
+    "CausalCorrection",
     "Forecast",
     "History",
     "Inference",
@@ -49,10 +53,13 @@ __all__ = [
     "Recordings",
     "ReducedModel",
     "Scores",
+    "Sensitivity",
     "Station",
     "TactileTransformer",
     "Windows",
     "add_onnx",
+    "analyse",
+    "correct",
     "diagnostic_array",
     "evaluate",
     "load",
@@ -63,9 +70,11 @@ __all__ = [
     "save_adapter",
     "save_model",
     "save_npz",
+    "sensitivity",
     "simulate",
     "split",
     "train",
+    "train_fault_aware",
     "write_diagnostics",
 ]
 
@@ -74,6 +83,7 @@ _HOMES = {
     "Adapter": "adapter",
     "Bundle": "robot.bundle",
     "Calibration": "calibration",
+    "CausalCorrection": "baselines.correction",
     "Forecast": "forecast",
     "History": "history",
     "Inference": "inference",
@@ -86,9 +96,12 @@ _HOMES = {
     "ReducedModel": "reduction",
     "Station": "acquisition",
     "Scores": "evaluation",
+    "Sensitivity": "single_faults",
     "TactileTransformer": "network",
     "Windows": "windows",
     "add_onnx": "export",
+    "analyse": "single_faults",
+    "correct": "baselines.correction",
     "diagnostic_array": "ros",
     "evaluate": "evaluation",
     "load": "recordings",
@@ -99,9 +112,11 @@ _HOMES = {
     "save_adapter": "replay",
     "save_model": "store",
     "save_npz": "recordings",
+    "sensitivity": "single_faults",
     "simulate": "grasps",
     "split": "windows",
     "train": "training",
+    "train_fault_aware": "baselines.fault_aware",
     "write_diagnostics": "ros",
 }
 

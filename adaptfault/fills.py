@@ -8,6 +8,7 @@ nearest fill adds what it got wrong on the healthy frames that look most like th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -77,6 +78,26 @@ class CellStatistics:
         within = self.covariance[np.ix_(healthy, healthy)] + np.finfo(float).tiny ** 0.25 * np.eye(len(healthy))
         weight = cho_solve(cho_factor(within), between).T
         return weight, self.mean[missing] - weight @ self.mean[healthy]
+
+    @cached_property
+    def precision(self) -> NDArray[np.float64]:
+        """Inverse of the covariance, ``[D, D]``."""
+        from scipy.linalg import cho_factor, cho_solve
+
+        still = np.finfo(float).tiny ** 0.25  # as in conditional_mean
+        factor = cho_factor(self.covariance + still * np.eye(len(self.mean)))
+        return np.asarray(cho_solve(factor, np.eye(len(self.mean))))
+
+    def expected(self, frames: NDArray[Any], missing: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return what the ``missing [D]`` cells of ``frames [n, D]`` would read, ``[n, k]``, not yet limited to 0..1.
+
+        The same mean as :meth:`conditional_mean`, from the precision P: mean_F - P_FF^-1 P_FR (x_R - mean_R). Quicker
+        for few cells, where the set of them is another for each frame.
+        """
+        surprise = np.where(missing, 0.0, frames - self.mean) @ self.precision[:, missing]
+        within = self.precision[np.ix_(missing, missing)]
+        # For a handful of cells numpy's solver is a few times quicker than scipy's Cholesky.
+        return np.asarray(self.mean[missing] - np.linalg.solve(within, surprise.T).T)
 
 
 class AffineFill(nn.Module):

@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
@@ -26,6 +27,17 @@ from adaptfault.windows import Windows
 from diagnostics import SensorLayout
 
 Augment = Callable[[Tensor, torch.Generator], Tensor]
+
+
+class MoreWindows(Protocol):
+    """Training windows that are made when they are needed; ``str`` of it tells one set from another."""
+
+    @property
+    def y(self) -> NDArray[np.int64]:
+        """The class of each, int ``[M]``."""
+
+    def draw(self, index: NDArray[np.int64], /) -> NDArray[np.float32]:
+        """Return those with these numbers, ``[B, T, D]``; the same each time."""
 
 
 def train(
@@ -43,6 +55,7 @@ def train(
     evaluate_start: bool = False,
     augment: Augment | None = None,
     repairable: bool = False,
+    more: MoreWindows | None = None,
     checkpoint: str | Path | None = None,
     on_epoch: Callable[[History], None] | None = None,
     progress: bool | None = None,
@@ -71,6 +84,7 @@ def train(
         repairable: make a base that is easy to repair: in parts of each batch random cells, lines, blocks or a pad go
             missing and are filled in from the rest, as :class:`~adaptfault.adapter.Adapter` will do. Validation
             then looks at the windows twice, whole and repaired. Needs about twice the epochs.
+        more: windows to train on besides, made when they are needed; an epoch passes over all of them.
         checkpoint: file written after each epoch. If it exists, training continues from it, and ends as it would have
             ended without the interruption; ``epochs``, ``patience`` and ``budget`` may differ from the earlier run's.
         on_epoch: called with the history so far after each epoch, once its checkpoint is on disk.
@@ -103,11 +117,13 @@ def train(
             "evaluate_start": evaluate_start,
             "augment": None if augment is None else getattr(augment, "__qualname__", type(augment).__qualname__),
             "data": fingerprint_windows(train, validation),
+            "more": None if more is None else str(more),
             "starting weights": fingerprint_weights(model),
         }
         run.resume()
         clock.spent = sum(run.history.seconds)
-    inputs, labels, device = as_tensor(train.x), as_tensor(train.y), next(model.parameters()).device
+    source = _Source(train, more)
+    n, device = len(source.y), next(model.parameters()).device
     hide = None if progress is None else not progress
     try:
         if evaluate_start and run.history.start is None:
@@ -118,19 +134,19 @@ def train(
             with clock.closing(len(sample) / len(validation)):
                 _validate(model, sample)
         with tqdm(total=epochs, initial=run.history.epochs, unit="epoch", disable=hide) as bar:
-            while (stopped := _stop(run.history, epochs, patience, clock, len(labels))) is None:
+            while (stopped := _stop(run.history, epochs, patience, clock, n)) is None:
                 began = time.perf_counter()
                 model.train()
                 with _seeded(seed, run.history.epochs, device) as generator:
-                    order = torch.split(torch.randperm(len(labels), generator=generator), batch_size)
-                    loss, seen = _pass(run, inputs, labels, order, augment, generator, clock)
-                if seen < len(labels) and run.history.epochs:
+                    order = torch.split(torch.randperm(n, generator=generator), batch_size)
+                    loss, seen = _pass(run, source, order, augment, generator, clock)
+                if seen < n and run.history.epochs:
                     continue  # out of time in the midst of a later epoch
                 with clock.closing():
                     with run.averaged():
                         scores = _validate(model, validation)
                     history = run.history.longer(loss, scores, time.perf_counter() - began)
-                    run.record(history, save=seen == len(labels))  # a cut epoch is no place to resume from
+                    run.record(history, save=seen == n)  # a cut epoch is no place to resume from
                 bar.update()
                 bar.set_postfix(loss=f"{loss:.4f}", accuracy=f"{scores[1]:.4f}", best=history.best_epoch)
                 if on_epoch is not None:
@@ -143,8 +159,7 @@ def train(
 
 def _pass(
     run: _Run,
-    inputs: Tensor,
-    labels: Tensor,
+    source: _Source,
     order: Sequence[Tensor],
     augment: Augment | None,
     generator: torch.Generator,
@@ -156,7 +171,7 @@ def _pass(
         if seen and clock.late(len(index)):
             clock.over = True
             break
-        x, y = inputs[index], labels[index]  # copies
+        x, y = source.take(index), source.y[index]  # copies
         x = x if augment is None else augment(x, generator)
         loss = F.cross_entropy(run.model(x.to(device)), y.to(device))
         run.optimizer.zero_grad()
@@ -168,6 +183,23 @@ def _pass(
             raise ValueError(f"the loss became {loss.item()} in epoch {run.history.epochs + 1}: lower learning_rate")
         clock.pace = (time.perf_counter() - began) / seen
     return total / seen, seen
+
+
+class _Source:
+    """The training windows, and more of them where there are."""
+
+    def __init__(self, windows: Windows, more: MoreWindows | None) -> None:
+        self.x, self.more, self.known = as_tensor(windows.x), more, len(windows)
+        self.y = as_tensor(windows.y if more is None else np.concatenate([windows.y, more.y]))
+
+    def take(self, index: Tensor) -> Tensor:
+        """Return a copy of the windows with these numbers, ``[B, T, D]``."""
+        if self.more is None:
+            return self.x[index]
+        added = index >= self.known
+        x = self.x[index.clamp(max=self.known - 1)]
+        x[added] = torch.from_numpy(self.more.draw((index[added] - self.known).numpy()))
+        return x
 
 
 class _Run:

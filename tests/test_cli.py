@@ -207,7 +207,22 @@ def test_a_robot_forecasts_and_adapts_without_the_recordings(home, capsys):
     assert "leave the recordings out" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["train", "diagnose", "adapt", "evaluate", "listen", "demo"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "train",
+        "diagnose",
+        "adapt",
+        "evaluate",
+        "demo",
+        "reproduce",
+        "maintain",
+        "rollback",
+        "history",
+        "report",
+        "listen",
+    ],
+)
 def test_help_shows_an_example(command, capsys):
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])

@@ -7,9 +7,21 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from adaptfault.cli import adapt, demo, diagnose, evaluate, history, listen, maintain, report, rollback, train
+from adaptfault.cli import (
+    adapt,
+    demo,
+    diagnose,
+    evaluate,
+    history,
+    listen,
+    maintain,
+    report,
+    reproduce,
+    rollback,
+    train,
+)
 
-_COMMANDS = (train, diagnose, adapt, evaluate, demo, maintain, rollback, history, report, listen)
+_COMMANDS = (train, diagnose, adapt, evaluate, demo, reproduce, maintain, rollback, history, report, listen)
 
 BAD_INPUT = 3  # exit code for unusable input or usage, as monitoring tools understand it ("unknown")
 

@@ -1,0 +1,1 @@
+"""What the paper does about faults that nobody has diagnosed: correction of abnormal values, fault-aware training."""

@@ -1,0 +1,278 @@
+"""The bench of one seed: split, networks, faults and strategies; networks are kept in the run's folder."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.adaptation import Adaptation
+from adaptfault.adapter import Adapter
+from adaptfault.baselines.correction import CausalCorrection, correct
+from adaptfault.baselines.fault_aware import FaultPattern, train_fault_aware
+from adaptfault.network import TactileTransformer, logits_of
+from adaptfault.paper.settings import Settings, Task
+from adaptfault.recordings import Recordings
+from adaptfault.reduction import ReducedModel, phi, reduce_windows
+from adaptfault.store import MANIFEST, load_model, save_model
+from adaptfault.training import train
+from adaptfault.windows import Windows, evenly, make_windows, split
+from diagnostics import Fault, FaultKind, FaultSet, SelfDiagnosis, inject
+
+_LOG, _REFERENCE = 20, 200  # recordings of the broken sensor that the diagnosis sees; healthy ones that it learns from
+_SPREAD = 50_000  # seeds of different draws lie apart
+
+Floats = NDArray[np.float32]
+Classes = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What all seeds share.
+
+    Attributes:
+        recordings: labelled and fault-free.
+        windows: cut from them.
+        settings: how thoroughly to measure.
+        folder: of the run; networks go into ``models``.
+        device: that networks are trained on.
+        progress: show or hide it.
+        say: told what is being done.
+    """
+
+    recordings: Recordings
+    windows: Windows
+    settings: Settings
+    folder: Path
+    device: str
+    progress: bool | None
+    say: Callable[[str], None]
+
+
+class Bench:
+    """Everything that the tasks of one seed need, made when first needed."""
+
+    def __init__(self, setup: Setup, seed: int) -> None:
+        self.setup, self.seed, self.layout = setup, seed, setup.recordings.layout
+        self.train, self.validation, self.whole = split(setup.windows, seed=seed)
+        starts = np.unique(self.whole.recording, return_index=True)[1]
+        sizes = np.diff([*starts, len(self.whole)])
+        rng = np.random.default_rng(seed)
+        few = [s + np.sort(rng.permutation(n)[: setup.settings.windows]) for s, n in zip(starts, sizes, strict=True)]
+        self.kept = np.concatenate(few)  # which windows of each recording are tested
+        self.test = self.whole.select(self.kept)
+        self.present = np.flatnonzero(self.layout.present)
+
+    def predict(self, task: Task) -> Classes:
+        """Return the class of each test window under a task's faults and strategy."""
+        if task.strategy == "adapted" and task.figure == 5:
+            return self._adapted(self.fault_set(task.k))
+        if task.strategy == "trained anew":
+            return self._trained_anew(self.fault_set(task.k))
+        if task.figure == 7:
+            return self._against(task)
+        x = self.whole.x if task.faults == "none" else self.broken(task.faults, task.k)
+        return self._answers(task.strategy, x)
+
+    def _answers(self, strategy: str, x: Floats) -> Classes:
+        """Answer windows ``[N, T, D]`` of all test recordings by a strategy that needs no diagnosis."""
+        if strategy.startswith("fault-aware"):
+            _, n, *lines = strategy.split()
+            return self.aware(int(n), "lines" if lines else "cells").predict(x[self.kept])
+        match strategy:
+            case "nothing":
+                corrected = x[self.kept]
+            case "correct to 0":
+                corrected = correct(x[self.kept])
+            case "correct to half":
+                corrected = correct(x[self.kept], abnormal=(1.0,), neutral=0.5)
+            case "correct to the mean":
+                corrected = correct(x[self.kept], abnormal=(1.0,), neutral=self.adapter.statistics)
+            case "correct to 0, wait 5":
+                corrected = self._waiting(x)[self.kept]
+            case _:
+                raise ValueError(f"no such strategy: {strategy}")
+        return self.base.predict(corrected)
+
+    def _waiting(self, x: Floats) -> Floats:
+        """Correct causally, recording by recording."""
+        out = x.copy()
+        for number in np.unique(self.whole.recording):
+            of = self.whole.recording == number
+            frames = x[of].reshape(-1, x.shape[2])
+            out[of] = CausalCorrection(wait=5).correct(frames).reshape(-1, *x.shape[1:])
+        return out
+
+    # Faults
+
+    def broken(self, faults: str, k: int) -> Floats:
+        """Return the test windows with k faults in each recording, drawn for each anew, ``[N, T, D]``.
+
+        So one pass averages over as many fault sets as there are recordings. Open and short ones hit the same cells,
+        and fewer are among the more.
+        """
+        x = self.whole.x.copy()
+        frames = np.arange(x.shape[1])
+        lines = [self.layout.cells_on(line) for line in self.layout.lines if line.kind in ("row", "column")]
+        for number in np.unique(self.whole.recording).tolist():
+            rng = np.random.default_rng([self.seed, number])
+            cells, ends = rng.permutation(self.present)[:k], rng.integers(0, 2, len(self.present))[:k]
+            of = self.whole.recording == number
+            if faults == "lines":
+                for line, end in zip(rng.permutation(len(lines))[:k], ends, strict=True):
+                    x[np.ix_(of, frames, lines[line])] = end
+            else:
+                value = {"open": 0.0, "short": 1.0}.get(faults, ends)
+                x[np.ix_(of, frames, cells)] = value
+        return x
+
+    def fault_set(self, k: int) -> FaultSet:
+        """Return the F of this seed with k cells; smaller ones are part of larger ones."""
+        cells = np.random.default_rng(_SPREAD + self.seed).permutation(self.present)[:k]
+        return FaultSet(tuple(cells.tolist()), self.layout.n_cells)
+
+    # Networks
+
+    @cached_property
+    def base(self) -> TactileTransformer:
+        """The fault-free network."""
+        name, epochs = f"base{self.seed}", self.setup.settings.epochs
+        return self._kept(
+            name,
+            self._fresh(self.seed),
+            lambda model: train(model, self.train, self.validation, epochs=epochs, **self._options(name)),
+        )
+
+    def aware(self, n: int, kind: FaultPattern = "cells") -> TactileTransformer:
+        """Return the network trained with n more windows with faults; 0: the base."""
+        if not n:
+            return self.base
+        settings, name = self.setup.settings, f"aware{self.seed}-{n}-{kind}"
+
+        def fit(model: TactileTransformer) -> None:
+            train_fault_aware(
+                model,
+                self.train,
+                self.validation,
+                n_samples=n,
+                n_faults=(5, 10) if kind == "cells" else (1, 2),
+                kind=kind,
+                epochs=settings.aware_epochs,
+                **self._options(name),
+            )
+
+        start = copy.deepcopy(self.base) if settings.warm else self._fresh(self.seed)
+        return self._kept(name, start, fit)
+
+    def _fresh(self, seed: int) -> TactileTransformer:
+        n_classes = len(self.setup.recordings.class_names)
+        return TactileTransformer(self.layout, n_classes, seed=seed, **self.setup.settings.network)
+
+    def _options(self, name: str) -> dict[str, Any]:
+        """Return what all trainings have in common."""
+        settings = self.setup.settings
+        return {
+            "learning_rate": settings.learning_rate,
+            "patience": settings.patience,
+            "seed": self.seed,
+            "progress": self.setup.progress,
+            "checkpoint": self.setup.folder / "models" / f"{name}.training",
+        }
+
+    def _kept(
+        self, name: str, model: TactileTransformer, fit: Callable[[TactileTransformer], object]
+    ) -> TactileTransformer:
+        """Return the network of this name from the run's folder, or train one and keep it."""
+        folder = self.setup.folder / "models" / name
+        if (folder / MANIFEST).exists():
+            return load_model(folder)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        self.setup.say(f"seed {self.seed}: training {name}")
+        fit(model.to(self.setup.device))
+        save_model(folder, model.cpu())
+        (folder.parent / f"{name}.training").unlink(missing_ok=True)
+        return model
+
+    # Repair
+
+    @cached_property
+    def adapter(self) -> Adapter:
+        """Of the base."""
+        return Adapter(self.base, self.train, self.validation)
+
+    def _adapted(self, faults: FaultSet, x: Floats | None = None) -> Classes:
+        """Answer by the base adapted to F; the cells in F read NaN unless ``x`` is given."""
+        if faults not in self._adaptations:
+            self._adaptations[faults] = self.adapter.adapt(faults, seed=self.seed, progress=False)
+        if x is None:
+            x = self.test.x.copy()
+            x[..., list(faults)] = np.nan
+        return self._adaptations[faults].predict(x)
+
+    @cached_property
+    def _adaptations(self) -> dict[FaultSet, Adaptation]:
+        return {}
+
+    def _trained_anew(self, faults: FaultSet) -> Classes:
+        """Answer by a network trained on the healthy cells alone, the paper's protocol (Section IV)."""
+        reduced = ReducedModel(self._fresh(self.seed + 1), faults, self.adapter.statistics.linear(faults))
+        name = f"anew{self.seed}-{len(faults)}"
+        train(
+            reduced.to(self.setup.device),
+            reduce_windows(self.train, faults),
+            reduce_windows(self.validation, faults),
+            epochs=self.setup.settings.epochs,
+            **self._options(name),
+        )
+        predicted: Classes = logits_of(reduced, phi(self.test.x, faults)).argmax(1).numpy()
+        (self.setup.folder / "models" / f"{name}.training").unlink(missing_ok=True)
+        return predicted
+
+    # Noise, drift, blinking: the same faulty cells in all recordings, as a diagnosis needs them
+
+    def _against(self, task: Task) -> Classes:
+        """Answer the test recordings of a sensor whose k cells have a fault of one kind."""
+        faults, x = self.fault_set(task.k), self._injected(task.faults, task.k).x
+        if task.strategy == "adapted":
+            return self._adapted(faults, x[self.kept])
+        if task.strategy == "combined":
+            return self._combined(x)
+        return self._answers(task.strategy, x)
+
+    def _injected(self, kind: str, k: int) -> Windows:
+        """Return the windows of the test recordings with the seed's k cells broken; all of them, in their order."""
+        faults = [Fault(FaultKind(kind), (cell,)) for cell in self.fault_set(k)]
+        frames, length = self.setup.recordings.frames, self.whole.x.shape[1]
+        broken = [
+            inject(frames[i], faults, self.layout, seed=_SPREAD * self.seed + i)
+            for i in np.unique(self.whole.recording).tolist()
+        ]
+        return make_windows(broken, None, self.layout, length=length)
+
+    def _combined(self, x: Floats) -> Classes:
+        """Correct while the sensor is not diagnosed yet; diagnose it from that log; adapt, and answer the rest."""
+        numbers = np.unique(self.whole.recording)
+        log = np.random.default_rng(self.seed).permutation(numbers)[: min(_LOG, len(numbers) // 2)]
+        full_scale = self.layout.full_scale
+        frames = [
+            x[self.whole.recording == i].reshape(-1, x.shape[2]).astype(np.float64) * full_scale for i in log.tolist()
+        ]
+        found = self.diagnoser.diagnose(frames).fault_set
+        first = np.isin(self.test.recording, log)
+        answers = self._answers("correct to the mean", x)
+        answers[~first] = self._adapted(found, x[self.kept])[~first]
+        return answers
+
+    @cached_property
+    def diagnoser(self) -> SelfDiagnosis:
+        """Knows fault-free recordings."""
+        known = np.unique(self.train.recording)
+        return SelfDiagnosis(self.layout).fit(
+            [self.setup.recordings.frames[i] for i in known[evenly(len(known), _REFERENCE)]]
+        )

@@ -1,0 +1,132 @@
+"""The page of a run: claims and verdicts, every figure with its table, and what it was made with."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from adaptfault.atomic import atomic_write
+from adaptfault.paper.bench import Bench, Setup
+from adaptfault.paper.claims import judge
+from adaptfault.paper.figures import TITLES, Row, draw, force_maps, rows, table
+from adaptfault.paper.ledger import Ledger
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_NOTES = {
+    2: "Every test recording gets faults of its own, so that each figure averages over as many fault sets; open and"
+    " short ones hit the same cells.",
+    4: "Fault-aware networks, by the number of training windows with faults (5 or 10 cells, open or short) that were"
+    " added; tested with faults of their own kind, with short ones alone, and with broken lines.",
+    5: "One F for each seed, the smaller ones part of the larger. *adapted*: the missing cells are filled in, and where"
+    " that is not enough a head is fitted in closed form. *trained anew*: the paper's protocol.",
+    6: "*to 0* as in the paper; *to half*: its other proposal, 2.5 N, for full scale alone; *to the mean*: what the"
+    " other cells say, for full scale alone; *wait 5*: only a cell that has stayed at a rail for 5 frames.",
+    7: "The same faulty cells in all recordings of a seed. *adapted* is told which; *combined* is not: it corrects"
+    " to the mean while a log is recorded, diagnoses that, and adapts. Drift starts anew with each recording.",
+}
+
+_ERRATA = """\
+## Where the paper errs, or is silent
+
+- It prints 2^n - 1 fault combinations. Each cell is healthy, open or short: 3^n - 1, and its 10^105 is 3^220.
+- Correcting short cells to 0 gives the very input that open cells give, so that Figure 6 equals the open half of Figure
+  2 by construction, unless healthy cells press to the rail: then it costs accuracy. Full scale replaced by what the
+  other cells say does better.
+- Its other neutral value, 2.5 N for 0 *and* 5 N, ruins a healthy sensor: cells that nothing touches read exactly 0.
+  Here 2.5 N stands for full scale alone.
+- "Equal to 5.0" is 1.0 after its own scaling, and no equality survives calibration: a tolerance of 1.5 converter steps.
+- More fault-aware samples also mean more training steps; the paper does not separate the two, nor is it done here.
+- The D - k inputs of its reduced model do not fill the grid of its convolutions: a front end fills in what is missing.
+- The feed-forward block must return to width d for the residual sum. Text and tensors disagree on rows and columns:
+  here the first axis has 11. Padding, initial weights and |F| of Figures 2 and 6 are not stated.
+"""
+
+
+def write_page(setup: Setup, ledger: Ledger, figures: tuple[int, ...], about: dict[str, Any]) -> Path:
+    """Write figures (PNG), tables (CSV) and the page into the run's folder; returns the page's path."""
+    layout = setup.recordings.layout
+    lines = [f"# The paper's experiments on {about['recordings']}", ""]
+    lines += [f"{len(setup.recordings)} recordings of {layout}; {len(setup.recordings.class_names)} classes.", ""]
+    claims = judge(
+        ledger, setup.settings, n_classes=len(setup.recordings.class_names), present=int(layout.present.sum())
+    )
+    if claims:
+        lines += ["| the paper states | here | verdict |", "|---|---|---|"]
+        lines += [f"| {c.statement} | {c.here} | **{c.verdict}** ({c.criterion}) |" for c in claims]
+        lines.append("")
+    lines += [
+        f"Accuracies on test recordings, means of {len(setup.settings.seeds)} seeds, each with its own split, weights"
+        " and faults; in brackets the 95 % interval, clustered by recording. *spread*: deviation between seeds.",
+        "",
+    ]
+    for figure in figures:
+        lines += _section(setup, ledger, figure)
+    if set(figures) >= {2, 3}:
+        lines += _single_faults(setup)
+    lines += [_ERRATA, "## Made with", "", f"`{about['command']}` on {about['device']}", ""]
+    lines += [f"- {name} {version}" for name, version in about["versions"].items()]
+    lines += ["", "Settings and seeds: `config.json`; results of each task: `results.jsonl`.", ""]
+    path = setup.folder / "README.md"
+    atomic_write(path, "\n".join(lines).encode())
+    return path
+
+
+def _section(setup: Setup, ledger: Ledger, figure: int) -> list[str]:
+    """Write one figure; return its part of the page."""
+    name = f"figure{figure}"
+    if figure == 3:
+        windows, layout = setup.windows, setup.recordings.layout
+        frames = windows.x.reshape(-1, layout.n_cells) * layout.full_scale
+        picture, maps = force_maps(frames, layout, setup.settings.seeds[0])
+        header = ",".join(["cell", *maps])
+        cells = (",".join([str(i), *(f"{m[i]:.4f}" for m in maps.values())]) for i in range(layout.n_cells))
+        _write(setup.folder, name, picture, "\n".join([header, *cells, ""]))
+        return [f"## {TITLES[3]}", "", f"![{TITLES[3]}]({name}.png)", ""]
+    found = rows(ledger, figure)
+    if not found:
+        return []
+    _write(setup.folder, name, draw(ledger, figure), table(found))
+    return [f"## {TITLES[figure]}", "", _NOTES[figure], "", f"![{TITLES[figure]}]({name}.png)", "", *_markdown(found)]
+
+
+def _markdown(found: Sequence[Row]) -> list[str]:
+    lines = [
+        "| strategy | faults | k | accuracy | precision | recall | F1 | spread |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for task, m in found:
+        numbers = " | ".join(f"{value:.3f}" for value in (m.precision, m.recall, m.f1, m.spread))
+        lines.append(f"| {task.strategy} | {task.faults} | {task.k} | {m} | {numbers} |")
+    return [*lines, ""]
+
+
+def _single_faults(setup: Setup) -> list[str]:
+    """Write the map of which cell must not fail, unless it is there, for the first seed; return its part."""
+    from adaptfault.single_faults import analyse
+
+    summary = setup.folder / "single_faults.txt"
+    if not summary.exists():
+        setup.say("breaking every cell and wire in turn")
+        bench = Bench(setup, setup.settings.seeds[0])
+        chosen = np.random.default_rng(0).permutation(len(bench.test))[: setup.settings.single]
+        result = analyse(bench.base, bench.test.select(chosen), progress=setup.progress)
+        names = [f"{what}_at_{v:g}" for what in ("accuracy_lost", "gradient") for v in result.values]
+        columns = np.column_stack([*result.accuracy_lost, *result.gradient])
+        lines = [",".join([str(i), *(f"{number:.5f}" for number in row)]) for i, row in enumerate(columns)]
+        _write(setup.folder, "single_faults", result.plot(), "\n".join([",".join(["cell", *names]), *lines, ""]))
+        atomic_write(summary, str(result).encode())
+    title = "Which cell must not fail"
+    return [f"## {title}", "", f"![{title}](single_faults.png)", "", "```", summary.read_text(), "```", ""]
+
+
+def _write(folder: Path, name: str, picture: Figure, csv: str) -> None:
+    image = io.BytesIO()
+    picture.savefig(image, format="png", dpi=110)
+    atomic_write(folder / f"{name}.png", image.getvalue())
+    atomic_write(folder / f"{name}.csv", csv.encode())

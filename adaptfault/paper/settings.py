@@ -1,0 +1,154 @@
+"""What a reproduction measures, and how thoroughly: the quick run and the full one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+PAPER_CELLS = 220
+FUTURE = ("open", "short", "noisy", "drift", "intermittent")  # the last three are the paper's future work
+
+CORRECTIONS = ("correct to 0", "correct to half", "correct to the mean", "correct to 0, wait 5")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One cell of work: a strategy on a kind of fault.
+
+    Attributes:
+        figure: number of the paper's figure; 7 is what the paper leaves to future work.
+        seed: of split, weights, training and faults.
+        faults: "none", "open", "short", "mixed" (each with equal chance), "lines", or a kind of :data:`FUTURE`.
+        k: number of faulty cells (of lines, for "lines").
+        strategy: what is done about it.
+    """
+
+    figure: int
+    seed: int
+    faults: str
+    k: int
+    strategy: str
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How thoroughly to measure.
+
+    Attributes:
+        seeds: each has its own split, weights, training and faults.
+        grasps: simulated, of each class.
+        epochs, learning_rate, network: of the fault-free base.
+        patience: of every training; None trains all epochs.
+        counts: k of Figures 2 and 6.
+        adapted: |F| of Figure 5, as on the paper's 220 cells.
+        scratch: those of them for which a network is trained anew as well, the paper's protocol.
+        samples: extra windows of fault-aware training.
+        warm: fault-aware training goes on from the base, for ``aware_epochs``.
+        aware_epochs: of fault-aware training.
+        aware_lines: train fault-aware on broken lines too, with the most samples.
+        future: faulty cells in the comparison of strategies.
+        windows: tested of each recording, at most: more of the same grasp say little more.
+        single: windows for the sensitivity to single faults.
+    """
+
+    seeds: tuple[int, ...] = (0, 1, 2)
+    grasps: int = 200
+    epochs: int = 50
+    learning_rate: float = 1e-4
+    network: dict[str, Any] = field(default_factory=dict)
+    patience: int | None = 10
+    counts: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
+    adapted: tuple[int, ...] = (0, 5, 10, 20, 50, 100, 150, 200)
+    scratch: tuple[int, ...] = (5, 10, 20, 50, 100, 150, 200)
+    samples: tuple[int, ...] = (10_000, 100_000, 200_000)
+    warm: bool = False
+    aware_epochs: int = 50
+    aware_lines: bool = True
+    future: int = 10
+    windows: int = 10
+    single: int = 500
+
+    @classmethod
+    def full(cls) -> Settings:
+        """As the paper: up to 50 epochs, 10k to 200k samples, a network trained anew for each F. For a GPU."""
+        return cls()
+
+    @classmethod
+    def quick(cls, *, simulated: bool) -> Settings:
+        """Everything, smaller: under 15 minutes on two cores on simulated grasps."""
+        small: dict[str, Any] = {
+            "patience": None,
+            "counts": (2, 5, 10, 20),
+            "samples": (2_000, 10_000),
+            "warm": True,
+            "aware_epochs": 1,
+            "aware_lines": False,
+            "windows": 2,
+            "single": 50,
+        }
+        if simulated:  # unpadded convolutions cost a third; Keras's initial weights learn in three epochs
+            return cls(
+                epochs=3, learning_rate=2e-4, network={"padding": "valid", "init": "glorot"}, scratch=(200,), **small
+            )
+        return cls(epochs=20, scratch=(), **small)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict."""
+        return asdict(self)
+
+    def sizes(self, counts: tuple[int, ...], present: int) -> tuple[int, ...]:
+        """Return |F| for an array of another size: up to 50 as on the paper's, beyond that the same share of it."""
+        scaled = (k if k <= 50 else round(k * present / PAPER_CELLS) for k in counts)
+        return tuple(sorted({k for k in scaled if k < present}))
+
+    def tasks(self, present: int, figures: tuple[int, ...]) -> Iterator[Task]:
+        """Yield the work for these figures on an array of ``present`` cells: what costs most training comes last.
+
+        Figure 6 is drawn beside what Figure 2 shows, and so needs that too.
+        """
+        figures = (*figures, 2) if 6 in figures else figures
+        for part in (self._stuck, self._adapted, self._future, self._fault_aware, self._trained_anew):
+            for seed in self.seeds:
+                for task in part(seed, present):
+                    if task.figure in figures:
+                        yield task
+
+    def _stuck(self, seed: int, present: int) -> Iterator[Task]:
+        counts = self.sizes(self.counts, present)
+        yield Task(2, seed, "none", 0, "nothing")
+        for kind in ("open", "short"):
+            for k in counts:
+                yield Task(2, seed, kind, k, "nothing")
+        for strategy in CORRECTIONS:
+            yield Task(6, seed, "none", 0, strategy)
+            for k in counts:
+                yield Task(6, seed, "short", k, strategy)
+
+    def _adapted(self, seed: int, present: int) -> Iterator[Task]:
+        for k in self.sizes(self.adapted, present):
+            yield Task(5, seed, "mixed", k, "adapted")
+
+    def _future(self, seed: int, present: int) -> Iterator[Task]:
+        for kind in FUTURE:
+            for strategy in ("nothing", "correct to 0", "correct to the mean", "adapted", "combined"):
+                yield Task(7, seed, kind, self.future, strategy)
+
+    def _fault_aware(self, seed: int, present: int) -> Iterator[Task]:
+        for n in (0, *self.samples):
+            for kind, k in (("none", 0), ("mixed", 5), ("mixed", 10), ("short", 5), ("lines", 2)):
+                yield Task(4, seed, kind, k, aware(n))
+        if self.aware_lines:
+            for kind, k in (("none", 0), ("mixed", 5), ("lines", 2)):
+                yield Task(4, seed, kind, k, f"{aware(max(self.samples))} lines")
+        for kind in FUTURE:
+            yield Task(7, seed, kind, self.future, aware(max(self.samples)))
+
+    def _trained_anew(self, seed: int, present: int) -> Iterator[Task]:
+        for k in self.sizes(self.scratch, present):
+            yield Task(5, seed, "mixed", k, "trained anew")
+
+
+def aware(n: int) -> str:
+    """Return the name of the strategy: fault-aware training with n more samples."""
+    return f"fault-aware {n}"

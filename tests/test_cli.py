@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptfault.cli import main
+from adaptfault.cli import COMMANDS, main
 from adaptfault.grasps import simulate
 from adaptfault.recordings import Recordings, save_npz
 from diagnostics import Diagnosis, Line, SensorLayout, inject, line_fault

@@ -21,7 +21,7 @@ from adaptfault.cli import (
     train,
 )
 
-_COMMANDS = (train, diagnose, adapt, evaluate, demo, reproduce, maintain, rollback, history, report, listen)
+COMMANDS = (train, diagnose, adapt, evaluate, demo, reproduce, maintain, rollback, history, report, listen)
 
 BAD_INPUT = 3  # exit code for unusable input or usage, as monitoring tools understand it ("unknown")
 
@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         epilog="Try: adaptfault demo",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in _COMMANDS:
+    for module in COMMANDS:
         module.add(commands)
     args = parser.parse_args(argv)
     try:

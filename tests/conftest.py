@@ -36,6 +36,17 @@ def without_torch(path: Path) -> bool:
 if importlib.util.find_spec("torch") is None:  # what does without it is tested without it: make test-pythons
     collect_ignore = [p.name for p in Path(__file__).parent.glob("test_*.py") if not without_torch(p)]
 
+    @pytest.hookimpl(wrapper=True)
+    def pytest_pyfunc_call() -> Iterator[None]:
+        """Skip the tests that turn out to need it."""
+        try:
+            return (yield)
+        except ModuleNotFoundError as error:
+            if error.name == "torch":
+                pytest.skip("needs torch")
+            raise
+
+
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "sdh2x13x6_grasps36.npz"
 
 

@@ -25,7 +25,6 @@ def small() -> Recordings:
 @pytest.fixture(scope="module")
 def home(small: Recordings, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with recordings, and a model trained on them by the command line."""
-    pytest.importorskip("torch")
     home = tmp_path_factory.mktemp("home")
     save_npz(home / "grasps.npz", small)
     assert main(["train", str(home / "grasps.npz"), "--out", str(home / "model"), "--epochs", "10", "--quiet"]) == 0
@@ -207,22 +206,7 @@ def test_a_robot_forecasts_and_adapts_without_the_recordings(home, capsys):
     assert "leave the recordings out" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "train",
-        "diagnose",
-        "adapt",
-        "evaluate",
-        "demo",
-        "reproduce",
-        "maintain",
-        "rollback",
-        "history",
-        "report",
-        "listen",
-    ],
-)
+@pytest.mark.parametrize("command", [module.__name__.rpartition(".")[2] for module in COMMANDS])
 def test_help_shows_an_example(command, capsys):
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])

@@ -56,7 +56,7 @@ def check(bundle: af.Bundle, confirmed: int) -> str:
     """Return what state a kill left the bundle in; raises if it is not a good one."""
     again = af.Bundle.open(bundle.path)
     version = again.active()
-    x = again.check_windows().x[:4]
+    x = again.parts.check_windows().x[:4]
     assert np.isfinite(af.Adaptation.load(version.folder).predict_proba(x)).all()
     assert version.number >= confirmed, f"version {confirmed} was confirmed, {version.number} runs"
     again.versions[confirmed]

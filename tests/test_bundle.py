@@ -17,7 +17,7 @@ from diagnostics import FaultSet, SelfDiagnosis
 
 def deploy(bundle: Bundle, *cells: int) -> int:
     """Deploy a version that does without these cells."""
-    adaptation = bundle.adapter().adapt(FaultSet(cells, bundle.layout.n_cells), method="fill")
+    adaptation = bundle.parts.adapter().adapt(FaultSet(cells, bundle.layout.n_cells), method="fill")
     number = bundle.write_version(adaptation, {"reason": "test"}).number
     bundle.deploy(number)
     return number
@@ -31,13 +31,13 @@ def test_a_bundle_holds_all_that_a_robot_needs(bundle, small_grasps, later_grasp
     model = Adaptation.load(version.folder)
     np.testing.assert_array_equal(model.predict(x), model.model.network.predict(x))
     assert bundle.diagnoser().diagnose(later_grasps).fault_set == set()
-    assert len(bundle.check_windows()) > 0
-    assert bundle.calibration is None
+    assert len(bundle.parts.check_windows()) > 0
+    assert bundle.parts.calibration is None
     assert bundle.problems() == []
 
 
 def test_what_new_versions_are_judged_on_was_never_learned_from(bundle):
-    adapter, check = bundle.adapter(), bundle.check_windows()
+    adapter, check = bundle.parts.adapter(), bundle.parts.check_windows()
     learned = set(adapter.train.recording) | set(adapter.validation.recording)
     assert not learned & set(check.recording)
 
@@ -49,14 +49,14 @@ def test_without_windows_to_judge_on_the_adapter_gives_up_half_of_its_validation
     adapter = Adapter(model, windows.select(windows.recording % 2 == 1), validation)
     diagnoser = SelfDiagnosis(small_grasps.layout).fit(small_grasps.frames[:20])
     bundle = Bundle.create(tmp_path / "a", model, adapter, diagnoser)
-    kept, given = bundle.adapter().validation, bundle.check_windows()
+    kept, given = bundle.parts.adapter().validation, bundle.parts.check_windows()
     assert set(kept.recording) | set(given.recording) == set(validation.recording)
     assert not set(kept.recording) & set(given.recording)
     assert set(given.y) == set(kept.y) == {0, 1, 2}
 
 
 def test_what_does_not_belong_together_is_refused_and_leaves_nothing(bundle, small_grasps, tmp_path):
-    adapter, model = bundle.adapter(), bundle.adapter().model
+    adapter, model = bundle.parts.adapter(), bundle.parts.adapter().model
     with pytest.raises(FileExistsError, match="choose another name"):
         Bundle.create(bundle.path, model, adapter, bundle.diagnoser())
     with pytest.raises(ValueError, match="fit first"):
@@ -147,7 +147,7 @@ def test_a_missing_or_truncated_file_is_noticed(bundle):
     part = next((bundle.path / "parts" / "adapter").glob("*.safetensors"))
     part.write_bytes(part.read_bytes()[:1000])
     with pytest.raises(Damaged):
-        Bundle.open(bundle.path).adapter()
+        Bundle.open(bundle.path).parts.adapter()
 
 
 def test_with_no_good_version_left_the_error_says_so(bundle):

@@ -61,7 +61,7 @@ def _station(args: argparse.Namespace) -> Station:
     if args.bundle and not table:
         from adaptfault.robot.bundle import Bundle
 
-        table = Bundle.open(args.bundle).calibration
+        table = Bundle.open(args.bundle).parts.calibration
     tables = Calibration.read(table) if table else None
     return Station(
         None if args.bundle else _layout(args, None if tables is None else tables.full_scale),

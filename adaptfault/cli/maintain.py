@@ -35,7 +35,9 @@ def run(args: argparse.Namespace) -> int:
     # What listen recorded lies beside a layout, and is in its unit already.
     ready = [p for p in args.recordings if ((Path(p) if Path(p).is_dir() else Path(p).parent) / "layout.json").exists()]
     raw = [p for p in args.recordings if p not in ready]
-    loaded = [load(p, layout=bundle.layout, calibration=t) for p, t in ((ready, None), (raw, bundle.calibration)) if p]
+    loaded = [
+        load(p, layout=bundle.layout, calibration=t) for p, t in ((ready, None), (raw, bundle.parts.calibration)) if p
+    ]
     for problem in (problem for part in loaded for problem in part.problems):
         print(problem, file=sys.stderr)
     report = maintain(

@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from datetime import datetime, timezone
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
@@ -17,12 +17,12 @@ from uuid import uuid4
 from adaptfault.robot.journal import Journal
 from adaptfault.robot.knowledge import Knowledge
 from adaptfault.robot.lock import locked
+from adaptfault.robot.parts import Parts
 from adaptfault.robot.pointer import NAME as POINTER
 from adaptfault.robot.pointer import SCHEMA as POINTER_SCHEMA
 from adaptfault.robot.pointer import STARTS, Pointer
 from adaptfault.robot.sealed import (
     Damaged,
-    check_files,
     damage,
     hash_files,
     read_either,
@@ -31,7 +31,6 @@ from adaptfault.robot.sealed import (
     write_twice,
 )
 from adaptfault.robot.versions import Version, Versions
-from adaptfault.store import load_arrays, save_arrays
 from diagnostics import SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
@@ -42,10 +41,8 @@ if TYPE_CHECKING:
     from adaptfault.windows import Windows
 
 SCHEMA = "adaptfault.bundle/1"
-_REFERENCE_SCHEMA = "adaptfault.reference/1"
 
 _ABOUT, _PARTS = "bundle.json", "parts"
-_ADAPTER, _REFERENCE, _CHECK, _CALIBRATION = "adapter", "reference", "check", "calibration.csv"
 _MAINTENANCE_LOCK, _STATE_LOCK = "maintenance.lock", "state.lock"
 
 PROCESS = uuid4().hex  # this one, among those that start versions
@@ -87,6 +84,7 @@ class Bundle:
         self.about: dict[str, Any] = read_either(self.path / _ABOUT, SCHEMA)
         self.layout = SensorLayout.from_dict(self.about["layout"])
         self.class_names: tuple[str, ...] = tuple(self.about["class_names"])
+        self.parts = Parts(self.path / _PARTS, self.about["parts"])
         self.versions = Versions(self.path / "versions")
         self.journal = Journal(self.path)
 
@@ -123,38 +121,25 @@ class Bundle:
             FileExistsError: there is something at ``path``.
             ValueError: the parts are of different arrays, or the diagnoser is not fitted.
         """
-        from adaptfault.replay import save_adapter, save_windows
-
         path = Path(path)
         if path.exists():
             raise FileExistsError(f"{path} exists: choose another name, or remove it")
-        if diagnoser.reference_ is None:
-            raise ValueError("a bundle needs a diagnoser that is fitted on fault-free recordings: call fit first")
         if not diagnoser.layout.shape == adapter.model.layout.shape == model.layout.shape:
             raise ValueError(
                 f"model, adapter and diagnoser are of different arrays: {model.layout}, {diagnoser.layout}"
             )
         if class_names and len(class_names) != model.n_classes:
             raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
-        if check is None:
-            adapter, check = _give_up_half(adapter)
         path.parent.mkdir(parents=True, exist_ok=True)
-        new = path.with_name(f".{path.name}.unfinished")  # of a crash, if it is there
-        shutil.rmtree(new, ignore_errors=True)
-        parts = new / _PARTS
-        parts.mkdir(parents=True)
-        save_adapter(parts / _ADAPTER, adapter)
-        save_windows(parts / _CHECK, check)
-        about, arrays = diagnoser.state()
-        save_arrays(parts / _REFERENCE, _REFERENCE_SCHEMA, {"diagnosis": about}, arrays)
-        if calibration is not None:
-            calibration.write(parts / _CALIBRATION)
-        about = {
+        new = path.with_name(f".{path.name}.unfinished")
+        shutil.rmtree(new, ignore_errors=True)  # of a crash, if it is there
+        Parts.write(new / _PARTS, adapter, diagnoser, check, calibration)
+        about: dict[str, Any] = {
             "schema": SCHEMA,
             "layout": model.layout.to_dict(),
             "class_names": list(class_names),
             "created": now(),
-            "parts": hash_files(parts),
+            "parts": hash_files(new / _PARTS),
         }
         write_twice(new / _ABOUT, about)
         bundle = cls(new)
@@ -238,7 +223,7 @@ class Bundle:
         problems = damage(self.pointer, POINTER_SCHEMA, mend=mend) + damage(self.path / _ABOUT, SCHEMA, mend=mend)
         problems += self.journal.damage(mend=mend)
         try:
-            check_files(self.path / _PARTS, self.about["parts"])
+            self.parts.check()
         except Damaged as error:
             problems.append(str(error))
         for number in self.versions.numbers:
@@ -257,39 +242,9 @@ class Bundle:
         after.write(self.path)
         self.journal.add(now(), "rollback", {"from": pointer.active, "to": after.active, "reason": reason})
 
-    # Its parts.
-
-    @cached_property
-    def _checked_parts(self) -> Path:
-        check_files(self.path / _PARTS, self.about["parts"])
-        return self.path / _PARTS
-
     def diagnoser(self) -> SelfDiagnosis:
-        """Return the fitted self-diagnosis. Needs no torch.
-
-        Raises:
-            Damaged: a part is not what was written.
-        """
-        about, arrays = load_arrays(self._checked_parts / _REFERENCE, _REFERENCE_SCHEMA)
-        return SelfDiagnosis.from_state(about["diagnosis"], arrays)
-
-    def adapter(self) -> Adapter:
-        """Return the adapter; raises Damaged."""
-        from adaptfault.replay import load_adapter
-
-        return load_adapter(self._checked_parts / _ADAPTER)
-
-    def check_windows(self) -> Windows:
-        """Return the windows that new versions are judged on; raises Damaged."""
-        from adaptfault.replay import load_windows
-
-        return load_windows(self._checked_parts / _CHECK)
-
-    @property
-    def calibration(self) -> Path | None:
-        """The table from raw counts to the layout's unit, if there is one."""
-        path = self._checked_parts / _CALIBRATION
-        return path if path.is_file() else None
+        """Return the fitted self-diagnosis; raises Damaged. Needs no torch."""
+        return self.parts.diagnoser()
 
     # Its history.
 
@@ -346,18 +301,3 @@ def _fault_free(model: TactileTransformer, validation: Windows) -> Adaptation:
 
     none = FaultSet((), model.layout.n_cells)
     return Adaptation(ReducedModel(model, none, None).eval(), none, (), _validation=validation)
-
-
-def _give_up_half(adapter: Adapter) -> tuple[Adapter, Windows]:
-    """Return an adapter with every second validation recording of each class, and the windows of the others."""
-    import numpy as np
-
-    from adaptfault.adapter import Adapter
-
-    windows = adapter.validation
-    recordings, first = np.unique(windows.recording, return_index=True)
-    if len(recordings) < 2:
-        raise ValueError("new versions are judged on windows that no model learns from: give them as check=")
-    by_class = recordings[np.argsort(windows.y[first], kind="stable")]
-    given = np.isin(windows.recording, by_class[1::2])
-    return Adapter(adapter.model, adapter.train, windows.select(~given)), windows.select(given)

@@ -212,7 +212,7 @@ class _Maintenance:
         faulty = known.fault_set
         found: dict[str, Any] = {"diagnosis": diagnosis, "used": tuple(r.name for r in usable)}
         frames = [r.frames for r in usable if r.frames is not None]
-        adapter = self.bundle.adapter()
+        adapter = self.bundle.parts.adapter()
         present = FaultSet(tuple(np.flatnonzero(self.bundle.layout.present).tolist()), faulty.n_cells)
         if not present - faulty:
             reason = "no healthy cell is left to predict from: replace the sensor"
@@ -240,7 +240,7 @@ class _Maintenance:
         from adaptfault.adaptation import Adaptation
 
         faulty = known.fault_set
-        windows = self.bundle.check_windows()
+        windows = self.bundle.parts.check_windows()
         broken = with_faults(windows, known.faults, self.bundle.layout)
         running = Adaptation.load(self.version.folder)
         free = float((adapter.model.predict(windows.x) == windows.y).mean())

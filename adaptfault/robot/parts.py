@@ -1,0 +1,106 @@
+"""The parts of a bundle that never change: what an adaptation, a diagnosis and a judgement start from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from adaptfault.robot.sealed import check_files
+from adaptfault.store import load_arrays, save_arrays
+from diagnostics import SelfDiagnosis
+
+if TYPE_CHECKING:
+    from adaptfault.adapter import Adapter
+    from adaptfault.calibration import Calibration
+    from adaptfault.windows import Windows
+
+_ADAPTER, _REFERENCE, _CHECK, _CALIBRATION = "adapter", "reference", "check", "calibration.csv"
+_SCHEMA = "adaptfault.reference/1"
+
+
+class Parts:
+    """Reads the parts; each is checked against its hash when it is first needed, and Damaged is raised.
+
+    Args:
+        folder: where they lie.
+        hashes: of their files.
+    """
+
+    def __init__(self, folder: Path, hashes: Mapping[str, str]) -> None:
+        self.folder, self.hashes = folder, hashes
+
+    @staticmethod
+    def write(
+        folder: Path,
+        adapter: Adapter,
+        diagnoser: SelfDiagnosis,
+        check: Windows | None,
+        calibration: Calibration | None,
+    ) -> None:
+        """Write them into a new folder; without windows to ``check`` on, the adapter gives up half of its validation.
+
+        Raises:
+            ValueError: the diagnoser is not fitted, or there are too few windows.
+        """
+        from adaptfault.replay import save_adapter, save_windows
+
+        if diagnoser.reference_ is None:
+            raise ValueError("a bundle needs a diagnoser that is fitted on fault-free recordings: call fit first")
+        if check is None:
+            adapter, check = _give_up_half(adapter)
+        folder.mkdir(parents=True)
+        save_adapter(folder / _ADAPTER, adapter)
+        save_windows(folder / _CHECK, check)
+        about, arrays = diagnoser.state()
+        save_arrays(folder / _REFERENCE, _SCHEMA, {"diagnosis": about}, arrays)
+        if calibration is not None:
+            calibration.write(folder / _CALIBRATION)
+
+    def check(self) -> None:
+        """Check all of them; raises Damaged."""
+        check_files(self.folder, self.hashes)
+
+    @cached_property
+    def _checked(self) -> Path:
+        self.check()
+        return self.folder
+
+    def diagnoser(self) -> SelfDiagnosis:
+        """Return the fitted self-diagnosis. Needs no torch."""
+        about, arrays = load_arrays(self._checked / _REFERENCE, _SCHEMA)
+        return SelfDiagnosis.from_state(about["diagnosis"], arrays)
+
+    def adapter(self) -> Adapter:
+        """Return the adapter, with the fault-free model and windows."""
+        from adaptfault.replay import load_adapter
+
+        return load_adapter(self._checked / _ADAPTER)
+
+    def check_windows(self) -> Windows:
+        """Return the windows that no model learns from, which new versions are judged on."""
+        from adaptfault.replay import load_windows
+
+        return load_windows(self._checked / _CHECK)
+
+    @property
+    def calibration(self) -> Path | None:
+        """The table from raw counts to the layout's unit, if there is one."""
+        path = self._checked / _CALIBRATION
+        return path if path.is_file() else None
+
+
+def _give_up_half(adapter: Adapter) -> tuple[Adapter, Windows]:
+    """Return an adapter with every second validation recording of each class, and the windows of the others."""
+    import numpy as np
+
+    from adaptfault.adapter import Adapter
+
+    windows = adapter.validation
+    recordings, first = np.unique(windows.recording, return_index=True)
+    if len(recordings) < 2:
+        raise ValueError("new versions are judged on windows that no model learns from: give them as check=")
+    by_class = recordings[np.argsort(windows.y[first], kind="stable")]
+    given = np.isin(windows.recording, by_class[1::2])
+    return Adapter(adapter.model, adapter.train, windows.select(~given)), windows.select(given)

@@ -5,7 +5,7 @@ from diagnostics import Line, SelfDiagnosis, inject, line_fault
 
 
 def main() -> None:
-    grasps = af.simulate(n_per_class=15)  # or: af.load("grasps/").recordings
+    grasps = af.simulate(n_per_class=30)  # or: af.load("grasps/").recordings
     windows = af.make_windows(grasps.frames, grasps.labels, grasps.layout)
     training, validation, test = af.split(windows)
     model = af.TactileTransformer(grasps.layout, n_classes=7, padding="valid", init="glorot")  # quick to learn
@@ -17,7 +17,7 @@ def main() -> None:
     broken_test = broken_test.select([r in set(test.recording) for r in broken_test.recording])
 
     healthy = [grasps.frames[i] for i in set(training.recording)]
-    diagnosis = SelfDiagnosis(grasps.layout).fit(healthy).diagnose(broken[30:45])
+    diagnosis = SelfDiagnosis(grasps.layout).fit(healthy).diagnose(broken[60:75])
     adaptation = af.Adapter(model, training, validation).adapt(diagnosis.fault_set, method="fill")
 
     print(diagnosis)

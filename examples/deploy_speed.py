@@ -4,62 +4,38 @@ Needs Linux and pip install 'adaptfault[deploy]'. Run: python examples/deploy_sp
 """
 
 import argparse
-import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
-from safetensors.numpy import load_file, save_file
 
-from adaptfault import Inference, Predictor
+from adaptfault import Bundle, Inference, Predictor
 from diagnostics import FaultSet, SelfDiagnosis
 
 RUNS = 100
 
 
-@dataclass
-class OneVersion:
-    """A bundle of a single version, as far as the predictor looks at it."""
-
-    folder: Path
-    fitted: SelfDiagnosis
-    class_names = ()
-
-    def __post_init__(self) -> None:
-        self.layout, self.pointer = self.fitted.layout, self.folder / "manifest.json"
-
-    def active(self) -> SimpleNamespace:
-        """Return the version."""
-        return SimpleNamespace(number=1, folder=self.folder)
-
-    begin = active
-
-    def diagnoser(self) -> SelfDiagnosis:
-        """Return the fitted diagnosis."""
-        return self.fitted
-
-
 def prepare(folder: Path) -> None:
-    """Write two versions, a fitted diagnosis and a recording; the weights are untrained, which costs the same."""
+    """Make two bundles and a recording; the weights are untrained, which costs the same."""
     import adaptfault as af
 
     grasps = af.simulate(n_per_class=10, seed=0)
     windows = af.make_windows(grasps.frames, grasps.labels, grasps.layout)
-    training, validation, _ = af.split(windows)
-    adapter = af.Adapter(af.TactileTransformer(grasps.layout, 7).eval(), training, validation)
+    training, validation, test = af.split(windows)
+    model = af.TactileTransformer(grasps.layout, 7).eval()
+    adapter = af.Adapter(model, training, validation)
+    af.Bundle.create(folder / "bare", model, adapter, SelfDiagnosis(grasps.layout).fit(grasps.frames), check=test)
+    shutil.copytree(folder / "bare", folder / "adapted")
+    adapted = af.Bundle.open(folder / "adapted")
     dead = FaultSet(tuple(range(0, 220, 11)), 220)
-    for name, method, fault_set in (("bare", "fill", dead - dead), ("adapted", "head", dead)):
-        adapter.adapt(fault_set, method=method, progress=False).save(folder / name)
-        af.add_onnx(folder / name)
-    about, arrays = SelfDiagnosis(grasps.layout).fit(grasps.frames).state()
-    (folder / "diagnosis.json").write_text(json.dumps(about))
-    save_file(arrays, folder / "diagnosis.safetensors")
+    version = adapted.write_version(adapter.adapt(dead, method="head", progress=False), {"reason": "measured"})
+    adapted.deploy(version.number)
+    adapted.confirm()
     np.save(folder / "frames.npy", np.concatenate(grasps.frames[:20]))
 
 
@@ -68,7 +44,8 @@ def latency(folder: Path) -> None:
     import torch
 
     torch.set_num_threads(1)
-    models = {runtime: Inference.load(folder, runtime=runtime) for runtime in ("onnx", "torch")}
+    version = Bundle.open(folder).active().folder
+    models = {runtime: Inference.load(version, runtime=runtime) for runtime in ("onnx", "torch")}
     x = np.random.default_rng(0).random((1, 10, 220), np.float32)
     seconds: dict[str, list[float]] = {runtime: [] for runtime in models}
     for _ in range(RUNS):
@@ -86,9 +63,7 @@ def loop(folder: Path, runtime: str, seconds: float) -> None:
     """Stream at 10 Hz in this process alone, and print what it takes."""
     if runtime == "torch":
         sys.modules["onnxruntime"] = None  # type: ignore[assignment]  # as if it were not installed
-    arrays = load_file(folder.parent / "diagnosis.safetensors")
-    fitted = SelfDiagnosis.from_state(json.loads((folder.parent / "diagnosis.json").read_text()), arrays)
-    predictor = Predictor(lambda: OneVersion(folder, fitted))
+    predictor = Predictor.load(folder)
     if runtime == "torch":
         sys.modules["torch"].set_num_threads(1)
     assert predictor.runtime == runtime

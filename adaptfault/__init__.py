@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from adaptfault.calibration import Calibration
     from adaptfault.evaluation import Scores, evaluate
     from adaptfault.export import add_onnx
+    from adaptfault.fleet.listing import Fleet
+    from adaptfault.fleet.report import FleetReport
+    from adaptfault.fleet.run import maintain_fleet
     from adaptfault.forecast import Forecast
     from adaptfault.grasps import simulate
     from adaptfault.history import History
@@ -42,6 +45,8 @@ __all__ = [
     "Bundle",
     "Calibration",
     "CausalCorrection",
+    "Fleet",
+    "FleetReport",
     "Forecast",
     "History",
     "Inference",
@@ -66,6 +71,7 @@ __all__ = [
     "load_adapter",
     "load_model",
     "maintain",
+    "maintain_fleet",
     "make_windows",
     "save_adapter",
     "save_model",
@@ -84,6 +90,8 @@ _HOMES = {
     "Bundle": "robot.bundle",
     "Calibration": "calibration",
     "CausalCorrection": "baselines.correction",
+    "Fleet": "fleet.listing",
+    "FleetReport": "fleet.report",
     "Forecast": "forecast",
     "History": "history",
     "Inference": "inference",
@@ -108,6 +116,7 @@ _HOMES = {
     "load_adapter": "replay",
     "load_model": "store",
     "maintain": "robot.maintenance",
+    "maintain_fleet": "fleet.run",
     "make_windows": "windows",
     "save_adapter": "replay",
     "save_model": "store",

@@ -12,6 +12,7 @@ from adaptfault.cli import (
     demo,
     diagnose,
     evaluate,
+    fleet,
     history,
     listen,
     maintain,
@@ -21,7 +22,7 @@ from adaptfault.cli import (
     train,
 )
 
-COMMANDS = (train, diagnose, adapt, evaluate, demo, reproduce, maintain, rollback, history, report, listen)
+COMMANDS = (train, diagnose, adapt, evaluate, demo, reproduce, maintain, rollback, history, report, listen, fleet)
 
 BAD_INPUT = 3  # exit code for unusable input or usage, as monitoring tools understand it ("unknown")
 

@@ -25,25 +25,19 @@ def add(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Maintain; the exit code says how the sensor is."""
     import sys
-    from pathlib import Path
 
-    from adaptfault.recordings import load
     from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.incoming import load_incoming
     from adaptfault.robot.maintenance import maintain
 
     bundle = Bundle.open(args.bundle)
-    # What listen recorded lies beside a layout, and is in its unit already.
-    ready = [p for p in args.recordings if ((Path(p) if Path(p).is_dir() else Path(p).parent) / "layout.json").exists()]
-    raw = [p for p in args.recordings if p not in ready]
-    loaded = [
-        load(p, layout=bundle.layout, calibration=t) for p, t in ((ready, None), (raw, bundle.parts.calibration)) if p
-    ]
-    for problem in (problem for part in loaded for problem in part.problems):
+    incoming = load_incoming(bundle, args.recordings)
+    for problem in incoming.problems:
         print(problem, file=sys.stderr)
     report = maintain(
         bundle,
-        [frames for part in loaded for frames in part.recordings.frames],
-        names=[name for part in loaded for name in part.recordings.names],
+        incoming.frames,
+        names=incoming.names,
         dry_run=args.dry_run,
         budget=args.budget,
         say=lambda text: say(args, text),

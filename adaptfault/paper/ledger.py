@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.atomic import atomic_write
 from adaptfault.evaluation import Scores, accuracy_interval
+from adaptfault.lines import Lines
 from adaptfault.paper.settings import Task
 from adaptfault.windows import Windows
 
@@ -109,22 +108,14 @@ class Ledger:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.results: dict[Task, Result] = {}
-        if not path.exists():
-            return
-        whole, _, part = path.read_bytes().rpartition(b"\n")
-        if part:
-            atomic_write(path, whole + b"\n" if whole else b"")
-        for line in whole.splitlines():
-            result = Result.from_dict(json.loads(line))
-            self.results[result.task] = result
+        self._lines = Lines(path)
+        results = [Result.from_dict(document) for document in self._lines.read()]
+        self.results: dict[Task, Result] = {result.task: result for result in results}
 
     def add(self, result: Result) -> None:
         """Keep a result."""
         self.results[result.task] = result
-        with self.path.open("a") as file:
-            file.write(json.dumps(result.to_dict(), allow_nan=False) + "\n")
+        self._lines.add(result.to_dict())
 
     def of(self, figure: int, **fields: Any) -> list[Result]:
         """Return the results of a figure whose tasks have these fields, in the order measured."""

@@ -16,7 +16,7 @@ from adaptfault.robot.judgement import Judgement, judge, with_faults
 from adaptfault.robot.knowledge import Knowledge
 from adaptfault.robot.plausible import contradiction, implausible
 from adaptfault.robot.pointer import Pointer
-from diagnostics import Diagnosis, FaultSet, SelfDiagnosis
+from diagnostics import Diagnosis, Fault, FaultSet, SelfDiagnosis
 
 if TYPE_CHECKING:
     from adaptfault.adaptation import Adaptation
@@ -42,6 +42,7 @@ class MaintenanceReport:
         reason: why, in one sentence.
         fault_set: F, as known now.
         version: that runs now.
+        faults: that are known now, one for each root cause.
         diagnosis: of the new recordings; None where there were none.
         judgement: of the last candidate beside what ran; None where there was none.
         accuracy: of what runs now, under the faults known now, on the windows kept for that; None if not judged.
@@ -58,6 +59,7 @@ class MaintenanceReport:
     reason: str
     fault_set: FaultSet
     version: int
+    faults: tuple[Fault, ...] = ()
     diagnosis: Diagnosis | None = None
     judgement: Judgement | None = None
     accuracy: float | None = None
@@ -99,6 +101,7 @@ class MaintenanceReport:
             "reason": self.reason,
             "fault_set": list(self.fault_set),
             "version": self.version,
+            "faults": [fault.to_dict() for fault in self.faults],
             "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
             "judgement": None if self.judgement is None else vars(self.judgement),
             "accuracy": self.accuracy,
@@ -321,6 +324,7 @@ class _Maintenance:
             reason=reason,
             fault_set=known.fault_set,
             version=self.version.number if number is None else number,
+            faults=known.faults,
             left_out=self.left_out,
             warnings=self.warnings,
             dry_run=self.dry_run,

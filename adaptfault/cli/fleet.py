@@ -1,0 +1,61 @@
+"""adaptfault fleet maintain: maintenance of many robots on workers, and what the fleet needs."""
+
+from __future__ import annotations
+
+import argparse
+
+from adaptfault.cli.options import Commands, command, emit, progress, say
+
+_EXAMPLE = """  adaptfault fleet maintain FLEET.toml --jobs 8
+      FLEET.toml lists robots as [[robots]] with name, bundle, recordings (and tags, commissioned = 2025-03-01),
+      or as bundles = "robots/*/robot.bundle" and recordings = "{bundle_dir}/recordings";
+      killed and started again it goes on where it was"""
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    group = commands.add_parser(
+        "fleet",
+        help="maintain many robots",
+        description="Maintain many robots.",
+        epilog=f"example:\n{_EXAMPLE}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    inner = group.add_subparsers(dest="fleet_command", required=True, metavar="COMMAND")
+    parser = command(
+        inner, "maintain", "maintain all robots of a list; exit code 2, 3, 1, 0: the worst of them", _EXAMPLE
+    )
+    parser.add_argument("fleet", metavar="FLEET.toml", help="list of the robots")
+    parser.add_argument("--jobs", type=int, metavar="N", help="worker processes (default: as many as cores)")
+    parser.add_argument("--dask", metavar="ADDRESS", help="a Dask scheduler whose workers do it, as tcp://host:8786")
+    parser.add_argument("--dry-run", action="store_true", help="report only, change nothing")
+    parser.add_argument("--budget", type=float, metavar="S", help="seconds that one adaptation may take")
+    parser.add_argument("--out", metavar="FOLDER", help="of ledger and reports (default: FLEET.fleet)")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Maintain; the exit code says how the worst robot is."""
+    import json
+    from pathlib import Path
+
+    from adaptfault.atomic import atomic_write
+    from adaptfault.fleet.listing import Fleet
+    from adaptfault.fleet.run import maintain_fleet
+
+    fleet = Fleet.read(args.fleet)
+    folder = Path(args.out or Path(args.fleet).with_suffix(".fleet"))
+    report = maintain_fleet(
+        fleet,
+        folder,
+        jobs=args.jobs,
+        dask=args.dask,
+        dry_run=args.dry_run,
+        budget=args.budget,
+        progress=progress(args),
+    )
+    atomic_write(folder / "report.json", json.dumps(report.to_dict(), indent=1, allow_nan=False).encode())
+    page = report.write_page(folder / "report.html")
+    say(args, f"report: {page}")
+    emit(args, report.to_dict(), str(report))
+    return report.exit_code

@@ -111,9 +111,9 @@ class Tile:
         own[:, place, :, np.arange(len(outputs))] = True
         weight, bias = _logistic(z.reshape(len(z), -1), targets, own.reshape(_FEATURES * len(inputs), -1))
         estimate = LedoitWolf().fit(z[:, 1].astype(np.float64))
-        # Cells of which none was ever touched say nothing of each other.
-        untouched = None if z[:, 1].any() else np.eye(len(inputs))
-        covariance, precision = (estimate.covariance_, estimate.precision_) if untouched is None else [untouched] * 2
+        covariance, precision = estimate.covariance_, estimate.precision_
+        if not z[:, 1].any():  # cells of which none was ever touched say nothing of each other
+            covariance = precision = np.eye(len(inputs))
         z1 = z[:, 1].astype(np.float64)
         error = (z1 @ precision / np.diag(precision))[:, place] * np.where(np.isfinite(scale[1]), scale[1], 0)[place]
         # Where nothing is loaded nothing errs: the spread is that of the loaded stretches.

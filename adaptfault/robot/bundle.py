@@ -250,11 +250,9 @@ class Bundle:
 
     def knowledge(self) -> Knowledge:
         """Return what is known of the cells after the last run."""
-        for run in reversed(self.journal.runs()):
-            if "knowledge" in run:
-                return Knowledge.from_dict(run["knowledge"])
-        # The journal is new or was lost: the version that runs knows what it was made for.
-        known = self.active().about.get("knowledge")
+        known = self.journal.last("knowledge")
+        if known is None:  # the journal is new or was lost: the version that runs knows what it was made for
+            known = self.active().about.get("knowledge")
         return Knowledge(self.layout.n_cells) if known is None else Knowledge.from_dict(known)
 
     def maintenance(self) -> AbstractContextManager[None]:

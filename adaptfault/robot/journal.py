@@ -88,6 +88,16 @@ class Journal:
             rows = connection.execute(query, (-1 if last is None else last,)).fetchall()
         return [{**json.loads(text), "id": i, "time": time, "what": what} for i, time, what, text in reversed(rows)]
 
+    def last(self, key: str) -> Any:
+        """Return what the last run whose document has this key says there; None if none has it."""
+        if not self.path.exists():
+            return None
+        with self._reading() as connection:
+            for (text,) in connection.execute("SELECT document FROM runs ORDER BY id DESC"):
+                if key in (document := json.loads(text)):
+                    return document[key]
+        return None
+
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
         # Not read-only: after a crash SQLite has to roll back first.

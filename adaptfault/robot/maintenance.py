@@ -16,7 +16,7 @@ from adaptfault.robot.judgement import Judgement, judge, with_faults
 from adaptfault.robot.knowledge import Knowledge
 from adaptfault.robot.plausible import contradiction, implausible
 from adaptfault.robot.pointer import Pointer
-from diagnostics import Diagnosis, Fault, FaultSet, SelfDiagnosis
+from diagnostics import Diagnosis, Fault, FaultSet
 
 if TYPE_CHECKING:
     from adaptfault.adaptation import Adaptation
@@ -202,19 +202,19 @@ class _Maintenance:
         if not usable:
             return self._report("refused", _UNKNOWN, "no recording is usable", self.before)
         self.say(f"diagnosing {len(usable)} new recordings")
-        diagnoser = bundle.diagnoser()
-        diagnosis = diagnoser.diagnose([r.frames for r in usable if r.frames is not None])
-        report = self._decide(diagnosis, diagnoser, usable)
+        frames = [r.frames for r in usable if r.frames is not None]
+        report = self._decide(bundle.diagnoser().diagnose(frames), frames, tuple(r.name for r in usable))
         if not self.dry_run:
             self._write(report, usable)
         return report
 
-    def _decide(self, diagnosis: Diagnosis, diagnoser: SelfDiagnosis, usable: Sequence[_Incoming]) -> MaintenanceReport:
+    def _decide(
+        self, diagnosis: Diagnosis, frames: list[NDArray[np.float64]], used: tuple[str, ...]
+    ) -> MaintenanceReport:
         """Say what is to be done about a diagnosis, and deploy if that is it."""
         known = self.before.merged(diagnosis)
         faulty = known.fault_set
-        found: dict[str, Any] = {"diagnosis": diagnosis, "used": tuple(r.name for r in usable)}
-        frames = [r.frames for r in usable if r.frames is not None]
+        found: dict[str, Any] = {"diagnosis": diagnosis, "used": used}
         adapter = self.bundle.parts.adapter()
         present = FaultSet(tuple(np.flatnonzero(self.bundle.layout.present).tolist()), faulty.n_cells)
         if not present - faulty:
@@ -274,8 +274,7 @@ class _Maintenance:
 
     def _judged_before(self, faulty: FaultSet) -> dict[str, Any] | None:
         """Return how an adaptation to these faults was judged beside what runs, if it was in the last run."""
-        runs = [run for run in self.bundle.journal.runs() if "judged" in run]
-        judged = runs[-1]["judged"] if runs else None
+        judged = self.bundle.journal.last("judged")
         if judged is None or (tuple(judged["fault_set"]), judged["version"]) != (faulty.cells, self.version.number):
             return None
         return dict(judged)

@@ -7,6 +7,7 @@ Models of single frames, nearest frames, trees, a neural network and one model s
 real grasps than these regressions on whole touches.
 
 Which cells can be trusted differs from log to log. What the others would have read is filled in from the trusted ones.
+What the regressions say is then corrected by what all cells have in common (see ``rim``).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from scipy import linalg
 from scipy.special import expit, logit
 
 from diagnostics.layout import SensorLayout
+from diagnostics.rim import Foreseen, Rim, around
 from diagnostics.temporal import segments
 from diagnostics.touches import SEGMENT, Array, Scale, Summary, Touch, Touches
 
@@ -27,7 +29,8 @@ _SAMPLES = 3000  # stretches of touches that the model is fitted on, about
 _MOST_DRAWS = 8  # stretches of one touch: more of them say the same
 _SHORTEST = 6  # frames of a stretch
 _RIDGE = 0.03  # on standardised inputs, per sample
-_STEPS = 200  # of accelerated gradient descent; the ridge makes it converge
+_FREE = 1e-6  # the same for the bias
+_STEPS = 25  # of accelerated descent; the ridge makes it converge
 _RESTING_QUANTILE = 0.05  # of a cell's readings: where it rests
 _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
 _LEAST_SPREAD = 0.02  # of the root load: nothing is predicted more exactly
@@ -35,6 +38,10 @@ _NOVEL = 0.1  # share of touches that resemble nothing known
 _TILE, _HALO = 8, 4  # cells: large pads are modelled in tiles, each with what surrounds it
 _MOST_CELLS = 400  # in one model; beyond that, tiles
 _FEATURES = 4  # of a cell in a touch, see Summary.features
+_FOLDS = 4  # of the touches: each teaches how far to believe what the others taught
+_LEFT_OUT = (0.03, 0.06, 0.12, 0.2, 0.4, 0.7, 0.95)  # of the cells, in turn: so many may be dead, or not moved yet
+_LOOKED_AT = 0.12  # of the cells at most, among those left out
+_RIM_SAMPLES = 100_000  # cells left out of a stretch that are looked at for that, about
 
 
 @dataclass(frozen=True)
@@ -75,7 +82,6 @@ class Tile:
         bias: ``[2 outputs]``.
         covariance, precision: of the mean root loads, standardised, ``[inputs, inputs]``.
         spread: ``[outputs]``.
-        surest: no probability is nearer to 0 or 1.
     """
 
     inputs: NDArray[np.intp]
@@ -88,7 +94,6 @@ class Tile:
     covariance: NDArray[np.float64]
     precision: NDArray[np.float64]
     spread: NDArray[np.float64]
-    surest: float
 
     def __post_init__(self) -> None:
         # Matrix products round differently in another memory order: a stored and restored one must say the same.
@@ -97,8 +102,8 @@ class Tile:
                 object.__setattr__(self, name, np.ascontiguousarray(value))
 
     @classmethod
-    def fit(cls, features: Array, inputs: NDArray[np.intp], outputs: NDArray[np.intp], surest: float) -> Tile:
-        """Fit on ``[n, 4, D]``; no probability is taken for nearer to 0 or 1 than ``surest``."""
+    def fit(cls, features: Array, inputs: NDArray[np.intp], outputs: NDArray[np.intp]) -> Tile:
+        """Fit on features ``[n, 4, D]``."""
         from sklearn.covariance import LedoitWolf
 
         x = features[:, :, inputs]
@@ -107,9 +112,8 @@ class Tile:
         z = (x - mean) / scale
         place = np.searchsorted(inputs, outputs)
         targets = np.concatenate([x[:, 2, place] == 0, x[:, 3, place] == 1], axis=1).astype(np.float32)
-        own = np.zeros((_FEATURES, len(inputs), 2, len(outputs)), bool)
-        own[:, place, :, np.arange(len(outputs))] = True
-        weight, bias = _logistic(z.reshape(len(z), -1), targets, own.reshape(_FEATURES * len(inputs), -1))
+        own = np.arange(_FEATURES) * len(inputs) + np.tile(place, 2)[:, None]
+        weight, bias = _logistic(z.reshape(len(z), -1), targets, own)
         estimate = LedoitWolf().fit(z[:, 1].astype(np.float64))
         covariance, precision = estimate.covariance_, estimate.precision_
         if not z[:, 1].any():  # cells of which none was ever touched say nothing of each other
@@ -124,24 +128,22 @@ class Tile:
         spread[~told.any(axis=0)] = np.nan  # how a cell reads that was never loaded is unknown
         return cls(
             inputs, outputs, place, mean, scale, weight, bias,
-            covariance, precision, spread, surest,
+            covariance, precision, spread,
         )  # fmt: skip
 
-    def expect(
-        self, features: Array, trusted: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return P(never loaded), P(always loaded) and the mean root load of the outputs, ``[n, outputs]`` each."""
+    def expect(self, features: Array, trusted: NDArray[np.bool_]) -> tuple[NDArray[np.float64], ...]:
+        """Return what ``Foreseen`` holds, of the outputs: ``[n, outputs]`` each."""
         z = (features[:, :, self.inputs] - self.mean) / self.scale
         known = trusted[self.inputs]
         self._fill(z, known)
-        odds = z.reshape(len(z), -1) @ self.weight + self.bias
-        p = np.clip(expit(odds.astype(np.float64)), self.surest, 1 - self.surest)
-        never, always = p[:, : len(self.outputs)], p[:, len(self.outputs) :]
+        odds = (z.reshape(len(z), -1) @ self.weight + self.bias).astype(np.float64)
+        never, always = odds[:, : len(self.outputs)], odds[:, len(self.outputs) :]
         # What all the other cells say of a cell: for those filled in, just what they were filled with.
         mean = z[:, 1].astype(np.float64)
         mean = mean[:, self.place] - mean @ self.precision[:, self.place] / np.diag(self.precision)[self.place]
         scale = np.where(np.isfinite(self.scale[1]), self.scale[1], 0)[self.place]
-        return never, always, mean * scale + self.mean[1][self.place]
+        usual = np.broadcast_to(self.mean[2][self.place], never.shape)
+        return never, always, mean * scale + self.mean[1][self.place], usual
 
     def _fill(self, z: Array, known: NDArray[np.bool_]) -> None:
         """Write into ``z`` ``[n, 4, inputs]`` what the unknown cells would say, as the linear regression has it."""
@@ -162,19 +164,32 @@ class Tile:
 
 @dataclass(frozen=True)
 class ContactModel:
-    """See the module; ``tiles`` cover the array."""
+    """See the module.
 
+    Attributes:
+        layout: the array.
+        tiles: cover it; what each cell's regressions foresee.
+        rim: corrects that.
+        surest: no probability is nearer to 0 or 1.
+    """
+
+    layout: SensorLayout
     tiles: tuple[Tile, ...]
+    rim: Rim
+    surest: float
 
     @classmethod
     def fit(
         cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale, seed: int = 0
     ) -> ContactModel:
         """Fit on fault-free recordings, ``[T, D]`` each."""
-        features, n_touches = stretches(recordings, scale, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        features, touch = stretches(recordings, scale, rng)
+        n_touches = len(np.unique(touch))
         # What never happened in n touches may happen in the next with a chance of about 1 in n (rule of succession).
         surest = max(_SUREST, 1 / (n_touches + 2))
-        return cls(tuple(Tile.fit(features, *cells, surest) for cells in _tiles(layout)))
+        rim = _rim(features, touch, layout, rng) if n_touches >= _FOLDS else Rim.none()
+        return cls(layout, _fitted(features, layout), rim, surest)
 
     def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Expected:
         """Say what healthy cells would do.
@@ -183,13 +198,52 @@ class ContactModel:
             features: ``[n, 4, D]``, of n stretches (see ``Summary.features``).
             trusted: bool ``[D]``, the cells that may be asked.
         """
-        shape = (len(features), features.shape[2])
-        never, always, mean = np.ones(shape), np.ones(shape), np.zeros(shape)
-        spread = np.ones(shape[1])
+        foreseen = _foreseen(self.tiles, features, trusted)
+        spread = np.ones(features.shape[2])
         for tile in self.tiles:
-            never[:, tile.outputs], always[:, tile.outputs], mean[:, tile.outputs] = tile.expect(features, trusted)
             spread[tile.outputs] = tile.spread
-        return Expected(never, always, mean, spread)
+        never, always = self.rim.believe(around(foreseen, features, trusted, self.layout))
+        # A cell that no touch of the reference reached may be out of reach, whatever those around it do.
+        never = np.where(np.isnan(spread), expit(foreseen.never), never)
+        present = self.layout.present.ravel()
+        never, always = (np.where(present, np.clip(p, self.surest, 1 - self.surest), 1.0) for p in (never, always))
+        return Expected(never, always, foreseen.mean, spread)
+
+
+def _fitted(features: Array, layout: SensorLayout) -> tuple[Tile, ...]:
+    return tuple(Tile.fit(features, *cells) for cells in _tiles(layout))
+
+
+def _foreseen(tiles: Sequence[Tile], features: Array, trusted: NDArray[np.bool_]) -> Foreseen:
+    shape = (len(features), features.shape[2])
+    foreseen = Foreseen(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape))
+    for tile in tiles:
+        of_tile = tile.expect(features, trusted)
+        for values, said in zip(vars(foreseen).values(), of_tile, strict=True):
+            values[:, tile.outputs] = said
+    return foreseen
+
+
+def _rim(features: Array, touch: NDArray[np.intp], layout: SensorLayout, rng: np.random.Generator) -> Rim:
+    """Fit on what models of most touches say of the others, for cells left out at random."""
+    present = np.flatnonzero(layout.present)
+    looked_at = sum(min(share, _LOOKED_AT) for share in _LEFT_OUT) * len(present)
+    most = max(1, round(_RIM_SAMPLES / (_FOLDS * looked_at)))  # stretches in each round
+    fold = rng.permutation(touch.max() + 1)[touch] % _FOLDS
+    samples, never, always = [], [], []
+    for k in range(_FOLDS):
+        tiles, held = _fitted(features[fold != k], layout), features[fold == k]
+        for share in _LEFT_OUT:
+            some = held[np.sort(rng.permutation(len(held))[:most])]
+            out = rng.permutation(present)[: max(1, round(share * len(present)))]
+            trusted = np.ones(layout.n_cells, bool)
+            trusted[out] = False
+            out = np.sort(out[: max(1, round(_LOOKED_AT * len(present)))])
+            told = around(_foreseen(tiles, some, trusted), some, trusted, layout)[:, out]
+            samples.append(told.reshape(-1, told.shape[-1]))
+            never.append((some[:, 2, out] == 0).ravel())
+            always.append((some[:, 3, out] == 1).ravel())
+    return Rim.fit(np.concatenate(samples), np.concatenate(never), np.concatenate(always))
 
 
 def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -211,14 +265,15 @@ def resting(recordings: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     return rest
 
 
-def stretches(recordings: Sequence[NDArray[np.float64]], scale: Scale, rng: np.random.Generator) -> tuple[Array, int]:
-    """Return features ``[n, 4, D]`` of random stretches of touches in fault-free recordings, and how many touches."""
+def stretches(
+    recordings: Sequence[NDArray[np.float64]], scale: Scale, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.intp]]:
+    """Return features ``[n, 4, D]`` of random stretches of touches in fault-free recordings, and of which touch."""
     ranges = []
     for i, recording in enumerate(recordings):
         for touch in _touches(recording, scale):
             ranges.append((i, touch.first, sum(part.n for part in touch.parts)))
-    n_touches = len(ranges)
-    draws = int(np.clip(round(_SAMPLES / n_touches), 1, _MOST_DRAWS))
+    draws = int(np.clip(round(_SAMPLES / len(ranges)), 1, _MOST_DRAWS))
     if len(ranges) > _SAMPLES:
         ranges = [ranges[i] for i in np.sort(rng.choice(len(ranges), _SAMPLES, replace=False))]
     features = []
@@ -228,7 +283,7 @@ def stretches(recordings: Sequence[NDArray[np.float64]], scale: Scale, rng: np.r
             length = int(rng.integers(min(_SHORTEST, n), n + 1)) if draw else n
             at = int(rng.integers(0, n - length + 1))
             features.append(Summary.of(root[at : at + length], first + at, scale.root_near).features())
-    return np.stack(features), n_touches
+    return np.stack(features), np.repeat(np.arange(len(ranges)), draws)
 
 
 def _touches(recording: NDArray[np.float64], scale: Scale) -> tuple[Touch, ...]:
@@ -256,24 +311,33 @@ def _tiles(layout: SensorLayout) -> list[tuple[NDArray[np.intp], NDArray[np.intp
     return tiles
 
 
-def _logistic(x: Array, y: Array, forbidden: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Fit one ridge logistic regression for each column of ``y`` ``[n, k]``; weights that are forbidden stay 0."""
-    n = len(x)
-    bias = logit((y.sum(axis=0) + 1) / (n + 2)).astype(np.float32)  # an imaginary sample of each kind keeps it finite
-    weight = np.zeros((x.shape[1], y.shape[1]), np.float32)
-    vector = np.ones(x.shape[1], np.float32)
-    for _ in range(20):  # the steepest direction, by power iteration
-        vector = x.T @ (x @ vector)
-        vector /= np.linalg.norm(vector) + 1e-12
-    steepest = float(np.linalg.norm(x @ vector) ** 2 / n)
-    step = np.float32(1 / (0.25 * (1.1 * steepest + 1) + _RIDGE))
-    ahead_w, ahead_b = weight, bias
-    for k in range(_STEPS):  # Nesterov's method: each step from a point ahead of the last
-        error = (expit(x @ ahead_w + ahead_b) - y) / np.float32(n)
-        next_w = ahead_w - step * (x.T @ error + np.float32(_RIDGE) * ahead_w)
-        next_w[forbidden] = 0
-        next_b = ahead_b - step * error.sum(axis=0)
-        momentum = np.float32(k / (k + 3))
-        ahead_w, ahead_b = next_w + momentum * (next_w - weight), next_b + momentum * (next_b - bias)
-        weight, bias = next_w, next_b
-    return weight, bias
+def _logistic(x: Array, y: Array, own: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Fit one ridge logistic regression for each column of ``y`` ``[n, k]``, in which some weights stay 0.
+
+    Each step minimises a parabola above the loss, of the same curvature for all (Boehning's bound), from a point ahead
+    of the last (Nesterov): a tenth of the steps that plain gradients take.
+
+    Args:
+        x: ``[n, d]``.
+        y: ``[n, k]``, 0 or 1.
+        own: int ``[k, f]``, the inputs whose weight stays 0, for each column.
+    """
+    n, d = x.shape
+    x = np.concatenate([x, np.ones((n, 1), np.float32)], axis=1)
+    penalty = np.full((d + 1, 1), _RIDGE, np.float32)
+    penalty[d] = _FREE
+    inverse = np.linalg.inv((x.T @ x).astype(np.float64) / (4 * n) + np.diag(penalty[:, 0])).astype(np.float32)
+    # What a step has to give up for the weights that stay 0 is shared out among the others.
+    block = np.linalg.inv(inverse[own[:, :, None], own[:, None, :]].astype(np.float64)).astype(np.float32)  # (k, f, f)
+    given_up = np.einsum("dkf,kfg->kdg", inverse[:, own], block)
+    weight = np.zeros((d + 1, y.shape[1]), np.float32)
+    weight[d] = logit((y.sum(axis=0) + 1) / (n + 2))  # an imaginary sample of each kind keeps it finite
+    ahead, column = weight, np.arange(len(own))[:, None]
+    for step in range(_STEPS):
+        change = inverse @ (x.T @ ((expit(x @ ahead) - y) / np.float32(n)) + penalty * ahead)
+        change -= np.matmul(given_up, change[own, column][:, :, None])[:, :, 0].T
+        change[own, column] = 0
+        following = ahead - change
+        ahead = following + np.float32(step / (step + 3)) * (following - weight)
+        weight = following
+    return weight[:d], weight[d]

@@ -19,9 +19,10 @@ from diagnostics.weighing import Weights, faulty_at, kinds
 
 Recording = NDArray[np.float64]
 
-SCHEMA = "adaptfault.diagnoser/1"
+SCHEMA = "adaptfault.diagnoser/2"
 
 _SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
+_SUSPICIOUS_COLD = 2.0  # log evidence from which on a cell is not asked about the others, in a cold start
 _OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is faulty: four touches
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved before is no longer called alive
 
@@ -31,7 +32,7 @@ class SelfDiagnosis:
 
     Args:
         layout: the array.
-        false_discovery_rate: expected share of healthy cells in F; at most this is accepted.
+        false_discovery_rate: expected share of healthy cells in F: it is cut where it comes nearest to this.
 
     Attributes:
         reference_: what healthy looks like, after :meth:`fit`.
@@ -106,7 +107,9 @@ class SelfDiagnosis:
 
     def memory(self) -> Memory:
         """Return an empty memory, to be fed with a log and judged."""
-        return Memory(self.layout, self.reference_ or Reference.unknown(self.layout))
+        if self.reference_ is None:
+            return Memory(self.layout, Reference.unknown(self.layout), _SUSPICIOUS_COLD)
+        return Memory(self.layout, self.reference_, self.weights_.suspicious)
 
     def judge(self, memory: Memory, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
         """Judge every cell from what is remembered of a log.
@@ -135,7 +138,9 @@ class SelfDiagnosis:
         drifting = present & ~wrong & ~intermittent & ~noisy & (spatial.offset >= _OFFSET)
         moving = intermittent | noisy | drifting
         probability = np.where(present, np.where(silent | moving, _SURE, still), 0.0)
-        faulty = faulty_at(np.where(silent | moving, 0.0, probability), self.false_discovery_rate)
+        # Where no reference has taught what evidence is worth, the rate is kept to half.
+        rate = self.false_discovery_rate * (1.0 if self.reference_ else 0.5)
+        faulty = faulty_at(np.where(silent | moving, 0.0, probability), rate)
         faulty = (faulty | silent | moving) & present & ~wrong
         # A cell that moved works, unless something speaks against what it does since.
         alive = present & ~wrong & ~faulty & runs.moved & (probability < _DOUBTED)

@@ -34,6 +34,7 @@ class Memory:
 
     Attributes:
         layout, reference: as given.
+        suspicious: log likelihood ratio from which on a cell is not asked about the others.
         stream: what is known of the transport.
         runs: the still stretch of each cell.
         touches: the last ones.
@@ -42,8 +43,8 @@ class Memory:
         twins: lines that read alike.
     """
 
-    def __init__(self, layout: SensorLayout, reference: Reference) -> None:
-        self.layout, self.reference = layout, reference
+    def __init__(self, layout: SensorLayout, reference: Reference, suspicious: float) -> None:
+        self.layout, self.reference, self.suspicious = layout, reference, suspicious
         self.present = layout.present.ravel()
         self.stream = Stream()
         self.runs = StillRuns.begin(layout.n_cells)
@@ -119,7 +120,7 @@ class Memory:
         sudden = self.reference.onsets.size(self.runs, self.layout.full_scale)
         return stuck_evidence(
             touches.kept, self.settled, self.runs, self.jump(), sudden, self.model(), self.reference.scale,
-            self.present & self.heard, wrong, self.reference.tolerance,
+            self.present & self.heard, wrong, self.reference.tolerance, self.suspicious,
         )  # fmt: skip
 
     def _close(self) -> None:

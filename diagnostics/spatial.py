@@ -28,7 +28,6 @@ from diagnostics.temporal import SHORTEST_RUN, StillRuns
 from diagnostics.touches import Array, Scale, Touch
 
 _RAIL_SHARE = 0.4  # of broken cells stick to the low rail, as many to the high one, the rest anywhere
-_SUSPICIOUS = 2.0  # log evidence from which on a cell is left out when others are judged
 _LEAST = 1e-4  # no touch is less likely than this: models err
 _SUDDEN = 1.0  # log ratio of a jump from which on a cell is no witness
 _TELLING = 0.5  # log evidence from which on a touch counts as one that tested the cell
@@ -80,6 +79,7 @@ def stuck_evidence(
     present: NDArray[np.bool_],
     wrong: NDArray[np.bool_],
     tolerance: float,
+    suspicious: float,
 ) -> Generator[None, None, Spatial]:
     """Weigh stuck against healthy for each cell that is still now. A generator that pauses on its way.
 
@@ -97,6 +97,7 @@ def stuck_evidence(
         present: bool ``[D]``: where there is a cell to judge.
         wrong: bool ``[D]``: cells that move but are known to be faulty.
         tolerance: how near to v counts as v.
+        suspicious: log evidence from which on a cell is left out when others are judged.
     """
     asked = present & ~wrong & (runs.length >= SHORTEST_RUN)
     askable = present & ~wrong
@@ -142,7 +143,7 @@ def stuck_evidence(
         brought = np.where(asked, settled + surprise.sum(axis=0), 0.0)
         evidence = np.where(asked, prior + brought, 0.0)
         told = (surprise > _TELLING).sum(axis=0)
-        trusted = askable & (evidence + jump < _SUSPICIOUS)
+        trusted = askable & (evidence + jump < suspicious)
         yield
     moving = present & runs.moved & fresh & ~np.isnan(expected.spread)
     return Spatial(evidence, brought, asked, told, _offset(features, begins, expected, moving))
@@ -163,7 +164,8 @@ def _believed(never: Floats, unloaded: NDArray[np.bool_], witness: NDArray[np.bo
     right = np.where(unloaded | np.isinf(odds), odds, -odds)[:, witness]  # where nothing is known, nothing is wrong
     likelihood = -np.stack([np.log1p(np.exp(-worth * right)).sum(axis=1) for worth in _WORTHS])
     share = softmax(_WITNESS_SHARE * likelihood, axis=0)  # (worths, n)
-    believed: Floats = np.sum([p[:, None] * expit(w * odds) for p, w in zip(share, _WORTHS, strict=True)], axis=0)
+    doubted = np.sum([p[:, None] * expit(w * odds) for p, w in zip(share, _WORTHS, strict=True)], axis=0)
+    believed: Floats = np.maximum(never, doubted)  # doubt is no evidence against cells expected to stay unloaded
     return believed
 
 

@@ -22,7 +22,7 @@ from diagnostics.layout import SensorLayout
 from diagnostics.memory import Memory, finished
 from diagnostics.reference import Reference
 
-_LOGS = 96  # drawn to fit the weights
+_LOGS, _FIRST_LOGS = 96, 32  # drawn to fit the weights
 _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
 _DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
 _FEWEST_RECORDINGS = 8  # below that the reference cannot be split
@@ -30,14 +30,17 @@ _PIECE = 100  # frames; longer recordings are cut, so that a single long one can
 _LEARNED_SHARE = 0.75  # of the recordings teach what healthy looks like, the others make the logs
 _MOST_JUMP = 1.0  # what a jump may be worth, whatever the logs say: alone it proves nothing
 _KINDS = 3
+_SUSPICIOUS = 2.8  # log likelihood ratio from which on a cell is left out when others are judged
+_SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw one
 _LOOSE = 10.0  # variance of the weights before any log is seen
 _CLIP = 6.0  # log ratios beyond this say "certain"; they must not steer the fit
 _SURE = 24.0  # and beyond this, not even more certain
 _EXPECTED, _EXPECTED_LATE = 0.02, 0.005  # share of faulty cells before a log is seen: from the start, and in it
-_EXPECTED_CELLS = 25.0  # worth so many cells
+_EXPECTED_CELLS, _EXPECTED_CELLS_LATE = 35.0, 25.0  # worth so many cells
 _MOVING_ODDS = -10.0  # log odds of a fault that holds one value, for a cell that moves
 
 Floats = NDArray[np.float64]
+_Trial = tuple[NDArray[np.intp], Floats, Floats, NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
@@ -62,16 +65,25 @@ class Weights:
         if len(recordings) < _FEWEST_RECORDINGS:
             return cls()
         rng = np.random.default_rng(seed)
-        trials = []
         order = rng.permutation(len(recordings))
         learned = round(_LEARNED_SHARE * len(order))
         reference = Reference.fit([recordings[i] for i in order[:learned]], layout)
+        logs = []
         for i in range(_LOGS):
             size = min(_LOG_SIZES[i % len(_LOG_SIZES)], len(order) - learned)
             log = np.concatenate([recordings[j] for j in rng.choice(order[learned:], size, replace=False)])
             share = _DEAD_SHARES[i // len(_LOG_SIZES) % len(_DEAD_SHARES)]
             onset = int(rng.uniform(0, 0.8) * len(log)) if i % 2 else None
-            trials.append(_trial(log, _random_faults(layout, share, onset, rng), layout, reference))
+            logs.append((log, _random_faults(layout, share, onset, rng)))
+        # Evidence depends on who is suspected, and that on what evidence is worth: first roughly, then well.
+        weights = cls()
+        for n in (_FIRST_LOGS, _LOGS):
+            weights = cls._of([_trial(*log, layout, reference, weights.suspicious) for log in logs[:n]])
+        return weights
+
+    @classmethod
+    def _of(cls, trials: Sequence[_Trial]) -> Weights:
+        """Fit on trials; too few faults in them give the defaults."""
         kind, ratio, jump, dead = (np.concatenate(column) for column in zip(*trials, strict=True))
         evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), jump])
         found = []
@@ -82,6 +94,11 @@ class Weights:
             found.append(_bounded_logistic(evidence[of], dead[of], float(logit(dead[alike].mean()))))
         offsets, slopes, jumps = zip(*found, strict=True)
         return cls(offsets, slopes, jumps) if min(slopes) > 0 else cls()
+
+    @property
+    def suspicious(self) -> float:
+        """The ratio from which on a cell is no longer asked about the others."""
+        return float(np.clip((_SUSPICIOUS - self.offset[0]) / self.slope[0], *_SUSPICIOUS_BOUNDS))
 
     def worth(self, ratio: Floats, jump: Floats, kind: NDArray[np.intp]) -> Floats:
         """Return the calibrated log likelihood ratio faulty : healthy, ``[D]``.
@@ -101,15 +118,24 @@ class Weights:
         Only the cells that were ``asked`` (bool ``[D]``) are still; the others move, and are as good as alive.
         """
         probability = np.full(len(worth), float(expit(_MOVING_ODDS)))
-        for which, expected in ((asked & (kind == 0), _EXPECTED), (asked & (kind > 0), _EXPECTED_LATE)):
-            share = expected
-            for _ in range(100):
-                posterior = expit(worth[which] + logit(share))
-                share, before = (posterior.sum() + expected * _EXPECTED_CELLS) / (which.sum() + _EXPECTED_CELLS), share
-                if abs(share - before) < 1e-6:
-                    break
-            probability[which] = expit(worth[which] + logit(share))
+        late, early = asked & (kind > 0), asked & (kind == 0)
+        probability[late] = _posterior(worth[late], _EXPECTED_LATE, _EXPECTED_CELLS_LATE)
+        # Of the cells that never moved as many broke in the log as of those that did, or they were broken before.
+        broke = probability[late].sum() / ((kind > 0).sum() + _EXPECTED_CELLS)
+        probability[early] = _posterior(worth[early], _EXPECTED + float(broke), _EXPECTED_CELLS)
         return probability
+
+
+def _posterior(worth: Floats, expected: float, cells: float) -> Floats:
+    """Return P(faulty) ``[n]``; the share of faulty cells is found in these, ``expected`` counts like so many more."""
+    share = expected
+    for _ in range(100):
+        posterior = expit(worth + logit(share))
+        share, before = (posterior.sum() + expected * cells) / (len(worth) + cells), share
+        if abs(share - before) < 1e-6:
+            break
+    probability: Floats = expit(worth + logit(share))
+    return probability
 
 
 def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) -> tuple[float, float, float]:
@@ -144,10 +170,10 @@ def kinds(memory: Memory) -> NDArray[np.intp]:
 
 
 def _trial(
-    log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference
-) -> tuple[NDArray[np.intp], Floats, Floats, NDArray[np.bool_]]:
+    log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference, suspicious: float
+) -> _Trial:
     """Return kind, ratio and jump of each still cell ``[n]`` when ``faults`` are in a log, and which are broken."""
-    memory = Memory(layout, reference)
+    memory = Memory(layout, reference, suspicious)
     memory.extend(inject(log, faults, layout))
     memory = memory.complete()
     spatial = finished(memory.spatial())
@@ -158,14 +184,18 @@ def _trial(
 
 
 def faulty_at(probability: Floats, false_discovery_rate: float) -> NDArray[np.bool_]:
-    """Return the largest set of cells whose expected share of false alarms stays within the rate, bool ``[D]``.
+    """Return the set of cells whose expected share of false alarms comes nearest to the rate, bool ``[D]``.
 
-    No cell that is rather alive than faulty is in it, however good the others look.
+    Nearest, and not below: few cells are found in one log, each is a big step, and to stop short of the rate every time
+    would be to keep to half of it. No cell that is rather alive than faulty is in it, however good the others look.
     """
     order = np.argsort(-probability, kind="stable")
-    expected_false = np.cumsum(1 - probability[order]) / np.arange(1, len(order) + 1)
+    false = np.cumsum(1 - probability[order])  # expected among the first 1, 2, ...
+    accepted = false_discovery_rate * np.arange(1, len(order) + 1)
+    beyond, short = false - accepted, accepted - np.concatenate([[0.0], false[:-1]])
+    within = np.logical_and.accumulate(beyond <= np.maximum(short, 0.0))
     chosen = np.zeros(len(probability), bool)
-    chosen[order[expected_false <= false_discovery_rate]] = True
+    chosen[order[within]] = True
     return chosen & (probability > 0.5)
 
 

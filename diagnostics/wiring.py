@@ -34,7 +34,7 @@ _TRIED = 0.3  # log ratio of a cell that was put to the test
 _DOUBTFUL_SHARE = 0.7  # of the evidence of doubtful cells counts: neighbours are wrong together
 _LEAST = -1.0  # log ratio that one doubtful cell can bring
 _STRONGEST = np.log(1000.0)  # log ratio that one of the cells should have, if none is faulty beyond doubt
-_LEADERLESS_COST = np.log(100.0)  # if none has it: at an edge all cells of a line may be wrongly suspected
+_LEADERLESS_COST = np.log(20_000.0)  # if none has it: at an edge all cells of a line may be wrongly suspected
 _PROVEN = np.log(9.0)  # log odds from which on a wire is named: single cells are the safer guess
 _ROUNDS = 5
 

@@ -287,7 +287,7 @@ def test_many_dead_cells_do_not_crash_it_and_hardly_mislead_it(fitted, log, shar
     faults = [Fault(k, (int(c),)) for c, k in zip(cells, rng.choice(["open", "short"], len(cells)), strict=True)]
     found = fitted.diagnose(broken(log, faults)).fault_set
     assert len(found & set(cells.tolist())) > 0.4 * share * 220
-    assert len(found - set(cells.tolist())) <= 0.02 * max(1, len(found))
+    assert len(found - set(cells.tolist())) <= 0.04 * max(1, len(found))
 
 
 def test_a_cell_beside_dead_ones_is_not_dragged_along(fitted, log):

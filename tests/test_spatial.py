@@ -53,7 +53,7 @@ def judged(
         touches.append(Touch(halves, root.min(axis=0), root.max(axis=0)))
     work: Generator[None, None, Spatial] = stuck_evidence(
         touches, np.zeros(CELLS) if settled is None else settled, runs, np.full(CELLS, jump), np.full(CELLS, jump),
-        model or Copycat(), SCALE, np.ones(CELLS, bool), wrong, 0.025,
+        model or Copycat(), SCALE, np.ones(CELLS, bool), wrong, 0.025, 2.0,
     )  # fmt: skip
     return finished(work)
 

@@ -101,7 +101,7 @@ def test_an_array_that_is_missing_misshapen_or_not_finite_is_refused_by_name(arr
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"schema": "adaptfault.diagnoser/2"}, "schema"),
+        ({"schema": "adaptfault.diagnoser/1"}, "schema"),
         ({"layout": {"rows": 3}}, "pads"),
         ({"layout": None}, "damaged"),
         ({"false_discovery_rate": None}, "damaged"),
@@ -118,7 +118,8 @@ def test_a_field_that_is_missing_or_wrong_is_refused(wrong, said):
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("tolerance", -1.0), ("surest", [2.0]), ("surest", []), ("patience", 0), ("blinks", None)]
+    ("field", "value"),
+    [("tolerance", -1.0), ("surest", 2.0), ("surest", None), ("tiles", 0), ("patience", 0), ("blinks", None)],
 )
 def test_a_reference_whose_numbers_cannot_be_is_refused(field, value):
     about, arrays = small_fit(SensorLayout(1, 3, 3)).state()

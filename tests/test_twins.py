@@ -29,7 +29,7 @@ def pressed(seed: int, presses: int = 25) -> np.ndarray:
 
 
 def remembered(log: np.ndarray) -> Memory:
-    memory = Memory(LAYOUT, Reference.unknown(LAYOUT))
+    memory = Memory(LAYOUT, Reference.unknown(LAYOUT), 2.0)
     memory.extend(log)
     return memory.complete()
 
@@ -91,7 +91,7 @@ def test_a_missing_reading_differs_from_nothing_and_a_position_without_a_cell_ne
     present[1, 2, 2] = False
     layout = SensorLayout(2, 6, 5, present=present)
     log[:, layout.cell(1, 2, 2)] = 5.0
-    memory = Memory(layout, Reference.unknown(layout))
+    memory = Memory(layout, Reference.unknown(layout), 2.0)
     memory.extend(log)
     assert len(memory.complete().twins.joined(usual=2)) == 1
 

@@ -1,5 +1,7 @@
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,7 +83,7 @@ def test_two_workers_report_what_one_does(fleet, sequential, tmp_path):
 def test_two_workers_of_a_dask_cluster_report_what_one_process_does(fleet, sequential, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
     ) as cluster:
         report = maintain_fleet(fleet, tmp_path, dask=cluster.scheduler_address, dry_run=True, progress=False)
     assert told(report) == told(sequential)
@@ -108,7 +110,7 @@ def test_a_fleet_is_maintained_through_the_command_line(made_bundle, later_grasp
     assert "no robot in it" in capsys.readouterr().err
 
 
-# A killed run. These fake the work: what is asked is who is worked on.
+# A killed run. These fake the workers: what is asked is who is worked on.
 
 
 def robots(n: int) -> Fleet:
@@ -120,11 +122,12 @@ def worked(monkeypatch) -> list[str]:
     """Names of the robots that were worked on, in order."""
     names: list[str] = []
 
-    def work(robot: Robot, **options: object) -> Outcome:
-        names.append(robot.name)
-        return outcome(robot)
+    def work(robots: list[Robot]) -> Iterator[Outcome]:
+        for robot in robots:
+            names.append(robot.name)
+            yield outcome(robot)
 
-    monkeypatch.setattr(running, "maintain_robot", work)
+    monkeypatch.setattr(running, "engine", lambda task, **where: nullcontext(work))
     return names
 
 
@@ -188,26 +191,13 @@ def test_two_processes_do_not_maintain_the_same_fleet(worked, tmp_path):
         maintain_fleet(robots(1), tmp_path, jobs=1)
 
 
-def die_or_work(robot: Robot, **options: object) -> Outcome:
-    """Stand for a crash in a native library."""
-    import os
-
-    if robot.name == "r2":
-        os._exit(1)
-    return outcome(robot)
-
-
-def test_a_robot_that_kills_its_worker_stops_no_other(monkeypatch, tmp_path):
-    monkeypatch.setattr(running, "maintain_robot", die_or_work)
-    report = maintain_fleet(robots(6), tmp_path, jobs=2, progress=False)
-    assert [o.decision for o in report.outcomes] == ["unchanged", "unchanged", "error", *["unchanged"] * 3]
-    assert "died" in report.errors[0].reason
-
-
 def test_workers_that_make_no_sense_are_refused(tmp_path):
     for options in ({"jobs": 0}, {"jobs": 2, "dask": "tcp://127.0.0.1:1"}):
         with pytest.raises(ValueError, match="expected at least 1"):
             maintain_fleet(robots(1), tmp_path, **options)
+    for limit in (0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="expected seconds, more than 0"):
+            maintain_fleet(robots(1), tmp_path, limit=limit)
 
 
 # The report.

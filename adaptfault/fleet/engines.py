@@ -1,31 +1,32 @@
-"""Where the work is done: joblib's processes on this machine, or the workers of a Dask cluster."""
+"""Who goes through the robots: joblib's threads on this machine, or a Dask cluster; each robot in a guarded process."""
 
 from __future__ import annotations
 
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from functools import partial
+from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
+from adaptfault.fleet.guard import Guard, Task, do_on_worker, quiet
 from adaptfault.fleet.listing import Robot
 from adaptfault.fleet.outcome import Outcome
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Future
 
-Work = Callable[[Robot], Outcome]
-Attempt = Callable[[Sequence[Robot]], Iterator[Outcome]]
-"""Works on robots and yields outcomes as they come; of those at workers that died it yields none."""
+Engine = Callable[[Sequence[Robot]], Iterator[Outcome]]
+"""Works on robots and yields their outcomes as they come."""
 
-_SUSPECTS = 8  # tried alone before the rest is given to all workers again
-_WAIT = 30  # s for a cluster's first worker
-_DIED = "the process that maintained it died; memory may be short, or a native library crashed"
+_WAIT = 60  # s for a cluster's first worker, and that it may be without any later on
+_LOOK = 0.1  # s between two looks for finished robots
+_DIED = "every Dask worker that had it died; one may be short of memory"
 
 
 @contextmanager
-def engine(work: Work, *, jobs: int | None, dask: str | None) -> Iterator[Attempt]:
+def engine(task: Task, *, jobs: int | None, dask: str | None) -> Iterator[Engine]:
     """Give what works on robots; see :func:`adaptfault.maintain_fleet` for the arguments.
 
     Raises:
@@ -35,10 +36,14 @@ def engine(work: Work, *, jobs: int | None, dask: str | None) -> Iterator[Attemp
     if dask is None:
         from joblib import cpu_count
 
+        guards = [Guard() for _ in range(jobs or cpu_count())]
         with warnings.catch_warnings():
-            # A worker that has grown by 300 MB is replaced between two robots: loky's guard, and no loss.
-            warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given")
-            yield partial(_on_joblib, work, jobs or cpu_count())
+            quiet()
+            try:
+                yield partial(_on_joblib, task, guards)
+            finally:
+                for guard in guards:
+                    guard.close()
         return
     try:
         from distributed import Client
@@ -49,42 +54,72 @@ def engine(work: Work, *, jobs: int | None, dask: str | None) -> Iterator[Attemp
             client.wait_for_workers(1, timeout=_WAIT)
         except Exception as error:  # its own TimeoutError, which differs between versions
             raise OSError(f"the Dask scheduler at {dask} has no worker after {_WAIT} s ({error})") from None
-        yield partial(_on_dask, client, work)
+        yield partial(_on_dask, client, task)
 
 
-def outcomes(robots: Sequence[Robot], attempt: Attempt) -> Iterator[Outcome]:
-    """Yield every robot's outcome as it comes. Where workers died, who was there is tried again, one at a time."""
-    waiting = {robot.name: robot for robot in robots}
-    while waiting:
-        for outcome in attempt(list(waiting.values())):
-            del waiting[outcome.robot.name]
-            yield outcome
-        for robot in list(waiting.values())[:_SUSPECTS]:
-            alone = list(attempt([robot]))
-            del waiting[robot.name]
-            yield alone[0] if alone else Outcome.error(robot, _DIED)
+def _on_joblib(task: Task, guards: Sequence[Guard], robots: Sequence[Robot]) -> Iterator[Outcome]:
+    from joblib import Parallel, delayed
+
+    free: SimpleQueue[Guard] = SimpleQueue()
+    for guard in guards:
+        free.put(guard)
+
+    def done(robot: Robot) -> Outcome:
+        guard = free.get()
+        try:
+            return guard.do(task, robot)
+        finally:
+            free.put(guard)
+
+    # Threads, which only wait: joblib's own processes are one pool, which a single crash brings down.
+    parallel = Parallel(len(guards), backend="threading", return_as="generator_unordered", batch_size=1)
+    yield from parallel(delayed(done)(robot) for robot in robots)
 
 
-def _on_joblib(work: Work, jobs: int, robots: Sequence[Robot]) -> Iterator[Outcome]:
-    from joblib import Parallel, delayed, parallel_config
-
-    try:
-        with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1):
-            # One robot a task: each takes seconds, and its outcome should be on disk when it is there.
-            parallel = Parallel(return_as="generator_unordered", batch_size=1)
-            yield from parallel(delayed(work)(robot) for robot in robots)
-    except BrokenExecutor:
-        return
-
-
-def _on_dask(client: Client, work: Work, robots: Sequence[Robot]) -> Iterator[Outcome]:
+def _on_dask(client: Client, task: Task, robots: Sequence[Robot]) -> Iterator[Outcome]:
     # Not through joblib: its Dask backend (1.6) waits for ever for a task whose worker died.
-    from distributed import KilledWorker, as_completed
+    suspects = []
+    for robot, outcome in _finished(client, task, robots):
+        if outcome is None:
+            suspects.append(robot)
+        else:
+            yield outcome
+    for suspect in suspects:  # alone: some only waited beside one that takes workers down
+        for robot, outcome in _finished(client, task, [suspect]):
+            yield outcome or Outcome.error(robot, _DIED)
 
-    robot_of = dict(zip(client.map(work, robots, pure=False), robots, strict=True))
-    for future in as_completed(list(robot_of), loop=client.loop):
-        robot = robot_of.pop(future)
-        if future.status == "finished":
-            yield future.result()
-        elif not isinstance(error := future.exception(), KilledWorker):
-            yield Outcome.error(robot, f"{type(error).__name__}: {error}")
+
+def _finished(client: Client, task: Task, robots: Sequence[Robot]) -> Iterator[tuple[Robot, Outcome | None]]:
+    """Yield robots as they are done, with None where their workers died.
+
+    Raises:
+        OSError: the scheduler or the last worker is gone.
+    """
+    from distributed import as_completed
+
+    robot_of = dict(zip(client.map(partial(do_on_worker, task), robots, pure=False), robots, strict=True))
+    coming, seen = as_completed(list(robot_of), loop=client.loop), time.monotonic()
+    while robot_of:
+        for future in coming.next_batch(block=False):
+            if future.cancelled():
+                raise OSError(
+                    "the Dask scheduler went away or was restarted; start the run again to go on where it was"
+                )
+            yield (robot := robot_of.pop(future)), _outcome(future, robot)
+        if not coming.has_ready():
+            time.sleep(_LOOK)
+        if (idle := time.monotonic() - seen) > _WAIT / 10:
+            if client.nthreads():
+                seen = time.monotonic()
+            elif idle > _WAIT:
+                raise OSError(f"no Dask worker for {_WAIT} s; start workers and the run again to go on where it was")
+
+
+def _outcome(future: Future, robot: Robot) -> Outcome | None:
+    from distributed import KilledWorker
+
+    if future.status != "error":
+        outcome: Outcome = future.result()
+        return outcome
+    error = future.exception()
+    return None if isinstance(error, KilledWorker) else Outcome.error(robot, f"{type(error).__name__}: {error}")

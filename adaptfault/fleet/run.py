@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from adaptfault.fleet.engines import engine, outcomes
+from adaptfault.fleet.engines import engine
+from adaptfault.fleet.guard import Task
 from adaptfault.fleet.listing import Fleet, Robot
 from adaptfault.fleet.outcome import Outcome
-from adaptfault.fleet.work import maintain_robot
+from adaptfault.fleet.work import maintain_robot, ready
 from adaptfault.lines import Lines
 from adaptfault.robot.bundle import now
 from adaptfault.robot.lock import locked
@@ -36,6 +37,7 @@ def maintain_fleet(
     dask: str | None = None,
     dry_run: bool = False,
     budget: float | None = None,
+    limit: float | None = None,
     progress: bool | None = None,
 ) -> FleetReport:
     """Run ``maintain`` over all robots; one that fails is an error in the report, and the others go on.
@@ -46,14 +48,16 @@ def maintain_fleet(
     Args:
         fleet: the robots. Their paths must mean the same on every worker (a shared folder, with Dask).
         folder: of the run; made if need be.
-        jobs: worker processes on this machine, one thread each; None: as many as cores. 1 works in this process.
+        jobs: worker processes on this machine, one thread each; None: as many as cores.
         dask: address of a Dask scheduler whose workers do it instead, as "tcp://host:8786".
         dry_run: report only, change nothing.
         budget: seconds that one adaptation may take.
+        limit: seconds that one robot may take; its process is killed then, and the robot is an error. None: no limit.
         progress: show or hide it on stderr; None shows it on a terminal.
 
     Raises:
-        ValueError: ``jobs`` is below 1 or given with ``dask``, Dask is not installed, or the ledger is not one.
+        ValueError: ``jobs`` is below 1 or given with ``dask``, ``limit`` is not above 0, Dask is not installed, or the
+            ledger is not one.
         Busy: another process maintains the fleet in this folder.
         OSError: the scheduler does not answer.
     """
@@ -61,6 +65,8 @@ def maintain_fleet(
 
     if jobs is not None and (jobs < 1 or dask is not None):
         raise ValueError(f"jobs {jobs}: expected at least 1, and none with a Dask cluster, which has its own workers")
+    if limit is not None and not limit > 0:
+        raise ValueError(f"limit {limit}: expected seconds, more than 0")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder / "run.lock", wait=False):
@@ -74,9 +80,9 @@ def maintain_fleet(
         hide = None if progress is None else not progress
         with (
             tqdm(total=len(fleet), initial=len(done), unit="robot", disable=hide) as bar,
-            engine(partial(maintain_robot, **options), jobs=jobs, dask=dask) as attempt,
+            engine(Task(partial(maintain_robot, **options), ready, limit), jobs=jobs, dask=dask) as work,
         ):
-            for outcome in outcomes(left, attempt):
+            for outcome in work(left):
                 lines.add({"time": now(), "outcome": outcome.to_dict()})
                 done[outcome.robot.name] = outcome
                 bar.update()

@@ -1,29 +1,71 @@
-"""What maintaining a fleet costs, and what two workers gain: fleet_scaling.py [--robots N]
+"""What two workers gain on a fleet, and what a night of 100,000 robots costs: fleet_scaling.py [--robots N]
 
-Makes N simulated robots (copies of one small bundle; a share of them has a short row since yesterday), maintains copies
-of them with one worker process and with two, in one run, and prints the speed-up. Then, on paper, from the costs of
-one robot measured here: cores, memory and network for 100,000 such robots a night.
+Copies one small trained bundle for N simulated robots, which have recorded twelve grasps each, and maintains them with
+one worker and with two: on loky, and on Dask clusters on loopback. One and two take turns, batch by batch on fresh
+copies, so that a machine that is busy with something else slows both alike. A few robots have a new short row and are
+adapted. From what one robot took (CPU, memory, bytes) follows, on paper, what 100,000 a night need.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
-import resource
+import logging
 import shutil
+import statistics
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
-import numpy as np
-from joblib import Parallel, delayed, parallel_config
-
 import adaptfault as af
+from adaptfault.fleet.engines import Engine, engine
+from adaptfault.fleet.guard import Task
+from adaptfault.fleet.listing import Robot
+from adaptfault.fleet.work import ready
 from diagnostics import Line, SelfDiagnosis, SensorLayout, inject, line_fault
 
 LAYOUT = SensorLayout(2, 6, 5)
 CLASSES = ("nothing", "softer", "harder")
-ROBOTS, NIGHT, SHARE = 100_000, 8, 0.01  # robots, hours, and the share of robots with a new fault
+ROBOTS, NIGHT = 100_000, 8  # robots, and hours to do them in
+
+
+@dataclass
+class Costs:
+    """Of robots, in lists of equal length: CPU seconds, peak MB of the process, bytes read, written and sent back."""
+
+    cpu: list[float] = field(default_factory=list)
+    memory: list[float] = field(default_factory=list)
+    read: list[float] = field(default_factory=list)
+    written: list[float] = field(default_factory=list)
+    sent: list[float] = field(default_factory=list)
+
+
+def measured(robot: Robot) -> tuple[str, dict[str, float]]:
+    """Maintain a robot in the worker's process; returns the decision and what it cost."""
+    import json
+    import time
+
+    from adaptfault.fleet.work import maintain_robot
+
+    def bytes_so_far() -> dict[str, int]:
+        with open("/proc/self/io") as file:
+            return {key: int(value) for key, value in (line.split(": ") for line in file)}
+
+    before, began = bytes_so_far(), time.process_time()
+    outcome = maintain_robot(robot)
+    cpu, after = time.process_time() - began, bytes_so_far()
+    with open("/proc/self/status") as file:
+        peak = next(int(line.split()[1]) for line in file if line.startswith("VmHWM"))  # kB
+    return outcome.decision, {
+        "cpu": cpu,
+        "memory": peak / 1024,
+        "read": after["rchar"] - before["rchar"],
+        "written": after["wchar"] - before["wchar"],
+        "sent": len(json.dumps(outcome.to_dict())),
+    }
 
 
 def make_bundle(folder: Path) -> Path:
@@ -36,105 +78,144 @@ def make_bundle(folder: Path) -> Path:
     return af.Bundle.create(folder / "robot.bundle", model, adapter, diagnoser, check=test, class_names=CLASSES).path
 
 
-def make_fleet(folder: Path, bundle: Path, robots: int, broken: float) -> af.Fleet:
-    """Copy the bundle for each robot; every one has recorded twelve grasps, the broken ones with a short row."""
-    grasps = af.simulate(6, LAYOUT, n_frames=60, seed=99, classes=CLASSES[1:])
-    rng = np.random.default_rng(0)
-    for number in range(robots):
-        home = folder / f"r{number:05d}"
-        shutil.copytree(bundle, home / "robot.bundle")
-        frames = list(grasps.frames)
-        if int((number + 1) * broken) > int(number * broken):
-            row = Line(int(rng.integers(2)), "row", int(rng.integers(LAYOUT.rows)))
-            frames = [inject(r, [line_fault(LAYOUT, row, "short")], LAYOUT).astype("f4") for r in frames]
-        (home / "recordings").mkdir()
-        af.save_npz(home / "recordings" / "log.npz", af.Recordings(tuple(frames), LAYOUT))
-    (folder / "fleet.toml").write_text('bundles = "*/robot.bundle"\nrecordings = "{bundle_dir}/recordings"\n')
-    return af.Fleet.read(folder / "fleet.toml")
+@dataclass(frozen=True)
+class Farm:
+    """Gives robots: copies of a bundle that have recorded grasps, healthy ones or with a short row."""
+
+    folder: Path
+    bundle: Path
+
+    @contextmanager
+    def robots(self, number: int, *, broken: bool = False) -> Iterator[list[Robot]]:
+        """Make them; they are removed afterwards."""
+        frames = list(af.simulate(6, LAYOUT, n_frames=60, seed=99, classes=CLASSES[1:]).frames)
+        if broken:
+            row = line_fault(LAYOUT, Line(1, "row", 2), "short")
+            frames = [inject(r, [row], LAYOUT).astype("f4") for r in frames]
+        with tempfile.TemporaryDirectory(dir=self.folder) as made:
+            homes = [Path(made) / f"r{i:05d}" for i in range(number)]
+            for home in homes:
+                shutil.copytree(self.bundle, home / "robot.bundle")
+                af.save_npz(home / "log.npz", af.Recordings(tuple(frames), LAYOUT))
+            yield [Robot(home.name, str(home / "robot.bundle"), (str(home / "log.npz"),)) for home in homes]
 
 
-def ready() -> float:
-    """Load what a worker loads before its first robot; returns its peak memory in MB."""
-    import adaptfault.robot.incoming
-    import adaptfault.robot.maintenance
-    import adaptfault.training  # noqa: F401
-
-    time.sleep(0.2)  # so that no worker takes the task of another
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-def on_each(workers: int) -> float:
-    """Return the peak memory of the most greedy worker, in MB; starts the workers that maintain_fleet goes on with."""
-    with parallel_config(backend="loky", n_jobs=workers, inner_max_num_threads=1):
-        return max(Parallel(batch_size=1)(delayed(ready)() for _ in range(3 * workers)))
+def timed(workers: Engine, farm: Farm, number: int, costs: Costs, *, broken: bool = False) -> float:
+    """Return the seconds for a batch of fresh robots; adds what each took to the costs."""
+    with farm.robots(number, broken=broken) as robots:
+        began = time.perf_counter()
+        ended = list(workers(robots))
+        seconds = time.perf_counter() - began
+    for decision, robot in ended:
+        assert decision == ("deployed" if broken else "unchanged"), decision
+        for name, value in robot.items():
+            getattr(costs, name).append(value)
+    return seconds
 
 
-def size(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+def alternating(name: str, one: Engine, two: Engine, farm: Farm, batches: Sequence[int], all_costs: Costs) -> float:
+    """Let one worker and two take turns, every other time two first; prints and returns the median speed-up."""
+    turns: list[tuple[Engine, list[float], Costs]] = [(one, [], Costs()), (two, [], Costs())]
+    for number, batch in enumerate(batches):
+        for workers, seconds, costs in turns if number % 2 else turns[::-1]:
+            seconds.append(timed(workers, farm, batch, costs))
+    speedup = statistics.median(a / b for a, b in zip(turns[0][1], turns[1][1], strict=True))
+    for workers, (_, seconds, costs) in enumerate(turns, 1):
+        gain = f"{speedup:9.2f}{speedup / 2:11.0%}" if workers == 2 else f"{1:9}{1:11.0%}"
+        rate, cpu = sum(batches) / sum(seconds), statistics.mean(costs.cpu)
+        print(f"{name:8}{workers:7}{sum(batches):8}{rate:10.2f}{gain}{cpu:13.3f}", flush=True)
+        for key, values in vars(costs).items():
+            getattr(all_costs, key).extend(values)
+    return speedup
 
 
-def median(seconds: list[float]) -> float:
-    return float(np.median(seconds)) if seconds else float("nan")
+@contextmanager
+def loky() -> Iterator[tuple[Engine, Engine]]:
+    task = Task(measured, ready)
+    with engine(task, jobs=1, dask=None) as one, engine(task, jobs=2, dask=None) as two:
+        yield one, two
 
 
-def on_paper(
-    idle: float, adapting: float, efficiency: float, memory: float, read: float, back: float, price: float
-) -> str:
-    """Calculate a night: seconds of a robot without and with an adaptation, MB of a worker, bytes in and out of one."""
-    hours = ROBOTS * ((1 - SHARE) * idle + SHARE * adapting) / efficiency / 3600
-    cores = math.ceil(hours / NIGHT)
-    network = 8 * ROBOTS * read / (3600 * NIGHT) / 1e6
-    return (
-        f"{ROBOTS:,} robots in a night of {NIGHT} h, {100 * SHARE:g} % of them with a new fault:"
-        f" {hours:.0f} core hours,"
-        f" {cores} cores, {cores * memory / 1024:.1f} GB of memory;\n"
-        f"read {ROBOTS * read / 1e9:.0f} GB ({network:.0f} Mbit/s"
-        f" throughout), sent back {ROBOTS * back / 1e6:.0f} MB; {price * hours:.2f} at {price:g} a core hour"
+@contextmanager
+def dask() -> Iterator[tuple[Engine, Engine]]:
+    from distributed import LocalCluster
+
+    start = partial(
+        LocalCluster,
+        threads_per_worker=1,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
     )
+    task = Task(measured, ready)
+    with (
+        start(n_workers=1) as small,
+        start(n_workers=2) as large,
+        engine(task, jobs=None, dask=small.scheduler_address) as one,
+        engine(task, jobs=None, dask=large.scheduler_address) as two,
+    ):
+        yield one, two
+
+
+def on_paper(idle: Costs, adapting: Costs, efficiency: float, share: float, price: float) -> list[tuple[str, str]]:
+    """Return the rows of a night: what is needed, and from what."""
+
+    def each(name: str) -> float:
+        """The mean of a robot, as they come."""
+        a, b = statistics.mean(getattr(idle, name)), statistics.mean(getattr(adapting, name))
+        return (1 - share) * a + share * b
+
+    memory = max(*idle.memory, *adapting.memory)
+    hours = ROBOTS * each("cpu") / efficiency / 3600
+    cores = max(1, -int(-hours // NIGHT))
+    seconds = 3600 * NIGHT
+    return [
+        ("core hours", f"{hours:.1f}   {each('cpu'):.3f} CPU s a robot, at an efficiency of {efficiency:.2f}"),
+        ("cores", f"{cores}   for {NIGHT} hours"),
+        ("memory", f"{cores * memory / 1024:.1f} GB   {memory:.0f} MB a worker at its peak"),
+        ("read", f"{ROBOTS * each('read') / 1e9:.0f} GB   {8 * ROBOTS * each('read') / seconds / 1e6:.1f} Mbit/s"),
+        ("written", f"{ROBOTS * each('written') / 1e9:.1f} GB"),
+        ("sent back", f"{ROBOTS * each('sent') / 1e6:.0f} MB   {8 * ROBOTS * each('sent') / seconds / 1e3:.0f} kbit/s"),
+        ("money", f"{price * hours:.2f}   at {price:g} a core hour"),
+    ]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--robots", type=int, default=4)
-    parser.add_argument(
-        "--broken", type=float, default=0.25, help="share of the robots with a new fault (default 0.25)"
-    )
+    parser.add_argument("--robots", type=int, default=200, help="for each engine and number of workers (default 200)")
+    parser.add_argument("--batch", type=int, default=10, help="robots of a turn (default 10)")
+    parser.add_argument("--adapted", type=int, default=2, help="robots with a new fault (default 2)")
+    parser.add_argument("--share", type=float, default=0.01, help="of robots with a new fault a night (default 0.01)")
     parser.add_argument("--price", type=float, default=0.04, help="of a core hour, an assumption (default 0.04)")
     args = parser.parse_args()
-    took, starts, reports = {}, {}, {}
+    batch = max(1, min(args.batch, args.robots))
+    batches = [batch] * (args.robots // batch)
+    idle, adapting, warm = Costs(), Costs(), Costs()
+    print("engine  workers  robots  robots/s  speed-up  efficiency  CPU s/robot", flush=True)
     with tempfile.TemporaryDirectory() as home:
-        bundle = make_bundle(Path(home))
-        for workers in (1, 2):
-            folder = Path(home) / f"with{workers}"
-            fleet = make_fleet(folder, bundle, args.robots, args.broken)
-            began = time.perf_counter()
-            if workers > 1:
-                on_each(workers)
-            starts[workers] = time.perf_counter() - began
-            began = time.perf_counter()
-            reports[workers] = af.maintain_fleet(fleet, folder / "run", jobs=workers, progress=False)
-            took[workers] = time.perf_counter() - began
-        memory = on_each(2)
-        robot = folder / "r00000"
-        read, back = size(robot), size(folder / "run") / args.robots
-    speedup = took[1] / took[2]
-    assert reports[1].counts == reports[2].counts, (reports[1].counts, reports[2].counts)
-    of = {
-        deployed: [o.seconds for o in reports[1].outcomes if (o.decision == "deployed") == deployed]
-        for deployed in (0, 1)
-    }
-    idle, adapting = median(of[False]), median(of[True])
-    print(reports[2])
-    print(
-        f"\n{args.robots} robots: {took[1]:.1f} s with one worker, {took[2]:.1f} s with two:"
-        f" {speedup:.2f} times as fast"
-    )
-    print(f"({took[1] / (took[2] + starts[2]):.2f} with the {starts[2]:.1f} s that the two processes took to start)")
-    print(
-        f"one robot: {idle:.2f} s where nothing is new, {adapting:.2f} s with an adaptation and its export; reads"
-        f" {read / 1e6:.2f} MB, sends {back:.0f} bytes; a worker holds {memory:.0f} MB"
-    )
-    print(on_paper(idle, adapting, speedup / 2, memory, read, back, args.price))
+        farm = Farm(Path(home), make_bundle(Path(home)))
+        with loky() as (one, two):
+            for workers in (one, two):
+                timed(workers, farm, 4, warm)
+            speedup = alternating("loky", one, two, farm, batches, idle)
+            timed(two, farm, args.adapted, adapting, broken=True)
+        with dask() as (one, two):
+            for workers in (one, two):
+                timed(workers, farm, 4, warm)
+            alternating("Dask", one, two, farm, batches, idle)
+    print("\na robot                nothing new   adapted")
+    for label, key, scale in (
+        ("CPU s", "cpu", 1),
+        ("peak MB", "memory", 1),
+        ("MB read", "read", 1e-6),
+        ("MB written", "written", 1e-6),
+        ("bytes sent back", "sent", 1),
+    ):
+        a, b = (statistics.mean(getattr(costs, key)) * scale for costs in (idle, adapting))
+        print(f"  {label:18}{a:14.3f}{b:10.3f}")
+    print(f"\n{ROBOTS:,} such robots a night, {args.share:.1%} of them with a new fault")
+    for label, value in on_paper(idle, adapting, min(1.0, speedup / 2), args.share, args.price):
+        print(f"  {label:12}{value}")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 import json
 import shutil
+import threading
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
@@ -9,11 +10,13 @@ import numpy as np
 import pytest
 
 import adaptfault.fleet.run as running
+import adaptfault.fleet.work as working
 from adaptfault.cli import main
 from adaptfault.fleet.listing import Fleet, Robot
 from adaptfault.fleet.outcome import Cause, Outcome
 from adaptfault.fleet.report import FleetReport
 from adaptfault.fleet.run import maintain_fleet
+from adaptfault.fleet.work import maintain_robot
 from adaptfault.lines import Lines
 from adaptfault.recordings import Recordings, save_npz
 from adaptfault.robot.bundle import Bundle
@@ -80,6 +83,18 @@ def test_two_workers_report_what_one_does(fleet, sequential, tmp_path):
     assert told(parallel) == told(sequential)
 
 
+def test_a_robot_that_is_being_maintained_is_waited_for(fleet, monkeypatch):
+    held = Bundle.open(fleet.robots[0].bundle).maintenance()
+    held.__enter__()
+    threading.Timer(0.3, held.__exit__, (None, None, None)).start()
+    assert maintain_robot(fleet.robots[0], dry_run=True).decision == "unchanged"
+    with Bundle.open(fleet.robots[0].bundle).maintenance():
+        monkeypatch.setattr(working, "_PATIENCE", 0)
+        outcome = maintain_robot(fleet.robots[0], dry_run=True)
+    assert outcome.decision == "error"
+    assert "being maintained by another process" in outcome.reason
+
+
 def test_two_workers_of_a_dask_cluster_report_what_one_process_does(fleet, sequential, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
@@ -94,7 +109,7 @@ def test_a_fleet_is_maintained_through_the_command_line(made_bundle, later_grasp
     save_npz(tmp_path / "log.npz", Recordings(tuple(r.astype(np.float32) for r in later_grasps), LAYOUT))
     listed = '[[robots]]\nname = "r"\nbundle = "r.bundle"\nrecordings = "*.npz"\ncommissioned = 2020-01-01\n'
     (tmp_path / "f.toml").write_text(listed)
-    arguments = ["fleet", "maintain", str(tmp_path / "f.toml"), "--jobs", "1", "--quiet"]
+    arguments = ["fleet", "maintain", str(tmp_path / "f.toml"), "--jobs", "1", "--limit", "600", "--quiet"]
     assert main(arguments) == 0
     assert capsys.readouterr().out.startswith("ADAPTFAULT FLEET OK - 1 robots: 1 ok | ok=1;;;0;1 degraded=0")
     assert len(Bundle.open(tmp_path / "r.bundle").journal.runs()) == 1

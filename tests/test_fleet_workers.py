@@ -121,17 +121,15 @@ def test_a_cluster_that_is_restarted_ends_the_run_without_an_outcome(cluster):
             next(outcomes)
 
 
-# A run that is killed, by the command that people use, with work that leaves a mark and takes its time.
+# A run that is killed, with work that leaves a mark and takes its time.
 
 _RUN = """
-import os, sys, time
-from pathlib import Path
 import adaptfault.fleet.run as running
 from adaptfault.fleet.listing import Fleet
 from adaptfault.fleet.outcome import Outcome
 
 def work(robot, **options):
-    import fcntl, os, time
+    import fcntl, time
     from pathlib import Path
     with open(robot.bundle, "a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as a bundle's: an orphan that goes on would hold it
@@ -140,7 +138,6 @@ def work(robot, **options):
             marks.write(robot.name + "\\n")
     return Outcome(robot, "unchanged", 0, "no faulty cell", 1, 60, 0, "2 x 6 x 5")
 
-work.__module__ = "__main__"
 running.maintain_robot, running.ready = work, int
 print(running.maintain_fleet(Fleet.read("fleet.toml"), "run", jobs=2, progress=False))
 """

@@ -2,8 +2,9 @@
 
 Copies one small trained bundle for N simulated robots, which have recorded twelve grasps each, and maintains them with
 one worker and with two: on loky, and on Dask clusters on loopback. One and two take turns, batch by batch on fresh
-copies, so that a machine that is busy with something else slows both alike. A few robots have a new short row and are
-adapted. From what one robot took (CPU, memory, bytes) follows, on paper, what 100,000 a night need.
+copies, so that a machine that is busy with something else slows both alike; "on cores of their own" is the same less
+the time that workers stood in line for a core (/proc/self/schedstat). A few robots have a new short row and are
+adapted. From what one robot took (CPU, memory, bytes) follows, on paper, what 100,000 a night need. Linux only.
 """
 
 from __future__ import annotations
@@ -24,7 +25,6 @@ import adaptfault as af
 from adaptfault.fleet.engines import Engine, engine
 from adaptfault.fleet.guard import Task
 from adaptfault.fleet.listing import Robot
-from adaptfault.fleet.work import ready
 from diagnostics import Line, SelfDiagnosis, SensorLayout, inject, line_fault
 
 LAYOUT = SensorLayout(2, 6, 5)
@@ -34,9 +34,13 @@ ROBOTS, NIGHT = 100_000, 8  # robots, and hours to do them in
 
 @dataclass
 class Costs:
-    """Of robots, in lists of equal length: CPU seconds, peak MB of the process, bytes read, written and sent back."""
+    """Of robots, in lists of equal length.
+
+    CPU seconds, seconds in line for a core, peak MB of the process, bytes read, written and sent back.
+    """
 
     cpu: list[float] = field(default_factory=list)
+    waited: list[float] = field(default_factory=list)
     memory: list[float] = field(default_factory=list)
     read: list[float] = field(default_factory=list)
     written: list[float] = field(default_factory=list)
@@ -50,22 +54,35 @@ def measured(robot: Robot) -> tuple[str, dict[str, float]]:
 
     from adaptfault.fleet.work import maintain_robot
 
-    def bytes_so_far() -> dict[str, int]:
-        with open("/proc/self/io") as file:
-            return {key: int(value) for key, value in (line.split(": ") for line in file)}
+    def so_far() -> dict[str, int]:
+        with open("/proc/self/io") as io, open("/proc/self/schedstat") as stat:
+            lines = (line.split(": ") for line in io)
+            return {"waited": int(stat.read().split()[1]), **{key: int(value) for key, value in lines}}
 
-    before, began = bytes_so_far(), time.process_time()
+    before, began = so_far(), time.process_time()
     outcome = maintain_robot(robot)
-    cpu, after = time.process_time() - began, bytes_so_far()
+    cpu, after = time.process_time() - began, so_far()
     with open("/proc/self/status") as file:
         peak = next(int(line.split()[1]) for line in file if line.startswith("VmHWM"))  # kB
     return outcome.decision, {
         "cpu": cpu,
+        "waited": (after["waited"] - before["waited"]) * 1e-9,
         "memory": peak / 1024,
         "read": after["rchar"] - before["rchar"],
         "written": after["wchar"] - before["wchar"],
         "sent": len(json.dumps(outcome.to_dict())),
     }
+
+
+def prepare() -> None:
+    """Load what maintenance needs, in a session of its own: some kernels share cores among sessions, not processes."""
+    import os
+
+    from adaptfault.fleet.work import ready
+
+    if os.getsid(0) != os.getpid():
+        os.setsid()
+    ready()
 
 
 def make_bundle(folder: Path) -> Path:
@@ -113,25 +130,48 @@ def timed(workers: Engine, farm: Farm, number: int, costs: Costs, *, broken: boo
     return seconds
 
 
+@dataclass(frozen=True)
+class Turns:
+    """Batches of one number of workers: seconds, the same on cores of their own, and costs."""
+
+    workers: Engine
+    seconds: list[float]
+    alone: list[float]
+    costs: Costs
+
+    def take(self, farm: Farm, batch: int, number: int) -> None:
+        """Do a batch; the workers are so many."""
+        known = len(self.costs.waited)
+        self.seconds.append(timed(self.workers, farm, batch, self.costs))
+        self.alone.append(self.seconds[-1] - sum(self.costs.waited[known:]) / number)
+
+
 def alternating(name: str, one: Engine, two: Engine, farm: Farm, batches: Sequence[int], all_costs: Costs) -> float:
-    """Let one worker and two take turns, every other time two first; prints and returns the median speed-up."""
-    turns: list[tuple[Engine, list[float], Costs]] = [(one, [], Costs()), (two, [], Costs())]
-    for number, batch in enumerate(batches):
-        for workers, seconds, costs in turns if number % 2 else turns[::-1]:
-            seconds.append(timed(workers, farm, batch, costs))
-    speedup = statistics.median(a / b for a, b in zip(turns[0][1], turns[1][1], strict=True))
-    for workers, (_, seconds, costs) in enumerate(turns, 1):
-        gain = f"{speedup:9.2f}{speedup / 2:11.0%}" if workers == 2 else f"{1:9}{1:11.0%}"
-        rate, cpu = sum(batches) / sum(seconds), statistics.mean(costs.cpu)
-        print(f"{name:8}{workers:7}{sum(batches):8}{rate:10.2f}{gain}{cpu:13.3f}", flush=True)
-        for key, values in vars(costs).items():
+    """Let one worker and two take turns, every other time two first; prints, and returns the speed-up."""
+    turns = {number: Turns(workers, [], [], Costs()) for number, workers in ((1, one), (2, two))}
+    for i, batch in enumerate(batches):
+        for number in (1, 2) if i % 2 else (2, 1):
+            turns[number].take(farm, batch, number)
+    seen, alone = (
+        [a / b for a, b in zip(getattr(turns[1], kind), getattr(turns[2], kind), strict=True)]
+        for kind in ("seconds", "alone")
+    )
+    for number, turn in turns.items():
+        gains = [1.0] * 2 if number == 1 else [statistics.median(seen), statistics.median(alone)]
+        rates = [sum(batches) / sum(turn.seconds), sum(batches) / sum(turn.alone)]
+        print(
+            f"{name:8}{number:7}{sum(batches):8}   {rates[0]:7.2f} {gains[0]:6.2f} {gains[0] / number:5.0%}"
+            f"   {rates[1]:7.2f} {gains[1]:6.2f} {gains[1] / number:5.0%}{statistics.mean(turn.costs.cpu):13.3f}",
+            flush=True,
+        )
+        for key, values in vars(turn.costs).items():
             getattr(all_costs, key).extend(values)
-    return speedup
+    return statistics.median(alone)
 
 
 @contextmanager
 def loky() -> Iterator[tuple[Engine, Engine]]:
-    task = Task(measured, ready)
+    task = Task(measured, prepare)
     with engine(task, jobs=1, dask=None) as one, engine(task, jobs=2, dask=None) as two:
         yield one, two
 
@@ -147,7 +187,7 @@ def dask() -> Iterator[tuple[Engine, Engine]]:
         dashboard_address="127.0.0.1:0",
         silence_logs=logging.CRITICAL,
     )
-    task = Task(measured, ready)
+    task = Task(measured, prepare)
     with (
         start(n_workers=1) as small,
         start(n_workers=2) as large,
@@ -191,7 +231,8 @@ def main() -> None:
     batch = max(1, min(args.batch, args.robots))
     batches = [batch] * (args.robots // batch)
     idle, adapting, warm = Costs(), Costs(), Costs()
-    print("engine  workers  robots  robots/s  speed-up  efficiency  CPU s/robot", flush=True)
+    print("                            as it was: speed-up,    on cores of their own:")
+    print("engine  workers  robots  robots/s, efficiency        the same                CPU s/robot", flush=True)
     with tempfile.TemporaryDirectory() as home:
         farm = Farm(Path(home), make_bundle(Path(home)))
         with loky() as (one, two):

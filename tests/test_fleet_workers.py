@@ -97,6 +97,20 @@ def test_a_robot_that_kills_a_dask_worker_stops_no_other(cluster):
     assert "every Dask worker that had it died" in found["killer"]
 
 
+def test_two_workers_work_at_the_same_time(where, tmp_path):
+    def meet(robot: Robot) -> Outcome:
+        """Wait for the other robot."""
+        import time
+
+        (tmp_path / robot.name).touch()
+        while len(list(tmp_path.iterdir())) < 2:
+            time.sleep(0.01)
+        return Outcome(robot, "unchanged", 0, "met", 1, 60, 0, "2 x 6 x 5")
+
+    with engine(Task(meet, int, 20), **{"jobs": None, "dask": None, **where}) as workers:
+        assert [o.reason for o in workers(robots("a", "b"))] == ["met", "met"]
+
+
 def test_processes_go_on_from_robot_to_robot():
     assert len({o.reason for o in done("a b c d e f", jobs=2).values()}) <= 2
 

@@ -223,6 +223,7 @@ def on_paper(idle: Costs, adapting: Costs, efficiency: float, share: float, pric
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, default=200, help="for each engine and number of workers (default 200)")
+    parser.add_argument("--engines", nargs="+", choices=["loky", "dask"], default=["loky", "dask"])
     parser.add_argument("--batch", type=int, default=10, help="robots of a turn (default 10)")
     parser.add_argument("--adapted", type=int, default=2, help="robots with a new fault (default 2)")
     parser.add_argument("--share", type=float, default=0.01, help="of robots with a new fault a night (default 0.01)")
@@ -235,15 +236,14 @@ def main() -> None:
     print("engine  workers  robots  robots/s, efficiency        the same                CPU s/robot", flush=True)
     with tempfile.TemporaryDirectory() as home:
         farm = Farm(Path(home), make_bundle(Path(home)))
-        with loky() as (one, two):
-            for workers in (one, two):
-                timed(workers, farm, 4, warm)
-            speedup = alternating("loky", one, two, farm, batches, idle)
-            timed(two, farm, args.adapted, adapting, broken=True)
-        with dask() as (one, two):
-            for workers in (one, two):
-                timed(workers, farm, 4, warm)
-            alternating("Dask", one, two, farm, batches, idle)
+        speedups = []
+        for name in args.engines:
+            with {"loky": loky, "dask": dask}[name]() as (one, two):
+                for workers in (one, two):
+                    timed(workers, farm, 4, warm)
+                speedups.append(alternating(name, one, two, farm, batches, idle))
+                if name == args.engines[0]:
+                    timed(two, farm, args.adapted, adapting, broken=True)
     print("\na robot                nothing new   adapted")
     for label, key, scale in (
         ("CPU s", "cpu", 1),
@@ -255,7 +255,7 @@ def main() -> None:
         a, b = (statistics.mean(getattr(costs, key)) * scale for costs in (idle, adapting))
         print(f"  {label:18}{a:14.3f}{b:10.3f}")
     print(f"\n{ROBOTS:,} such robots a night, {args.share:.1%} of them with a new fault")
-    for label, value in on_paper(idle, adapting, min(1.0, speedup / 2), args.share, args.price):
+    for label, value in on_paper(idle, adapting, min(1.0, speedups[0] / 2), args.share, args.price):
         print(f"  {label:12}{value}")
 
 

@@ -36,12 +36,14 @@ ROBOTS, NIGHT = 100_000, 8  # robots, and hours to do them in
 class Costs:
     """Of robots, in lists of equal length.
 
-    CPU seconds, seconds in line for a core, peak MB of the process, bytes read, written and sent back.
+    CPU seconds, seconds in line for a core, peak MB of the process, bytes of its files, read (most files are read three
+    times, for their checksums), written and sent back.
     """
 
     cpu: list[float] = field(default_factory=list)
     waited: list[float] = field(default_factory=list)
     memory: list[float] = field(default_factory=list)
+    files: list[float] = field(default_factory=list)
     read: list[float] = field(default_factory=list)
     written: list[float] = field(default_factory=list)
     sent: list[float] = field(default_factory=list)
@@ -51,6 +53,7 @@ def measured(robot: Robot) -> tuple[str, dict[str, float]]:
     """Maintain a robot in the worker's process; returns the decision and what it cost."""
     import json
     import time
+    from pathlib import Path
 
     from adaptfault.fleet.work import maintain_robot
 
@@ -59,6 +62,7 @@ def measured(robot: Robot) -> tuple[str, dict[str, float]]:
             lines = (line.split(": ") for line in io)
             return {"waited": int(stat.read().split()[1]), **{key: int(value) for key, value in lines}}
 
+    files = sum(path.stat().st_size for path in Path(robot.bundle).parent.rglob("*") if path.is_file())
     before, began = so_far(), time.process_time()
     outcome = maintain_robot(robot)
     cpu, after = time.process_time() - began, so_far()
@@ -68,6 +72,7 @@ def measured(robot: Robot) -> tuple[str, dict[str, float]]:
         "cpu": cpu,
         "waited": (after["waited"] - before["waited"]) * 1e-9,
         "memory": peak / 1024,
+        "files": files,
         "read": after["rchar"] - before["rchar"],
         "written": after["wchar"] - before["wchar"],
         "sent": len(json.dumps(outcome.to_dict())),
@@ -208,14 +213,16 @@ def on_paper(idle: Costs, adapting: Costs, efficiency: float, share: float, pric
     memory = max(*idle.memory, *adapting.memory)
     hours = ROBOTS * each("cpu") / efficiency / 3600
     cores = max(1, -int(-hours // NIGHT))
-    seconds = 3600 * NIGHT
+
+    def mbit(name: str) -> float:
+        return 8 * ROBOTS * each(name) / (3600 * NIGHT) / 1e6
+
     return [
         ("core hours", f"{hours:.1f}   {each('cpu'):.3f} CPU s a robot, at an efficiency of {efficiency:.2f}"),
         ("cores", f"{cores}   for {NIGHT} hours"),
         ("memory", f"{cores * memory / 1024:.1f} GB   {memory:.0f} MB a worker at its peak"),
-        ("read", f"{ROBOTS * each('read') / 1e9:.0f} GB   {8 * ROBOTS * each('read') / seconds / 1e6:.1f} Mbit/s"),
-        ("written", f"{ROBOTS * each('written') / 1e9:.1f} GB"),
-        ("sent back", f"{ROBOTS * each('sent') / 1e6:.0f} MB   {8 * ROBOTS * each('sent') / seconds / 1e3:.0f} kbit/s"),
+        ("network in", f"{mbit('files'):.0f} Mbit/s where workers cache files, {mbit('read'):.0f} where they do not"),
+        ("network out", f"{mbit('written'):.1f} Mbit/s written, {mbit('sent'):.3f} sent back as reports"),
         ("money", f"{price * hours:.2f}   at {price:g} a core hour"),
     ]
 
@@ -248,6 +255,7 @@ def main() -> None:
     for label, key, scale in (
         ("CPU s", "cpu", 1),
         ("peak MB", "memory", 1),
+        ("MB of files", "files", 1e-6),
         ("MB read", "read", 1e-6),
         ("MB written", "written", 1e-6),
         ("bytes sent back", "sent", 1),

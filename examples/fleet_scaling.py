@@ -231,7 +231,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, default=200, help="for each engine and number of workers (default 200)")
     parser.add_argument("--engines", nargs="+", choices=["loky", "dask"], default=["loky", "dask"])
-    parser.add_argument("--batch", type=int, default=10, help="robots of a turn (default 10)")
+    parser.add_argument("--batch", type=int, default=20, help="robots of a turn (default 20)")
     parser.add_argument("--adapted", type=int, default=2, help="robots with a new fault (default 2)")
     parser.add_argument("--share", type=float, default=0.01, help="of robots with a new fault a night (default 0.01)")
     parser.add_argument("--price", type=float, default=0.04, help="of a core hour, an assumption (default 0.04)")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _DIED = "the process that maintained it died; memory may be short, or a native library crashed"
 _START = 600  # s for a process to start and load what maintenance needs, from a cold disk
-_IDLE = 60  # s after which a process without work ends by itself
+_IDLE = 300  # s after which a process without work ends by itself
 _LOOK = 0.2  # s between two looks whether who started the process still lives
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 

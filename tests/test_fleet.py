@@ -1,5 +1,8 @@
 import json
 import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,11 +10,13 @@ import numpy as np
 import pytest
 
 import adaptfault.fleet.run as running
+import adaptfault.fleet.work as working
 from adaptfault.cli import main
 from adaptfault.fleet.listing import Fleet, Robot
 from adaptfault.fleet.outcome import Cause, Outcome
 from adaptfault.fleet.report import FleetReport
 from adaptfault.fleet.run import maintain_fleet
+from adaptfault.fleet.work import maintain_robot
 from adaptfault.lines import Lines
 from adaptfault.recordings import Recordings, save_npz
 from adaptfault.robot.bundle import Bundle
@@ -78,10 +83,22 @@ def test_two_workers_report_what_one_does(fleet, sequential, tmp_path):
     assert told(parallel) == told(sequential)
 
 
+def test_a_robot_that_is_being_maintained_is_waited_for(fleet, monkeypatch):
+    held = Bundle.open(fleet.robots[0].bundle).maintenance()
+    held.__enter__()
+    threading.Timer(0.3, held.__exit__, (None, None, None)).start()
+    assert maintain_robot(fleet.robots[0], dry_run=True).decision == "unchanged"
+    with Bundle.open(fleet.robots[0].bundle).maintenance():
+        monkeypatch.setattr(working, "_PATIENCE", 0)
+        outcome = maintain_robot(fleet.robots[0], dry_run=True)
+    assert outcome.decision == "error"
+    assert "being maintained by another process" in outcome.reason
+
+
 def test_two_workers_of_a_dask_cluster_report_what_one_process_does(fleet, sequential, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
     ) as cluster:
         report = maintain_fleet(fleet, tmp_path, dask=cluster.scheduler_address, dry_run=True, progress=False)
     assert told(report) == told(sequential)
@@ -92,7 +109,7 @@ def test_a_fleet_is_maintained_through_the_command_line(made_bundle, later_grasp
     save_npz(tmp_path / "log.npz", Recordings(tuple(r.astype(np.float32) for r in later_grasps), LAYOUT))
     listed = '[[robots]]\nname = "r"\nbundle = "r.bundle"\nrecordings = "*.npz"\ncommissioned = 2020-01-01\n'
     (tmp_path / "f.toml").write_text(listed)
-    arguments = ["fleet", "maintain", str(tmp_path / "f.toml"), "--jobs", "1", "--quiet"]
+    arguments = ["fleet", "maintain", str(tmp_path / "f.toml"), "--jobs", "1", "--limit", "600", "--quiet"]
     assert main(arguments) == 0
     assert capsys.readouterr().out.startswith("ADAPTFAULT FLEET OK - 1 robots: 1 ok | ok=1;;;0;1 degraded=0")
     assert len(Bundle.open(tmp_path / "r.bundle").journal.runs()) == 1
@@ -108,7 +125,7 @@ def test_a_fleet_is_maintained_through_the_command_line(made_bundle, later_grasp
     assert "no robot in it" in capsys.readouterr().err
 
 
-# A killed run. These fake the work: what is asked is who is worked on.
+# A killed run. These fake the workers: what is asked is who is worked on.
 
 
 def robots(n: int) -> Fleet:
@@ -120,11 +137,12 @@ def worked(monkeypatch) -> list[str]:
     """Names of the robots that were worked on, in order."""
     names: list[str] = []
 
-    def work(robot: Robot, **options: object) -> Outcome:
-        names.append(robot.name)
-        return outcome(robot)
+    def work(robots: list[Robot]) -> Iterator[Outcome]:
+        for robot in robots:
+            names.append(robot.name)
+            yield outcome(robot)
 
-    monkeypatch.setattr(running, "maintain_robot", work)
+    monkeypatch.setattr(running, "engine", lambda task, **where: nullcontext(work))
     return names
 
 
@@ -188,26 +206,13 @@ def test_two_processes_do_not_maintain_the_same_fleet(worked, tmp_path):
         maintain_fleet(robots(1), tmp_path, jobs=1)
 
 
-def die_or_work(robot: Robot, **options: object) -> Outcome:
-    """Stand for a crash in a native library."""
-    import os
-
-    if robot.name == "r2":
-        os._exit(1)
-    return outcome(robot)
-
-
-def test_a_robot_that_kills_its_worker_stops_no_other(monkeypatch, tmp_path):
-    monkeypatch.setattr(running, "maintain_robot", die_or_work)
-    report = maintain_fleet(robots(6), tmp_path, jobs=2, progress=False)
-    assert [o.decision for o in report.outcomes] == ["unchanged", "unchanged", "error", *["unchanged"] * 3]
-    assert "died" in report.errors[0].reason
-
-
 def test_workers_that_make_no_sense_are_refused(tmp_path):
     for options in ({"jobs": 0}, {"jobs": 2, "dask": "tcp://127.0.0.1:1"}):
         with pytest.raises(ValueError, match="expected at least 1"):
             maintain_fleet(robots(1), tmp_path, **options)
+    for limit in (0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="expected seconds, more than 0"):
+            maintain_fleet(robots(1), tmp_path, limit=limit)
 
 
 # The report.

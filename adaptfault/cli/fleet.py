@@ -30,6 +30,12 @@ def add(commands: Commands) -> None:
     parser.add_argument("--dask", metavar="ADDRESS", help="a Dask scheduler whose workers do it, as tcp://host:8786")
     parser.add_argument("--dry-run", action="store_true", help="report only, change nothing")
     parser.add_argument("--budget", type=float, metavar="S", help="seconds that one adaptation may take")
+    parser.add_argument(
+        "--limit",
+        type=float,
+        metavar="S",
+        help="seconds that one robot may take; past it, it is an error (default: none)",
+    )
     parser.add_argument("--out", metavar="FOLDER", help="of ledger and reports (default: FLEET.fleet)")
     parser.set_defaults(run=run)
 
@@ -52,6 +58,7 @@ def run(args: argparse.Namespace) -> int:
         dask=args.dask,
         dry_run=args.dry_run,
         budget=args.budget,
+        limit=args.limit,
         progress=progress(args),
     )
     atomic_write(folder / "report.json", json.dumps(report.to_dict(), indent=1, allow_nan=False).encode())

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from adaptfault.fleet.listing import Robot
-from adaptfault.robot.bundle import Bundle
-from adaptfault.robot.maintenance import Decision, MaintenanceReport
-from diagnostics import Fault
+
+if TYPE_CHECKING:  # who only passes outcomes on does without torch
+    from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.maintenance import Decision, MaintenanceReport
+    from diagnostics import Fault
 
 _NOTES = 5
 

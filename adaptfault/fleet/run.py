@@ -1,12 +1,9 @@
-"""Maintains a whole fleet on joblib's workers; what is done is on disk at once, so a killed run goes on."""
+"""Maintains a whole fleet on workers; what is done is on disk at once, so a killed run goes on."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from functools import partial
 from pathlib import Path
@@ -14,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from adaptfault.fleet.engines import engine
+from adaptfault.fleet.guard import Task
 from adaptfault.fleet.listing import Fleet, Robot
 from adaptfault.fleet.outcome import Outcome
-from adaptfault.fleet.work import maintain_robot
+from adaptfault.fleet.work import maintain_robot, ready
 from adaptfault.lines import Lines
 from adaptfault.robot.bundle import now
 from adaptfault.robot.lock import locked
@@ -28,7 +27,6 @@ SCHEMA = "adaptfault.fleet-ledger/1"
 LEDGER = "ledger.jsonl"
 
 _OVER = timedelta(hours=12)  # a run that stood still for so long is not gone on with: robots have recorded since
-_DIED = "the process that maintained it died; memory may be short, or a native library crashed"
 
 
 def maintain_fleet(
@@ -39,6 +37,7 @@ def maintain_fleet(
     dask: str | None = None,
     dry_run: bool = False,
     budget: float | None = None,
+    limit: float | None = None,
     progress: bool | None = None,
 ) -> FleetReport:
     """Run ``maintain`` over all robots; one that fails is an error in the report, and the others go on.
@@ -49,14 +48,16 @@ def maintain_fleet(
     Args:
         fleet: the robots. Their paths must mean the same on every worker (a shared folder, with Dask).
         folder: of the run; made if need be.
-        jobs: worker processes on this machine, one thread each; None: as many as cores. 1 works in this process.
+        jobs: worker processes on this machine, one thread each; None: as many as cores.
         dask: address of a Dask scheduler whose workers do it instead, as "tcp://host:8786".
         dry_run: report only, change nothing.
         budget: seconds that one adaptation may take.
+        limit: seconds that one robot may take; its process is killed then, and the robot is an error. None: no limit.
         progress: show or hide it on stderr; None shows it on a terminal.
 
     Raises:
-        ValueError: ``jobs`` is below 1 or given with ``dask``, Dask is not installed, or the ledger is not one.
+        ValueError: ``jobs`` is below 1 or given with ``dask``, ``limit`` is not above 0, Dask is not installed, or the
+            ledger is not one.
         Busy: another process maintains the fleet in this folder.
         OSError: the scheduler does not answer.
     """
@@ -64,6 +65,8 @@ def maintain_fleet(
 
     if jobs is not None and (jobs < 1 or dask is not None):
         raise ValueError(f"jobs {jobs}: expected at least 1, and none with a Dask cluster, which has its own workers")
+    if limit is not None and not limit > 0:
+        raise ValueError(f"limit {limit}: expected seconds, more than 0")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder / "run.lock", wait=False):
@@ -77,9 +80,9 @@ def maintain_fleet(
         hide = None if progress is None else not progress
         with (
             tqdm(total=len(fleet), initial=len(done), unit="robot", disable=hide) as bar,
-            _engine(jobs, dask) as engine,
+            engine(Task(partial(maintain_robot, **options), ready, limit), jobs=jobs, dask=dask) as work,
         ):
-            for outcome in _outcomes(left, engine, options):
+            for outcome in work(left):
                 lines.add({"time": now(), "outcome": outcome.to_dict()})
                 done[outcome.robot.name] = outcome
                 bar.update()
@@ -98,67 +101,12 @@ def _resumed(documents: list[Any], fleet: Fleet, options: dict[str, Any]) -> tup
     over = bool(entries) and "ended" in entries[-1]
     if over or head["options"] != options or datetime.now(timezone.utc) - last > _OVER:
         return "", {}
-    outcomes = [Outcome.from_dict(entry["outcome"]) for entry in entries]
+    earlier = [Outcome.from_dict(entry["outcome"]) for entry in entries]
     # A robot whose bundle or recordings are elsewhere now is done again.
-    now_listed = {_where(robot) for robot in fleet.robots}
-    return head["began"], {o.robot.name: o for o in outcomes if _where(o.robot) in now_listed}
+    listed = {_where(robot): robot for robot in fleet.robots}
+    done = {robot.name: replace(o, robot=robot) for o in earlier if (robot := listed.get(_where(o.robot)))}
+    return head["began"], done
 
 
 def _where(robot: Robot) -> str:
     return json.dumps([robot.name, robot.bundle, robot.recordings])
-
-
-def _outcomes(left: Sequence[Robot], engine: _Engine, options: dict[str, Any]) -> Iterator[Outcome]:
-    """Yield outcomes as they come. If a worker dies, the robots that it may have had are done one at a time."""
-    work = partial(maintain_robot, **options)
-    waiting = {robot.name: robot for robot in left}
-    while waiting:
-        try:
-            for outcome in engine.each(work, list(waiting.values())):
-                del waiting[outcome.robot.name]
-                yield outcome
-        except engine.death:
-            for robot in list(waiting.values())[: engine.ahead]:
-                try:
-                    (outcome,) = engine.each(work, [robot])
-                except engine.death:
-                    outcome = Outcome.error(robot, _DIED)
-                del waiting[robot.name]
-                yield outcome
-
-
-@dataclass(frozen=True)
-class _Engine:
-    """joblib with its backend chosen.
-
-    Attributes:
-        ahead: how many robots may be at the workers at once.
-        death: what is raised when a worker process dies.
-    """
-
-    ahead: int
-    death: tuple[type[BaseException], ...]
-
-    def each(self, work: Callable[[Robot], Outcome], robots: Sequence[Robot]) -> Iterator[Outcome]:
-        """Yield the outcomes as they come."""
-        from joblib import Parallel, delayed
-
-        parallel = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch=self.ahead)
-        yield from parallel(delayed(work)(robot) for robot in robots)
-
-
-@contextmanager
-def _engine(jobs: int | None, dask: str | None) -> Iterator[_Engine]:
-    from joblib import cpu_count, parallel_config
-
-    if dask is None:
-        jobs = jobs or cpu_count()
-        with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1):
-            yield _Engine(2 * jobs, (BrokenExecutor,))
-        return
-    try:
-        from distributed import Client, KilledWorker
-    except ImportError:
-        raise ValueError("a Dask cluster needs Dask: pip install 'adaptfault[fleet]'") from None
-    with Client(dask, set_as_default=False) as client, parallel_config(backend="dask", client=client):
-        yield _Engine(2 * max(1, sum(client.ncores().values())), (KilledWorker,))

@@ -8,6 +8,17 @@ from contextlib import contextmanager
 
 from adaptfault.fleet.listing import Robot
 from adaptfault.fleet.outcome import Outcome
+from adaptfault.robot.lock import Busy
+
+_PATIENCE, _PAUSE = 120, 0.5  # s to wait for a robot that another process maintains, and between two tries
+
+
+def ready() -> None:
+    """Load what maintenance needs."""
+    import adaptfault.adaptation
+    import adaptfault.robot.incoming
+    import adaptfault.robot.maintenance
+    import adaptfault.training  # noqa: F401
 
 
 def maintain_robot(robot: Robot, *, dry_run: bool = False, budget: float | None = None) -> Outcome:
@@ -21,11 +32,22 @@ def maintain_robot(robot: Robot, *, dry_run: bool = False, budget: float | None 
     began = time.perf_counter()
     try:
         with _one_thread():
-            return _maintained(robot, dry_run, budget, began)
+            return _patiently(robot, dry_run, budget, began)
     except (ValueError, OSError) as error:
         return Outcome.error(robot, str(error), time.perf_counter() - began)
     except Exception as error:  # one robot never ends the night of all the others
         return Outcome.error(robot, f"{type(error).__name__}: {error}", time.perf_counter() - began)
+
+
+def _patiently(robot: Robot, dry_run: bool, budget: float | None, began: float) -> Outcome:
+    """Wait for a robot that is being maintained: a Dask worker goes on with it for a while after its run was killed."""
+    while True:
+        try:
+            return _maintained(robot, dry_run, budget, began)
+        except Busy:
+            if time.perf_counter() - began > _PATIENCE:
+                raise
+        time.sleep(_PAUSE)
 
 
 def _maintained(robot: Robot, dry_run: bool, budget: float | None, began: float) -> Outcome:

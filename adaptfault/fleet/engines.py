@@ -1,0 +1,125 @@
+"""Who goes through the robots: joblib's threads on this machine, or a Dask cluster; each robot in a guarded process."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from queue import SimpleQueue
+from typing import TYPE_CHECKING
+
+from adaptfault.fleet.guard import Guard, Task, do_on_worker, quiet
+from adaptfault.fleet.listing import Robot
+from adaptfault.fleet.outcome import Outcome
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+Engine = Callable[[Sequence[Robot]], Iterator[Outcome]]
+"""Works on robots and yields their outcomes as they come."""
+
+_WAIT = 60  # s for a cluster's first worker, and that it may be without any later on
+_LOOK = 0.1  # s between two looks for finished robots
+_DIED = "every Dask worker that had it died; one may be short of memory"
+
+
+@contextmanager
+def engine(task: Task, *, jobs: int | None, dask: str | None) -> Iterator[Engine]:
+    """Give what works on robots; see :func:`adaptfault.maintain_fleet` for the arguments.
+
+    Raises:
+        ValueError: Dask is not installed.
+        OSError: there is no scheduler at the address, or it has no worker.
+    """
+    if dask is None:
+        from joblib import cpu_count
+
+        guards = [Guard() for _ in range(jobs or cpu_count())]
+        with warnings.catch_warnings():
+            quiet()
+            try:
+                yield partial(_on_joblib, task, guards)
+            finally:
+                for guard in guards:
+                    guard.close()
+        return
+    try:
+        from distributed import Client
+    except ImportError:
+        raise ValueError("a Dask cluster needs Dask: pip install 'adaptfault[fleet]'") from None
+    with Client(dask, set_as_default=False) as client:
+        try:
+            client.wait_for_workers(1, timeout=_WAIT)
+        except Exception as error:  # its own TimeoutError, which differs between versions
+            raise OSError(f"the Dask scheduler at {dask} has no worker after {_WAIT} s ({error})") from None
+        yield partial(_on_dask, client, task)
+
+
+def _on_joblib(task: Task, guards: Sequence[Guard], robots: Sequence[Robot]) -> Iterator[Outcome]:
+    from joblib import Parallel, delayed
+
+    free: SimpleQueue[Guard] = SimpleQueue()
+    for guard in guards:
+        free.put(guard)
+
+    def done(robot: Robot) -> Outcome:
+        guard = free.get()
+        try:
+            return guard.do(task, robot)
+        finally:
+            free.put(guard)
+
+    # Threads, which only wait: joblib's own processes are one pool, which a single crash brings down.
+    parallel = Parallel(len(guards), backend="threading", return_as="generator_unordered", batch_size=1)
+    yield from parallel(delayed(done)(robot) for robot in robots)
+
+
+def _on_dask(client: Client, task: Task, robots: Sequence[Robot]) -> Iterator[Outcome]:
+    # Not through joblib: its Dask backend (1.6) waits for ever for a task whose worker died.
+    suspects = []
+    for robot, outcome in _finished(client, task, robots):
+        if outcome is None:
+            suspects.append(robot)
+        else:
+            yield outcome
+    for suspect in suspects:  # alone: some only waited beside one that takes workers down
+        for robot, outcome in _finished(client, task, [suspect]):
+            yield outcome or Outcome.error(robot, _DIED)
+
+
+def _finished(client: Client, task: Task, robots: Sequence[Robot]) -> Iterator[tuple[Robot, Outcome | None]]:
+    """Yield robots as they are done, with None where their workers died.
+
+    Raises:
+        OSError: the scheduler or the last worker is gone.
+    """
+    from distributed import as_completed
+
+    robot_of = dict(zip(client.map(partial(do_on_worker, task), robots, pure=False), robots, strict=True))
+    coming, seen = as_completed(list(robot_of), loop=client.loop), time.monotonic()
+    while robot_of:
+        for future in coming.next_batch(block=False):
+            if future.cancelled():
+                raise OSError(
+                    "the Dask scheduler went away or was restarted; start the run again to go on where it was"
+                )
+            yield (robot := robot_of.pop(future)), _outcome(future, robot)
+        if not coming.has_ready():
+            time.sleep(_LOOK)
+        if (idle := time.monotonic() - seen) > _WAIT / 10:
+            if client.nthreads():
+                seen = time.monotonic()
+            elif idle > _WAIT:
+                raise OSError(f"no Dask worker for {_WAIT} s; start workers and the run again to go on where it was")
+
+
+def _outcome(future: Future, robot: Robot) -> Outcome | None:
+    from distributed import KilledWorker
+
+    if future.status != "error":
+        outcome: Outcome = future.result()
+        return outcome
+    error = future.exception()
+    return None if isinstance(error, KilledWorker) else Outcome.error(robot, f"{type(error).__name__}: {error}")

@@ -59,6 +59,16 @@ nitpick_ignore_regex = [
 suppress_warnings = ["ref.python"]  # two modules may have a class of one name
 
 
+# Pages whose source lies elsewhere, so that links work in the repository as well as on the site.
+ELSEWHERE = {f"../examples/paper/{name}/README.md": f"paper/{name}.md" for name in ("simulated", "real")}
+
+
+def follow_elsewhere(app: Sphinx, page: str, source: list[str]) -> None:
+    """Make links to these pages links within the site."""
+    for there, here in ELSEWHERE.items():
+        source[0] = source[0].replace(f"]({there})", f"]({here})")
+
+
 def missing_names(app: Sphinx, env: BuildEnvironment) -> None:
     """Warn of each public name that the reference lacks; ``make docs`` takes warnings for errors."""
     documented = env.get_domain("py").objects
@@ -107,6 +117,7 @@ def setup(app: Sphinx) -> None:
     for field in PyObject.doc_field_types:
         if field.name == "variable":
             field.label = "Attributes"
+    app.connect("source-read", follow_elsewhere)
     app.connect("env-check-consistency", missing_names)
     app.connect("missing-reference", public_name)
     app.connect("autodoc-skip-member", described_elsewhere)

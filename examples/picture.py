@@ -82,10 +82,12 @@ def draw(result: DemoResult) -> Figure:
         ax.set_title(f"pad {pad}", size=10, color=INK)
         ax.set(xticks=[], yticks=[])
         ax.spines[:].set_visible(False)
-    found = f"found {len(result.found)} of {n_broken}, {len(result.false_alarms)} false alarms"
-    for part, title in zip(
-        parts, (f"{n_broken} of {layout.present.sum()} cells died", found, "accuracy of the classifier"), strict=True
-    ):
+    titles = (
+        f"{n_broken} of {layout.present.sum()} cells died",
+        f"found {len(result.found)} of {n_broken}, {len(result.false_alarms)} false alarms",
+        "accuracy of the classifier",
+    )
+    for part, title in zip(parts, titles, strict=True):
         part.suptitle(title, size=13, weight="bold", color=INK)
     return figure
 

@@ -30,6 +30,7 @@ extensions = [
     "sphinx_copybutton",
 ]
 templates_path = ["templates"]
+highlight_language = "text"  # of blocks that do not say
 exclude_patterns = ["templates"]
 html_theme = "furo"
 html_title = f"adaptfault {version}"

@@ -51,7 +51,15 @@ def draw_verdicts(axes: list[Axes], diagnosis: Diagnosis) -> None:
     letters = ", ".join(f"{letter} {kind.value}" for kind, letter in LETTERS.items())
     names = {**dict.fromkeys(VERDICTS, ""), "faulty": f" ({letters})"}
     patches = [Patch(color=color, label=name + names[name]) for name, color in reversed(VERDICTS.items())]
-    axes[0].figure.legend(handles=patches, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    axes[0].figure.legend(
+        handles=patches,
+        loc="outside lower center",
+        ncols=3,
+        frameon=False,
+        fontsize=8.5,
+        handlelength=1,
+        columnspacing=1,
+    )
 
 
 def draw_accuracy(ax: Axes, result: DemoResult) -> None:

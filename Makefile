@@ -25,7 +25,7 @@ examples: .venv/installed-dev
 
 # Warnings are errors: links and names that lead nowhere, public names that are on no page.
 docs: .venv/installed-docs
-	rm -rf docs/api/modules
+	rm -rf build/site docs/api/modules
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --jobs auto -d build/doctrees docs build/site
 	@echo build/site/index.html
 

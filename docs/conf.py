@@ -113,6 +113,13 @@ def plain_words(app: Sphinx, what: str, name: str, thing: Any, options: Any, lin
         lines.insert(0, "")
 
 
+def several_names(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Keep attributes that are described together, "low, high", from being read as a type and a name."""
+    for i, line in enumerate(lines):
+        if names := re.match(r":ivar (\w+(?:, \w+)+):", line):
+            lines[i] = f":ivar {names[1].replace(', ', ',')}:{line[names.end() :]}"
+
+
 def setup(app: Sphinx) -> None:
     """Connect the functions above."""
     for field in PyObject.doc_field_types:
@@ -123,3 +130,4 @@ def setup(app: Sphinx) -> None:
     app.connect("missing-reference", public_name)
     app.connect("autodoc-skip-member", described_elsewhere)
     app.connect("autodoc-process-docstring", plain_words, priority=100)  # before napoleon
+    app.connect("autodoc-process-docstring", several_names, priority=900)  # after it

@@ -24,7 +24,7 @@ NOT_RUN = {"reproduce": "test_paper.py runs it, small"}
 QUICK = {
     "train": ["--epochs", "1"],
     "demo": ["--epochs", "1"],
-    "listen": ["--seconds", "0.2"],
+    "listen": ["--port", "0", "--seconds", "0.2"],
     "fleet": ["--jobs", "1"],
 }
 

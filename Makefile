@@ -27,6 +27,7 @@ examples: .venv/installed-dev
 docs: .venv/installed-docs
 	rm -rf build/site docs/api/modules
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --jobs auto -d build/doctrees docs build/site
+	$(BIN)/python docs/check_links.py build/site
 	@echo build/site/index.html
 
 wheel-check: .venv/installed-dev

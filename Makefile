@@ -1,5 +1,7 @@
-# make demo   the main job on simulated grasps, with a report     make test   lint, formatting, types and tests
-# Both make their own .venv. PYTHON=/path/to/python3 chooses the interpreter.
+# make demo       the main job on simulated grasps, with a report     make test         lint, formatting, types and tests
+# make examples   every script of examples/, and every block of code in the docs, in a small version
+# make docs       the site, in build/site: pages and API reference    make wheel-check  the wheel, installed somewhere else
+# They make their own .venv. PYTHON=/path/to/python3 chooses the interpreter.
 
 # torch 2.13.0 on Python 3.11 is the pinned pair (constraints.txt). A python3.11 on the PATH may be a shim that fails,
 # so each candidate has to prove that it runs and can make an environment.
@@ -7,7 +9,7 @@ PYTHON ?= $(shell for p in python3.11 /usr/bin/python3.11 python3.12 python3.13 
 	$$p -c 'import ensurepip, venv, sys; sys.exit(sys.version_info < (3, 10))' >/dev/null 2>&1 && echo $$p && break; done)
 BIN := .venv/bin
 
-.PHONY: demo test test-pythons format clean
+.PHONY: demo test examples docs wheel-check test-pythons format clean
 
 demo: .venv/installed
 	$(BIN)/adaptfault demo
@@ -17,6 +19,21 @@ test: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
+
+examples: .venv/installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal -v -rs tests/test_examples.py tests/test_docs.py
+
+# Warnings are errors: links and names that lead nowhere, public names that are on no page.
+docs: .venv/installed-docs
+	rm -rf build/site docs/api/modules
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --jobs auto -d build/doctrees docs build/site
+	$(BIN)/python docs/check_links.py build/site
+	@echo build/site/index.html
+
+wheel-check: .venv/installed-dev
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python tests/check_wheel.py dist
 
 # Everything that does without torch, on each other Python that is found and runs.
 test-pythons: .venv/installed
@@ -45,5 +62,9 @@ format: .venv/installed-dev
 	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $@
 
+.venv/installed-docs: .venv/installed
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	@touch $@
+
 clean:
-	rm -rf .venv .venv-* adaptfault-demo
+	rm -rf .venv .venv-* adaptfault-demo build dist docs/api/modules

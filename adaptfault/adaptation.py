@@ -46,7 +46,7 @@ class Adaptation:
 
     Attributes:
         model: the reduced model, from the D - k healthy cells to logits.
-        fault_set: F.
+        fault_set: F, the cells it does without.
         stages: what each stage cost and reached, in the order they ran.
     """
 

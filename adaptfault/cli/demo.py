@@ -13,8 +13,8 @@ _EXAMPLE = """  adaptfault demo
 
 # The paper has 200 grasps a class and up to 50 epochs at 1e-4. So that the demo ends within a minute or so, it
 # has fewer grasps and learns faster, in a network that costs a third (unpadded convolutions).
-_SIMULATED_PER_CLASS = 160
-_QUICK = {"epochs": 2, "learning_rate": 2e-4, "network": {"padding": "valid", "init": "glorot"}}
+SIMULATED_PER_CLASS = 160
+QUICK = {"epochs": 2, "learning_rate": 2e-4, "network": {"padding": "valid", "init": "glorot"}}
 _EPOCHS = 20
 
 
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         from adaptfault.grasps import simulate
 
-        recordings = simulate(_SIMULATED_PER_CLASS, seed=args.seed)
+        recordings = simulate(SIMULATED_PER_CLASS, seed=args.seed)
     faults = None
     if args.inject:
         faults = parse_faults(args.inject, recordings.layout, np.random.default_rng(args.seed))
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     result = run_demo(
         recordings,
         faults,
-        **({"epochs": _EPOCHS} if args.recordings else _QUICK) | ({"epochs": args.epochs} if args.epochs else {}),
+        **({"epochs": _EPOCHS} if args.recordings else QUICK) | ({"epochs": args.epochs} if args.epochs else {}),
         seed=args.seed,
         checkpoint=checkpoint,
         progress=progress(args),

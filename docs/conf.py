@@ -1,0 +1,132 @@
+"""Sphinx: the pages of this folder, and the reference made from the docstrings. ``make docs`` builds the site."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from functools import cache
+from importlib.metadata import version as version_of
+from typing import Any
+
+from docutils.nodes import Element, TextElement
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.domains.python import PyObject
+from sphinx.environment import BuildEnvironment
+from sphinx.util import logging
+
+PUBLIC = ("adaptfault", "diagnostics")
+
+project = "adaptfault"
+author = copyright = "The adaptfault developers"
+version = release = version_of("adaptfault")
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+]
+templates_path = ["templates"]
+highlight_language = "text"  # of blocks that do not say
+exclude_patterns = ["templates"]
+html_theme = "furo"
+html_title = f"adaptfault {version}"
+html_show_sourcelink = False
+html_show_copyright = False
+
+myst_heading_anchors = 3
+
+autodoc_default_options = {"members": True, "member-order": "bysource"}
+# Not what these stand for, which fills half a page; functions with NDArray[...] then show what their source says.
+autodoc_type_aliases = {"NDArray": "NDArray", "ArrayLike": "ArrayLike", "StateArrays": "StateArrays"}
+autodoc_preserve_defaults = True
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 100
+napoleon_numpy_docstring = False
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+napoleon_attr_annotations = False  # the signature above has the types
+
+# A name of these packages that leads nowhere is an error; other projects' pages are not at hand when the site is built.
+nitpicky = True
+nitpick_ignore_regex = [
+    (r"py:.*", r"(?!adaptfault\.|diagnostics\.).*"),
+    (r"py:.*", r".*\._\w+"),
+    (r"py:.*", r".*\.Result"),  # a type variable
+]
+suppress_warnings = ["ref.python"]  # two modules may have a class of one name
+
+
+# Pages whose source lies elsewhere, so that links work in the repository as well as on the site.
+ELSEWHERE = {f"../examples/paper/{name}/README.md": f"paper/{name}.md" for name in ("simulated", "real")}
+
+
+def follow_elsewhere(app: Sphinx, page: str, source: list[str]) -> None:
+    """Make links to these pages links within the site."""
+    for there, here in ELSEWHERE.items():
+        source[0] = source[0].replace(f"]({there})", f"]({here})")
+
+
+def missing_names(app: Sphinx, env: BuildEnvironment) -> None:
+    """Warn of each public name that the reference lacks; ``make docs`` takes warnings for errors."""
+    documented = env.get_domain("py").objects
+    for package in PUBLIC:
+        for name in importlib.import_module(package).__all__:
+            if f"{package}.{name}" not in documented:
+                logging.getLogger(__name__).warning("%s.%s is public, but on no page of docs/api", package, name)
+
+
+def public_name(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: TextElement) -> Element | None:
+    """Lead a name as other modules have it, ``FaultSet`` or ``adaptfault.store.save_model``, to the public one."""
+    domain, parts = env.get_domain("py"), node.get("reftarget", "").split(".")
+    for package in PUBLIC if node.get("refdomain") == "py" else ():
+        for full in (f"{package}.{parts[-1]}", ".".join([package, *parts[-2:]])):
+            if full in domain.objects:
+                return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", full, node, content)
+    return None
+
+
+def described_elsewhere(app: Sphinx, what: str, name: str, thing: Any, skip: bool, options: Any) -> bool | None:
+    """Leave public names out of the pages of modules: they have pages of their own."""
+    if what == "module" and any(thing is public for public in public_things()):
+        return True
+    return None
+
+
+@cache
+def public_things() -> tuple[Any, ...]:
+    """Return what the public names stand for."""
+    packages = [importlib.import_module(name) for name in PUBLIC]
+    return tuple(getattr(package, name) for package in packages for name in package.__all__)
+
+
+def plain_words(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Keep from being read as markup what is none: bars, and what stands before a colon in a property."""
+    for i, line in enumerate(lines):
+        parts = re.split(r"(``.*?``)", line)  # every other one is a literal
+        parts[::2] = [part.replace("|", "\\|") for part in parts[::2]]
+        lines[i] = "".join(parts)
+    if what == "property":
+        lines.insert(0, "")
+
+
+def several_names(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Keep attributes that are described together, "low, high", from being read as a type and a name."""
+    for i, line in enumerate(lines):
+        if names := re.match(r":ivar (\w+(?:, \w+)+):", line):
+            lines[i] = f":ivar {names[1].replace(', ', ',')}:{line[names.end() :]}"
+
+
+def setup(app: Sphinx) -> None:
+    """Connect the functions above."""
+    for field in PyObject.doc_field_types:
+        if field.name == "variable":
+            field.label = "Attributes"
+    app.connect("source-read", follow_elsewhere)
+    app.connect("env-check-consistency", missing_names)
+    app.connect("missing-reference", public_name)
+    app.connect("autodoc-skip-member", described_elsewhere)
+    app.connect("autodoc-process-docstring", plain_words, priority=100)  # before napoleon
+    app.connect("autodoc-process-docstring", several_names, priority=900)  # after it

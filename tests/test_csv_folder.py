@@ -1,0 +1,223 @@
+"""CSV files: what is taken, what is refused, and what the user is told."""
+
+import time
+
+import numpy as np
+import pytest
+from recording_files import PAPER, messages, newtons, refusal, rng, text, write
+
+from adaptfault.recordings import load
+
+
+def test_a_csv_of_100_rows_and_220_columns_is_the_papers_sensor(tmp_path):
+    values = newtons()
+    loaded = load(write(tmp_path / "a.csv", values))
+    assert loaded.problems == ()
+    assert loaded.recordings.layout == PAPER
+    assert loaded.recordings.labels is None
+    np.testing.assert_array_equal(loaded.recordings.frames[0], values.astype(np.float32))
+
+
+def test_the_class_is_the_folders_name_and_numeric_names_sort_as_numbers(tmp_path):
+    for name in ("10", "9", "0"):
+        write(tmp_path / name / "x.csv", newtons(3))
+    recordings = load(tmp_path).recordings
+    assert recordings.class_names == ("0", "9", "10")
+    assert recordings.labels.tolist() == [0, 1, 2]
+    assert recordings.names == ("0/x.csv", "9/x.csv", "10/x.csv")
+
+
+def test_files_of_two_folders_given_one_by_one_get_their_folders_as_classes(tmp_path):
+    files = [write(tmp_path / name / "x.csv", newtons(3)) for name in ("b", "a")]
+    recordings = load(files).recordings
+    assert recordings.class_names == ("a", "b")
+    assert recordings.labels.tolist() == [1, 0]
+    assert load(files[0]).recordings.labels is None
+
+
+def test_the_files_of_a_folder_come_in_natural_order(tmp_path):
+    for i in (10, 9, 1):
+        write(tmp_path / f"grasp{i}.csv", newtons(2))
+    assert load(tmp_path).recordings.names == ("grasp1.csv", "grasp9.csv", "grasp10.csv")
+
+
+@pytest.mark.parametrize(
+    "header", [",".join(f"cell_{i}" for i in range(220)), ",".join(map(str, range(220))), ",".join(['"c"'] * 220)]
+)
+def test_a_header_line_is_passed_over_and_counted_in_line_numbers(tmp_path, header):
+    values = newtons(4)
+    values[2, 7] = np.nan
+    loaded = load(write(tmp_path / "a.csv", header + "\n" + text(values)))
+    assert len(loaded.recordings.frames[0]) == 4
+    assert "line 4" in messages(loaded, "warning")[0]
+
+
+@pytest.mark.parametrize("disguise", ["{}\n\n  \n", "\ufeff{}", "\n{}", '"{}'])
+def test_blank_lines_byte_order_marks_and_quotes_do_no_harm(tmp_path, disguise):
+    values = newtons(3)
+    body = text(values).replace("\n", '"\n"').replace(",", '","')[:-1] if '"' in disguise else text(values)
+    loaded = load(write(tmp_path / "a.csv", disguise.format(body)))
+    np.testing.assert_array_equal(loaded.recordings.frames[0], values.astype(np.float32))
+
+
+@pytest.mark.parametrize("end", ["\r\n", "\r"])
+def test_line_ends_of_other_systems_are_read(tmp_path, end):
+    values = newtons(3)
+    (tmp_path / "a.csv").write_bytes(text(values).replace("\n", end).encode())
+    np.testing.assert_array_equal(load(tmp_path).recordings.frames[0], values.astype(np.float32))
+
+
+@pytest.mark.parametrize("gap", ["", "  ", "nan", "NaN"])
+def test_a_missing_reading_is_kept_as_nan_and_told_with_its_line(tmp_path, gap):
+    rows = text(newtons(5)).split("\n")
+    rows[3] = gap + "," + rows[3].split(",", 1)[1]
+    loaded = load(write(tmp_path / "a.csv", "\n".join(rows)))
+    assert np.isnan(loaded.recordings.frames[0][3, 0])
+    assert np.isnan(loaded.recordings.frames[0]).sum() == 1
+    assert messages(loaded, "warning") == [f"{tmp_path / 'a.csv'}: 1 missing reading, first in line 4: kept as missing"]
+
+
+def damaged(change):
+    rows = text(newtons(6)).split("\n")[:-1]
+    return "\n".join(change(rows)) + "\n"
+
+
+def put(rows, line, cell, value):
+    cells = rows[line].split(",")
+    cells[cell : cell + 1] = value
+    return [*rows[:line], ",".join(cells), *rows[line + 1 :]]
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (damaged(lambda r: put(r, 2, 7, ["abc"])), "a.csv, line 3, column 8: 'abc' is not a number; write the reading"),
+        (damaged(lambda r: put(r, 2, 7, ["1_0"])), "a.csv, line 3, column 8: '1_0' is not a number"),
+        (damaged(lambda r: put(r, 0, 7, ["abc"])), "a.csv, line 1, column 8: 'abc' is not a number"),
+        (damaged(lambda r: put(r, 4, 0, ["inf"])), "a.csv, line 5: value 1 is infinite or too large"),
+        (damaged(lambda r: put(r, 4, 0, ["-1e999"])), "a.csv, line 5: value 1 is infinite or too large"),
+        (damaged(lambda r: put(r, 2, 7, [])), "a.csv, line 3: 219 values where the other lines have 220"),
+        (damaged(lambda r: put(r, 0, 7, [])), "a.csv, line 1: 219 values where the other lines have 220"),
+        (
+            damaged(lambda r: put(r, 5, 7, [])),
+            "a.csv, line 6: 219 values where the other lines have 220; the recording",
+        ),
+        (text(newtons(6, 219)), "a.csv, line 1: 219 values a frame, expected 220: a column is missing"),
+        (text(newtons(6, 221)), "a.csv, line 1: 221 values a frame, expected 220: if the first column is a time"),
+        (damaged(lambda r: [x + "," for x in r]), "expected 220: each line ends with a comma, remove it"),
+        (damaged(lambda r: ["2024-05-01," + x for x in r]), "a.csv, line 1, column 1: '2024-05-01' is not a number"),
+        (text(newtons(6)).replace(",", ";"), "a.csv, line 1: separated by ';'? use commas"),
+        (text(newtons(6)).replace(",", ";").replace(".", ","), "a.csv, line 1: separated by ';'? use commas"),
+        (text(newtons(6)).replace(",", "\t"), "a.csv, line 1: separated by tabs? use commas"),
+        (text(newtons(6)).replace(",", " "), "a.csv, line 1: separated by spaces? use commas"),
+        ("", "a.csv: is empty (0 bytes)"),
+        ("\n\n", "a.csv: holds no readings"),
+        ("cell_0,cell_1\n", "a.csv: holds no readings"),
+        ("# notes\nwritten by hand\n", "a.csv, line 2"),
+    ],
+)
+def test_a_bad_csv_is_refused_with_its_line_and_the_mend(tmp_path, content, expected):
+    assert expected in refusal(write(tmp_path / "a.csv", content))
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"\x00\x01\x02", "is not a text file"),
+        (b"\x89PNG\r\n\x1a\n\x00", "is not a text file"),
+        ("0,1\n".encode("utf-16"), "is UTF-16 text; save it as UTF-8"),
+        (b"1,2,3\n1,2,\xb5\n", "line 2: is not UTF-8 text (byte 0xb5)"),
+    ],
+)
+def test_a_binary_csv_is_refused(tmp_path, content, expected):
+    (tmp_path / "a.csv").write_bytes(content)
+    assert expected in refusal(tmp_path / "a.csv")
+
+
+def test_a_csv_that_was_cut_off_anywhere_gives_every_line_before_the_cut_and_says_so(tmp_path):
+    values = newtons(4)
+    data = text(values).encode()
+    ends = [i + 1 for i, byte in enumerate(data) if byte == ord("\n")]
+    for cut in range(ends[0] + 1, len(data) + 1, 7):
+        for zeros in (b"", b"\0" * 100):
+            (tmp_path / "a.csv").write_bytes(data[:cut] + zeros)
+            loaded = load(tmp_path / "a.csv")
+            (frames,) = loaded.recordings.frames
+            complete = sum(end <= cut for end in ends)
+            np.testing.assert_array_equal(frames[:complete], values[:complete].astype(np.float32))
+            if len(frames) > complete:  # the cut lies in the line's last number, or at its end
+                assert cut > ends[complete] - 6 and not zeros  # noqa: PT018
+            elif cut not in ends:
+                (warning,) = messages(loaded, "warning")
+                assert f"line {complete + 1}: cut off in this line: the lines before it are kept" in warning
+
+
+def test_one_bad_file_does_not_lose_the_others(tmp_path):
+    for i in range(4):
+        write(tmp_path / f"{i}.csv", newtons(10))
+    write(tmp_path / "bad.csv", "0.1,x,0.2\n")
+    write(tmp_path / "narrow.csv", newtons(10, 219))
+    loaded = load(tmp_path)
+    assert len(loaded.recordings) == 4
+    bad, narrow = messages(loaded, "error")
+    assert "bad.csv, line 1, column 2" in bad
+    assert "narrow.csv, line 1: 219 values a frame, expected 220" in narrow
+
+
+def test_where_nothing_survives_the_first_problem_and_their_number_are_told(tmp_path):
+    for i in range(3):
+        write(tmp_path / f"{i}.csv", "a,b\nc,d\n")
+    message = refusal(tmp_path)
+    assert message.startswith(f"{tmp_path / '0.csv'}, line 2, column 1: 'c' is not a number")
+    assert message.endswith("(no recording is left; 3 errors in all)")
+
+
+def test_99_rows_where_the_others_have_100_are_kept_with_a_warning(tmp_path):
+    for i in range(10):
+        write(tmp_path / f"{i}.csv", newtons(99 if i == 4 else 100))
+    loaded = load(tmp_path)
+    assert len(loaded.recordings) == 10
+    assert messages(loaded, "error") == []
+    assert messages(loaded, "warning") == [
+        f"{tmp_path / '4.csv'}: 99 rows where the others have 100: kept; windows use whole windows only"
+    ]
+
+
+def test_99_rows_are_refused_where_100_were_asked_for(tmp_path):
+    for i in range(3):
+        write(tmp_path / f"{i}.csv", newtons(99 if i == 1 else 100))
+    loaded = load(tmp_path, frames=100)
+    assert len(loaded.recordings) == 2
+    assert messages(loaded, "error")[0].startswith(f"{tmp_path / '1.csv'}: 99 rows where 100 were expected;")
+
+
+def test_lengths_that_differ_throughout_are_no_problem(tmp_path):
+    for i in range(5):
+        write(tmp_path / f"{i}.csv", newtons(10 + i))
+    assert load(tmp_path).problems == ()
+
+
+def test_readings_outside_the_full_scale_are_kept_and_counted_with_the_first_line(tmp_path):
+    values = newtons(20)
+    values[3, 4], values[9, 0] = 7.5, -1
+    loaded = load(write(tmp_path / "a.csv", values))
+    assert loaded.recordings.frames[0][3, 4] == 7.5
+    assert "2 readings outside 0..5 N, first in line 4, the farthest 7.5: kept" in messages(loaded, "warning")[0]
+    values[3, 4], values[9, 0] = 5.05, -0.05
+    assert load(write(tmp_path / "a.csv", values)).problems == ()
+
+
+def test_a_scale_that_most_files_exceed_is_told_once(tmp_path):
+    for i in range(9):
+        write(tmp_path / f"{i}.csv", rng.uniform(0, 4000, (10, 220)))
+    (warning,) = messages(load(tmp_path, layout=PAPER), "warning")
+    assert "9 of 9 files hold readings outside 0..5 N: check the layout's full scale" in warning
+
+
+def test_a_file_is_read_in_milliseconds(tmp_path):
+    body = text(newtons())
+    for i in range(70):
+        write(tmp_path / str(i % 7) / f"{i}.csv", body)
+    start = time.process_time()
+    assert len(load(tmp_path).recordings) == 70
+    assert (time.process_time() - start) / 70 < 0.02

@@ -5,16 +5,18 @@ from __future__ import annotations
 import copy
 import math
 import time
-from dataclasses import replace
+from collections.abc import Generator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from adaptfault.adaptation import Adaptation, Stage
+from adaptfault.compact import WORTH, CompactNetwork
 from adaptfault.evaluation import evaluate
 from adaptfault.fills import CellStatistics
 from adaptfault.forecast import Forecast
@@ -65,9 +67,14 @@ class Adapter:
         return CellStatistics.fit(self.train)
 
     @cached_property
+    def compact(self) -> CompactNetwork | None:
+        """The fault-free network on fewer numbers; None where there are too few windows, or too many cells, for it."""
+        return _compact(self.model, len(self.train) + len(self.validation))
+
+    @cached_property
     def fault_free_accuracy(self) -> float:
         """Of the fault-free model on the fault-free validation windows."""
-        return evaluate(self.model, self.validation).accuracy
+        return evaluate(self.compact or self.model, self.validation).accuracy
 
     def adapt(
         self,
@@ -99,7 +106,7 @@ class Adapter:
         if method not in get_args(Method):
             raise ValueError(f"unknown method {method!r}: use one of {', '.join(get_args(Method))}")
         self._check(fault_set)
-        return _Run(self, fault_set, budget, seed, progress).go(method)
+        return Run(self, fault_set, budget, seed, progress).go(method)
 
     def forecast(self, fault_set: FaultSet) -> Forecast:
         """Say what accuracy to expect of each stage, from validation windows with F taken away.
@@ -111,9 +118,9 @@ class Adapter:
         """
         self._check(fault_set)
         windows = self.validation
-        predicted = {"fault-free": self.model.predict(windows.x)}
+        predicted = {"fault-free": logits_of(self.compact or self.model, windows.x).argmax(1).numpy()}
         if len(fault_set):
-            run = _Run(self, fault_set, None, 0, False)
+            run = Run(self, fault_set, None, 0, False)
             predicted["fill"] = run.held_out().argmax(1).numpy()
             run.head()
             predicted["head"] = run.held_out().argmax(1).numpy()
@@ -130,7 +137,22 @@ class Adapter:
             )
 
 
-class _Run:
+@dataclass(frozen=True, eq=False)
+class Lesson:
+    """Training that an adaptation asks for: as :func:`~adaptfault.training.train` takes it."""
+
+    reduced: ReducedModel
+    epochs: int
+    seed: int
+    patience: int | None
+    reserve: float = 0.0  # seconds to be left of a budget
+
+
+Trained = Generator[Lesson, History, None]  # asks for training, and is told how it went
+Work = Generator[Lesson, History, Adaptation]
+
+
+class Run:
     """One adaptation under way: ``reduced`` is the best model so far, ``logits`` its answers to the validation windows.
 
     Each answer is by a head that did not learn from that window.
@@ -140,51 +162,63 @@ class _Run:
         self, adapter: Adapter, fault_set: FaultSet, budget: float | None, seed: int, progress: bool | None
     ) -> None:
         self.adapter, self.fault_set, self.seed, self.progress = adapter, fault_set, seed, progress
-        self.began, self.budget = time.perf_counter(), budget
+        self.budget, self.device = budget, adapter.model.head.weight.device
         self.training = reduce_windows(adapter.train, fault_set)
         self.validation = reduce_windows(adapter.validation, fault_set)
         self.logits: Tensor | None = None
+        self.quick: CompactNetwork | None = None  # the network of the weights at hand, on fewer numbers
         self.head_seconds = 0.0
         statistics = adapter.statistics  # estimated once, not a cost of this F
         began = time.perf_counter()
         front = statistics.nearest(fault_set) if len(fault_set) else None
         self.stages = [Stage("fill", time.perf_counter() - began)]
-        self.reduced = ReducedModel(copy.deepcopy(adapter.model), fault_set, front).eval()
+        self.reduced = self._behind(front, copy.deepcopy(adapter.model))
 
     def go(self, method: Method) -> Adaptation:
-        """Run the stages of a method."""
+        """Run the stages of a method, each training as it comes."""
+        work = self.stages_of(method)
+        try:
+            lesson = next(work)
+            while True:
+                lesson = work.send(self._train(lesson))
+        except StopIteration as end:
+            adaptation: Adaptation = end.value
+            return adaptation
+
+    def stages_of(self, method: Method) -> Work:
+        """Run the stages of a method, but for the training: that is asked of the caller, who may train several F."""
         if not len(self.fault_set) and method != "scratch":
             return self.done()  # nothing to repair: the fault-free model, bit for bit
+        if method not in ("fill", "scratch"):
+            self.quick = self.adapter.compact  # made once, not a cost of this F
+        self.began = time.perf_counter()
         match method:
-            case "fill":
-                pass
             case "scratch":
-                self.scratch()
+                yield from self.scratch()
             case "head":
                 self.head()
             case "finetune":
                 self.head()
-                self.finetune()
+                yield from self.finetune()
             case "auto":
-                for stage in (self.head, self.finetune) if self.budget is not None else (self.head,):
-                    if self.accuracy() >= _ENOUGH * self.adapter.fault_free_accuracy:
-                        break
-                    stage()
+                if self.accuracy() < _ENOUGH * self.adapter.fault_free_accuracy:
+                    self.head()
+                    if self.budget is not None and self.accuracy() < _ENOUGH * self.adapter.fault_free_accuracy:
+                        yield from self.finetune()
         return self.done()
 
     def head(self) -> None:
         """Fit a new head in closed form; kept if validation agrees that it is better."""
-        linear = self.adapter.statistics.linear(self.fault_set)
-        self._keep_better("head", ReducedModel(self.reduced.network, self.fault_set, linear).eval())
+        self._keep_better("head", self._behind(self.adapter.statistics.linear(self.fault_set), self.reduced.network))
 
-    def finetune(self) -> None:
+    def finetune(self) -> Trained:
         """Train on, front end included, in rounds that each end with a new head; stop when a round brings nothing.
 
         A larger budget only allows more of the same rounds, so it never ends worse.
         """
         network = copy.deepcopy(self.adapter.model)
-        reduced = ReducedModel(network, self.fault_set, self.adapter.statistics.linear(self.fault_set)).eval()
-        features = self._views(reduced, self.training)[0].double().numpy()
+        reduced = self._behind(self.adapter.statistics.linear(self.fault_set), network)
+        features = self._views(reduced, self.training)[0].cpu().double().numpy()
         weight, bias = linear_head(features, self.training.y, network.n_classes)
         network.head.load_state_dict({"weight": weight, "bias": bias})
         idle, took = 0, 0.0
@@ -192,30 +226,30 @@ class _Run:
             if idle > _ROUND_PATIENCE or self.left() < took + self.head_seconds:
                 break
             began = time.perf_counter()
-            history = self._train(
-                reduced, _ROUND_EPOCHS, seed=self.seed * _ROUNDS + number, reserve=self.head_seconds, patience=None
-            )
+            self.quick = None  # of other weights
+            history = yield Lesson(reduced, _ROUND_EPOCHS, self.seed * _ROUNDS + number, None, self.head_seconds)
             if history.stopped == "budget":
                 break
+            self.quick = _compact(network, len(self.training) + len(self.validation))
             took = time.perf_counter() - began
             better = self._keep_better("finetune", copy.deepcopy(reduced), began)
             idle = 0 if better else idle + 1
 
-    def scratch(self) -> None:
+    def scratch(self) -> Trained:
         """Train a new network behind the fill, as the paper does for each F."""
         model = self.adapter.model
         fresh = type(model).from_config({**model.config, "seed": self.seed + 1})
-        self.reduced = ReducedModel(fresh, self.fault_set, self.adapter.statistics.linear(self.fault_set))
+        self.reduced = self._behind(self.adapter.statistics.linear(self.fault_set), fresh)
         self.stages.clear()
         began = time.perf_counter()
-        history = self._train(self.reduced, _SCRATCH_EPOCHS, seed=self.seed, patience=_SCRATCH_PATIENCE)
+        history = yield Lesson(self.reduced, _SCRATCH_EPOCHS, self.seed, _SCRATCH_PATIENCE)
         self.stages.append(Stage("scratch", time.perf_counter() - began, history.best_accuracy))
         self.logits = None
 
     def held_out(self) -> Tensor:
         """Return the logits ``[N, n_classes]`` of the validation windows, from what did not learn from them."""
         if self.logits is None:
-            self.logits = logits_of(self.reduced, self.validation.x)
+            self.logits = logits_of(self._quickly(self.reduced), self.validation.x)
         return self.logits
 
     def accuracy(self) -> float:
@@ -233,6 +267,7 @@ class _Run:
         return math.inf if self.budget is None else self.budget - (time.perf_counter() - self.began)
 
     def done(self) -> Adaptation:
+        """Return the adaptation as it stands."""
         return Adaptation(
             self.reduced.eval(),
             self.fault_set,
@@ -273,11 +308,23 @@ class _Run:
         folds = np.unique(self.validation.recording, return_inverse=True)[1] % _FOLDS
         return fit_head(first, second, adapter.targets[learnt], adapter.validation_targets, folds)
 
+    def _behind(self, front: nn.Module | None, network: TactileTransformer) -> ReducedModel:
+        """Return the reduced model of a front end and a network, on the adapter's device."""
+        return ReducedModel(network, self.fault_set, front).to(self.device).eval()
+
+    def _quickly(self, reduced: ReducedModel) -> ReducedModel:
+        """Return the same model with its network on fewer numbers, where there is such a one of these weights."""
+        if self.quick is None:
+            return reduced
+        same = ReducedModel(reduced.network, self.fault_set, reduced.front, reduced.head)
+        same.add_module("network", self.quick)
+        return same.eval()
+
     def _views(self, reduced: ReducedModel, windows: Windows) -> tuple[Tensor, Tensor]:
-        """Return both views of windows, computed in batches."""
-        reduced.eval()
+        """Return both views of windows, computed in batches, on the adapter's device."""
+        quick = self._quickly(reduced.eval())
         with torch.no_grad():
-            views = [reduced.views(x) for x in torch.split(as_tensor(windows.x), _BATCH)]
+            views = [quick.views(x.to(self.device)) for x in torch.split(as_tensor(windows.x), _BATCH)]
         return torch.cat([v[0] for v in views]), torch.cat([v[1] for v in views])
 
     def _too_long(self, reduced: ReducedModel, n: int) -> bool:
@@ -298,19 +345,24 @@ class _Run:
         fit = (time.perf_counter() - began) * (n / m) ** 1.8  # between the forest's 1 and the kernel's 3
         return bool(pace * n + fit > self.left())
 
-    def _train(
-        self, reduced: ReducedModel, epochs: int, *, seed: int, patience: int | None, reserve: float = 0.0
-    ) -> History:
+    def _train(self, lesson: Lesson) -> History:
         return train(
-            reduced,
+            lesson.reduced,
             self.training,
             self.validation,
-            epochs=epochs,
-            patience=patience,
-            budget=None if self.budget is None else max(0.0, self.left() - reserve),
-            seed=seed,
+            epochs=lesson.epochs,
+            patience=lesson.patience,
+            budget=None if self.budget is None else max(0.0, self.left() - lesson.reserve),
+            seed=lesson.seed,
             progress=self.progress,
         )
+
+
+def _compact(network: TactileTransformer, n: int) -> CompactNetwork | None:
+    """Return the network on fewer numbers, where that is worth its while for n windows."""
+    if n < WORTH or not CompactNetwork.suits(network):
+        return None
+    return CompactNetwork(network).to(network.head.weight.device)
 
 
 def _labelled(model: TactileTransformer, windows: Windows) -> tuple[Windows, NDArray[np.float32]]:

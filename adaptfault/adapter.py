@@ -103,9 +103,7 @@ class Adapter:
         Raises:
             ValueError: an unknown method, F over another number of cells, or no healthy cell left.
         """
-        if method not in get_args(Method):
-            raise ValueError(f"unknown method {method!r}: use one of {', '.join(get_args(Method))}")
-        self._check(fault_set)
+        self.check(fault_set, method)
         return Run(self, fault_set, budget, seed, progress).go(method)
 
     def forecast(self, fault_set: FaultSet) -> Forecast:
@@ -116,7 +114,7 @@ class Adapter:
         Raises:
             ValueError: F over another number of cells, or no healthy cell left.
         """
-        self._check(fault_set)
+        self.check(fault_set)
         windows = self.validation
         predicted = {"fault-free": logits_of(self.compact or self.model, windows.x).argmax(1).numpy()}
         if len(fault_set):
@@ -126,7 +124,21 @@ class Adapter:
             predicted["head"] = run.held_out().argmax(1).numpy()
         return Forecast.of(fault_set, windows.y, windows.recording, predicted)
 
-    def _check(self, fault_set: FaultSet) -> None:
+    def to(self, device: str | torch.device) -> Adapter:
+        """Return an adapter that works on a device, as "cuda"; this one stays. What it adapts is on that device too."""
+        other = copy.copy(self)
+        other.model = copy.deepcopy(self.model).to(device)
+        other.__dict__.pop("compact", None)  # is on the device that it was made on
+        return other
+
+    def check(self, fault_set: FaultSet, method: Method = "auto") -> None:
+        """Refuse what cannot be adapted to.
+
+        Raises:
+            ValueError: an unknown method, F over another number of cells, or no healthy cell left.
+        """
+        if method not in get_args(Method):
+            raise ValueError(f"unknown method {method!r}: use one of {', '.join(get_args(Method))}")
         d = self.train.x.shape[2]
         if fault_set.n_cells != d:
             raise ValueError(f"F is over {fault_set.n_cells} cells, the model over {d}")

@@ -20,7 +20,7 @@ from adaptfault.network import BLOCKS, HEAD_DIM, HEADS, HIDDEN, EncoderBlock, Ta
 _UPDATES = BLOCKS * (HEADS * HEAD_DIM + HIDDEN + 2)  # numbers that the blocks add to those of a frame's cells
 _MOST = 20_000_000  # numbers in a basis; beyond that the decomposition costs more than it is worth
 _DEPENDENT = 1e-5  # columns of which less is left beside the others are not decomposed by the quick way
-WORTH = 2000  # windows that take the network as long as it takes to be folded and to run the folded one, twice over
+_WORTH = 2000  # windows that take the network as long as it takes to be folded and to run the folded one, twice over
 
 
 class _Wide:
@@ -120,6 +120,13 @@ class CompactNetwork(nn.Module):
         """Map windows ``[N, T, D]`` to logits ``[N, n_classes]``."""
         logits: Tensor = self.head(self.features(x))
         return logits
+
+
+def compacted(network: TactileTransformer, n: int) -> CompactNetwork | None:
+    """Return a network on fewer numbers, on its device, where making it is worth its while for ``n`` windows."""
+    if n < _WORTH or not CompactNetwork.suits(network):
+        return None
+    return CompactNetwork(network).to(network.head.weight.device)
 
 
 def _orthonormal(columns: Tensor) -> tuple[Tensor, Tensor]:

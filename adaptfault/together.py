@@ -21,11 +21,12 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from tqdm import tqdm
 
 from adaptfault.adaptation import Adaptation
-from adaptfault.adapter import Adapter, Lesson, Method, Run
+from adaptfault.adapter import Adapter
 from adaptfault.fills import AffineFill
 from adaptfault.history import History
 from adaptfault.network import as_tensor, logits_of
 from adaptfault.reduction import ReducedModel
+from adaptfault.stages import Lesson, Method, Run
 from adaptfault.training import Optimisation, seeded
 from adaptfault.windows import Windows
 from diagnostics import FaultSet

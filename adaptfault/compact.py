@@ -19,6 +19,8 @@ from adaptfault.network import BLOCKS, HEAD_DIM, HEADS, HIDDEN, EncoderBlock, Ta
 
 _UPDATES = BLOCKS * (HEADS * HEAD_DIM + HIDDEN + 2)  # numbers that the blocks add to those of a frame's cells
 _MOST = 20_000_000  # numbers in a basis; beyond that the decomposition costs more than it is worth
+_DEPENDENT = 1e-5  # columns of which less is left beside the others are not decomposed by the quick way
+_WORTH = 2000  # windows that take the network as long as it takes to be folded and to run the folded one, twice over
 
 
 class _Wide:
@@ -34,7 +36,7 @@ class _Wide:
     def add_and_norm(self, layer: nn.Linear, norm: nn.LayerNorm) -> tuple[CompactNorm, _Wide]:
         """Return what maps y and the values that ``layer`` reads to the new y, after ``norm(x + layer(values))``."""
         rows = torch.cat([self.basis, layer.weight.T, (self.offset + layer.bias)[None]])
-        directions, lengths = torch.linalg.qr((rows - rows.mean(1, keepdim=True)).T)  # (d, k'), (k', rows)
+        directions, lengths = _orthonormal((rows - rows.mean(1, keepdim=True)).T)  # (d, k'), (k', rows)
         folded = CompactNorm(_linear(lengths[:, :-1], lengths[:, -1]), rows.shape[1], norm.eps)
         return folded, _Wide(directions.T * norm.weight, norm.bias)
 
@@ -118,6 +120,23 @@ class CompactNetwork(nn.Module):
         """Map windows ``[N, T, D]`` to logits ``[N, n_classes]``."""
         logits: Tensor = self.head(self.features(x))
         return logits
+
+
+def compacted(network: TactileTransformer, n: int) -> CompactNetwork | None:
+    """Return a network on fewer numbers, on its device, where making it is worth its while for ``n`` windows."""
+    if n < _WORTH or not CompactNetwork.suits(network):
+        return None
+    return CompactNetwork(network).to(network.head.weight.device)
+
+
+def _orthonormal(columns: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the QR decomposition of double ``columns [d, n]``; by Cholesky, half the time, where that is as exact."""
+    root, failed = torch.linalg.cholesky_ex(columns.T @ columns)
+    left = root.diagonal()
+    if failed or left.min() < _DEPENDENT * left.max():
+        directions, lengths = torch.linalg.qr(columns)
+        return directions, lengths
+    return torch.linalg.solve_triangular(root, columns.T, upper=False).T, root.T
 
 
 def _linear(weight: Tensor, bias: Tensor) -> nn.Linear:

@@ -168,8 +168,8 @@ class NearestFill(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Map ``[N, T, D-k]`` to ``[N, T, D]``; what is filled in lies within 0..1."""
         # The frame's own square is the same for every neighbour, so the softmax does without it.
-        distance = self.roots.square().sum(1) - 2 * x.clamp_min(0.0).sqrt() @ self.roots.T  # (N, T, M)
-        weights = torch.softmax(-distance / self.width, dim=-1)
+        roots, own = x.clamp_min(0.0).sqrt() * (2 / self.width), self.roots.square().sum(1) / -self.width
+        weights = torch.softmax(nn.functional.linear(roots, self.roots, own), dim=-1)  # (N, T, M), in one pass
         return self.linear.merge(x, self.linear.missing(x) + weights @ self.residuals)
 
 

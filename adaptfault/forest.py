@@ -34,10 +34,11 @@ class Forest(nn.Module):
 
     @classmethod
     def fit(cls, x: Tensor, y: NDArray[np.int64], n_classes: int, *, seed: int = 0) -> Forest:
-        """Grow trees on ``x [M, p]`` and classes ``y [M]``."""
+        """Grow trees on ``x [M, p]`` and classes ``y [M]``, with as many threads as torch; they come to x's device."""
         from sklearn.ensemble import ExtraTreesClassifier
 
-        grown = ExtraTreesClassifier(_TREES, random_state=seed).fit(x.numpy(), y)
+        # The number of threads does not change the trees: each has a seed of its own.
+        grown = ExtraTreesClassifier(_TREES, random_state=seed, n_jobs=torch.get_num_threads()).fit(x.cpu().numpy(), y)
         trees = [estimator.tree_ for estimator in grown.estimators_]
         most = max(tree.node_count for tree in trees)
         nodes, thresholds = np.zeros((_TREES, most, 3), np.int64), np.full((_TREES, most), np.inf, np.float32)
@@ -49,7 +50,8 @@ class Forest(nn.Module):
             nodes[i, :n, 2] = np.where(leaf, itself, tree.children_right)
             thresholds[i, :n] = np.where(leaf, np.inf, _as_float32(tree.threshold))
         depth = max(tree.max_depth for tree in trees)
-        return cls(torch.from_numpy(nodes), torch.from_numpy(thresholds), depth, n_classes)
+        forest = cls(torch.from_numpy(nodes), torch.from_numpy(thresholds), depth, n_classes)
+        return forest.to(x.device)
 
     @classmethod
     def empty(cls, about: dict[str, Any]) -> Forest:

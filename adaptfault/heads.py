@@ -58,8 +58,8 @@ class KernelHead(nn.Module):
         super().__init__()
         for i, view in enumerate(views):
             self.register_buffer(f"known{i}", view)
-        self.register_buffer("widths", torch.as_tensor(widths, dtype=torch.float32))
-        self.register_buffer("shares", torch.as_tensor(shares, dtype=torch.float32))
+        self.register_buffer("widths", torch.as_tensor(widths, dtype=torch.float32, device=weights.device))
+        self.register_buffer("shares", torch.as_tensor(shares, dtype=torch.float32, device=weights.device))
         self.register_buffer("weights", weights)
         self.register_buffer("bias", bias)
 
@@ -139,7 +139,7 @@ class KernelFit:
     """Kernel heads for known windows, with several shares of the views, each tried on windows held out of it.
 
     Args:
-        views: of the M known windows, each ``[M, p]``.
+        views: of the M known windows, each ``[M, p]``, on the device that is to do the work.
         targets: ``[M, n_classes]``, 1 at each window's class, or probabilities; a class with none is never the answer.
         folds: int ``[n]``; the last n windows are held out in turn, those of one fold together.
     """
@@ -148,7 +148,7 @@ class KernelFit:
         self.views, self.targets, self.folds = views, targets, folds
         distances = [_squared_distance(view, view) for view in views]
         self.widths = [_WIDTH * (float(d.median()) or 1.0) for d in distances]
-        self.kernels = [torch.exp(-d / width).numpy() for d, width in zip(distances, self.widths, strict=True)]
+        self.kernels = [d.div_(-width).exp_() for d, width in zip(distances, self.widths, strict=True)]
 
     def fit(self, shares: Sequence[float]) -> tuple[KernelHead, Tensor]:
         """Fit a head on all windows.
@@ -157,37 +157,38 @@ class KernelFit:
         solve for each fold.
 
         Returns:
-            The head, whose logits have no scale yet (:func:`calibrate`), and ``[n, n_classes]``, the logits that each
-            held-out window gets from a head fitted without its fold.
+            The head, whose logits have no scale yet (:func:`calibrate`), and on the CPU ``[n, n_classes]``, the logits
+            that each held-out window gets from a head fitted without its fold.
         """
-        from scipy.linalg import cho_factor, cho_solve
-
-        kernel = np.zeros_like(self.kernels[0])
+        kernel = torch.zeros_like(self.kernels[0])
         for share, of_view in zip(shares, self.kernels, strict=True):
-            kernel += np.float32(share) * of_view
-        kernel[np.diag_indices_from(kernel)] += _RIDGE
-        n_classes = self.targets.shape[1]
-        targets = self.targets - np.float32(1 / n_classes)
-        m = len(targets) - len(self.folds)  # never held out
-        between = kernel[:m, m:]
-        solved = cho_solve(cho_factor(kernel[:m, :m], check_finite=False), np.hstack([between, targets[:m]]))
-        from_others, first = solved[:, : len(self.folds)], solved[:, len(self.folds) :]
+            if share:
+                kernel.add_(of_view, alpha=share)
+        kernel.diagonal().add_(_RIDGE)
+        n_classes, n = self.targets.shape[1], len(self.folds)
+        targets = torch.from_numpy(self.targets - np.float32(1 / n_classes)).to(kernel.device)
+        m = len(targets) - n  # never held out
+        root = torch.linalg.cholesky(kernel[:m, :m])
+        # Halfway through the solve: the rest needs no more than products of this.
+        half = torch.linalg.solve_triangular(root, torch.cat([kernel[:m, m:], targets[:m]], dim=1), upper=False)
+        between, first = half[:, :n], half[:, n:]
         expected = between.T @ first  # of the held-out windows by the others
-        rest, surprise = kernel[m:, m:] - between.T @ from_others, targets[m:] - expected
+        rest, surprise = kernel[m:, m:] - between.T @ between, targets[m:] - expected
 
-        held_out = np.empty_like(surprise)
-        for fold in np.unique(self.folds):
-            out, known = self.folds == fold, self.folds != fold
-            within = cho_factor(rest[np.ix_(known, known)], check_finite=False)
-            held_out[out] = expected[out] + rest[np.ix_(out, known)] @ cho_solve(within, surprise[known])
-        last = cho_solve(cho_factor(rest, check_finite=False), surprise)
-        weights = np.vstack([first - from_others @ last, last])
+        held_out = torch.empty_like(surprise)
+        folds = torch.from_numpy(self.folds).to(kernel.device)
+        for fold in torch.unique(folds):
+            out, known = folds == fold, folds != fold
+            within = torch.linalg.cholesky(rest[known][:, known])
+            held_out[out] = expected[out] + rest[out][:, known] @ torch.cholesky_solve(surprise[known], within)
+        last = torch.cholesky_solve(surprise, torch.linalg.cholesky(rest))
+        weights = torch.cat([torch.linalg.solve_triangular(root.T, first - between @ last, upper=True), last])
 
         lacking = torch.from_numpy(self.targets.max(axis=0) == 0)
         bias = torch.zeros(n_classes).masked_fill(lacking, _NO_CLASS)
-        logits = torch.from_numpy(held_out.astype(np.float32)).masked_fill(lacking, _NO_CLASS)
-        weights_ = torch.from_numpy(weights.astype(np.float32)).masked_fill(lacking, 0.0)
-        return KernelHead(self.views, self.widths, shares, weights_, bias), logits
+        weights = weights.masked_fill(lacking.to(weights.device), 0.0)
+        head = KernelHead(self.views, self.widths, shares, weights, bias.to(weights.device))
+        return head, held_out.cpu().masked_fill(lacking, _NO_CLASS)
 
 
 def fit_head(
@@ -222,7 +223,7 @@ def fit_head(
     for half in (0, 1):  # held out in turn
         known, out = folds % 2 != half, folds % 2 == half
         grown = Forest.fit(torch.cat([training[1], held[1][known]]), np.concatenate([classes, y[known]]), n_classes)
-        voted[out] = grown(held[1][out])
+        voted[out] = grown(held[1][out]).cpu()
     scale, _ = calibrate(voted, y)
     losses = [calibrate(blend(logits, scale * voted, share), y)[1] for share in _KERNEL_SHARES]
     share = _KERNEL_SHARES[int(np.argmin(losses))]

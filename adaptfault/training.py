@@ -137,7 +137,7 @@ def train(
             while (stopped := _stop(run.history, epochs, patience, clock, n)) is None:
                 began = time.perf_counter()
                 model.train()
-                with _seeded(seed, run.history.epochs, device) as generator:
+                with seeded(seed, run.history.epochs, device) as generator:
                     order = torch.split(torch.randperm(n, generator=generator), batch_size)
                     loss, seen = _pass(run, source, order, augment, generator, clock)
                 if seen < n and run.history.epochs:
@@ -202,13 +202,11 @@ class _Source:
         return x
 
 
-class _Run:
-    """A run's moving parts: model, best weights, Adam's moments and history, on disk too where there is a path."""
+class Optimisation:
+    """Adam on a model's parameters, fused, and their exponential average."""
 
-    def __init__(self, model: nn.Module, learning_rate: float, averaging: float, path: Path | None) -> None:
-        self.model, self.averaging, self.path, self.history = model, averaging, path, History()
-        frozen = {name for name, p in model.named_parameters() if not p.requires_grad}
-        self.names = [name for name in model.state_dict() if name not in frozen]  # what training changes
+    def __init__(self, model: nn.Module, learning_rate: float, averaging: float) -> None:
+        self.averaging = averaging
         self.trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
         if not self.trained:
             raise ValueError("nothing to train: every parameter of the model has requires_grad False")
@@ -216,12 +214,6 @@ class _Run:
         self.optimizer = torch.optim.Adam(self.trained.values(), lr=learning_rate, fused=True)
         self.average = {name: p.detach().clone() for name, p in self.trained.items()}
         self.steps = 0
-        self.best = self._weights()
-        self.settings: dict[str, Any] = {}
-
-    def _weights(self) -> dict[str, Tensor]:
-        state = self.model.state_dict()
-        return {name: state[name].detach().clone(memory_format=torch.contiguous_format) for name in self.names}
 
     @torch.no_grad()
     def follow(self) -> None:
@@ -242,6 +234,22 @@ class _Run:
     def _swap(self) -> None:
         for name, parameter in self.trained.items():
             parameter.data, self.average[name] = self.average[name], parameter.data
+
+
+class _Run(Optimisation):
+    """A run's moving parts: model, best weights, Adam's moments and history, on disk too where there is a path."""
+
+    def __init__(self, model: nn.Module, learning_rate: float, averaging: float, path: Path | None) -> None:
+        super().__init__(model, learning_rate, averaging)
+        self.model, self.path, self.history = model, path, History()
+        frozen = {name for name, p in model.named_parameters() if not p.requires_grad}
+        self.names = [name for name in model.state_dict() if name not in frozen]  # what training changes
+        self.best = self._weights()
+        self.settings: dict[str, Any] = {}
+
+    def _weights(self) -> dict[str, Tensor]:
+        state = self.model.state_dict()
+        return {name: state[name].detach().clone(memory_format=torch.contiguous_format) for name in self.names}
 
     def restore_best(self) -> None:
         self.model.load_state_dict(self.best, strict=False)
@@ -323,7 +331,7 @@ def _stop(history: History, epochs: int, patience: int | None, clock: Clock, who
 
 
 @contextmanager
-def _seeded(seed: int, epoch: int, device: torch.device) -> Iterator[torch.Generator]:
+def seeded(seed: int, epoch: int, device: torch.device) -> Iterator[torch.Generator]:
     """Give an epoch its own random numbers, dropout's too, so that a resumed run draws what an unbroken one would."""
     state = int(np.random.SeedSequence([seed, epoch]).generate_state(1, np.uint64)[0] >> np.uint64(1))
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):

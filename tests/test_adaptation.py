@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from adaptfault import compact
 from adaptfault.adaptation import Adaptation
 from adaptfault.adapter import Adapter
 from adaptfault.evaluation import evaluate
@@ -93,6 +94,18 @@ def test_each_stage_repairs_and_none_is_worse_than_the_one_before(adapter):
     assert collapsed < 0.7
     assert reached[0] > 0.75
     assert reached == sorted(reached)
+
+
+def test_the_network_on_fewer_numbers_gives_the_same_head_and_forecast(adapter, monkeypatch):
+    assert adapter.compact is None
+    monkeypatch.setattr(compact, "_WORTH", 1)
+    quick = Adapter(adapter.model, adapter.train, adapter.validation)
+    assert quick.compact is not None
+    usual, same = (a.adapt(F, method="head").predict_proba(adapter.validation.x) for a in (adapter, quick))
+    np.testing.assert_allclose(same, usual, atol=1e-4)
+    assert {n: s.accuracy for n, s in quick.forecast(F).stages.items()} == pytest.approx(
+        {n: s.accuracy for n, s in adapter.forecast(F).stages.items()}, abs=1 / 120
+    )
 
 
 def test_auto_stops_at_the_first_stage_that_is_enough(adapter):

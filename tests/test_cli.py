@@ -175,6 +175,11 @@ def test_a_label_table_that_names_a_missing_file_is_told_and_the_rest_is_used(tm
         (["adapt", "{home}/model", "{home}/grasps.npz", "--forecast"], "nothing to do"),
         (["adapt", "{home}/model", "--faults", "1", "--forecast"], "give the fault-free recordings"),
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--adapted", "{home}/gone"], "gone"),
+        (["evaluate", "{home}/model", "{home}/grasps.npz", "--device", "abacus"], "--device abacus"),
+        (
+            ["adapt", "{home}/model", "{home}/grasps.npz", "--faults", "1", "--forecast", "--device", "abacus"],
+            "--device abacus",
+        ),
     ],
 )
 def test_unusable_input_is_one_line_and_exit_code_3(home, small, arguments, message, capsys):

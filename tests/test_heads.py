@@ -27,7 +27,7 @@ def test_the_head_is_kernel_ridge_regression():
     views, y = windows()
     fit = KernelFit(views, one_hot(y), np.zeros(30, int))
     head, _ = fit.fit((0.5, 0.5))
-    kernel = 0.5 * fit.kernels[0] + 0.5 * fit.kernels[1]
+    kernel = 0.5 * fit.kernels[0].numpy() + 0.5 * fit.kernels[1].numpy()
     expected = kernel @ np.linalg.solve(kernel + 0.05 * np.eye(90), one_hot(y) - 1 / 3)
     np.testing.assert_allclose(head(views).numpy(), expected, atol=1e-4)
 
@@ -37,7 +37,7 @@ def test_held_out_logits_are_those_of_a_head_fitted_without_that_fold():
     folds = np.arange(30) % 3
     fit = KernelFit(views, one_hot(y), folds)
     _, logits = fit.fit((0.7, 0.3))
-    kernel = 0.7 * fit.kernels[0] + 0.3 * fit.kernels[1]
+    kernel = 0.7 * fit.kernels[0].numpy() + 0.3 * fit.kernels[1].numpy()
     for fold in range(3):
         out = 60 + np.flatnonzero(folds == fold)
         known = np.setdiff1d(np.arange(90), out)

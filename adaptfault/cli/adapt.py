@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.options import (
     Commands,
+    add_device,
     add_recordings,
     command,
+    device,
     emit,
     fault_set,
     load_recordings,
@@ -48,6 +50,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("--budget", type=float, metavar="S", help="seconds of training allowed")
     parser.add_argument("--seed", type=int, default=0, help="of training (default 0)")
+    add_device(parser)
     parser.set_defaults(run=run)
 
 
@@ -68,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
         lines.append(f"adapter kept: {args.keep}")
     if args.faults is not None:
         faults = fault_set(args.faults, adapter.model.layout)
+        adapter = adapter.to(device(args))
         if args.forecast:
             say(args, f"{len(faults)} of {faults.n_cells} cells are faulty; forecasting")
             forecast = adapter.forecast(faults)

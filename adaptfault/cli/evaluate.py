@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from adaptfault.cli.inject_option import INJECT_HELP, parse_faults
-from adaptfault.cli.options import Commands, add_recordings, command, emit, load_recordings
+from adaptfault.cli.options import Commands, add_device, add_recordings, command, device, emit, load_recordings
 
 _EXAMPLE = """  adaptfault evaluate model grasps/ --inject random:5=short
   adaptfault evaluate model grasps/ --inject row:0:3=open --adapted adapted"""
@@ -20,6 +20,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--inject", action="append", default=[], metavar="FAULT", help=INJECT_HELP)
     parser.add_argument("--seed", type=int, default=0, help="of random faults (default 0)")
     parser.add_argument("--all", action="store_true", help="score on all recordings, not only on the test share")
+    add_device(parser)
     parser.set_defaults(run=run)
 
 
@@ -35,6 +36,7 @@ def run(args: argparse.Namespace) -> int:
     model, manifest = open_model(args.model)
     recordings = load_recordings(args, args.recordings, labelled=True)
     classifier = Adaptation.load(args.adapted) if args.adapted else model
+    (classifier.model if isinstance(classifier, Adaptation) else model).to(device(args))
     if isinstance(classifier, Adaptation) and classifier.fault_set.n_cells != model.layout.n_cells:
         raise ValueError(f"{args.adapted}: an adaptation over {classifier.fault_set.n_cells} cells, not of this model")
     windows = windows_of(recordings, model, manifest) if args.all else parts_of(recordings, model, manifest)[2]

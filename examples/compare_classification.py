@@ -120,8 +120,9 @@ def compare(tasks: Iterator[Task], peers: list[Peer], few: bool, path: Path) -> 
         sets = {"none": FaultSet((), task.layout.n_cells)} | {name: known[name] for name in wanted if name in known}
         for peer in peers:
             done = {(row.name, row.faults) for row in rows if row.seed == task.seed}
+            anew = peer.protocol == "anew"  # without a fault there is nothing to learn anew
             try:
-                for row in measure(peer, task, sets, done):
+                for row in measure(peer, task, {k: f for k, f in sets.items() if len(f) or not anew}, done):
                     rows.append(row)
                     fresh = not path.exists()
                     with path.open("a", newline="") as file:
@@ -228,7 +229,7 @@ def main() -> None:
         "--networks", type=Path, help="fault-free networks instead of training them: --out of adaptation_figures.py"
     )
     parser.add_argument("--only", nargs="+", metavar="NAME", help="peers, by the start of their names")
-    parser.add_argument("--out", type=Path, default=Path("compare"), help="folder for classification.csv and .png")
+    parser.add_argument("--out", type=Path, default=Path("comparison"), help="folder for classification.csv and .png")
     options = parser.parse_args()
     simulated = options.simulated or options.recordings is None
     small = options.small or (options.recordings is None and not options.simulated)

@@ -129,7 +129,7 @@ def race(parts: tuple, layout: SensorLayout, names: list[str], options: argparse
     setup = Setup(layout, *parts, seed, options.epochs, options.small)
     model = af.TactileTransformer(layout, setup.n_classes, length=parts[0].x.shape[1], seed=seed)
     setup.weights.update({name: value.numpy() for name, value in model.state_dict().items()})
-    Race(names, setup, results).run(*((1, 2) if options.small else (5, 512)))
+    Race(names, setup, results).run(*((1, 2) if options.small else (5, 20)))
 
 
 def show(results: dict[str, Result]) -> None:
@@ -235,7 +235,7 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=10, help="default 10")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of split and weights (default 0)")
     parser.add_argument("--small", action="store_true", help="a few simulated grasps, one epoch")
-    parser.add_argument("--out", type=Path, default=Path("compare"), help="folder for keras.csv and keras.png")
+    parser.add_argument("--out", type=Path, default=Path("comparison"), help="folder for keras.csv and keras.png")
     options = parser.parse_args()
     options.small = options.small or options.recordings is None
     if options.small:

@@ -83,6 +83,8 @@ def measure(peer: Peer, task: Task, sets: dict[str, FaultSet], done: set[tuple[s
     """Yield a row for each of the peer's classifiers and each fault set that is not done yet."""
     if all((name, faults) in done for name in peer.rows for faults in sets):
         return
+    with quiet():
+        peer.warm_up(task)
     with quiet(), Stopwatch() as before:
         prepared = peer.prepare(task)
     unknown = peer.prepare is adaptfault and task.networks is not None  # what the network took elsewhere

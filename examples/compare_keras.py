@@ -28,6 +28,7 @@ import numpy as np
 from compare.stacks import OURS, STACKS, Failure, Setup, serve
 
 import adaptfault as af
+from adaptfault.windows import evenly
 from diagnostics import SensorLayout
 
 BATCHES = (1, 256)
@@ -129,7 +130,7 @@ def race(parts: tuple, layout: SensorLayout, names: list[str], options: argparse
     setup = Setup(layout, *parts, seed, options.epochs, options.small)
     model = af.TactileTransformer(layout, setup.n_classes, length=parts[0].x.shape[1], seed=seed)
     setup.weights.update({name: value.numpy() for name, value in model.state_dict().items()})
-    Race(names, setup, results).run(*((1, 2) if options.small else (5, 20)))
+    Race(names, setup, results).run(*((1, 2) if options.small else (5, 10)))
 
 
 def show(results: dict[str, Result]) -> None:
@@ -234,6 +235,7 @@ def main() -> None:
     parser.add_argument("recordings", nargs="?", help="labelled recordings of a healthy array")
     parser.add_argument("--epochs", type=int, default=10, help="default 10")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of split and weights (default 0)")
+    parser.add_argument("--windows", type=int, default=10**9, help="train on at most so many (default: all)")
     parser.add_argument("--small", action="store_true", help="a few simulated grasps, one epoch")
     parser.add_argument("--out", type=Path, default=Path("comparison"), help="folder for keras.csv and keras.png")
     options = parser.parse_args()
@@ -244,11 +246,17 @@ def main() -> None:
     windows = af.make_windows(recordings.frames, recordings.labels, recordings.layout)
     windows = af.Windows(windows.x * recordings.layout.present.ravel(), windows.y, windows.recording)
     names = installed()
-    print(f"{windows}; epochs {options.epochs}, seeds {options.seeds}, one thread a stack")
+    few = f"at most {options.windows} to train on; " if options.windows < len(windows) else ""
+    print(f"{windows}; {few}epochs {options.epochs}, seeds {options.seeds}, one thread a stack")
     results = {name: Result() for name in names}
     for seed in options.seeds:
-        race(af.split(windows, seed=seed), recordings.layout, names, options, seed, results)
+        train, *rest = af.split(windows, seed=seed)
+        race(
+            (train.select(evenly(len(train), options.windows)), *rest), recordings.layout, names, options, seed, results
+        )
     results = {name: result for name, result in results.items() if result.megabytes}
+    if OURS not in results:
+        raise SystemExit(f"{OURS} failed: there is nothing to compare with")
     show(results)
     options.out.mkdir(parents=True, exist_ok=True)
     write(results, options.out / "keras.csv")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -157,7 +157,7 @@ def minirocket(task: Task, cells: np.ndarray) -> Predict:
 
 
 def minirocket_ready(task: Task) -> Repair:
-    """It takes no NaN: a dead cell reads its healthy mean."""
+    """Let a dead cell read its healthy mean: it takes no NaN."""
     predict, mean = minirocket(task, task.healthy()), task.x.mean(axis=(0, 1))
 
     def repair(faults: FaultSet) -> Predict:
@@ -194,6 +194,16 @@ def grud_anew(task: Task) -> Repair:
     return repair
 
 
+def minirocket_anew(task: Task) -> Repair:
+    return lambda faults: minirocket(task, task.healthy(faults))
+
+
+def compile_minirocket(task: Task) -> None:
+    """Let numba compile, which it does once and not while a clock runs."""
+    few = [windows.select(evenly(len(windows), 40)) for windows in (task.train, task.validation)]
+    minirocket(replace(task, train=few[0], validation=few[1], effort=SMALL), task.healthy())(task.test.x[:2])
+
+
 @dataclass(frozen=True)
 class Peer:
     """A classifier, where it comes from, when it learns, and what it does before the fault."""
@@ -202,6 +212,7 @@ class Peer:
     package: str
     protocol: str  # ready, adapted or anew
     prepare: Callable[[Task], Repair | dict[str, Repair]]
+    warm_up: Callable[[Task], None] = lambda task: None  # not timed
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -230,8 +241,8 @@ PEERS = (
             lambda task: HistGradientBoostingClassifier(max_iter=task.effort.trees, random_state=task.seed),
         ),
     ),
-    Peer("MiniRocket ready", "aeon", "ready", minirocket_ready),
-    Peer("MiniRocket anew", "aeon", "anew", lambda task: lambda faults: minirocket(task, task.healthy(faults))),
+    Peer("MiniRocket ready", "aeon", "ready", minirocket_ready, compile_minirocket),
+    Peer("MiniRocket anew", "aeon", "anew", minirocket_anew, compile_minirocket),
     Peer("GRU-D ready", "pypots", "ready", grud_ready),
     Peer("GRU-D anew", "pypots", "anew", grud_anew),
 )

@@ -80,7 +80,7 @@ class Ours:
             from adaptfault.reduction import ReducedModel
 
             none = FaultSet((), self.setup.layout.n_cells)
-            session = open_session(to_onnx(ReducedModel(self.model, none).eval()))
+            session = open_session(to_onnx(ReducedModel(self.model, none, None).eval()))
             ways["ONNX Runtime"] = lambda x: run_session(session, x).argmax(1)
         return ways
 

@@ -198,7 +198,7 @@ def verdict(table: dict[str, Reached]) -> Iterator[str]:
 
 
 def plot(table: dict[str, Reached], path: Path) -> None:
-    """Draw accuracy against the seconds after F is known, one panel a fault set."""
+    """Draw accuracy against the CPU seconds after F is known, one panel a fault set."""
     from matplotlib.figure import Figure
 
     names = [name for name in next(iter(table.values())).accuracy if name != "none"]
@@ -210,11 +210,11 @@ def plot(table: dict[str, Reached], path: Path) -> None:
             if accuracy:
                 ours = name.startswith("adaptfault")
                 axis.errorbar(
-                    max(got.repair, 0.01), np.mean(accuracy), np.std(accuracy), color=f"C{i % 10}", capsize=2,
+                    max(got.repair_cpu, 0.01), np.mean(accuracy), np.std(accuracy), color=f"C{i % 10}", capsize=2,
                     fmt="*" if ours else markers[got.protocol], ms=13 if ours else 6, mfc="none" if i >= 10 else None,
                     label=f"{name} ({got.protocol})" if got.protocol not in name else name,
                 )  # fmt: skip
-        axis.set(xscale="log", title=case, xlabel="seconds after F is known (none: 0.01)")
+        axis.set(xscale="log", title=case, xlabel="CPU seconds after F is known (none: 0.01)")
         axis.grid(alpha=0.3)
     figure.axes[0].set_ylabel("test accuracy, mean and spread over seeds")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)

@@ -193,7 +193,7 @@ def plot(results: dict[str, Result], path: Path) -> None:
         axis.barh(
             [f"{name}\n{way}" for name, way, _ in ways], [cpu for *_, cpu in ways], color=[colors[n] for n, *_ in ways]
         )
-        axis.set(title=f"{batch} window{'s' * (batch > 1)}, ms of CPU", xscale="log")
+        axis.set(title=f"{batch} window{'s' * (batch > 1)}, ms of CPU")
         axis.tick_params(axis="y", labelsize=7)
     for axis in figure.axes:
         axis.invert_yaxis()

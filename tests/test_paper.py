@@ -19,7 +19,7 @@ from adaptfault.grasps import simulate
 from adaptfault.paper.bench import Bench, Setup
 from adaptfault.paper.claims import judge
 from adaptfault.paper.ledger import Ledger, Result, mean
-from adaptfault.paper.settings import PAPER_CELLS, Settings, Task, aware
+from adaptfault.paper.settings import PAPER_CELLS, Settings, Task, aware, is_aware
 from adaptfault.recordings import Recordings, save_npz
 from adaptfault.windows import Windows, make_windows
 from diagnostics import SensorLayout
@@ -37,7 +37,9 @@ TINY = Settings(
     samples=(64,),
     warm=True,
     aware_epochs=1,
+    aware_kinds=("blocks",),
     future=5,
+    wiring=1,
     windows=2,
     single=4,
 )
@@ -197,6 +199,35 @@ def test_claims_are_judged_both_ways(tmp_path):
         "Open": "does not hold",
         "Short": "holds",
     }
+
+
+def test_fault_aware_training_is_judged_beside_as_many_fault_free_steps(tmp_path):
+    verdicts = []
+    for number, control in enumerate(([2] * 20, [4] * 20)):
+        ledger = Ledger(tmp_path / f"{number}.jsonl")
+        for strategy, right in ((aware(0), [1] * 20), (aware(64), [4] * 20), (aware(64, "none"), control)):
+            ledger.add(result(0, right, Task(4, 0, "mixed", 5, strategy)))
+            ledger.add(result(0, [4] * 20, Task(4, 0, "none", 0, strategy)))
+        (claim,) = judge(ledger, TINY, n_classes=7, present=60)
+        verdicts.append(claim.verdict)
+    assert verdicts == ["holds", "holds in part"]
+
+
+@pytest.mark.parametrize("kind", ["cells", "lines", "blocks", "none"])
+def test_the_name_of_a_strategy_tells_its_samples_and_their_faults(kind):
+    assert is_aware(aware(64, kind)) == (64, kind)
+    assert is_aware("correct to 0, wait 5") is None
+
+
+def test_a_sensor_with_broken_wiring_has_the_same_faults_in_all_recordings(bench):
+    for kind, sizes in (("lines", {5, 6}), ("blocks", set(range(1, 17)))):
+        causes = bench.causes(kind, 2)
+        assert [len(cause.cells) in sizes for cause in causes] == [True, True]
+        cells = sorted({cell for cause in causes for cell in cause.cells})
+        x = bench._injected(causes).x[..., cells]
+        assert (x == x[:1, :1]).all()
+        assert set(np.unique(x)) <= {0, 1}
+        assert bench.causes(kind, 2) == causes
 
 
 def test_other_arrays_get_sizes_that_fit():

@@ -116,6 +116,14 @@ def test_an_unknown_device_is_one_line(home, capsys):
     assert "--device warp" in capsys.readouterr().err
 
 
+def test_windows_added_can_be_chosen_but_not_none(home, capsys):
+    assert main(command(home, "--samples", "0", "--out", str(home / "x"), "--quiet")) == 3
+    assert "--samples 0" in capsys.readouterr().err
+    out = home / "few"
+    assert main(command(home, "--figure", "3", "--samples", "64", "32", "--out", str(out), "--quiet")) == 0
+    assert json.loads((out / "config.json").read_text())["settings"]["samples"] == [32, 64]
+
+
 def test_every_strategy_of_every_figure_answers_every_test_window(bench):
     tasks = [t for t in TINY.tasks(60, (2, 4, 5, 6, 7)) if t.seed == 0]
     assert {t.figure for t in tasks} == {2, 4, 5, 6, 7}

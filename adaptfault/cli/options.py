@@ -50,6 +50,29 @@ def add_recordings(
     group.add_argument("--frames", type=int, metavar="T", help="refuse recordings of another length")
 
 
+def add_device(parser: argparse.ArgumentParser) -> None:
+    """Add where networks are trained."""
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default auto: cuda where there is one)")
+
+
+def device(args: argparse.Namespace) -> str:
+    """Return the device that networks are trained on.
+
+    Raises:
+        ValueError: there is no such device.
+    """
+    import torch
+
+    name: str = args.device
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.empty(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"--device {name}: {str(error).splitlines()[0]}; use auto, cpu or cuda") from None
+    return name
+
+
 def add_array(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     """Add what describes the array; returns the group of options."""
     group = parser.add_argument_group("how recordings are read")

@@ -1,7 +1,7 @@
 """Which cell must not fail: what each cell, row, column and address bit costs when it is stuck (the paper's abstract).
 
-Exact by enumeration: every cell is stuck at every value in every window. For the paper's network that takes half of the
-time of as many passes with unpadded convolutions, and a fifth with padded ones (:mod:`adaptfault.stuck`).
+Exact by enumeration: every cell is stuck at every value in every window. For the paper's network that takes a third of
+the time of as many passes with unpadded convolutions, and a tenth with padded ones (:mod:`adaptfault.stuck`).
 """
 
 from __future__ import annotations

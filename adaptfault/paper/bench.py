@@ -207,7 +207,8 @@ class Bench:
     @cached_property
     def adapter(self) -> Adapter:
         """Of the base."""
-        return Adapter(self.base, self.train, self.validation)
+        judged = evenly(len(self.validation), self.setup.settings.judged)
+        return Adapter(self.base, self.train, self.validation.select(judged))
 
     def _adapted(self, faults: FaultSet, x: Floats | None = None) -> Classes:
         """Answer by the base adapted to F; the cells in F read NaN unless ``x`` is given."""

@@ -49,6 +49,7 @@ class Settings:
         aware_epochs: of fault-aware training.
         aware_kinds: of :data:`WIRING`; train fault-aware on these too, with the most samples.
         future: faulty cells in the comparison of strategies.
+        judged: validation windows, at most, that repairs are judged on.
         wiring: faulty lines or blocks there and in Figure 4.
         windows: tested of each recording, at most: more of the same grasp say little more.
         single: windows for the sensitivity to single faults.
@@ -68,6 +69,7 @@ class Settings:
     aware_epochs: int = 50
     aware_kinds: tuple[str, ...] = WIRING
     future: int = 10
+    judged: int = 10_000
     wiring: int = 2
     windows: int = 10
     single: int = 500
@@ -79,15 +81,20 @@ class Settings:
 
     @classmethod
     def quick(cls, *, simulated: bool) -> Settings:
-        """Everything but the networks trained anew, smaller: about 15 minutes on two free cores on simulated grasps."""
+        """Everything but the networks trained anew, smaller: about 15 minutes on two free cores on simulated grasps.
+
+        Most of it is training: three bases, three fault-aware networks, three for the control.
+        """
         small: dict[str, Any] = {
             "patience": None,
             "counts": (2, 5, 10, 20),
+            "adapted": (0, 5, 20, 50, 100, 200),
             "scratch": (),
             "samples": (10_000,),
             "warm": True,
             "aware_epochs": 1,
             "aware_kinds": (),
+            "judged": 800,
             "windows": 2,
             "single": 50,
         }

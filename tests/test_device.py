@@ -12,11 +12,14 @@ from torch.utils._pytree import tree_flatten, tree_map_only
 
 from adaptfault.adapter import Adapter
 from adaptfault.baselines.fault_aware import train_fault_aware
+from adaptfault.grasps import simulate
 from adaptfault.network import TactileTransformer
+from adaptfault.paper.bench import Bench, Setup
+from adaptfault.paper.settings import Settings, Task, aware
 from adaptfault.single_faults import analyse
 from adaptfault.store import load_model, save_model
 from adaptfault.training import train
-from adaptfault.windows import Windows
+from adaptfault.windows import Windows, make_windows
 from diagnostics import FaultSet, SensorLayout
 
 LAYOUT = SensorLayout(1, 5, 6, present=np.arange(30).reshape(1, 5, 6) > 0)
@@ -129,3 +132,16 @@ def test_an_adapter_works_on_the_cpu_wherever_the_model_is(elsewhere):
     adaptation = Adapter(model, data, held).adapt(faults, method="head", progress=False)
     assert adaptation.predict(held.x).shape == (32,)
     assert model.head.weight.device == AWAY
+
+
+def test_the_papers_networks_are_trained_there_and_answer_as_those_trained_here(elsewhere, tmp_path):
+    grasps = simulate(6, SensorLayout(2, 6, 5), n_frames=30, seed=1, classes=("nothing", "softer", "harder"))
+    data = make_windows(grasps.frames, grasps.labels, grasps.layout)
+    settings = Settings(seeds=(0,), epochs=1, patience=None, samples=(32,), warm=True, aware_epochs=1, windows=2)
+    tasks = [Task(4, 0, "mixed", 5, aware(32, kind)) for kind in ("cells", "none", "blocks")]
+    tasks.append(Task(5, 0, "mixed", 5, "trained anew"))
+    answers = []
+    for device in ("cpu", elsewhere):
+        bench = Bench(Setup(grasps, data, settings, tmp_path / str(device), device, False, lambda text: None), 0)
+        answers.append([bench.predict(task).tolist() for task in tasks])
+    assert answers[0] == answers[1]

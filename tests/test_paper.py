@@ -39,6 +39,7 @@ TINY = Settings(
     aware_epochs=1,
     aware_kinds=("blocks",),
     future=5,
+    judged=10,
     wiring=1,
     windows=2,
     single=4,
@@ -131,6 +132,7 @@ def test_every_strategy_of_every_figure_answers_every_test_window(bench):
         predicted = bench.predict(task)
         assert predicted.shape == bench.test.y.shape
         assert set(predicted.tolist()) <= {0, 1, 2}
+    assert len(bench.adapter.validation) == 10 < len(bench.validation)
 
 
 def test_open_and_short_hit_the_same_cells_each_recording_its_own_and_fewer_are_among_more(bench):

@@ -109,7 +109,8 @@ def _samples(found: Sequence[Row]) -> Figure:
         ax.remove()
     picture.suptitle(TITLES[4])
     picture.supylabel("test accuracy")
-    picture.supxlabel("training windows added")
+    for ax in axes[: len(tests)][-columns:]:
+        ax.set_xlabel("training windows added", fontsize=9)
     picture.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     return picture
 

@@ -26,7 +26,8 @@ _NOTES = {
     " cells) open or short. *fault-free* is the control: the same windows were added without faults, so it took as many"
     " steps.",
     5: "One F for each seed, the smaller ones part of the larger. *adapted*: the missing cells are filled in, and where"
-    " that is not enough a head is fitted in closed form. *trained anew*: the paper's protocol.",
+    " that is not enough a head is fitted in closed form; it sees the healthy cells besides the network's features, and"
+    " may do better than the network's own. *trained anew*: the paper's protocol.",
     6: "*to 0* as in the paper; *to half*: its other proposal, 2.5 N, for full scale alone; *to the mean*: what the"
     " other cells say, for full scale alone; *wait 5*: only a cell that has stayed at a rail for 5 frames.",
     7: "The same faulty cells in all recordings of a seed; also two broken lines or blocks, each open or short."

@@ -191,6 +191,15 @@ def test_results_survive_the_way_through_the_file(tmp_path):
     assert Ledger(tmp_path / "r.jsonl").results == first.results
 
 
+def test_a_page_reads_the_same_whatever_was_measured_first(tmp_path):
+    ledger = Ledger(tmp_path / "r.jsonl")
+    tasks = [Task(2, 0, "short", k, "nothing") for k in (2, 5, 10)]
+    for task in (tasks[2], tasks[0], tasks[1]):
+        ledger.add(result(0, [4, 2], task))
+    ledger.arrange(tasks[:2])
+    assert list(ledger.results) == tasks
+
+
 def judged(tmp_path: Path, short: list[int], opened: list[int], free: list[int]) -> dict[str, str]:
     ledger = Ledger(tmp_path / "r.jsonl")
     for faults, k, right in (("none", 0, free), ("short", 5, short), ("open", 5, opened)):

@@ -29,7 +29,7 @@ class Adapter:
     Windows without a label (y = -1) take the fault-free model's word for it: the heads learn its probabilities.
 
     Args:
-        model: the fault-free model; it is copied, never changed.
+        model: the fault-free model; it is copied, never changed. All is worked out on the CPU, wherever the model is.
         train, validation: fault-free windows, ``[N, T, D]``; more than 2500 for validation are thinned evenly.
 
     Raises:
@@ -42,7 +42,7 @@ class Adapter:
             raise TypeError(f"an adapter repairs a TactileTransformer, got {type(model).__name__}")
         if not len(train) or not len(validation):
             raise ValueError("an adapter needs fault-free windows to learn from and to validate on; one set is empty")
-        self.model = model
+        self.model = model if model.head.weight.device.type == "cpu" else copy.deepcopy(model).cpu()
         self.train, self.targets = _labelled(model, train)
         most = MOST_WINDOWS // 2  # tell accuracies well enough apart
         self.validation, self.validation_targets = _labelled(model, validation.select(evenly(len(validation), most)))

@@ -57,9 +57,15 @@ def test_many_samples_take_no_room():
     assert samples.draw(np.array([9_999_999])).shape == (1, 10, 40)
 
 
+def test_without_faults_the_samples_are_the_very_windows_that_the_faults_hit():
+    broken, healthy = (FaultySamples(windows(), LAYOUT, n=50, n_faults=k) for k in ((5, 10), (0,)))
+    np.testing.assert_array_equal(healthy.draw(np.arange(50)), healthy.windows.x[broken.source])
+    np.testing.assert_array_equal(healthy.y, broken.y)
+
+
 def test_lines_break_as_a_whole_and_blocks_are_patches():
     lines = FaultySamples(windows(), LAYOUT, n=50, n_faults=(1,), kind="lines")
-    wires = [set(cells.tolist()) for cells in lines.lines]
+    wires = [set(cells.tolist()) for cells in lines.faults.lines]
     assert all(set(np.flatnonzero(row)) in wires for row in changed(lines, 50))
     blocks = FaultySamples(windows(), LAYOUT, n=50, n_faults=(1,), kind="blocks")
     sizes = set()
@@ -108,7 +114,7 @@ def test_an_interrupted_training_ends_as_an_unbroken_one(tmp_path):
 
 def test_what_does_not_fit_is_said():
     data = windows()
-    with pytest.raises(ValueError, match=r"from 1 to 39, got 10 and \[40\]"):
+    with pytest.raises(ValueError, match=r"from 0 to 39, got 10 and \[40\]"):
         FaultySamples(data, LAYOUT, n=10, n_faults=(40,))
     with pytest.raises(ValueError, match="unknown kind 'pads'"):
         FaultySamples(data, LAYOUT, n=10, kind="pads")

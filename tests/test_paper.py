@@ -19,7 +19,7 @@ from adaptfault.grasps import simulate
 from adaptfault.paper.bench import Bench, Setup
 from adaptfault.paper.claims import judge
 from adaptfault.paper.ledger import Ledger, Result, mean
-from adaptfault.paper.settings import PAPER_CELLS, Settings, Task, aware
+from adaptfault.paper.settings import PAPER_CELLS, Settings, Task, aware, is_aware
 from adaptfault.recordings import Recordings, save_npz
 from adaptfault.windows import Windows, make_windows
 from diagnostics import SensorLayout
@@ -37,7 +37,10 @@ TINY = Settings(
     samples=(64,),
     warm=True,
     aware_epochs=1,
+    aware_kinds=("blocks",),
     future=5,
+    judged=10,
+    wiring=1,
     windows=2,
     single=4,
 )
@@ -114,6 +117,14 @@ def test_an_unknown_device_is_one_line(home, capsys):
     assert "--device warp" in capsys.readouterr().err
 
 
+def test_windows_added_can_be_chosen_but_not_none(home, capsys):
+    assert main(command(home, "--samples", "0", "--out", str(home / "x"), "--quiet")) == 3
+    assert "--samples 0" in capsys.readouterr().err
+    out = home / "few"
+    assert main(command(home, "--figure", "3", "--samples", "64", "32", "--out", str(out), "--quiet")) == 0
+    assert json.loads((out / "config.json").read_text())["settings"]["samples"] == [32, 64]
+
+
 def test_every_strategy_of_every_figure_answers_every_test_window(bench):
     tasks = [t for t in TINY.tasks(60, (2, 4, 5, 6, 7)) if t.seed == 0]
     assert {t.figure for t in tasks} == {2, 4, 5, 6, 7}
@@ -121,6 +132,7 @@ def test_every_strategy_of_every_figure_answers_every_test_window(bench):
         predicted = bench.predict(task)
         assert predicted.shape == bench.test.y.shape
         assert set(predicted.tolist()) <= {0, 1, 2}
+    assert len(bench.adapter.validation) == 10 < len(bench.validation)
 
 
 def test_open_and_short_hit_the_same_cells_each_recording_its_own_and_fewer_are_among_more(bench):
@@ -179,6 +191,15 @@ def test_results_survive_the_way_through_the_file(tmp_path):
     assert Ledger(tmp_path / "r.jsonl").results == first.results
 
 
+def test_a_page_reads_the_same_whatever_was_measured_first(tmp_path):
+    ledger = Ledger(tmp_path / "r.jsonl")
+    tasks = [Task(2, 0, "short", k, "nothing") for k in (2, 5, 10)]
+    for task in (tasks[2], tasks[0], tasks[1]):
+        ledger.add(result(0, [4, 2], task))
+    ledger.arrange(tasks[:2])
+    assert list(ledger.results) == tasks
+
+
 def judged(tmp_path: Path, short: list[int], opened: list[int], free: list[int]) -> dict[str, str]:
     ledger = Ledger(tmp_path / "r.jsonl")
     for faults, k, right in (("none", 0, free), ("short", 5, short), ("open", 5, opened)):
@@ -197,6 +218,35 @@ def test_claims_are_judged_both_ways(tmp_path):
         "Open": "does not hold",
         "Short": "holds",
     }
+
+
+def test_fault_aware_training_is_judged_beside_as_many_fault_free_steps(tmp_path):
+    verdicts = []
+    for number, control in enumerate(([2] * 20, [4] * 20)):
+        ledger = Ledger(tmp_path / f"{number}.jsonl")
+        for strategy, right in ((aware(0), [1] * 20), (aware(64), [4] * 20), (aware(64, "none"), control)):
+            ledger.add(result(0, right, Task(4, 0, "mixed", 5, strategy)))
+            ledger.add(result(0, [4] * 20, Task(4, 0, "none", 0, strategy)))
+        (claim,) = judge(ledger, TINY, n_classes=7, present=60)
+        verdicts.append(claim.verdict)
+    assert verdicts == ["holds", "holds in part"]
+
+
+@pytest.mark.parametrize("kind", ["cells", "lines", "blocks", "none"])
+def test_the_name_of_a_strategy_tells_its_samples_and_their_faults(kind):
+    assert is_aware(aware(64, kind)) == (64, kind)
+    assert is_aware("correct to 0, wait 5") is None
+
+
+def test_a_sensor_with_broken_wiring_has_the_same_faults_in_all_recordings(bench):
+    for kind, sizes in (("lines", {5, 6}), ("blocks", set(range(1, 17)))):
+        causes = bench.causes(kind, 2)
+        assert [len(cause.cells) in sizes for cause in causes] == [True, True]
+        cells = sorted({cell for cause in causes for cell in cause.cells})
+        x = bench._injected(causes).x[..., cells]
+        assert (x == x[:1, :1]).all()
+        assert set(np.unique(x)) <= {0, 1}
+        assert bench.causes(kind, 2) == causes
 
 
 def test_other_arrays_get_sizes_that_fit():

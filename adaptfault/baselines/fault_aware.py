@@ -8,18 +8,17 @@ lines and patches, so ``kind`` offers those as well.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
 from adaptfault import training
+from adaptfault.baselines.random_faults import FaultPattern, RandomFaults
 from adaptfault.history import History
 from adaptfault.windows import Windows
 from diagnostics import SensorLayout
-
-FaultPattern = Literal["cells", "lines", "blocks"]
 
 
 class FaultySamples:
@@ -32,8 +31,8 @@ class FaultySamples:
         windows: fault-free.
         layout: the array.
         n: number of samples.
-        n_faults: numbers of faults to draw from: of cells, or of lines or blocks.
-        kind: "cells" anywhere, whole "lines" (rows and columns of one pad) or "blocks" (up to 4 x 4 cells).
+        n_faults: numbers of faults to draw from: of cells, or of lines or blocks; (0,) gives the same windows healthy.
+        kind: "cells", "lines" or "blocks" (:class:`~adaptfault.baselines.random_faults.RandomFaults`).
         seed: of it all.
 
     Raises:
@@ -50,14 +49,10 @@ class FaultySamples:
         kind: FaultPattern = "cells",
         seed: int = 0,
     ) -> None:
-        if kind not in get_args(FaultPattern):
-            raise ValueError(f"unknown kind {kind!r}: use one of {', '.join(get_args(FaultPattern))}")
-        self.cells = np.flatnonzero(layout.present)
-        wires = [layout.cells_on(line) for line in layout.lines if line.kind in ("row", "column")]
-        self.lines = [cells for cells in wires if len(cells)]
-        most = {"cells": len(self.cells), "lines": len(self.lines), "blocks": len(self.cells)}[kind]
-        if n < 0 or not len(n_faults) or min(n_faults) < 1 or max(n_faults) > most:
-            raise ValueError(f"expected n >= 0 and numbers of faults from 1 to {most}, got {n} and {list(n_faults)}")
+        self.faults = RandomFaults(layout, kind)
+        if n < 0 or not len(n_faults) or min(n_faults) < 0 or max(n_faults) > self.faults.most:
+            most = self.faults.most
+            raise ValueError(f"expected n >= 0 and numbers of faults from 0 to {most}, got {n} and {list(n_faults)}")
         if not len(windows) or windows.x.shape[2] != layout.n_cells:
             raise ValueError(f"expected windows of {layout.n_cells} cells, got {list(windows.x.shape)}")
         self.windows, self.layout, self.n_faults, self.kind, self.seed = windows, layout, tuple(n_faults), kind, seed
@@ -75,30 +70,9 @@ class FaultySamples:
         x = self.windows.x[self.source[index]]
         for window, i in zip(x, index.tolist(), strict=True):
             rng = np.random.default_rng([self.seed, i])
-            for cells, value in self._faults(rng):
+            for cells, value in self.faults.draw(int(rng.choice(self.n_faults)), rng):
                 window[:, cells] = value
         return x
-
-    def _faults(self, rng: np.random.Generator) -> list[tuple[Any, Any]]:
-        """Draw cells, and what they read."""
-        k = int(rng.choice(self.n_faults))
-        values = rng.integers(0, 2, k).astype(np.float32)
-        match self.kind:
-            case "cells":
-                return [(rng.choice(self.cells, k, replace=False), values)]
-            case "lines":
-                which = rng.choice(len(self.lines), k, replace=False)
-                return [(self.lines[i], value) for i, value in zip(which, values, strict=True)]
-            case _:
-                return [(self._block(rng), value) for value in values]
-
-    def _block(self, rng: np.random.Generator) -> NDArray[np.intp]:
-        """Draw a patch of up to 4 x 4 cells around one of them."""
-        pad, row, col = self.layout.position(int(rng.choice(self.cells)))
-        high, wide = rng.integers(1, 5, 2)
-        top, left = max(0, row - high // 2), max(0, col - wide // 2)
-        pads = np.arange(self.layout.n_cells).reshape(self.layout.shape)
-        return np.intersect1d(pads[pad, top : row + (high + 1) // 2, left : col + (wide + 1) // 2], self.cells)
 
 
 def train_fault_aware(
@@ -120,7 +94,8 @@ def train_fault_aware(
     Args:
         model: a network of a known layout.
         train, validation: fault-free windows.
-        n_faults: numbers of faults in a sample, drawn with equal chance.
+        n_faults: numbers of faults in a sample, drawn with equal chance. (0,) is the control: the same windows in the
+            same order, as many steps, no faults.
         n_samples: windows with faults in an epoch, the same in each epoch.
         kind: "cells" as in the paper, "lines" or "blocks" (:class:`FaultySamples`).
         seed: of the faults, and of training.

@@ -5,7 +5,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from adaptfault.cli.options import Commands, add_recordings, command, emit, load_recordings, progress, say
+from adaptfault.cli.options import (
+    Commands,
+    add_device,
+    add_recordings,
+    command,
+    device,
+    emit,
+    load_recordings,
+    progress,
+    say,
+)
 
 _EXAMPLE = """  adaptfault reproduce --quick
   adaptfault reproduce --figure 6 --recordings grasps.npz --out real
@@ -29,7 +39,10 @@ def add(commands: Commands) -> None:
     parser.add_argument("--seeds", type=int, nargs="+", help="default 0 1 2")
     parser.add_argument("--grasps", type=int, help="simulated grasps of each class (default 200)")
     parser.add_argument("--epochs", type=int, help="of the fault-free network")
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default auto)")
+    parser.add_argument(
+        "--samples", type=int, nargs="+", metavar="N", help="windows added in fault-aware training (--quick: 10000)"
+    )
+    add_device(parser)
     parser.add_argument("--out", default="adaptfault-paper", metavar="FOLDER", help="default adaptfault-paper")
     parser.set_defaults(run=run)
 
@@ -43,12 +56,15 @@ def run(args: argparse.Namespace) -> int:
 
     if args.recordings:
         recordings, source = load_recordings(args, args.recordings, labelled=True), Path(args.recordings[0]).name
+    if args.samples and min(args.samples) < 1:
+        raise ValueError(f"--samples {min(args.samples)}: fault-aware training adds 1 window or more")
     settings = Settings.full() if args.full else Settings.quick(simulated=not args.recordings)
     settings = replace(
         settings,
         seeds=tuple(args.seeds or settings.seeds),
         grasps=args.grasps or settings.grasps,
         epochs=args.epochs or settings.epochs,
+        samples=tuple(sorted(set(args.samples or settings.samples))),
     )
     if not args.recordings:
         from adaptfault.grasps import simulate
@@ -66,26 +82,9 @@ def run(args: argparse.Namespace) -> int:
         figures=tuple(sorted(set(args.figure))) if args.figure else FIGURES,
         source=source,
         command=" ".join(["adaptfault", *sys.argv[1:]]),
-        device=_device(args.device),
+        device=device(args),
         progress=progress(args),
         say=lambda text: say(args, text),
     )
     emit(args, {"schema": "adaptfault.reproduce/1", "page": str(page)}, f"page: {page}")
     return 0
-
-
-def _device(name: str) -> str:
-    """Return the device that networks are trained on.
-
-    Raises:
-        ValueError: there is no such device.
-    """
-    import torch
-
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        torch.empty(1, device=name)
-    except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"--device {name}: {str(error).splitlines()[0]}; use auto, cpu or cuda") from None
-    return name

@@ -7,7 +7,17 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from adaptfault.cli.options import Commands, add_recordings, command, emit, load_recordings, progress, say
+from adaptfault.cli.options import (
+    Commands,
+    add_device,
+    add_recordings,
+    command,
+    device,
+    emit,
+    load_recordings,
+    progress,
+    say,
+)
 
 if TYPE_CHECKING:
     from adaptfault.network import TactileTransformer
@@ -33,12 +43,13 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="let random cells go missing while training: a fill alone then repairs more; needs about twice the epochs",
     )
+    add_device(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Train, evaluate on the test recordings, save."""
-    recordings = load_recordings(args, args.recordings, labelled=True)
+    recordings, where = load_recordings(args, args.recordings, labelled=True), device(args)
 
     from adaptfault.evaluation import evaluate
     from adaptfault.network import TactileTransformer
@@ -60,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     if checkpoint.exists():
         say(args, f"continuing from {checkpoint}")
     history = train(
-        model,
+        model.to(where),
         parts[0],
         parts[1],
         epochs=args.epochs,
@@ -69,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         checkpoint=checkpoint,
         progress=progress(args),
     )
-    scores = evaluate(model, parts[2])
+    scores = evaluate(model.cpu(), parts[2])
     extra = {"split_seed": args.seed, "test_scores": scores.to_dict(), "history": history.to_dict()}
     if bundled:
         say(args, "learning what healthy looks like")

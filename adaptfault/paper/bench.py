@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from adaptfault.adaptation import Adaptation
 from adaptfault.adapter import Adapter
 from adaptfault.baselines.correction import CausalCorrection, correct
-from adaptfault.baselines.fault_aware import FaultPattern, train_fault_aware
+from adaptfault.baselines.fault_aware import train_fault_aware
+from adaptfault.baselines.random_faults import FaultPattern, RandomFaults
 from adaptfault.network import TactileTransformer, logits_of
-from adaptfault.paper.settings import Settings, Task
+from adaptfault.paper.settings import WIRING, Settings, Task, is_aware
 from adaptfault.recordings import Recordings
 from adaptfault.reduction import ReducedModel, phi, reduce_windows
 from adaptfault.store import MANIFEST, load_model, save_model
@@ -82,9 +83,8 @@ class Bench:
 
     def _answers(self, strategy: str, x: Floats) -> Classes:
         """Answer windows ``[N, T, D]`` of all test recordings by a strategy that needs no diagnosis."""
-        if strategy.startswith("fault-aware"):
-            _, n, *lines = strategy.split()
-            return self.aware(int(n), "lines" if lines else "cells").predict(x[self.kept])
+        if (more := is_aware(strategy)) is not None:
+            return self.aware(*more).predict(x[self.kept])
         match strategy:
             case "nothing":
                 corrected = x[self.kept]
@@ -119,18 +119,21 @@ class Bench:
         """
         x = self.whole.x.copy()
         frames = np.arange(x.shape[1])
-        lines = [self.layout.cells_on(line) for line in self.layout.lines if line.kind in ("row", "column")]
         for number in np.unique(self.whole.recording).tolist():
             rng = np.random.default_rng([self.seed, number])
             cells, ends = rng.permutation(self.present)[:k], rng.integers(0, 2, len(self.present))[:k]
             of = self.whole.recording == number
-            if faults == "lines":
-                for line, end in zip(rng.permutation(len(lines))[:k], ends, strict=True):
-                    x[np.ix_(of, frames, lines[line])] = end
+            if faults in WIRING:
+                for wired, end in self._wiring(faults, k, rng):
+                    x[np.ix_(of, frames, wired)] = end
             else:
                 value = {"open": 0.0, "short": 1.0}.get(faults, ends)
                 x[np.ix_(of, frames, cells)] = value
         return x
+
+    def _wiring(self, kind: str, k: int, rng: np.random.Generator) -> list[tuple[NDArray[np.intp], float]]:
+        """Draw k broken lines or blocks: their cells, and what they read on the 0..1 scale."""
+        return RandomFaults(self.layout, cast("FaultPattern", kind)).draw(k, rng)
 
     def fault_set(self, k: int) -> FaultSet:
         """Return the F of this seed with k cells; smaller ones are part of larger ones."""
@@ -149,8 +152,8 @@ class Bench:
             lambda model: train(model, self.train, self.validation, epochs=epochs, **self._options(name)),
         )
 
-    def aware(self, n: int, kind: FaultPattern = "cells") -> TactileTransformer:
-        """Return the network trained with n more windows with faults; 0: the base."""
+    def aware(self, n: int, kind: str = "cells") -> TactileTransformer:
+        """Return the network trained with n more windows with faults of a kind ("none": without); n = 0: the base."""
         if not n:
             return self.base
         settings, name = self.setup.settings, f"aware{self.seed}-{n}-{kind}"
@@ -161,8 +164,8 @@ class Bench:
                 self.train,
                 self.validation,
                 n_samples=n,
-                n_faults=(5, 10) if kind == "cells" else (1, 2),
-                kind=kind,
+                n_faults={"none": (0,), "cells": (5, 10)}.get(kind, (1, 2)),
+                kind=cast("FaultPattern", "cells" if kind == "none" else kind),
                 epochs=settings.aware_epochs,
                 **self._options(name),
             )
@@ -204,7 +207,8 @@ class Bench:
     @cached_property
     def adapter(self) -> Adapter:
         """Of the base."""
-        return Adapter(self.base, self.train, self.validation)
+        judged = evenly(len(self.validation), self.setup.settings.judged)
+        return Adapter(self.base, self.train, self.validation.select(judged))
 
     def _adapted(self, faults: FaultSet, x: Floats | None = None) -> Classes:
         """Answer by the base adapted to F; the cells in F read NaN unless ``x`` is given."""
@@ -234,20 +238,28 @@ class Bench:
         (self.setup.folder / "models" / f"{name}.training").unlink(missing_ok=True)
         return predicted
 
-    # Noise, drift, blinking: the same faulty cells in all recordings, as a diagnosis needs them
+    # Noise, drift, blinking, wiring: the same faults in all recordings, as a diagnosis needs them
+
+    def causes(self, kind: str, k: int) -> list[Fault]:
+        """Return k faults of one kind, those of this seed."""
+        if kind not in WIRING:
+            return [Fault(FaultKind(kind), (cell,)) for cell in self.fault_set(k)]
+        drawn = self._wiring(kind, k, np.random.default_rng(_SPREAD + self.seed))
+        return [Fault(FaultKind.SHORT if end else FaultKind.OPEN, tuple(cells.tolist())) for cells, end in drawn]
 
     def _against(self, task: Task) -> Classes:
-        """Answer the test recordings of a sensor whose k cells have a fault of one kind."""
-        faults, x = self.fault_set(task.k), self._injected(task.faults, task.k).x
+        """Answer the test recordings of a sensor that has k faults of one kind."""
+        causes = self.causes(task.faults, task.k)
+        x = self._injected(causes).x
         if task.strategy == "adapted":
-            return self._adapted(faults, x[self.kept])
+            broken = {cell for cause in causes for cell in cause.cells}
+            return self._adapted(FaultSet(tuple(broken), self.layout.n_cells), x[self.kept])
         if task.strategy == "combined":
             return self._combined(x)
         return self._answers(task.strategy, x)
 
-    def _injected(self, kind: str, k: int) -> Windows:
-        """Return the windows of the test recordings with the seed's k cells broken; all of them, in their order."""
-        faults = [Fault(FaultKind(kind), (cell,)) for cell in self.fault_set(k)]
+    def _injected(self, faults: list[Fault]) -> Windows:
+        """Return the windows of the test recordings with these faults; all of them, in their order."""
         frames, length = self.setup.recordings.frames, self.whole.x.shape[1]
         broken = [
             inject(frames[i], faults, self.layout, seed=_SPREAD * self.seed + i)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.paper.ledger import Ledger, Mean, mean
-from adaptfault.paper.settings import Task
+from adaptfault.paper.settings import WIRING, Task, is_aware
 from diagnostics import SensorLayout
 from diagnostics.picture import draw_forces, pads_figure
 
@@ -56,6 +56,8 @@ def draw(ledger: Ledger, figure: int) -> Figure:
     """Draw Figure 2, 4, 5, 6 or 7."""
     from matplotlib.figure import Figure
 
+    if figure == 4:
+        return _samples(rows(ledger, 4))
     picture = Figure(figsize=(7.5, 4.2), layout="constrained")
     ax, found = picture.subplots(), rows(ledger, figure)
     match figure:
@@ -72,7 +74,7 @@ def draw(ledger: Ledger, figure: int) -> Figure:
             for strategy in dict.fromkeys(t.strategy for t, _ in found):
                 _line(ax, [(t.k, m) for t, m in found if t.strategy == strategy and t.k], strategy)
         case _:
-            _bars(ax, found, by_kind=figure == 7)
+            _bars(ax, found)
     free = ledger.mean(2, "none", 0, "nothing")
     if free is not None:
         ax.axhline(free.accuracy, color="0.6", lw=1, ls="--", zorder=0, label="fault-free")
@@ -84,6 +86,35 @@ def draw(ledger: Ledger, figure: int) -> Figure:
     return picture
 
 
+def _samples(found: Sequence[Row]) -> Figure:
+    """Draw Figure 4: a panel for each test, accuracy over the number of samples that were added in training."""
+    from matplotlib.figure import Figure
+
+    tests = list(dict.fromkeys((t.faults, t.k) for t, _ in found))
+    columns = min(len(tests), 3)
+    picture = Figure(figsize=(7.5, 5.2), layout="constrained")
+    axes = picture.subplots(-(-len(tests) // columns), columns, sharey=True, squeeze=False).ravel()
+    known = [(is_aware(t.strategy) or (0, "cells"), (t.faults, t.k), m) for t, m in found]
+    numbers = sorted({n for (n, _), _, _ in known})
+    for ax, test in zip(axes, tests, strict=False):
+        for kind in dict.fromkeys(kind for (_, kind), _, _ in known):
+            of = [(numbers.index(n), m) for (n, own), at, m in known if at == test and (own == kind or n == 0)]
+            style = {"linestyle": "--", "color": "0.4"} if kind == "none" else {}
+            label = "without faults (control)" if kind == "none" else f"with faulty {kind}"
+            _line(ax, of, label, **style)
+        ax.set_title("no fault" if not test[1] else f"{test[1]} {_NAMES.get(test[0], test[0])}", fontsize=9)
+        ax.set(ylim=(0, 1), xticks=range(len(numbers)))
+        ax.set_xticklabels([f"{n // 1000}k" if n >= 1000 else str(n) for n in numbers])
+    for ax in axes[len(tests) :]:
+        ax.remove()
+    picture.suptitle(TITLES[4])
+    picture.supylabel("test accuracy")
+    for ax in axes[: len(tests)][-columns:]:
+        ax.set_xlabel("training windows added", fontsize=9)
+    picture.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    return picture
+
+
 def _line(ax: Axes, points: Sequence[tuple[int, Mean]], label: str, **style: Any) -> None:
     points = sorted(points, key=lambda point: point[0])
     if points:
@@ -92,7 +123,7 @@ def _line(ax: Axes, points: Sequence[tuple[int, Mean]], label: str, **style: Any
         ax.errorbar([k for k, _ in points], reached, np.maximum(around, 0), marker="o", capsize=3, label=label, **style)
 
 
-def _bars(ax: Axes, found: Sequence[Row], *, by_kind: bool) -> None:
+def _bars(ax: Axes, found: Sequence[Row]) -> None:
     """Draw a group of bars for each kind of fault, one for each strategy."""
     groups = list(dict.fromkeys((t.faults, t.k) for t, _ in found))
     strategies = list(dict.fromkeys(t.strategy for t, _ in found))
@@ -104,8 +135,8 @@ def _bars(ax: Axes, found: Sequence[Row], *, by_kind: bool) -> None:
         reached = np.array([m.accuracy for m in shown])
         around = [reached - [m.low for m in shown], [m.high for m in shown] - reached]
         ax.bar(at, reached, width, yerr=np.maximum(around, 0), label=strategy, error_kw={"elinewidth": 1})
-    names = [kind if by_kind else "no fault" if not k else f"{k} {_NAMES.get(kind, kind)}" for kind, k in groups]
-    ax.set_xticks(range(len(groups)), names)
+    names = [f"{k} {kind}" if kind in WIRING else kind for kind, k in groups]
+    ax.set_xticks(range(len(groups)), names, fontsize=9)
 
 
 def force_maps(

@@ -117,8 +117,14 @@ class Ledger:
         self.results[result.task] = result
         self._lines.add(result.to_dict())
 
+    def arrange(self, tasks: Iterable[Task]) -> None:
+        """Read the results in the order of these tasks, whatever order they were measured in."""
+        place = {task: i for i, task in enumerate(tasks)}
+        known = sorted(self.results.items(), key=lambda pair: place.get(pair[0], len(place)))
+        self.results = dict(known)
+
     def of(self, figure: int, **fields: Any) -> list[Result]:
-        """Return the results of a figure whose tasks have these fields, in the order measured."""
+        """Return the results of a figure whose tasks have these fields."""
         wanted = {"figure": figure, **fields}
         return [r for r in self.results.values() if all(getattr(r.task, k) == v for k, v in wanted.items())]
 

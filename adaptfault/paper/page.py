@@ -22,13 +22,17 @@ _NOTES = {
     2: "Every test recording gets faults of its own, so that each figure averages over as many fault sets; open and"
     " short ones hit the same cells.",
     4: "Fault-aware networks, by the number of training windows with faults (5 or 10 cells, open or short) that were"
-    " added; tested with faults of their own kind, with short ones alone, and with broken lines.",
+    " added; tested with faults of their own kind, with short ones alone, and with whole lines and blocks (up to 4 x 4"
+    " cells) open or short. *fault-free* is the control: the same windows were added without faults, so it took as many"
+    " steps.",
     5: "One F for each seed, the smaller ones part of the larger. *adapted*: the missing cells are filled in, and where"
-    " that is not enough a head is fitted in closed form. *trained anew*: the paper's protocol.",
+    " that is not enough a head is fitted in closed form; it sees the healthy cells besides the network's features, and"
+    " may do better than the network's own. *trained anew*: the paper's protocol.",
     6: "*to 0* as in the paper; *to half*: its other proposal, 2.5 N, for full scale alone; *to the mean*: what the"
     " other cells say, for full scale alone; *wait 5*: only a cell that has stayed at a rail for 5 frames.",
-    7: "The same faulty cells in all recordings of a seed. *adapted* is told which; *combined* is not: it corrects"
-    " to the mean while a log is recorded, diagnoses that, and adapts. Drift starts anew with each recording.",
+    7: "The same faulty cells in all recordings of a seed; also two broken lines or blocks, each open or short."
+    " *adapted* is told which cells; *combined* is not: it corrects to the mean while a log is recorded, diagnoses"
+    " that, and adapts. Drift starts anew with each recording.",
 }
 
 _ERRATA = """\
@@ -41,7 +45,8 @@ _ERRATA = """\
 - Its other neutral value, 2.5 N for 0 *and* 5 N, ruins a healthy sensor: cells that nothing touches read exactly 0.
   Here 2.5 N stands for full scale alone.
 - "Equal to 5.0" is 1.0 after its own scaling, and no equality survives calibration: a tolerance of 1.5 converter steps.
-- More fault-aware samples also mean more training steps; the paper does not separate the two, nor is it done here.
+- More fault-aware samples also mean more training steps. The paper does not separate the two; here the control does.
+- Its faults are scattered cells. Arrays lose lines and patches: Figure 4 and the last comparison have those as well.
 - The D - k inputs of its reduced model do not fill the grid of its convolutions: a front end fills in what is missing.
 - The feed-forward block must return to width d for the residual sum. Text and tensors disagree on rows and columns:
   here the first axis has 11. Padding, initial weights and |F| of Figures 2 and 6 are not stated.

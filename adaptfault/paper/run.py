@@ -102,3 +102,4 @@ def _measure(setup: Setup, ledger: Ledger, figures: tuple[int, ...]) -> None:
             ledger.add(result)
             bar.update()
             setup.say(f"{task.strategy}, {task.k} {task.faults}, seed {task.seed}: accuracy {result.accuracy:.3f}")
+    ledger.arrange(setup.settings.tasks(present, FIGURES))

@@ -8,6 +8,7 @@ from typing import Any
 
 PAPER_CELLS = 220
 FUTURE = ("open", "short", "noisy", "drift", "intermittent")  # the last three are the paper's future work
+WIRING = ("lines", "blocks")  # what breaks together on real arrays; the paper has scattered cells only
 
 CORRECTIONS = ("correct to 0", "correct to half", "correct to the mean", "correct to 0, wait 5")
 
@@ -19,8 +20,8 @@ class Task:
     Attributes:
         figure: number of the paper's figure; 7 is what the paper leaves to future work.
         seed: of split, weights, training and faults.
-        faults: "none", "open", "short", "mixed" (each with equal chance), "lines", or a kind of :data:`FUTURE`.
-        k: number of faulty cells (of lines, for "lines").
+        faults: "none", "open", "short", "mixed" (each with equal chance), a kind of :data:`FUTURE` or :data:`WIRING`.
+        k: number of faulty cells (of lines or blocks, for :data:`WIRING`).
         strategy: what is done about it.
     """
 
@@ -46,8 +47,10 @@ class Settings:
         samples: extra windows of fault-aware training.
         warm: fault-aware training goes on from the base, for ``aware_epochs``.
         aware_epochs: of fault-aware training.
-        aware_lines: train fault-aware on broken lines too, with the most samples.
+        aware_kinds: of :data:`WIRING`; train fault-aware on these too, with the most samples.
         future: faulty cells in the comparison of strategies.
+        judged: validation windows, at most, that repairs are judged on.
+        wiring: faulty lines or blocks there and in Figure 4.
         windows: tested of each recording, at most: more of the same grasp say little more.
         single: windows for the sensitivity to single faults.
     """
@@ -64,8 +67,10 @@ class Settings:
     samples: tuple[int, ...] = (10_000, 100_000, 200_000)
     warm: bool = False
     aware_epochs: int = 50
-    aware_lines: bool = True
+    aware_kinds: tuple[str, ...] = WIRING
     future: int = 10
+    judged: int = 10_000
+    wiring: int = 2
     windows: int = 10
     single: int = 500
 
@@ -76,15 +81,20 @@ class Settings:
 
     @classmethod
     def quick(cls, *, simulated: bool) -> Settings:
-        """Everything but the networks trained anew, smaller: about 15 minutes on two free cores on simulated grasps."""
+        """Everything but the networks trained anew, smaller: about 15 minutes on two free cores on simulated grasps.
+
+        Most of it is training: three bases, three fault-aware networks, three for the control.
+        """
         small: dict[str, Any] = {
             "patience": None,
             "counts": (2, 5, 10, 20),
+            "adapted": (0, 5, 20, 50, 100, 200),
             "scratch": (),
             "samples": (10_000,),
             "warm": True,
             "aware_epochs": 1,
-            "aware_lines": False,
+            "aware_kinds": (),
+            "judged": 800,
             "windows": 2,
             "single": 50,
         }
@@ -129,25 +139,41 @@ class Settings:
             yield Task(5, seed, "mixed", k, "adapted")
 
     def _future(self, seed: int, present: int) -> Iterator[Task]:
-        for kind in FUTURE:
+        for kind, k in self._kinds():
             for strategy in ("nothing", "correct to 0", "correct to the mean", "adapted", "combined"):
-                yield Task(7, seed, kind, self.future, strategy)
+                yield Task(7, seed, kind, k, strategy)
+
+    def _kinds(self) -> list[tuple[str, int]]:
+        return [*((kind, self.future) for kind in FUTURE), *((kind, self.wiring) for kind in WIRING)]
 
     def _fault_aware(self, seed: int, present: int) -> Iterator[Task]:
-        for n in (0, *self.samples):
-            for kind, k in (("none", 0), ("mixed", 5), ("mixed", 10), ("short", 5), ("lines", 2)):
-                yield Task(4, seed, kind, k, aware(n))
-        if self.aware_lines:
-            for kind, k in (("none", 0), ("mixed", 5), ("lines", 2)):
-                yield Task(4, seed, kind, k, f"{aware(max(self.samples))} lines")
-        for kind in FUTURE:
-            yield Task(7, seed, kind, self.future, aware(max(self.samples)))
+        wiring = [(kind, self.wiring) for kind in WIRING]
+        most = max(self.samples)
+        networks = [aware(n) for n in (0, *self.samples)]
+        networks += [aware(n, "none") for n in self.samples] + [aware(most, kind) for kind in self.aware_kinds]
+        for strategy in networks:
+            for kind, k in (("none", 0), ("mixed", 5), ("mixed", 10), ("short", 5), *wiring):
+                yield Task(4, seed, kind, k, strategy)
+        for kind, k in self._kinds():
+            yield Task(7, seed, kind, k, aware(most))
 
     def _trained_anew(self, seed: int, present: int) -> Iterator[Task]:
         for k in self.sizes(self.scratch, present):
             yield Task(5, seed, "mixed", k, "trained anew")
 
 
-def aware(n: int) -> str:
-    """Return the name of the strategy: fault-aware training with n more samples."""
-    return f"fault-aware {n}"
+def aware(n: int, kind: str = "cells") -> str:
+    """Return the name of the strategy: training with n more windows, which have such faults ("none": the control)."""
+    if kind == "none":
+        return f"fault-free {n}"
+    return f"fault-aware {n}" if kind == "cells" else f"fault-aware {n} {kind}"
+
+
+def is_aware(strategy: str) -> tuple[int, str] | None:
+    """Return n and kind of :func:`aware`'s name; None for another strategy."""
+    match strategy.split():
+        case ["fault-free", n]:
+            return int(n), "none"
+        case ["fault-aware", n, *kind]:
+            return int(n), kind[0] if kind else "cells"
+    return None

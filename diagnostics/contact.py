@@ -11,15 +11,20 @@ Which cells can be trusted differs from log to log. What the others would have r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 from scipy.special import expit, logit
 
+from diagnostics.few import covariance_and_precision
+from diagnostics.few import logistic as logistic_of_few
 from diagnostics.layout import SensorLayout
+from diagnostics.patches import Patch, PatchTouches, patches
+from diagnostics.readings import Readings
 from diagnostics.temporal import segments
 from diagnostics.touches import SEGMENT, Array, Scale, Summary, Touch, Touches
 
@@ -32,8 +37,9 @@ _RESTING_QUANTILE = 0.05  # of a cell's readings: where it rests
 _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
 _LEAST_SPREAD = 0.02  # of the root load: nothing is predicted more exactly
 _NOVEL = 0.1  # share of touches that resemble nothing known
-_TILE, _HALO = 8, 4  # cells: large pads are modelled in tiles, each with what surrounds it
-_MOST_CELLS = 400  # in one model; beyond that, tiles
+_PATCH_SAMPLES = 256  # stretches for the model of one patch out of many
+_PATCH_RIDGE = 30.0  # of a patch, per touch: it sees far fewer of them than a whole array
+_BLOCK = 4096  # cells looked at together
 _FEATURES = 4  # of a cell in a touch, see Summary.features
 
 
@@ -96,9 +102,29 @@ class Tile:
             if isinstance(value, np.ndarray):
                 object.__setattr__(self, name, np.ascontiguousarray(value))
 
+    @property
+    def patch(self) -> Patch:
+        """The cells that it is about."""
+        return Patch(self.inputs, self.outputs)
+
+    @cached_property
+    def alone(self) -> Tile:
+        """The same model of an array that has no cells but the inputs."""
+        return replace(self, inputs=np.arange(len(self.inputs)), outputs=self.place)
+
     @classmethod
-    def fit(cls, features: Array, inputs: NDArray[np.intp], outputs: NDArray[np.intp], surest: float) -> Tile:
-        """Fit on ``[n, 4, D]``; no probability is taken for nearer to 0 or 1 than ``surest``."""
+    def fit(
+        cls,
+        features: Array,
+        inputs: NDArray[np.intp],
+        outputs: NDArray[np.intp],
+        surest: float,
+        ridge: float | None = None,
+    ) -> Tile:
+        """Fit on ``[n, 4, D]``; no probability is taken for nearer to 0 or 1 than ``surest``.
+
+        With a ``ridge`` of its own, it is fitted as one patch of many, on few samples.
+        """
         from sklearn.covariance import LedoitWolf
 
         x = features[:, :, inputs]
@@ -109,9 +135,16 @@ class Tile:
         targets = np.concatenate([x[:, 2, place] == 0, x[:, 3, place] == 1], axis=1).astype(np.float32)
         own = np.zeros((_FEATURES, len(inputs), 2, len(outputs)), bool)
         own[:, place, :, np.arange(len(outputs))] = True
-        weight, bias = _logistic(z.reshape(len(z), -1), targets, own.reshape(_FEATURES * len(inputs), -1))
-        estimate = LedoitWolf().fit(z[:, 1].astype(np.float64))
-        covariance, precision = estimate.covariance_, estimate.precision_
+        flat, forbidden = z.reshape(len(z), -1), own.reshape(_FEATURES * len(inputs), -1)
+        if ridge is None:
+            weight, bias = _logistic(flat, targets, forbidden)
+            estimate = LedoitWolf().fit(z[:, 1].astype(np.float64))
+            covariance, precision = estimate.covariance_, estimate.precision_
+        else:
+            of_samples, bias = logistic_of_few(flat, targets.reshape(len(z), 2, -1), z[:, :, place], ridge)
+            weight, bias = flat.T @ of_samples.reshape(len(z), -1), bias.ravel()
+            weight[forbidden] = 0
+            covariance, precision = covariance_and_precision(z[:, 1].astype(np.float64))
         if not z[:, 1].any():  # cells of which none was ever touched say nothing of each other
             covariance = precision = np.eye(len(inputs))
         z1 = z[:, 1].astype(np.float64)
@@ -171,10 +204,11 @@ class ContactModel:
         cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale, seed: int = 0
     ) -> ContactModel:
         """Fit on fault-free recordings, ``[T, D]`` each."""
-        features, n_touches = stretches(recordings, scale, np.random.default_rng(seed))
-        # What never happened in n touches may happen in the next with a chance of about 1 in n (rule of succession).
-        surest = max(_SUREST, 1 / (n_touches + 2))
-        return cls(tuple(Tile.fit(features, *cells, surest) for cells in _tiles(layout)))
+        rng, every = np.random.default_rng(seed), patches(layout)
+        if len(every) > 1:
+            return cls(tuple(_patch_tiles(Readings.of(recordings), every, scale, rng)))
+        features, n_touches = stretches(recordings, scale, rng)
+        return cls((Tile.fit(features, every[0].inputs, every[0].outputs, _surest(n_touches)),))
 
     def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Expected:
         """Say what healthy cells would do.
@@ -204,10 +238,13 @@ def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def resting(recordings: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return where each cell rests, ``[D]``: a low quantile of its readings; 0 for a cell without any."""
-    frames = np.concatenate(recordings)
-    heard = ~np.isnan(frames).all(axis=0)
-    rest = np.zeros(frames.shape[1])
-    rest[heard] = np.nanquantile(frames[:, heard], _RESTING_QUANTILE, axis=0)
+    readings, n_cells = Readings.of(recordings), recordings[0].shape[1]
+    rest = np.zeros(n_cells)
+    for first in range(0, n_cells, _BLOCK):
+        cells = np.arange(first, min(first + _BLOCK, n_cells))
+        frames = np.concatenate([readings.piece(i, slice(None), cells) for i in range(len(readings))])
+        heard = ~np.isnan(frames).all(axis=0)
+        rest[cells[heard]] = np.nanquantile(frames[:, heard], _RESTING_QUANTILE, axis=0)
     return rest
 
 
@@ -217,18 +254,56 @@ def stretches(recordings: Sequence[NDArray[np.float64]], scale: Scale, rng: np.r
     for i, recording in enumerate(recordings):
         for touch in _touches(recording, scale):
             ranges.append((i, touch.first, sum(part.n for part in touch.parts)))
-    n_touches = len(ranges)
-    draws = int(np.clip(round(_SAMPLES / n_touches), 1, _MOST_DRAWS))
-    if len(ranges) > _SAMPLES:
-        ranges = [ranges[i] for i in np.sort(rng.choice(len(ranges), _SAMPLES, replace=False))]
+    return _drawn(ranges, lambda i, frames: recordings[i][frames], scale, rng, _SAMPLES), len(ranges)
+
+
+def _drawn(
+    ranges: list[tuple[int, int, int]],
+    read: Callable[[int, slice], NDArray[np.float64]],
+    scale: Scale,
+    rng: np.random.Generator,
+    most: int,
+) -> Array:
+    """Return features ``[n, 4, D]`` of random stretches of touches: (recording, first frame, frames) each."""
+    draws = int(np.clip(round(most / len(ranges)), 1, _MOST_DRAWS))
+    if len(ranges) > most:
+        ranges = [ranges[i] for i in np.sort(rng.choice(len(ranges), most, replace=False))]
     features = []
     for i, first, n in ranges:
-        root = scale.root_load(recordings[i][first : first + n])
+        root = scale.root_load(read(i, slice(first, first + n)))
+        n = len(root)
         for draw in range(draws):
             length = int(rng.integers(min(_SHORTEST, n), n + 1)) if draw else n
             at = int(rng.integers(0, n - length + 1))
             features.append(Summary.of(root[at : at + length], first + at, scale.root_near).features())
-    return np.stack(features), n_touches
+    return np.stack(features)
+
+
+def _patch_tiles(
+    readings: Readings, every: tuple[Patch, ...], scale: Scale, rng: np.random.Generator
+) -> Iterator[Tile]:
+    """Yield the model of each patch, fitted on the touches of that patch."""
+    ranges: list[list[tuple[int, int, int]]] = [[] for _ in every]
+    for i, recording in enumerate(readings):
+        touches = PatchTouches.begin(every)
+        for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
+            touches = touches.extend(frames, numbers, scale, still)
+        for k, of_patch in touches.kept():
+            ranges[k] += [(i, touch.first, sum(part.n for part in touch.parts)) for touch in of_patch.kept]
+    for patch, of in zip(every, ranges, strict=True):
+        cells = patch.inputs
+        if of:
+            features = _drawn(of, partial(readings.piece, cells=cells), scale.of(cells), rng, _PATCH_SAMPLES)
+        else:  # nothing is known of a patch that was never touched
+            features = np.zeros((2, _FEATURES, len(cells)), np.float32)
+        ridge = max(_RIDGE, _PATCH_RIDGE / max(len(of), 1))
+        tile = Tile.fit(features, np.arange(len(cells)), patch.place, _surest(len(of)), ridge)
+        yield replace(tile, inputs=cells, outputs=patch.outputs)
+
+
+def _surest(n_touches: int) -> float:
+    """What never happened in n touches may happen in the next with a chance of about 1 in n (rule of succession)."""
+    return max(_SUREST, 1 / (n_touches + 2))
 
 
 def _touches(recording: NDArray[np.float64], scale: Scale) -> tuple[Touch, ...]:
@@ -236,24 +311,6 @@ def _touches(recording: NDArray[np.float64], scale: Scale) -> tuple[Touch, ...]:
     for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
         touches = touches.extend(frames, numbers, scale, still)
     return touches.kept
-
-
-def _tiles(layout: SensorLayout) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Return (inputs, outputs) of each model: all cells if they are few, else tiles of the pads."""
-    cells = layout.grid(np.arange(layout.n_cells))
-    present = np.flatnonzero(layout.present)
-    if len(present) <= _MOST_CELLS:
-        return [(present, present)]
-    tiles = []
-    for pad in cells:
-        for r in range(0, layout.rows, _TILE):
-            for c in range(0, layout.cols, _TILE):
-                core = pad[r : r + _TILE, c : c + _TILE]
-                around = pad[max(0, r - _HALO) : r + _TILE + _HALO, max(0, c - _HALO) : c + _TILE + _HALO]
-                outputs, inputs = np.intersect1d(core, present), np.intersect1d(around, present)
-                if len(outputs):
-                    tiles.append((inputs, outputs))
-    return tiles
 
 
 def _logistic(x: Array, y: Array, forbidden: NDArray[np.bool_]) -> tuple[Array, Array]:

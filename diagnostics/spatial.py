@@ -28,7 +28,7 @@ from diagnostics.temporal import SHORTEST_RUN, StillRuns
 from diagnostics.touches import Array, Scale, Touch
 
 _RAIL_SHARE = 0.4  # of broken cells stick to the low rail, as many to the high one, the rest anywhere
-_SUSPICIOUS = 2.0  # log evidence from which on a cell is left out when others are judged
+SUSPICIOUS = 2.0  # log evidence from which on a cell is left out when others are judged
 _LEAST = 1e-4  # no touch is less likely than this: models err
 _SUDDEN = 1.0  # log ratio of a jump from which on a cell is no witness
 _TELLING = 0.5  # log evidence from which on a touch counts as one that tested the cell
@@ -142,7 +142,7 @@ def stuck_evidence(
         brought = np.where(asked, settled + surprise.sum(axis=0), 0.0)
         evidence = np.where(asked, prior + brought, 0.0)
         told = (surprise > _TELLING).sum(axis=0)
-        trusted = askable & (evidence + jump < _SUSPICIOUS)
+        trusted = askable & (evidence + jump < SUSPICIOUS)
         yield
     moving = present & runs.moved & fresh & ~np.isnan(expected.spread)
     return Spatial(evidence, brought, asked, told, _offset(features, begins, expected, moving))

@@ -9,7 +9,7 @@ differs from one robot to the next.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,9 +20,12 @@ from diagnostics.faults import Fault, FaultKind
 from diagnostics.injection import inject
 from diagnostics.layout import SensorLayout
 from diagnostics.memory import Memory, finished
+from diagnostics.patched import remembering
+from diagnostics.patches import MOST_CELLS
 from diagnostics.reference import Reference
+from diagnostics.specimens import specimen
 
-_LOGS = 96  # drawn to fit the weights
+_LOGS, _LOGS_OF_LARGE = 96, 32  # drawn to fit the weights; large arrays have more cells in each
 _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
 _DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
 _FEWEST_RECORDINGS = 8  # below that the reference cannot be split
@@ -58,20 +61,12 @@ class Weights:
     @classmethod
     def fit(cls, recordings: Sequence[Floats], layout: SensorLayout, *, seed: int = 0) -> Weights:
         """Fit on fault-free recordings, ``[T, D]`` each; too few of them give the defaults."""
-        recordings = [piece for r in recordings for piece in np.array_split(r, max(1, len(r) // _PIECE))]
-        if len(recordings) < _FEWEST_RECORDINGS:
-            return cls()
         rng = np.random.default_rng(seed)
-        trials = []
-        order = rng.permutation(len(recordings))
-        learned = round(_LEARNED_SHARE * len(order))
-        reference = Reference.fit([recordings[i] for i in order[:learned]], layout)
-        for i in range(_LOGS):
-            size = min(_LOG_SIZES[i % len(_LOG_SIZES)], len(order) - learned)
-            log = np.concatenate([recordings[j] for j in rng.choice(order[learned:], size, replace=False)])
-            share = _DEAD_SHARES[i // len(_LOG_SIZES) % len(_DEAD_SHARES)]
-            onset = int(rng.uniform(0, 0.8) * len(log)) if i % 2 else None
-            trials.append(_trial(log, _random_faults(layout, share, onset, rng), layout, reference))
+        large = layout.present.sum() > MOST_CELLS
+        part = specimen(recordings, layout, _PIECE)
+        trials = list(_trials(*part, _LOGS_OF_LARGE if large else _LOGS, rng))
+        if not trials:
+            return cls()
         kind, ratio, jump, dead = (np.concatenate(column) for column in zip(*trials, strict=True))
         evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), jump])
         found = []
@@ -112,6 +107,24 @@ class Weights:
         return probability
 
 
+def _trials(
+    recordings: Sequence[Floats], layout: SensorLayout, logs: int, rng: np.random.Generator
+) -> Iterator[tuple[NDArray[np.intp], Floats, Floats, NDArray[np.bool_]]]:
+    """Yield trials (see ``_trial``) of so many logs; too few recordings give none."""
+    recordings = [piece for r in recordings for piece in np.array_split(r, max(1, len(r) // _PIECE))]
+    if len(recordings) < _FEWEST_RECORDINGS:
+        return
+    order = rng.permutation(len(recordings))
+    learned = round(_LEARNED_SHARE * len(order))
+    reference = Reference.fit([recordings[i] for i in order[:learned]], layout)
+    for i in range(logs):
+        size = min(_LOG_SIZES[i % len(_LOG_SIZES)], len(order) - learned)
+        log = np.concatenate([recordings[j] for j in rng.choice(order[learned:], size, replace=False)])
+        share = _DEAD_SHARES[i // len(_LOG_SIZES) % len(_DEAD_SHARES)]
+        onset = int(rng.uniform(0, 0.8) * len(log)) if i % 2 else None
+        yield _trial(log, _random_faults(layout, share, onset, rng), layout, reference)
+
+
 def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) -> tuple[float, float, float]:
     """Return offset, slope and the jump's weight of a logistic regression, within bounds.
 
@@ -147,7 +160,7 @@ def _trial(
     log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference
 ) -> tuple[NDArray[np.intp], Floats, Floats, NDArray[np.bool_]]:
     """Return kind, ratio and jump of each still cell ``[n]`` when ``faults`` are in a log, and which are broken."""
-    memory = Memory(layout, reference)
+    memory = remembering(layout, reference)
     memory.extend(inject(log, faults, layout))
     memory = memory.complete()
     spatial = finished(memory.spatial())

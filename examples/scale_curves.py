@@ -66,7 +66,7 @@ def recording(layout: SensorLayout, rng: np.random.Generator) -> np.ndarray:
         rows, cols = (np.arange(s.start, min(s.stop, n)) for s, n in zip(box[1:], layout.shape[1:], strict=True))
         away = ((rows - path[:, :1]) / size[0])[:, :, None] ** 2 + ((cols - path[:, 1:]) / size[1])[:, None, :] ** 2
         pressed = (force[:, None, None] * np.maximum(1 - away, 0))[kept]
-        frames[max(first, 0) : first + lasts, *box] += pressed
+        frames[(slice(max(first, 0), first + lasts), *box)] += pressed
     gain = np.random.default_rng(1).uniform(0.8, 1.2, layout.shape)  # the same cells in all recordings
     frames *= (gain * (1 + 0.01 * rng.standard_normal(layout.shape))).astype(np.float32)
     step = np.float32(FULL_SCALE / STEPS)
@@ -109,6 +109,7 @@ def measure(layout: SensorLayout, frames: int) -> None:
     import sklearn.covariance  # noqa: F401
 
     from adaptfault.fills import CellStatistics
+    from adaptfault.patch_fills import LARGE, PatchStatistics
     from adaptfault.windows import make_windows
     from diagnostics import FaultSet, Monitor, SelfDiagnosis
 
@@ -140,7 +141,8 @@ def measure(layout: SensorLayout, frames: int) -> None:
     fault_set = FaultSet(tuple({cell for fault in faults for cell in fault.cells}), layout.n_cells)
     measured("windows", 0.0)
     began = time.process_time()
-    fill = CellStatistics.fit(windows).nearest(fault_set)
+    large = layout.n_cells > LARGE
+    fill = (PatchStatistics.fit(windows, layout) if large else CellStatistics.fit(windows)).nearest(fault_set)
     measured("fill build", time.process_time() - began)
     held_out = make_windows(log[:1], None, layout).x
     began = time.process_time()

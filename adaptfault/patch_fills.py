@@ -215,7 +215,10 @@ class PatchFill(nn.Module):
         around = (torch.cat([x, x @ self.average], dim=1)[:, self.index] * self.valid).transpose(0, 1)  # (P, B, h)
         filled = torch.baddbmm(self.bias[:, None], around, self.weight.transpose(1, 2))  # (P, B, m)
         if self.sizes[3]:
-            alike = around.clamp_min(0.0).sqrt() @ self.roots.transpose(1, 2)  # (P, B, M)
-            weights = torch.softmax((2 * alike - self.squares[:, None]) / self.width[:, None, None], dim=-1)
+            loads, width = around.clamp_min(0.0), self.width[:, None, None]
+            nearness = 2 * loads.sqrt() @ self.roots.transpose(1, 2) - self.squares[:, None]  # (P, B, M)
+            # One more, as far as near neighbours usually lie, for which the linear fill is right.
+            usual = loads.sum(-1, keepdim=True) - width / _WIDTH
+            weights = torch.softmax(torch.cat([nearness, usual], dim=-1) / width, dim=-1)[..., :-1]
             filled = filled + weights @ self.residuals
         return filled.transpose(0, 1).reshape(len(x), -1)[:, self.slot]

@@ -21,6 +21,7 @@ from adaptfault.forecast import Forecast
 from adaptfault.heads import MOST_WINDOWS, Blend, calibrate, fit_head, linear_head
 from adaptfault.history import History
 from adaptfault.network import TactileTransformer, as_tensor, logits_of
+from adaptfault.patch_fills import LARGE, PatchStatistics
 from adaptfault.reduction import ReducedModel, reduce_windows
 from adaptfault.training import train
 from adaptfault.windows import Windows, evenly
@@ -63,6 +64,12 @@ class Adapter:
     def statistics(self) -> CellStatistics:
         """What the fills know of the fault-free frames; estimated once, used for every F."""
         return CellStatistics.fit(self.train)
+
+    @cached_property
+    def fills(self) -> CellStatistics | PatchStatistics:
+        """What makes the fills: of a large array, what surrounds each cell; else ``statistics``."""
+        layout = self.model.layout
+        return PatchStatistics.fit(self.train, layout) if layout.n_cells > LARGE else self.statistics
 
     @cached_property
     def fault_free_accuracy(self) -> float:
@@ -145,9 +152,9 @@ class _Run:
         self.validation = reduce_windows(adapter.validation, fault_set)
         self.logits: Tensor | None = None
         self.head_seconds = 0.0
-        statistics = adapter.statistics  # estimated once, not a cost of this F
+        fills = adapter.fills  # estimated once, not a cost of this F
         began = time.perf_counter()
-        front = statistics.nearest(fault_set) if len(fault_set) else None
+        front = fills.nearest(fault_set) if len(fault_set) else None
         self.stages = [Stage("fill", time.perf_counter() - began)]
         self.reduced = ReducedModel(copy.deepcopy(adapter.model), fault_set, front).eval()
 
@@ -174,7 +181,7 @@ class _Run:
 
     def head(self) -> None:
         """Fit a new head in closed form; kept if validation agrees that it is better."""
-        linear = self.adapter.statistics.linear(self.fault_set)
+        linear = self.adapter.fills.linear(self.fault_set)
         self._keep_better("head", ReducedModel(self.reduced.network, self.fault_set, linear).eval())
 
     def finetune(self) -> None:
@@ -183,7 +190,7 @@ class _Run:
         A larger budget only allows more of the same rounds, so it never ends worse.
         """
         network = copy.deepcopy(self.adapter.model)
-        reduced = ReducedModel(network, self.fault_set, self.adapter.statistics.linear(self.fault_set)).eval()
+        reduced = ReducedModel(network, self.fault_set, self.adapter.fills.linear(self.fault_set)).eval()
         features = self._views(reduced, self.training)[0].double().numpy()
         weight, bias = linear_head(features, self.training.y, network.n_classes)
         network.head.load_state_dict({"weight": weight, "bias": bias})
@@ -205,7 +212,7 @@ class _Run:
         """Train a new network behind the fill, as the paper does for each F."""
         model = self.adapter.model
         fresh = type(model).from_config({**model.config, "seed": self.seed + 1})
-        self.reduced = ReducedModel(fresh, self.fault_set, self.adapter.statistics.linear(self.fault_set))
+        self.reduced = ReducedModel(fresh, self.fault_set, self.adapter.fills.linear(self.fault_set))
         self.stages.clear()
         began = time.perf_counter()
         history = self._train(self.reduced, _SCRATCH_EPOCHS, seed=self.seed, patience=_SCRATCH_PATIENCE)

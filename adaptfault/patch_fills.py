@@ -75,6 +75,10 @@ class PatchStatistics:
 
     def _fill(self, fault_set: FaultSet, references: int) -> PatchFill:
         average = _averages(fault_set, self.layout)
+        if average.shape[1]:  # means vary little: they are to weigh as much as a cell does
+            some = self.frames[evenly(len(self.frames), _REFERENCE_FRAMES)][:, fault_set.healthy]
+            spread = float((some @ average).std(axis=0).max())
+            average *= float(np.sqrt(some.var(axis=0).mean())) / spread if spread else 1.0
         parts = list(self._parts(fault_set, average, references))
         sizes = len(parts), *(max((len(of) for of in each), default=0) for each in _lists(parts)), average.shape[1]
         fill = PatchFill(fault_set, sizes)

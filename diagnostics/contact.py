@@ -23,6 +23,7 @@ from scipy.special import expit, logit
 from diagnostics.few import covariance_and_precision
 from diagnostics.few import logistic as logistic_of_few
 from diagnostics.layout import SensorLayout
+from diagnostics.nearby import Nearby, Samples
 from diagnostics.patches import Patch, PatchTouches, patches
 from diagnostics.readings import Readings
 from diagnostics.temporal import segments
@@ -39,6 +40,8 @@ _LEAST_SPREAD = 0.02  # of the root load: nothing is predicted more exactly
 _NOVEL = 0.1  # share of touches that resemble nothing known
 _PATCH_SAMPLES = 256  # stretches for the model of one patch out of many
 _PATCH_RIDGE = 30.0  # of a patch, per touch: it sees far fewer of them than a whole array
+_FAR = 3.0  # cells: as far as correlations in a patch are believed
+_ASKED, _OF_EACH, _MOST_OF_EACH = 100, 64, 600  # patches that tell what all have in common; stretches, cells of each
 _BLOCK = 4096  # cells looked at together
 _FEATURES = 4  # of a cell in a touch, see Summary.features
 
@@ -68,6 +71,22 @@ class Expected:
         # Now and then a touch is like none before: then any load is as likely as any other.
         p = (1 - _NOVEL) * likely + _NOVEL * (np.minimum(high, 1.0) - low)
         return np.where(np.isnan(spread), 1.0, p)
+
+
+@dataclass(frozen=True)
+class Start:
+    """What is known of a patch before its own touches are seen.
+
+    Attributes:
+        weight, bias: ``[4, inputs, 2, outputs]`` and ``[2]``, of features that are not standardised.
+        ridge: of what is learned on top of them.
+        taper: ``[inputs, inputs]``, how much two cells may have to do with each other.
+    """
+
+    weight: NDArray[np.float64]
+    bias: NDArray[np.float64]
+    ridge: float
+    taper: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -119,32 +138,40 @@ class Tile:
         inputs: NDArray[np.intp],
         outputs: NDArray[np.intp],
         surest: float,
-        ridge: float | None = None,
+        start: Start | None = None,
     ) -> Tile:
         """Fit on ``[n, 4, D]``; no probability is taken for nearer to 0 or 1 than ``surest``.
 
-        With a ``ridge`` of its own, it is fitted as one patch of many, on few samples.
+        One patch of many, of few samples, has a ``start``.
         """
         from sklearn.covariance import LedoitWolf
 
         x = features[:, :, inputs]
         mean, scale = x.mean(axis=0), x.std(axis=0)
-        scale[scale < 1e-4] = np.inf  # what never changes tells nothing
+        if start is None:
+            scale[scale < 1e-4] = np.inf  # what never changes tells nothing
+        else:  # or has not changed yet
+            scale = np.broadcast_to(np.maximum(scale.mean(axis=1, keepdims=True), 1e-2), scale.shape).copy()
         z = (x - mean) / scale
         place = np.searchsorted(inputs, outputs)
         targets = np.concatenate([x[:, 2, place] == 0, x[:, 3, place] == 1], axis=1).astype(np.float32)
         own = np.zeros((_FEATURES, len(inputs), 2, len(outputs)), bool)
         own[:, place, :, np.arange(len(outputs))] = True
         flat, forbidden = z.reshape(len(z), -1), own.reshape(_FEATURES * len(inputs), -1)
-        if ridge is None:
+        if start is None:
             weight, bias = _logistic(flat, targets, forbidden)
             estimate = LedoitWolf().fit(z[:, 1].astype(np.float64))
             covariance, precision = estimate.covariance_, estimate.precision_
         else:
-            of_samples, bias = logistic_of_few(flat, targets.reshape(len(z), 2, -1), z[:, :, place], ridge)
-            weight, bias = flat.T @ of_samples.reshape(len(z), -1), bias.ravel()
+            shared = start.weight.reshape(len(forbidden), -1).astype(np.float32)
+            shared_odds = x.reshape(len(z), -1) @ shared + np.repeat(start.bias, len(outputs)).astype(np.float32)
+            y = targets.reshape(len(z), 2, -1)
+            of_samples, own_bias = logistic_of_few(flat, y, z[:, :, place], start.ridge, shared_odds.reshape(y.shape))
+            weight, bias = flat.T @ of_samples.reshape(len(z), -1), own_bias.ravel()
             weight[forbidden] = 0
-            covariance, precision = covariance_and_precision(z[:, 1].astype(np.float64))
+            weight += shared * scale.reshape(-1, 1)
+            bias += mean.reshape(-1) @ shared + np.repeat(start.bias, len(outputs)).astype(np.float32)
+            covariance, precision = covariance_and_precision(z[:, 1].astype(np.float64), start.taper)
         if not z[:, 1].any():  # cells of which none was ever touched say nothing of each other
             covariance = precision = np.eye(len(inputs))
         z1 = z[:, 1].astype(np.float64)
@@ -206,7 +233,7 @@ class ContactModel:
         """Fit on fault-free recordings, ``[T, D]`` each."""
         rng, every = np.random.default_rng(seed), patches(layout)
         if len(every) > 1:
-            return cls(tuple(_patch_tiles(Readings.of(recordings), every, scale, rng)))
+            return cls(tuple(_patch_tiles(Readings.of(recordings), layout, scale, rng)))
         features, n_touches = stretches(recordings, scale, rng)
         return cls((Tile.fit(features, every[0].inputs, every[0].outputs, _surest(n_touches)),))
 
@@ -279,10 +306,9 @@ def _drawn(
     return np.stack(features)
 
 
-def _patch_tiles(
-    readings: Readings, every: tuple[Patch, ...], scale: Scale, rng: np.random.Generator
-) -> Iterator[Tile]:
+def _patch_tiles(readings: Readings, layout: SensorLayout, scale: Scale, rng: np.random.Generator) -> Iterator[Tile]:
     """Yield the model of each patch, fitted on the touches of that patch."""
+    every = patches(layout)
     ranges: list[list[tuple[int, int, int]]] = [[] for _ in every]
     for i, recording in enumerate(readings):
         touches = PatchTouches.begin(every)
@@ -290,15 +316,30 @@ def _patch_tiles(
             touches = touches.extend(frames, numbers, scale, still)
         for k, of_patch in touches.kept():
             ranges[k] += [(i, touch.first, sum(part.n for part in touch.parts)) for touch in of_patch.kept]
-    for patch, of in zip(every, ranges, strict=True):
-        cells = patch.inputs
-        if of:
-            features = _drawn(of, partial(readings.piece, cells=cells), scale.of(cells), rng, _PATCH_SAMPLES)
-        else:  # nothing is known of a patch that was never touched
-            features = np.zeros((2, _FEATURES, len(cells)), np.float32)
-        ridge = max(_RIDGE, _PATCH_RIDGE / max(len(of), 1))
-        tile = Tile.fit(features, np.arange(len(cells)), patch.place, _surest(len(of)), ridge)
-        yield replace(tile, inputs=cells, outputs=patch.outputs)
+
+    def features_of(k: int, most: int) -> Array:
+        cells = every[k].inputs
+        if not ranges[k]:  # nothing is known of a patch that was never touched but what all have in common
+            return np.zeros((2, _FEATURES, len(cells)), np.float32)
+        return _drawn(ranges[k], partial(readings.piece, cells=cells), scale.of(cells), rng, most)
+
+    some = rng.permutation(np.flatnonzero([bool(of) for of in ranges]))[:_ASKED].tolist()
+    parts = [Samples.of(features_of(k, _OF_EACH), every[k], layout, rng, _MOST_OF_EACH) for k in some]
+    nearby = Nearby.fit(parts) if parts else None
+    for k, patch in enumerate(every):
+        features, n = features_of(k, _PATCH_SAMPLES), len(ranges[k])
+        weight = np.zeros((_FEATURES, len(patch.inputs), 2, len(patch.outputs)))
+        usual = (weight, np.zeros(2)) if nearby is None else (nearby.on(patch, layout), nearby.bias)
+        start = Start(*usual, max(_RIDGE, _PATCH_RIDGE / max(n, 1)), _taper(patch, layout))
+        tile = Tile.fit(features, np.arange(len(patch.inputs)), patch.place, _surest(n), start)
+        yield replace(tile, inputs=patch.inputs, outputs=patch.outputs)
+
+
+def _taper(patch: Patch, layout: SensorLayout) -> NDArray[np.float64]:
+    """Return how much two inputs may have to do with each other, by their distance."""
+    rows, cols = patch.inputs // layout.cols % layout.rows, patch.inputs % layout.cols
+    squared = (rows[:, None] - rows) ** 2 + (cols[:, None] - cols) ** 2
+    return np.asarray(np.exp(-squared / (2 * _FAR**2)))
 
 
 def _surest(n_touches: int) -> float:

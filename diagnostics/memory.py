@@ -144,7 +144,7 @@ class Memory:
         still = self.runs.start <= numbers[0]
         self._remember(frames, numbers, still)
         self.unrest = self.unrest.extend(frames, numbers, scale, self.reference.usual, still)
-        self.twins = self.twins.extend(frames, numbers, telling(frames, still, scale), scale.near)
+        self.twins = self.twins.extend(self._comparable(frames), numbers, telling(frames, still, scale), scale.near)
 
     @property
     def _crowded(self) -> bool:
@@ -152,6 +152,9 @@ class Memory:
 
     def _remember(self, frames: NDArray[np.float64], numbers: NDArray[np.intp], still: NDArray[np.bool_]) -> None:
         self.touches = self.touches.extend(frames, numbers, self.reference.scale, still)
+
+    def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
+        return frames
 
     def _let_go(self) -> None:
         old, self.touches = self.touches.split(KEPT_TOUCHES)

@@ -11,9 +11,9 @@ Which cells can be trusted differs from log to log. What the others would have r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,7 @@ from scipy.special import expit, logit
 from diagnostics.few import covariance_and_precision
 from diagnostics.few import logistic as logistic_of_few
 from diagnostics.layout import SensorLayout
-from diagnostics.nearby import Nearby, Samples
-from diagnostics.patches import Patch, PatchTouches, patches
+from diagnostics.patches import Patch
 from diagnostics.readings import Readings
 from diagnostics.temporal import segments
 from diagnostics.touches import SEGMENT, Array, Scale, Summary, Touch, Touches
@@ -32,18 +31,14 @@ from diagnostics.touches import SEGMENT, Array, Scale, Summary, Touch, Touches
 _SAMPLES = 3000  # stretches of touches that the model is fitted on, about
 _MOST_DRAWS = 8  # stretches of one touch: more of them say the same
 _SHORTEST = 6  # frames of a stretch
-_RIDGE = 0.03  # on standardised inputs, per sample
+RIDGE = 0.03  # on standardised inputs, per sample
 _STEPS = 200  # of accelerated gradient descent; the ridge makes it converge
 _RESTING_QUANTILE = 0.05  # of a cell's readings: where it rests
 _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
 _LEAST_SPREAD = 0.02  # of the root load: nothing is predicted more exactly
 _NOVEL = 0.1  # share of touches that resemble nothing known
-_PATCH_SAMPLES = 256  # stretches for the model of one patch out of many
-_PATCH_RIDGE = 30.0  # of a patch, per touch: it sees far fewer of them than a whole array
-_FAR = 3.0  # cells: as far as correlations in a patch are believed
-_ASKED, _OF_EACH, _MOST_OF_EACH = 100, 64, 600  # patches that tell what all have in common; stretches, cells of each
 _BLOCK = 4096  # cells looked at together
-_FEATURES = 4  # of a cell in a touch, see Summary.features
+FEATURES = 4  # of a cell in a touch, see Summary.features
 
 
 @dataclass(frozen=True)
@@ -155,9 +150,9 @@ class Tile:
         z = (x - mean) / scale
         place = np.searchsorted(inputs, outputs)
         targets = np.concatenate([x[:, 2, place] == 0, x[:, 3, place] == 1], axis=1).astype(np.float32)
-        own = np.zeros((_FEATURES, len(inputs), 2, len(outputs)), bool)
+        own = np.zeros((FEATURES, len(inputs), 2, len(outputs)), bool)
         own[:, place, :, np.arange(len(outputs))] = True
-        flat, forbidden = z.reshape(len(z), -1), own.reshape(_FEATURES * len(inputs), -1)
+        flat, forbidden = z.reshape(len(z), -1), own.reshape(FEATURES * len(inputs), -1)
         if start is None:
             weight, bias = _logistic(flat, targets, forbidden)
             estimate = LedoitWolf().fit(z[:, 1].astype(np.float64))
@@ -230,12 +225,10 @@ class ContactModel:
     def fit(
         cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale, seed: int = 0
     ) -> ContactModel:
-        """Fit on fault-free recordings, ``[T, D]`` each."""
-        rng, every = np.random.default_rng(seed), patches(layout)
-        if len(every) > 1:
-            return cls(tuple(_patch_tiles(Readings.of(recordings), layout, scale, rng)))
-        features, n_touches = stretches(recordings, scale, rng)
-        return cls((Tile.fit(features, every[0].inputs, every[0].outputs, _surest(n_touches)),))
+        """Fit on fault-free recordings, ``[T, D]`` each, all cells together; large arrays: ``patch_models``."""
+        features, n_touches = stretches(recordings, scale, np.random.default_rng(seed))
+        every = np.flatnonzero(layout.present)
+        return cls((Tile.fit(features, every, every, surest_of(n_touches)),))
 
     def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Expected:
         """Say what healthy cells would do.
@@ -281,10 +274,10 @@ def stretches(recordings: Sequence[NDArray[np.float64]], scale: Scale, rng: np.r
     for i, recording in enumerate(recordings):
         for touch in _touches(recording, scale):
             ranges.append((i, touch.first, sum(part.n for part in touch.parts)))
-    return _drawn(ranges, lambda i, frames: recordings[i][frames], scale, rng, _SAMPLES), len(ranges)
+    return drawn(ranges, lambda i, frames: recordings[i][frames], scale, rng, _SAMPLES), len(ranges)
 
 
-def _drawn(
+def drawn(
     ranges: list[tuple[int, int, int]],
     read: Callable[[int, slice], NDArray[np.float64]],
     scale: Scale,
@@ -306,43 +299,7 @@ def _drawn(
     return np.stack(features)
 
 
-def _patch_tiles(readings: Readings, layout: SensorLayout, scale: Scale, rng: np.random.Generator) -> Iterator[Tile]:
-    """Yield the model of each patch, fitted on the touches of that patch."""
-    every = patches(layout)
-    ranges: list[list[tuple[int, int, int]]] = [[] for _ in every]
-    for i, recording in enumerate(readings):
-        touches = PatchTouches.begin(every)
-        for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
-            touches = touches.extend(frames, numbers, scale, still)
-        for k, of_patch in touches.kept():
-            ranges[k] += [(i, touch.first, sum(part.n for part in touch.parts)) for touch in of_patch.kept]
-
-    def features_of(k: int, most: int) -> Array:
-        cells = every[k].inputs
-        if not ranges[k]:  # nothing is known of a patch that was never touched but what all have in common
-            return np.zeros((2, _FEATURES, len(cells)), np.float32)
-        return _drawn(ranges[k], partial(readings.piece, cells=cells), scale.of(cells), rng, most)
-
-    some = rng.permutation(np.flatnonzero([bool(of) for of in ranges]))[:_ASKED].tolist()
-    parts = [Samples.of(features_of(k, _OF_EACH), every[k], layout, rng, _MOST_OF_EACH) for k in some]
-    nearby = Nearby.fit(parts) if parts else None
-    for k, patch in enumerate(every):
-        features, n = features_of(k, _PATCH_SAMPLES), len(ranges[k])
-        weight = np.zeros((_FEATURES, len(patch.inputs), 2, len(patch.outputs)))
-        usual = (weight, np.zeros(2)) if nearby is None else (nearby.on(patch, layout), nearby.bias)
-        start = Start(*usual, max(_RIDGE, _PATCH_RIDGE / max(n, 1)), _taper(patch, layout))
-        tile = Tile.fit(features, np.arange(len(patch.inputs)), patch.place, _surest(n), start)
-        yield replace(tile, inputs=patch.inputs, outputs=patch.outputs)
-
-
-def _taper(patch: Patch, layout: SensorLayout) -> NDArray[np.float64]:
-    """Return how much two inputs may have to do with each other, by their distance."""
-    rows, cols = patch.inputs // layout.cols % layout.rows, patch.inputs % layout.cols
-    squared = (rows[:, None] - rows) ** 2 + (cols[:, None] - cols) ** 2
-    return np.asarray(np.exp(-squared / (2 * _FAR**2)))
-
-
-def _surest(n_touches: int) -> float:
+def surest_of(n_touches: int) -> float:
     """What never happened in n touches may happen in the next with a chance of about 1 in n (rule of succession)."""
     return max(_SUREST, 1 / (n_touches + 2))
 
@@ -364,11 +321,11 @@ def _logistic(x: Array, y: Array, forbidden: NDArray[np.bool_]) -> tuple[Array, 
         vector = x.T @ (x @ vector)
         vector /= np.linalg.norm(vector) + 1e-12
     steepest = float(np.linalg.norm(x @ vector) ** 2 / n)
-    step = np.float32(1 / (0.25 * (1.1 * steepest + 1) + _RIDGE))
+    step = np.float32(1 / (0.25 * (1.1 * steepest + 1) + RIDGE))
     ahead_w, ahead_b = weight, bias
     for k in range(_STEPS):  # Nesterov's method: each step from a point ahead of the last
         error = (expit(x @ ahead_w + ahead_b) - y) / np.float32(n)
-        next_w = ahead_w - step * (x.T @ error + np.float32(_RIDGE) * ahead_w)
+        next_w = ahead_w - step * (x.T @ error + np.float32(RIDGE) * ahead_w)
         next_w[forbidden] = 0
         next_b = ahead_b - step * error.sum(axis=0)
         momentum = np.float32(k / (k + 3))

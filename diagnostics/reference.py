@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from diagnostics.contact import ContactModel, resting
 from diagnostics.layout import SensorLayout
+from diagnostics.patch_models import contact_model
 from diagnostics.temporal import Onsets, segments
 from diagnostics.touches import SEGMENT, Scale
 from diagnostics.transport import longest_repetition
@@ -52,7 +53,7 @@ class Reference:
         scale = Scale(resting(recordings), 2 * tolerance, layout.full_scale)
         onsets = Onsets.fit(recordings, tolerance, layout.full_scale)
         patience = max(_PATIENCE, 2 * max(longest_repetition(r) for r in recordings))
-        model = ContactModel.fit(recordings, layout, scale)
+        model = contact_model(recordings, layout, scale)
         return cls(
             tolerance,
             scale,

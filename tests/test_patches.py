@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from diagnostics import Fault, FaultKind, Line, Monitor, SelfDiagnosis, SensorLayout, inject, line_fault
-from diagnostics.contact import ContactModel
 from diagnostics.injection import bridge
+from diagnostics.patch_models import contact_model
 from diagnostics.patches import HALO, PATCH, PatchTouches, patches
 from diagnostics.readings import Readings
 from diagnostics.touches import Scale
@@ -124,7 +124,7 @@ def test_memory_for_a_cell_grows_with_the_cells_neither_in_fitting_nor_in_diagno
         recordings = Readings([log(layout, 40, seed).astype(np.float32) for seed in range(2)])
         scale = Scale(np.zeros(layout.n_cells), 0.05, 5.0)
         diagnoser = SelfDiagnosis(layout)
-        for work in (lambda: ContactModel.fit(recordings, layout, scale), lambda: diagnoser.diagnose(list(recordings))):  # noqa: B023
+        for work in (lambda: contact_model(recordings, layout, scale), lambda: diagnoser.diagnose(list(recordings))):  # noqa: B023
             tracemalloc.start()
             work()
             peaks.append(tracemalloc.get_traced_memory()[1] / layout.n_cells)

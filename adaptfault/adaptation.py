@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from adaptfault.evaluation import Scores, evaluate
 from adaptfault.fills import AffineFill, NearestFill
 from adaptfault.heads import Blend
 from adaptfault.network import TactileTransformer, logits_of
+from adaptfault.patch_fills import PatchFill
 from adaptfault.reduction import ReducedModel, phi
 from adaptfault.store import ADAPTATION, load_tensors, save_tensors
 from adaptfault.windows import Windows
@@ -92,6 +93,7 @@ class Adaptation:
             "network": model.network.config,
             "fault_set": list(self.fault_set),
             "reference_frames": len(model.front.roots) if isinstance(model.front, NearestFill) else None,
+            "patches": model.front.sizes if isinstance(model.front, PatchFill) else None,
             "head": None if model.head is None else model.head.about,
             "stages": [vars(stage) for stage in self.stages],
             "scores": self.scores.to_dict(),
@@ -110,9 +112,7 @@ class Adaptation:
         try:
             network = TactileTransformer.from_config(about["network"])
             fault_set = FaultSet(tuple(about["fault_set"]), network.layout.n_cells)
-            linear = AffineFill.empty(fault_set)
-            nearest, frames = about["reference_frames"] is not None, about["reference_frames"] or 0
-            front = NearestFill(fault_set, linear, np.zeros((frames, fault_set.n_cells), "f4")) if nearest else linear
+            front = _empty_front(about, fault_set)
             head = None if about["head"] is None else Blend.empty(about["head"], network.n_classes)
             model = ReducedModel(network, fault_set, front, head)
             model.load_state_dict(tensors)
@@ -121,3 +121,13 @@ class Adaptation:
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise ValueError(f"the adaptation in {path} is damaged: {str(error).splitlines()[0]}") from None
         return cls(model.eval(), fault_set, stages, _scores=scores)
+
+
+def _empty_front(about: dict[str, Any], fault_set: FaultSet) -> nn.Module:
+    """Build the front end that a state was saved of, to load it into."""
+    if about.get("patches") is not None:
+        return PatchFill(fault_set, about["patches"])
+    linear, frames = AffineFill.empty(fault_set), about["reference_frames"]
+    if frames is None:
+        return linear
+    return NearestFill(fault_set, linear, np.zeros((frames, fault_set.n_cells), "f4"))

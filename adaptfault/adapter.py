@@ -18,6 +18,7 @@ from adaptfault.fills import CellStatistics
 from adaptfault.forecast import Forecast
 from adaptfault.heads import MOST_WINDOWS
 from adaptfault.network import TactileTransformer, logits_of
+from adaptfault.patch_fills import LARGE, PatchStatistics
 from adaptfault.stages import Method, Run
 from adaptfault.windows import Windows, evenly
 from diagnostics import FaultSet
@@ -56,6 +57,12 @@ class Adapter:
     def compact(self) -> CompactNetwork | None:
         """The fault-free network on fewer numbers; None where there are too few windows, or too many cells, for it."""
         return compacted(self.model, len(self.train) + len(self.validation))
+
+    @cached_property
+    def fills(self) -> CellStatistics | PatchStatistics:
+        """What makes the fills: of a large array, what surrounds each cell; else ``statistics``."""
+        layout = self.model.layout
+        return PatchStatistics.fit(self.train, layout) if layout.n_cells > LARGE else self.statistics
 
     @cached_property
     def fault_free_accuracy(self) -> float:

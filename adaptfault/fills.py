@@ -163,7 +163,7 @@ class NearestFill(nn.Module):
         roots = np.sqrt(np.maximum(healthy, 0.0))
         self.register_buffer("roots", torch.from_numpy(roots))
         self.register_buffer("residuals", torch.from_numpy(missing - expected))
-        self.register_buffer("width", torch.tensor(_WIDTH * _near_distance(roots), dtype=torch.float32))
+        self.register_buffer("width", torch.tensor(_WIDTH * near_distance(roots), dtype=torch.float32))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map ``[N, T, D-k]`` to ``[N, T, D]``; what is filled in lies within 0..1."""
@@ -173,7 +173,7 @@ class NearestFill(nn.Module):
         return self.linear.merge(x, self.linear.missing(x) + weights @ self.residuals)
 
 
-def _near_distance(roots: NDArray[np.float32]) -> float:
+def near_distance(roots: NDArray[np.float32]) -> float:
     """Return the squared distance of a near neighbour, the typical one among frames ``[M, R]``; never 0."""
     from sklearn.metrics.pairwise import euclidean_distances
 

@@ -112,21 +112,20 @@ def _level_ratio(line: Line, onset: int, memory: Memory) -> float:
     Under each level other lines are read truly: which of the two sets makes sense, each cell given all the others?
     """
     layout = memory.layout
-    suffixes = [s for touch in memory.touches.kept for s in touch.suffixes() if s.first >= onset]
-    if not suffixes:
-        return 0.0
-    features = np.stack([s.features() for s in suffixes])
     ratio = 0.0
     for level, sign in ((0, -1.0), (1, 1.0)):
         wrong, sources = layout.misaddressed(line, level)
-        true = np.unique(sources[sources >= 0])
+        true, empty = np.unique(sources[sources >= 0]), wrong[sources < 0]
         trusted = memory.present.copy()
         trusted[wrong] = False
-        expected = memory.model().expect(features, trusted)
-        ratio += sign * _plausible(features, expected, true)
+        loaded = False
+        for features, cells, judged, model in memory.views(onset):
+            those = judged[np.isin(cells[judged], true)]
+            if len(those):
+                ratio += sign * _plausible(features, model.expect(features, trusted[cells]), those)
+            loaded |= bool((features[:, 2, np.isin(cells, empty)] > 0).any())
         # What nothing is connected to never reads a load.
-        empty = wrong[sources < 0]
-        if len(empty) and (features[:, 2, empty] > 0).any():
+        if loaded:
             ratio -= sign * 10.0
     return ratio
 

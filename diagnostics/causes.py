@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from diagnostics.addresses import Aliasing
 from diagnostics.faults import Fault, FaultKind
-from diagnostics.layout import Line, SensorLayout
+from diagnostics.layout import Line, LineKind, SensorLayout
 from diagnostics.wiring import Cause, explain
 
 _SAME_VALUE = 0.02  # of full scale: stuck cells this near to each other may share a cause
@@ -230,16 +231,16 @@ def _wire(line: Line) -> str:
 
 def _addresses_of_dead_rows(faults: list[Fault], found: Findings, layout: SensorLayout) -> list[Fault]:
     """Put dead lines together that one stuck address bit would explain: it then reads lines that nothing touched."""
-    if sum(f.line is not None and f.kind is FaultKind.OPEN for f in faults) < 2:
-        return faults
+    open_lines = Counter((f.line.pad, f.line.kind) for f in faults if f.line and f.kind is FaultKind.OPEN)
     for line in layout.lines:
         if line.kind not in ("row_address", "column_address"):
             continue
-        kind = "row" if line.kind == "row_address" else "column"
+        kind: LineKind = "row" if line.kind == "row_address" else "column"
+        if open_lines[line.pad, kind] < 2:
+            continue
         for level in (0, 1):
             cells, sources = layout.misaddressed(line, level)
-            across = 1 if kind == "row" else 2
-            moved = {layout.position(c)[across] for c in cells.tolist()}
+            moved = set(_index(cells, kind, layout))
             dead = [
                 f for f in faults
                 if f.kind is FaultKind.OPEN and f.line is not None and (f.line.pad, f.line.kind) == (line.pad, kind)
@@ -249,7 +250,7 @@ def _addresses_of_dead_rows(faults: list[Fault], found: Findings, layout: Sensor
             idle = ~found.alive[sources[sources >= 0]]
             if len(moved) < 2 or {f.line.index for f in dead if f.line} != moved or not idle.all():
                 continue
-            reads = sorted({layout.position(s)[across] for s in sources[sources >= 0].tolist()})
+            reads = _index(sources[sources >= 0], kind, layout)
             instead = f"untouched {kind}s {', '.join(map(str, reads))}" if reads else f"addresses without a {kind}"
             named = ", ".join(str(i) for i in sorted(moved))
             text = f"{line} is stuck at {level}: {kind}s {named} read nothing, as {instead} would"
@@ -266,3 +267,10 @@ def _addresses_of_dead_rows(faults: list[Fault], found: Findings, layout: Sensor
             )
             faults = [f for f in faults if f not in dead] + [merged]
     return faults
+
+
+def _index(cells: NDArray[np.intp], kind: LineKind, layout: SensorLayout) -> list[int]:
+    """Return the numbers of the rows, or columns, that cells lie on, ascending."""
+    on = cells // layout.cols % layout.rows if kind == "row" else cells % layout.cols
+    numbers: list[int] = np.unique(on).tolist()
+    return numbers

@@ -12,15 +12,20 @@ What the regressions say is then corrected by what all cells have in common (see
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 from scipy.special import expit, logit
 
+from diagnostics.few import covariance_and_precision
+from diagnostics.few import logistic as logistic_of_few
 from diagnostics.layout import SensorLayout
+from diagnostics.patches import Patch
+from diagnostics.readings import Readings
 from diagnostics.rim import Foreseen, Rim, around
 from diagnostics.temporal import segments
 from diagnostics.touches import SEGMENT, Array, Scale, Summary, Touch, Touches
@@ -28,16 +33,15 @@ from diagnostics.touches import SEGMENT, Array, Scale, Summary, Touch, Touches
 _SAMPLES = 3000  # stretches of touches that the model is fitted on, about
 _MOST_DRAWS = 8  # stretches of one touch: more of them say the same
 _SHORTEST = 6  # frames of a stretch
-_RIDGE = 0.03  # on standardised inputs, per sample
+RIDGE = 0.03  # on standardised inputs, per sample
 _FREE = 1e-6  # the same for the bias
 _STEPS = 25  # of accelerated descent; the ridge makes it converge
 _RESTING_QUANTILE = 0.05  # of a cell's readings: where it rests
 _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
 _LEAST_SPREAD = 0.02  # of the root load: nothing is predicted more exactly
 _NOVEL = 0.1  # share of touches that resemble nothing known
-_TILE, _HALO = 8, 4  # cells: large pads are modelled in tiles, each with what surrounds it
-_MOST_CELLS = 400  # in one model; beyond that, tiles
-_FEATURES = 4  # of a cell in a touch, see Summary.features
+_BLOCK = 4096  # cells looked at together
+FEATURES = 4  # of a cell in a touch, see Summary.features
 _FOLDS = 4  # of the touches: each teaches how far to believe what the others taught
 _LEFT_OUT = (0.03, 0.06, 0.12, 0.2, 0.4, 0.7, 0.95)  # of the cells, in turn: so many may be dead, or not moved yet
 _LOOKED_AT = 0.12  # of the cells at most, among those left out
@@ -72,6 +76,22 @@ class Expected:
 
 
 @dataclass(frozen=True)
+class Start:
+    """What is known of a patch before its own touches are seen.
+
+    Attributes:
+        weight, bias: ``[4, inputs, 2, outputs]`` and ``[2]``, of features that are not standardised.
+        ridge: of what is learned on top of them.
+        taper: ``[inputs, inputs]``, how much two cells may have to do with each other.
+    """
+
+    weight: NDArray[np.float64]
+    bias: NDArray[np.float64]
+    ridge: float
+    taper: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
 class Tile:
     """The model of some cells (``outputs``) from those around them (``inputs``, which hold the outputs too).
 
@@ -82,6 +102,7 @@ class Tile:
         bias: ``[2 outputs]``.
         covariance, precision: of the mean root loads, standardised, ``[inputs, inputs]``.
         spread: ``[outputs]``.
+        surest: no probability is taken for nearer to 0 or 1.
     """
 
     inputs: NDArray[np.intp]
@@ -94,6 +115,7 @@ class Tile:
     covariance: NDArray[np.float64]
     precision: NDArray[np.float64]
     spread: NDArray[np.float64]
+    surest: float
 
     def __post_init__(self) -> None:
         # Matrix products round differently in another memory order: a stored and restored one must say the same.
@@ -101,21 +123,56 @@ class Tile:
             if isinstance(value, np.ndarray):
                 object.__setattr__(self, name, np.ascontiguousarray(value))
 
+    @property
+    def patch(self) -> Patch:
+        """The cells that it is about."""
+        return Patch(self.inputs, self.outputs)
+
+    @cached_property
+    def alone(self) -> Tile:
+        """The same model of an array that has no cells but the inputs."""
+        return replace(self, inputs=np.arange(len(self.inputs)), outputs=self.place)
+
     @classmethod
-    def fit(cls, features: Array, inputs: NDArray[np.intp], outputs: NDArray[np.intp]) -> Tile:
-        """Fit on features ``[n, 4, D]``."""
+    def fit(
+        cls,
+        features: Array,
+        inputs: NDArray[np.intp],
+        outputs: NDArray[np.intp],
+        surest: float,
+        start: Start | None = None,
+    ) -> Tile:
+        """Fit on features ``[n, 4, D]``.
+
+        One patch of many, of few samples, has a ``start``.
+        """
         from sklearn.covariance import LedoitWolf
 
         x = features[:, :, inputs]
         mean, scale = x.mean(axis=0), x.std(axis=0)
-        scale[scale < 1e-4] = np.inf  # what never changes tells nothing
+        if start is None:
+            scale[scale < 1e-4] = np.inf  # what never changes tells nothing
+        else:  # or has not changed yet
+            scale = np.broadcast_to(np.maximum(scale.mean(axis=1, keepdims=True), 1e-2), scale.shape).copy()
         z = (x - mean) / scale
         place = np.searchsorted(inputs, outputs)
         targets = np.concatenate([x[:, 2, place] == 0, x[:, 3, place] == 1], axis=1).astype(np.float32)
-        own = np.arange(_FEATURES) * len(inputs) + np.tile(place, 2)[:, None]
-        weight, bias = _logistic(z.reshape(len(z), -1), targets, own)
-        estimate = LedoitWolf().fit(z[:, 1].astype(np.float64))
-        covariance, precision = estimate.covariance_, estimate.precision_
+        own = np.arange(FEATURES) * len(inputs) + np.tile(place, 2)[:, None]
+        flat = z.reshape(len(z), -1)
+        if start is None:
+            weight, bias = _logistic(flat, targets, own)
+            estimate = LedoitWolf().fit(z[:, 1].astype(np.float64))
+            covariance, precision = estimate.covariance_, estimate.precision_
+        else:
+            shared = start.weight.reshape(flat.shape[1], -1).astype(np.float32)
+            shared_odds = x.reshape(len(z), -1) @ shared + np.repeat(start.bias, len(outputs)).astype(np.float32)
+            y = targets.reshape(len(z), 2, -1)
+            of_samples, own_bias = logistic_of_few(flat, y, z[:, :, place], start.ridge, shared_odds.reshape(y.shape))
+            weight, bias = flat.T @ of_samples.reshape(len(z), -1), own_bias.ravel()
+            weight[own, np.arange(len(own))[:, None]] = 0
+            weight += shared * scale.reshape(-1, 1)
+            bias += mean.reshape(-1) @ shared + np.repeat(start.bias, len(outputs)).astype(np.float32)
+            covariance, precision = covariance_and_precision(z[:, 1].astype(np.float64), start.taper)
         if not z[:, 1].any():  # cells of which none was ever touched say nothing of each other
             covariance = precision = np.eye(len(inputs))
         z1 = z[:, 1].astype(np.float64)
@@ -128,7 +185,7 @@ class Tile:
         spread[~told.any(axis=0)] = np.nan  # how a cell reads that was never loaded is unknown
         return cls(
             inputs, outputs, place, mean, scale, weight, bias,
-            covariance, precision, spread,
+            covariance, precision, spread, surest,
         )  # fmt: skip
 
     def expect(self, features: Array, trusted: NDArray[np.bool_]) -> tuple[NDArray[np.float64], ...]:
@@ -167,29 +224,25 @@ class ContactModel:
     """See the module.
 
     Attributes:
-        layout: the array.
-        tiles: cover it; what each cell's regressions foresee.
-        rim: corrects that.
-        surest: no probability is nearer to 0 or 1.
+        tiles: the models of all cells.
+        layout: the array; rim: corrects what they foresee. Without: believed as it is, as patches of a large array are.
     """
 
-    layout: SensorLayout
     tiles: tuple[Tile, ...]
-    rim: Rim
-    surest: float
+    layout: SensorLayout | None = None
+    rim: Rim | None = None
 
     @classmethod
     def fit(
         cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale, seed: int = 0
     ) -> ContactModel:
-        """Fit on fault-free recordings, ``[T, D]`` each."""
+        """Fit on fault-free recordings, ``[T, D]`` each, all cells together; large arrays: ``patch_models``."""
         rng = np.random.default_rng(seed)
         features, touch = stretches(recordings, scale, rng)
-        n_touches = len(np.unique(touch))
-        # What never happened in n touches may happen in the next with a chance of about 1 in n (rule of succession).
-        surest = max(_SUREST, 1 / (n_touches + 2))
-        rim = _rim(features, touch, layout, rng) if n_touches >= _FOLDS else Rim.none()
-        return cls(layout, _fitted(features, layout), rim, surest)
+        n_touches = int(touch.max()) + 1
+        every = np.flatnonzero(layout.present)
+        rim = _rim(features, touch, layout, rng) if n_touches >= _FOLDS else None
+        return cls((Tile.fit(features, every, every, surest_of(n_touches)),), layout, rim)
 
     def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Expected:
         """Say what healthy cells would do.
@@ -199,19 +252,17 @@ class ContactModel:
             trusted: bool ``[D]``, the cells that may be asked.
         """
         foreseen = _foreseen(self.tiles, features, trusted)
-        spread = np.ones(features.shape[2])
+        shape = features.shape[2]
+        spread, surest, known = np.ones(shape), np.zeros(shape), np.zeros(shape, bool)
         for tile in self.tiles:
-            spread[tile.outputs] = tile.spread
-        never, always = self.rim.believe(around(foreseen, features, trusted, self.layout))
-        # A cell that no touch of the reference reached may be out of reach, whatever those around it do.
-        never = np.where(np.isnan(spread), expit(foreseen.never), never)
-        present = self.layout.present.ravel()
-        never, always = (np.where(present, np.clip(p, self.surest, 1 - self.surest), 1.0) for p in (never, always))
+            spread[tile.outputs], surest[tile.outputs], known[tile.outputs] = tile.spread, tile.surest, True
+        never, always = expit(foreseen.never), expit(foreseen.always)
+        if self.rim is not None and self.layout is not None:
+            corrected, always = self.rim.believe(around(foreseen, features, trusted, self.layout))
+            # A cell that no touch of the reference reached may be out of reach, whatever those around it do.
+            never = np.where(np.isnan(spread), never, corrected)
+        never, always = (np.where(known, np.clip(p, surest, 1 - surest), 1.0) for p in (never, always))
         return Expected(never, always, foreseen.mean, spread)
-
-
-def _fitted(features: Array, layout: SensorLayout) -> tuple[Tile, ...]:
-    return tuple(Tile.fit(features, *cells) for cells in _tiles(layout))
 
 
 def _foreseen(tiles: Sequence[Tile], features: Array, trusted: NDArray[np.bool_]) -> Foreseen:
@@ -232,7 +283,7 @@ def _rim(features: Array, touch: NDArray[np.intp], layout: SensorLayout, rng: np
     fold = rng.permutation(touch.max() + 1)[touch] % _FOLDS
     samples, never, always = [], [], []
     for k in range(_FOLDS):
-        tiles, held = _fitted(features[fold != k], layout), features[fold == k]
+        tiles, held = (Tile.fit(features[fold != k], present, present, _SUREST),), features[fold == k]
         for share in _LEFT_OUT:
             some = held[np.sort(rng.permutation(len(held))[:most])]
             out = rng.permutation(present)[: max(1, round(share * len(present)))]
@@ -258,10 +309,13 @@ def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def resting(recordings: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return where each cell rests, ``[D]``: a low quantile of its readings; 0 for a cell without any."""
-    frames = np.concatenate(recordings)
-    heard = ~np.isnan(frames).all(axis=0)
-    rest = np.zeros(frames.shape[1])
-    rest[heard] = np.nanquantile(frames[:, heard], _RESTING_QUANTILE, axis=0)
+    readings, n_cells = Readings.of(recordings), recordings[0].shape[1]
+    rest = np.zeros(n_cells)
+    for first in range(0, n_cells, _BLOCK):
+        cells = np.arange(first, min(first + _BLOCK, n_cells))
+        frames = np.concatenate([readings.piece(i, slice(None), cells) for i in range(len(readings))])
+        heard = ~np.isnan(frames).all(axis=0)
+        rest[cells[heard]] = np.nanquantile(frames[:, heard], _RESTING_QUANTILE, axis=0)
     return rest
 
 
@@ -273,17 +327,36 @@ def stretches(
     for i, recording in enumerate(recordings):
         for touch in _touches(recording, scale):
             ranges.append((i, touch.first, sum(part.n for part in touch.parts)))
-    draws = int(np.clip(round(_SAMPLES / len(ranges)), 1, _MOST_DRAWS))
-    if len(ranges) > _SAMPLES:
-        ranges = [ranges[i] for i in np.sort(rng.choice(len(ranges), _SAMPLES, replace=False))]
+    features = drawn(ranges, lambda i, frames: recordings[i][frames], scale, rng, _SAMPLES)
+    draws = len(features) // min(len(ranges), _SAMPLES)
+    return features, np.arange(len(features)) // draws
+
+
+def drawn(
+    ranges: list[tuple[int, int, int]],
+    read: Callable[[int, slice], NDArray[np.float64]],
+    scale: Scale,
+    rng: np.random.Generator,
+    most: int,
+) -> Array:
+    """Return features ``[n, 4, D]`` of random stretches of touches: (recording, first frame, frames) each."""
+    draws = int(np.clip(round(most / len(ranges)), 1, _MOST_DRAWS))
+    if len(ranges) > most:
+        ranges = [ranges[i] for i in np.sort(rng.choice(len(ranges), most, replace=False))]
     features = []
     for i, first, n in ranges:
-        root = scale.root_load(recordings[i][first : first + n])
+        root = scale.root_load(read(i, slice(first, first + n)))
+        n = len(root)
         for draw in range(draws):
             length = int(rng.integers(min(_SHORTEST, n), n + 1)) if draw else n
             at = int(rng.integers(0, n - length + 1))
             features.append(Summary.of(root[at : at + length], first + at, scale.root_near).features())
-    return np.stack(features), np.repeat(np.arange(len(ranges)), draws)
+    return np.stack(features)
+
+
+def surest_of(n_touches: int) -> float:
+    """What never happened in n touches may happen in the next with a chance of about 1 in n (rule of succession)."""
+    return max(_SUREST, 1 / (n_touches + 2))
 
 
 def _touches(recording: NDArray[np.float64], scale: Scale) -> tuple[Touch, ...]:
@@ -291,24 +364,6 @@ def _touches(recording: NDArray[np.float64], scale: Scale) -> tuple[Touch, ...]:
     for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
         touches = touches.extend(frames, numbers, scale, still)
     return touches.kept
-
-
-def _tiles(layout: SensorLayout) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Return (inputs, outputs) of each model: all cells if they are few, else tiles of the pads."""
-    cells = layout.grid(np.arange(layout.n_cells))
-    present = np.flatnonzero(layout.present)
-    if len(present) <= _MOST_CELLS:
-        return [(present, present)]
-    tiles = []
-    for pad in cells:
-        for r in range(0, layout.rows, _TILE):
-            for c in range(0, layout.cols, _TILE):
-                core = pad[r : r + _TILE, c : c + _TILE]
-                around = pad[max(0, r - _HALO) : r + _TILE + _HALO, max(0, c - _HALO) : c + _TILE + _HALO]
-                outputs, inputs = np.intersect1d(core, present), np.intersect1d(around, present)
-                if len(outputs):
-                    tiles.append((inputs, outputs))
-    return tiles
 
 
 def _logistic(x: Array, y: Array, own: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -324,7 +379,7 @@ def _logistic(x: Array, y: Array, own: NDArray[np.intp]) -> tuple[Array, Array]:
     """
     n, d = x.shape
     x = np.concatenate([x, np.ones((n, 1), np.float32)], axis=1)
-    penalty = np.full((d + 1, 1), _RIDGE, np.float32)
+    penalty = np.full((d + 1, 1), RIDGE, np.float32)
     penalty[d] = _FREE
     inverse = np.linalg.inv((x.T @ x).astype(np.float64) / (4 * n) + np.diag(penalty[:, 0])).astype(np.float32)
     # What a step has to give up for the weights that stay 0 is shared out among the others.

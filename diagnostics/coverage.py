@@ -64,8 +64,9 @@ def _touches(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple[str, ..
     regions: list[tuple[int, str]] = []
     for pad, grid in enumerate(layout.grid(untested)):
         labelled, _ = ndimage.label(grid, structure=np.ones((3, 3)))
+        sizes = np.bincount(labelled.ravel())
         for i, (rows, cols) in enumerate(ndimage.find_objects(labelled), start=1):
-            size = int((labelled == i).sum())
+            size = int(sizes[i])
             where = f"pad {pad}, {_span('row', rows)}, {_span('column', cols)}"
             regions.append((size, f"press {where} ({size} {'cell' if size == 1 else 'cells'} untested)"))
     return tuple(text for _, text in sorted(regions, key=lambda region: -region[0]))

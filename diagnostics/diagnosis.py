@@ -12,12 +12,12 @@ from diagnostics.addresses import aliasings
 from diagnostics.causes import Findings, root_causes
 from diagnostics.layout import SensorLayout
 from diagnostics.memory import Memory, finished
+from diagnostics.patched import remembering
+from diagnostics.readings import Readings
 from diagnostics.reference import Reference
 from diagnostics.stored import Arrays, reference_from_state, reference_state, weights_from_state, weights_state
 from diagnostics.verdicts import Diagnosis
 from diagnostics.weighing import Weights, faulty_at, kinds
-
-Recording = NDArray[np.float64]
 
 SCHEMA = "adaptfault.diagnoser/2"
 
@@ -67,8 +67,8 @@ class SelfDiagnosis:
         """
         log = _recordings(recordings, self.layout)
         memory = self.memory()
-        for recording in log:
-            memory.extend(recording)
+        for frames in log.blocks():
+            memory.extend(frames)
         return finished(self.judge(memory, n_recordings=len(log)))
 
     def state(self) -> tuple[dict[str, Any], Arrays]:
@@ -108,8 +108,8 @@ class SelfDiagnosis:
     def memory(self) -> Memory:
         """Return an empty memory, to be fed with a log and judged."""
         if self.reference_ is None:
-            return Memory(self.layout, Reference.unknown(self.layout), _SUSPICIOUS_COLD)
-        return Memory(self.layout, self.reference_, self.weights_.suspicious)
+            return remembering(self.layout, Reference.unknown(self.layout), _SUSPICIOUS_COLD)
+        return remembering(self.layout, self.reference_, self.weights_.suspicious)
 
     def judge(self, memory: Memory, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
         """Judge every cell from what is remembered of a log.
@@ -184,12 +184,20 @@ class SelfDiagnosis:
         )
 
 
-def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> list[Recording]:
-    """Return recordings as a list of ``[T, D]``, T >= 1."""
+def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> Readings:
+    """Return recordings, each ``[T, D]``, T >= 1."""
     given: Any = recordings
     single = isinstance(given, np.ndarray) and (given.shape[1:] == layout.shape or given.ndim <= 2)
-    checked = [layout.check_recording(r, f"recording {i}") for i, r in enumerate([given] if single else given)]
+    checked = [_checked(r, f"recording {i}", layout) for i, r in enumerate([given] if single else given)]
     checked = [r for r in checked if len(r)]
     if not checked:
         raise ValueError("no frames: expected recordings [T, D] with T >= 1")
-    return checked
+    return Readings(checked)
+
+
+def _checked(recording: ArrayLike, name: str, layout: SensorLayout) -> NDArray[Any]:
+    """Return a recording as ``[T, D]``; numbers stay as they are, and are converted where they are read."""
+    given = np.asarray(recording)
+    if given.dtype.kind in "fiu" and given.shape[1:] in (layout.shape, (layout.n_cells,)):
+        return given.reshape(len(given), -1)
+    return layout.check_recording(recording, name)

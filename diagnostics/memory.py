@@ -6,7 +6,7 @@ touches. Older touches are weighed, and only their evidence stays.
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from copy import copy
 from typing import TypeVar
 
@@ -18,14 +18,14 @@ from diagnostics.reference import Reference
 from diagnostics.spatial import Model, Spatial, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.temporal import StillRuns
-from diagnostics.touches import SEGMENT, Touches
+from diagnostics.touches import SEGMENT, Array, Touches
 from diagnostics.transport import Stream
 from diagnostics.twins import Twins, telling
 from diagnostics.unrest import Unrest
 
 Result = TypeVar("Result")
 
-_MOST_TOUCHES, _KEPT_TOUCHES = 40, 32  # when there are more, all but the last so many are weighed and let go
+MOST_TOUCHES, KEPT_TOUCHES = 40, 32  # when there are more, all but the last so many are weighed and let go
 _PAUSE = SEGMENT // 2  # frames of a segment after which that happens: not all work falls into one frame
 
 
@@ -64,7 +64,7 @@ class Memory:
         completed = False
         taken = 0
         while taken < len(told):
-            if self._filled == _PAUSE and len(self.touches.kept) > _MOST_TOUCHES:
+            if self._filled == _PAUSE and self._crowded:
                 self._let_go()
             n = min((_PAUSE if self._filled < _PAUSE else SEGMENT) - self._filled, len(told) - taken)
             chosen = told[taken : taken + n]
@@ -108,6 +108,16 @@ class Memory:
         """What healthy cells would do; without a reference, as far as this log tells."""
         return self.reference.model or Surroundings.of(self.touches.kept, self.layout)
 
+    def views(self, onset: int) -> Iterator[tuple[Array, NDArray[np.intp], NDArray[np.intp], Model]]:
+        """Yield what happened from frame ``onset`` on: features ``[n, 4, k]``, the k cells, those judged, by a model.
+
+        The cells that the model judges are given by their place among the k.
+        """
+        suffixes = [s.features() for touch in self.touches.kept for s in touch.suffixes() if s.first >= onset]
+        if suffixes:
+            every = np.arange(self.layout.n_cells)
+            yield np.stack(suffixes), every, every, self.model()
+
     def spatial(
         self, wrong: NDArray[np.bool_] | None = None, touches: Touches | None = None
     ) -> Generator[None, None, Spatial]:
@@ -133,12 +143,22 @@ class Memory:
         self.settled = np.where(self.runs.start == start, self.settled, 0.0)
         scale = self.reference.scale
         still = self.runs.start <= numbers[0]
-        self.touches = self.touches.extend(frames, numbers, scale, still)
+        self._remember(frames, numbers, still)
         self.unrest = self.unrest.extend(frames, numbers, scale, self.reference.usual, still)
-        self.twins = self.twins.extend(frames, numbers, telling(frames, still, scale), scale.near)
+        self.twins = self.twins.extend(self._comparable(frames), numbers, telling(frames, still, scale), scale.near)
+
+    @property
+    def _crowded(self) -> bool:
+        return len(self.touches.kept) > MOST_TOUCHES
+
+    def _remember(self, frames: NDArray[np.float64], numbers: NDArray[np.intp], still: NDArray[np.bool_]) -> None:
+        self.touches = self.touches.extend(frames, numbers, self.reference.scale, still)
+
+    def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
+        return frames
 
     def _let_go(self) -> None:
-        old, self.touches = self.touches.split(_KEPT_TOUCHES)
+        old, self.touches = self.touches.split(KEPT_TOUCHES)
         self.settled = finished(self.spatial(touches=old)).surprise
 
 

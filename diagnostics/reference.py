@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from diagnostics.contact import ContactModel, resting
 from diagnostics.layout import SensorLayout
+from diagnostics.patch_models import contact_model
 from diagnostics.temporal import Onsets, segments
 from diagnostics.touches import SEGMENT, Scale
 from diagnostics.transport import longest_repetition
@@ -19,6 +20,7 @@ from diagnostics.unrest import Usual
 _TOLERANCE = 0.005  # of full scale: how far a stuck cell's reading may wander, a converter's dither
 _STEPS = 1.5  # and at least so many converter steps
 _TWINS = 5  # witnesses that two healthy lines may have, where no reference tells
+_SAMPLED = 2000  # cells, about, that tell the converter's step
 _PATIENCE = 32  # a frame may come again so often, and twice as often as it ever did in the reference
 
 
@@ -51,7 +53,7 @@ class Reference:
         scale = Scale(resting(recordings), 2 * tolerance, layout.full_scale)
         onsets = Onsets.fit(recordings, tolerance, layout.full_scale)
         patience = max(_PATIENCE, 2 * max(longest_repetition(r) for r in recordings))
-        model = ContactModel.fit(recordings, layout, scale)
+        model = contact_model(recordings, layout, scale)
         return cls(
             tolerance,
             scale,
@@ -72,7 +74,8 @@ class Reference:
 
 def _tolerance(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
     """Return how near to a value counts as that value: what a converter's dither needs, whatever its step."""
-    sample = np.concatenate([r[:: max(1, len(r) // 20)].ravel() for r in recordings])
+    cells = slice(None, None, max(1, layout.n_cells // _SAMPLED))
+    sample = np.concatenate([r[:: max(1, len(r) // 20), cells].ravel() for r in recordings])
     steps = np.diff(np.unique(sample[np.isfinite(sample)]))
     steps = steps[steps > 1e-6 * layout.full_scale]  # what is finer is rounding
     step = float(steps.min()) if len(steps) else 0.0

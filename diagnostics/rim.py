@@ -22,7 +22,7 @@ _EMPTY = 0.5  # of a ring's cells: so much the mean of the whole array counts, a
 _RIDGE = 1.0  # towards believing the cells' own regressions
 _LEAST_SCALE = 1e-3
 _RARE = 0.005  # share that a cell was ever found loaded in, at least and at most
-_INPUTS = 28  # of a cell, see around
+INPUTS = 28  # of a cell, see around
 
 Floats = NDArray[np.float64]
 
@@ -70,13 +70,6 @@ class Rim:
         fitted = [_corrected(z, did, column, mean, scale) for column, did in enumerate((never, always))]
         weight, bias = (np.stack(column, axis=-1) for column in zip(*fitted, strict=True))
         return cls(mean, scale, weight, bias)
-
-    @classmethod
-    def none(cls) -> Rim:
-        """Believe what the cells' own regressions say."""
-        weight = np.zeros((_INPUTS, 2))
-        weight[0, 0] = weight[1, 1] = 1.0
-        return cls(np.zeros(_INPUTS), np.ones(_INPUTS), weight, np.zeros(2))
 
     def believe(self, samples: Floats) -> tuple[Floats, Floats]:
         """Return P(unloaded throughout) and P(loaded throughout), ``[...]`` each, of samples ``[..., k]``."""

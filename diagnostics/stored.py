@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from diagnostics.contact import ContactModel, Tile
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference
-from diagnostics.rim import Rim
+from diagnostics.rim import INPUTS, Rim
 from diagnostics.temporal import Onsets
 from diagnostics.touches import Scale
 from diagnostics.unrest import Usual
@@ -19,7 +19,7 @@ from diagnostics.weighing import Weights
 
 Arrays = dict[str, NDArray[Any]]
 
-_FOLLOWS = ("place",)  # fields of a tile that follow from others, and are not stored
+_TOLD = ("surest", "place")  # fields of a tile that are not stored as arrays: in the dict, or following from others
 _ENDLESS = ("scale",)  # arrays that may hold infinity: a feature that never changed is divided by it
 _UNKNOWN = ("spread",)  # arrays that may hold NaN: of cells that were never loaded
 
@@ -51,19 +51,19 @@ def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
         "patience": int(reference.patience),
         "blinks": float(reference.usual.blinks),
         "twins": int(reference.twins),
-        "tiles": None if reference.model is None else len(reference.model.tiles),
+        "surest": None if reference.model is None else [float(tile.surest) for tile in reference.model.tiles],
+        "rim": bool(reference.model and reference.model.rim),
     }
-    if reference.model:
-        about["surest"] = float(reference.model.surest)
     arrays: Arrays = {
         "resting": reference.scale.resting,
         "onsets": reference.onsets.log_ratio,
         "noise": reference.usual.noise,
     }
     if reference.model:
-        arrays |= {f"rim.{name}": value for name, value in vars(reference.model.rim).items()}
+        rim = vars(reference.model.rim) if reference.model.rim else {}
+        arrays |= {f"rim.{name}": value for name, value in rim.items()}
         for i, tile in enumerate(reference.model.tiles):
-            arrays |= {f"tile{i}.{name}": value for name, value in vars(tile).items() if name not in _FOLLOWS}
+            arrays |= {f"tile{i}.{name}": value for name, value in vars(tile).items() if name not in _TOLD}
     return about, {name: np.array(value, order="C") for name, value in arrays.items()}
 
 
@@ -86,7 +86,7 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
         int(about["patience"]),
         Usual(float(about["blinks"]), read("noise", unknown.usual.noise)),
         int(about["twins"]),
-        None if about["tiles"] is None else _model(about, arrays, layout),
+        None if about["surest"] is None else _model(about, arrays, layout),
     )
     positive = (reference.tolerance, scale.near, reference.patience, reference.usual.blinks)
     if not (np.isfinite(positive).all() and min(positive) > 0):
@@ -95,19 +95,21 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
 
 
 def _model(about: Mapping[str, Any], arrays: Mapping[str, ArrayLike], layout: SensorLayout) -> ContactModel:
-    surest = float(about["surest"])
-    if not 0 < surest < 0.5:
-        raise ValueError(f"expected surest between 0 and 0.5, got {surest}")
-    tiles = tuple(_tile(arrays, i, layout) for i in range(int(about["tiles"])))
+    tiles = tuple(_tile(arrays, i, float(surest), layout) for i, surest in enumerate(about["surest"]))
     outputs = np.sort(np.concatenate([tile.outputs for tile in tiles])) if tiles else np.zeros(0)
     if not np.array_equal(outputs, np.flatnonzero(layout.present)):
         raise ValueError(f"the models do not cover the cells of {layout}, each once")
-    like = vars(Rim.none())
-    rim = Rim(**{name: _checked(f"rim.{name}", arrays[f"rim.{name}"], of.shape, of.dtype) for name, of in like.items()})
-    return ContactModel(layout, tiles, rim, surest)
+    if not about["rim"]:
+        return ContactModel(tiles, layout)
+    shapes = {"mean": (INPUTS,), "scale": (INPUTS,), "weight": (INPUTS, 2), "bias": (2,)}
+    kind = np.dtype(np.float64)
+    rim = Rim(**{name: _checked(f"rim.{name}", arrays[f"rim.{name}"], shape, kind) for name, shape in shapes.items()})
+    return ContactModel(tiles, layout, rim)
 
 
-def _tile(arrays: Mapping[str, ArrayLike], i: int, layout: SensorLayout) -> Tile:
+def _tile(arrays: Mapping[str, ArrayLike], i: int, surest: float, layout: SensorLayout) -> Tile:
+    if not 0 < surest < 1:
+        raise ValueError(f"expected surest between 0 and 1, got {surest}")
     inputs, outputs = (_cells(f"tile{i}.{name}", arrays, layout) for name in ("inputs", "outputs"))
     n_in, n_out = len(inputs), len(outputs)
     if not np.isin(outputs, inputs).all():
@@ -123,7 +125,7 @@ def _tile(arrays: Mapping[str, ArrayLike], i: int, layout: SensorLayout) -> Tile
         "spread": ((n_out,), double),
     }
     read = {name: _checked(f"tile{i}.{name}", arrays[f"tile{i}.{name}"], *like) for name, like in shapes.items()}
-    return Tile(inputs, outputs, np.searchsorted(inputs, outputs), **read)
+    return Tile(inputs, outputs, np.searchsorted(inputs, outputs), **read, surest=surest)
 
 
 def _cells(name: str, arrays: Mapping[str, ArrayLike], layout: SensorLayout) -> NDArray[np.intp]:

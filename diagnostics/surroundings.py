@@ -57,8 +57,11 @@ class Surroundings:
         asked = _surroundings(features, trusted, self.layout)
         judged = np.flatnonzero(np.isfinite(asked).all(axis=(0, 2)) & present)
         neighbours = min(_NEIGHBOURS, len(answers))
-        _, nearest = tree.query(asked[:, judged], k=neighbours)
-        near = answers[nearest.reshape(len(features), len(judged), neighbours)]  # (n, judged, K, 4)
+        # Most cells lie far from any load, and are surrounded alike: each surrounding is looked up once.
+        alike, which = np.unique(asked[:, judged].reshape(-1, asked.shape[2]), axis=0, return_inverse=True)
+        _, nearest = tree.query(alike, k=neighbours)
+        near = answers[nearest.reshape(len(alike), neighbours)[which.ravel()]]
+        near = near.reshape(len(features), len(judged), neighbours, -1)  # (n, judged, K, 4)
 
         def share(of: NDArray[np.bool_], overall: NDArray[np.bool_]) -> NDArray[np.float64]:
             prior = (overall.sum() + 0.5) / (len(overall) + 1)

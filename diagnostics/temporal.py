@@ -94,6 +94,10 @@ class StillRuns:
             last = np.where(heard > 0, frames[len(frames) - 1 - backwards, np.arange(len(last))], self.last)
         return StillRuns(start, length, low, high, jump, company, last)
 
+    def of(self, cells: NDArray[np.intp]) -> StillRuns:
+        """Return the runs of some cells."""
+        return StillRuns(*(values[cells] for values in vars(self).values()))
+
     @property
     def value(self) -> Floats:
         """float ``[D]``, what each cell reads during its stretch; NaN for one that never delivered a reading."""

@@ -20,9 +20,12 @@ from diagnostics.faults import Fault, FaultKind
 from diagnostics.injection import inject
 from diagnostics.layout import SensorLayout
 from diagnostics.memory import Memory, finished
+from diagnostics.patched import remembering
+from diagnostics.patches import MOST_CELLS
 from diagnostics.reference import Reference
+from diagnostics.specimens import specimen
 
-_LOGS, _FIRST_LOGS = 96, 32  # drawn to fit the weights
+_LOGS, _LOGS_OF_LARGE = 96, 32  # drawn to fit the weights; large arrays have more cells in each
 _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
 _DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
 _FEWEST_RECORDINGS = 8  # below that the reference cannot be split
@@ -61,15 +64,17 @@ class Weights:
     @classmethod
     def fit(cls, recordings: Sequence[Floats], layout: SensorLayout, *, seed: int = 0) -> Weights:
         """Fit on fault-free recordings, ``[T, D]`` each; too few of them give the defaults."""
+        rng = np.random.default_rng(seed)
+        n_logs = _LOGS if layout.present.sum() <= MOST_CELLS else _LOGS_OF_LARGE
+        recordings, layout = specimen(recordings, layout, _PIECE)
         recordings = [piece for r in recordings for piece in np.array_split(r, max(1, len(r) // _PIECE))]
         if len(recordings) < _FEWEST_RECORDINGS:
             return cls()
-        rng = np.random.default_rng(seed)
         order = rng.permutation(len(recordings))
         learned = round(_LEARNED_SHARE * len(order))
         reference = Reference.fit([recordings[i] for i in order[:learned]], layout)
         logs = []
-        for i in range(_LOGS):
+        for i in range(n_logs):
             size = min(_LOG_SIZES[i % len(_LOG_SIZES)], len(order) - learned)
             log = np.concatenate([recordings[j] for j in rng.choice(order[learned:], size, replace=False)])
             share = _DEAD_SHARES[i // len(_LOG_SIZES) % len(_DEAD_SHARES)]
@@ -77,7 +82,7 @@ class Weights:
             logs.append((log, _random_faults(layout, share, onset, rng)))
         # Evidence depends on who is suspected, and that on what evidence is worth: first roughly, then well.
         weights = cls()
-        for n in (_FIRST_LOGS, _LOGS):
+        for n in (n_logs // 3, n_logs):
             weights = cls._of([_trial(*log, layout, reference, weights.suspicious) for log in logs[:n]])
         return weights
 
@@ -173,7 +178,7 @@ def _trial(
     log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference, suspicious: float
 ) -> _Trial:
     """Return kind, ratio and jump of each still cell ``[n]`` when ``faults`` are in a log, and which are broken."""
-    memory = Memory(layout, reference, suspicious)
+    memory = remembering(layout, reference, suspicious)
     memory.extend(inject(log, faults, layout))
     memory = memory.complete()
     spatial = finished(memory.spatial())

@@ -14,7 +14,8 @@ single faults are is then read off the solution, and the programme solved again 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,12 +90,28 @@ def explain(
     causes: list[Cause] = []
     pads = layout.grid(alike).any(axis=(1, 2))
     for pad in np.flatnonzero(pads).tolist():
-        causes += _explain_pad(pad, faulty, alike, against, weight, layout, common)
+        own = _one_pad(layout.rows, layout.cols, layout.present[pad].tobytes())
+        first = pad * own.n_cells
+        on = slice(first, first + own.n_cells)
+        of_pad = _explain_pad(faulty[on], alike[on], against[on], weight[on], own, common)
+        causes += [_moved(cause, pad, first) for cause in of_pad]
     return tuple(causes)
 
 
+@lru_cache(maxsize=64)
+def _one_pad(rows: int, cols: int, present: bytes) -> SensorLayout:
+    """Return one pad as an array of its own: most pads of a skin are alike, and none costs more for the others."""
+    return SensorLayout(1, rows, cols, present=np.frombuffer(present, bool))
+
+
+def _moved(cause: Cause, pad: int, first: int) -> Cause:
+    """Return a cause on the only pad as one on ``pad``, whose first cell is ``first``."""
+    cells, seen = (tuple(first + cell for cell in those) for those in (cause.cells, cause.seen))
+    line = None if cause.line is None else replace(cause.line, pad=pad)
+    return replace(cause, line=line, cells=cells, seen=seen)
+
+
 def _explain_pad(
-    pad: int,
     faulty: NDArray[np.bool_],
     alike: NDArray[np.bool_],
     against: NDArray[np.bool_],
@@ -109,12 +126,11 @@ def _explain_pad(
     candidates = []
     lines = layout.lines if witness.sum() >= 2 else ()
     for line in lines:
-        if line.pad == pad and line.kind in ("row", "column", "converter"):
+        if line.kind in ("row", "column", "converter"):
             candidates += _candidates(line, layout.cells_on(line), against, witness, tried, leading)
-    on_pad = np.zeros(layout.n_cells, bool)
-    on_pad[layout.cells_on(Line(pad, "converter", 0))] = True
-    found = np.flatnonzero(faulty & on_pad)
-    tested = int((against & on_pad).sum()) + len(found)
+    present = layout.present.ravel()
+    found = np.flatnonzero(faulty & present)
+    tested = int((against & present).sum()) + len(found)
     blamed: list[_Candidate] = []
     support, cell_cost = weight, float(-np.log(_RAREST))
     singles = 0
@@ -187,29 +203,33 @@ def _cheapest(
     cell_cost: float,
 ) -> list[_Candidate]:
     """Return the wires of the cheapest set of wires and single cells that covers every faulty cell."""
+    from scipy import sparse
     from scipy.optimize import Bounds, LinearConstraint, milp
 
     # A wire that costs more than it could save is in no cheapest set.
     candidates = [c for c in candidates if _gain(c, faulty, np.maximum(support, 0), cell_cost) > _PROVEN]
     if len(candidates) <= 1:
         return [c for c in candidates if _gain(c, faulty, support, cell_cost) > _PROVEN]
-    doubtful = np.unique(np.concatenate([c.cells[~faulty[c.cells]] for c in candidates]))
+    on_any = np.concatenate([c.cells for c in candidates])
+    doubtful = np.unique(on_any[~faulty[on_any]])
+    found = found[np.isin(found, on_any)]  # a cell on none of them explains itself, whatever they cost
     n, f, d = len(candidates), len(found), len(doubtful)
     cost = np.concatenate([[c.cost for c in candidates], np.full(f, cell_cost), -_DOUBTFUL_SHARE * support[doubtful]])
-    by_line = np.column_stack([np.isin(found, c.cells) for c in candidates]).astype(float)
-    covers = np.hstack([by_line, np.eye(f), np.zeros((f, d))])
+    by_line = sparse.csr_array(np.column_stack([np.isin(found, c.cells) for c in candidates]).astype(float))
+    covers = sparse.hstack([by_line, sparse.eye_array(f), sparse.csr_array((f, d))])
     constraints = [LinearConstraint(covers, lb=1)] if f else []
     if d:
         # A doubtful cell counts if, and only if, a wire through it is blamed.
-        through = np.column_stack([np.isin(doubtful, c.cells) for c in candidates]).astype(float)
-        constraints.append(LinearConstraint(np.hstack([through, np.zeros((d, f)), -np.eye(d)]), lb=0))
-        for i in range(n):
-            with_it = np.flatnonzero(through[:, i])
-            rows = np.zeros((len(with_it), n + f + d))
-            rows[:, i] = -1
-            rows[np.arange(len(with_it)), n + f + with_it] = 1
-            if len(with_it):
-                constraints.append(LinearConstraint(rows, lb=0))
+        through = sparse.csr_array(np.column_stack([np.isin(doubtful, c.cells) for c in candidates]).astype(float))
+        constraints.append(
+            LinearConstraint(sparse.hstack([through, sparse.csr_array((d, f)), -sparse.eye_array(d)]), lb=0)
+        )
+        which, cell = through.T.nonzero()
+        of_line = sparse.csr_array((np.ones(len(which)), (np.arange(len(which)), which)), (len(which), n))
+        of_cell = sparse.csr_array((np.ones(len(cell)), (np.arange(len(cell)), cell)), (len(cell), d))
+        constraints.append(
+            LinearConstraint(sparse.hstack([-of_line, sparse.csr_array((len(which), f)), of_cell]), lb=0)
+        )
     solution = milp(cost, constraints=constraints, integrality=np.ones(len(cost), dtype=int), bounds=Bounds(0, 1))
     # Feasible by construction: every cell can explain itself.
     chosen = np.asarray(solution.x)[:n] > 0.5

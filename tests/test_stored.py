@@ -119,7 +119,7 @@ def test_a_field_that_is_missing_or_wrong_is_refused(wrong, said):
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("tolerance", -1.0), ("surest", 2.0), ("surest", None), ("tiles", 0), ("patience", 0), ("blinks", None)],
+    [("tolerance", -1.0), ("surest", [2.0]), ("surest", []), ("patience", 0), ("blinks", None)],
 )
 def test_a_reference_whose_numbers_cannot_be_is_refused(field, value):
     about, arrays = small_fit(SensorLayout(1, 3, 3)).state()

@@ -1,0 +1,175 @@
+"""The memory and the judgement of a large array: touches are kept, and cells judged, patch by patch (see ``patches``).
+
+A patch cannot tell which of the cells around it are broken: their own patches can. So all patches judge twice: at first
+each asks, of the cells around it, only those that moved; then it leaves out those that their own patch suspects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.contact import ContactModel, Expected
+from diagnostics.layout import SensorLayout
+from diagnostics.memory import KEPT_TOUCHES, MOST_TOUCHES, Memory, finished
+from diagnostics.patches import MOST_CELLS, Patch, PatchTouches, patches
+from diagnostics.reference import Reference
+from diagnostics.spatial import Model, Spatial, stuck_evidence
+from diagnostics.surroundings import Surroundings
+from diagnostics.touches import Array, Touches
+
+_SUSPICIOUS = 2.0  # log evidence from which on a cell is left out when others are judged, here and by its neighbours
+_PAUSES = 8  # of each of the two judgements: a monitor waits for all of them
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class _Trusting:
+    """A model that asks, of the cells around its patch, only some: bool ``[inputs]``."""
+
+    model: Model
+    asked: Mask
+
+    def expect(self, features: Array, trusted: Mask) -> Expected:
+        """See ``ContactModel.expect``."""
+        return self.model.expect(features, trusted & self.asked)
+
+
+@dataclass(frozen=True)
+class _PatchSurroundings:
+    """A cold start's model of a patch: its inputs as the pad of a layout of their own."""
+
+    log: Surroundings
+    cells: NDArray[np.intp]  # of that layout, that the inputs are
+
+    @classmethod
+    def of(cls, patch: Patch, touches: Touches, layout: SensorLayout) -> _PatchSurroundings:
+        """Learn from the touches of the patch."""
+        (top, left), (rows, cols) = patch.corner, patch.size
+        present = layout.present[patch.pad, top : top + rows, left : left + cols]
+        own = SensorLayout(1, rows, cols, full_scale=layout.full_scale, present=present)
+        cells = np.flatnonzero(present)
+        return cls(Surroundings(_on(Surroundings.of(touches.kept, own).log, cells, own.n_cells), own), cells)
+
+    def expect(self, features: Array, trusted: Mask) -> Expected:
+        """See ``ContactModel.expect``."""
+        n_cells = self.log.layout.n_cells
+        e = self.log.expect(_on(features, self.cells, n_cells), _on(trusted, self.cells, n_cells))
+        cells = self.cells
+        return Expected(e.never[:, cells], e.always[:, cells], e.mean[:, cells], e.spread[cells])
+
+
+def _on(values: NDArray[Any], cells: NDArray[np.intp], n_cells: int) -> NDArray[Any]:
+    """Return ``values [..., k]`` of k cells as ``[..., n_cells]``, 0 elsewhere."""
+    out = np.zeros((*values.shape[:-1], n_cells), values.dtype)
+    out[..., cells] = values
+    return out
+
+
+class PatchedMemory(Memory):
+    """A :class:`~diagnostics.memory.Memory` of an array of several patches.
+
+    Attributes:
+        local: the touches of each patch; ``touches`` stays empty.
+    """
+
+    def __init__(self, layout: SensorLayout, reference: Reference) -> None:
+        super().__init__(layout, reference, _SUSPICIOUS)
+        tiles = reference.model.tiles if reference.model else None
+        self.local = PatchTouches.begin(patches(layout) if tiles is None else tuple(t.patch for t in tiles))
+
+    def spatial(self, wrong: Mask | None = None, touches: Touches | None = None) -> Generator[None, None, Spatial]:
+        """See :meth:`Memory.spatial`."""
+        assert touches is None, "touches belong to a patch here"
+        # At first, of the cells around a patch, those that moved are asked.
+        first = yield from self._judged(self.local, wrong, self.runs.moved)
+        suspected = first.asked & (first.evidence + self.jump() >= self.suspicious)
+        return (yield from self._judged(self.local, wrong, ~suspected))
+
+    def views(self, onset: int) -> Iterator[tuple[Array, NDArray[np.intp], NDArray[np.intp], Model]]:
+        """See :meth:`Memory.views`."""
+        for i, touches in self.local.kept():
+            patch = self.local.patches[i]
+            suffixes = [s.features() for t in touches.kept for s in t.suffixes() if s.first >= onset]
+            if suffixes:
+                yield np.stack(suffixes), patch.inputs, patch.place, self._model(i, touches)
+
+    def _model(self, i: int, touches: Touches) -> Model:
+        if self.reference.model is None:
+            return _PatchSurroundings.of(self.local.patches[i], touches, self.layout)
+        return ContactModel((self.reference.model.tiles[i].alone,))
+
+    def _judged(self, local: PatchTouches, wrong: Mask | None, around: Mask) -> Generator[None, None, Spatial]:
+        """Judge all patches, each asking those of the cells ``around`` it (bool ``[D]``)."""
+        wrong = self.unrest.intermittent | self.unrest.excess | (False if wrong is None else wrong)
+        onsets, runs, tolerance = self.reference.onsets, self.runs, self.reference.tolerance
+        jump, sudden = self.jump(), onsets.size(runs, self.layout.full_scale)
+        present = self.present & self.heard
+        untouched = stuck_evidence(
+            (),
+            self.settled,
+            runs,
+            jump,
+            sudden,
+            ContactModel(()),
+            self.reference.scale,
+            present,
+            wrong,
+            tolerance,
+            self.suspicious,
+        )
+        total = Spatial(*(np.array(values) for values in vars(finished(untouched)).values()))
+        touched = list(local.kept())
+        for k, (i, touches) in enumerate(touched):
+            patch = local.patches[i]
+            cells = patch.inputs
+            asked = around[cells]
+            asked[patch.place] = True
+            of_patch = finished(
+                stuck_evidence(
+                    touches.kept, self.settled[cells], runs.of(cells), jump[cells], sudden[cells],
+                    _Trusting(self._model(i, touches), asked), self.reference.scale.of(cells),
+                    present[cells], wrong[cells], tolerance, self.suspicious,
+                )
+            )  # fmt: skip
+            for name, values in vars(of_patch).items():
+                getattr(total, name)[patch.outputs] = values[patch.place]
+            if k * _PAUSES // len(touched) != (k + 1) * _PAUSES // len(touched):
+                yield
+        return total
+
+    @property
+    def _crowded(self) -> bool:
+        return any(len(touches.kept) > MOST_TOUCHES for touches in self.local.of)
+
+    def _remember(self, frames: NDArray[np.float64], numbers: NDArray[np.intp], still: Mask) -> None:
+        self.local = self.local.extend(frames, numbers, self.reference.scale, still)
+
+    def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
+        # On a line of a hundred cells one is always dead: what never moved does not tell two lines apart.
+        return np.where(self.runs.moved, frames, np.nan)
+
+    def _let_go(self) -> None:
+        old, kept = [], []
+        for touches in self.local.of:
+            crowded = len(touches.kept) > MOST_TOUCHES
+            gone, left = touches.split(KEPT_TOUCHES) if crowded else (Touches(), touches)
+            old.append(gone)
+            kept.append(left)
+        settled = finished(self._judged(self.local.replaced(old), None, self.runs.moved)).surprise
+        self.local, self.settled = self.local.replaced(kept), settled
+
+
+def remembering(layout: SensorLayout, reference: Reference, suspicious: float) -> Memory:
+    """Return an empty memory of the kind that an array needs: large ones are remembered patch by patch.
+
+    From log evidence ``suspicious`` on a cell of a small array is not asked about the others.
+    """
+    if layout.present.sum() > MOST_CELLS:
+        return PatchedMemory(layout, reference)
+    return Memory(layout, reference, suspicious)

@@ -1,0 +1,119 @@
+"""Large skins, patch by patch: each patch has touches of its own, and its cells are judged by what surrounds it.
+
+On a skin of thousands of cells something is touched somewhere all the time, so "a touch of the skin" means nothing, and
+what happens at one end tells nothing of the other. So a large array is cut into patches that overlap: the cells of a
+patch (outputs) are judged by all cells within a few rows and columns (inputs). A patch in which nothing moves costs
+nothing; time and memory grow with the cells, never with their square. A small array is a single patch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.layout import SensorLayout
+from diagnostics.touches import Scale, Touches
+
+PATCH, HALO = 8, 4  # cells: a patch, and how far what surrounds it reaches
+MOST_CELLS = 400  # that are judged as one; beyond that, patches
+
+Cells = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Some neighbouring cells of one pad.
+
+    Attributes:
+        inputs, outputs: cell indices, ascending; the inputs hold the outputs.
+        pad: the pad; corner: first row and column of the rectangle of the inputs; size: its rows and columns. Not
+            known of a patch that comes with a fitted model.
+    """
+
+    inputs: Cells
+    outputs: Cells
+    pad: int = 0
+    corner: tuple[int, int] = (0, 0)
+    size: tuple[int, int] = (0, 0)
+
+    @cached_property
+    def place(self) -> Cells:
+        """Where the outputs lie among the inputs."""
+        return np.searchsorted(self.inputs, self.outputs)
+
+
+def patches(layout: SensorLayout) -> tuple[Patch, ...]:
+    """Return the patches of a layout, each cell an output of exactly one; a single one if the cells are few."""
+    cells, present = layout.grid(np.arange(layout.n_cells)), layout.present
+    if present.sum() <= MOST_CELLS:
+        every = np.flatnonzero(present)
+        return (Patch(every, every),)
+    found = []
+    for pad in range(layout.pads):
+        for r in range(0, layout.rows, PATCH):
+            for c in range(0, layout.cols, PATCH):
+                core = pad, slice(r, r + PATCH), slice(c, c + PATCH)
+                top, left = max(0, r - HALO), max(0, c - HALO)
+                around = pad, slice(top, r + PATCH + HALO), slice(left, c + PATCH + HALO)
+                if present[core].any():
+                    inputs, outputs = cells[around][present[around]], cells[core][present[core]]
+                    found.append(Patch(inputs, outputs, pad, (top, left), cells[around].shape))
+    return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Inputs:
+    """The inputs of all patches, one after the other: ``cells[starts[i]:starts[i + 1]]`` are those of patch i."""
+
+    cells: Cells
+    starts: Cells
+
+    @classmethod
+    def of(cls, all_patches: Sequence[Patch]) -> _Inputs:
+        sizes = [len(patch.inputs) for patch in all_patches]
+        return cls(np.concatenate([p.inputs for p in all_patches]), np.concatenate([[0], np.cumsum(sizes)]))
+
+    def with_any(self, mask: NDArray[np.bool_]) -> list[int]:
+        """Return the patches that have an input in ``mask`` (bool ``[D]``)."""
+        found: list[int] = np.flatnonzero(np.logical_or.reduceat(mask[self.cells], self.starts[:-1])).tolist()
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class PatchTouches:
+    """The touches of each patch so far.
+
+    Attributes:
+        patches: of the array; of: the touches of each, over its inputs.
+    """
+
+    patches: tuple[Patch, ...]
+    of: tuple[Touches, ...]
+    _inputs: _Inputs
+
+    @classmethod
+    def begin(cls, all_patches: tuple[Patch, ...]) -> PatchTouches:
+        """Nothing seen yet."""
+        return cls(all_patches, (Touches(),) * len(all_patches), _Inputs.of(all_patches))
+
+    def extend(
+        self, frames: NDArray[np.float64], numbers: Cells, scale: Scale, still: NDArray[np.bool_]
+    ) -> PatchTouches:
+        """Return the touches after more frames, see ``Touches.extend``; a patch in which nothing moves is as before."""
+        of = list(self.of)
+        for i in self._inputs.with_any(~still):
+            cells = self.patches[i].inputs
+            of[i] = of[i].extend(frames[:, cells], numbers, scale.of(cells), still[cells])
+        return self.replaced(of)
+
+    def replaced(self, of: Sequence[Touches]) -> PatchTouches:
+        """Return the same patches with other touches."""
+        return PatchTouches(self.patches, tuple(of), self._inputs)
+
+    def kept(self) -> Iterator[tuple[int, Touches]]:
+        """Yield the patches that were touched, and their touches."""
+        return ((i, touches) for i, touches in enumerate(self.of) if touches.kept)

@@ -1,0 +1,52 @@
+"""Recordings as they came, turned into float64 only where they are read: large ones are never held twice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+Recording = NDArray[np.float64]
+
+_MOST_VALUES = 1 << 23  # of a block of frames
+
+
+class Readings(Sequence[Recording]):
+    """A sequence of recordings, float64 ``[T, D]`` each when asked for.
+
+    Args:
+        given: arrays ``[T, D]`` of numbers; kept as they are.
+    """
+
+    def __init__(self, given: Sequence[NDArray[Any]]) -> None:
+        self._given = list(given)
+
+    def __len__(self) -> int:
+        return len(self._given)
+
+    @overload
+    def __getitem__(self, which: int) -> Recording: ...
+    @overload
+    def __getitem__(self, which: slice) -> Readings: ...
+    def __getitem__(self, which: int | slice) -> Recording | Readings:
+        if isinstance(which, slice):
+            return Readings(self._given[which])
+        return np.asarray(self._given[which], dtype=np.float64)
+
+    def piece(self, which: int, frames: slice, cells: NDArray[np.intp]) -> Recording:
+        """Return some frames of some cells of one recording."""
+        return np.asarray(self._given[which][frames][:, cells], dtype=np.float64)
+
+    def blocks(self) -> Iterator[Recording]:
+        """Yield all frames in order, so many at once that a block stays small."""
+        for given in self._given:
+            step = max(1, _MOST_VALUES // given.shape[1])
+            for first in range(0, len(given), step):
+                yield np.asarray(given[first : first + step], dtype=np.float64)
+
+    @classmethod
+    def of(cls, recordings: Sequence[NDArray[Any]]) -> Readings:
+        """Return ``recordings`` if they are that already."""
+        return recordings if isinstance(recordings, Readings) else cls(recordings)

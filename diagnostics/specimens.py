@@ -1,0 +1,74 @@
+"""A part of a large array that stands for all of it, where something is learned that is the same for every cell.
+
+What evidence is worth differs little from one end of a skin to the other. So it is learned on a few blocks of cells
+that were touched often, at a cost that does not grow with the array.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.layout import SensorLayout
+from diagnostics.patches import MOST_CELLS
+from diagnostics.readings import Readings
+
+_SIDE = 24  # rows and columns of a block, at most: nine patches
+_CELLS = 1000  # in all, about
+_EVERY = 5  # frames looked at to see where an array is touched
+_TOUCHED = 0.05  # of full scale, above a cell's lowest reading
+
+Recordings = Sequence[NDArray[np.float64]]
+
+
+def specimen(recordings: Recordings, layout: SensorLayout, piece: int) -> tuple[Recordings, SensorLayout]:
+    """Return recordings of the blocks of an array that were touched most, as an array of their own; a small one as is.
+
+    Args:
+        recordings: ``[T, D]`` each.
+        layout: the array.
+        piece: frames of a piece of a recording; only those in which something touches a block are returned.
+    """
+    rows, cols = min(layout.rows, _SIDE), min(layout.cols, _SIDE)
+    wanted = max(2, -(-_CELLS // (rows * cols)))
+    blocks = [
+        (pad, slice(r, r + rows), slice(c, c + cols))
+        for pad in range(layout.pads)
+        for r in range(0, layout.rows - rows + 1, rows)
+        for c in range(0, layout.cols - cols + 1, cols)
+    ]
+    if layout.present.sum() <= MOST_CELLS or len(blocks) <= wanted:
+        return recordings, layout
+    readings = Readings.of(recordings)
+    touched = layout.grid(_touched(readings, layout))
+    busiest = np.argsort([-int(touched[block].sum()) for block in blocks], kind="stable")[:wanted]
+    chosen = [blocks[i] for i in sorted(busiest.tolist())]
+    index = layout.grid(np.arange(layout.n_cells))
+    cells = np.concatenate([index[block].ravel() for block in chosen])
+    own = SensorLayout(
+        wanted, rows, cols, full_scale=layout.full_scale, unit=layout.unit, rate=layout.rate,
+        present=layout.present.ravel()[cells],
+    )  # fmt: skip
+    return _pieces(readings, cells, piece, _TOUCHED * layout.full_scale), own
+
+
+def _pieces(readings: Readings, cells: NDArray[np.intp], piece: int, least: float) -> list[NDArray[np.float64]]:
+    """Return the pieces in which one of the cells moves by over ``least``."""
+    found = []
+    for i in range(len(readings)):
+        frames = readings.piece(i, slice(None), cells)
+        for part in np.array_split(frames, max(1, len(frames) // piece)):
+            if np.fmax.reduce(np.fmax.reduce(part) - np.fmin.reduce(part)) > least:
+                found.append(part)
+    return found
+
+
+def _touched(readings: Readings, layout: SensorLayout) -> NDArray[np.intp]:
+    """Return in how many of the frames looked at each cell was touched, ``[D]``."""
+    count = np.zeros(layout.n_cells, np.intp)
+    for recording in readings:
+        load = recording[::_EVERY] - np.fmin.reduce(recording, axis=0)
+        count += (load > _TOUCHED * layout.full_scale).sum(axis=0)
+    return count

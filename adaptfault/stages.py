@@ -66,9 +66,9 @@ class Run:
         self.logits: Tensor | None = None
         self.quick: CompactNetwork | None = None  # the network of the weights at hand, on fewer numbers
         self.head_seconds = 0.0
-        statistics = adapter.statistics  # estimated once, not a cost of this F
+        fills = adapter.fills  # estimated once, not a cost of this F
         began = time.perf_counter()
-        front = statistics.nearest(fault_set) if len(fault_set) else None
+        front = fills.nearest(fault_set) if len(fault_set) else None
         self.stages = [Stage("fill", time.perf_counter() - began)]
         self.reduced = self._behind(front, copy.deepcopy(adapter.model))
 
@@ -107,7 +107,7 @@ class Run:
 
     def head(self) -> None:
         """Fit a new head in closed form; kept if validation agrees that it is better."""
-        self._keep_better("head", self._behind(self.adapter.statistics.linear(self.fault_set), self.reduced.network))
+        self._keep_better("head", self._behind(self.adapter.fills.linear(self.fault_set), self.reduced.network))
 
     def finetune(self) -> Trained:
         """Train on, front end included, in rounds that each end with a new head; stop when a round brings nothing.
@@ -115,7 +115,7 @@ class Run:
         A larger budget only allows more of the same rounds, so it never ends worse.
         """
         network = copy.deepcopy(self.adapter.model)
-        reduced = self._behind(self.adapter.statistics.linear(self.fault_set), network)
+        reduced = self._behind(self.adapter.fills.linear(self.fault_set), network)
         features = self._views(reduced, self.training)[0].cpu().double().numpy()
         weight, bias = linear_head(features, self.training.y, network.n_classes)
         network.head.load_state_dict({"weight": weight, "bias": bias})
@@ -137,7 +137,7 @@ class Run:
         """Train a new network behind the fill, as the paper does for each F."""
         model = self.adapter.model
         fresh = type(model).from_config({**model.config, "seed": self.seed + 1})
-        self.reduced = self._behind(self.adapter.statistics.linear(self.fault_set), fresh)
+        self.reduced = self._behind(self.adapter.fills.linear(self.fault_set), fresh)
         self.stages.clear()
         began = time.perf_counter()
         history = yield Lesson(self.reduced, _SCRATCH_EPOCHS, self.seed, _SCRATCH_PATIENCE)

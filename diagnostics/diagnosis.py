@@ -138,9 +138,7 @@ class SelfDiagnosis:
         drifting = present & ~wrong & ~intermittent & ~noisy & (spatial.offset >= _OFFSET)
         moving = intermittent | noisy | drifting
         probability = np.where(present, np.where(silent | moving, _SURE, still), 0.0)
-        # Where no reference has taught what evidence is worth, the rate is kept to half.
-        rate = self.false_discovery_rate * (1.0 if self.reference_ else 0.5)
-        faulty = faulty_at(np.where(silent | moving, 0.0, probability), rate)
+        faulty = faulty_at(np.where(silent | moving, 0.0, probability), self.false_discovery_rate)
         faulty = (faulty | silent | moving) & present & ~wrong
         # A cell that moved works, unless something speaks against what it does since.
         alive = present & ~wrong & ~faulty & runs.moved & (probability < _DOUBTED)
@@ -199,5 +197,5 @@ def _checked(recording: ArrayLike, name: str, layout: SensorLayout) -> NDArray[A
     """Return a recording as ``[T, D]``; numbers stay as they are, and are converted where they are read."""
     given = np.asarray(recording)
     if given.dtype.kind in "fiu" and given.shape[1:] in (layout.shape, (layout.n_cells,)):
-        return given.reshape(len(given), -1)
+        return given.reshape(len(given), layout.n_cells)
     return layout.check_recording(recording, name)

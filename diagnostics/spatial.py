@@ -35,7 +35,7 @@ _LEAST_OFFSET = 0.02  # of full scale, at the mean: a smaller one does no harm
 _MOST_OFFSET = 3.0  # log evidence of one touch that a moving cell does not come to rest
 _WORTHS = (0.25, 0.5, 0.75, 1.0)  # of the log odds of the model, in one touch or another
 _WITNESS_SHARE = 0.5  # of what the moving cells say of that counts: neighbours err together
-_ROUNDS = 3  # of judging, leaving suspects out and putting others back
+_MOST_ROUNDS = 8  # of judging, leaving suspects out and putting others back
 
 
 Floats = NDArray[np.float64]
@@ -84,7 +84,7 @@ def stuck_evidence(
     """Weigh stuck against healthy for each cell that is still now. A generator that pauses on its way.
 
     Cells that moved answer first; still cells whose value proved normal are then put back, and those that look
-    stuck are left out, before the final judgement.
+    stuck are left out, until no cell changes sides: cells that died side by side vouch for each other at first.
 
     Args:
         touches: what happened.
@@ -133,7 +133,7 @@ def stuck_evidence(
     # few are broken.
     trusted = askable & runs.moved & (rests | (fresh & (jump < _SUDDEN)))
     evidence = brought
-    for _ in range(_ROUNDS):
+    for _ in range(_MOST_ROUNDS):
         yield
         expected = model.expect(features, trusted)
         yield
@@ -143,8 +143,11 @@ def stuck_evidence(
         brought = np.where(asked, settled + surprise.sum(axis=0), 0.0)
         evidence = np.where(asked, prior + brought, 0.0)
         told = (surprise > _TELLING).sum(axis=0)
+        asked_now = trusted
         trusted = askable & (evidence + jump < suspicious)
         yield
+        if (trusted == asked_now).all():
+            break
     moving = present & runs.moved & fresh & ~np.isnan(expected.spread)
     return Spatial(evidence, brought, asked, told, _offset(features, begins, expected, moving))
 

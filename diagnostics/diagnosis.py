@@ -22,7 +22,7 @@ from diagnostics.weighing import Weights, faulty_at, kinds
 SCHEMA = "adaptfault.diagnoser/2"
 
 _SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
-_SUSPICIOUS_COLD = 2.0  # log evidence from which on a cell is not asked about the others, in a cold start
+_SUSPICIOUS_COLD = 3.0  # log evidence from which on a cell is not asked about the others, in a cold start
 _OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is faulty: four touches
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved before is no longer called alive
 

@@ -198,6 +198,7 @@ def faulty_at(probability: Floats, false_discovery_rate: float) -> NDArray[np.bo
     false = np.cumsum(1 - probability[order])  # expected among the first 1, 2, ...
     accepted = false_discovery_rate * np.arange(1, len(order) + 1)
     beyond, short = false - accepted, accepted - np.concatenate([[0.0], false[:-1]])
+    short[:1] = 0.0
     within = np.logical_and.accumulate(beyond <= np.maximum(short, 0.0))
     chosen = np.zeros(len(probability), bool)
     chosen[order[within]] = True

@@ -77,6 +77,23 @@ def test_lines_that_have_read_alike_since_some_frame_are_dated():
     assert pair.witnesses > 5
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_lines_under_equal_loads_are_told_from_one_line_read_twice(seed: int):
+    rng = np.random.default_rng(seed)
+    force = 1 + 0.2 * np.sin(np.arange(400) / 9)[:, None]
+    bar = rng.uniform(0.5, 0.8, 5)  # it lies evenly across two rows
+    log = np.zeros((400, 2, 6, 5))
+    log[:, 0, 2], log[:, 0, 3] = force * bar, force * (bar + rng.uniform(-0.02, 0.02, 5))
+    noise = rng.normal(0, 0.004, log.shape) * (log > 0)
+
+    def rows() -> list[tuple[int, int]]:
+        return [(j.first, j.second) for j in joined((log + noise).reshape(400, 60)) if j.kind == "row"]
+
+    assert rows() == []
+    log[:, 0, 3] = log[:, 0, 2]
+    assert rows() == [(2, 3)]
+
+
 def test_one_clear_difference_parts_two_lines_again():
     log = inject(pressed(1), [bridge(LAYOUT, Line(1, "row", 2))], LAYOUT, until=500)
     assert joined(log) == []

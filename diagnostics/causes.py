@@ -240,19 +240,19 @@ def _addresses_of_dead_rows(faults: list[Fault], found: Findings, layout: Sensor
             continue
         for level in (0, 1):
             cells, sources = layout.misaddressed(line, level)
-            moved = set(_index(cells, kind, layout))
+            moved = _index(cells, kind, layout)
             dead = [
                 f for f in faults
                 if f.kind is FaultKind.OPEN and f.line is not None and (f.line.pad, f.line.kind) == (line.pad, kind)
-                and set(layout.cells_on(f.line).tolist()) == set(f.cells)
+                and f.line.index in moved and set(layout.cells_on(f.line).tolist()) == set(f.cells)
             ]  # fmt: skip
-            # One broken bit is likelier than two broken wires, and moves just these lines.
-            idle = ~found.alive[sources[sources >= 0]]
-            if len(moved) < 2 or {f.line.index for f in dead if f.line} != moved or not idle.all():
+            # One broken bit is likelier than two broken wires; all the lines that it moves are dead, or never tested.
+            if len(dead) < max(2, len(moved) / 2) or found.alive[[*cells, *sources[sources >= 0]]].any():
                 continue
             reads = _index(sources[sources >= 0], kind, layout)
             instead = f"untouched {kind}s {', '.join(map(str, reads))}" if reads else f"addresses without a {kind}"
-            named = ", ".join(str(i) for i in sorted(moved))
+            named = ", ".join(map(str, moved))
+            wires = ", ".join(str(f.line.index) for f in dead if f.line)
             text = f"{line} is stuck at {level}: {kind}s {named} read nothing, as {instead} would"
             merged = Fault(
                 FaultKind.ALIAS,
@@ -263,7 +263,7 @@ def _addresses_of_dead_rows(faults: list[Fault], found: Findings, layout: Sensor
                 probability=min(f.probability or 0.0 for f in dead),
                 reason=f"{text}; check the {kind} multiplexer and its address wires",
                 evidence=sum(f.evidence or 0 for f in dead),
-                alternatives=(f"the wires of {kind}s {named} are open, each for itself",),
+                alternatives=(f"the wires of {kind}s {wires} are open, each for itself",),
             )
             faults = [f for f in faults if f not in dead] + [merged]
     return faults

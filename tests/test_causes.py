@@ -171,6 +171,21 @@ def test_lines_that_one_dead_address_bit_explains_are_one_fault():
     assert any("each for itself" in text for text in fault.alternatives)
 
 
+def test_an_address_bit_is_named_though_one_of_its_lines_was_never_touched():
+    # Bit 0 stuck at 0: columns 1, 3 and 5 read columns 0, 2 and 4.
+    idle = untested(HEALTHY, np.concatenate([column(i) for i in (0, 2, 4, 5)]))
+    (fault,) = causes(dead(idle, np.r_[column(1), column(3)]))
+    assert (fault.kind, fault.line, fault.value) == (FaultKind.ALIAS, Line(0, "column_address", 0), 0)
+    assert set(column(5)) <= set(fault.cells)
+    assert "columns 1, 3 are open" in fault.alternatives[0]
+
+
+def test_lines_are_not_put_down_to_an_address_bit_if_another_of_its_lines_works():
+    idle = untested(HEALTHY, np.concatenate([column(i) for i in (0, 2, 4)]))
+    faults = causes(dead(idle, np.r_[column(1), column(3)]))
+    assert {fault.line for fault in faults} == {Line(0, "column", 1), Line(0, "column", 3)}
+
+
 def test_lines_are_not_put_down_to_an_address_bit_if_what_they_would_read_is_loaded():
     faults = causes(dead(HEALTHY, np.r_[column(4), column(5)]))
     assert {fault.line for fault in faults} == {Line(0, "column", 4), Line(0, "column", 5)}

@@ -8,7 +8,7 @@ from diagnostics.addresses import Aliasing
 from diagnostics.causes import Findings, root_causes
 from diagnostics.memory import finished
 
-LAYOUT = SensorLayout(2, 8, 6)
+LAYOUT = SensorLayout(2, 11, 6)
 CELLS = LAYOUT.n_cells
 NONE = np.zeros(CELLS, bool)
 ZERO = np.zeros(CELLS)
@@ -172,18 +172,18 @@ def test_lines_that_one_dead_address_bit_explains_are_one_fault():
 
 
 def test_an_address_bit_is_named_though_one_of_its_lines_was_never_touched():
-    # Bit 0 stuck at 0: columns 1, 3 and 5 read columns 0, 2 and 4.
-    idle = untested(HEALTHY, np.concatenate([column(i) for i in (0, 2, 4, 5)]))
-    (fault,) = causes(dead(idle, np.r_[column(1), column(3)]))
-    assert (fault.kind, fault.line, fault.value) == (FaultKind.ALIAS, Line(0, "column_address", 0), 0)
-    assert set(column(5)) <= set(fault.cells)
-    assert "columns 1, 3 are open" in fault.alternatives[0]
+    # Bit 3 stuck at 0: rows 8, 9 and 10 read rows 0, 1 and 2.
+    idle = untested(HEALTHY, np.concatenate([row(0, i) for i in (0, 1, 2, 10)]))
+    (fault,) = causes(dead(idle, np.r_[row(0, 8), row(0, 9)]))
+    assert (fault.kind, fault.line, fault.value) == (FaultKind.ALIAS, Line(0, "row_address", 3), 0)
+    assert set(row(0, 10)) <= set(fault.cells)
+    assert "rows 8, 9 are open" in fault.alternatives[0]
 
 
 def test_lines_are_not_put_down_to_an_address_bit_if_another_of_its_lines_works():
-    idle = untested(HEALTHY, np.concatenate([column(i) for i in (0, 2, 4)]))
-    faults = causes(dead(idle, np.r_[column(1), column(3)]))
-    assert {fault.line for fault in faults} == {Line(0, "column", 1), Line(0, "column", 3)}
+    idle = untested(HEALTHY, np.concatenate([row(0, i) for i in (0, 1, 2)]))
+    faults = causes(dead(idle, np.r_[row(0, 8), row(0, 9)]))
+    assert {fault.line for fault in faults} == {Line(0, "row", 8), Line(0, "row", 9)}
 
 
 def test_lines_are_not_put_down_to_an_address_bit_if_what_they_would_read_is_loaded():

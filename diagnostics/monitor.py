@@ -30,7 +30,8 @@ class Monitor:
     """
 
     def __init__(self, fitted: SelfDiagnosis) -> None:
-        import scipy.optimize  # noqa: F401  now, not in the loop
+        import scipy.ndimage  # now, not in the loop
+        import scipy.optimize  # noqa: F401
         from threadpoolctl import ThreadpoolController
 
         # Threads that wait for each other on a busy robot cost far more than they save on such small matrices.

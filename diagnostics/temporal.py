@@ -86,7 +86,8 @@ class StillRuns:
             # way are company. When many break at once, some fall and some rise.
             share = np.stack([(-step > drastic).sum(axis=1), (step > drastic).sum(axis=1)]) / loaded
             low[broke], high[broke] = lowest[count - 1, at], highest[count - 1, at]
-            jump[broke] = np.nan_to_num(step[first, broke])
+            into = step[first, broke]
+            jump[broke] = np.where(np.isnan(into), 0.0, into)
             company[broke] = share[(jump[broke] > 0).astype(np.intp), first]
         last = frames[-1].copy()
         if any_missing:

@@ -105,7 +105,9 @@ class Twins:
             present = layout.present if axis == 0 else layout.present.swapaxes(1, 2)
             moving = told if axis == 0 else told.swapaxes(1, 2)
             # A missing reading differs from nothing; a position without a cell neither.
-            differ = np.abs(lines[:, :, a] - lines[:, :, b]) > tolerance
+            difference = np.take(lines, a, axis=2)
+            difference -= np.take(lines, b, axis=2)
+            differ = np.abs(difference, out=difference) > tolerance
             differ &= present[:, a] & present[:, b]
             apart = differ.any(axis=3)  # [t, pads, pairs]
             ever = apart.any(axis=0)
@@ -166,13 +168,14 @@ def _summed(
         apart: bool ``[pads, pairs]``, that differ clearly: they begin anew.
         tolerance: as far as two conversions of one cell may differ.
     """
-    pad, pair = np.nonzero(both.any(axis=2) & ~apart)
-    if not (len(pad) or apart.any()):
+    pad, pair, position = np.nonzero(both & ~apart[..., None])
+    if not (len(pad) or sums[1][apart].any()):
         return sums
     after = np.where(apart[..., None], np.float32(0), sums)
-    difference = np.where(both[pad, pair], np.nan_to_num(lines[:, pad, a[pair]] - lines[:, pad, b[pair]]), 0)
-    after[0, pad, pair] += difference.sum(axis=0)
-    after[1, pad, pair] += (difference**2 + both[pad, pair] * np.float32(_STEP * tolerance) ** 2).sum(axis=0)
+    difference = lines[:, pad, a[pair], position] - lines[:, pad, b[pair], position]  # [t, cells that tell]
+    difference[np.isnan(difference)] = 0
+    after[0, pad, pair, position] += difference.sum(axis=0)
+    after[1, pad, pair, position] += (difference**2).sum(axis=0) + len(lines) * np.float32(_STEP * tolerance) ** 2
     return after
 
 

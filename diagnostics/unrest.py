@@ -149,7 +149,7 @@ def _measure(
     frames: Floats, scale: Scale
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, Floats, NDArray[np.intp]]:
     """Return for each cell ``[D]``: blinks to rest, blinks to full scale, loaded frames, noise, level of load."""
-    x = frames - scale.resting
+    x = (frames - scale.resting).astype(np.float32)
     if np.isnan(x).any():
         x = np.nan_to_num(x)
     near, top = scale.near, scale.full_scale - scale.near
@@ -172,8 +172,17 @@ def _measure(
             missing = missing[:-1] & gone[gap:]
         return count
 
-    bend = np.abs(np.diff(x, 2, axis=0)) if len(x) > 2 else np.zeros((1, x.shape[1]))
-    restless = np.median(bend, axis=0) / scale.full_scale
+    bend = np.abs(np.diff(x, 2, axis=0)) if len(x) > 2 else np.zeros((1, x.shape[1]), np.float32)
+    restless = _median(bend) / scale.full_scale
     mean = scale.root_load(frames).mean(axis=0)
     level = np.searchsorted(_LEVELS, mean, side="right") - 1
     return blinks(rests), blinks(full), loaded.sum(axis=0).astype(float), restless, np.maximum(level, 0)
+
+
+def _median(values: NDArray[np.float32]) -> Floats:
+    """Return the median over the first axis, in half of NumPy's time: cell by cell, and without a search for NaN."""
+    half = len(values) // 2
+    middle = [half] if len(values) % 2 else [half - 1, half]
+    ordered = np.partition(np.ascontiguousarray(values.T), middle, axis=1)
+    median: Floats = ordered[:, middle].mean(axis=1, dtype=np.float64)
+    return median

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from diagnostics.contact import Expected
 from diagnostics.layout import Line, LineKind, address_bits
-from diagnostics.memory import Memory
+from diagnostics.memory import Memory, finished
 from diagnostics.twins import Joined
 
 _CLEAR = 3.0  # log ratio: below it the data cannot tell which level a bit is stuck at
@@ -122,7 +122,7 @@ def _level_ratio(line: Line, onset: int, memory: Memory) -> float:
         for features, cells, judged, model in memory.views(onset):
             those = judged[np.isin(cells[judged], true)]
             if len(those):
-                ratio += sign * _plausible(features, model.expect(features, trusted[cells]), those)
+                ratio += sign * _plausible(features, finished(model.expect(features, trusted[cells])), those)
             loaded |= bool((features[:, 2, np.isin(cells, empty)] > 0).any())
         # What nothing is connected to never reads a load.
         if loaded:

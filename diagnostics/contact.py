@@ -12,7 +12,7 @@ What the regressions say is then corrected by what all cells have in common (see
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -41,6 +41,7 @@ _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however ma
 _LEAST_SPREAD = 0.02  # of the root load: nothing is predicted more exactly
 _NOVEL = 0.1  # share of touches that resemble nothing known
 _BLOCK = 4096  # cells looked at together
+_AT_ONCE = 8192  # cells of stretches looked at between two pauses
 FEATURES = 4  # of a cell in a touch, see Summary.features
 _FOLDS = 4  # of the touches: each teaches how far to believe what the others taught
 _LEFT_OUT = (0.03, 0.06, 0.12, 0.2, 0.4, 0.7, 0.95)  # of the cells, in turn: so many may be dead, or not moved yet
@@ -244,8 +245,8 @@ class ContactModel:
         rim = _rim(features, touch, layout, rng) if n_touches >= _FOLDS else None
         return cls((Tile.fit(features, every, every, surest_of(n_touches)),), layout, rim)
 
-    def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Expected:
-        """Say what healthy cells would do.
+    def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Generator[None, None, Expected]:
+        """Say what healthy cells would do. A generator that pauses on its way, for those who cannot wait.
 
         Args:
             features: ``[n, 4, D]``, of n stretches (see ``Summary.features``).
@@ -258,9 +259,15 @@ class ContactModel:
             spread[tile.outputs], surest[tile.outputs], known[tile.outputs] = tile.spread, tile.surest, True
         never, always = expit(foreseen.never), expit(foreseen.always)
         if self.rim is not None and self.layout is not None:
-            corrected, always = self.rim.believe(around(foreseen, features, trusted, self.layout))
-            # A cell that no touch of the reference reached may be out of reach, whatever those around it do.
-            never = np.where(np.isnan(spread), never, corrected)
+            step = max(1, _AT_ONCE // shape)
+            for first in range(0, len(features), step):
+                yield
+                some = slice(first, first + step)
+                of_some = Foreseen(*(values[some] for values in vars(foreseen).values()))
+                told = self.rim.believe(around(of_some, features[some], trusted, self.layout))
+                corrected, always[some] = (p.T for p in told)
+                # A cell that no touch of the reference reached may be out of reach, whatever those around it do.
+                never[some] = np.where(np.isnan(spread), never[some], corrected)
         never, always = (np.where(known, np.clip(p, surest, 1 - surest), 1.0) for p in (never, always))
         return Expected(never, always, foreseen.mean, spread)
 
@@ -291,9 +298,9 @@ def _rim(features: Array, touch: NDArray[np.intp], layout: SensorLayout, rng: np
             trusted[out] = False
             out = np.sort(out[: max(1, round(_LOOKED_AT * len(present)))])
             told = around(_foreseen(tiles, some, trusted), some, trusted, layout)[:, out]
-            samples.append(told.reshape(-1, told.shape[-1]))
-            never.append((some[:, 2, out] == 0).ravel())
-            always.append((some[:, 3, out] == 1).ravel())
+            samples.append(told.reshape(len(told), -1).T.astype(np.float64))
+            never.append((some[:, 2, out] == 0).T.ravel())
+            always.append((some[:, 3, out] == 1).T.ravel())
     return Rim.fit(np.concatenate(samples), np.concatenate(never), np.concatenate(always))
 
 

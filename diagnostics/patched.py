@@ -35,7 +35,7 @@ class _Trusting:
     model: Model
     asked: Mask
 
-    def expect(self, features: Array, trusted: Mask) -> Expected:
+    def expect(self, features: Array, trusted: Mask) -> Generator[None, None, Expected]:
         """See ``ContactModel.expect``."""
         return self.model.expect(features, trusted & self.asked)
 
@@ -56,10 +56,10 @@ class _PatchSurroundings:
         cells = np.flatnonzero(present)
         return cls(Surroundings(_on(Surroundings.of(touches.kept, own).log, cells, own.n_cells), own), cells)
 
-    def expect(self, features: Array, trusted: Mask) -> Expected:
+    def expect(self, features: Array, trusted: Mask) -> Generator[None, None, Expected]:
         """See ``ContactModel.expect``."""
         n_cells = self.log.layout.n_cells
-        e = self.log.expect(_on(features, self.cells, n_cells), _on(trusted, self.cells, n_cells))
+        e = yield from self.log.expect(_on(features, self.cells, n_cells), _on(trusted, self.cells, n_cells))
         cells = self.cells
         return Expected(e.never[:, cells], e.always[:, cells], e.mean[:, cells], e.spread[cells])
 

@@ -18,7 +18,9 @@ from diagnostics.layout import SensorLayout
 from diagnostics.touches import Array
 
 _SURE = 8.0  # log odds that a cell's own regressions are taken for at most
-_EMPTY = 0.5  # of a ring's cells: so much the mean of the whole array counts, all there is where none is trusted
+_EMPTY = np.float32(
+    0.5
+)  # of a ring's cells: so much the mean of the whole array counts, all there is where none is trusted
 _RIDGE = 1.0  # towards believing the cells' own regressions
 _LEAST_SCALE = 1e-3
 _RARE = 0.005  # share that a cell was ever found loaded in, at least and at most
@@ -71,15 +73,17 @@ class Rim:
         weight, bias = (np.stack(column, axis=-1) for column in zip(*fitted, strict=True))
         return cls(mean, scale, weight, bias)
 
-    def believe(self, samples: Floats) -> tuple[Floats, Floats]:
-        """Return P(unloaded throughout) and P(loaded throughout), ``[...]`` each, of samples ``[..., k]``."""
-        odds = ((samples - self.mean) / self.scale) @ self.weight + self.bias
-        p: Floats = expit(odds)
-        return p[..., 0], p[..., 1]
+    def believe(self, samples: Array) -> tuple[Floats, Floats]:
+        """Return P(unloaded throughout) and P(loaded throughout), ``[...]`` each, of samples ``[k, ...]``."""
+        weight = (self.weight / self.scale[:, None]).astype(np.float32)
+        odds = weight.T @ samples.reshape(len(samples), -1)
+        p: Floats = expit(odds.astype(np.float64) + (self.bias - self.mean @ weight)[:, None])
+        never, always = p.reshape(2, *samples.shape[1:])
+        return never, always
 
 
-def around(foreseen: Foreseen, features: Array, trusted: NDArray[np.bool_], layout: SensorLayout) -> Floats:
-    """Return what there is to know of each cell in each stretch, itself apart, ``[n, D, k]``.
+def around(foreseen: Foreseen, features: Array, trusted: NDArray[np.bool_], layout: SensorLayout) -> Array:
+    """Return what there is to know of each cell in each stretch, itself apart, ``[k, D, n]``.
 
     Args:
         foreseen: by the cells' own regressions.
@@ -87,64 +91,81 @@ def around(foreseen: Foreseen, features: Array, trusted: NDArray[np.bool_], layo
         trusted: bool ``[D]``, the cells that may be asked.
         layout: the array.
     """
-    from scipy.ndimage import correlate1d
-
     asked = (trusted & layout.present.ravel()).astype(np.float32)
-    known = layout.grid(
-        np.concatenate([features * asked, np.broadcast_to(asked, (len(features), 1, len(asked)))], axis=1)
-    )
-
-    def window(values: Array, width: int) -> Array:
-        ones = np.ones(width, np.float32)
-        rows: Array = correlate1d(values, ones, axis=-2, mode="constant")
-        both: Array = correlate1d(rows, ones, axis=-1, mode="constant")
-        return both
-
-    beside = np.array([1, 0, 1], np.float32)
-    cross = correlate1d(known, beside, axis=-1, mode="constant") + correlate1d(known, beside, axis=-2, mode="constant")
-    three, five = window(known, 3), window(known, 5)
+    n = len(features)
+    # Four features of the trusted cells, and where these are. Stretches come last: long inner loops are fast.
+    known = np.empty((5, *layout.shape, n), np.float32)
+    by_cell = known.reshape(5, -1, n)
+    np.multiply(features.transpose(1, 2, 0), asked[:, None], out=by_cell[:4])
+    by_cell[4] = asked[:, None]
+    cross, three, five = _windows(known)
+    corners = three - cross
     # Means over the pad and over the array leave the cell itself out, as the rings do.
-    pads = known.sum(axis=(-2, -1), keepdims=True)  # (n, 5, pads, 1, 1)
-    pad, whole = pads - known, pads.sum(axis=2, keepdims=True) - known
+    pads = known.sum(axis=(2, 3), keepdims=True)  # (5, pads, 1, 1, n)
+    pad, whole = pads - known, pads.sum(axis=1, keepdims=True) - known
+    told = np.empty((INPUTS, layout.n_cells, n), np.float32)
+    of_cells, of_place, *rings, on_pad, overall = told.reshape(7, 4, *layout.shape, n)
+    for values, own in zip(
+        of_cells.reshape(4, -1, n),
+        (
+            np.clip(foreseen.never, -_SURE, _SURE),
+            np.clip(foreseen.always, -_SURE, _SURE),
+            foreseen.mean,
+            logit(np.clip(foreseen.usual, _RARE, 1 - _RARE)),
+        ),
+        strict=True,
+    ):
+        values[:] = own.T
+    of_place[0], of_place[1], of_place[2], of_place[3] = cross[4], corners[4], _inside(layout), _enclosed(known[1])
+    np.divide(whole[:4], np.maximum(whole[4:], 1), out=overall)
+    np.divide(pad[:4] + _EMPTY * overall, pad[4:] + _EMPTY, out=on_pad)
+    for total, ring in zip((cross, corners, five - three - known), rings, strict=True):
+        np.divide(total[:4] + _EMPTY * on_pad, total[4:] + _EMPTY, out=ring)
+    return told
 
-    def means(total: Array, of: Array) -> Array:
-        mean: Array = (total[:, :4] + _EMPTY * of) / (total[:, 4:] + _EMPTY)
-        return mean
 
-    overall = whole[:, :4] / np.maximum(whole[:, 4:], 1)
-    on_pad = means(pad, overall)
-    rings = [means(total, on_pad) for total in (cross, three - known - cross, five - three)]
-    loads = np.concatenate([*rings, on_pad, overall], axis=1).reshape(len(features), -1, layout.n_cells)
-    place = np.stack(
-        [cross[:, 4], three[:, 4] - known[:, 4] - cross[:, 4], _inside(layout)[None].repeat(len(known), 0)]
-    )
-    enclosed = _enclosed(known[:, 1])
-    beyond = np.concatenate([place, enclosed[None]]).reshape(4, len(features), -1)
-    own = (
-        np.clip(foreseen.never, -_SURE, _SURE),
-        np.clip(foreseen.always, -_SURE, _SURE),
-        foreseen.mean,
-        logit(np.clip(foreseen.usual, _RARE, 1 - _RARE)),
-    )
-    return np.concatenate([np.stack(own, axis=2), np.moveaxis(beyond, 0, 2), np.moveaxis(loads, 1, 2)], axis=2)
+def _windows(known: Array) -> tuple[Array, Array, Array]:
+    """Return sums ``[..., rows, cols, n]`` over the four next cells, the eight next, and all 25 within two steps."""
+    rows, cols = known.shape[2:4]
+    padded = np.pad(known, ((0, 0), (0, 0), (2, 2), (2, 2), (0, 0)))
+
+    def beside(values: Array, axis: int, size: int, reach: int) -> Array:
+        def moved(by: int) -> Array:
+            part = slice(2 + by, 2 + by + size)
+            return values[:, :, :, part] if axis == 3 else values[:, :, part]
+
+        total: Array = moved(-reach) + moved(reach)
+        return total
+
+    inner = slice(2, 2 + rows)
+    centre = padded[:, :, :, 2 : 2 + cols]
+    across = beside(padded, 3, cols, 1)  # (5, pads, rows + 4, cols, n)
+    in_row = across + centre
+    cross = across[:, :, inner] + beside(centre, 2, rows, 1)
+    three = across[:, :, inner] + beside(in_row, 2, rows, 1)
+    wide = in_row + beside(padded, 3, cols, 2)
+    five = wide[:, :, inner] + beside(wide, 2, rows, 1) + beside(wide, 2, rows, 2)
+    return cross, three, five
 
 
 def _inside(layout: SensorLayout) -> Array:
-    """Return 1 for cells with four neighbours, 0 at the border of what the skin covers, ``[pads, rows, cols]``."""
+    """Return 1 for cells with four neighbours, 0 at the border of what the skin covers, ``[pads, rows, cols, 1]``."""
     there = np.pad(layout.present, ((0, 0), (1, 1), (1, 1)))
     inside = there[:, 2:, 1:-1] & there[:, :-2, 1:-1] & there[:, 1:-1, 2:] & there[:, 1:-1, :-2]
-    return inside.astype(np.float32)
+    return inside[..., None].astype(np.float32)
 
 
 def _enclosed(load: Array) -> Array:
-    """Return how well the loads around each cell enclose it: the smaller of two opposite ones, the best pair counts."""
-    padded = np.pad(load, ((0, 0), (0, 0), (1, 1), (1, 1)))
-    rows, cols = load.shape[2:]
-    pairs = []
+    """Return how well the loads ``[pads, rows, cols, n]`` around each cell enclose it.
+
+    That is the smaller of two opposite ones; the best of four pairs counts.
+    """
+    padded = np.pad(load, ((0, 0), (1, 1), (1, 1), (0, 0)))
+    rows, cols = load.shape[1:3]
+    best = np.zeros_like(load)
     for r, c in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        one, other = (padded[..., 1 + s * r : 1 + s * r + rows, 1 + s * c : 1 + s * c + cols] for s in (1, -1))
-        pairs.append(np.minimum(one, other))
-    best: Array = np.maximum.reduce(pairs)
+        one, other = (padded[:, 1 + s * r : 1 + s * r + rows, 1 + s * c : 1 + s * c + cols] for s in (1, -1))
+        np.maximum(best, np.minimum(one, other), out=best)
     return best
 
 

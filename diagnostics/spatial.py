@@ -44,7 +44,7 @@ Floats = NDArray[np.float64]
 class Model(Protocol):
     """Knows what healthy cells would do in a touch."""
 
-    def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Expected:
+    def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Generator[None, None, Expected]:
         """See ``ContactModel.expect``."""
 
 
@@ -135,7 +135,7 @@ def stuck_evidence(
     evidence = brought
     for _ in range(_MOST_ROUNDS):
         yield
-        expected = model.expect(features, trusted)
+        expected = yield from model.expect(features, trusted)
         yield
         likely = _believed(expected.never, features[:, 2] == 0, trusted & runs.moved)
         likely[:, held] = expected.always[:, held] * expected.within(low[held], high[held], held)

@@ -8,7 +8,7 @@ of the contact is rightly unloaded, however loaded its neighbours on one side ar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +38,7 @@ class Surroundings:
             np.stack([part.features() for touch in touches for part in (*touch.parts, touch.suffixes()[0])]), layout
         )
 
-    def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Expected:
+    def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Generator[None, None, Expected]:
         """See ``ContactModel.expect``. A cell between no two trusted neighbours is not judged: all is as expected."""
         from scipy.spatial import cKDTree
 
@@ -47,6 +47,7 @@ class Surroundings:
         spread = np.full(shape[1], np.nan)
         present = self.layout.present.ravel()
         known = _surroundings(self.log, trusted, self.layout)
+        yield
         usable = np.flatnonzero(trusted & present & np.isfinite(known).all(axis=(0, 2)))
         if not len(usable):
             return Expected(never, always, mean, spread)
@@ -54,6 +55,7 @@ class Surroundings:
         answers = np.moveaxis(self.log[:, :, usable], 1, -1).reshape(-1, self.log.shape[1])
         kept = np.linspace(0, len(samples) - 1, min(len(samples), _MOST_SAMPLES)).astype(int)
         tree, answers = cKDTree(samples[kept]), answers[kept]
+        yield
         asked = _surroundings(features, trusted, self.layout)
         judged = np.flatnonzero(np.isfinite(asked).all(axis=(0, 2)) & present)
         neighbours = min(_NEIGHBOURS, len(answers))

@@ -3,6 +3,7 @@ import pytest
 
 from diagnostics import SensorLayout, contact
 from diagnostics.contact import ContactModel, Expected, resting, stretches
+from diagnostics.memory import finished
 from diagnostics.touches import Scale
 
 LAYOUT = SensorLayout(1, 1, 12)
@@ -39,7 +40,7 @@ def all_but(*cells: int) -> np.ndarray:
 
 
 def test_a_cell_between_loaded_ones_is_hardly_ever_unloaded_and_one_far_from_them_nearly_always(model, unseen):
-    never = model.expect(unseen, ALL).never
+    never = finished(model.expect(unseen, ALL)).never
     loaded = unseen[:, 2] > 0
     assert np.median(never[:, 4][loaded[:, 3] & loaded[:, 5]]) < 0.05
     assert never[:, 10][~loaded[:, 8:].any(axis=1)].min() > 0.9
@@ -54,7 +55,7 @@ def test_it_tells_more_about_touches_not_seen_than_each_cells_own_share(model, u
         return float(-np.log(np.where(unloaded, p, 1 - p)).mean())
 
     own_share = np.broadcast_to((seen[:, 2, cells] == 0).mean(axis=0), unloaded.shape)
-    assert log_loss(model.expect(unseen, ALL).never[:, cells]) < 0.5 * log_loss(own_share)
+    assert log_loss(finished(model.expect(unseen, ALL)).never[:, cells]) < 0.5 * log_loss(own_share)
 
 
 @pytest.mark.parametrize("trusted", [ALL, all_but(4)])
@@ -62,7 +63,7 @@ def test_what_a_cell_reads_itself_does_not_matter(model, unseen, trusted):
     spoiled = unseen.copy()
     spoiled[:, :, 4] = 1.0
     for name in ("never", "always", "mean"):
-        said, of_spoiled = (getattr(model.expect(f, trusted), name)[:, 4] for f in (unseen, spoiled))
+        said, of_spoiled = (getattr(finished(model.expect(f, trusted)), name)[:, 4] for f in (unseen, spoiled))
         np.testing.assert_allclose(of_spoiled, said, atol=1e-5, err_msg=name)
 
 
@@ -71,26 +72,26 @@ def test_what_an_untrusted_cell_reads_matters_to_no_cell(model, unseen):
     spoiled = unseen.copy()
     spoiled[:, :, [3, 6]] = 0.7
     for name in ("never", "always", "mean"):
-        said, of_spoiled = (getattr(model.expect(f, trusted), name) for f in (unseen, spoiled))
+        said, of_spoiled = (getattr(finished(model.expect(f, trusted)), name) for f in (unseen, spoiled))
         np.testing.assert_allclose(of_spoiled, said, atol=1e-5, err_msg=name)
 
 
 def test_the_load_of_a_cell_is_foreseen_from_the_others_even_beside_untrusted_ones(model, unseen):
     truth = unseen[:, 1, 4]
     for trusted, share in ((ALL, 0.3), (all_but(4, 5), 0.5)):
-        error = model.expect(unseen, trusted).mean[:, 4] - truth
+        error = finished(model.expect(unseen, trusted)).mean[:, 4] - truth
         assert np.sqrt(np.mean(error**2)) < share * truth.std()
 
 
 def test_without_a_trusted_cell_the_usual_is_expected(model, unseen):
-    expected = model.expect(unseen, ~ALL)
+    expected = finished(model.expect(unseen, ~ALL))
     assert np.ptp(expected.never, axis=0).max() < 1e-5
-    assert expected.mean[0] == pytest.approx(model.expect(unseen, ~ALL).mean[-1])
+    assert expected.mean[0] == pytest.approx(finished(model.expect(unseen, ~ALL)).mean[-1])
     assert expected.never[0, 10] > expected.never[0, 4]
 
 
 def test_a_cell_that_was_never_loaded_is_expected_to_stay_so(model, unseen):
-    assert model.expect(unseen, ALL).never[:, 11].min() > 0.99
+    assert finished(model.expect(unseen, ALL)).never[:, 11].min() > 0.99
 
 
 def test_cells_may_rest_at_any_value():
@@ -134,7 +135,7 @@ def test_large_arrays_are_modelled_in_tiles_that_know_every_cell(monkeypatch):
     monkeypatch.setattr(contact, "stretches", lambda *of: tuple(each[::10] for each in stretches(*of)))
     model = ContactModel.fit(recordings, layout, scale)
     features = stretches(recordings, scale, rng)[0]
-    expected = model.expect(features, np.ones(402, bool))
+    expected = finished(model.expect(features, np.ones(402, bool)))
     assert np.isfinite(expected.spread).all()
     loaded = features[:, 2] > 0
     assert expected.never[loaded].mean() < 0.3

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from diagnostics import SensorLayout
+from diagnostics.memory import finished
 from diagnostics.surroundings import Surroundings
 from diagnostics.touches import Scale, Summary, Touch
 
@@ -31,7 +32,7 @@ def features(touches) -> np.ndarray:
 
 
 def test_a_cell_enclosed_by_loaded_ones_is_expected_to_be_loaded_and_one_far_from_them_not(touches, features):
-    never = Surroundings.of(touches, LAYOUT).expect(features, ALL).never
+    never = finished(Surroundings.of(touches, LAYOUT).expect(features, ALL)).never
     grid = (features[:, 2] > 0).reshape(-1, 9, 9)
     enclosed = np.zeros_like(grid)
     far = np.zeros_like(grid)
@@ -50,12 +51,14 @@ def test_what_a_cell_reads_itself_does_not_matter_where_it_is_not_trusted(touche
     spoiled = features.copy()
     spoiled[:, :, centre] = 1.0
     model = Surroundings.of(touches, LAYOUT)
-    np.testing.assert_array_equal(model.expect(spoiled, trusted).never, model.expect(features, trusted).never)
+    np.testing.assert_array_equal(
+        finished(model.expect(spoiled, trusted)).never, finished(model.expect(features, trusted)).never
+    )
 
 
 def test_a_cell_between_no_two_trusted_neighbours_is_not_judged(touches, features):
     corner = LAYOUT.cell(0, 0, 0)
-    expected = Surroundings.of(touches, LAYOUT).expect(features, ALL)
+    expected = finished(Surroundings.of(touches, LAYOUT).expect(features, ALL))
     assert (expected.never[:, corner] == 1).all()
     assert (expected.always[:, corner] == 1).all()
     assert np.isnan(expected.spread[corner])
@@ -63,7 +66,7 @@ def test_a_cell_between_no_two_trusted_neighbours_is_not_judged(touches, feature
 
 
 def test_without_trusted_cells_everything_is_as_expected(touches, features):
-    expected = Surroundings.of(touches, LAYOUT).expect(features, ~ALL)
+    expected = finished(Surroundings.of(touches, LAYOUT).expect(features, ~ALL))
     assert (expected.never == 1).all()
     assert np.isnan(expected.spread).all()
 
@@ -72,6 +75,6 @@ def test_positions_without_a_cell_are_not_judged(touches, features):
     present = np.ones(LAYOUT.shape, bool)
     present[0, 4, 4] = False
     layout = SensorLayout(1, 9, 9, present=present)
-    expected = Surroundings.of(touches, layout).expect(features, ALL)
+    expected = finished(Surroundings.of(touches, layout).expect(features, ALL))
     assert (expected.never[:, LAYOUT.cell(0, 4, 4)] == 1).all()
     assert (expected.never[:, LAYOUT.cell(0, 4, 6)] < 1).any()

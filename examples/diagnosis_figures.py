@@ -452,12 +452,12 @@ def monitor_speed(fitted: SelfDiagnosis, log: np.ndarray, asked: bool) -> Row:
 
 
 def speed(bench: Bench) -> Iterator[Row]:
-    """The arrays of 220 and 2048 cells learn from three simulated grasps: how fast it is does not depend on them."""
+    """The arrays of 220 and 2048 cells learn from nine simulated grasps: how fast it is does not depend on them."""
     log = long_log([bench.recordings.frames[i] for i in bench.rest], 20_000)
     yield batch_speed(bench.fitted, log, None)
     yield monitor_speed(bench.fitted, log[:4000], False)
     for layout, length, wanted in ((SensorLayout.paper(), 20_000, 5.0), (SensorLayout(1, 64, 32), 2_000, 1.0)):
-        grasps = simulate(1, layout, n_frames=60, seed=3, classes=("normal", "void", "harder")).frames
+        grasps = simulate(3, layout, n_frames=60, seed=3, classes=("normal", "void", "harder")).frames
         fitted = SelfDiagnosis(layout).fit(grasps)
         log = long_log(simulate(5, layout, n_frames=60, seed=4).frames, length)
         yield batch_speed(fitted, log, wanted)

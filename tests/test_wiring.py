@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from diagnostics import Line, SensorLayout
-from diagnostics.wiring import Cause, explain
+from diagnostics.wiring import Cause, cheapest_of_few, cheapest_of_many, explain
 
 LAYOUT = SensorLayout(2, 11, 10)
 SURE, DOUBTFUL, NOTHING = 8.0, 3.0, 0.0
@@ -197,3 +197,14 @@ def test_suspects_alone_need_more_than_a_certain_cell_does():
         weight = np.where(mask(row[6:]), 4.0, NOTHING)
         causes = explained(faulty, against, weight=weight)
         assert any(cause.line is not None for cause in causes) == bool(certain)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_trying_all_sets_of_wires_and_integer_programming_agree(seed: int):
+    rng = np.random.default_rng(seed)
+    wires, cells = int(rng.integers(1, 9)), int(rng.integers(1, 20))
+    covers = rng.random((wires, cells)) < 0.4
+    cost, saves = rng.uniform(1, 9, wires), rng.uniform(-1, 6, cells)
+    few, many = cheapest_of_few(cost, covers, saves), cheapest_of_many(cost, covers, saves)
+    assert few.any() or many.sum() == 0
+    np.testing.assert_array_equal(few, many)

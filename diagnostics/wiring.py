@@ -7,9 +7,9 @@ contradicts it ``log 1000``. A cell that is not faulty beyond doubt counts with
     w - log(1 - q + q exp w)
 
 what a broken wire explains better than a single fault of chance q, or none; w is its log likelihood ratio. Many
-doubtful cells on one wire may convict it together. The set of least cost is found by trying all, or by integer
-programming; how rare single faults are is then read off the solution, and the set sought again until it no longer
-changes.
+doubtful cells on one wire may convict it together, but not each for a full one: at the edge of a contact neighbours are
+wrong together. The set of least cost is found by trying all, or by integer programming; how rare single faults are is
+then read off the solution, and the set sought again until it no longer changes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _RAREST, _MOST_COMMON = 0.005, 0.5  # bounds on the share of single faults, whic
 _FEWEST_WITNESSES, _WITNESS_SHARE = 2, 1 / 3
 _WITNESS = 2.5  # log ratio of a cell that counts as one
 _TRIED = 0.3  # log ratio of a cell that was put to the test
-_DOUBTFUL_SHARE = 0.7  # of the evidence of doubtful cells counts: neighbours are wrong together
+_ALIKE = 0.2  # correlation of what doubtful cells on one wire say: at the edge of a contact they are wrong together
 _LEAST = -1.0  # log ratio that one doubtful cell can bring
 _STRONGEST = np.log(1000.0)  # log ratio that one of the cells should have, if none is faulty beyond doubt
 _LEADERLESS_COST = np.log(20_000.0)  # if none has it: at an edge all cells of a line may be wrongly suspected
@@ -136,11 +136,12 @@ def _explain_pad(
     found = np.flatnonzero(faulty & present)
     tested = int((against & present).sum()) + len(found)
     blamed: list[_Candidate] = []
+    counts = _counting(candidates, tried & ~faulty)
     support, cell_cost = weight, float(-np.log(_RAREST))
     singles = 0
     for _ in range(_ROUNDS if candidates else 0):
         cell_cost = float(-np.log(np.clip(max(singles / max(tested, 1), common), _RAREST, _MOST_COMMON)))
-        support = weight - np.logaddexp(np.log1p(-np.exp(-cell_cost)), weight - cell_cost)
+        support = counts * (weight - np.logaddexp(np.log1p(-np.exp(-cell_cost)), weight - cell_cost))
         blamed = _cheapest(candidates, found, faulty, support, cell_cost)
         behind = np.zeros(layout.n_cells, bool)
         for candidate in blamed:
@@ -193,10 +194,21 @@ def _candidates(
     return found
 
 
+def _counting(candidates: Sequence[_Candidate], doubtful: Mask) -> NDArray[np.float64]:
+    """Return what share of a doubtful cell's evidence counts, ``[D]``: the less, the more of them a wire serves.
+
+    So many cells whose evidence correlates are worth as much as fewer independent ones (Kish's design effect).
+    """
+    counts = np.ones(len(doubtful))
+    for c in candidates:
+        n = int(doubtful[c.cells].sum())
+        counts[c.cells] = np.minimum(counts[c.cells], 1 / (1 + _ALIKE * max(n - 1, 0)))
+    return counts
+
+
 def _gain(c: _Candidate, faulty: NDArray[np.bool_], support: NDArray[np.float64], cell_cost: float) -> float:
     doubtful = c.cells[~faulty[c.cells]]
-    doubt = _DOUBTFUL_SHARE * float(support[doubtful].sum())
-    return float(faulty[c.cells].sum()) * cell_cost + doubt - c.cost
+    return float(faulty[c.cells].sum()) * cell_cost + float(support[doubtful].sum()) - c.cost
 
 
 def _cheapest(
@@ -215,7 +227,7 @@ def _cheapest(
         found = found[np.isin(found, on_any)]  # a cell on none of them explains itself, whatever they cost
         covers = np.array([np.isin(np.r_[found, doubtful], c.cells) for c in candidates])
         # What it saves if a wire through a cell is blamed.
-        saves = np.r_[np.full(len(found), cell_cost), _DOUBTFUL_SHARE * support[doubtful]]
+        saves = np.r_[np.full(len(found), cell_cost), support[doubtful]]
         cheapest = cheapest_of_few if len(candidates) <= _FEW else cheapest_of_many
         chosen = cheapest(np.array([c.cost for c in candidates]), covers, saves)
         candidates = [c for c, is_chosen in zip(candidates, chosen, strict=True) if is_chosen]

@@ -5,7 +5,7 @@ from diagnostics import Line, SensorLayout
 from diagnostics.wiring import Cause, cheapest_of_few, cheapest_of_many, explain
 
 LAYOUT = SensorLayout(2, 11, 10)
-SURE, DOUBTFUL, NOTHING = 8.0, 3.0, 0.0
+SURE, DOUBTFUL, NOTHING = 8.0, 5.0, 0.0
 
 
 def mask(*cells: np.ndarray | list[int]) -> np.ndarray:
@@ -108,6 +108,13 @@ def test_doubtful_cells_on_one_wire_convict_it_together():
 def test_as_many_doubtful_cells_here_and_there_convict_nothing():
     alike = mask(np.random.default_rng(0).choice(220, 10, replace=False))
     assert explained(mask(), ~alike, alike, np.where(alike, DOUBTFUL, NOTHING)) == ()
+
+
+def test_a_long_line_of_weak_suspects_is_the_edge_of_a_contact_and_no_wire():
+    layout = SensorLayout(1, 64, 32)
+    alike = np.isin(np.arange(2048), layout.cells_on(Line(0, "row", 5)))
+    none = np.zeros(2048, bool)
+    assert explain(none, alike, ~alike, np.where(alike, 2.6, NOTHING), layout) == ()
 
 
 def test_a_few_doubtful_cells_do_not_convict_a_wire():

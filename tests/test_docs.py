@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _pytest.mark import ParameterSet
 from conftest import without_export
 
 import adaptfault as af
@@ -21,6 +22,7 @@ HOME = Path(__file__).parents[1]
 PAGES = [HOME / "README.md", *sorted((HOME / "docs").glob("*.md"))]
 WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text()]
 NOT_RUN = {"reproduce": "test_paper.py runs it, small"}
+SLOW = ("README.md", "maintenance.md")  # whose commands are: make examples runs them, make test does not
 QUICK = {
     "train": ["--epochs", "1"],
     "demo": ["--epochs", "1"],
@@ -76,7 +78,12 @@ def test_the_python_on_a_page_runs(page, place, later_grasps, capsys):
         exec(compile(code, page.name, "exec"), given)
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if commands(p)], ids=lambda page: page.name)
+def with_commands() -> list[ParameterSet]:
+    slow = dict.fromkeys(SLOW, pytest.mark.slow)
+    return [pytest.param(page, marks=slow.get(page.name, ()), id=page.name) for page in PAGES if commands(page)]
+
+
+@pytest.mark.parametrize("page", with_commands())
 def test_the_commands_on_a_page_run(page, place, capsys):
     for command, *arguments in commands(page):
         if command in NOT_RUN:

@@ -21,7 +21,7 @@ test: .venv/installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal -m 'not slow'
 
 examples: .venv/installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal -v -rs tests/test_examples.py tests/test_docs.py
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal -vv -rs tests/test_examples.py tests/test_docs.py
 
 # Warnings are errors: links and names that lead nowhere, public names that are on no page.
 docs: .venv/installed-docs

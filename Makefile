@@ -1,5 +1,5 @@
 # make demo       the main job on simulated grasps, with a report     make test         lint, formatting, types and tests
-# make examples   every script of examples/, and every block of code in the docs, in a small version
+# make examples   every script of examples/, and every block of code in the docs, small; the quick ones are in make test
 # make docs       the site, in build/site: pages and API reference    make wheel-check  the wheel, installed somewhere else
 # They make their own .venv. PYTHON=/path/to/python3 chooses the interpreter.
 
@@ -18,10 +18,10 @@ test: .venv/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal -m 'not slow'
 
 examples: .venv/installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal -v -rs tests/test_examples.py tests/test_docs.py
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal -vv -rs tests/test_examples.py tests/test_docs.py
 
 # Warnings are errors: links and names that lead nowhere, public names that are on no page.
 docs: .venv/installed-docs

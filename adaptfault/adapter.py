@@ -30,7 +30,7 @@ class Adapter:
     Windows without a label (y = -1) take the fault-free model's word for it: the heads learn its probabilities.
 
     Args:
-        model: the fault-free model; it is copied, never changed. All is worked out on the CPU, wherever the model is.
+        model: the fault-free model; it is never changed. The work is done on the CPU, unless :meth:`to` moves it.
         train, validation: fault-free windows, ``[N, T, D]``; more than 2500 for validation are thinned evenly.
 
     Raises:

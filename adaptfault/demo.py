@@ -131,42 +131,28 @@ def run_demo(
     layout = recordings.layout
     if recordings.labels is None:
         raise ValueError("the recordings have no labels: the demo trains a classifier")
-    clock = _Clock({})
+    clock, rng = _Clock({}), np.random.default_rng(seed)
     windows = make_windows(recordings.frames, recordings.labels, layout)
     training, validation, test = split(windows, seed=seed)
     healthy = [recordings.frames[i] for i in np.unique(training.recording)]
-    tested = np.unique(test.recording)
     say(f"recordings   {len(recordings)} of {layout}; {len(recordings.class_names)} classes, {len(windows)} windows")
 
     model = TactileTransformer(layout, len(recordings.class_names), seed=seed, **(network or {}))
+    options: dict[str, Any] = {"checkpoint": checkpoint, "progress": progress, "seed": seed}
     with clock("training"):
-        history = train(
-            model,
-            training,
-            validation,
-            epochs=epochs,
-            learning_rate=learning_rate,
-            seed=seed,
-            checkpoint=checkpoint,
-            progress=progress,
-        )
+        history = train(model, training, validation, epochs=epochs, learning_rate=learning_rate, **options)
     say(f"training     {history}")
-    fault_free, fault_free_interval = _score(model, test)
-    say(f"fault-free   {fault_free}")
+    fault_free = _score(model, test)
+    say(f"fault-free   {fault_free[0]}")
 
-    rng = np.random.default_rng(seed)
     injected = tuple(default_faults(healthy, layout, rng) if faults is None else faults)
-    broken = [inject(recordings.frames[i], injected, layout, seed=seed + int(i)) for i in tested]
-    broken_windows = _labelled(make_windows(broken, None, layout), tested, recordings)
-    collapsed, collapsed_interval = _score(model, broken_windows)
-    say(f"broken       {len({c for fault in injected for c in fault.cells})} cells; {collapsed}")
+    broken, broken_windows = _broken(recordings, np.unique(test.recording), injected, seed)
+    collapsed = _score(model, broken_windows)
+    say(f"broken       {len({c for fault in injected for c in fault.cells})} cells; {collapsed[0]}")
     _list(say, [fault.describe(layout) for fault in injected])
 
-    with clock("learning what healthy looks like"):
-        diagnoser = SelfDiagnosis(layout).fit(healthy)
     log = [broken[i] for i in rng.permutation(len(broken))[:_LOG_RECORDINGS]]
-    with clock("diagnosis"):
-        diagnosis = diagnoser.diagnose(log)
+    diagnosis = _diagnosed(layout, healthy, log, clock)
     say(_found(diagnosis, injected, len(log), clock.seconds["diagnosis"]))
     _list(say, [fault.reason for fault in diagnosis.faults])
 
@@ -174,28 +160,51 @@ def run_demo(
         adaptation = Adapter(model, training, validation).adapt(diagnosis.fault_set, seed=seed, progress=progress)
     for stage in adaptation.stages:
         say(f"adaptation   {stage}")
-    repaired, repaired_interval = _score(adaptation, broken_windows)
+    repaired = _score(adaptation, broken_windows)
     result = DemoResult(
         recordings=recordings,
         seed=seed,
         injected=injected,
-        fault_free=fault_free,
-        broken=collapsed,
-        repaired=repaired,
-        intervals=(fault_free_interval, collapsed_interval, repaired_interval),
+        fault_free=fault_free[0],
+        broken=collapsed[0],
+        repaired=repaired[0],
+        intervals=(fault_free[1], collapsed[1], repaired[1]),
         history=history,
         diagnosis=diagnosis,
         adaptation=adaptation,
         n_log=len(log),
         seconds=clock.seconds,
-        maps=_force_maps([recordings.frames[i] for i in tested], broken, adaptation, layout),
+        maps=_force_maps([recordings.frames[i] for i in np.unique(test.recording)], broken, adaptation, layout),
     )
-    say(f"repaired     {repaired}")
-    steps = (
-        f"{fault_free.accuracy:.3f} fault-free -> {collapsed.accuracy:.3f} broken -> {repaired.accuracy:.3f} repaired"
-    )
-    say(f"accuracy     {steps} ({result.recovered:.0%} of fault-free) in {clock.seconds['adaptation']:.1f} s")
+    say(f"repaired     {result.repaired}")
+    say(_summary(result))
     return result
+
+
+def _broken(
+    recordings: Recordings, which: NDArray[np.int64], faults: Sequence[Fault], seed: int
+) -> tuple[list[NDArray[np.float64]], Windows]:
+    """Return some of the recordings with the faults in them, and their windows, labelled."""
+    layout = recordings.layout
+    broken = [inject(recordings.frames[i], faults, layout, seed=seed + int(i)) for i in which]
+    return broken, _labelled(make_windows(broken, None, layout), which, recordings)
+
+
+def _diagnosed(
+    layout: SensorLayout, healthy: Sequence[NDArray[Any]], log: Sequence[NDArray[np.float64]], clock: _Clock
+) -> Diagnosis:
+    """Learn what healthy looks like, and diagnose the log."""
+    with clock("learning what healthy looks like"):
+        diagnoser = SelfDiagnosis(layout).fit(healthy)
+    with clock("diagnosis"):
+        return diagnoser.diagnose(log)
+
+
+def _summary(result: DemoResult) -> str:
+    """Say in one line what the faults did and what the repair brought back."""
+    steps = {"fault-free": result.fault_free, "broken": result.broken, "repaired": result.repaired}
+    told = " -> ".join(f"{scores.accuracy:.3f} {name}" for name, scores in steps.items())
+    return f"accuracy     {told} ({result.recovered:.0%} of fault-free) in {result.seconds['adaptation']:.1f} s"
 
 
 def _list(say: Callable[[str], None], lines: Sequence[str]) -> None:

@@ -95,12 +95,7 @@ def train(
             loss that is no longer finite; ``repairable`` together with ``augment``.
         TypeError: ``repairable`` for a model without a layout.
     """
-    if epochs < 1 or batch_size < 1 or not learning_rate > 0:
-        raise ValueError(
-            f"training needs epochs, batch_size, learning_rate > 0, got {epochs}, {batch_size}, {learning_rate}"
-        )
-    if not 0 <= averaging < 1:
-        raise ValueError(f"averaging must lie in [0, 1), got {averaging}")
+    _check_options(epochs, batch_size, learning_rate, averaging)
     clock = Clock(budget)
     _check(model, train, validation)
     if repairable:
@@ -123,38 +118,59 @@ def train(
         run.resume()
         clock.spent = sum(run.history.seconds)
     source = _Source(train, more)
-    n, device = len(source.y), next(model.parameters()).device
     hide = None if progress is None else not progress
     try:
-        if evaluate_start and run.history.start is None:
-            with clock.closing():
-                run.record(replace(run.history, start=_validate(model, validation)))
-        elif budget is not None:  # the first epoch, too, has to leave time for its validation
-            sample = validation.select(slice(0, 32))
-            with clock.closing(len(sample) / len(validation)):
-                _validate(model, sample)
+        _begin(run, validation, clock, evaluate_start)
         with tqdm(total=epochs, initial=run.history.epochs, unit="epoch", disable=hide) as bar:
-            while (stopped := _stop(run.history, epochs, patience, clock, n)) is None:
-                began = time.perf_counter()
-                model.train()
-                with seeded(seed, run.history.epochs, device) as generator:
-                    order = torch.split(torch.randperm(n, generator=generator), batch_size)
-                    loss, seen = _pass(run, source, order, augment, generator, clock)
-                if seen < n and run.history.epochs:
-                    continue  # out of time in the midst of a later epoch
-                with clock.closing():
-                    with run.averaged():
-                        scores = _validate(model, validation)
-                    history = run.history.longer(loss, scores, time.perf_counter() - began)
-                    run.record(history, save=seen == n)  # a cut epoch is no place to resume from
+            while (stopped := _stop(run.history, epochs, patience, clock, len(source.y))) is None:
+                history = _epoch(run, source, validation, batch_size, seed, augment, clock)
+                if history is None:
+                    continue
                 bar.update()
-                bar.set_postfix(loss=f"{loss:.4f}", accuracy=f"{scores[1]:.4f}", best=history.best_epoch)
+                loss, accuracy = history.train_loss[-1], history.validation_accuracy[-1]
+                bar.set_postfix(loss=f"{loss:.4f}", accuracy=f"{accuracy:.4f}", best=history.best_epoch)
                 if on_epoch is not None:
                     on_epoch(history)
     finally:
         run.restore_best()
         model.eval()
     return replace(run.history, stopped=stopped)
+
+
+def _begin(run: _Run, validation: Windows, clock: Clock, evaluate_start: bool) -> None:
+    """Validate the starting weights if they compete; else, with a budget, see what a validation takes."""
+    if evaluate_start and run.history.start is None:
+        with clock.closing():
+            run.record(replace(run.history, start=_validate(run.model, validation)))
+    elif clock.budget < math.inf:  # the first epoch, too, has to leave time for its validation
+        sample = validation.select(slice(0, 32))
+        with clock.closing(len(sample) / len(validation)):
+            _validate(run.model, sample)
+
+
+def _epoch(
+    run: _Run,
+    source: _Source,
+    validation: Windows,
+    batch_size: int,
+    seed: int,
+    augment: Augment | None,
+    clock: Clock,
+) -> History | None:
+    """Train for an epoch, validate, and keep both; None if the time ran out in the midst of a later epoch."""
+    began, n, device = time.perf_counter(), len(source.y), next(run.model.parameters()).device
+    run.model.train()
+    with seeded(seed, run.history.epochs, device) as generator:
+        order = torch.split(torch.randperm(n, generator=generator), batch_size)
+        loss, seen = _pass(run, source, order, augment, generator, clock)
+    if seen < n and run.history.epochs:
+        return None
+    with clock.closing():
+        with run.averaged():
+            scores = _validate(run.model, validation)
+        history = run.history.longer(loss, scores, time.perf_counter() - began)
+        run.record(history, save=seen == n)  # a cut epoch is no place to resume from
+    return history
 
 
 def _pass(
@@ -284,6 +300,15 @@ class _Run(Optimisation):
                 self.optimizer.state[self.trained[name]][key] = value.to(self.trained[name].device)
                 if key == "step":
                     self.steps = int(value)
+
+
+def _check_options(epochs: int, batch_size: int, learning_rate: float, averaging: float) -> None:
+    if epochs < 1 or batch_size < 1 or not learning_rate > 0:
+        raise ValueError(
+            f"training needs epochs, batch_size, learning_rate > 0, got {epochs}, {batch_size}, {learning_rate}"
+        )
+    if not 0 <= averaging < 1:
+        raise ValueError(f"averaging must lie in [0, 1), got {averaging}")
 
 
 def _check(model: nn.Module, train: Windows, validation: Windows) -> None:

@@ -102,6 +102,15 @@ def public_things() -> tuple[Any, ...]:
     return tuple(getattr(package, name) for package in packages for name in package.__all__)
 
 
+def public_names(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Lead from a module's page to its public names, which are described elsewhere."""
+    for package in PUBLIC if what == "module" and name not in PUBLIC else ():
+        there = importlib.import_module(package)
+        names = [n for n in there.__all__ if getattr(getattr(there, n), "__module__", None) == name]
+        if names:
+            lines += ["", f"Public, see :doc:`/api/{package}`: " + ", ".join(f":py:obj:`{package}.{n}`" for n in names)]
+
+
 def plain_words(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
     """Keep from being read as markup what is none: bars, and what stands before a colon in a property."""
     for i, line in enumerate(lines):
@@ -129,4 +138,5 @@ def setup(app: Sphinx) -> None:
     app.connect("missing-reference", public_name)
     app.connect("autodoc-skip-member", described_elsewhere)
     app.connect("autodoc-process-docstring", plain_words, priority=100)  # before napoleon
+    app.connect("autodoc-process-docstring", public_names)
     app.connect("autodoc-process-docstring", several_names, priority=900)  # after it

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import json
+import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -57,9 +59,41 @@ def grasps() -> Recordings:
 
 
 @pytest.fixture(scope="session")
-def fitted(grasps: Recordings) -> SelfDiagnosis:
-    """Fitted on every other of the simulated grasps."""
-    return SelfDiagnosis(grasps.layout).fit(grasps.frames[::2])
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """Return a folder that ``make`` fills, once for all processes of ``pytest -n``."""
+    home = tmp_path_factory.getbasetemp()
+
+    def made_once(name: str, make: Callable[[Path], object]) -> Path:
+        if "PYTEST_XDIST_WORKER" not in os.environ:
+            (home / name).mkdir()
+            make(home / name)
+            return home / name
+        from filelock import FileLock
+
+        place, made = home.parent / name, home.parent / f"{name}.made"
+        with FileLock(f"{place}.lock"):
+            if not made.exists():
+                shutil.rmtree(place, ignore_errors=True)
+                place.mkdir()
+                make(place)
+                made.touch()
+        return place
+
+    return made_once
+
+
+@pytest.fixture(scope="session")
+def fitted(grasps: Recordings, made_once) -> SelfDiagnosis:
+    """Fitted on every other of the simulated grasps; test_stored.py proves that files lose nothing of it."""
+
+    def make(folder: Path) -> None:
+        about, arrays = SelfDiagnosis(grasps.layout).fit(grasps.frames[::2]).state()
+        (folder / "about.json").write_text(json.dumps(about))
+        np.savez(folder / "arrays.npz", **arrays)
+
+    folder = made_once("fitted", make)
+    with np.load(folder / "arrays.npz") as arrays:
+        return SelfDiagnosis.from_state(json.loads((folder / "about.json").read_text()), dict(arrays))
 
 
 @pytest.fixture(scope="session")
@@ -82,8 +116,13 @@ def small_windows(n: int, seed: int = 0) -> np.ndarray:
 
 
 @pytest.fixture(scope="session")
-def versions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def versions(made_once) -> dict[str, Path]:
     """Folders of two adaptations of one small network, with ONNX files: F empty, and one with all parts."""
+    home = made_once("versions", export_versions)
+    return {name: home / name for name in DROPPED}
+
+
+def export_versions(home: Path) -> None:
     import torch
 
     from adaptfault.adaptation import Adaptation, Stage
@@ -97,7 +136,6 @@ def versions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
     network = TactileTransformer(SMALL, 3, length=5).eval()
     windows = Windows(small_windows(60), np.arange(60) % 3, np.arange(60))
-    folders = {}
     for name, cells in DROPPED.items():
         fault_set, front, head = FaultSet(cells, 18), None, None
         if name == "head":
@@ -109,10 +147,27 @@ def versions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
             forest = Forest.fit(views[1][:9], windows.y[:9], 3)  # shallow: each level takes time to export
             head = Blend(kernel, forest, 0.5, 2.0)
         model = ReducedModel(network, fault_set, front, head).eval()
-        folders[name] = tmp_path_factory.mktemp(name)
-        Adaptation(model, fault_set, (Stage("fill", 0.1),), _validation=windows).save(folders[name])
-        add_onnx(folders[name])
-    return folders
+        Adaptation(model, fault_set, (Stage("fill", 0.1),), _validation=windows).save(home / name)
+        add_onnx(home / name)
+
+
+class Clock:
+    """Stands in for the time module: its seconds pass only where a test lets them, however fast the machine is."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """The clock that budgets go by in this test."""
+    clock = Clock()
+    for module in ("clock", "stages", "training"):
+        monkeypatch.setattr(f"adaptfault.{module}.time", clock)
+    return clock
 
 
 @pytest.fixture
@@ -144,14 +199,16 @@ def without_export() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def made_bundle(small_grasps: Recordings, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made_bundle(small_grasps: Recordings, made_once) -> Path:
     """A bundle made by the command line; not to be changed."""
-    home = tmp_path_factory.mktemp("bundle")
-    save_npz(home / "grasps.npz", small_grasps)
-    out = home / "robot.bundle"
-    with without_export():
-        assert main(["train", str(home / "grasps.npz"), "--out", str(out), "--epochs", "8", "--quiet"]) == 0
-    return out
+
+    def make(home: Path) -> None:
+        save_npz(home / "grasps.npz", small_grasps)
+        command = ["train", str(home / "grasps.npz"), "--out", str(home / "robot.bundle"), "--epochs", "8", "--quiet"]
+        with without_export():
+            assert main(command) == 0
+
+    return made_once("bundle", make) / "robot.bundle"
 
 
 @pytest.fixture

@@ -1,12 +1,12 @@
 import json
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from conftest import Clock
 
-from adaptfault import compact
+from adaptfault import compact, forest, stages
 from adaptfault.adaptation import Adaptation
 from adaptfault.adapter import Adapter
 from adaptfault.evaluation import evaluate
@@ -45,6 +45,30 @@ def adapter() -> Adapter:
     return Adapter(model, training, validation)
 
 
+@pytest.fixture(scope="module")
+def quick(adapter) -> Adapter:
+    """The same with fewer windows, where many trainings follow one another."""
+    return Adapter(adapter.model, adapter.train.select(slice(0, 120)), adapter.validation.select(slice(0, 60)))
+
+
+@pytest.fixture
+def working_clock(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """A clock that work moves: 1 ms for each window that the network sees, 2 ms for each that a head is fitted to."""
+    features, fit = TactileTransformer.features, stages.fit_head
+
+    def features_in_time(network, x):
+        clock.now += len(x) * 1e-3
+        return features(network, x)
+
+    def fit_in_time(first, second, *rest):
+        clock.now += (len(first[0]) + len(second[0])) * 2e-3
+        return fit(first, second, *rest)
+
+    monkeypatch.setattr(TactileTransformer, "features", features_in_time)
+    monkeypatch.setattr(stages, "fit_head", fit_in_time)
+    return clock
+
+
 F = FaultSet((0, 5, 6, 7, 21), D)
 
 
@@ -67,13 +91,14 @@ def test_with_f_empty_the_logits_are_bit_identical(adapter):
 
 
 @pytest.mark.parametrize("method", ["fill", "head", "finetune"])
-@pytest.mark.parametrize("value", [0.0, 1.0, np.nan, np.inf, -1e30])
-def test_the_value_of_a_dropped_cell_never_reaches_the_output(adapter, method, value):
-    adapted = adapter.adapt(F, method=method, budget=0.3, progress=False)
-    x = adapter.validation.x[:20].copy()
+def test_the_value_of_a_dropped_cell_never_reaches_the_output(quick, working_clock, method):
+    adapted = quick.adapt(F, method=method, budget=3.0, progress=False)
+    assert adapted.stages[-1].name == method
+    x = quick.validation.x[:20].copy()
     before = adapted.predict_proba(x)
-    x[:, :, list(F)] = value
-    np.testing.assert_array_equal(adapted.predict_proba(x), before)
+    for value in (0.0, 1.0, np.nan, np.inf, -1e30):
+        x[:, :, list(F)] = value
+        np.testing.assert_array_equal(adapted.predict_proba(x), before)
     assert np.isfinite(before).all()
 
 
@@ -108,40 +133,41 @@ def test_the_network_on_fewer_numbers_gives_the_same_head_and_forecast(adapter, 
     )
 
 
-def test_auto_stops_at_the_first_stage_that_is_enough(adapter):
+def test_auto_stops_at_the_first_stage_that_is_enough(adapter, working_clock):
     assert [stage.name for stage in adapter.adapt(FaultSet((3,), D)).stages] == ["fill"]
     hard = FaultSet(range(30), D)
     assert [stage.name for stage in adapter.adapt(hard).stages] == ["fill", "head"]
-    stages = adapter.adapt(hard, budget=30.0, progress=False).stages
-    assert [stage.name for stage in stages][:3] == ["fill", "head", "finetune"]
+    stages = adapter.adapt(hard, budget=8.0, progress=False).stages
+    assert [stage.name for stage in stages] == ["fill", "head", "finetune"]
     assert all(stage.accuracy is not None for stage in stages)
 
 
-def test_a_larger_budget_never_ends_worse_and_none_is_overdrawn(adapter):
+def test_a_larger_budget_never_ends_worse_and_none_is_overdrawn(adapter, working_clock):
     hard, reached = FaultSet(range(30), D), []
-    for budget in (0.0, 1.0, 4.0):
-        began = time.perf_counter()
+    for budget in (0.0, 2.0, 4.0, 8.0):
+        began = working_clock.now
         adapted = adapter.adapt(hard, method="finetune", budget=budget, progress=False)
-        assert time.perf_counter() - began < 1.25 * budget + 4.0  # the fill, the scores, a busy machine
+        assert working_clock.now - began <= max(budget, 1.6)  # that goes for seeing what a head would take
         reached.append(adapted.scores.accuracy)
     assert reached == sorted(reached)
     assert reached[-1] > reached[0]
+    assert [stage.name for stage in adapted.stages] == ["fill", "head", "finetune"]
 
 
-def test_scratch_learns_a_new_network_on_the_healthy_cells(adapter):
-    scratch = adapter.adapt(F, method="scratch", budget=4.0, progress=False)
+def test_scratch_learns_a_new_network_on_the_healthy_cells(adapter, working_clock):
+    scratch = adapter.adapt(F, method="scratch", budget=3.0, progress=False)
     assert [stage.name for stage in scratch.stages] == ["scratch"]
     assert scratch.scores.accuracy > 0.5
     assert not torch.equal(scratch.model.network.head.weight, adapter.model.head.weight)
 
 
-def test_adapting_never_changes_the_fault_free_model_so_order_does_not_matter(adapter):
-    before = {name: tensor.clone() for name, tensor in adapter.model.state_dict().items()}
-    first = adapter.adapt(F, method="finetune", progress=False)
-    adapter.adapt(FaultSet(range(10), D), method="finetune", progress=False)
-    again = adapter.adapt(F, method="finetune", progress=False)
-    assert all(torch.equal(tensor, before[name]) for name, tensor in adapter.model.state_dict().items())
-    np.testing.assert_array_equal(first.predict_proba(adapter.validation.x), again.predict_proba(adapter.validation.x))
+def test_adapting_never_changes_the_fault_free_model_so_order_does_not_matter(quick):
+    before = {name: tensor.clone() for name, tensor in quick.model.state_dict().items()}
+    first = quick.adapt(F, method="finetune", progress=False)
+    quick.adapt(FaultSet(range(10), D), method="finetune", progress=False)
+    again = quick.adapt(F, method="finetune", progress=False)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in quick.model.state_dict().items())
+    np.testing.assert_array_equal(first.predict_proba(quick.validation.x), again.predict_proba(quick.validation.x))
 
 
 def test_a_class_without_training_windows_does_not_break_the_head(adapter):
@@ -194,10 +220,11 @@ def test_the_forecast_is_what_the_stages_then_reach(adapter):
     assert "without 5 cells, from 120 recordings" in str(forecast)
 
 
-def test_the_interval_covers_new_recordings(adapter):
+def test_the_interval_covers_new_recordings(adapter, quick, monkeypatch):
+    monkeypatch.setattr(forest, "_TREES", 20)  # quicker grown; the interval is of whatever head there is
     covered, rng = 0, np.random.default_rng(0)
     for i in range(20):
-        one = Adapter(adapter.model, adapter.train, blobs(120, 100 + i))
+        one = Adapter(adapter.model, quick.train, blobs(60, 100 + i))
         lost = FaultSet(rng.choice(D, int(rng.integers(1, 28)), replace=False).tolist(), D)
         expected = one.forecast(lost).stages["head"]
         covered += (

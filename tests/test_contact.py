@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 
-from diagnostics import SensorLayout, contact
+from diagnostics import SensorLayout
 from diagnostics.contact import ContactModel, Expected, resting, stretches
 from diagnostics.memory import finished
+from diagnostics.patch_models import contact_model
 from diagnostics.touches import Scale
 
 LAYOUT = SensorLayout(1, 1, 12)
@@ -122,20 +123,20 @@ def test_a_wider_range_of_loads_is_likelier_and_that_of_an_unknown_cell_is_certa
     assert narrow[0, 1] == far[0, 1] == 1
 
 
-def test_large_arrays_are_modelled_in_tiles_that_know_every_cell(monkeypatch):
-    layout = SensorLayout(1, 2, 201)
+def test_large_arrays_are_modelled_in_tiles_that_know_every_cell():
+    layout = SensorLayout(1, 2, 260)
     rng = np.random.default_rng(0)
-    column = np.arange(402) % 201
+    column = np.arange(520) % 260
     recordings = []
     for _ in range(300):
         force = 2 * np.sin(np.linspace(0, np.pi, 8))[:, None]
-        recordings.append(np.maximum(0, force * (1 - ((column - rng.uniform(0, 200)) / 12) ** 2)))
-    scale = Scale(np.zeros(402), 0.05, 5.0)
-    # A tenth of the samples will do, and is quicker.
-    monkeypatch.setattr(contact, "stretches", lambda *of: tuple(each[::10] for each in stretches(*of)))
-    model = ContactModel.fit(recordings, layout, scale)
+        recordings.append(np.maximum(0, force * (1 - ((column - rng.uniform(0, 260)) / 12) ** 2)))
+    scale = Scale(np.zeros(520), 0.05, 5.0)
+    model = contact_model(recordings, layout, scale)
+    assert len(model.tiles) > 1
+    assert sorted(np.concatenate([tile.outputs for tile in model.tiles])) == list(range(520))
     features = stretches(recordings, scale, rng)[0]
-    expected = finished(model.expect(features, np.ones(402, bool)))
+    expected = finished(model.expect(features, np.ones(520, bool)))
     assert np.isfinite(expected.spread).all()
     loaded = features[:, 2] > 0
     assert expected.never[loaded].mean() < 0.3

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _pytest.mark import ParameterSet
 from conftest import without_export
 
 import adaptfault as af
@@ -21,6 +22,7 @@ HOME = Path(__file__).parents[1]
 PAGES = [HOME / "README.md", *sorted((HOME / "docs").glob("*.md"))]
 WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text()]
 NOT_RUN = {"reproduce": "test_paper.py runs it, small"}
+SLOW = {"": ("README.md", "maintenance.md"), "python": ("robot-software.md",)}  # make examples alone runs these
 QUICK = {
     "train": ["--epochs", "1"],
     "demo": ["--epochs", "1"],
@@ -37,6 +39,11 @@ def blocks(page: Path, language: str) -> list[str]:
 def commands(page: Path) -> list[list[str]]:
     lines = "".join(blocks(page, "")).splitlines()
     return [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("adaptfault ")]
+
+
+def marked(pages: list[Path], language: str) -> list[ParameterSet]:
+    slow = dict.fromkeys(SLOW[language], pytest.mark.slow)
+    return [pytest.param(page, marks=slow.get(page.name, ()), id=page.name) for page in pages]
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +74,7 @@ def place(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
         yield place
 
 
-@pytest.mark.parametrize("page", WITH_PYTHON, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", marked(WITH_PYTHON, "python"))
 def test_the_python_on_a_page_runs(page, place, later_grasps, capsys):
     diagnoser = Bundle.open("robot.bundle").diagnoser()
     frames = np.concatenate(later_grasps)
@@ -76,7 +83,7 @@ def test_the_python_on_a_page_runs(page, place, later_grasps, capsys):
         exec(compile(code, page.name, "exec"), given)
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if commands(p)], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", marked([page for page in PAGES if commands(page)], ""))
 def test_the_commands_on_a_page_run(page, place, capsys):
     for command, *arguments in commands(page):
         if command in NOT_RUN:

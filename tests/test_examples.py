@@ -1,26 +1,50 @@
-"""Every example runs as its first line says, and on recordings where it takes some. ``make examples`` shows them."""
+"""Every example runs as its first line says, and on recordings where it takes some. ``make examples`` shows them.
+
+Those that are marked slow run there only, not in ``make test``.
+"""
 
 import importlib.util
 import os
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
+from _pytest.mark import ParameterSet
 
 from adaptfault.recordings import Recordings, save_npz
 
-EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
+HOME = Path(__file__).parents[1] / "examples"
+EXAMPLES = sorted(HOME.glob("*.py"))
 # What an example takes on recordings, as small as it goes.
 ON_RECORDINGS = {
     "adaptation_figures.py": ["--epochs", "1", "--cases", "1", "--only", "fill"],
+    "compare_classification.py": ["--small", "--only", "adaptfault"],
     "compare_diagnosis.py": ["--logs", "1"],
+    "compare_keras.py": ["--epochs", "1", "--windows", "32"],
     "diagnosis_figures.py": ["1", "--only", "cells"],
     "esp32_sender.py": ["--frames", "20"],
     "simulated_vs_real.py": [],
     "wrong_fault_set.py": ["--draws", "1"],
 }
 LESS = {"fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"]}  # it takes minutes
+SLOW = {  # more than 7 s of CPU time
+    "adaptation_figures.py",
+    "compare_classification.py",
+    "compare_diagnosis.py",
+    "compare_keras.py",
+    "core_speed.py",
+    "deploy_speed.py",
+    "diagnosis_figures.py",
+    "fleet_scaling.py",
+    "kill_maintenance.py",
+    "picture.py",
+    "repair.py",
+    "scale_curves.py",
+    "wrong_fault_set.py",
+}
+SLOW_ON_RECORDINGS = {"adaptation_figures.py", "compare_classification.py", "compare_keras.py"}
 NEEDS = {"deploy_speed.py": "onnxruntime"}  # others do without, and say so
 
 
@@ -34,15 +58,19 @@ def run(example: Path, folder: Path, *arguments: str | Path) -> None:
     assert done.stdout.strip()
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.name)
-def test_the_example_runs(example: Path, tmp_path: Path):
-    run(example, tmp_path, *LESS.get(example.name, []))
+def marked(names: Iterable[str], slow: set[str]) -> list[ParameterSet]:
+    return [pytest.param(name, marks=pytest.mark.slow if name in slow else (), id=name) for name in names]
 
 
-@pytest.mark.parametrize("name", ON_RECORDINGS)
+@pytest.mark.parametrize("name", marked([path.name for path in EXAMPLES], SLOW))
+def test_the_example_runs(name: str, tmp_path: Path):
+    run(HOME / name, tmp_path, *LESS.get(name, []))
+
+
+@pytest.mark.parametrize("name", marked(ON_RECORDINGS, SLOW_ON_RECORDINGS))
 def test_the_example_runs_on_recordings(name: str, small_grasps: Recordings, tmp_path: Path):
     save_npz(tmp_path / "grasps.npz", small_grasps)
-    run(EXAMPLES[0].with_name(name), tmp_path, "grasps.npz", *ON_RECORDINGS[name])
+    run(HOME / name, tmp_path, "grasps.npz", *ON_RECORDINGS[name])
 
 
 def test_no_example_that_takes_recordings_is_left_out():

@@ -18,6 +18,12 @@ def stored(diagnoser: SelfDiagnosis) -> SelfDiagnosis:
 
 
 @pytest.fixture(scope="module")
+def fitted(grasps: Recordings) -> SelfDiagnosis:
+    """Fitted here: that of all tests may have come from a file, and what that lost would go unseen."""
+    return SelfDiagnosis(grasps.layout).fit(grasps.frames[::20])
+
+
+@pytest.fixture(scope="module")
 def log(grasps: Recordings) -> np.ndarray:
     """Eight grasps that the reference does not hold, with a broken row, a stuck and a loose cell."""
     frames = np.concatenate([grasps.frames[i] for i in range(21, 140, 15)]).astype(float)

@@ -27,7 +27,7 @@ GIVE_SCALE = "give the full scale and unit (a layout with full_scale and unit, o
 
 @dataclass(frozen=True)
 class Scale:
-    """The range of readings, 0..``full_scale`` in ``unit``, and what is doubtful about it."""
+    """The range of readings, from 0 to ``full_scale`` in ``unit``, and what is doubtful about it."""
 
     full_scale: float
     unit: str

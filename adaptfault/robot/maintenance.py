@@ -188,6 +188,7 @@ class _Maintenance:
     judged: dict[str, Any] | None = field(default=None, init=False)
 
     def run(self, incoming: Sequence[_Incoming]) -> MaintenanceReport:
+        """Diagnose what was not seen before, decide, and write down what was done, unless this is a dry run."""
         bundle = self.bundle
         self.warnings = tuple(bundle.problems(mend=not self.dry_run))
         self.version = bundle.active()

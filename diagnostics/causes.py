@@ -37,6 +37,7 @@ class Findings:
         probability: P(faulty).
         weight: log likelihood ratio faulty : healthy.
         touches: how many touches tested the cell, or how often it blinked.
+        known: those that were dead in the reference already.
     """
 
     faulty: Mask
@@ -52,6 +53,7 @@ class Findings:
     probability: Floats
     weight: Floats
     touches: NDArray[np.intp]
+    known: Mask
 
 
 def root_causes(
@@ -186,7 +188,8 @@ def _reason(fault: Fault, cause: Cause, found: Findings, layout: SensorLayout) -
     if fault.line is None:
         pad, row, column = layout.position(fault.cells[0])
         whatever = "" if fault.kind in _DOING else ", whatever touches it"
-        return f"pad {pad}, row {row}, column {column} is {fault.kind}: it {does}{since}{whatever}"
+        already = ", and did so in the reference already" if found.known[fault.cells[0]] else ""
+        return f"pad {pad}, row {row}, column {column} is {fault.kind}: it {does}{since}{whatever}{already}"
     inferred = len(cause.cells) - len(cause.seen)
     also = f"; {inferred} more, not tested, are inferred from the wire" if inferred else ""
     where = "" if cause.whole else _span(fault, layout)

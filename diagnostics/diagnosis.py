@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.addresses import aliasings
 from diagnostics.causes import Findings, root_causes
+from diagnostics.dead_before import dead_before
 from diagnostics.layout import SensorLayout
 from diagnostics.memory import Memory, finished
 from diagnostics.patched import remembering
 from diagnostics.readings import Readings
-from diagnostics.reference import Reference
+from diagnostics.reference import Reference, living, tolerance_of
 from diagnostics.stored import Arrays, reference_from_state, reference_state, weights_from_state, weights_state
 from diagnostics.verdicts import Diagnosis
 from diagnostics.weighing import Weights, faulty_at, kinds
@@ -24,6 +25,7 @@ SCHEMA = "adaptfault.diagnoser/2"
 _SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
 _SUSPICIOUS_COLD = 3.0  # log evidence from which on a cell is not asked about the others, in a cold start
 _OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is faulty: four touches
+_KNOWN = 9.0  # log likelihood ratio of a cell that was dead in the reference already
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved before is no longer called alive
 
 
@@ -49,12 +51,16 @@ class SelfDiagnosis:
     def fit(self, recordings: ArrayLike | Sequence[ArrayLike]) -> SelfDiagnosis:
         """Learn from fault-free recordings, ``[T, D]`` or a list of them, what healthy looks like.
 
+        Cells that are dead in them all the same are found first, and called so in every log in which they do not move.
+
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
         healthy = _recordings(recordings, self.layout)
-        self.reference_ = Reference.fit(healthy, self.layout)
-        self.weights_ = Weights.fit(healthy, self.layout)
+        cold = SelfDiagnosis(self.layout)
+        dead = dead_before(healthy, self.layout, tolerance_of(healthy, self.layout), cold.diagnose)
+        self.reference_ = Reference.fit(healthy, self.layout, dead)
+        self.weights_ = Weights.fit(healthy, living(self.layout, dead))
         return self
 
     def diagnose(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Diagnosis:
@@ -132,8 +138,10 @@ class SelfDiagnosis:
         spatial = yield from memory.spatial(wrong)
         jump = memory.jump()
         kind = kinds(memory)
+        known = spatial.asked & ~runs.moved & (reference.dead > 0)
         worth = self.weights_.worth(spatial.evidence, jump, kind)
-        still = self.weights_.probability(worth, kind, spatial.asked)
+        still = self.weights_.probability(worth, kind, spatial.asked & ~known)
+        still[known] = reference.dead[known]
         intermittent, noisy = unrest.intermittent & present & ~wrong, unrest.excess & present & ~wrong
         drifting = present & ~wrong & ~intermittent & ~noisy & (spatial.offset >= _OFFSET)
         moving = intermittent | noisy | drifting
@@ -157,8 +165,9 @@ class SelfDiagnosis:
             since=np.select([intermittent, noisy, drifting], [unrest.blinks_since, unrest.noisy_since, 0], runs.start),
             probability=probability,
             # What the line hypothesis asks of a cell at rest is only whether touches speak against it.
-            weight=self.weights_.worth(spatial.surprise, jump, kind),
+            weight=np.where(known, _KNOWN, self.weights_.worth(spatial.surprise, jump, kind)),
             touches=np.where(intermittent, unrest.blinks, spatial.touches),
+            known=known,
         )
         yield
         causes = yield from root_causes(found, aliased, layout)

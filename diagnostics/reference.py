@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,7 @@ class Reference:
         usual: how restless healthy cells are.
         twins: how many witnesses two healthy lines ever had of being one.
         model: how a touch loads a cell; None: to be learned from the log at hand (cold start).
+        dead: float ``[D]``, P(dead) of cells that were dead in it already, 0 for all others.
     """
 
     tolerance: float
@@ -45,12 +46,19 @@ class Reference:
     usual: Usual
     twins: int
     model: ContactModel | None
+    dead: NDArray[np.float64]
 
     @classmethod
-    def fit(cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> Reference:
-        """Learn from fault-free recordings, ``[T, D]`` each."""
-        tolerance = _tolerance(recordings, layout)
-        scale = Scale(resting(recordings), 2 * tolerance, layout.full_scale)
+    def fit(
+        cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, dead: NDArray[np.float64] | None = None
+    ) -> Reference:
+        """Learn from fault-free recordings, ``[T, D]`` each; from cells that are ``dead`` in them (``[D]``) nothing."""
+        tolerance = tolerance_of(recordings, layout)
+        rest = resting(recordings)
+        dead = np.zeros(layout.n_cells) if dead is None else dead
+        layout = living(layout, dead)
+        rest[dead > 0] = np.median(rest[layout.present.ravel()])  # where they would rest
+        scale = Scale(rest, 2 * tolerance, layout.full_scale)
         onsets = Onsets.fit(recordings, tolerance, layout.full_scale)
         patience = max(_PATIENCE, 2 * max(longest_repetition(r) for r in recordings))
         model = contact_model(recordings, layout, scale)
@@ -62,6 +70,7 @@ class Reference:
             Usual.fit(recordings, scale),
             _most_twins(recordings, layout, scale),
             model,
+            dead,
         )
 
     @classmethod
@@ -69,10 +78,24 @@ class Reference:
         """Stand in for a reference: untouched cells read 0, and jumps say nothing."""
         tolerance = _TOLERANCE * layout.full_scale
         scale = Scale(np.zeros(layout.n_cells), 2 * tolerance, layout.full_scale)
-        return cls(tolerance, scale, Onsets.silent(), 2 * _PATIENCE, Usual.unknown(scale), _TWINS, None)
+        return cls(
+            tolerance,
+            scale,
+            Onsets.silent(),
+            2 * _PATIENCE,
+            Usual.unknown(scale),
+            _TWINS,
+            None,
+            np.zeros(layout.n_cells),
+        )
 
 
-def _tolerance(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
+def living(layout: SensorLayout, dead: NDArray[np.float64]) -> SensorLayout:
+    """Return a layout without the cells that are ``dead`` (P(dead) ``[D]``)."""
+    return replace(layout, present=layout.present & ~layout.grid(dead > 0)) if dead.any() else layout
+
+
+def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
     """Return how near to a value counts as that value: what a converter's dither needs, whatever its step."""
     cells = slice(None, None, max(1, layout.n_cells // _SAMPLED))
     sample = np.concatenate([r[:: max(1, len(r) // 20), cells].ravel() for r in recordings])

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.contact import ContactModel, Tile
 from diagnostics.layout import SensorLayout
-from diagnostics.reference import Reference
+from diagnostics.reference import Reference, living
 from diagnostics.rim import INPUTS, Rim
 from diagnostics.temporal import Onsets
 from diagnostics.touches import Scale
@@ -58,6 +58,7 @@ def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
         "resting": reference.scale.resting,
         "onsets": reference.onsets.log_ratio,
         "noise": reference.usual.noise,
+        "dead": reference.dead,
     }
     if reference.model:
         rim = vars(reference.model.rim) if reference.model.rim else {}
@@ -79,6 +80,7 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
         return _checked(name, arrays[name], like.shape, like.dtype)
 
     scale = Scale(read("resting", unknown.scale.resting), float(about["near"]), layout.full_scale)
+    dead = read("dead", unknown.dead)
     reference = Reference(
         float(about["tolerance"]),
         scale,
@@ -86,7 +88,8 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
         int(about["patience"]),
         Usual(float(about["blinks"]), read("noise", unknown.usual.noise)),
         int(about["twins"]),
-        None if about["surest"] is None else _model(about, arrays, layout),
+        None if about["surest"] is None else _model(about, arrays, living(layout, dead)),
+        dead,
     )
     positive = (reference.tolerance, scale.near, reference.patience, reference.usual.blinks)
     if not (np.isfinite(positive).all() and min(positive) > 0):

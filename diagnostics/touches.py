@@ -21,7 +21,7 @@ _PARTS = 4  # of a touch at most; neighbours are put together beyond that
 _RELEASED = 0.3  # of its highest load: when less is left, a touch is over
 _LEAST = 0.1  # root load: what moved less in all has touched nothing
 _WEAKEST = 0.1  # of the strongest touch so far: less is unrest, not a touch that could end
-_MOVING = 0.25  # of a load must be going when a touch is said to be over
+_MOVING = 0.25  # of a load must be going, and as much of it gone, when a touch is said to be over
 _SAME_PLACE = 0.6  # cosine between loads of one touch; less alike, and it is another
 
 
@@ -195,7 +195,9 @@ class Touches:
             moving = swing[:, ~still].sum(axis=1)
             left = (ahead - lowest)[:, ~still].sum(axis=1)
             enough = np.maximum(_MOVING * swing.sum(axis=1), max(_WEAKEST * widest, _LEAST))
-            released = (left <= _RELEASED * moving) & (moving > enough)
+            # A load that only relaxes is lowest in the end too, but most of it is still there.
+            peak, now = highest[:, ~still].sum(axis=1), ahead[:, ~still].sum(axis=1)
+            released = (left <= _RELEASED * moving) & (moving > enough) & (peak - now >= _MOVING * peak)
             end = int(released.argmax()) if released.any() else len(ahead)
             if end:
                 part = Summary.of(ahead[:end], int(numbers[begin]), scale.root_near)

@@ -1,0 +1,60 @@
+"""Cells that were dead already when the reference was recorded, and so must not teach what healthy looks like.
+
+Hardly any skin that has been used for a while is free of them. What was taken for fault-free is therefore diagnosed
+itself first, as in a cold start: by the cells around each. Only cells that never moved in any recording come into
+question; where all moved, nothing is done.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.layout import SensorLayout
+from diagnostics.readings import Readings
+from diagnostics.verdicts import Diagnosis
+
+_PIECES, _FRAMES = 60, 200  # of the reference that are diagnosed, at most, spread evenly; frames of each
+_SURE = 0.99  # P(faulty) from which on a cell counts as dead: it will be called so in every log
+_MOST = 0.5  # share of the cells: if more look dead, it is no reference, or it touched next to nothing
+
+
+def dead_before(
+    recordings: Readings, layout: SensorLayout, tolerance: float, diagnose: Callable[[Readings], Diagnosis]
+) -> NDArray[np.float64]:
+    """Return P(dead) of the cells that are dead throughout the reference, ``[D]``; 0 for all others.
+
+    Args:
+        recordings: the reference.
+        layout: the array.
+        tolerance: how far the reading of a cell that does not move may wander to either side.
+        diagnose: a diagnosis without a reference.
+    """
+    present = layout.present.ravel()
+    never_moved = present & _still(recordings, 2 * tolerance)
+    if not never_moved.any() or never_moved[present].mean() > _MOST:
+        return np.zeros(layout.n_cells)
+    found = diagnose(_sample(recordings))
+    dead = never_moved & found.fault_set.mask & (found.probability >= _SURE)
+    return np.where(dead, found.probability, 0.0)
+
+
+def _still(recordings: Readings, most: float) -> NDArray[np.bool_]:
+    """Return which cells stayed within ``most`` all through, and did read something, ``[D]``."""
+    low, high = np.inf, -np.inf
+    for frames in recordings.blocks():
+        low, high = np.fmin(low, np.fmin.reduce(frames)), np.fmax(high, np.fmax.reduce(frames))
+    still: NDArray[np.bool_] = np.asarray(high - low <= most)
+    return still
+
+
+def _sample(recordings: Readings) -> Readings:
+    """Return some recordings, the long ones shortened: a cold start learns little from more."""
+    pieces = [(i, first) for i in range(len(recordings)) for first in range(0, len(recordings[i]), _FRAMES)]
+    chosen = np.unique(np.linspace(0, len(pieces) - 1, _PIECES).round().astype(int))
+    every = np.arange(recordings[0].shape[1])
+    return Readings(
+        [recordings.piece(i, slice(first, first + _FRAMES), every) for i, first in map(pieces.__getitem__, chosen)]
+    )

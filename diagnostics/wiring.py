@@ -35,8 +35,7 @@ _WITNESS = 2.5  # log ratio of a cell that counts as one
 _TRIED = 0.3  # log ratio of a cell that was put to the test
 _ALIKE = 0.2  # correlation of what doubtful cells on one wire say: at the edge of a contact they are wrong together
 _LEAST = -1.0  # log ratio that one doubtful cell can bring
-_STRONGEST = np.log(1000.0)  # log ratio that one of the cells should have, if none is faulty beyond doubt
-_LEADERLESS_COST = np.log(200.0)  # if none has it: at an edge all cells of a line may be wrongly suspected
+_LEADERLESS_COST = np.log(50.0)  # more, where no cell is faulty beyond doubt: at an edge many are wrongly suspected
 _PROVEN = np.log(9.0)  # log odds from which on a wire is named: single cells are the safer guess
 _ROUNDS = 5
 _FEW = 8  # wires of which all sets are tried
@@ -126,12 +125,11 @@ def _explain_pad(
     weight = np.where(alike, np.maximum(weight, _LEAST), 0.0)
     witness = alike & (faulty | (weight >= _WITNESS))
     tried = alike & (faulty | (weight > _TRIED))
-    leading = faulty | (weight >= _STRONGEST)
     candidates = []
     lines = layout.lines if witness.sum() >= 2 else ()
     for line in lines:
         if line.kind in ("row", "column", "converter"):
-            candidates += _candidates(line, layout.cells_on(line), against, witness, tried, leading)
+            candidates += _candidates(line, layout.cells_on(line), against, witness, tried, faulty)
     present = layout.present.ravel()
     found = np.flatnonzero(faulty & present)
     tested = int((against & present).sum()) + len(found)
@@ -168,7 +166,7 @@ def _candidates(
     against: NDArray[np.bool_],
     witness: NDArray[np.bool_],
     tried: NDArray[np.bool_],
-    leading: NDArray[np.bool_],
+    faulty: NDArray[np.bool_],
 ) -> list[_Candidate]:
     """Return the wire as a whole, and broken in its middle with either end alive, as far as cells bear witness."""
 
@@ -176,7 +174,7 @@ def _candidates(
         return bool(witness[behind].sum() >= max(_FEWEST_WITNESSES, _WITNESS_SHARE * float(tried[behind].sum())))
 
     def cost(behind: NDArray[np.intp]) -> float:
-        return float(_LINE_COST if leading[behind].any() else _LINE_COST + _LEADERLESS_COST)
+        return float(_LINE_COST if faulty[behind].any() else _LINE_COST + _LEADERLESS_COST)
 
     contradictions = np.flatnonzero(against[cells])
     found = []

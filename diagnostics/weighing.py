@@ -10,7 +10,7 @@ differs from one robot to the next.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ _MOST_JUMP = 1.0  # what a jump may be worth, whatever the logs say: alone it pr
 _KINDS = 3
 _SUSPICIOUS = 2.8  # log likelihood ratio from which on a cell is left out when others are judged
 _SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw one
+_STRANGE = 3.0  # recordings in which evidence meant nothing, beside those that were held out: few meet the strange ones
 _LOOSE = 10.0  # variance of the weights before any log is seen
 _CLIP = 6.0  # log ratios beyond this say "certain"; they must not steer the fit
 _SURE = 24.0  # and beyond this, not even more certain
@@ -84,7 +85,10 @@ class Weights:
         weights = cls()
         for n in (n_logs // 3, n_logs):
             weights = cls._of([_trial(*log, layout, reference, weights.suspicious) for log in logs[:n]])
-        return weights
+        if weights == cls():
+            return weights
+        held_out = len(order) - learned
+        return replace(weights, slope=tuple(held_out / (held_out + _STRANGE) * slope for slope in weights.slope))
 
     @classmethod
     def _of(cls, trials: Sequence[_Trial]) -> Weights:

@@ -82,9 +82,10 @@ class PatchedMemory(Memory):
             patch = self.local.patches[i]
             suffixes = [s.features() for t in touches.kept for s in t.suffixes() if s.first >= onset]
             if suffixes:
-                yield np.stack(suffixes), patch.inputs, patch.place, self._model(i, touches)
+                yield np.stack(suffixes), patch.inputs, patch.place, self.model_of(i, touches)
 
-    def _model(self, i: int, touches: Touches) -> Model:
+    def model_of(self, i: int, touches: Touches) -> Model:
+        """What healthy cells of patch i would do; without a reference, as far as its ``touches`` tell."""
         known = self.reference.model
         if known is not None and i in self._models:
             return self._models[i]
@@ -124,7 +125,7 @@ class PatchedMemory(Memory):
             of_patch = finished(
                 stuck_evidence(
                     touches.kept, self.settled[cells], runs.of(cells), jump[cells], sudden[cells],
-                    _Trusting(self._model(i, touches), asked), self.reference.scale.of(cells),
+                    _Trusting(self.model_of(i, touches), asked), self.reference.scale.of(cells),
                     present[cells], wrong[cells], tolerance, self.suspicious,
                 )
             )  # fmt: skip

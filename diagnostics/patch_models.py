@@ -1,4 +1,8 @@
-"""What healthy looks like on a large array: a model for each patch, on top of what all patches have in common."""
+"""What healthy looks like on a large array: a model for each patch, on top of what all patches have in common.
+
+Two things are shared: where the model of a patch starts from (see ``nearby``), and how far its cells are believed (see
+``rim``). The patches that were touched most teach both: the cost of that does not grow with the array.
+"""
 
 from __future__ import annotations
 
@@ -51,6 +55,7 @@ class _Touched:
 
     @classmethod
     def of(cls, readings: Readings, layout: SensorLayout, scale: Scale) -> _Touched:
+        """Find them in fault-free recordings."""
         every = patches(layout)
         ranges: list[list[tuple[int, int, int]]] = [[] for _ in every]
         for i, recording in enumerate(readings):

@@ -21,7 +21,7 @@ from diagnostics.spatial import Model, Spatial, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.touches import Array, Touches
 
-_SUSPICIOUS = 4.0  # log evidence from which on a cell is left out when others are judged, here and by its neighbours
+_SUSPICIOUS = 3.0  # log evidence from which on a cell is left out when others are judged, here and by its neighbours
 _PAUSES = 8  # of each of the two judgements: a monitor waits for all of them
 
 Mask = NDArray[np.bool_]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from scipy.special import expit, logit
 from diagnostics.few import covariance_and_precision
 from diagnostics.few import logistic as logistic_of_few
 from diagnostics.layout import SensorLayout
+from diagnostics.lessons import FOLDS, Lessons, Regressions
 from diagnostics.patches import Patch
 from diagnostics.readings import Readings
 from diagnostics.rim import Foreseen, Rim, around
@@ -43,10 +44,6 @@ _NOVEL = 0.1  # share of touches that resemble nothing known
 _BLOCK = 4096  # cells looked at together
 _AT_ONCE = 8192  # cells of stretches looked at between two pauses
 FEATURES = 4  # of a cell in a touch, see Summary.features
-_FOLDS = 4  # of the touches: each teaches how far to believe what the others taught
-_LEFT_OUT = (0.03, 0.06, 0.12, 0.2, 0.4, 0.7, 0.95)  # of the cells, in turn: so many may be dead, or not moved yet
-_LOOKED_AT = 0.12  # of the cells at most, among those left out
-_RIM_SAMPLES = 100_000  # cells left out of a stretch that are looked at for that, about
 
 
 @dataclass(frozen=True)
@@ -129,10 +126,9 @@ class Tile:
         """The cells that it is about."""
         return Patch(self.inputs, self.outputs)
 
-    @cached_property
-    def alone(self) -> Tile:
-        """The same model of an array that has no cells but the inputs."""
-        return replace(self, inputs=np.arange(len(self.inputs)), outputs=self.place)
+    def at(self, cells: NDArray[np.intp]) -> Tile:
+        """Return the same model of another array, whose ``cells`` are the inputs here."""
+        return replace(self, inputs=cells, outputs=cells[self.place])
 
     @classmethod
     def fit(
@@ -226,7 +222,7 @@ class ContactModel:
 
     Attributes:
         tiles: the models of all cells.
-        layout: the array; rim: corrects what they foresee. Without: believed as it is, as patches of a large array are.
+        layout: the array; rim: corrects what they foresee. Without: believed as it is.
     """
 
     tiles: tuple[Tile, ...]
@@ -242,7 +238,13 @@ class ContactModel:
         features, touch = stretches(recordings, scale, rng)
         n_touches = int(touch.max()) + 1
         every = np.flatnonzero(layout.present)
-        rim = _rim(features, touch, layout, rng) if n_touches >= _FOLDS else None
+
+        def regressions(of: Array) -> Regressions:
+            return partial(foreseen_by, (Tile.fit(of, every, every, _SUREST),))
+
+        rim = None
+        if n_touches >= FOLDS:
+            rim = Lessons.of(features, touch, layout, every, regressions, 1.0, rng).learned()
         return cls((Tile.fit(features, every, every, surest_of(n_touches)),), layout, rim)
 
     def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Generator[None, None, Expected]:
@@ -252,27 +254,29 @@ class ContactModel:
             features: ``[n, 4, D]``, of n stretches (see ``Summary.features``).
             trusted: bool ``[D]``, the cells that may be asked.
         """
-        foreseen = _foreseen(self.tiles, features, trusted)
+        foreseen = foreseen_by(self.tiles, features, trusted)
         shape = features.shape[2]
         spread, surest, known = np.ones(shape), np.zeros(shape), np.zeros(shape, bool)
         for tile in self.tiles:
             spread[tile.outputs], surest[tile.outputs], known[tile.outputs] = tile.spread, tile.surest, True
         never, always = expit(foreseen.never), expit(foreseen.always)
         if self.rim is not None and self.layout is not None:
-            step = max(1, _AT_ONCE // shape)
+            judged = np.flatnonzero(known)
+            step = max(1, _AT_ONCE // len(judged))
             for first in range(0, len(features), step):
                 yield
                 some = slice(first, first + step)
                 of_some = Foreseen(*(values[some] for values in vars(foreseen).values()))
-                told = self.rim.believe(around(of_some, features[some], trusted, self.layout))
-                corrected, always[some] = (p.T for p in told)
+                told = self.rim.believe(around(of_some, features[some], trusted, self.layout, judged))
+                corrected, always[some, judged] = (p.T for p in told)
                 # A cell that no touch of the reference reached may be out of reach, whatever those around it do.
-                never[some] = np.where(np.isnan(spread), never[some], corrected)
+                never[some, judged] = np.where(np.isnan(spread[judged]), never[some, judged], corrected)
         never, always = (np.where(known, np.clip(p, surest, 1 - surest), 1.0) for p in (never, always))
         return Expected(never, always, foreseen.mean, spread)
 
 
-def _foreseen(tiles: Sequence[Tile], features: Array, trusted: NDArray[np.bool_]) -> Foreseen:
+def foreseen_by(tiles: Sequence[Tile], features: Array, trusted: NDArray[np.bool_]) -> Foreseen:
+    """Return what the models say of their cells, 0 for others; see :meth:`ContactModel.expect`."""
     shape = (len(features), features.shape[2])
     foreseen = Foreseen(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape))
     for tile in tiles:
@@ -280,28 +284,6 @@ def _foreseen(tiles: Sequence[Tile], features: Array, trusted: NDArray[np.bool_]
         for values, said in zip(vars(foreseen).values(), of_tile, strict=True):
             values[:, tile.outputs] = said
     return foreseen
-
-
-def _rim(features: Array, touch: NDArray[np.intp], layout: SensorLayout, rng: np.random.Generator) -> Rim:
-    """Fit on what models of most touches say of the others, for cells left out at random."""
-    present = np.flatnonzero(layout.present)
-    looked_at = sum(min(share, _LOOKED_AT) for share in _LEFT_OUT) * len(present)
-    most = max(1, round(_RIM_SAMPLES / (_FOLDS * looked_at)))  # stretches in each round
-    fold = rng.permutation(touch.max() + 1)[touch] % _FOLDS
-    samples, never, always = [], [], []
-    for k in range(_FOLDS):
-        tiles, held = (Tile.fit(features[fold != k], present, present, _SUREST),), features[fold == k]
-        for share in _LEFT_OUT:
-            some = held[np.sort(rng.permutation(len(held))[:most])]
-            out = rng.permutation(present)[: max(1, round(share * len(present)))]
-            trusted = np.ones(layout.n_cells, bool)
-            trusted[out] = False
-            out = np.sort(out[: max(1, round(_LOOKED_AT * len(present)))])
-            told = around(_foreseen(tiles, some, trusted), some, trusted, layout)[:, out]
-            samples.append(told.reshape(len(told), -1).T.astype(np.float64))
-            never.append((some[:, 2, out] == 0).T.ravel())
-            always.append((some[:, 3, out] == 1).T.ravel())
-    return Rim.fit(np.concatenate(samples), np.concatenate(never), np.concatenate(always))
 
 
 def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -334,9 +316,7 @@ def stretches(
     for i, recording in enumerate(recordings):
         for touch in _touches(recording, scale):
             ranges.append((i, touch.first, sum(part.n for part in touch.parts)))
-    features = drawn(ranges, lambda i, frames: recordings[i][frames], scale, rng, _SAMPLES)
-    draws = len(features) // min(len(ranges), _SAMPLES)
-    return features, np.arange(len(features)) // draws
+    return drawn(ranges, lambda i, frames: recordings[i][frames], scale, rng, _SAMPLES)
 
 
 def drawn(
@@ -345,8 +325,11 @@ def drawn(
     scale: Scale,
     rng: np.random.Generator,
     most: int,
-) -> Array:
-    """Return features ``[n, 4, D]`` of random stretches of touches: (recording, first frame, frames) each."""
+) -> tuple[Array, NDArray[np.intp]]:
+    """Return features ``[n, 4, D]`` of random stretches of touches: (recording, first frame, frames) each.
+
+    And ``[n]``, which touch each is of, among those that were drawn.
+    """
     draws = int(np.clip(round(most / len(ranges)), 1, _MOST_DRAWS))
     if len(ranges) > most:
         ranges = [ranges[i] for i in np.sort(rng.choice(len(ranges), most, replace=False))]
@@ -358,7 +341,7 @@ def drawn(
             length = int(rng.integers(min(_SHORTEST, n), n + 1)) if draw else n
             at = int(rng.integers(0, n - length + 1))
             features.append(Summary.of(root[at : at + length], first + at, scale.root_near).features())
-    return np.stack(features)
+    return np.stack(features), np.arange(len(features)) // draws
 
 
 def surest_of(n_touches: int) -> float:

@@ -35,9 +35,10 @@ class Samples:
     @classmethod
     def of(cls, features: Array, patch: Patch, layout: SensorLayout, rng: np.random.Generator, most: int) -> Samples:
         """Take at most so many from the stretches of a patch, features ``[n, 4, inputs]``."""
-        (top, left), (rows, cols) = patch.corner, patch.size
+        alone = patch.rectangle(layout)
+        rows, cols = alone.layout.rows, alone.layout.cols
         grid = np.zeros((len(features), _FEATURES, rows + 2 * REACH, cols + 2 * REACH), np.float32)
-        r, c = patch.inputs // layout.cols % layout.rows - top, patch.inputs % layout.cols - left
+        r, c = alone.cells // cols, alone.cells % cols
         grid[:, :, r + REACH, c + REACH] = features
         windows = np.lib.stride_tricks.sliding_window_view(grid, (2 * REACH + 1,) * 2, axis=(2, 3))
         around = windows[:, :, r[patch.place], c[patch.place]].transpose(0, 2, 1, 3, 4)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +15,13 @@ from numpy.typing import NDArray
 from diagnostics.contact import ContactModel, Expected
 from diagnostics.layout import SensorLayout
 from diagnostics.memory import KEPT_TOUCHES, MOST_TOUCHES, Memory, finished
-from diagnostics.patches import MOST_CELLS, Patch, PatchTouches, patches
+from diagnostics.patches import MOST_CELLS, PatchTouches, Rectangle, patches
 from diagnostics.reference import Reference
 from diagnostics.spatial import Model, Spatial, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.touches import Array, Touches
 
-_SUSPICIOUS = 2.0  # log evidence from which on a cell is left out when others are judged, here and by its neighbours
+_SUSPICIOUS = 3.0  # log evidence from which on a cell is left out when others are judged, here and by its neighbours
 _PAUSES = 8  # of each of the two judgements: a monitor waits for all of them
 
 Mask = NDArray[np.bool_]
@@ -41,34 +40,19 @@ class _Trusting:
 
 
 @dataclass(frozen=True)
-class _PatchSurroundings:
-    """A cold start's model of a patch: its inputs as the pad of a layout of their own."""
+class _Alone:
+    """A model of a patch as an array of its own, asked about the inputs."""
 
-    log: Surroundings
-    cells: NDArray[np.intp]  # of that layout, that the inputs are
-
-    @classmethod
-    def of(cls, patch: Patch, touches: Touches, layout: SensorLayout) -> _PatchSurroundings:
-        """Learn from the touches of the patch."""
-        (top, left), (rows, cols) = patch.corner, patch.size
-        present = layout.present[patch.pad, top : top + rows, left : left + cols]
-        own = SensorLayout(1, rows, cols, full_scale=layout.full_scale, present=present)
-        cells = np.flatnonzero(present)
-        return cls(Surroundings(_on(Surroundings.of(touches.kept, own).log, cells, own.n_cells), own), cells)
+    model: Model
+    own: Rectangle
 
     def expect(self, features: Array, trusted: Mask) -> Generator[None, None, Expected]:
         """See ``ContactModel.expect``."""
-        n_cells = self.log.layout.n_cells
-        e = yield from self.log.expect(_on(features, self.cells, n_cells), _on(trusted, self.cells, n_cells))
-        cells = self.cells
+        e = yield from self.model.expect(self.own.on(features), self.own.on(trusted))
+        if self.own.full:
+            return e
+        cells = self.own.cells
         return Expected(e.never[:, cells], e.always[:, cells], e.mean[:, cells], e.spread[cells])
-
-
-def _on(values: NDArray[Any], cells: NDArray[np.intp], n_cells: int) -> NDArray[Any]:
-    """Return ``values [..., k]`` of k cells as ``[..., n_cells]``, 0 elsewhere."""
-    out = np.zeros((*values.shape[:-1], n_cells), values.dtype)
-    out[..., cells] = values
-    return out
 
 
 class PatchedMemory(Memory):
@@ -82,6 +66,7 @@ class PatchedMemory(Memory):
         super().__init__(layout, reference, _SUSPICIOUS)
         tiles = reference.model.tiles if reference.model else None
         self.local = PatchTouches.begin(patches(layout) if tiles is None else tuple(t.patch for t in tiles))
+        self._models: dict[int, Model] = {}  # of the patches that were touched, as the reference has them
 
     def spatial(self, wrong: Mask | None = None, touches: Touches | None = None) -> Generator[None, None, Spatial]:
         """See :meth:`Memory.spatial`."""
@@ -97,12 +82,19 @@ class PatchedMemory(Memory):
             patch = self.local.patches[i]
             suffixes = [s.features() for t in touches.kept for s in t.suffixes() if s.first >= onset]
             if suffixes:
-                yield np.stack(suffixes), patch.inputs, patch.place, self._model(i, touches)
+                yield np.stack(suffixes), patch.inputs, patch.place, self.model_of(i, touches)
 
-    def _model(self, i: int, touches: Touches) -> Model:
-        if self.reference.model is None:
-            return _PatchSurroundings.of(self.local.patches[i], touches, self.layout)
-        return ContactModel((self.reference.model.tiles[i].alone,))
+    def model_of(self, i: int, touches: Touches) -> Model:
+        """What healthy cells of patch i would do; without a reference, as far as its ``touches`` tell."""
+        known = self.reference.model
+        if known is not None and i in self._models:
+            return self._models[i]
+        own = self.local.patches[i].rectangle(self.layout)
+        if known is None:
+            log = Surroundings.of(touches.kept, own.layout).log
+            return _Alone(Surroundings(own.on(log), own.layout), own)
+        model = ContactModel((known.tiles[i].at(own.cells),), own.layout, known.rim)
+        return self._models.setdefault(i, _Alone(model, own))
 
     def _judged(self, local: PatchTouches, wrong: Mask | None, around: Mask) -> Generator[None, None, Spatial]:
         """Judge all patches, each asking those of the cells ``around`` it (bool ``[D]``)."""
@@ -133,7 +125,7 @@ class PatchedMemory(Memory):
             of_patch = finished(
                 stuck_evidence(
                     touches.kept, self.settled[cells], runs.of(cells), jump[cells], sudden[cells],
-                    _Trusting(self._model(i, touches), asked), self.reference.scale.of(cells),
+                    _Trusting(self.model_of(i, touches), asked), self.reference.scale.of(cells),
                     present[cells], wrong[cells], tolerance, self.suspicious,
                 )
             )  # fmt: skip

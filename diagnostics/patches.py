@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,20 +31,49 @@ class Patch:
 
     Attributes:
         inputs, outputs: cell indices, ascending; the inputs hold the outputs.
-        pad: the pad; corner: first row and column of the rectangle of the inputs; size: its rows and columns. Not
-            known of a patch that comes with a fitted model.
     """
 
     inputs: Cells
     outputs: Cells
-    pad: int = 0
-    corner: tuple[int, int] = (0, 0)
-    size: tuple[int, int] = (0, 0)
 
     @cached_property
     def place(self) -> Cells:
         """Where the outputs lie among the inputs."""
         return np.searchsorted(self.inputs, self.outputs)
+
+    def rectangle(self, layout: SensorLayout) -> Rectangle:
+        """Return the patch as an array of its own."""
+        row, col = self.inputs // layout.cols % layout.rows, self.inputs % layout.cols
+        row, col = row - row.min(), col - col.min()
+        present = np.zeros((1, int(row.max()) + 1, int(col.max()) + 1), bool)
+        present[0, row, col] = True
+        own = SensorLayout(*present.shape, full_scale=layout.full_scale, present=present)
+        return Rectangle(own, np.flatnonzero(present))
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """The rectangle that the inputs of a patch lie in.
+
+    Attributes:
+        layout: of an array that has no cells but the inputs; cells: int ``[inputs]``, where these are in it.
+    """
+
+    layout: SensorLayout
+    cells: Cells
+
+    @property
+    def full(self) -> bool:
+        """Whether no cell of it is absent."""
+        return len(self.cells) == self.layout.n_cells
+
+    def on(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return ``values [..., inputs]`` as those of all positions of the rectangle, 0 where no cell is."""
+        if self.full:
+            return values
+        out = np.zeros((*values.shape[:-1], self.layout.n_cells), values.dtype)
+        out[..., self.cells] = values
+        return out
 
 
 def patches(layout: SensorLayout) -> tuple[Patch, ...]:
@@ -57,11 +87,9 @@ def patches(layout: SensorLayout) -> tuple[Patch, ...]:
         for r in range(0, layout.rows, PATCH):
             for c in range(0, layout.cols, PATCH):
                 core = pad, slice(r, r + PATCH), slice(c, c + PATCH)
-                top, left = max(0, r - HALO), max(0, c - HALO)
-                around = pad, slice(top, r + PATCH + HALO), slice(left, c + PATCH + HALO)
+                around = pad, slice(max(0, r - HALO), r + PATCH + HALO), slice(max(0, c - HALO), c + PATCH + HALO)
                 if present[core].any():
-                    inputs, outputs = cells[around][present[around]], cells[core][present[core]]
-                    found.append(Patch(inputs, outputs, pad, (top, left), cells[around].shape))
+                    found.append(Patch(cells[around][present[around]], cells[core][present[core]]))
     return tuple(found)
 
 

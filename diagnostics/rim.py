@@ -82,44 +82,59 @@ class Rim:
         return never, always
 
 
-def around(foreseen: Foreseen, features: Array, trusted: NDArray[np.bool_], layout: SensorLayout) -> Array:
-    """Return what there is to know of each cell in each stretch, itself apart, ``[k, D, n]``.
+def around(
+    foreseen: Foreseen,
+    features: Array,
+    trusted: NDArray[np.bool_],
+    layout: SensorLayout,
+    cells: NDArray[np.intp] | None = None,
+) -> Array:
+    """Return what there is to know of each of k cells in each stretch, itself apart, ``[28, k, n]``.
 
     Args:
         foreseen: by the cells' own regressions.
         features: ``[n, 4, D]`` (see ``Summary.features``).
         trusted: bool ``[D]``, the cells that may be asked.
         layout: the array.
+        cells: int ``[k]``, ascending, those wanted; None: all D.
     """
     asked = (trusted & layout.present.ravel()).astype(np.float32)
-    n = len(features)
+    n, wanted = len(features), slice(None) if cells is None or len(cells) == layout.n_cells else cells
     # Four features of the trusted cells, and where these are. Stretches come last: long inner loops are fast.
     known = np.empty((5, *layout.shape, n), np.float32)
     by_cell = known.reshape(5, -1, n)
     np.multiply(features.transpose(1, 2, 0), asked[:, None], out=by_cell[:4])
     by_cell[4] = asked[:, None]
-    cross, three, five = _windows(known)
-    corners = three - cross
+
+    def of(values: Array) -> Array:
+        """Take the wanted of ``[..., pads, rows, cols, n]``."""
+        return values.reshape(*values.shape[:-4], layout.n_cells, values.shape[-1])[..., wanted, :]
+
+    cross, three, five = map(of, _windows(known))
+    corners, itself = three - cross, of(known)
     # Means over the pad and over the array leave the cell itself out, as the rings do.
-    pads = known.sum(axis=(2, 3), keepdims=True)  # (5, pads, 1, 1, n)
-    pad, whole = pads - known, pads.sum(axis=1, keepdims=True) - known
-    told = np.empty((INPUTS, layout.n_cells, n), np.float32)
-    of_cells, of_place, *rings, on_pad, overall = told.reshape(7, 4, *layout.shape, n)
-    for values, own in zip(
-        of_cells.reshape(4, -1, n),
-        (
-            np.clip(foreseen.never, -_SURE, _SURE),
-            np.clip(foreseen.always, -_SURE, _SURE),
-            foreseen.mean,
-            logit(np.clip(foreseen.usual, _RARE, 1 - _RARE)),
-        ),
-        strict=True,
-    ):
-        values[:] = own.T
-    of_place[0], of_place[1], of_place[2], of_place[3] = cross[4], corners[4], _inside(layout), _enclosed(known[1])
+    pads = known.sum(axis=(2, 3))  # (5, pads, n)
+    pad = np.repeat(pads, layout.rows * layout.cols, axis=1)[:, wanted] - itself
+    whole = pads.sum(axis=1, keepdims=True) - itself
+    told = np.empty((INPUTS, *itself.shape[1:]), np.float32)
+    of_cells, of_place, *rings, on_pad, overall = told.reshape(7, 4, *itself.shape[1:])
+    own = (
+        np.clip(foreseen.never[:, wanted], -_SURE, _SURE),
+        np.clip(foreseen.always[:, wanted], -_SURE, _SURE),
+        foreseen.mean[:, wanted],
+        logit(np.clip(foreseen.usual[:, wanted], _RARE, 1 - _RARE)),
+    )
+    for values, said in zip(of_cells, own, strict=True):
+        values[:] = said.T
+    of_place[0], of_place[1], of_place[2], of_place[3] = (
+        cross[4],
+        corners[4],
+        of(_inside(layout)),
+        of(_enclosed(known[1])),
+    )
     np.divide(whole[:4], np.maximum(whole[4:], 1), out=overall)
     np.divide(pad[:4] + _EMPTY * overall, pad[4:] + _EMPTY, out=on_pad)
-    for total, ring in zip((cross, corners, five - three - known), rings, strict=True):
+    for total, ring in zip((cross, corners, five - three - itself), rings, strict=True):
         np.divide(total[:4] + _EMPTY * on_pad, total[4:] + _EMPTY, out=ring)
     return told
 

@@ -55,6 +55,14 @@ def test_each_ring_is_the_mean_of_its_trusted_cells_nearly(trusted: np.ndarray):
         np.testing.assert_allclose(rings[4][:, cell].T, overall, atol=1e-5)
 
 
+def test_of_some_cells_it_says_what_it_says_of_all():
+    rng, cells = np.random.default_rng(6), np.array([1, 8, 33, 59])
+    said = Foreseen(*rng.normal(size=(4, STRETCHES, 60)))
+    trusted = rng.random(60) < 0.7
+    of_all = around(said, touched(4), trusted, LAYOUT)
+    np.testing.assert_array_equal(around(said, touched(4), trusted, LAYOUT, cells), of_all[:, cells])
+
+
 def test_what_a_cell_does_itself_says_nothing_of_it():
     features = touched(1)
     for cell in (0, 14, 40):

@@ -1,0 +1,89 @@
+"""What a rim is taught by: cells left out at random, in touches that the regressions of these cells were not fitted on.
+
+A rim is to learn how far the regressions can be believed when some of the cells are dead, or have not moved yet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.layout import SensorLayout
+from diagnostics.rim import Foreseen, Rim, around
+from diagnostics.touches import Array
+
+FOLDS = 4  # of the touches: each teaches how far to believe what the others taught
+_LEFT_OUT = (0.03, 0.06, 0.12, 0.2, 0.4, 0.7, 0.95)  # of the cells, in turn: so many may be dead, or not moved yet
+_LOOKED_AT = 0.12  # of the cells at most, among those left out
+_SAMPLES = 100_000  # cells left out of a stretch that are looked at in all, about
+
+Cells = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+Regressions = Callable[[Array, Mask], Foreseen]  # of features [n, 4, D], where the cells bool [D] may be asked
+
+
+@dataclass(frozen=True)
+class Lessons:
+    """Cells of which it is known what they did.
+
+    Attributes:
+        samples: float64 ``[m, k]``, what there was to know of each, see ``rim.around``.
+        never, always: bool ``[m]``, whether it stayed unloaded, or loaded, throughout.
+    """
+
+    samples: NDArray[np.float64]
+    never: Mask
+    always: Mask
+
+    @classmethod
+    def of(
+        cls,
+        features: Array,
+        touch: Cells,
+        layout: SensorLayout,
+        outputs: Cells,
+        fit: Callable[[Array], Regressions],
+        share: float,
+        rng: np.random.Generator,
+    ) -> Lessons:
+        """Draw from stretches of touches of an array, cross-fitted in folds of the touches.
+
+        Args:
+            features: ``[n, 4, D]``; touch: int ``[n]``, the touch that each stretch is of.
+            layout: the array.
+            outputs: the cells that regressions are for.
+            fit: returns the regressions of the ``outputs``, fitted on features ``[m, 4, D]``.
+            share: of all lessons that this array gives.
+            rng: draws them.
+        """
+        present = np.flatnonzero(layout.present)
+        looked_at = sum(min(left, _LOOKED_AT) for left in _LEFT_OUT) * len(outputs)
+        most = max(1, round(share * _SAMPLES / (FOLDS * looked_at)))  # stretches in each round
+        fold = rng.permutation(touch.max() + 1)[touch] % FOLDS
+        found = []
+        for k in range(FOLDS):
+            foreseen, held = fit(features[fold != k]), features[fold == k]
+            for left in _LEFT_OUT:
+                some = held[np.sort(rng.permutation(len(held))[:most])]
+                out = rng.permutation(present)[: max(1, round(left * len(present)))]
+                trusted = np.ones(layout.n_cells, bool)
+                trusted[out] = False
+                out = out[np.isin(out, outputs)]
+                out = np.sort(out[: max(1, round(_LOOKED_AT * len(outputs)))])
+                told = around(foreseen(some, trusted), some, trusted, layout, out)
+                samples = told.reshape(len(told), -1).T.astype(np.float64)
+                found.append(cls(samples, (some[:, 2, out] == 0).T.ravel(), (some[:, 3, out] == 1).T.ravel()))
+        return cls.together(found)
+
+    @classmethod
+    def together(cls, parts: Sequence[Lessons]) -> Lessons:
+        """Join the lessons of several arrays."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
+
+    def learned(self) -> Rim:
+        """Return what they teach."""
+        return Rim.fit(self.samples, self.never, self.always)

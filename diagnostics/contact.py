@@ -42,7 +42,7 @@ _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however ma
 _LEAST_SPREAD = 0.02  # of the root load: nothing is predicted more exactly
 _NOVEL = 0.1  # share of touches that resemble nothing known
 _BLOCK = 4096  # cells looked at together
-_AT_ONCE = 8192  # cells of stretches looked at between two pauses
+_AT_ONCE = 4096  # cells of stretches looked at between two pauses
 FEATURES = 4  # of a cell in a touch, see Summary.features
 
 

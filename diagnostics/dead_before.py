@@ -46,7 +46,7 @@ def _still(recordings: Readings, most: float) -> NDArray[np.bool_]:
     low, high = np.inf, -np.inf
     for frames in recordings.blocks():
         low, high = np.fmin(low, np.fmin.reduce(frames)), np.fmax(high, np.fmax.reduce(frames))
-    still: NDArray[np.bool_] = np.asarray(high - low <= most)
+    still: NDArray[np.bool_] = np.asarray((high >= low) & (high - low <= most))
     return still
 
 

@@ -58,6 +58,13 @@ def test_a_cell_that_moved_once_was_not_dead(worn):
     assert SHORT not in np.flatnonzero(looked_for(moved))
 
 
+def test_a_cell_that_delivered_nothing_is_not_taken_for_one_that_stood_still(worn):
+    silent = [frames.copy() for frames in worn]
+    for frames in silent:
+        frames[:, SHORT] = np.nan
+    assert set(np.flatnonzero(looked_for(silent)).tolist()) == DEAD - {SHORT}
+
+
 def test_they_are_called_faulty_in_every_log_by_what_they_do(worn, fitted):
     for log in (worn[1:12:2], worn[1:2]):
         diagnosis = fitted.diagnose(log)

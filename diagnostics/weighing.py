@@ -196,7 +196,8 @@ def faulty_at(probability: Floats, false_discovery_rate: float) -> NDArray[np.bo
     """Return the set of cells whose expected share of false alarms comes nearest to the rate, bool ``[D]``.
 
     Nearest, and not below: few cells are found in one log, each is a big step, and to stop short of the rate every time
-    would be to keep to half of it. No cell that is rather alive than faulty is in it, however good the others look.
+    would be to keep to half of it. But the first keeps to it: most robots are healthy. No cell that is rather alive
+    than faulty is in the set, however good the others look.
     """
     order = np.argsort(-probability, kind="stable")
     false = np.cumsum(1 - probability[order])  # expected among the first 1, 2, ...

@@ -104,6 +104,17 @@ def real_grasps() -> Recordings:
     return load(REAL).recordings
 
 
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Threads cost more than they bring on small models."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 SMALL = SensorLayout(2, 3, 3, full_scale=4.0, present=np.arange(18) != 4)
 DROPPED = {"whole": (), "head": (1, 9, 17)}
 

@@ -10,13 +10,7 @@ from diagnostics import SensorLayout
 SMALL = SensorLayout(1, 4, 4)
 
 
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Threads cost more than they bring on models this small."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def windows(layout: SensorLayout, n: int = 3, length: int = 10) -> torch.Tensor:

@@ -21,12 +21,7 @@ SETS = [FaultSet((0,), D), FaultSet((1, 2, 10), D), FaultSet((), D), FaultSet(ra
 TOLERANCE = 1e-4  # of a logit
 
 
-@pytest.fixture(autouse=True)
-def _one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def blobs(n: int, seed: int) -> Windows:

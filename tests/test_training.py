@@ -22,13 +22,7 @@ from diagnostics import SensorLayout
 LAYOUT = SensorLayout(1, 4, 4)
 
 
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Threads cost more than they bring on models this small."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def grasps(n: int = 60, seed: int = 0, cells: int = 16, length: int = 10) -> Windows:

@@ -197,5 +197,11 @@ def _corrected(z: Floats, did: NDArray[np.bool_], column: int, mean: Floats, sca
         value = np.logaddexp(0, odds).sum() - odds[did].sum() + 0.5 * _RIDGE * (change @ change)
         return float(value), x.T @ (expit(odds) - did) + _RIDGE * change
 
-    found = minimize(loss, start, jac=True, method="L-BFGS-B").x
+    def curvature(weights: Floats) -> Floats:
+        p = expit(x @ weights)
+        bent: Floats = x.T @ (x * (p * (1 - p))[:, None]) + _RIDGE * np.eye(len(start))
+        return bent
+
+    # Few weights and many samples: second derivatives are cheap, and a handful of steps is all it takes.
+    found = minimize(loss, start, jac=True, hess=curvature, method="trust-exact").x
     return found[:-1], float(found[-1])

@@ -23,12 +23,16 @@ ON_RECORDINGS = {
     "compare_classification.py": ["--small", "--only", "adaptfault"],
     "compare_diagnosis.py": ["--logs", "1"],
     "compare_keras.py": ["--epochs", "1", "--windows", "32"],
+    "diagnosis_constants.py": ["1", "--only", "rim._RIDGE"],
     "diagnosis_figures.py": ["1", "--only", "cells"],
     "esp32_sender.py": ["--frames", "20"],
     "simulated_vs_real.py": [],
     "wrong_fault_set.py": ["--draws", "1"],
 }
-LESS = {"fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"]}  # it takes minutes
+LESS = {  # they take minutes
+    "diagnosis_constants.py": ["--only", "rim._RIDGE"],
+    "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
+}
 SLOW = {  # more than 7 s of CPU time
     "adaptation_figures.py",
     "compare_classification.py",
@@ -36,6 +40,7 @@ SLOW = {  # more than 7 s of CPU time
     "compare_keras.py",
     "core_speed.py",
     "deploy_speed.py",
+    "diagnosis_constants.py",
     "diagnosis_figures.py",
     "fleet_scaling.py",
     "kill_maintenance.py",

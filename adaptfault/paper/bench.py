@@ -61,7 +61,8 @@ class Bench:
 
     def __init__(self, setup: Setup, seed: int) -> None:
         self.setup, self.seed, self.layout = setup, seed, setup.recordings.layout
-        self.train, self.validation, self.whole = split(setup.windows, seed=seed)
+        self.train, validation, self.whole = split(setup.windows, seed=seed)
+        self.validation = validation.select(evenly(len(validation), setup.settings.judged))
         starts = np.unique(self.whole.recording, return_index=True)[1]
         sizes = np.diff([*starts, len(self.whole)])
         rng = np.random.default_rng(seed)
@@ -207,8 +208,7 @@ class Bench:
     @cached_property
     def adapter(self) -> Adapter:
         """Of the base."""
-        judged = evenly(len(self.validation), self.setup.settings.judged)
-        return Adapter(self.base, self.train, self.validation.select(judged))
+        return Adapter(self.base, self.train, self.validation)
 
     def _adapted(self, faults: FaultSet, x: Floats | None = None) -> Classes:
         """Answer by the base adapted to F; the cells in F read NaN unless ``x`` is given."""

@@ -66,7 +66,7 @@ def write_page(setup: Setup, ledger: Ledger, figures: tuple[int, ...], about: di
         lines += [f"| {c.statement} | {c.here} | **{c.verdict}** ({c.criterion}) |" for c in claims]
         lines.append("")
     lines += [
-        f"Accuracies on test recordings, means of {len(setup.settings.seeds)} seeds, each with its own split, weights"
+        f"Accuracies on test recordings, means of up to {len(setup.settings.seeds)} seeds, each with its own split, weights"
         " and faults; in brackets the 95 % interval, clustered by recording. *spread*: deviation between seeds.",
         "",
     ]
@@ -102,12 +102,13 @@ def _section(setup: Setup, ledger: Ledger, figure: int) -> list[str]:
 
 def _markdown(found: Sequence[Row]) -> list[str]:
     lines = [
-        "| strategy | faults | k | accuracy | precision | recall | F1 | spread |",
-        "|---|---|---|---|---|---|---|---|",
+        "| strategy | faults | k | accuracy | precision | recall | F1 | spread | seeds |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for task, m in found:
-        numbers = " | ".join(f"{value:.3f}" for value in (m.precision, m.recall, m.f1, m.spread))
-        lines.append(f"| {task.strategy} | {task.faults} | {task.k} | {m} | {numbers} |")
+        numbers = " | ".join(f"{value:.3f}" for value in (m.precision, m.recall, m.f1))
+        spread = f"{m.spread:.3f}" if m.seeds > 1 else "-"
+        lines.append(f"| {task.strategy} | {task.faults} | {task.k} | {m} | {numbers} | {spread} | {m.seeds} |")
     return [*lines, ""]
 
 

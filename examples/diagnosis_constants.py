@@ -1,0 +1,186 @@
+"""Does the diagnosis hang on its constants? python examples/diagnosis_constants.py [RECORDINGS [LOGS]]
+
+Halves and doubles every number that `diagnostics` holds for itself, one at a time, fits anew, and measures the first
+row of `diagnosis_figures.py`: 16 % of the cells dead. Numbers that this array never meets (those of large skins, say)
+are told apart by watching which functions run. ``--out`` keeps what is measured: run again, it goes on from there.
+
+Two bounds: what is wanted of the first row, and a looser one, 1 % off it, that shows what a constant breaks and what
+it only moves. ``--only spatial._LEAST ...`` picks constants. Without RECORDINGS: simulated grasps of a small array.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import importlib
+import pkgutil
+import re
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import FrameType
+
+from diagnosis_figures import Bench, dead_cells, small
+from joblib import Parallel, delayed, parallel_config
+
+import diagnostics
+from adaptfault.recordings import Recordings, load
+from diagnostics import SelfDiagnosis
+
+PRECISION, RECALL, SLACK = 0.995, 0.98, 0.01
+SHARE = 0.16
+NOT_DIAGNOSING = ("circuit", "injection", "picture")  # public tools and the injector
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A number of a module, and what it is changed to."""
+
+    module: str
+    name: str
+    value: float
+    changed: float
+
+    def __str__(self) -> str:
+        return f"{self.module.removeprefix('diagnostics.')}.{self.name} {self.value:g} -> {self.changed:g}"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The first row with a constant changed; ``error``: it could not be measured."""
+
+    constant: str
+    precision: float
+    recall: float
+    error: str = ""
+
+    def verdict(self) -> str:
+        """Say whether the first row still holds, nearly does, or not."""
+        if self.error:
+            return "FAILS"
+        if self.precision >= PRECISION and self.recall >= RECALL:
+            return "holds"
+        return "near" if self.precision >= PRECISION - SLACK and self.recall >= RECALL - SLACK else "BREAKS"
+
+
+def constants() -> Iterator[Constant]:
+    """Yield all of them, halved and doubled."""
+    for info in pkgutil.iter_modules(diagnostics.__path__):
+        if info.name in NOT_DIAGNOSING:
+            continue
+        module = importlib.import_module(f"diagnostics.{info.name}")
+        for name, value in sorted(vars(module).items()):
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if number and re.fullmatch(r"_[A-Z][A-Z0-9_]*", name):
+                for changed in (value / 2 if isinstance(value, float) else value // 2, 2 * value):
+                    if changed not in (0, value):
+                        yield Constant(module.__name__, name, value, changed)
+
+
+def mentioned(work: Callable[[], object]) -> set[tuple[str, str]]:
+    """Return module and name of what the functions of `diagnostics` that run during the work mention."""
+    found: set[tuple[str, str]] = set()
+    codes = set()
+
+    def look(frame: FrameType, event: str, arg: object) -> None:
+        if event == "call" and frame.f_code not in codes:
+            codes.add(frame.f_code)
+            module = frame.f_globals.get("__name__", "")
+            if module.startswith("diagnostics."):
+                found.update((module, name) for name in frame.f_code.co_names)
+
+    sys.setprofile(look)
+    try:
+        work()
+    finally:
+        sys.setprofile(None)
+    return found
+
+
+def first_row(recordings: Recordings, split: int, count: int) -> tuple[float, float]:
+    """Fit, and return precision and recall of the first row."""
+    bench = Bench(recordings, split, count)
+    fitted = SelfDiagnosis(bench.layout).fit([recordings.frames[i] for i in bench.reference])
+    tally = dead_cells(bench, fitted, SHARE)
+    return tally.precision, tally.recall
+
+
+def changed_row(constant: Constant, recordings: Recordings, split: int, count: int) -> Measured:
+    """Measure the first row with a constant changed."""
+    module = importlib.import_module(constant.module)
+    setattr(module, constant.name, constant.changed)
+    try:
+        return Measured(str(constant), *first_row(recordings, split, count))
+    except Exception as error:  # a constant that must not be changed: to be told, too
+        return Measured(str(constant), 0.0, 0.0, f"{type(error).__name__}: {error}")
+    finally:
+        setattr(module, constant.name, constant.value)
+
+
+def known(path: Path | None) -> dict[str, Measured]:
+    """Read what an earlier run measured."""
+    if path is None or not path.exists():
+        return {}
+    with path.open(newline="") as file:
+        rows = [
+            Measured(r["constant"], float(r["precision"]), float(r["recall"]), r["error"]) for r in csv.DictReader(file)
+        ]
+    return {row.constant: row for row in rows}
+
+
+def keep(path: Path | None, row: Measured) -> None:
+    if path is None:
+        return
+    fresh = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, ["constant", "precision", "recall", "error"], lineterminator="\n")
+        if fresh:
+            writer.writeheader()
+        writer.writerow({**asdict(row), "precision": f"{row.precision:.4f}", "recall": f"{row.recall:.4f}"})
+
+
+def show(row: Measured) -> None:
+    told = row.error or f"precision {row.precision:.4f}, recall {row.recall:.4f}"
+    print(f"{row.verdict():8s}{row.constant:45s}{told}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Does the diagnosis hang on its constants?")
+    parser.add_argument("recordings", nargs="?", help="fault-free recordings; without: simulated grasps")
+    parser.add_argument("logs", nargs="?", type=int, default=20, help="logs for each constant (default 20)")
+    parser.add_argument("--split", type=int, default=0, help="seed of the halves (default 0)")
+    parser.add_argument("--out", type=Path, help="CSV of what is measured; what it holds already is not measured again")
+    parser.add_argument("--jobs", type=int, default=-1, help="processes (default: one a core)")
+    parser.add_argument("--only", nargs="+", metavar="MODULE.NAME", help="constants")
+    options = parser.parse_args()
+    recordings = load(options.recordings).recordings if options.recordings else small()
+    count = options.logs if options.recordings else 2
+    job = recordings, options.split, count
+    usual: list[tuple[float, float]] = []
+    met = mentioned(lambda: usual.append(first_row(*job)))
+    show(Measured("as they are", *usual[0]))
+    every = [
+        c
+        for c in constants()
+        if not options.only or f"{c.module}.{c.name}" in {f"diagnostics.{n}" for n in options.only}
+    ]
+    used = [c for c in every if (c.module, c.name) in met]
+    print(f"{len(every)} changes, {len(used)} of constants that this array meets")
+    rows = known(options.out)
+    for row in rows.values():
+        show(row)
+    left = [c for c in used if str(c) not in rows]
+    with parallel_config(backend="loky", inner_max_num_threads=1):
+        for row in Parallel(n_jobs=options.jobs, return_as="generator_unordered")(
+            delayed(changed_row)(c, *job) for c in left
+        ):
+            show(row)
+            keep(options.out, row)
+            rows[row.constant] = row
+    verdicts = [row.verdict() for row in rows.values()]
+    print(", ".join(f"{verdicts.count(v)} {v}" for v in ("holds", "near", "BREAKS", "FAILS")))
+
+
+if __name__ == "__main__":
+    main()

@@ -66,8 +66,8 @@ def write_page(setup: Setup, ledger: Ledger, figures: tuple[int, ...], about: di
         lines += [f"| {c.statement} | {c.here} | **{c.verdict}** ({c.criterion}) |" for c in claims]
         lines.append("")
     lines += [
-        f"Accuracies on test recordings, means of up to {len(setup.settings.seeds)} seeds, each with its own split, weights"
-        " and faults; in brackets the 95 % interval, clustered by recording. *spread*: deviation between seeds.",
+        f"Accuracies on test recordings, means of up to {len(setup.settings.seeds)} seeds, each with its own split,"
+        " weights and faults; in brackets the 95 % interval, clustered by recording. *spread*: deviation between them.",
         "",
     ]
     for figure in figures:

@@ -16,6 +16,7 @@ from diagnostics.memory import Memory, finished
 from diagnostics.patched import remembering
 from diagnostics.readings import Readings
 from diagnostics.reference import Reference, living, tolerance_of
+from diagnostics.spatial import Spatial
 from diagnostics.stored import Arrays, reference_from_state, reference_state, weights_from_state, weights_state
 from diagnostics.verdicts import Diagnosis
 from diagnostics.weighing import Weights, faulty_at, kinds
@@ -128,66 +129,69 @@ class SelfDiagnosis:
         memory = memory.complete()
         if not memory.heard.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
-        reference, layout, runs, unrest = memory.reference, self.layout, memory.runs, memory.unrest
-        present, silent = memory.present, memory.present & ~memory.heard
-
         aliased = aliasings(memory)
         yield
-        wrong = np.zeros(layout.n_cells, bool)
+        wrong = np.zeros(self.layout.n_cells, bool)
         wrong[[cell for aliasing in aliased for cell in (*aliasing.cells, *aliasing.doubtful)]] = True
         spatial = yield from memory.spatial(wrong)
-        jump = memory.jump()
-        kind = kinds(memory)
+        found = self._found(memory, spatial, wrong)
+        yield
+        causes = yield from root_causes(found, aliased, self.layout)
+        probability, inferred = found.probability.copy(), np.zeros(self.layout.n_cells, bool)
+        for fault in causes:
+            cells = list(fault.cells)
+            probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
+            inferred[cells] = True
+        scale, unrest = memory.reference.scale, memory.unrest
+        working = found.alive & ~inferred
+        return Diagnosis(
+            layout=self.layout,
+            faults=causes,
+            probability=probability,
+            tested=found.alive | inferred,
+            transport=memory.stream.faults(scale.resting + scale.near, working, self.layout.rate),
+            evidence={
+                "spatial": spatial.evidence + spatial.offset,
+                "temporal": np.where(spatial.asked, memory.jump(), unrest.blinking + unrest.noisy),
+                "touches": spatial.touches.astype(np.float64),
+            },
+            n_frames=memory.stream.seen,
+            n_recordings=n_recordings,
+        )
+
+    def _found(self, memory: Memory, spatial: Spatial, wrong: NDArray[np.bool_]) -> Findings:
+        """Weigh the evidence, and cut F; cells that are ``wrong`` (bool ``[D]``) have been explained already."""
+        reference, runs, unrest = memory.reference, memory.runs, memory.unrest
+        present, silent = memory.present, memory.present & ~memory.heard
+        jump, kind = memory.jump(), kinds(memory)
         known = spatial.asked & ~runs.moved & (reference.dead > 0)
         worth = self.weights_.worth(spatial.evidence, jump, kind)
         still = self.weights_.probability(worth, kind, spatial.asked & ~known)
         still[known] = reference.dead[known]
         intermittent, noisy = unrest.intermittent & present & ~wrong, unrest.excess & present & ~wrong
         drifting = present & ~wrong & ~intermittent & ~noisy & (spatial.offset >= _OFFSET)
-        moving = intermittent | noisy | drifting
-        probability = np.where(present, np.where(silent | moving, _SURE, still), 0.0)
-        faulty = faulty_at(np.where(silent | moving, 0.0, probability), self.false_discovery_rate)
-        faulty = (faulty | silent | moving) & present & ~wrong
-        # A cell that moved works, unless something speaks against what it does since.
-        alive = present & ~wrong & ~faulty & runs.moved & (probability < _DOUBTED)
-        value = runs.value
-        rests = spatial.asked & memory.rests()
-        found = Findings(
+        counted_out = silent | intermittent | noisy | drifting
+        probability = np.where(present, np.where(counted_out, _SURE, still), 0.0)
+        faulty = faulty_at(np.where(counted_out, 0.0, probability), self.false_discovery_rate)
+        faulty = (faulty | counted_out) & present & ~wrong
+        value, rests = runs.value, spatial.asked & memory.rests()
+        return Findings(
             faulty=faulty,
-            alive=alive,
+            # A cell that moved works, unless something speaks against what it does since.
+            alive=present & ~wrong & ~faulty & runs.moved & (probability < _DOUBTED),
             silent=silent,
             rests=rests,
-            full=spatial.asked & ~rests & (value >= layout.full_scale - 2 * reference.tolerance),
+            full=spatial.asked & ~rests & (value >= self.layout.full_scale - 2 * reference.tolerance),
             intermittent=intermittent,
             noisy=noisy,
             drifting=drifting,
-            value=np.where(intermittent, np.where(2 * unrest.high > unrest.blinks, layout.full_scale, 0.0), value),
+            value=np.where(intermittent, np.where(2 * unrest.high > unrest.blinks, self.layout.full_scale, 0.0), value),
             since=np.select([intermittent, noisy, drifting], [unrest.blinks_since, unrest.noisy_since, 0], runs.start),
             probability=probability,
             # What the line hypothesis asks of a cell at rest is only whether touches speak against it.
             weight=np.where(known, _KNOWN, self.weights_.worth(spatial.surprise, jump, kind)),
             touches=np.where(intermittent, unrest.blinks, spatial.touches),
             known=known,
-        )
-        yield
-        causes = yield from root_causes(found, aliased, layout)
-        inferred = np.zeros(layout.n_cells, bool)
-        for fault in causes:
-            cells = list(fault.cells)
-            probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
-            inferred[cells] = True
-        temporal = np.where(spatial.asked, jump, unrest.blinking + unrest.noisy)
-        tested = spatial.touches.astype(np.float64)
-        loaded_from = reference.scale.resting + reference.scale.near
-        return Diagnosis(
-            layout=layout,
-            faults=causes,
-            probability=probability,
-            tested=alive | inferred,
-            transport=memory.stream.faults(loaded_from, alive & ~inferred, layout.rate),
-            evidence={"spatial": spatial.evidence + spatial.offset, "temporal": temporal, "touches": tested},
-            n_frames=memory.stream.seen,
-            n_recordings=n_recordings,
         )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference
-from diagnostics.spatial import Model, Spatial, stuck_evidence
+from diagnostics.spatial import Cells, Model, Spatial, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.temporal import StillRuns
 from diagnostics.touches import SEGMENT, Array, Touches
@@ -126,12 +126,16 @@ class Memory:
         Cells that are known to be ``wrong`` (bool ``[D]``) are not asked.
         """
         touches = self.touches if touches is None else touches
+        return stuck_evidence(
+            touches.kept, self.cells(wrong), self.model(), self.reference.scale, self.reference.tolerance,
+            self.suspicious,
+        )  # fmt: skip
+
+    def cells(self, wrong: NDArray[np.bool_] | None) -> Cells:
+        """What is known of the cells before the others are asked, but those that are known to be ``wrong``."""
         wrong = self.unrest.intermittent | self.unrest.excess | (False if wrong is None else wrong)
         sudden = self.reference.onsets.size(self.runs, self.layout.full_scale)
-        return stuck_evidence(
-            touches.kept, self.settled, self.runs, self.jump(), sudden, self.model(), self.reference.scale,
-            self.present & self.heard, wrong, self.reference.tolerance, self.suspicious,
-        )  # fmt: skip
+        return Cells(self.runs, self.settled, self.jump(), sudden, self.present & self.heard & ~wrong)
 
     def _close(self) -> None:
         frames, numbers = self._buffer[: self._filled], self._numbers[: self._filled]

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.contact import FEATURES, RIDGE, ContactModel, Start, Tile, drawn, foreseen_by, surest_of
+from diagnostics.contact import ContactModel, drawn, surest_of
 from diagnostics.layout import SensorLayout
 from diagnostics.lessons import FOLDS, Lessons, Regressions
 from diagnostics.nearby import Nearby, Samples
@@ -21,6 +21,7 @@ from diagnostics.patches import MOST_CELLS, Patch, PatchTouches, patches
 from diagnostics.readings import Readings
 from diagnostics.rim import Rim
 from diagnostics.temporal import segments
+from diagnostics.tiles import FEATURES, RIDGE, Start, Tile, foreseen_by
 from diagnostics.touches import SEGMENT, Array, Scale
 
 _SAMPLES = 256  # stretches for the model of one patch out of many

@@ -98,37 +98,17 @@ class PatchedMemory(Memory):
 
     def _judged(self, local: PatchTouches, wrong: Mask | None, around: Mask) -> Generator[None, None, Spatial]:
         """Judge all patches, each asking those of the cells ``around`` it (bool ``[D]``)."""
-        wrong = self.unrest.intermittent | self.unrest.excess | (False if wrong is None else wrong)
-        onsets, runs, tolerance = self.reference.onsets, self.runs, self.reference.tolerance
-        jump, sudden = self.jump(), onsets.size(runs, self.layout.full_scale)
-        present = self.present & self.heard
-        untouched = stuck_evidence(
-            (),
-            self.settled,
-            runs,
-            jump,
-            sudden,
-            ContactModel(()),
-            self.reference.scale,
-            present,
-            wrong,
-            tolerance,
-            self.suspicious,
-        )
-        total = Spatial(*(np.array(values) for values in vars(finished(untouched)).values()))
+        every = self.cells(wrong)
+        total = Spatial(*(np.array(values) for values in vars(Spatial.before(every)).values()))
         touched = list(local.kept())
         for k, (i, touches) in enumerate(touched):
             patch = local.patches[i]
             cells = patch.inputs
             asked = around[cells]
             asked[patch.place] = True
-            of_patch = finished(
-                stuck_evidence(
-                    touches.kept, self.settled[cells], runs.of(cells), jump[cells], sudden[cells],
-                    _Trusting(self.model_of(i, touches), asked), self.reference.scale.of(cells),
-                    present[cells], wrong[cells], tolerance, self.suspicious,
-                )
-            )  # fmt: skip
+            model = _Trusting(self.model_of(i, touches), asked)
+            scale, tolerance = self.reference.scale.of(cells), self.reference.tolerance
+            of_patch = finished(stuck_evidence(touches.kept, every.of(cells), model, scale, tolerance, self.suspicious))
             for name, values in vars(of_patch).items():
                 getattr(total, name)[patch.outputs] = values[patch.place]
             if k * _PAUSES // len(touched) != (k + 1) * _PAUSES // len(touched):

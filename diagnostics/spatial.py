@@ -37,8 +37,8 @@ _WORTHS = (0.25, 0.5, 0.75, 1.0)  # of the log odds of the model, in one touch o
 _WITNESS_SHARE = 0.5  # of what the moving cells say of that counts: neighbours err together
 _MOST_ROUNDS = 8  # of judging, leaving suspects out and putting others back
 
-
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 class Model(Protocol):
@@ -46,6 +46,31 @@ class Model(Protocol):
 
     def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Generator[None, None, Expected]:
         """See ``ContactModel.expect``."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """What is known of each cell before the others are asked, ``[D]``.
+
+    Attributes:
+        runs: the still stretch of each.
+        settled: float, evidence from earlier touches, of the stretches that still go on.
+        jump: float, log likelihood ratio of the jump into it, where the cell jumped alone.
+        sudden: float, the same wherever it jumped.
+        askable: bool, where there is a cell that is not known to be faulty.
+    """
+
+    runs: StillRuns
+    settled: Floats
+    jump: Floats
+    sudden: Floats
+    askable: Mask
+
+    def of(self, cells: NDArray[np.intp]) -> Cells:
+        """Return the same of some cells."""
+        return Cells(
+            self.runs.of(cells), self.settled[cells], self.jump[cells], self.sudden[cells], self.askable[cells]
+        )
 
 
 @dataclass(frozen=True)
@@ -61,25 +86,47 @@ class Spatial:
             however little the others are; 0 for the others.
     """
 
-    evidence: NDArray[np.float64]
-    surprise: NDArray[np.float64]
-    asked: NDArray[np.bool_]
+    evidence: Floats
+    surprise: Floats
+    asked: Mask
     touches: NDArray[np.intp]
-    offset: NDArray[np.float64]
+    offset: Floats
+
+    @classmethod
+    def before(cls, cells: Cells) -> Spatial:
+        """Return what is known where nothing touched the cells since earlier touches were weighed."""
+        asked = cells.askable & (cells.runs.length >= SHORTEST_RUN)
+        settled, nothing = np.where(asked, cells.settled, 0.0), np.zeros(len(asked))
+        return cls(settled, settled, asked, np.zeros(len(asked), np.intp), nothing)
+
+
+@dataclass(frozen=True)
+class _Values:
+    """What still cells read, ``[D]``.
+
+    Attributes:
+        rests: bool, the reading of an untouched cell.
+        low, high: root loads between which a cell reads the same.
+        prior: log probability that a broken cell sticks to this value.
+    """
+
+    rests: Mask
+    low: Floats
+    high: Floats
+    prior: Floats
+
+    @classmethod
+    def of(cls, value: Floats, scale: Scale, tolerance: float) -> _Values:
+        rests = scale.root_load(value) <= scale.root_near
+        full = value >= scale.full_scale - 2 * tolerance
+        low = scale.root_load(value - 2 * tolerance).astype(np.float64)
+        high = np.where(full, np.inf, scale.root_load(value + 2 * tolerance))
+        anywhere = (1 - 2 * _RAIL_SHARE) * 4 * tolerance / scale.full_scale
+        return cls(rests, low, high, np.log(np.where(rests | full, _RAIL_SHARE, anywhere)))
 
 
 def stuck_evidence(
-    touches: Sequence[Touch],
-    settled: NDArray[np.float64],
-    runs: StillRuns,
-    jump: NDArray[np.float64],
-    sudden: NDArray[np.float64],
-    model: Model,
-    scale: Scale,
-    present: NDArray[np.bool_],
-    wrong: NDArray[np.bool_],
-    tolerance: float,
-    suspicious: float,
+    touches: Sequence[Touch], cells: Cells, model: Model, scale: Scale, tolerance: float, suspicious: float
 ) -> Generator[None, None, Spatial]:
     """Weigh stuck against healthy for each cell that is still now. A generator that pauses on its way.
 
@@ -88,68 +135,59 @@ def stuck_evidence(
 
     Args:
         touches: what happened.
-        settled: float ``[D]``, evidence from earlier touches, of the stretches that still go on.
-        runs: the still stretch of each cell.
-        jump: float ``[D]``, log likelihood ratio of the jump into it, where the cell jumped alone.
-        sudden: float ``[D]``, the same wherever it jumped.
+        cells: what is known of them.
         model: what healthy looks like.
         scale: what a reading means.
-        present: bool ``[D]``: where there is a cell to judge.
-        wrong: bool ``[D]``: cells that move but are known to be faulty.
         tolerance: how near to v counts as v.
         suspicious: log evidence from which on a cell is left out when others are judged.
     """
-    asked = present & ~wrong & (runs.length >= SHORTEST_RUN)
-    askable = present & ~wrong
-    brought, told = np.where(asked, settled, 0.0), np.zeros(len(present), np.intp)
+    known, runs = Spatial.before(cells), cells.runs
     if not touches:
-        return Spatial(brought, brought, asked, told, np.zeros(len(present)))
-    value = np.where(asked, np.nan_to_num(runs.value), 0.0)
-    root = scale.root_load(value)
-    rests = root <= scale.root_near
+        return known
+    values = _Values.of(np.where(known.asked, np.nan_to_num(runs.value), 0.0), scale, tolerance)
     # A load that came all of a sudden, and is still held: a quick grasp, or many cells broken at once. While this touch
     # lasts nobody can tell, so such cells are neither judged by it nor asked about the others.
     fresh = runs.start >= touches[-1].first
-    unsure = asked & ~rests & runs.moved & fresh & (sudden >= _SUDDEN) & (jump < _SUDDEN)
-    asked, askable = asked & ~unsure, askable & ~unsure
-    held = np.flatnonzero(asked & ~rests)
-    full = value >= scale.full_scale - 2 * tolerance
-    low = scale.root_load(value - 2 * tolerance).astype(np.float64)
-    high = np.where(full, np.inf, scale.root_load(value + 2 * tolerance))
-    anywhere = (1 - 2 * _RAIL_SHARE) * 4 * tolerance / scale.full_scale
-    prior = np.log(np.where(rests | full, _RAIL_SHARE, anywhere))
-
-    suffixes = [suffix for touch in touches for suffix in touch.suffixes()]
-    first = np.array([suffix.first for suffix in suffixes])
-    begins = np.array([i == 0 for touch in touches for i in range(len(touch.parts))])
-    # Of each touch, the longest part that lies within the still stretch.
-    within = first[:, None] >= runs.start
-    earlier = np.concatenate([np.zeros((1, len(value)), bool), within[:-1]]) & ~begins[:, None]
-    counted = within & ~earlier & asked
-    needed = begins | counted.any(axis=1)
-    counted, begins = counted[needed], begins[needed]
-    features = np.stack([suffixes[i].features() for i in np.flatnonzero(needed)])  # (n, 4, D)
+    jumped = cells.jump >= _SUDDEN
+    unsure = known.asked & ~values.rests & runs.moved & fresh & (cells.sudden >= _SUDDEN) & ~jumped
+    asked, askable = known.asked & ~unsure, cells.askable & ~unsure
+    held = np.flatnonzero(asked & ~values.rests)
+    features, begins, counted = _looked_at(touches, runs, asked)
     # At first those are asked that moved, unless their load has outlived a touch, or jumped alone. Of the cells at rest
     # few are broken.
-    trusted = askable & runs.moved & (rests | (fresh & (jump < _SUDDEN)))
-    evidence = brought
+    trusted = askable & runs.moved & (values.rests | (fresh & ~jumped))
     for _ in range(_MOST_ROUNDS):
         yield
         expected = yield from model.expect(features, trusted)
         yield
         likely = _believed(expected.never, features[:, 2] == 0, trusted & runs.moved)
-        likely[:, held] = expected.always[:, held] * expected.within(low[held], high[held], held)
+        likely[:, held] = expected.always[:, held] * expected.within(values.low[held], values.high[held], held)
         surprise = np.where(counted, -np.log(np.maximum(likely, _LEAST)), 0.0)
-        brought = np.where(asked, settled + surprise.sum(axis=0), 0.0)
-        evidence = np.where(asked, prior + brought, 0.0)
-        told = (surprise > _TELLING).sum(axis=0)
-        asked_now = trusted
-        trusted = askable & (evidence + jump < suspicious)
+        brought = np.where(asked, cells.settled + surprise.sum(axis=0), 0.0)
+        evidence = np.where(asked, values.prior + brought, 0.0)
+        asked_now, trusted = trusted, askable & (evidence + cells.jump < suspicious)
         yield
         if (trusted == asked_now).all():
             break
-    moving = present & runs.moved & fresh & ~np.isnan(expected.spread)
+    moving = cells.askable & runs.moved & fresh & ~np.isnan(expected.spread)
+    told = (surprise > _TELLING).sum(axis=0)
     return Spatial(evidence, brought, asked, told, _offset(features, begins, expected, moving))
+
+
+def _looked_at(touches: Sequence[Touch], runs: StillRuns, asked: Mask) -> tuple[Array, Mask, Mask]:
+    """Return the stretches that tell something: features ``[n, 4, D]``, whole touches ``[n]``, those that count.
+
+    For each cell that is ``asked`` (bool ``[D]``) one stretch of each touch counts, ``[n, D]``: the longest within its
+    still stretch.
+    """
+    suffixes = [suffix for touch in touches for suffix in touch.suffixes()]
+    first = np.array([suffix.first for suffix in suffixes])
+    begins = np.array([i == 0 for touch in touches for i in range(len(touch.parts))])
+    within = first[:, None] >= runs.start
+    earlier = np.concatenate([np.zeros((1, len(asked)), bool), within[:-1]]) & ~begins[:, None]
+    counted = within & ~earlier & asked
+    needed = np.flatnonzero(begins | counted.any(axis=1))
+    return np.stack([suffixes[i].features() for i in needed]), begins[needed], counted[needed]
 
 
 def _believed(never: Floats, unloaded: NDArray[np.bool_], witness: NDArray[np.bool_]) -> Floats:

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.contact import ContactModel, Tile
+from diagnostics.contact import ContactModel
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference, living
 from diagnostics.rim import INPUTS, Rim
 from diagnostics.temporal import Onsets
+from diagnostics.tiles import Tile
 from diagnostics.touches import Scale
 from diagnostics.unrest import Usual
 from diagnostics.weighing import Weights

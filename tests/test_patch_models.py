@@ -8,10 +8,11 @@ from safetensors.numpy import load, save
 
 from adaptfault.grasps import simulate
 from diagnostics import Fault, FaultKind, SelfDiagnosis, SensorLayout, inject
-from diagnostics.contact import ContactModel, Tile
+from diagnostics.contact import ContactModel
 from diagnostics.memory import finished
 from diagnostics.patch_models import contact_model
 from diagnostics.patches import Patch
+from diagnostics.tiles import Tile
 from diagnostics.touches import Scale, Touches
 
 PRESENT = np.ones((1, 24, 20), bool)

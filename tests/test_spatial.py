@@ -5,7 +5,7 @@ import pytest
 
 from diagnostics.contact import Expected
 from diagnostics.memory import finished
-from diagnostics.spatial import Model, Spatial, stuck_evidence
+from diagnostics.spatial import Cells, Model, Spatial, stuck_evidence
 from diagnostics.temporal import StillRuns
 from diagnostics.touches import Array, Scale, Summary, Touch
 
@@ -53,9 +53,10 @@ def judged(
         root = SCALE.root_load(frames)
         halves = tuple(Summary.of(root[i : i + 10], first + i, SCALE.root_near) for i in (0, 10))
         touches.append(Touch(halves, root.min(axis=0), root.max(axis=0)))
+    settled = np.zeros(CELLS) if settled is None else settled
     work: Generator[None, None, Spatial] = stuck_evidence(
-        touches, np.zeros(CELLS) if settled is None else settled, runs, np.full(CELLS, jump), np.full(CELLS, jump),
-        model or Copycat(), SCALE, np.ones(CELLS, bool), wrong, 0.025, 2.0,
+        touches, Cells(runs, settled, np.full(CELLS, jump), np.full(CELLS, jump), ~wrong), model or Copycat(), SCALE,
+        0.025, 2.0,
     )  # fmt: skip
     return finished(work)
 

@@ -186,5 +186,5 @@ def surest_of(n_touches: int) -> float:
 def _touches(recording: NDArray[np.float64], scale: Scale) -> tuple[Touch, ...]:
     touches = Touches()
     for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
-        touches = touches.extend(frames, numbers, scale, still)
+        touches = touches.extend(scale.root_load(frames), numbers, scale.root_near, still)
     return touches.kept

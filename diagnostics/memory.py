@@ -146,17 +146,17 @@ class Memory:
         # Evidence belongs to a stretch, and ends with it.
         self.settled = np.where(self.runs.start == start, self.settled, 0.0)
         scale = self.reference.scale
-        still = self.runs.start <= numbers[0]
-        self._remember(frames, numbers, still)
-        self.unrest = self.unrest.extend(frames, numbers, scale, self.reference.usual, still)
+        root, still = scale.root_load(frames), self.runs.start <= numbers[0]
+        self._remember(root, numbers, still)
+        self.unrest = self.unrest.extend(frames, root, numbers, scale, self.reference.usual, still)
         self.twins = self.twins.extend(self._comparable(frames), numbers, telling(frames, still, scale), scale.near)
 
     @property
     def _crowded(self) -> bool:
         return len(self.touches.kept) > MOST_TOUCHES
 
-    def _remember(self, frames: NDArray[np.float64], numbers: NDArray[np.intp], still: NDArray[np.bool_]) -> None:
-        self.touches = self.touches.extend(frames, numbers, self.reference.scale, still)
+    def _remember(self, root: Array, numbers: NDArray[np.intp], still: NDArray[np.bool_]) -> None:
+        self.touches = self.touches.extend(root, numbers, self.reference.scale.root_near, still)
 
     def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
         return frames

@@ -119,8 +119,8 @@ class PatchedMemory(Memory):
     def _crowded(self) -> bool:
         return any(len(touches.kept) > MOST_TOUCHES for touches in self.local.of)
 
-    def _remember(self, frames: NDArray[np.float64], numbers: NDArray[np.intp], still: Mask) -> None:
-        self.local = self.local.extend(frames, numbers, self.reference.scale, still)
+    def _remember(self, root: Array, numbers: NDArray[np.intp], still: Mask) -> None:
+        self.local = self.local.extend(root, numbers, self.reference.scale.root_near, still)
 
     def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
         # On a line of a hundred cells one is always dead: what never moved does not tell two lines apart.

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
-from diagnostics.touches import Scale, Touches
+from diagnostics.touches import Array, Touches
 
 PATCH, HALO = 8, 4  # cells: a patch, and how far what surrounds it reaches
 MOST_CELLS = 400  # that are judged as one; beyond that, patches
@@ -128,14 +128,12 @@ class PatchTouches:
         """Nothing seen yet."""
         return cls(all_patches, (Touches(),) * len(all_patches), _Inputs.of(all_patches))
 
-    def extend(
-        self, frames: NDArray[np.float64], numbers: Cells, scale: Scale, still: NDArray[np.bool_]
-    ) -> PatchTouches:
+    def extend(self, root: Array, numbers: Cells, root_near: float, still: NDArray[np.bool_]) -> PatchTouches:
         """Return the touches after more frames, see ``Touches.extend``; a patch in which nothing moves is as before."""
         of = list(self.of)
         for i in self._inputs.with_any(~still):
             cells = self.patches[i].inputs
-            of[i] = of[i].extend(frames[:, cells], numbers, scale.of(cells), still[cells])
+            of[i] = of[i].extend(root[:, cells], numbers, root_near, still[cells])
         return self.replaced(of)
 
     def replaced(self, of: Sequence[Touches]) -> PatchTouches:

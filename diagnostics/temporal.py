@@ -74,21 +74,23 @@ class StillRuns:
             first = len(frames) - count
             start[broke] = numbers[first]
             length[broke] = np.minimum(count, heard[broke])
-            before = np.concatenate([self.last[None], frames[:-1]])
-            step = frames - before
-            size = np.fmax(frames, before)
-            drastic = np.maximum(size / 2, 4 * tolerance)
+            # What the cells did in the steps into those stretches.
+            steps, which = np.unique(first, return_inverse=True)
+            before = np.where(steps[:, None] > 0, frames[steps - 1], self.last)
+            step = frames[steps] - before
+            size = np.fmax(frames[steps], before)
+            drastic = np.maximum(0.5 * size, 4 * tolerance)
             # Broken cells hold their value all along: only cells that moved lately could have jumped too.
             lately = high - low > 2 * tolerance
             lately |= self.length < _LATELY
-            loaded = np.maximum(((size > 4 * tolerance) & lately).sum(axis=1), 1)
+            loaded = np.maximum(_in_each((size > 4 * tolerance) & lately), 1)
             # A release lets cells fall together and none rise, a grasp the other way round: only cells that go the same
             # way are company. When many break at once, some fall and some rise.
-            share = np.stack([(-step > drastic).sum(axis=1), (step > drastic).sum(axis=1)]) / loaded
+            share = np.stack([_in_each(step < -drastic), _in_each(step > drastic)]) / loaded
             low[broke], high[broke] = lowest[count - 1, at], highest[count - 1, at]
-            into = step[first, broke]
+            into = step[which, broke]
             jump[broke] = np.where(np.isnan(into), 0.0, into)
-            company[broke] = share[(jump[broke] > 0).astype(np.intp), first]
+            company[broke] = share[(jump[broke] > 0).astype(np.intp), which]
         last = frames[-1].copy()
         if any_missing:
             backwards = (~missing[::-1]).argmax(axis=0)
@@ -115,6 +117,12 @@ class StillRuns:
         """bool ``[D]``, False where a cell jumped into its stretch as many others did, as when a grasp ends."""
         alone: NDArray[np.bool_] = self.company < _COMPANY
         return alone
+
+
+def _in_each(which: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Return how many cells of ``[t, D]`` there are in each frame."""
+    count: NDArray[np.int32] = which.sum(axis=1, dtype=np.int32)  # faster than what NumPy would count in
+    return count
 
 
 def segments(

@@ -137,9 +137,9 @@ class Touch:
         """Whether ``part`` loads about the same cells; no load lies anywhere."""
         floor = np.minimum(self.lowest, lowest)
         n = sum(p.n for p in self.parts)
-        before = np.sum([p.total for p in self.parts], axis=0) / n - floor
+        before = sum((p.total for p in self.parts[1:]), self.parts[0].total) / n - floor
         now = part.total / part.n - floor
-        size = float(np.linalg.norm(before) * np.linalg.norm(now))
+        size = float(np.sqrt((before @ before) * (now @ now)))
         return size == 0 or float(before @ now) >= _SAME_PLACE * size
 
 
@@ -159,22 +159,21 @@ class Touches:
     fading: bool = False
     last: Array | None = None
 
-    def extend(
-        self, frames: NDArray[np.float64], numbers: NDArray[np.intp], scale: Scale, still: NDArray[np.bool_]
-    ) -> Touches:
+    def extend(self, root: Array, numbers: NDArray[np.intp], root_near: float, still: NDArray[np.bool_]) -> Touches:
         """Return the touches after more frames.
 
         Args:
-            frames: ``[t, D]``, t >= 1.
+            root: root loads ``[t, D]`` of the frames, t >= 1.
             numbers: int ``[t]``, of the frames, ascending.
-            scale: what a reading means.
+            root_near: the root load from which on a cell counts as loaded.
             still: bool ``[D]``, cells that do not move in these frames. Whether a load is released is asked of the
                 others: broken cells hold their value for ever.
         """
-        root = scale.root_load(frames)
         kept, widest, fading, last = list(self.kept), self.widest, self.fading, self.last
         going_on = bool(kept) and not fading  # the next part belongs to the last touch
         begin = 0
+        weigh = np.ones((root.shape[1], 2), np.float32)  # a product sums over the cells that move, and over all
+        weigh[:, 0] = ~still
         while begin < len(root):
             if fading:
                 # While the load is still going, frames say nothing new.
@@ -191,16 +190,15 @@ class Touches:
             if going_on:
                 lowest = np.minimum(lowest, kept[-1].lowest)
                 highest = np.maximum(highest, kept[-1].highest)
-            swing = highest - lowest
-            moving = swing[:, ~still].sum(axis=1)
-            left = (ahead - lowest)[:, ~still].sum(axis=1)
-            enough = np.maximum(_MOVING * swing.sum(axis=1), max(_WEAKEST * widest, _LEAST))
+            (floor, lowest_of_all), (peak, highest_of_all) = (lowest @ weigh).T, (highest @ weigh).T
+            now, moving = (ahead @ weigh)[:, 0], peak - floor
+            enough = np.maximum(_MOVING * (highest_of_all - lowest_of_all), max(_WEAKEST * widest, _LEAST))
             # A load that only relaxes is lowest in the end too, but most of it is still there.
-            peak, now = highest[:, ~still].sum(axis=1), ahead[:, ~still].sum(axis=1)
-            released = (left <= _RELEASED * moving) & (moving > enough) & (peak - now >= _MOVING * peak)
+            gone = peak - now >= _MOVING * peak
+            released = (now - floor <= _RELEASED * moving) & (moving > enough) & gone
             end = int(released.argmax()) if released.any() else len(ahead)
             if end:
-                part = Summary.of(ahead[:end], int(numbers[begin]), scale.root_near)
+                part = Summary.of(ahead[:end], int(numbers[begin]), root_near)
                 low, high = lowest[end - 1], highest[end - 1]
                 if going_on and kept[-1].same_place(part, low):
                     kept[-1] = kept[-1].grown(part, low, high)

@@ -83,7 +83,8 @@ class Stream:
             present: bool ``[D]``, where there is a cell.
             patience: a frame that has come again more often than this says nothing new.
         """
-        arrived = ~np.isnan(frames).all(axis=1, where=present)
+        missing = np.isnan(frames)
+        arrived = ~missing.all(axis=1, where=present) if missing.any() else np.ones(len(frames), bool)
         there = np.flatnonzero(arrived)
         gone = len(frames) - len(there)
         lost, first_lost = self.lost + gone, self.first_lost
@@ -162,5 +163,8 @@ def longest_repetition(frames: NDArray[np.float64]) -> int:
 
 def _as_before(frames: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return for each frame but the first, ``[T - 1]``, whether it equals the one before, missing readings included."""
-    same: NDArray[np.bool_] = ((frames[1:] == frames[:-1]) | np.isnan(frames[1:]) & np.isnan(frames[:-1])).all(axis=1)
+    same: NDArray[np.bool_] = (frames[1:] == frames[:-1]).all(axis=1)
+    missing = np.isnan(frames)
+    if missing.any():
+        same = ((frames[1:] == frames[:-1]) | missing[1:] & missing[:-1]).all(axis=1)
     return same

@@ -9,7 +9,8 @@ is noise around zero, as of one cell read twice, or a small but steady differenc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 
@@ -23,6 +24,8 @@ _EVERY = 4  # frames; a lasting fault does not hide between them
 FEWEST_WITNESSES = 4  # and two more than healthy lines ever had
 _STEADY = 5.0  # squared z value of a difference, mean over the cells: 1 if it is noise around zero
 _STEP = 0.1  # of the tolerance: so small a difference is none
+
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -55,38 +58,92 @@ def pairs(count: int) -> tuple[tuple[int, int], ...]:
 
 
 @dataclass(frozen=True)
+class _Pairs:
+    """What is known of all pairs of rows, or of columns.
+
+    Attributes:
+        first, second: int ``[pairs]``, the lines of each.
+        there: bool ``[pads, pairs, positions]``, where both have a cell.
+        since, told, witnesses: int ``[pads, pairs]``, see :class:`Joined`.
+        sums: of what the cells of a pair differed by while both told something: the difference, and its square, float
+            ``[2, pads, pairs, positions]``; above 0 where there were witnesses.
+    """
+
+    first: NDArray[np.intp]
+    second: NDArray[np.intp]
+    there: Mask
+    since: NDArray[np.intp]
+    told: NDArray[np.intp]
+    witnesses: NDArray[np.intp]
+    sums: NDArray[np.float32]
+
+    @classmethod
+    def begin(cls, present: Mask) -> _Pairs:
+        """Nothing seen yet of lines ``[pads, lines, positions]``."""
+        first, second = np.array(pairs(present.shape[1]) or np.empty((0, 2)), dtype=np.intp).reshape(-1, 2).T
+        there = present[:, first] & present[:, second]
+        nothing = np.zeros(there.shape[:2], np.intp)
+        return cls(first, second, there, nothing, nothing, nothing, np.zeros((2, *there.shape), np.float32))
+
+    def extend(self, lines: NDArray[np.float32], numbers: NDArray[np.intp], telling: Mask, tolerance: float) -> _Pairs:
+        """Return the pairs after readings ``[t, pads, lines, positions]`` of some of the frames with these numbers."""
+        # A missing reading differs from nothing; a position without a cell neither.
+        difference = np.take(lines, self.first, axis=2)
+        difference -= np.take(lines, self.second, axis=2)
+        differ = np.abs(difference, out=difference) > tolerance
+        differ &= self.there
+        apart = np.asarray(differ.any(axis=3))  # [t, pads, pairs]
+        ever = np.asarray(apart.any(axis=0))
+        last = len(apart) - 1 - apart[::-1].argmax(axis=0)
+        since = np.where(ever, numbers[_EVERY * last] + 1, self.since)
+        both: Mask = np.take(telling, self.first, axis=1)  # [pads, pairs, positions]
+        both &= np.take(telling, self.second, axis=1)
+        told, witnesses, sums = self.told, self.witnesses, self.sums
+        agree = both.any(axis=2) & ~ever
+        if agree.any() or (ever & (witnesses > 0)).any():
+            witnesses = np.where(ever, 0, witnesses + both.sum(axis=2))
+            told = np.where(agree & (self.witnesses == 0), numbers[-1], told)
+            sums = self._summed(lines, both & ~ever[..., None], ever, tolerance)
+        return replace(self, since=since, told=told, witnesses=witnesses, sums=sums)
+
+    def _summed(self, lines: NDArray[np.float32], both: Mask, anew: Mask, tolerance: float) -> NDArray[np.float32]:
+        """Return the sums with what ``both`` cells of a pair tell; pairs that differ clearly begin ``anew``."""
+        after = np.where(anew[..., None], np.float32(0), self.sums)
+        pad, pair, position = np.nonzero(both)
+        difference = lines[:, pad, self.first[pair], position] - lines[:, pad, self.second[pair], position]
+        difference[np.isnan(difference)] = 0
+        after[0, pad, pair, position] += difference.sum(axis=0)
+        after[1, pad, pair, position] += (difference**2).sum(axis=0) + len(lines) * np.float32(_STEP * tolerance) ** 2
+        return after
+
+    def steady(self, pad: int, pair: int) -> bool:
+        """Whether two lines differ by little, but always the same: two cells under equal loads, not one read twice."""
+        difference, squares = self.sums[:, pad, pair]
+        told = squares > 0
+        return bool((difference[told] ** 2 / squares[told]).mean() > _STEADY)
+
+
+@dataclass(frozen=True)
 class Twins:
     """What is known of all pairs of lines.
 
     Attributes:
         layout: the array.
-        since: for rows and for columns, int ``[pads, pairs]``; told, witnesses: likewise (see :class:`Joined`).
-        sums: of what the cells of a pair differed by while both told something, for rows and for columns: the
-            difference, and its square, float ``[2, pads, pairs, positions]``.
+        of: the pairs of rows and of columns.
         most: the most witnesses that any pair ever had.
     """
 
     layout: SensorLayout
-    since: tuple[NDArray[np.intp], NDArray[np.intp]]
-    told: tuple[NDArray[np.intp], NDArray[np.intp]]
-    witnesses: tuple[NDArray[np.intp], NDArray[np.intp]]
-    sums: tuple[NDArray[np.float32], NDArray[np.float32]]
+    of: Mapping[LineKind, _Pairs]
     most: int = 0
 
     @classmethod
     def begin(cls, layout: SensorLayout) -> Twins:
         """Nothing seen yet."""
-        nothing = tuple(np.zeros((layout.pads, len(pairs(n))), np.intp) for n in (layout.rows, layout.cols))
-        both = (nothing[0], nothing[1])
-        no_sums = (
-            np.zeros((2, *nothing[0].shape, layout.cols), np.float32),
-            np.zeros((2, *nothing[1].shape, layout.rows), np.float32),
-        )
-        return cls(layout, both, both, both, no_sums)
+        present = layout.present
+        return cls(layout, {"row": _Pairs.begin(present), "column": _Pairs.begin(present.swapaxes(1, 2))})
 
-    def extend(
-        self, frames: NDArray[np.float64], numbers: NDArray[np.intp], telling: NDArray[np.bool_], tolerance: float
-    ) -> Twins:
+    def extend(self, frames: NDArray[np.float64], numbers: NDArray[np.intp], telling: Mask, tolerance: float) -> Twins:
         """Return the pairs after more frames.
 
         Args:
@@ -95,92 +152,36 @@ class Twins:
             telling: bool ``[D]``, cells that are loaded and move in these frames.
             tolerance: as far as two conversions of one cell may differ.
         """
-        layout = self.layout
-        grid = layout.grid(frames[::_EVERY].astype(np.float32))
-        told = layout.grid(telling)
-        since, told_at, witnesses, sums, most = [], [], [], [], self.most
-        for axis, count in enumerate((layout.rows, layout.cols)):
-            a, b = np.array(pairs(count) or np.empty((0, 2)), dtype=np.intp).reshape(-1, 2).T
-            lines = grid if axis == 0 else grid.swapaxes(2, 3)  # [t, pads, lines, positions]
-            present = layout.present if axis == 0 else layout.present.swapaxes(1, 2)
-            moving = told if axis == 0 else told.swapaxes(1, 2)
-            # A missing reading differs from nothing; a position without a cell neither.
-            difference = np.take(lines, a, axis=2)
-            difference -= np.take(lines, b, axis=2)
-            differ = np.abs(difference, out=difference) > tolerance
-            differ &= present[:, a] & present[:, b]
-            apart = differ.any(axis=3)  # [t, pads, pairs]
-            ever = apart.any(axis=0)
-            last = len(apart) - 1 - apart[::-1].argmax(axis=0)
-            since.append(np.where(ever, numbers[::_EVERY][last] + 1, self.since[axis]))
-            both = moving[:, a] & moving[:, b]  # [pads, pairs, positions]
-            seen = both.sum(axis=2)
-            count_now = np.where(ever, 0, self.witnesses[axis] + seen)
-            sums.append(_summed(self.sums[axis], lines, a, b, both, ever, tolerance))
-            witnesses.append(count_now)
-            fresh = (count_now > 0) & ((self.witnesses[axis] == 0) | ever)
-            told_at.append(np.where(fresh, numbers[-1], self.told[axis]))
-            most = max(most, int(count_now.max(initial=0)))
-        return Twins(
-            layout, (since[0], since[1]), (told_at[0], told_at[1]), (witnesses[0], witnesses[1]),
-            (sums[0], sums[1]), most,
-        )  # fmt: skip
+        grid, told = self.layout.grid(frames[::_EVERY].astype(np.float32)), self.layout.grid(telling)
+        of: dict[LineKind, _Pairs] = {
+            "row": self.of["row"].extend(grid, numbers, told, tolerance),
+            "column": self.of["column"].extend(grid.swapaxes(2, 3), numbers, told.swapaxes(1, 2), tolerance),
+        }
+        most = max(int(each.witnesses.max(initial=0)) for each in of.values())
+        return Twins(self.layout, of, max(self.most, most))
 
     def joined(self, usual: int) -> list[Joined]:
         """Return the pairs without a steady difference that have more witnesses than healthy ones, up to ``usual``."""
         needed = max(FEWEST_WITNESSES, usual + 2)
-        found = []
-        kinds: tuple[LineKind, LineKind] = ("row", "column")
-        for axis, count in enumerate((self.layout.rows, self.layout.cols)):
-            of_lines = pairs(count)
-            for pad, i in np.argwhere(self.witnesses[axis] >= needed).tolist():
-                difference, squares = self.sums[axis][:, pad, i]
-                told = squares > 0
-                if (difference[told] ** 2 / squares[told]).mean() > _STEADY:
-                    continue
-                numbers = (int(of[axis][pad, i]) for of in (self.since, self.told, self.witnesses))
-                found.append(Joined(pad, kinds[axis], *of_lines[i], *numbers))
-        return found
+        return [
+            Joined(
+                pad, kind, int(each.first[i]), int(each.second[i]),
+                *(int(values[pad, i]) for values in (each.since, each.told, each.witnesses)),
+            )
+            for kind, each in self.of.items()
+            for pad, i in np.argwhere(each.witnesses >= needed).tolist()
+            if not each.steady(pad, i)
+        ]  # fmt: skip
 
     def apart_since(self, pad: int, kind: LineKind, first: int, second: int) -> int:
         """Return the first frame from which on two lines did not differ."""
-        axis = 0 if kind == "row" else 1
-        of_lines = pairs(self.layout.rows if axis == 0 else self.layout.cols)
-        return int(self.since[axis][pad, of_lines.index((first, second))])
+        each = self.of[kind]
+        (i,) = np.flatnonzero((each.first == first) & (each.second == second))
+        return int(each.since[pad, i])
 
 
-def _summed(
-    sums: NDArray[np.float32],
-    lines: NDArray[np.float32],
-    a: NDArray[np.intp],
-    b: NDArray[np.intp],
-    both: NDArray[np.bool_],
-    apart: NDArray[np.bool_],
-    tolerance: float,
-) -> NDArray[np.float32]:
-    """Return the sums of :class:`Twins` after readings of lines ``[t, pads, lines, positions]``.
-
-    Args:
-        sums: before.
-        lines: the readings.
-        a, b: int ``[pairs]``, the lines of each pair.
-        both: bool ``[pads, pairs, positions]``, where both cells tell something.
-        apart: bool ``[pads, pairs]``, that differ clearly: they begin anew.
-        tolerance: as far as two conversions of one cell may differ.
-    """
-    pad, pair, position = np.nonzero(both & ~apart[..., None])
-    if not (len(pad) or sums[1][apart].any()):
-        return sums
-    after = np.where(apart[..., None], np.float32(0), sums)
-    difference = lines[:, pad, a[pair], position] - lines[:, pad, b[pair], position]  # [t, cells that tell]
-    difference[np.isnan(difference)] = 0
-    after[0, pad, pair, position] += difference.sum(axis=0)
-    after[1, pad, pair, position] += (difference**2).sum(axis=0) + len(lines) * np.float32(_STEP * tolerance) ** 2
-    return after
-
-
-def telling(frames: NDArray[np.float64], still: NDArray[np.bool_], scale: Scale) -> NDArray[np.bool_]:
+def telling(frames: NDArray[np.float64], still: Mask, scale: Scale) -> Mask:
     """Return the cells ``[D]`` that are loaded, not saturated, and move in ``frames``: two alike are no chance."""
-    now = np.nan_to_num(frames[-1])
-    found: NDArray[np.bool_] = ~still & (now > scale.resting + scale.near) & (now < scale.full_scale - scale.near)
+    now = frames[-1]  # a missing reading is neither above nor below anything
+    found: Mask = ~still & (now > scale.resting + scale.near) & (now < scale.full_scale - scale.near)
     return found

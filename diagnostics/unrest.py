@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.touches import SEGMENT, Scale
+from diagnostics.touches import SEGMENT, Array, Scale
 
 Floats = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ class Usual:
         for recording in recordings:
             for first in range(0, len(recording), SEGMENT):
                 frames = recording[first : first + SEGMENT]
-                low, high, under_load, restless, level = _measure(frames, scale)
+                low, high, under_load, restless, level = _measure(frames, scale.root_load(frames), scale)
                 blinks += float((low + high).sum())
                 loaded += float(under_load.sum())
                 if len(frames) >= _SHORTEST:
@@ -98,13 +98,22 @@ class Unrest:
         return cls(zero, zero, none, none, none, none)
 
     def extend(
-        self, frames: Floats, numbers: NDArray[np.intp], scale: Scale, usual: Usual, still: NDArray[np.bool_]
+        self,
+        frames: Floats,
+        root: Array,
+        numbers: NDArray[np.intp],
+        scale: Scale,
+        usual: Usual,
+        still: NDArray[np.bool_],
     ) -> Unrest:
-        """Return the evidence after more frames, ``[t, D]``; ``still`` cells (bool ``[D]``) have no part in it."""
+        """Return the evidence after more frames, ``[t, D]``, and their root loads, likewise.
+
+        ``still`` cells (bool ``[D]``) have no part in it.
+        """
         if len(frames) < _SHORTEST or still.all():
             return self
         moving = np.flatnonzero(~still)
-        low, high, loaded, restless, level = _measure(frames[:, moving], scale.of(moving))
+        low, high, loaded, restless, level = _measure(frames[:, moving], root[:, moving], scale.of(moving))
         events = low + high
         crowd = max(1.0, _ALONE * float((loaded > 0).sum()))
         if (events > 0).sum() > crowd:
@@ -146,7 +155,7 @@ class Unrest:
 
 
 def _measure(
-    frames: Floats, scale: Scale
+    frames: Floats, root: Array, scale: Scale
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, Floats, NDArray[np.intp]]:
     """Return for each cell ``[D]``: blinks to rest, blinks to full scale, loaded frames, noise, level of load."""
     x = (frames - scale.resting).astype(np.float32)
@@ -160,7 +169,10 @@ def _measure(
     def blinks(away: NDArray[np.bool_]) -> NDArray[np.intp]:
         # Gone in one step and back in one step, to about the load that was there: as no finger could.
         count = np.zeros(x.shape[1], np.intp)
-        some = np.flatnonzero((moderate[:-1] & away[1:]).any(axis=0))
+        went = moderate[:-1] & away[1:]
+        if not went.any():
+            return count
+        some = np.flatnonzero(went.any(axis=0) & (away[:-1] & moderate[1:]).any(axis=0))
         if not len(some):
             return count
         there, gone, of = moderate[:, some], away[:, some], x[:, some]
@@ -172,17 +184,16 @@ def _measure(
             missing = missing[:-1] & gone[gap:]
         return count
 
-    bend = np.abs(np.diff(x, 2, axis=0)) if len(x) > 2 else np.zeros((1, x.shape[1]), np.float32)
+    step = x[1:] - x[:-1]
+    bend = np.abs(step[1:] - step[:-1]) if len(x) > 2 else np.zeros((1, x.shape[1]), np.float32)
     restless = _median(bend) / scale.full_scale
-    mean = scale.root_load(frames).mean(axis=0)
-    level = np.searchsorted(_LEVELS, mean, side="right") - 1
-    return blinks(rests), blinks(full), loaded.sum(axis=0).astype(float), restless, np.maximum(level, 0)
+    level = np.searchsorted(_LEVELS, root.sum(axis=0) / np.float32(len(root)), side="right") - 1
+    return blinks(rests), blinks(full), loaded.sum(axis=0, dtype=np.float64), restless, np.maximum(level, 0)
 
 
 def _median(values: NDArray[np.float32]) -> Floats:
-    """Return the median over the first axis, in half of NumPy's time: cell by cell, and without a search for NaN."""
-    half = len(values) // 2
-    middle = [half] if len(values) % 2 else [half - 1, half]
-    ordered = np.partition(np.ascontiguousarray(values.T), middle, axis=1)
-    median: Floats = ordered[:, middle].mean(axis=1, dtype=np.float64)
+    """Return the median over the first axis, in a quarter of NumPy's time: cell by cell, with no search for NaN."""
+    ordered = np.sort(np.ascontiguousarray(values.T), axis=1)  # of so few values faster than a partition
+    below, above = ordered[:, (len(values) - 1) // 2], ordered[:, len(values) // 2]
+    median: Floats = (below.astype(np.float64) + above) / 2
     return median

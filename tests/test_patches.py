@@ -62,7 +62,8 @@ def test_a_patch_in_which_nothing_moves_costs_nothing():
     still[SKIN.cell(1, 12, 12)] = False
     frames = np.zeros((32, SKIN.n_cells))
     frames[:, ~still] = np.linspace(0, 2, 32)[:, None]
-    after = touches.extend(frames, np.arange(32), Scale(np.zeros(SKIN.n_cells), 0.05, 5.0), still)
+    scale = Scale(np.zeros(SKIN.n_cells), 0.05, 5.0)
+    after = touches.extend(scale.root_load(frames), np.arange(32), scale.root_near, still)
     touched = {i for i, patch in enumerate(touches.patches) if not still[patch.inputs].all()}
     assert {i for i, (a, b) in enumerate(zip(touches.of, after.of, strict=True)) if a is not b} == touched
     assert 0 < len(touched) < len(touches.patches)

@@ -27,7 +27,7 @@ def touches_of(log: np.ndarray, size: int = 32) -> Touches:
         frames = log[first : first + size]
         numbers = np.arange(first, first + len(frames))
         runs = runs.extend(frames, numbers, 0.025)
-        touches = touches.extend(frames, numbers, SCALE, runs.start <= first)
+        touches = touches.extend(SCALE.root_load(frames), numbers, SCALE.root_near, runs.start <= first)
     return touches
 
 

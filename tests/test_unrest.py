@@ -28,7 +28,8 @@ def unrest_of(log: np.ndarray, usual: Usual, still: np.ndarray = STILL) -> Unres
     unrest = Unrest.begin(CELLS)
     for first in range(0, len(log), 32):
         frames = log[first : first + 32]
-        unrest = unrest.extend(frames, np.arange(first, first + len(frames)), SCALE, usual, still)
+        numbers = np.arange(first, first + len(frames))
+        unrest = unrest.extend(frames, SCALE.root_load(frames), numbers, SCALE, usual, still)
     return unrest
 
 

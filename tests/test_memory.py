@@ -45,9 +45,9 @@ def same(a: Memory, b: Memory) -> None:
             np.testing.assert_array_equal(of_a, of_b, err_msg=f"{part}.{name}")
     np.testing.assert_array_equal(a.settled, b.settled)
     np.testing.assert_array_equal(a.heard, b.heard)
-    for name in ("since", "told", "witnesses"):
-        for of_a, of_b in zip(getattr(a.twins, name), getattr(b.twins, name), strict=True):
-            np.testing.assert_array_equal(of_a, of_b)
+    for kind, of_a in a.twins.of.items():
+        for name in ("since", "told", "witnesses", "sums"):
+            np.testing.assert_array_equal(getattr(of_a, name), getattr(b.twins.of[kind], name), err_msg=name)
     assert [(r.onset, r.frames) for r in a.stream.repetitions] == [(r.onset, r.frames) for r in b.stream.repetitions]
     assert len(a.touches.kept) == len(b.touches.kept)
     for t, u in zip(a.touches.kept, b.touches.kept, strict=True):

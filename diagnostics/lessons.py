@@ -32,11 +32,13 @@ class Lessons:
     Attributes:
         samples: float64 ``[m, k]``, what there was to know of each, see ``rim.around``.
         never, always: bool ``[m]``, whether it stayed unloaded, or loaded, throughout.
+        touches: that they are of.
     """
 
     samples: NDArray[np.float64]
     never: Mask
     always: Mask
+    touches: int
 
     @classmethod
     def of(
@@ -63,7 +65,7 @@ class Lessons:
         looked_at = sum(min(left, _LOOKED_AT) for left in _LEFT_OUT) * len(outputs)
         most = max(1, round(share * _SAMPLES / (FOLDS * looked_at)))  # stretches in each round
         fold = rng.permutation(touch.max() + 1)[touch] % FOLDS
-        found = []
+        found: list[tuple[NDArray[np.float64], Mask, Mask]] = []
         for k in range(FOLDS):
             foreseen, held = fit(features[fold != k]), features[fold == k]
             for left in _LEFT_OUT:
@@ -75,15 +77,18 @@ class Lessons:
                 out = np.sort(out[: max(1, round(_LOOKED_AT * len(outputs)))])
                 told = around(foreseen(some, trusted), some, trusted, layout, out)
                 samples = told.reshape(len(told), -1).T.astype(np.float64)
-                found.append(cls(samples, (some[:, 2, out] == 0).T.ravel(), (some[:, 3, out] == 1).T.ravel()))
-        return cls.together(found)
+                found.append((samples, (some[:, 2, out] == 0).T.ravel(), (some[:, 3, out] == 1).T.ravel()))
+        together, never, always = (np.concatenate(column) for column in zip(*found, strict=True))
+        return cls(together, never, always, int(touch.max()) + 1)
 
     @classmethod
     def together(cls, parts: Sequence[Lessons]) -> Lessons:
         """Join the lessons of several arrays."""
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        return cls(*(np.concatenate(column) for column in columns))
+        samples, never, always = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("samples", "never", "always")
+        )
+        return cls(samples, never, always, sum(part.touches for part in parts))
 
     def learned(self) -> Rim:
         """Return what they teach."""
-        return Rim.fit(self.samples, self.never, self.always)
+        return Rim.fit(self.samples, self.never, self.always, self.touches)

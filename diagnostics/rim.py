@@ -1,9 +1,10 @@
 """Where a contact ends: what the loads around a cell say of its own, learned once for all cells of a skin.
 
 The regressions of a cell know that cell, from the few touches that reached it. How a contact fades from cell to cell is
-the same everywhere: two logistic regressions, shared by all cells, correct what each cell's own regressions foresee by
-what the three rings of cells around it do. Fitted on touches that the others were not fitted on, so that they learn
-how far those can be believed.
+the same everywhere: a small network, shared by all cells, corrects what each cell's own regressions foresee by what the
+three rings of cells around it do. Fitted on touches that the regressions were not fitted on, so that it learns how far
+those can be believed. Few touches teach no network: the fewer there are, the more two logistic regressions count beside
+it, which stay near to what the cell's own foresee.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ _SURE = 8.0  # log odds that a cell's own regressions are taken for at most
 _EMPTY = np.float32(
     0.5
 )  # of a ring's cells: so much the mean of the whole array counts, all there is where none is trusted
-_RIDGE = 1.0  # towards believing the cells' own regressions
+_RIDGE = 1.0  # of the regressions, towards believing the cells' own
+_HIDDEN, _DECAY, _EPOCHS, _BATCH, _RATE = 32, 0.3, 20, 512, 2e-3  # of the network: units, penalty, training
+_FEW = 20  # touches from which the network learns as much as the regressions
 _LEAST_SCALE = 1e-3
 _RARE = 0.005  # share that a cell was ever found loaded in, at least and at most
 INPUTS = 28  # of a cell, see around
@@ -47,36 +50,49 @@ class Foreseen:
 
 @dataclass(frozen=True)
 class Rim:
-    """The two regressions.
+    """The regressions and the network, both part of the same log odds of never and of always loaded.
 
     Attributes:
         mean, scale: of what goes in, ``[k]``.
-        weight: ``[k, 2]``, never loaded and always loaded; bias: ``[2]``.
+        weight: ``[k, 2]``; bias: ``[2]``.
+        hidden: ``[k, h]``, of the network's units; threshold: ``[h]``; out: ``[h, 2]``.
     """
 
     mean: Floats
     scale: Floats
     weight: Floats
     bias: Floats
+    hidden: Floats
+    threshold: Floats
+    out: Floats
 
     @classmethod
     def fit(
-        cls,
-        samples: NDArray[np.float64],
-        never: NDArray[np.bool_],
-        always: NDArray[np.bool_],
+        cls, samples: NDArray[np.float64], never: NDArray[np.bool_], always: NDArray[np.bool_], touches: int
     ) -> Rim:
-        """Fit on samples ``[m, k]`` of cells that were not asked (see :func:`around`), and what they did, ``[m]``."""
+        """Fit on samples ``[m, k]`` of cells that were not asked (see :func:`around`), and what they did, ``[m]``.
+
+        Args:
+            samples, never, always: see above.
+            touches: that they are of.
+        """
         mean, scale = samples.mean(axis=0), np.maximum(samples.std(axis=0), _LEAST_SCALE)
         z = (samples - mean) / scale
         fitted = [_corrected(z, did, column, mean, scale) for column, did in enumerate((never, always))]
         weight, bias = (np.stack(column, axis=-1) for column in zip(*fitted, strict=True))
-        return cls(mean, scale, weight, bias)
+        hidden, threshold, out, net_bias = _network(z, np.stack([never, always], axis=1))
+        share = touches / (touches + _FEW)
+        return cls(
+            mean, scale, (1 - share) * weight, (1 - share) * bias + share * net_bias, hidden, threshold, share * out
+        )
 
     def believe(self, samples: Array) -> tuple[Floats, Floats]:
         """Return P(unloaded throughout) and P(loaded throughout), ``[...]`` each, of samples ``[k, ...]``."""
-        weight = (self.weight / self.scale[:, None]).astype(np.float32)
-        odds = weight.T @ samples.reshape(len(samples), -1)
+        flat = samples.reshape(len(samples), -1)
+        weight, hidden = ((w / self.scale[:, None]).astype(np.float32) for w in (self.weight, self.hidden))
+        units = hidden.T @ flat
+        units += (self.threshold - self.mean @ hidden).astype(np.float32)[:, None]
+        odds = weight.T @ flat + self.out.T.astype(np.float32) @ np.maximum(units, 0, out=units)
         p: Floats = expit(odds.astype(np.float64) + (self.bias - self.mean @ weight)[:, None])
         never, always = p.reshape(2, *samples.shape[1:])
         return never, always
@@ -205,3 +221,18 @@ def _corrected(z: Floats, did: NDArray[np.bool_], column: int, mean: Floats, sca
     # Few weights and many samples: second derivatives are cheap, and a handful of steps is all it takes.
     found = minimize(loss, start, jac=True, hess=curvature, method="trust-exact").x
     return found[:-1], float(found[-1])
+
+
+def _network(z: Floats, did: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats, Floats]:
+    """Fit a network with one hidden layer; return its weights ``[k, h]``, ``[h]``, ``[h, 2]``, ``[2]``."""
+    from sklearn.neural_network import MLPClassifier
+
+    # Not trained to the end, which would be to learn these few touches by heart.
+    network = MLPClassifier(
+        (_HIDDEN,), alpha=_DECAY, batch_size=min(_BATCH, len(z)), learning_rate_init=_RATE, random_state=0
+    )
+    inputs, targets = z.astype(np.float32), did.astype(int)
+    for _ in range(_EPOCHS):
+        network.partial_fit(inputs, targets, classes=[0, 1])
+    (hidden, out), (threshold, bias) = network.coefs_, network.intercepts_
+    return hidden.astype(np.float64), threshold.astype(np.float64), out.astype(np.float64), bias.astype(np.float64)

@@ -105,7 +105,11 @@ def _model(about: Mapping[str, Any], arrays: Mapping[str, ArrayLike], layout: Se
         raise ValueError(f"the models do not cover the cells of {layout}, each once")
     if not about["rim"]:
         return ContactModel(tiles, layout)
-    shapes = {"mean": (INPUTS,), "scale": (INPUTS,), "weight": (INPUTS, 2), "bias": (2,)}
+    units = np.shape(arrays["rim.hidden"])[1:2]
+    shapes = {
+        "mean": (INPUTS,), "scale": (INPUTS,), "weight": (INPUTS, 2), "bias": (2,),
+        "hidden": (INPUTS, *units), "threshold": units, "out": (*units, 2),
+    }  # fmt: skip
     kind = np.dtype(np.float64)
     rim = Rim(**{name: _checked(f"rim.{name}", arrays[f"rim.{name}"], shape, kind) for name, shape in shapes.items()})
     return ContactModel(tiles, layout, rim)

@@ -93,13 +93,14 @@ def test_with_no_cell_to_ask_there_is_no_load_and_all_is_finite():
     assert not told(touched(3), ~ALL).any()
 
 
-def test_it_learns_to_doubt_regressions_that_are_wrong_and_to_believe_those_that_are_right():
+@pytest.mark.parametrize("touches", [5, 500])
+def test_it_learns_to_doubt_regressions_that_are_wrong_and_to_believe_those_that_are_right(touches: int):
     rng = np.random.default_rng(0)
-    samples = rng.normal(size=(4000, INPUTS))
-    sure = rng.normal(0, 3, 4000)
+    samples = rng.normal(size=(20_000, INPUTS))
+    sure = rng.normal(0, 3, 20_000)
     samples[:, 0], samples[:, 1] = sure, sure
-    right, no_better_than_chance = rng.random(4000) < 1 / (1 + np.exp(-sure)), rng.random(4000) < 0.5
-    rim = Rim.fit(samples, right, no_better_than_chance)
+    right, no_better_than_chance = rng.random(20_000) < 1 / (1 + np.exp(-sure)), rng.random(20_000) < 0.5
+    rim = Rim.fit(samples, right, no_better_than_chance, touches)
     never, always = rim.believe(samples.T.astype(np.float32))
     assert np.corrcoef(logit(never), sure)[0, 1] > 0.98
     assert np.abs(logit(never) - sure).mean() < 0.4
@@ -111,6 +112,6 @@ def test_it_hears_the_rings_where_the_regressions_say_nothing():
     samples = rng.normal(size=(4000, INPUTS))
     samples[:, :2] = 0
     loaded_around = samples[:, 10] > 0
-    never, _ = Rim.fit(samples, ~loaded_around, loaded_around).believe(samples.T.astype(np.float32))
+    never, _ = Rim.fit(samples, ~loaded_around, loaded_around, 100).believe(samples.T.astype(np.float32))
     assert (never < 0.5)[loaded_around].mean() > 0.95
     assert (never > 0.5)[~loaded_around].mean() > 0.95

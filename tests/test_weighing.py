@@ -63,7 +63,7 @@ def test_no_cells_at_all_are_asked_without_harm():
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_the_expected_share_of_false_alarms_comes_as_near_to_the_rate_as_can_be(seed: int):
+def test_the_expected_share_of_false_alarms_goes_no_farther_beyond_the_rate_than_it_would_fall_short(seed: int):
     p = np.random.default_rng(seed).beta(0.3, 0.3, 200)
     for rate in (0.001, 0.01, 0.2):
         chosen = faulty_at(p, rate)
@@ -72,9 +72,10 @@ def test_the_expected_share_of_false_alarms_comes_as_near_to_the_rate_as_can_be(
         def off(cells: np.ndarray, rate: float = rate) -> float:
             return float((1 - cells).sum() - rate * len(cells))
 
-        assert abs(off(inside)) <= abs(off(inside[1:])) + rate or off(inside) <= 0
-        if len(rest):  # one more would have been farther off
-            assert off(np.append(inside, rest.max())) > -off(inside) - rate
+        # By half as much again: each cell is a bigger step than the last.
+        assert off(inside) <= 1.5 * max(rate - off(inside[1:]), 0)
+        if len(rest):  # one more would have been too far
+            assert off(np.append(inside, rest.max())) > 1.5 * (rate - off(inside))
 
 
 def test_a_looser_rate_never_takes_a_cell_out_again():

@@ -88,13 +88,13 @@ class Rim:
 
     def believe(self, samples: Array) -> tuple[Floats, Floats]:
         """Return P(unloaded throughout) and P(loaded throughout), ``[...]`` each, of samples ``[k, ...]``."""
-        flat = samples.reshape(len(samples), -1)
-        weight, hidden = ((w / self.scale[:, None]).astype(np.float32) for w in (self.weight, self.hidden))
-        units = hidden.T @ flat
-        units += (self.threshold - self.mean @ hidden).astype(np.float32)[:, None]
-        odds = weight.T @ flat + self.out.T.astype(np.float32) @ np.maximum(units, 0, out=units)
-        p: Floats = expit(odds.astype(np.float64) + (self.bias - self.mean @ weight)[:, None])
-        never, always = p.reshape(2, *samples.shape[1:])
+        weight = np.concatenate([self.weight, self.hidden], axis=1) / self.scale[:, None]
+        bias = np.concatenate([self.bias, self.threshold]) - self.mean @ weight
+        said = weight.T.astype(np.float32) @ samples.reshape(len(samples), -1)
+        said += bias.astype(np.float32)[:, None]
+        odds, units = said[:2], np.maximum(said[2:], 0, out=said[2:])
+        odds += self.out.T.astype(np.float32) @ units
+        never, always = expit(odds).astype(np.float64).reshape(2, *samples.shape[1:])
         return never, always
 
 

@@ -51,7 +51,8 @@ def touched(log: Sequence[np.ndarray]) -> np.ndarray:
 # Inject, then find
 
 
-def test_what_is_injected_is_found_named_and_nothing_else(fitted, log):
+def test_what_is_injected_is_found_named_and_nothing_else(fitted, grasps: Recordings):
+    log = [grasps.frames[i] for i in range(21, 140, 6)]
     row = line_fault(LAYOUT, Line(0, "row", 5), FaultKind.OPEN)
     cells = touched(log)
     short, stuck = (int(c) for c in cells[cells >= 110][[5, 20]])

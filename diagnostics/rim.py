@@ -19,9 +19,8 @@ from diagnostics.layout import SensorLayout
 from diagnostics.touches import Array
 
 _SURE = 8.0  # log odds that a cell's own regressions are taken for at most
-_EMPTY = np.float32(
-    0.5
-)  # of a ring's cells: so much the mean of the whole array counts, all there is where none is trusted
+# Of a ring's cells: so much the mean of the whole array counts, all there is where none is trusted.
+_EMPTY = np.float32(0.5)
 _RIDGE = 1.0  # of the regressions, towards believing the cells' own
 _HIDDEN, _DECAY, _EPOCHS, _BATCH, _RATE = 32, 0.3, 20, 512, 2e-3  # of the network: units, penalty, training
 _FEW = 20  # touches from which the network learns as much as the regressions

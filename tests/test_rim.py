@@ -115,3 +115,15 @@ def test_it_hears_the_rings_where_the_regressions_say_nothing():
     never, _ = Rim.fit(samples, ~loaded_around, loaded_around, 100).believe(samples.T.astype(np.float32))
     assert (never < 0.5)[loaded_around].mean() > 0.95
     assert (never > 0.5)[~loaded_around].mean() > 0.95
+
+
+@pytest.mark.parametrize("touches", [1, 500])
+def test_many_touches_teach_it_what_only_two_rings_together_say_and_few_do_not(touches: int):
+    rng = np.random.default_rng(2)
+    samples = rng.normal(size=(20_000, INPUTS))
+    samples[:, :2] = 0
+    one_of_two = (samples[:, 10] > 0) ^ (samples[:, 14] > 0)
+    never, always = Rim.fit(samples, ~one_of_two, one_of_two, touches).believe(samples.T.astype(np.float32))
+    for said in (1 - never, always):
+        sure = (said > 0.8)[one_of_two].mean()
+        assert sure > 0.7 if touches > 1 else sure < 0.01

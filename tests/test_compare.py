@@ -1,5 +1,6 @@
 """The comparisons with other tools treat all alike, go on where they were, and own up to what they lose."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,15 @@ def test_no_peer_sees_a_dead_cell(task):
             with quiet():
                 predict = peer.prepare(task)(faults)
                 np.testing.assert_array_equal(predict(garbled), predict(task.test.x), err_msg=peer.name)
+
+
+def test_what_peers_print_is_kept_back_in_an_encoding(examples, capsys: pytest.CaptureFixture[str]):
+    from compare_classification import quiet
+
+    with quiet():
+        assert sys.stdout.encoding == "utf-8"  # PyPOTS prints a logo, and asks before
+        print("═╗")
+    assert capsys.readouterr().out == ""
 
 
 def test_what_learns_from_losses_sees_each_window_whole_and_broken(task):

@@ -1,6 +1,9 @@
 """The comparisons with other tools treat all alike, go on where they were, and own up to what they lose."""
 
+import signal
 import sys
+import time
+from multiprocessing import Pipe, get_context
 from pathlib import Path
 
 import numpy as np
@@ -130,6 +133,21 @@ def test_keras_where_it_is_better_the_verdict_says_so(examples):
         better[1]
         == "  b: 1 window: 2.50 ms (fast) against 3.00 (fast); 256 windows: 2.50 ms (fast) against 3.00 (fast)"
     )
+
+
+def test_a_stack_that_hangs_is_killed_and_out(examples):
+    from compare_keras import Worker
+
+    line, far = Pipe()
+    process = get_context("spawn").Process(target=time.sleep, args=(600,))
+    process.start()
+    worker = Worker("Keras", process, line, 0.1)
+    with pytest.raises(RuntimeError, match=r"Keras failed: no answer in 0\.1 s"):
+        worker.ask()
+    process.join(60)
+    assert process.exitcode == -signal.SIGKILL
+    far.send("late")
+    assert worker.ask("") == "late"
 
 
 @pytest.mark.filterwarnings("ignore")  # Keras's own

@@ -40,7 +40,7 @@ class Effort:
     rounds: int  # of IterativeImputer
 
 
-FULL, SMALL = Effort(20, 30, 30, 10_000, 1000, 10), Effort(1, 2, 1, 84, 40, 1)
+FULL, SMALL = Effort(20, 100, 30, 10_000, 1000, 10), Effort(1, 2, 1, 84, 40, 1)
 
 
 @dataclass(frozen=True)

@@ -73,8 +73,8 @@ class Stopwatch:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keep back what the peers print and warn about themselves."""
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+    """Keep back what the peers print and warn about themselves; PyPOTS asks which encoding it prints in."""
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.TextIOWrapper(io.BytesIO(), encoding="utf-8")):
         warnings.simplefilter("ignore")
         yield
 

@@ -22,6 +22,8 @@ from dataclasses import dataclass, field
 from importlib.metadata import version
 from importlib.util import find_spec
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
@@ -56,39 +58,57 @@ class Result:
         return {way: tuple(np.median(ms, axis=0)) for (way, n), ms in self.milliseconds.items() if n == batch}
 
 
+@dataclass(frozen=True)
 class Worker:
-    """A stack's process, and the line to it."""
+    """A stack's process, the line to it, and how many seconds it may take for an answer."""
 
-    def __init__(self, name: str, setup: Setup) -> None:
+    name: str
+    process: BaseProcess
+    line: Connection
+    limit: float
+
+    @classmethod
+    def start(cls, name: str, setup: Setup, limit: float) -> Worker:
+        """Start a process that serves one stack."""
         context = get_context("spawn")
-        self.name, (self.line, far) = name, context.Pipe()
-        self.process = context.Process(target=serve, args=(far, name, setup), daemon=True)
-        self.process.start()
+        line, far = context.Pipe()
+        process = context.Process(target=serve, args=(far, name, setup), daemon=True)
+        process.start()
         far.close()
+        return cls(name, process, line, limit)
 
     def ask(self, question: object = "on"):
         """Send a question, if any, and wait for the answer.
 
         Raises:
-            RuntimeError: the stack failed.
+            RuntimeError: the stack failed, or gave no answer in time and was killed.
         """
         try:
             if question != "":
                 self.line.send(question)
-            answer = self.line.recv()
+            if self.line.poll(self.limit):
+                answer = self.line.recv()
+            else:
+                self.process.kill()
+                answer = Failure(f"no answer in {self.limit:g} s")
         except (EOFError, OSError):
             answer = Failure("its process ended")
         if isinstance(answer, Failure):
             raise RuntimeError(f"{self.name} failed: {answer.text}")
         return answer
 
+    def end(self) -> None:
+        """Wait until it has ended, or kill it."""
+        self.process.join(self.limit)
+        self.process.kill()
+
 
 class Race:
     """All stacks on one setup, in turns; one that fails is out, the others go on."""
 
-    def __init__(self, names: list[str], setup: Setup, results: dict[str, Result]) -> None:
+    def __init__(self, names: list[str], setup: Setup, results: dict[str, Result], limit: float) -> None:
         self.setup, self.results = setup, results
-        self.workers = {name: Worker(name, setup) for name in names}
+        self.workers = {name: Worker.start(name, setup, limit) for name in names}
 
     def each(self, question: object, keep: Callable[[Result, object], None]) -> None:
         """Put one question to all, one after another."""
@@ -122,7 +142,7 @@ class Race:
                 self.each((batch, max(2, runs // batch)), keep)
         self.each(None, lambda result, megabytes: setattr(result, "megabytes", max(result.megabytes, megabytes)))
         for worker in self.workers.values():
-            worker.process.join()
+            worker.end()
 
 
 def race(parts: tuple, layout: SensorLayout, names: list[str], options: argparse.Namespace, seed: int, results) -> None:
@@ -130,7 +150,7 @@ def race(parts: tuple, layout: SensorLayout, names: list[str], options: argparse
     setup = Setup(layout, *parts, seed, options.epochs, options.small)
     model = af.TactileTransformer(layout, setup.n_classes, length=parts[0].x.shape[1], seed=seed)
     setup.weights.update({name: value.numpy() for name, value in model.state_dict().items()})
-    Race(names, setup, results).run(*((1, 2) if options.small else (5, 10)))
+    Race(names, setup, results, options.limit).run(*((1, 2) if options.small else (5, 10)))
 
 
 def show(results: dict[str, Result]) -> None:
@@ -236,6 +256,7 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=10, help="default 10")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of split and weights (default 0)")
     parser.add_argument("--windows", type=int, default=10**9, help="train on at most so many (default: all)")
+    parser.add_argument("--limit", type=float, default=1800, help="seconds a stack may take for a step (default 1800)")
     parser.add_argument("--small", action="store_true", help="a few simulated grasps, one epoch")
     parser.add_argument("--out", type=Path, default=Path("comparison"), help="folder for keras.csv and keras.png")
     options = parser.parse_args()

@@ -1,5 +1,9 @@
 """The comparisons with other tools treat all alike, go on where they were, and own up to what they lose."""
 
+import signal
+import sys
+import time
+from multiprocessing import Pipe, get_context
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +41,15 @@ def test_no_peer_sees_a_dead_cell(task):
             with quiet():
                 predict = peer.prepare(task)(faults)
                 np.testing.assert_array_equal(predict(garbled), predict(task.test.x), err_msg=peer.name)
+
+
+def test_what_peers_print_is_kept_back_in_an_encoding(examples, capsys: pytest.CaptureFixture[str]):
+    from compare_classification import quiet
+
+    with quiet():
+        assert sys.stdout.encoding == "utf-8"  # PyPOTS prints a logo, and asks before
+        print("═╗")
+    assert capsys.readouterr().out == ""
 
 
 def test_what_learns_from_losses_sees_each_window_whole_and_broken(task):
@@ -120,6 +133,21 @@ def test_keras_where_it_is_better_the_verdict_says_so(examples):
         better[1]
         == "  b: 1 window: 2.50 ms (fast) against 3.00 (fast); 256 windows: 2.50 ms (fast) against 3.00 (fast)"
     )
+
+
+def test_a_stack_that_hangs_is_killed_and_out(examples):
+    from compare_keras import Worker
+
+    line, far = Pipe()
+    process = get_context("spawn").Process(target=time.sleep, args=(600,))
+    process.start()
+    worker = Worker("Keras", process, line, 0.1)
+    with pytest.raises(RuntimeError, match=r"Keras failed: no answer in 0\.1 s"):
+        worker.ask()
+    process.join(60)
+    assert process.exitcode == -signal.SIGKILL
+    far.send("late")
+    assert worker.ask("") == "late"
 
 
 @pytest.mark.filterwarnings("ignore")  # Keras's own

@@ -27,7 +27,7 @@ from diagnostics.contact import Expected
 from diagnostics.temporal import SHORTEST_RUN, StillRuns
 from diagnostics.touches import Array, Scale, Touch
 
-_RAIL_SHARE = 0.4  # of broken cells stick to the low rail, as many to the high one, the rest anywhere
+_ANYWHERE = 0.2  # of broken cells stick anywhere, of the rest as many to the low rail as to the high one
 _LEAST = 1e-4  # no touch is less likely than this: models err
 _SUDDEN = 1.0  # log ratio of a jump from which on a cell is no witness
 _TELLING = 0.5  # log evidence from which on a touch counts as one that tested the cell
@@ -121,8 +121,8 @@ class _Values:
         full = value >= scale.full_scale - 2 * tolerance
         low = scale.root_load(value - 2 * tolerance).astype(np.float64)
         high = np.where(full, np.inf, scale.root_load(value + 2 * tolerance))
-        anywhere = (1 - 2 * _RAIL_SHARE) * 4 * tolerance / scale.full_scale
-        return cls(rests, low, high, np.log(np.where(rests | full, _RAIL_SHARE, anywhere)))
+        anywhere = _ANYWHERE * 4 * tolerance / scale.full_scale
+        return cls(rests, low, high, np.log(np.where(rests | full, (1 - _ANYWHERE) / 2, anywhere)))
 
 
 def stuck_evidence(

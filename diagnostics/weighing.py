@@ -35,7 +35,7 @@ _MOST_JUMP = 1.0  # what a jump may be worth, whatever the logs say: alone it pr
 _KINDS = 3
 _SUSPICIOUS = 2.8  # log likelihood ratio from which on a cell is left out when others are judged
 _SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw one
-_STRANGE = 3.0  # recordings in which evidence meant nothing, beside those that were held out: few meet the strange ones
+_DOUBT, _STRANGE = 0.5, 22.0  # so much of the evidence does not count where few recordings were held out, and how few
 _LOOSE = 10.0  # variance of the weights before any log is seen
 _CLIP = 6.0  # log ratios beyond this say "certain"; they must not steer the fit
 _SURE = 24.0  # and beyond this, not even more certain
@@ -89,7 +89,9 @@ class Weights:
         if weights == cls():
             return weights
         held_out = len(order) - learned
-        return replace(weights, slope=tuple(held_out / (held_out + _STRANGE) * slope for slope in weights.slope))
+        # Few meet the strange touches.
+        counts = 1 - _DOUBT / (1 + (held_out / _STRANGE) ** 2)
+        return replace(weights, slope=tuple(counts * slope for slope in weights.slope))
 
     @classmethod
     def _of(cls, trials: Sequence[_Trial]) -> Weights:

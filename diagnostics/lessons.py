@@ -6,7 +6,7 @@ A rim is to learn how far the regressions can be believed when some of the cells
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ class Lessons:
         looked_at = sum(min(left, _LOOKED_AT) for left in _LEFT_OUT) * len(outputs)
         most = max(1, round(share * _SAMPLES / (FOLDS * looked_at)))  # stretches in each round
         fold = rng.permutation(touch.max() + 1)[touch] % FOLDS
-        found: list[tuple[NDArray[np.float64], Mask, Mask]] = []
+        found = []
         for k in range(FOLDS):
             foreseen, held = fit(features[fold != k]), features[fold == k]
             for left in _LEFT_OUT:
@@ -77,9 +77,8 @@ class Lessons:
                 out = np.sort(out[: max(1, round(_LOOKED_AT * len(outputs)))])
                 told = around(foreseen(some, trusted), some, trusted, layout, out)
                 samples = told.reshape(len(told), -1).T.astype(np.float64)
-                found.append((samples, (some[:, 2, out] == 0).T.ravel(), (some[:, 3, out] == 1).T.ravel()))
-        together, never, always = (np.concatenate(column) for column in zip(*found, strict=True))
-        return cls(together, never, always, int(touch.max()) + 1)
+                found.append(cls(samples, (some[:, 2, out] == 0).T.ravel(), (some[:, 3, out] == 1).T.ravel(), 0))
+        return replace(cls.together(found), touches=int(touch.max()) + 1)
 
     @classmethod
     def together(cls, parts: Sequence[Lessons]) -> Lessons:

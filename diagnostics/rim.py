@@ -69,10 +69,10 @@ class Rim:
     def fit(
         cls, samples: NDArray[np.float64], never: NDArray[np.bool_], always: NDArray[np.bool_], touches: int
     ) -> Rim:
-        """Fit on samples ``[m, k]`` of cells that were not asked (see :func:`around`), and what they did, ``[m]``.
+        """Fit on samples of cells that were not asked.
 
         Args:
-            samples, never, always: see above.
+            samples: ``[m, k]``, see :func:`around`; never, always: bool ``[m]``, what they did.
             touches: that they are of.
         """
         mean, scale = samples.mean(axis=0), np.maximum(samples.std(axis=0), _LEAST_SCALE)

@@ -163,8 +163,8 @@ def longest_repetition(frames: NDArray[np.float64]) -> int:
 
 def _as_before(frames: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return for each frame but the first, ``[T - 1]``, whether it equals the one before, missing readings included."""
-    same: NDArray[np.bool_] = (frames[1:] == frames[:-1]).all(axis=1)
-    missing = np.isnan(frames)
+    alike, missing = frames[1:] == frames[:-1], np.isnan(frames)
     if missing.any():
-        same = ((frames[1:] == frames[:-1]) | missing[1:] & missing[:-1]).all(axis=1)
+        alike |= missing[1:] & missing[:-1]
+    same: NDArray[np.bool_] = alike.all(axis=1)
     return same

@@ -11,7 +11,6 @@ it only moves. ``--only spatial._LEAST ...`` picks constants. Without RECORDINGS
 from __future__ import annotations
 
 import argparse
-import csv
 import importlib
 import pkgutil
 import re
@@ -20,14 +19,18 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
+from typing import TypeVar
 
+import numpy as np
 from diagnosis_figures import Bench, dead_cells, small
 from joblib import Parallel, delayed, parallel_config
 
 import diagnostics
+from adaptfault.lines import Lines
 from adaptfault.recordings import Recordings, load
 from diagnostics import SelfDiagnosis
 
+Result = TypeVar("Result")
 PRECISION, RECALL, SLACK = 0.995, 0.98, 0.01
 SHARE = 0.16
 NOT_DIAGNOSING = ("circuit", "injection", "picture")  # public tools and the injector
@@ -78,8 +81,8 @@ def constants() -> Iterator[Constant]:
                         yield Constant(module.__name__, name, value, changed)
 
 
-def mentioned(work: Callable[[], object]) -> set[tuple[str, str]]:
-    """Return module and name of what the functions of `diagnostics` that run during the work mention."""
+def mentioned(work: Callable[[], Result]) -> tuple[Result, set[tuple[str, str]]]:
+    """Do work; return its result, and module and name of what the functions of `diagnostics` that ran mention."""
     found: set[tuple[str, str]] = set()
     codes = set()
 
@@ -92,10 +95,10 @@ def mentioned(work: Callable[[], object]) -> set[tuple[str, str]]:
 
     sys.setprofile(look)
     try:
-        work()
+        result = work()
     finally:
         sys.setprofile(None)
-    return found
+    return result, found
 
 
 def first_row(recordings: Recordings, split: int, count: int) -> tuple[float, float]:
@@ -103,7 +106,7 @@ def first_row(recordings: Recordings, split: int, count: int) -> tuple[float, fl
     bench = Bench(recordings, split, count)
     fitted = SelfDiagnosis(bench.layout).fit([recordings.frames[i] for i in bench.reference])
     tally = dead_cells(bench, fitted, SHARE)
-    return tally.precision, tally.recall
+    return float(np.nan_to_num(tally.precision)), tally.recall  # of nothing found no part is right
 
 
 def changed_row(constant: Constant, recordings: Recordings, split: int, count: int) -> Measured:
@@ -118,28 +121,6 @@ def changed_row(constant: Constant, recordings: Recordings, split: int, count: i
         setattr(module, constant.name, constant.value)
 
 
-def known(path: Path | None) -> dict[str, Measured]:
-    """Read what an earlier run measured."""
-    if path is None or not path.exists():
-        return {}
-    with path.open(newline="") as file:
-        rows = [
-            Measured(r["constant"], float(r["precision"]), float(r["recall"]), r["error"]) for r in csv.DictReader(file)
-        ]
-    return {row.constant: row for row in rows}
-
-
-def keep(path: Path | None, row: Measured) -> None:
-    if path is None:
-        return
-    fresh = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, ["constant", "precision", "recall", "error"], lineterminator="\n")
-        if fresh:
-            writer.writeheader()
-        writer.writerow({**asdict(row), "precision": f"{row.precision:.4f}", "recall": f"{row.recall:.4f}"})
-
-
 def show(row: Measured) -> None:
     told = row.error or f"precision {row.precision:.4f}, recall {row.recall:.4f}"
     print(f"{row.verdict():8s}{row.constant:45s}{told}", flush=True)
@@ -150,35 +131,34 @@ def main() -> None:
     parser.add_argument("recordings", nargs="?", help="fault-free recordings; without: simulated grasps")
     parser.add_argument("logs", nargs="?", type=int, default=20, help="logs for each constant (default 20)")
     parser.add_argument("--split", type=int, default=0, help="seed of the halves (default 0)")
-    parser.add_argument("--out", type=Path, help="CSV of what is measured; what it holds already is not measured again")
+    parser.add_argument("--out", type=Path, help="JSON lines of what is measured; what it holds is not measured again")
     parser.add_argument("--jobs", type=int, default=-1, help="processes (default: one a core)")
     parser.add_argument("--only", nargs="+", metavar="MODULE.NAME", help="constants")
     options = parser.parse_args()
     recordings = load(options.recordings).recordings if options.recordings else small()
     count = options.logs if options.recordings else 2
     job = recordings, options.split, count
-    usual: list[tuple[float, float]] = []
-    met = mentioned(lambda: usual.append(first_row(*job)))
-    show(Measured("as they are", *usual[0]))
-    every = [
-        c
-        for c in constants()
-        if not options.only or f"{c.module}.{c.name}" in {f"diagnostics.{n}" for n in options.only}
-    ]
+    usual, met = mentioned(lambda: first_row(*job))
+    show(Measured("as they are", *usual))
+    wanted = {f"diagnostics.{name}" for name in options.only or ()}
+    every = [c for c in constants() if not wanted or f"{c.module}.{c.name}" in wanted]
     used = [c for c in every if (c.module, c.name) in met]
     print(f"{len(every)} changes, {len(used)} of constants that this array meets")
-    rows = known(options.out)
-    for row in rows.values():
+    kept = Lines(options.out) if options.out else None
+    rows = [Measured(**document) for document in kept.read()] if kept else []
+    for row in rows:
         show(row)
-    left = [c for c in used if str(c) not in rows]
+    done = {row.constant for row in rows}
+    left = [c for c in used if str(c) not in done]
     with parallel_config(backend="loky", inner_max_num_threads=1):
         for row in Parallel(n_jobs=options.jobs, return_as="generator_unordered")(
             delayed(changed_row)(c, *job) for c in left
         ):
             show(row)
-            keep(options.out, row)
-            rows[row.constant] = row
-    verdicts = [row.verdict() for row in rows.values()]
+            if kept:
+                kept.add(asdict(row))
+            rows.append(row)
+    verdicts = [row.verdict() for row in rows]
     print(", ".join(f"{verdicts.count(v)} {v}" for v in ("holds", "near", "BREAKS", "FAILS")))
 
 

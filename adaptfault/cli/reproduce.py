@@ -34,7 +34,7 @@ def add(commands: Commands) -> None:
         help="only this figure of the paper (7: its future work); may be given several times",
     )
     size = parser.add_mutually_exclusive_group()
-    size.add_argument("--quick", action="store_true", help="about 15 minutes on two free cores (default)")
+    size.add_argument("--quick", action="store_true", help="about 14 minutes on two free cores (default)")
     size.add_argument("--full", action="store_true", help="as the paper: 50 epochs, 200k samples; for a GPU")
     parser.add_argument("--seeds", type=int, nargs="+", help="default 0 1 2")
     parser.add_argument("--grasps", type=int, help="simulated grasps of each class (default 200)")

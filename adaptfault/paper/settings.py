@@ -83,7 +83,7 @@ class Settings:
 
     @classmethod
     def quick(cls, *, simulated: bool) -> Settings:
-        """Everything but the networks trained anew, smaller: about 15 minutes on two free cores on simulated grasps.
+        """Everything but the networks trained anew, smaller: about 14 minutes on two free cores on simulated grasps.
 
         Most of it is training: three bases, three fault-aware networks, one for the control.
         """

@@ -2,7 +2,8 @@
 
 Hardly any skin that has been used for a while is free of them. What was taken for fault-free is therefore diagnosed
 itself first, as in a cold start: by the cells around each. Only cells that never moved in any recording come into
-question; where all moved, nothing is done.
+question, and of a large skin only those among them that have cells that moved on both sides; where all moved, nothing
+is done.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import label
 
 from diagnostics.layout import SensorLayout
 from diagnostics.readings import Readings
@@ -18,11 +20,15 @@ from diagnostics.verdicts import Diagnosis
 
 _PIECES, _FRAMES = 60, 200  # of the reference that are diagnosed, at most, spread evenly; frames of each
 _SURE = 0.99  # P(faulty) from which on a cell counts as dead: it will be called so in every log
+_TOUCHING = np.array([np.zeros((3, 3)), np.ones((3, 3)), np.zeros((3, 3))])  # also corner to corner; not across pads
 _MOST = 0.5  # share of the cells: if more look dead, it is no reference, or it touched next to nothing
 
 
 def dead_before(
-    recordings: Readings, layout: SensorLayout, tolerance: float, diagnose: Callable[[Readings], Diagnosis]
+    recordings: Readings,
+    layout: SensorLayout,
+    tolerance: float,
+    diagnose: Callable[[Readings, NDArray[np.bool_]], Diagnosis],
 ) -> NDArray[np.float64]:
     """Return P(dead) of the cells that are dead throughout the reference, ``[D]``; 0 for all others.
 
@@ -30,13 +36,16 @@ def dead_before(
         recordings: the reference.
         layout: the array.
         tolerance: how far the reading of a cell that does not move may wander to either side.
-        diagnose: a diagnosis without a reference.
+        diagnose: a diagnosis without a reference, of the cells in question (bool ``[D]``) at least.
     """
     present = layout.present.ravel()
     never_moved = present & _still(recordings, 2 * tolerance)
     if not never_moved.any() or never_moved[present].mean() > _MOST:
         return np.zeros(layout.n_cells)
-    found = diagnose(_sample(recordings))
+    suspects = _enclosed(never_moved, layout)
+    if not suspects.any():
+        return np.zeros(layout.n_cells)
+    found = diagnose(_sample(recordings), suspects)
     dead = never_moved & found.fault_set.mask & (found.probability >= _SURE)
     return np.where(dead, found.probability, 0.0)
 
@@ -48,6 +57,20 @@ def _still(recordings: Readings, most: float) -> NDArray[np.bool_]:
         low, high = np.fmin(low, np.fmin.reduce(frames)), np.fmax(high, np.fmax.reduce(frames))
     still: NDArray[np.bool_] = np.asarray((high >= low) & (high - low <= most))
     return still
+
+
+def _enclosed(never_moved: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.bool_]:
+    """Return the groups of ``never_moved`` cells in which one lies between cells that moved, bool ``[D]``."""
+    moved = np.pad(layout.grid(~never_moved & layout.present.ravel()), ((0, 0), (1, 1), (1, 1)))
+    rows, cols = layout.rows, layout.cols
+
+    def at(r: int, c: int) -> NDArray[np.bool_]:
+        return moved[:, 1 + r : 1 + r + rows, 1 + c : 1 + c + cols]
+
+    between = np.logical_or.reduce([at(r, c) & at(-r, -c) for r, c in ((0, 1), (1, 0), (1, 1), (1, -1))])
+    groups, _ = label(layout.grid(never_moved), _TOUCHING)
+    enclosed: NDArray[np.bool_] = np.isin(groups, groups[between & (groups > 0)]).ravel()
+    return enclosed
 
 
 def _sample(recordings: Readings) -> Readings:

@@ -59,7 +59,7 @@ class SelfDiagnosis:
         """
         healthy = _recordings(recordings, self.layout)
         cold = SelfDiagnosis(self.layout)
-        dead = dead_before(healthy, self.layout, tolerance_of(healthy, self.layout), cold.diagnose)
+        dead = dead_before(healthy, self.layout, tolerance_of(healthy, self.layout), cold._diagnosed)
         self.reference_ = Reference.fit(healthy, self.layout, dead)
         self.weights_ = Weights.fit(healthy, living(self.layout, dead))
         return self
@@ -72,11 +72,7 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
-        log = _recordings(recordings, self.layout)
-        memory = self.memory()
-        for frames in log.blocks():
-            memory.extend(frames)
-        return finished(self.judge(memory, n_recordings=len(log)))
+        return self._diagnosed(_recordings(recordings, self.layout))
 
     def state(self) -> tuple[dict[str, Any], Arrays]:
         """Return all that it knows: a JSON-safe dict, and arrays by name, as :meth:`from_state` reads them."""
@@ -112,11 +108,11 @@ class SelfDiagnosis:
             raise ValueError(f"the stored diagnosis is damaged: {error}") from None
         return diagnoser
 
-    def memory(self) -> Memory:
-        """Return an empty memory, to be fed with a log and judged."""
+    def memory(self, needed: NDArray[np.bool_] | None = None) -> Memory:
+        """Return an empty memory, to be fed with a log and judged; see ``patched.remembering``."""
         if self.reference_ is None:
-            return remembering(self.layout, Reference.unknown(self.layout), _SUSPICIOUS_COLD)
-        return remembering(self.layout, self.reference_, self.weights_.suspicious)
+            return remembering(self.layout, Reference.unknown(self.layout), _SUSPICIOUS_COLD, needed)
+        return remembering(self.layout, self.reference_, self.weights_.suspicious, needed)
 
     def judge(self, memory: Memory, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
         """Judge every cell from what is remembered of a log.
@@ -158,6 +154,12 @@ class SelfDiagnosis:
             n_frames=memory.stream.seen,
             n_recordings=n_recordings,
         )
+
+    def _diagnosed(self, log: Readings, needed: NDArray[np.bool_] | None = None) -> Diagnosis:
+        memory = self.memory(needed)
+        for frames in log.blocks():
+            memory.extend(frames)
+        return finished(self.judge(memory, n_recordings=len(log)))
 
     def _found(self, memory: Memory, spatial: Spatial, wrong: NDArray[np.bool_]) -> Findings:
         """Weigh the evidence, and cut F; cells that are ``wrong`` (bool ``[D]``) have been explained already."""

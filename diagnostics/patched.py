@@ -62,10 +62,10 @@ class PatchedMemory(Memory):
         local: the touches of each patch; ``touches`` stays empty.
     """
 
-    def __init__(self, layout: SensorLayout, reference: Reference) -> None:
+    def __init__(self, layout: SensorLayout, reference: Reference, needed: Mask | None = None) -> None:
         super().__init__(layout, reference, _SUSPICIOUS)
         tiles = reference.model.tiles if reference.model else None
-        self.local = PatchTouches.begin(patches(layout) if tiles is None else tuple(t.patch for t in tiles))
+        self.local = PatchTouches.begin(patches(layout) if tiles is None else tuple(t.patch for t in tiles), needed)
         self._models: dict[int, Model] = {}  # of the patches that were touched, as the reference has them
 
     def spatial(self, wrong: Mask | None = None, touches: Touches | None = None) -> Generator[None, None, Spatial]:
@@ -137,11 +137,12 @@ class PatchedMemory(Memory):
         self.local, self.settled = self.local.replaced(kept), settled
 
 
-def remembering(layout: SensorLayout, reference: Reference, suspicious: float) -> Memory:
+def remembering(layout: SensorLayout, reference: Reference, suspicious: float, needed: Mask | None = None) -> Memory:
     """Return an empty memory of the kind that an array needs: large ones are remembered patch by patch.
 
-    From log evidence ``suspicious`` on a cell of a small array is not asked about the others.
+    From log evidence ``suspicious`` on a cell of a small array is not asked about the others. The touches of a patch
+    without a cell that is ``needed`` (bool ``[D]``; None: all) are not remembered.
     """
     if layout.present.sum() > MOST_CELLS:
-        return PatchedMemory(layout, reference)
+        return PatchedMemory(layout, reference, needed)
     return Memory(layout, reference, suspicious)

@@ -9,7 +9,7 @@ nothing; time and memory grow with the cells, never with their square. A small a
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -122,23 +122,26 @@ class PatchTouches:
     patches: tuple[Patch, ...]
     of: tuple[Touches, ...]
     _inputs: _Inputs
+    _needed: tuple[bool, ...]
 
     @classmethod
-    def begin(cls, all_patches: tuple[Patch, ...]) -> PatchTouches:
-        """Nothing seen yet."""
-        return cls(all_patches, (Touches(),) * len(all_patches), _Inputs.of(all_patches))
+    def begin(cls, all_patches: tuple[Patch, ...], needed: NDArray[np.bool_] | None = None) -> PatchTouches:
+        """Nothing seen yet. Patches without an output that is ``needed`` (bool ``[D]``; None: all) stay so."""
+        of_each = tuple(needed is None or bool(needed[patch.outputs].any()) for patch in all_patches)
+        return cls(all_patches, (Touches(),) * len(all_patches), _Inputs.of(all_patches), of_each)
 
     def extend(self, root: Array, numbers: Cells, root_near: float, still: NDArray[np.bool_]) -> PatchTouches:
         """Return the touches after more frames, see ``Touches.extend``; a patch in which nothing moves is as before."""
         of = list(self.of)
         for i in self._inputs.with_any(~still):
-            cells = self.patches[i].inputs
-            of[i] = of[i].extend(root[:, cells], numbers, root_near, still[cells])
+            if self._needed[i]:
+                cells = self.patches[i].inputs
+                of[i] = of[i].extend(root[:, cells], numbers, root_near, still[cells])
         return self.replaced(of)
 
     def replaced(self, of: Sequence[Touches]) -> PatchTouches:
         """Return the same patches with other touches."""
-        return PatchTouches(self.patches, tuple(of), self._inputs)
+        return replace(self, of=tuple(of))
 
     def kept(self) -> Iterator[tuple[int, Touches]]:
         """Yield the patches that were touched, and their touches."""

@@ -59,21 +59,23 @@ class Surroundings:
         asked = _surroundings(features, trusted, self.layout)
         judged = np.flatnonzero(np.isfinite(asked).all(axis=(0, 2)) & present)
         neighbours = min(_NEIGHBOURS, len(answers))
-        # Most cells lie far from any load, and are surrounded alike: each surrounding is looked up once.
-        alike, which = np.unique(asked[:, judged].reshape(-1, asked.shape[2]), axis=0, return_inverse=True)
-        _, nearest = tree.query(alike, k=neighbours)
-        near = answers[nearest.reshape(len(alike), neighbours)[which.ravel()]]
-        near = near.reshape(len(features), len(judged), neighbours, -1)  # (n, judged, K, 4)
+        # Most cells lie far from any load, and are surrounded alike: that is looked up once, as the first.
+        around = asked[:, judged].reshape(-1, asked.shape[2])
+        loaded = around.any(axis=1)
+        which = np.where(loaded, np.cumsum(loaded), 0).reshape(len(features), len(judged))
+        unloaded = np.zeros((1, asked.shape[2]))
+        _, nearest = tree.query(np.concatenate([unloaded, around[loaded]]), k=neighbours)
+        near = answers[nearest.reshape(-1, neighbours)]  # (m, K, 4)
 
         def share(of: NDArray[np.bool_], overall: NDArray[np.bool_]) -> NDArray[np.float64]:
             prior = (overall.sum() + 0.5) / (len(overall) + 1)
-            result: NDArray[np.float64] = (of.sum(axis=2) + prior * _PRIOR_WEIGHT) / (neighbours + _PRIOR_WEIGHT)
-            return result
+            result: NDArray[np.float64] = (of.sum(axis=1) + prior * _PRIOR_WEIGHT) / (neighbours + _PRIOR_WEIGHT)
+            return result[which]
 
         never[:, judged] = share(near[..., 2] == 0, answers[:, 2] == 0)
         always[:, judged] = share(near[..., 3] == 1, answers[:, 3] == 1)
-        mean[:, judged] = near[..., 1].mean(axis=2)
-        spread[judged] = max(float(near[..., 1].std(axis=2).mean()), _LEAST_SPREAD)
+        mean[:, judged] = near[..., 1].mean(axis=1)[which]
+        spread[judged] = max(float(near[..., 1].std(axis=1)[which].mean()), _LEAST_SPREAD)
         return Expected(never, always, mean, spread)
 
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from adaptfault.grasps import simulate
-from diagnostics import Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
+from diagnostics import Diagnosis, Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
 from diagnostics.dead_before import dead_before
+from diagnostics.memory import finished
 from diagnostics.readings import Readings
 from diagnostics.reference import tolerance_of
 
@@ -22,7 +23,9 @@ DEAD = {OPEN, SHORT, STUCK}
 
 def looked_for(recordings: list[np.ndarray], layout: SensorLayout = LAYOUT) -> np.ndarray:
     readings = Readings(recordings)
-    return dead_before(readings, layout, tolerance_of(readings, layout), SelfDiagnosis(layout).diagnose)
+    return dead_before(
+        readings, layout, tolerance_of(readings, layout), lambda log, _: SelfDiagnosis(layout).diagnose(list(log))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +43,7 @@ def test_cells_that_are_dead_throughout_are_found_and_no_other(worn):
 
 
 def test_a_fault_free_reference_has_none_and_costs_no_diagnosis():
-    def never(_: Readings):
+    def never(*_):
         raise AssertionError("all cells moved")
 
     moved = [frames + 0.1 * np.arange(len(frames))[:, None] for frames in GRASPS]
@@ -90,3 +93,34 @@ def test_a_stored_diagnosis_knows_them(worn, fitted):
     about, arrays = fitted.state()
     again = SelfDiagnosis.from_state(about, arrays).diagnose(worn[1:12:2])
     np.testing.assert_array_equal(again.probability, fitted.diagnose(worn[1:12:2]).probability)
+
+
+def test_of_a_large_skin_only_what_lies_around_suspects_is_judged_and_tells_the_same():
+    skin, rng = SensorLayout(1, 40, 40), np.random.default_rng(0)
+    places = np.argwhere(np.ones((40, 40)))
+
+    def touch() -> np.ndarray:
+        load = np.clip(2 - ((places - rng.uniform(4, 20, 2)) ** 2).sum(axis=1) / 6, 0, None)
+        return (np.sin(np.linspace(0, np.pi, 20))[:, None] * load).round(2)
+
+    reference = [np.concatenate([touch() for _ in range(6)]) for _ in range(20)]
+    dead = [skin.cell(0, 9, 9), *(skin.cell(0, 14, col) for col in range(8, 18)), skin.cell(0, 16, 11)]
+    for recording in reference:
+        recording[:, dead] = 0
+    asked_about: list[np.ndarray] = []
+
+    def all_of(log: Readings, needed: np.ndarray) -> Diagnosis:
+        asked_about.append(needed)
+        return SelfDiagnosis(skin).diagnose(list(log))
+
+    def some_of(log: Readings, needed: np.ndarray) -> Diagnosis:
+        cold = SelfDiagnosis(skin)
+        memory = cold.memory(needed)
+        for frames in log:
+            memory.extend(frames)
+        return finished(cold.judge(memory))
+
+    readings = Readings([*reference, 0.1 * np.ones((10, 1600)) * (places[:, 0] > 30)])  # nothing else moved there
+    whole, part = (dead_before(readings, skin, 0.01, diagnose) for diagnose in (all_of, some_of))
+    assert set(np.flatnonzero(whole)) == set(np.flatnonzero(part)) == set(dead)
+    assert set(dead) <= set(np.flatnonzero(asked_about[0]))

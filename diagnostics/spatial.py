@@ -166,7 +166,6 @@ def stuck_evidence(
         brought = np.where(asked, cells.settled + surprise.sum(axis=0), 0.0)
         evidence = np.where(asked, values.prior + brought, 0.0)
         asked_now, trusted = trusted, askable & (evidence + cells.jump < suspicious)
-        yield
         if (trusted == asked_now).all():
             break
     moving = cells.askable & runs.moved & fresh & ~np.isnan(expected.spread)

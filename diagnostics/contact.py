@@ -31,7 +31,7 @@ _RESTING_QUANTILE = 0.05  # of a cell's readings: where it rests
 _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
 _NOVEL = 0.1  # share of touches that resemble nothing known
 _BLOCK = 4096  # cells looked at together
-_AT_ONCE = 8192  # cells of stretches looked at between two pauses
+_AT_ONCE = 6144  # cells of stretches looked at between two pauses
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,8 @@ class StillRuns:
             start[broke] = numbers[first]
             length[broke] = np.minimum(count, heard[broke])
             # What the cells did in the steps into those stretches.
-            steps, which = np.unique(first, return_inverse=True)
+            steps = np.flatnonzero(np.bincount(first))
+            which = np.searchsorted(steps, first)
             before = np.where(steps[:, None] > 0, frames[steps - 1], self.last)
             step = frames[steps] - before
             size = np.fmax(frames[steps], before)

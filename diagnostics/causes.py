@@ -94,7 +94,8 @@ def _causes(
             against |= ~alike & ~found.silent
         explained = explain(faulty & ~aliased, alike & ~aliased, against, found.weight, layout, common)
         causes += [(kind, value, cause) for cause in explained]
-        yield
+        if faulty.sum() > 1:  # a single cell is soon explained
+            yield
     return causes
 
 

@@ -18,7 +18,6 @@ from scipy.special import expit
 
 from diagnostics.layout import SensorLayout
 from diagnostics.lessons import FOLDS, Lessons, Regressions
-from diagnostics.readings import Readings
 from diagnostics.rim import Foreseen, Rim, around
 from diagnostics.temporal import segments
 from diagnostics.tiles import Tile, foreseen_by
@@ -27,10 +26,8 @@ from diagnostics.touches import SEGMENT, Array, Scale, Summary, Touch, Touches
 _SAMPLES = 3000  # stretches of touches that the model is fitted on, about
 _MOST_DRAWS = 8  # stretches of one touch: more of them say the same
 _SHORTEST = 6  # frames of a stretch
-_RESTING_QUANTILE = 0.05  # of a cell's readings: where it rests
 _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
 _NOVEL = 0.1  # share of touches that resemble nothing known
-_BLOCK = 4096  # cells looked at together
 _AT_ONCE = 6144  # cells of stretches looked at between two pauses
 
 
@@ -128,18 +125,6 @@ def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:
     x = np.clip(x, -1e6, 1e6)
     u = x / np.sqrt(1 + x**2 / 4)
     return 0.5 + 0.375 * u * (1 - u**2 / 12)
-
-
-def resting(recordings: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return where each cell rests, ``[D]``: a low quantile of its readings; 0 for a cell without any."""
-    readings, n_cells = Readings.of(recordings), recordings[0].shape[1]
-    rest = np.zeros(n_cells)
-    for first in range(0, n_cells, _BLOCK):
-        cells = np.arange(first, min(first + _BLOCK, n_cells))
-        frames = np.concatenate([readings.piece(i, slice(None), cells) for i in range(len(readings))])
-        heard = ~np.isnan(frames).all(axis=0)
-        rest[cells[heard]] = np.nanquantile(frames[:, heard], _RESTING_QUANTILE, axis=0)
-    return rest
 
 
 def stretches(

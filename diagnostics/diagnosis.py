@@ -21,7 +21,7 @@ from diagnostics.stored import Arrays, reference_from_state, reference_state, we
 from diagnostics.verdicts import Diagnosis
 from diagnostics.weighing import Weights, faulty_at, kinds
 
-SCHEMA = "adaptfault.diagnoser/3"
+SCHEMA = "adaptfault.diagnoser/4"
 
 _SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
 _SUSPICIOUS_COLD = 3.0  # log evidence from which on a cell is not asked about the others, in a cold start
@@ -148,7 +148,7 @@ class SelfDiagnosis:
             transport=memory.stream.faults(scale.resting + scale.near, working, self.layout.rate),
             evidence={
                 "spatial": spatial.evidence + spatial.offset,
-                "temporal": np.where(spatial.asked, memory.jump(), unrest.blinking + unrest.noisy),
+                "temporal": np.where(spatial.asked, memory.temporal(), unrest.blinking + unrest.noisy),
                 "touches": spatial.touches.astype(np.float64),
             },
             n_frames=memory.stream.seen,
@@ -165,9 +165,9 @@ class SelfDiagnosis:
         """Weigh the evidence, and cut F; cells that are ``wrong`` (bool ``[D]``) have been explained already."""
         reference, runs, unrest = memory.reference, memory.runs, memory.unrest
         present, silent = memory.present, memory.present & ~memory.heard
-        jump, kind = memory.jump(), kinds(memory)
+        temporal, kind = memory.temporal(), kinds(memory)
         known = spatial.asked & ~runs.moved & (reference.dead > 0)
-        worth = self.weights_.worth(spatial.evidence, jump, kind)
+        worth = self.weights_.worth(spatial.evidence, temporal, kind)
         still = self.weights_.probability(worth, kind, spatial.asked & ~known)
         still[known] = reference.dead[known]
         intermittent, noisy = unrest.intermittent & present & ~wrong, unrest.excess & present & ~wrong
@@ -191,7 +191,7 @@ class SelfDiagnosis:
             since=np.select([intermittent, noisy, drifting], [unrest.blinks_since, unrest.noisy_since, 0], runs.start),
             probability=probability,
             # What the line hypothesis asks of a cell at rest is only whether touches speak against it.
-            weight=np.where(known, _KNOWN, self.weights_.worth(spatial.surprise, jump, kind)),
+            weight=np.where(known, _KNOWN, self.weights_.worth(spatial.surprise, temporal, kind)),
             touches=np.where(intermittent, unrest.blinks, spatial.touches),
             known=known,
         )

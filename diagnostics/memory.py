@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference
+from diagnostics.resting import less_than_healthy
 from diagnostics.spatial import Cells, Model, Spatial, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.temporal import StillRuns
@@ -100,9 +101,11 @@ class Memory:
         root = self.reference.scale.root_load(self.runs.value)
         return np.isfinite(self.runs.value) & (root <= self.reference.scale.root_near)
 
-    def jump(self) -> NDArray[np.float64]:
-        """What the jump into each cell's still stretch says, a log likelihood ratio ``[D]``."""
-        return self.reference.onsets.evidence(self.runs, self.layout.full_scale)
+    def temporal(self) -> NDArray[np.float64]:
+        """What each cell's still stretch says, and the jump into it, a log likelihood ratio ``[D]``."""
+        reference = self.reference
+        low = less_than_healthy(self.runs, reference.least, reference.tolerance, self.present)
+        return reference.onsets.evidence(self.runs, self.layout.full_scale) + low
 
     def model(self) -> Model:
         """What healthy cells would do; without a reference, as far as this log tells."""
@@ -135,7 +138,7 @@ class Memory:
         """What is known of the cells before the others are asked, but those that are known to be ``wrong``."""
         wrong = self.unrest.intermittent | self.unrest.excess | (False if wrong is None else wrong)
         sudden = self.reference.onsets.size(self.runs, self.layout.full_scale)
-        return Cells(self.runs, self.settled, self.jump(), sudden, self.present & self.heard & ~wrong)
+        return Cells(self.runs, self.settled, self.temporal(), sudden, self.present & self.heard & ~wrong)
 
     def _close(self) -> None:
         frames, numbers = self._buffer[: self._filled], self._numbers[: self._filled]

@@ -73,7 +73,7 @@ class PatchedMemory(Memory):
         assert touches is None, "touches belong to a patch here"
         # At first, of the cells around a patch, those that moved are asked.
         first = yield from self._judged(self.local, wrong, self.runs.moved)
-        suspected = first.asked & (first.evidence + self.jump() >= self.suspicious)
+        suspected = first.asked & (first.evidence + self.temporal() >= self.suspicious)
         return (yield from self._judged(self.local, wrong, ~suspected))
 
     def views(self, onset: int) -> Iterator[tuple[Array, NDArray[np.intp], NDArray[np.intp], Model]]:

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.contact import ContactModel, resting
+from diagnostics.contact import ContactModel
 from diagnostics.layout import SensorLayout
 from diagnostics.patch_models import contact_model
+from diagnostics.resting import resting
 from diagnostics.temporal import Onsets, segments
 from diagnostics.touches import SEGMENT, Scale
 from diagnostics.transport import longest_repetition
@@ -32,6 +33,7 @@ class Reference:
         tolerance: how near to a value counts as that value, in the layout's unit.
         scale: what a reading means.
         onsets: how abruptly healthy cells come to rest.
+        least: that a healthy cell reads, see ``resting``.
         patience: a frame that comes again more often than this says nothing new.
         usual: how restless healthy cells are.
         twins: how many witnesses two healthy lines ever had of being one.
@@ -42,6 +44,7 @@ class Reference:
     tolerance: float
     scale: Scale
     onsets: Onsets
+    least: float
     patience: int
     usual: Usual
     twins: int
@@ -54,10 +57,11 @@ class Reference:
     ) -> Reference:
         """Learn from fault-free recordings, ``[T, D]`` each; from cells that are ``dead`` in them (``[D]``) nothing."""
         tolerance = tolerance_of(recordings, layout)
-        rest = resting(recordings)
         dead = np.zeros(layout.n_cells) if dead is None else dead
         layout = living(layout, dead)
-        rest[dead > 0] = np.median(rest[layout.present.ravel()])  # where they would rest
+        present = layout.present.ravel()
+        rest, least = resting(recordings, present, tolerance, layout.full_scale)
+        rest[dead > 0] = np.median(rest[present])  # where they would rest
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
         onsets = Onsets.fit(recordings, tolerance, layout.full_scale)
         patience = max(_PATIENCE, 2 * max(longest_repetition(r) for r in recordings))
@@ -66,6 +70,7 @@ class Reference:
             tolerance,
             scale,
             onsets,
+            least,
             patience,
             Usual.fit(recordings, scale),
             _most_twins(recordings, layout, scale),
@@ -82,6 +87,7 @@ class Reference:
             tolerance,
             scale,
             Onsets.silent(),
+            -np.inf,
             2 * _PATIENCE,
             Usual.unknown(scale),
             _TWINS,

@@ -55,21 +55,21 @@ class Cells:
     Attributes:
         runs: the still stretch of each.
         settled: float, evidence from earlier touches, of the stretches that still go on.
-        jump: float, log likelihood ratio of the jump into it, where the cell jumped alone.
-        sudden: float, the same wherever it jumped.
+        temporal: float, log likelihood ratio of what it holds and of the jump into it, where the cell jumped alone.
+        sudden: float, that of the jump, wherever it jumped.
         askable: bool, where there is a cell that is not known to be faulty.
     """
 
     runs: StillRuns
     settled: Floats
-    jump: Floats
+    temporal: Floats
     sudden: Floats
     askable: Mask
 
     def of(self, cells: NDArray[np.intp]) -> Cells:
         """Return the same of some cells."""
         return Cells(
-            self.runs.of(cells), self.settled[cells], self.jump[cells], self.sudden[cells], self.askable[cells]
+            self.runs.of(cells), self.settled[cells], self.temporal[cells], self.sudden[cells], self.askable[cells]
         )
 
 
@@ -148,7 +148,7 @@ def stuck_evidence(
     # A load that came all of a sudden, and is still held: a quick grasp, or many cells broken at once. While this touch
     # lasts nobody can tell, so such cells are neither judged by it nor asked about the others.
     fresh = runs.start >= touches[-1].first
-    jumped = cells.jump >= _SUDDEN
+    jumped = cells.temporal >= _SUDDEN
     unsure = known.asked & ~values.rests & runs.moved & fresh & (cells.sudden >= _SUDDEN) & ~jumped
     asked, askable = known.asked & ~unsure, cells.askable & ~unsure
     held = np.flatnonzero(asked & ~values.rests)
@@ -165,7 +165,7 @@ def stuck_evidence(
         surprise = np.where(counted, -np.log(np.maximum(likely, _LEAST)), 0.0)
         brought = np.where(asked, cells.settled + surprise.sum(axis=0), 0.0)
         evidence = np.where(asked, values.prior + brought, 0.0)
-        asked_now, trusted = trusted, askable & (evidence + cells.jump < suspicious)
+        asked_now, trusted = trusted, askable & (evidence + cells.temporal < suspicious)
         if (trusted == asked_now).all():
             break
     moving = cells.askable & runs.moved & fresh & ~np.isnan(expected.spread)

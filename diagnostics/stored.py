@@ -49,6 +49,7 @@ def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
     about = {
         "tolerance": float(reference.tolerance),
         "near": float(reference.scale.near),
+        "least": float(reference.least) if np.isfinite(reference.least) else None,
         "patience": int(reference.patience),
         "blinks": float(reference.usual.blinks),
         "twins": int(reference.twins),
@@ -86,6 +87,7 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
         float(about["tolerance"]),
         scale,
         Onsets(read("onsets", unknown.onsets.log_ratio)),
+        -np.inf if about["least"] is None else float(about["least"]),
         int(about["patience"]),
         Usual(float(about["blinks"]), read("noise", unknown.usual.noise)),
         int(about["twins"]),
@@ -95,6 +97,8 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
     positive = (reference.tolerance, scale.near, reference.patience, reference.usual.blinks)
     if not (np.isfinite(positive).all() and min(positive) > 0):
         raise ValueError(f"expected positive numbers for tolerance, near, patience and blinks, got {positive}")
+    if np.isnan(reference.least):
+        raise ValueError("expected a number for least, got NaN")
     return reference
 
 

@@ -31,7 +31,7 @@ _DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
 _FEWEST_RECORDINGS = 8  # below that the reference cannot be split
 _PIECE = 100  # frames; longer recordings are cut, so that a single long one can be split too
 _LEARNED_SHARE = 0.75  # of the recordings teach what healthy looks like, the others make the logs
-_MOST_JUMP = 1.0  # what a jump may be worth, whatever the logs say: alone it proves nothing
+_MOST_TEMPORAL = 1.0  # what temporal evidence may be worth, whatever the logs say: a jump alone proves nothing
 _KINDS = 3
 _SUSPICIOUS = 2.8  # log likelihood ratio from which on a cell is left out when others are judged
 _SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw one
@@ -55,13 +55,13 @@ class Weights:
     Kind 0 never moved in the log, kind 1 came to rest, kind 2 came to hold a load. The defaults serve a cold start.
 
     Attributes:
-        offset, slope, jump: log odds = ``offset + slope * ratio + jump * ratio of the jump``, before how common faults
-            are; of each kind.
+        offset, slope, temporal: log odds = ``offset + slope * spatial ratio + temporal * temporal ratio``, before how
+            common faults are; of each kind.
     """
 
     offset: tuple[float, ...] = (0.0, -2.0, -2.0)
     slope: tuple[float, ...] = (0.6, 0.6, 0.6)
-    jump: tuple[float, ...] = (0.0, 0.5, 0.5)
+    temporal: tuple[float, ...] = (1.0, 0.5, 0.5)
 
     @classmethod
     def fit(cls, recordings: Sequence[Floats], layout: SensorLayout, *, seed: int = 0) -> Weights:
@@ -83,45 +83,44 @@ class Weights:
             onset = int(rng.uniform(0, 0.8) * len(log)) if i % 2 else None
             logs.append((log, _random_faults(layout, share, onset, rng)))
         # Evidence depends on who is suspected, and that on what evidence is worth: first roughly, then well.
-        weights = cls()
+        weights = usual = cls()
         for n in (n_logs // 3, n_logs):
             weights = cls._of([_trial(*log, layout, reference, weights.suspicious) for log in logs[:n]])
-        if weights == cls():
-            return weights
         held_out = len(order) - learned
         # Few meet the strange touches.
         counts = 1 - _DOUBT / (1 + (held_out / _STRANGE) ** 2)
-        return replace(weights, slope=tuple(counts * slope for slope in weights.slope))
+        slopes = zip(weights.slope, usual.slope, strict=True)
+        return replace(weights, slope=tuple(s if s == default else counts * s for s, default in slopes))
 
     @classmethod
     def _of(cls, trials: Sequence[_Trial]) -> Weights:
-        """Fit on trials; too few faults in them give the defaults."""
-        kind, ratio, jump, dead = (np.concatenate(column) for column in zip(*trials, strict=True))
-        evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), jump])
-        found = []
+        """Fit on trials; a kind of which they do not hold both broken and healthy cells keeps the defaults."""
+        kind, ratio, temporal, dead = (np.concatenate(column) for column in zip(*trials, strict=True))
+        evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
+        found = list(zip(*vars(cls()).values(), strict=True))
         for k in range(_KINDS):
             of, alike = kind == k, (kind > 0) == (k > 0)
-            if not (dead[of].any() and (~dead[of]).any()):
-                return cls()
-            found.append(_bounded_logistic(evidence[of], dead[of], float(logit(dead[alike].mean()))))
-        offsets, slopes, jumps = zip(*found, strict=True)
-        return cls(offsets, slopes, jumps) if min(slopes) > 0 else cls()
+            if dead[of].any() and (~dead[of]).any():
+                fitted = _bounded_logistic(evidence[of], dead[of], float(logit(dead[alike].mean())))
+                if fitted[1] > 0:
+                    found[k] = fitted
+        return cls(*zip(*found, strict=True))
 
     @property
     def suspicious(self) -> float:
         """The ratio from which on a cell is no longer asked about the others."""
         return float(np.clip((_SUSPICIOUS - self.offset[0]) / self.slope[0], *_SUSPICIOUS_BOUNDS))
 
-    def worth(self, ratio: Floats, jump: Floats, kind: NDArray[np.intp]) -> Floats:
+    def worth(self, ratio: Floats, temporal: Floats, kind: NDArray[np.intp]) -> Floats:
         """Return the calibrated log likelihood ratio faulty : healthy, ``[D]``.
 
         Args:
             ratio: float ``[D]``, spatial log likelihood ratio stuck : healthy.
-            jump: float ``[D]``, temporal log likelihood ratio.
+            temporal: float ``[D]``, temporal log likelihood ratio.
             kind: int ``[D]``, see the class.
         """
-        offset, slope, of_jump = (np.array(of)[kind] for of in (self.offset, self.slope, self.jump))
-        worth: Floats = offset + slope * np.clip(ratio, -_SURE, _SURE) + of_jump * jump
+        offset, slope, share = (np.array(of)[kind] for of in (self.offset, self.slope, self.temporal))
+        worth: Floats = offset + slope * np.clip(ratio, -_SURE, _SURE) + share * temporal
         return worth
 
     def probability(self, worth: Floats, kind: NDArray[np.intp], asked: NDArray[np.bool_]) -> Floats:
@@ -151,13 +150,13 @@ def _posterior(worth: Floats, expected: float, cells: float) -> Floats:
 
 
 def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) -> tuple[float, float, float]:
-    """Return offset, slope and the jump's weight of a logistic regression, within bounds.
+    """Return offset, slope and the weight of the temporal ratio of a logistic regression, within bounds.
 
     Evidence ``[n, 2]`` never speaks for what it speaks against, and none at all never speaks for a fault, however few
     healthy cells a small reference shows in this state.
 
     Args:
-        evidence: ratio and jump.
+        evidence: spatial and temporal ratio.
         dead: bool ``[n]``.
         base: log odds of a fault, before the evidence; how common faults were in these logs.
     """
@@ -171,9 +170,9 @@ def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) ->
         value = np.logaddexp(0, odds).sum() - odds[dead].sum() + 0.5 * (weights[1:] @ weights[1:]) / _LOOSE
         return float(value), x.T @ slack + np.array([0, *weights[1:]]) / _LOOSE
 
-    bounds = [(None, 0.0), (0.0, None), (0.0, _MOST_JUMP)]
-    offset, slope, jump = minimize(loss, np.array([0.0, 1.0, 0.5]), jac=True, bounds=bounds).x.tolist()
-    return offset, slope, jump
+    bounds = [(None, 0.0), (0.0, None), (0.0, _MOST_TEMPORAL)]
+    offset, slope, temporal = minimize(loss, np.array([0.0, 1.0, 0.5]), jac=True, bounds=bounds).x.tolist()
+    return offset, slope, temporal
 
 
 def kinds(memory: Memory) -> NDArray[np.intp]:
@@ -184,7 +183,7 @@ def kinds(memory: Memory) -> NDArray[np.intp]:
 def _trial(
     log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference, suspicious: float
 ) -> _Trial:
-    """Return kind, ratio and jump of each still cell ``[n]`` when ``faults`` are in a log, and which are broken."""
+    """Return kind and ratios of each still cell ``[n]`` when ``faults`` are in a log, and which are broken."""
     memory = remembering(layout, reference, suspicious)
     memory.extend(inject(log, faults, layout))
     memory = memory.complete()
@@ -192,7 +191,7 @@ def _trial(
     broken = np.zeros(layout.n_cells, bool)
     broken[[c for fault in faults for c in fault.cells]] = True
     asked = spatial.asked
-    return kinds(memory)[asked], spatial.evidence[asked], memory.jump()[asked], broken[asked]
+    return kinds(memory)[asked], spatial.evidence[asked], memory.temporal()[asked], broken[asked]
 
 
 def faulty_at(probability: Floats, false_discovery_rate: float) -> NDArray[np.bool_]:

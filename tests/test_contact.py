@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from diagnostics import SensorLayout
-from diagnostics.contact import ContactModel, Expected, resting, stretches
+from diagnostics.contact import ContactModel, Expected, stretches
 from diagnostics.memory import finished
 from diagnostics.patch_models import contact_model
 from diagnostics.touches import Scale
@@ -97,19 +97,9 @@ def test_a_cell_that_was_never_loaded_is_expected_to_stay_so(model, unseen):
 
 def test_cells_may_rest_at_any_value():
     offset = np.linspace(0, 2, 12)
-    shifted = [r + offset for r in blobs(0)]
-    rest = resting(shifted)
-    np.testing.assert_allclose(rest, offset)
-    moved = stretches(shifted, Scale(rest, 0.05, 5.0), np.random.default_rng(0))[0]
+    moved = stretches([r + offset for r in blobs(0)], Scale(offset, 0.05, 5.0), np.random.default_rng(0))[0]
     plain = stretches(blobs(0), SCALE, np.random.default_rng(0))[0]
     np.testing.assert_allclose(moved, plain, atol=1e-3)
-
-
-def test_a_cell_that_was_never_heard_rests_at_0():
-    log = np.full((30, 3), 0.4)
-    log[:, 1] = np.nan
-    log[::2, 2] = np.nan
-    assert resting([log]).tolist() == pytest.approx([0.4, 0, 0.4])
 
 
 def test_a_wider_range_of_loads_is_likelier_and_that_of_an_unknown_cell_is_certain():

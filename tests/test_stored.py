@@ -112,7 +112,7 @@ def test_an_array_that_is_missing_misshapen_or_not_finite_is_refused_by_name(arr
         ({"layout": None}, "damaged"),
         ({"false_discovery_rate": None}, "damaged"),
         ({"weights": {}}, "offset"),
-        ({"weights": {"offset": [0, 0], "slope": [1, 1, 1], "jump": [0, 0, 0]}}, "offset"),
+        ({"weights": {"offset": [0, 0], "slope": [1, 1, 1], "temporal": [0, 0, 0]}}, "offset"),
         ({"reference": {}}, "missing"),
         ({"reference": 3}, "damaged"),
     ],

@@ -138,7 +138,7 @@ class SelfDiagnosis:
             cells = list(fault.cells)
             probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
             inferred[cells] = True
-        scale, unrest = memory.reference.scale, memory.unrest
+        scale, unrest = memory.scale, memory.unrest
         working = found.alive & ~inferred
         return Diagnosis(
             layout=self.layout,

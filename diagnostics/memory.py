@@ -18,8 +18,9 @@ from diagnostics.reference import Reference
 from diagnostics.resting import less_than_healthy
 from diagnostics.spatial import Cells, Model, Spatial, stuck_evidence
 from diagnostics.surroundings import Surroundings
+from diagnostics.tare import Tare
 from diagnostics.temporal import StillRuns
-from diagnostics.touches import SEGMENT, Array, Touches
+from diagnostics.touches import SEGMENT, Array, Scale, Touches
 from diagnostics.transport import Stream
 from diagnostics.twins import Twins, telling
 from diagnostics.unrest import Unrest
@@ -42,6 +43,7 @@ class Memory:
         settled: float ``[D]``, evidence from touches that are gone, of the stretches that still go on.
         unrest: blinks and noise.
         twins: lines that read alike.
+        scale: what a reading means, as offsets are now.
     """
 
     def __init__(self, layout: SensorLayout, reference: Reference, suspicious: float) -> None:
@@ -54,6 +56,8 @@ class Memory:
         self.unrest = Unrest.begin(layout.n_cells)
         self.twins = Twins.begin(layout)
         self.heard = np.zeros(layout.n_cells, bool)
+        self.scale: Scale = reference.scale
+        self._tare = Tare.begin(layout.n_cells)
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
         self._filled = 0
@@ -98,8 +102,7 @@ class Memory:
 
     def rests(self) -> NDArray[np.bool_]:
         """Where a cell reads now, or held still at, what an untouched one reads, bool ``[D]``."""
-        root = self.reference.scale.root_load(self.runs.value)
-        return np.isfinite(self.runs.value) & (root <= self.reference.scale.root_near)
+        return np.isfinite(self.runs.value) & (self.scale.root_load(self.runs.value) <= self.scale.root_near)
 
     def temporal(self) -> NDArray[np.float64]:
         """What each cell's still stretch says, and the jump into it, a log likelihood ratio ``[D]``."""
@@ -130,7 +133,7 @@ class Memory:
         """
         touches = self.touches if touches is None else touches
         return stuck_evidence(
-            touches.kept, self.cells(wrong), self.model(), self.reference.scale, self.reference.tolerance,
+            touches.kept, self.cells(wrong), self.model(), self.scale, self.reference.tolerance,
             self.suspicious,
         )  # fmt: skip
 
@@ -148,8 +151,10 @@ class Memory:
         self.heard = self.heard | np.isfinite(self.runs.last)
         # Evidence belongs to a stretch, and ends with it.
         self.settled = np.where(self.runs.start == start, self.settled, 0.0)
-        scale = self.reference.scale
-        root, still = scale.root_load(frames), self.runs.start <= numbers[0]
+        of_all, of_one = self.reference.offsets
+        self._tare = self._tare.extend(frames, self.reference.scale, self.present, of_all)
+        self.scale = scale = self._tare.on(self.reference.scale, of_one)
+        root, still = scale.root_load(self._tare.off(frames)), self.runs.start <= numbers[0]
         self._remember(root, numbers, still)
         self.unrest = self.unrest.extend(frames, root, numbers, scale, self.reference.usual, still)
         self.twins = self.twins.extend(self._comparable(frames), numbers, telling(frames, still, scale), scale.near)
@@ -159,7 +164,7 @@ class Memory:
         return len(self.touches.kept) > MOST_TOUCHES
 
     def _remember(self, root: Array, numbers: NDArray[np.intp], still: NDArray[np.bool_]) -> None:
-        self.touches = self.touches.extend(root, numbers, self.reference.scale.root_near, still)
+        self.touches = self.touches.extend(root, numbers, self.scale.root_near, still)
 
     def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
         return frames

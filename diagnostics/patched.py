@@ -107,7 +107,7 @@ class PatchedMemory(Memory):
             asked = around[cells]
             asked[patch.place] = True
             model = _Trusting(self.model_of(i, touches), asked)
-            scale, tolerance = self.reference.scale.of(cells), self.reference.tolerance
+            scale, tolerance = self.scale.of(cells), self.reference.tolerance
             of_patch = finished(stuck_evidence(touches.kept, every.of(cells), model, scale, tolerance, self.suspicious))
             for name, values in vars(of_patch).items():
                 getattr(total, name)[patch.outputs] = values[patch.place]
@@ -120,7 +120,7 @@ class PatchedMemory(Memory):
         return any(len(touches.kept) > MOST_TOUCHES for touches in self.local.of)
 
     def _remember(self, root: Array, numbers: NDArray[np.intp], still: Mask) -> None:
-        self.local = self.local.extend(root, numbers, self.reference.scale.root_near, still)
+        self.local = self.local.extend(root, numbers, self.scale.root_near, still)
 
     def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
         # On a line of a hundred cells one is always dead: what never moved does not tell two lines apart.

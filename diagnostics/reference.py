@@ -12,6 +12,7 @@ from diagnostics.contact import ContactModel
 from diagnostics.layout import SensorLayout
 from diagnostics.patch_models import contact_model
 from diagnostics.resting import resting
+from diagnostics.tare import usual_offsets
 from diagnostics.temporal import Onsets, segments
 from diagnostics.touches import SEGMENT, Scale
 from diagnostics.transport import longest_repetition
@@ -34,6 +35,7 @@ class Reference:
         scale: what a reading means.
         onsets: how abruptly healthy cells come to rest.
         least: that a healthy cell reads, see ``resting``.
+        offsets: of all cells and of single ones, that are usual, see ``tare``.
         patience: a frame that comes again more often than this says nothing new.
         usual: how restless healthy cells are.
         twins: how many witnesses two healthy lines ever had of being one.
@@ -45,6 +47,7 @@ class Reference:
     scale: Scale
     onsets: Onsets
     least: float
+    offsets: tuple[float, float]
     patience: int
     usual: Usual
     twins: int
@@ -71,6 +74,7 @@ class Reference:
             scale,
             onsets,
             least,
+            usual_offsets(recordings, scale, present),
             patience,
             Usual.fit(recordings, scale),
             _most_twins(recordings, layout, scale),
@@ -88,6 +92,7 @@ class Reference:
             scale,
             Onsets.silent(),
             -np.inf,
+            (tolerance, tolerance),
             2 * _PATIENCE,
             Usual.unknown(scale),
             _TWINS,

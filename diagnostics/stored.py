@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,7 @@ def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
         "least": float(reference.least) if np.isfinite(reference.least) else None,
         "patience": int(reference.patience),
         "blinks": float(reference.usual.blinks),
+        "offsets": list(reference.offsets),
         "twins": int(reference.twins),
         "surest": None if reference.model is None else [float(tile.surest) for tile in reference.model.tiles],
         "rim": bool(reference.model and reference.model.rim),
@@ -88,6 +89,7 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
         scale,
         Onsets(read("onsets", unknown.onsets.log_ratio)),
         -np.inf if about["least"] is None else float(about["least"]),
+        _offsets(about["offsets"]),
         int(about["patience"]),
         Usual(float(about["blinks"]), read("noise", unknown.usual.noise)),
         int(about["twins"]),
@@ -100,6 +102,13 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
     if np.isnan(reference.least):
         raise ValueError("expected a number for least, got NaN")
     return reference
+
+
+def _offsets(given: Sequence[float]) -> tuple[float, float]:
+    of_all, of_one = map(float, given)
+    if not (of_all >= 0 and of_one >= 0):
+        raise ValueError(f"expected two numbers >= 0 for offsets, got {given}")
+    return of_all, of_one
 
 
 def _model(about: Mapping[str, Any], arrays: Mapping[str, ArrayLike], layout: SensorLayout) -> ContactModel:

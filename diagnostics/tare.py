@@ -1,0 +1,100 @@
+"""Offsets that have moved since the reference was recorded, as with temperature, told from touches and taken off.
+
+What moves all cells is seen at those that are loaded least; what moves a single one, at its own lowest reading in the
+log. Small offsets only, and larger ones than the reference itself shows: a cell that reads more all the time is loaded,
+or broken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.readings import Readings
+from diagnostics.touches import Scale
+
+_LEAST_LOADED = 0.25  # share of the cells that is hardly ever loaded all at once, and more than are open
+_COMMON, _OWN = 0.05, 0.02  # of full scale: the largest offset of all cells together, and of one beside that
+_USUAL = 0.95  # quantile of the offsets in the reference
+_RECORDINGS, _FRAMES, _CELLS = 200, 20, 2000  # that tell them, about; frames of each recording
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Tare:
+    """How far untouched cells now read above where they rested in the reference.
+
+    Attributes:
+        common: of all cells together, in each of the last frames ``[t]``.
+        lowest: float ``[D]``, the lowest reading of each so far above that; inf where there was none.
+    """
+
+    common: Floats
+    lowest: Floats
+
+    @classmethod
+    def begin(cls, n_cells: int) -> Tare:
+        """Nothing seen yet."""
+        return cls(np.zeros(1), np.full(n_cells, np.inf))
+
+    def extend(self, frames: Floats, scale: Scale, present: NDArray[np.bool_], usual: float) -> Tare:
+        """Return the offsets after more frames.
+
+        Args:
+            frames: ``[t, D]``, NaN = missing.
+            scale: where cells rested in the reference.
+            present: bool ``[D]``.
+            usual: offset of all cells that is as in the reference.
+        """
+        above = frames - scale.resting
+        # Mostly there is none: enough cells read no more than usual all through.
+        calm = np.fmax.reduce(above) <= usual
+        if (calm & present).sum() > _LEAST_LOADED * present.sum():
+            common = np.zeros(len(frames))
+        else:
+            common = np.array([_common(frame) for frame in above[:, present]])
+            common[(common <= usual) | (common >= _COMMON * scale.full_scale)] = 0.0
+            above = above - common[:, None]
+        return Tare(common, np.fmin(self.lowest, np.fmin.reduce(above)))
+
+    def on(self, scale: Scale, usual: float) -> Scale:
+        """Return where cells rest now; offsets of single ones up to ``usual`` are as in the reference."""
+        own = np.where((self.lowest > usual) & (self.lowest < _OWN * scale.full_scale), self.lowest, 0.0)
+        now = self.common[-1] + own
+        return replace(scale, resting=scale.resting + now) if now.any() else scale
+
+    def off(self, frames: Floats) -> Floats:
+        """Return the last frames ``[t, D]`` with the offset of the last of them throughout."""
+        drift = self.common - self.common[-1]
+        return frames - drift[:, None] if drift.any() else frames
+
+
+def usual_offsets(recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the largest offsets, of all cells and of single ones, that are usual in a reference, ``[T, D]`` each."""
+    readings, cells = Readings.of(recordings), np.flatnonzero(present)
+    cells = cells[:: max(1, len(cells) // _CELLS)]
+    common, own = [], []
+    for i in range(0, len(readings), max(1, len(readings) // _RECORDINGS)):
+        frames = readings.piece(i, slice(None), cells)
+        if len(frames):
+            above = frames - scale.resting[cells]
+            common += [_common(frame) for frame in above[:: max(1, len(above) // _FRAMES)]]
+            own.append(np.fmin.reduce(above))
+    light = np.concatenate(own) if own else np.zeros(0)
+    light = light[light < _OWN * scale.full_scale]
+    within = scale.near / 2
+    return (
+        max(within, float(np.quantile(common, _USUAL)) if common else 0.0),
+        max(within, float(np.quantile(light, _USUAL)) if len(light) else 0.0),
+    )
+
+
+def _common(above: Floats) -> float:
+    """Return how far the cells that are loaded least are above their rest, from that of all, ``[n]``."""
+    heard = above[np.isfinite(above)]
+    k = int(_LEAST_LOADED * (len(heard) - 1))
+    return float(np.partition(heard, k)[k]) if len(heard) else 0.0

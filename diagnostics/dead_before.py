@@ -16,6 +16,7 @@ from scipy.ndimage import label
 
 from diagnostics.layout import SensorLayout
 from diagnostics.readings import Readings
+from diagnostics.resting import resting
 from diagnostics.verdicts import Diagnosis
 
 _PIECES, _FRAMES = 60, 200  # of the reference that are diagnosed, at most, spread evenly; frames of each
@@ -28,7 +29,7 @@ def dead_before(
     recordings: Readings,
     layout: SensorLayout,
     tolerance: float,
-    diagnose: Callable[[Readings, NDArray[np.bool_]], Diagnosis],
+    diagnose: Callable[[Readings, NDArray[np.bool_], NDArray[np.float64]], Diagnosis],
 ) -> NDArray[np.float64]:
     """Return P(dead) of the cells that are dead throughout the reference, ``[D]``; 0 for all others.
 
@@ -36,7 +37,8 @@ def dead_before(
         recordings: the reference.
         layout: the array.
         tolerance: how far the reading of a cell that does not move may wander to either side.
-        diagnose: a diagnosis without a reference, of the cells in question (bool ``[D]``) at least.
+        diagnose: a diagnosis without a reference, but for where cells rest (float ``[D]``), of the cells in question
+            (bool ``[D]``) at least.
     """
     present = layout.present.ravel()
     never_moved = present & _still(recordings, 2 * tolerance)
@@ -45,7 +47,11 @@ def dead_before(
     suspects = _enclosed(never_moved, layout)
     if not suspects.any():
         return np.zeros(layout.n_cells)
-    found = diagnose(_sample(recordings), suspects)
+    rest, _ = resting(recordings, present & ~never_moved, tolerance, layout.full_scale)
+    usual = rest[present & ~never_moved]
+    # A cell that holds more than any rests at is loaded, or dead.
+    rest = np.where(rest > usual.max(), np.median(usual), rest)
+    found = diagnose(_sample(recordings), suspects, rest)
     dead = never_moved & found.fault_set.mask & (found.probability >= _SURE)
     return np.where(dead, found.probability, 0.0)
 

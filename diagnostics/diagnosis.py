@@ -58,8 +58,7 @@ class SelfDiagnosis:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
         healthy = _recordings(recordings, self.layout)
-        cold = SelfDiagnosis(self.layout)
-        dead = dead_before(healthy, self.layout, tolerance_of(healthy, self.layout), cold._diagnosed)
+        dead = dead_before(healthy, self.layout, tolerance_of(healthy, self.layout), self._diagnosed_cold)
         self.reference_ = Reference.fit(healthy, self.layout, dead)
         self.weights_ = Weights.fit(healthy, living(self.layout, dead))
         return self
@@ -110,9 +109,9 @@ class SelfDiagnosis:
 
     def memory(self, needed: NDArray[np.bool_] | None = None) -> Memory:
         """Return an empty memory, to be fed with a log and judged; see ``patched.remembering``."""
-        if self.reference_ is None:
-            return remembering(self.layout, Reference.unknown(self.layout), _SUSPICIOUS_COLD, needed)
-        return remembering(self.layout, self.reference_, self.weights_.suspicious, needed)
+        reference = self.reference_ or Reference.unknown(self.layout)
+        suspicious = self.weights_.suspicious if reference.model else _SUSPICIOUS_COLD
+        return remembering(self.layout, reference, suspicious, needed)
 
     def judge(self, memory: Memory, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
         """Judge every cell from what is remembered of a log.
@@ -161,6 +160,12 @@ class SelfDiagnosis:
             memory.extend(frames)
         return finished(self.judge(memory, n_recordings=len(log)))
 
+    def _diagnosed_cold(self, log: Readings, needed: NDArray[np.bool_], rest: NDArray[np.float64]) -> Diagnosis:
+        """Judge cells that are ``needed`` by those around them, as far as the log tells; they ``rest`` there."""
+        cold = SelfDiagnosis(self.layout)
+        cold.reference_ = Reference.unknown(self.layout, rest)
+        return cold._diagnosed(log, needed)
+
     def _found(self, memory: Memory, spatial: Spatial, wrong: NDArray[np.bool_]) -> Findings:
         """Weigh the evidence, and cut F; cells that are ``wrong`` (bool ``[D]``) have been explained already."""
         reference, runs, unrest = memory.reference, memory.runs, memory.unrest
@@ -179,8 +184,8 @@ class SelfDiagnosis:
         value, rests = runs.value, spatial.asked & memory.rests()
         return Findings(
             faulty=faulty,
-            # A cell that moved works, unless something speaks against what it does since.
-            alive=present & ~wrong & ~faulty & runs.moved & (probability < _DOUBTED),
+            # A cell that a load moved works, unless something speaks against what it does since.
+            alive=present & ~wrong & ~faulty & runs.moved & memory.touched & (probability < _DOUBTED),
             silent=silent,
             rests=rests,
             full=spatial.asked & ~rests & (value >= self.layout.full_scale - 2 * reference.tolerance),

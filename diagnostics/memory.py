@@ -43,6 +43,7 @@ class Memory:
         settled: float ``[D]``, evidence from touches that are gone, of the stretches that still go on.
         unrest: blinks and noise.
         twins: lines that read alike.
+        heard, touched: bool ``[D]``, cells that read something, and more than untouched ones do.
         scale: what a reading means, as offsets are now.
     """
 
@@ -56,6 +57,7 @@ class Memory:
         self.unrest = Unrest.begin(layout.n_cells)
         self.twins = Twins.begin(layout)
         self.heard = np.zeros(layout.n_cells, bool)
+        self.touched = np.zeros(layout.n_cells, bool)
         self.scale: Scale = reference.scale
         self._tare = Tare.begin(layout.n_cells)
         self._buffer = np.empty((SEGMENT, layout.n_cells))
@@ -151,10 +153,10 @@ class Memory:
         self.heard = self.heard | np.isfinite(self.runs.last)
         # Evidence belongs to a stretch, and ends with it.
         self.settled = np.where(self.runs.start == start, self.settled, 0.0)
-        of_all, of_one = self.reference.offsets
-        self._tare = self._tare.extend(frames, self.reference.scale, self.present, of_all)
-        self.scale = scale = self._tare.on(self.reference.scale, of_one)
+        self._tare = self._tare.extend(frames, self.reference.scale, self.present, self.reference.offsets)
+        self.scale = scale = self._tare.on(self.reference.scale)
         root, still = scale.root_load(self._tare.off(frames)), self.runs.start <= numbers[0]
+        self.touched = self.touched | root.any(axis=0)
         self._remember(root, numbers, still)
         self.unrest = self.unrest.extend(frames, root, numbers, scale, self.reference.usual, still)
         self.twins = self.twins.extend(self._comparable(frames), numbers, telling(frames, still, scale), scale.near)

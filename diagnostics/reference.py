@@ -12,7 +12,7 @@ from diagnostics.contact import ContactModel
 from diagnostics.layout import SensorLayout
 from diagnostics.patch_models import contact_model
 from diagnostics.resting import resting
-from diagnostics.tare import usual_offsets
+from diagnostics.tare import Offsets, usual_offsets
 from diagnostics.temporal import Onsets, segments
 from diagnostics.touches import SEGMENT, Scale
 from diagnostics.transport import longest_repetition
@@ -35,7 +35,7 @@ class Reference:
         scale: what a reading means.
         onsets: how abruptly healthy cells come to rest.
         least: that a healthy cell reads, see ``resting``.
-        offsets: of all cells and of single ones, that are usual, see ``tare``.
+        offsets: that are usual.
         patience: a frame that comes again more often than this says nothing new.
         usual: how restless healthy cells are.
         twins: how many witnesses two healthy lines ever had of being one.
@@ -47,7 +47,7 @@ class Reference:
     scale: Scale
     onsets: Onsets
     least: float
-    offsets: tuple[float, float]
+    offsets: Offsets
     patience: int
     usual: Usual
     twins: int
@@ -83,16 +83,17 @@ class Reference:
         )
 
     @classmethod
-    def unknown(cls, layout: SensorLayout) -> Reference:
-        """Stand in for a reference: untouched cells read 0, and jumps say nothing."""
+    def unknown(cls, layout: SensorLayout, rest: NDArray[np.float64] | None = None) -> Reference:
+        """Stand in for a reference: untouched cells read ``rest`` (``[D]``; None: 0), and jumps say nothing."""
         tolerance = _TOLERANCE * layout.full_scale
-        scale = Scale(np.zeros(layout.n_cells), 2 * tolerance, layout.full_scale)
+        rest = np.zeros(layout.n_cells) if rest is None else rest
+        scale = Scale(rest, 2 * tolerance, layout.full_scale)
         return cls(
             tolerance,
             scale,
             Onsets.silent(),
             -np.inf,
-            (tolerance, tolerance),
+            Offsets(tolerance, tolerance),
             2 * _PATIENCE,
             Usual.unknown(scale),
             _TWINS,

@@ -22,6 +22,7 @@ _LIGHT = 0.05  # of full scale: a cell that never read less above its rest than 
 _CALM = 0.25  # quantile of the noise of cells in recordings: touched cells have more
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
 _RARE = 0.001  # of the cells in recordings: what so few did is taken for none
+_WORTH = 10.0  # log likelihood ratio of reading less than any healthy cell
 _CROWD = 0.5  # share of the cells: when so many read less than ever, their offset has moved
 _BLOCK = 4096  # cells looked at together
 _RECORDINGS, _CELLS = 200, 2000  # that tell wander and noise, about
@@ -69,7 +70,7 @@ def less_than_healthy(runs: StillRuns, least: float, tolerance: float, present: 
     """Return what holding less than the ``least`` of any healthy cell says, a log likelihood ratio ``[D]``."""
     value = np.nan_to_num(runs.value, nan=np.inf)
     less = present & (runs.length >= SEGMENT) & (value < least - 2 * tolerance)
-    return np.where(less & (less.sum() <= _CROWD * present.sum()), -np.log(_RARE), 0.0)
+    return np.where(less & (less.sum() <= _CROWD * present.sum()), _WORTH, 0.0)
 
 
 def _low(recordings: Sequence[Floats]) -> Floats:

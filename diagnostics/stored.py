@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from diagnostics.contact import ContactModel
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference, living
 from diagnostics.rim import INPUTS, Rim
+from diagnostics.tare import Offsets
 from diagnostics.temporal import Onsets
 from diagnostics.tiles import Tile
 from diagnostics.touches import Scale
@@ -52,7 +53,7 @@ def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
         "least": float(reference.least) if np.isfinite(reference.least) else None,
         "patience": int(reference.patience),
         "blinks": float(reference.usual.blinks),
-        "offsets": list(reference.offsets),
+        "offsets": vars(reference.offsets),
         "twins": int(reference.twins),
         "surest": None if reference.model is None else [float(tile.surest) for tile in reference.model.tiles],
         "rim": bool(reference.model and reference.model.rim),
@@ -89,7 +90,7 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
         scale,
         Onsets(read("onsets", unknown.onsets.log_ratio)),
         -np.inf if about["least"] is None else float(about["least"]),
-        _offsets(about["offsets"]),
+        Offsets(float(about["offsets"]["common"]), float(about["offsets"]["own"])),
         int(about["patience"]),
         Usual(float(about["blinks"]), read("noise", unknown.usual.noise)),
         int(about["twins"]),
@@ -99,16 +100,9 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
     positive = (reference.tolerance, scale.near, reference.patience, reference.usual.blinks)
     if not (np.isfinite(positive).all() and min(positive) > 0):
         raise ValueError(f"expected positive numbers for tolerance, near, patience and blinks, got {positive}")
-    if np.isnan(reference.least):
-        raise ValueError("expected a number for least, got NaN")
+    if np.isnan([reference.least, *vars(reference.offsets).values()]).any():
+        raise ValueError("expected numbers for least and offsets, got NaN")
     return reference
-
-
-def _offsets(given: Sequence[float]) -> tuple[float, float]:
-    of_all, of_one = map(float, given)
-    if not (of_all >= 0 and of_one >= 0):
-        raise ValueError(f"expected two numbers >= 0 for offsets, got {given}")
-    return of_all, of_one
 
 
 def _model(about: Mapping[str, Any], arrays: Mapping[str, ArrayLike], layout: SensorLayout) -> ContactModel:

@@ -25,46 +25,57 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Offsets:
+    """Offsets that mean nothing: of all cells together, and of a single one."""
+
+    common: float
+    own: float
+
+
+@dataclass(frozen=True)
 class Tare:
     """How far untouched cells now read above where they rested in the reference.
 
     Attributes:
-        common: of all cells together, in each of the last frames ``[t]``.
-        lowest: float ``[D]``, the lowest reading of each so far above that; inf where there was none.
+        lowest: float ``[D]``, the lowest reading of each cell in the log, above that; inf where there was none.
+        own: float ``[D]``, the offset of each cell that follows from it.
+        common: that of all cells together, beside their own, in each of the last frames ``[t]``.
     """
 
-    common: Floats
     lowest: Floats
+    own: Floats
+    common: Floats
 
     @classmethod
     def begin(cls, n_cells: int) -> Tare:
         """Nothing seen yet."""
-        return cls(np.zeros(1), np.full(n_cells, np.inf))
+        return cls(np.full(n_cells, np.inf), np.zeros(n_cells), np.zeros(1))
 
-    def extend(self, frames: Floats, scale: Scale, present: NDArray[np.bool_], usual: float) -> Tare:
+    def extend(self, frames: Floats, scale: Scale, present: NDArray[np.bool_], usual: Offsets) -> Tare:
         """Return the offsets after more frames.
 
         Args:
             frames: ``[t, D]``, NaN = missing.
             scale: where cells rested in the reference.
             present: bool ``[D]``.
-            usual: offset of all cells that is as in the reference.
+            usual: offsets that are as in the reference.
         """
         above = frames - scale.resting
-        # Mostly there is none: enough cells read no more than usual all through.
-        calm = np.fmax.reduce(above) <= usual
+        lowest = np.fmin(self.lowest, np.fmin.reduce(above))
+        own = np.where((lowest > usual.own) & (lowest < _OWN * scale.full_scale), lowest, 0.0)
+        if own.any():
+            above -= own
+        # Mostly all cells together have none: enough of them read no more than usual all through.
+        calm = np.fmax.reduce(above) <= usual.common
         if (calm & present).sum() > _LEAST_LOADED * present.sum():
-            common = np.zeros(len(frames))
-        else:
-            common = np.array([_common(frame) for frame in above[:, present]])
-            common[(common <= usual) | (common >= _COMMON * scale.full_scale)] = 0.0
-            above = above - common[:, None]
-        return Tare(common, np.fmin(self.lowest, np.fmin.reduce(above)))
+            return Tare(lowest, own, np.zeros(len(frames)))
+        common = np.array([_common(frame) for frame in above[:, present]])
+        common[(common <= usual.common) | (common >= _COMMON * scale.full_scale)] = 0.0
+        return Tare(lowest, own, common)
 
-    def on(self, scale: Scale, usual: float) -> Scale:
-        """Return where cells rest now; offsets of single ones up to ``usual`` are as in the reference."""
-        own = np.where((self.lowest > usual) & (self.lowest < _OWN * scale.full_scale), self.lowest, 0.0)
-        now = self.common[-1] + own
+    def on(self, scale: Scale) -> Scale:
+        """Return where cells rest now."""
+        now = self.own + self.common[-1]
         return replace(scale, resting=scale.resting + now) if now.any() else scale
 
     def off(self, frames: Floats) -> Floats:
@@ -73,8 +84,8 @@ class Tare:
         return frames - drift[:, None] if drift.any() else frames
 
 
-def usual_offsets(recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_]) -> tuple[float, float]:
-    """Return the largest offsets, of all cells and of single ones, that are usual in a reference, ``[T, D]`` each."""
+def usual_offsets(recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_]) -> Offsets:
+    """Return the largest offsets that are usual in a reference, recordings ``[T, D]`` each."""
     readings, cells = Readings.of(recordings), np.flatnonzero(present)
     cells = cells[:: max(1, len(cells) // _CELLS)]
     common, own = [], []
@@ -87,7 +98,7 @@ def usual_offsets(recordings: Sequence[Floats], scale: Scale, present: NDArray[n
     light = np.concatenate(own) if own else np.zeros(0)
     light = light[light < _OWN * scale.full_scale]
     within = scale.near / 2
-    return (
+    return Offsets(
         max(within, float(np.quantile(common, _USUAL)) if common else 0.0),
         max(within, float(np.quantile(light, _USUAL)) if len(light) else 0.0),
     )

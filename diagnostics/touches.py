@@ -45,7 +45,8 @@ class Scale:
         A missing reading counts as resting.
         """
         load = ((frames - self.resting) / self.full_scale).astype(np.float32)
-        root: Array = np.sqrt(np.fmax(load, 0))  # fmax: not a number counts as none
+        # What rests is no load at all, so that a little noise at rest means nothing. Not a number counts as none.
+        root: Array = np.sqrt(np.where(load > np.float32(self.near / self.full_scale), load, np.float32(0)))
         return root
 
     def of(self, cells: NDArray[np.intp]) -> Scale:

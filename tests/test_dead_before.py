@@ -24,7 +24,7 @@ DEAD = {OPEN, SHORT, STUCK}
 def looked_for(recordings: list[np.ndarray], layout: SensorLayout = LAYOUT) -> np.ndarray:
     readings = Readings(recordings)
     return dead_before(
-        readings, layout, tolerance_of(readings, layout), lambda log, _: SelfDiagnosis(layout).diagnose(list(log))
+        readings, layout, tolerance_of(readings, layout), lambda log, *_: SelfDiagnosis(layout).diagnose(list(log))
     )
 
 
@@ -109,11 +109,11 @@ def test_of_a_large_skin_only_what_lies_around_suspects_is_judged_and_tells_the_
         recording[:, dead] = 0
     asked_about: list[np.ndarray] = []
 
-    def all_of(log: Readings, needed: np.ndarray) -> Diagnosis:
+    def all_of(log: Readings, needed: np.ndarray, _: np.ndarray) -> Diagnosis:
         asked_about.append(needed)
         return SelfDiagnosis(skin).diagnose(list(log))
 
-    def some_of(log: Readings, needed: np.ndarray) -> Diagnosis:
+    def some_of(log: Readings, needed: np.ndarray, _: np.ndarray) -> Diagnosis:
         cold = SelfDiagnosis(skin)
         memory = cold.memory(needed)
         for frames in log:

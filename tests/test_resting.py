@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+
+from diagnostics import Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
+from diagnostics.resting import less_than_healthy, resting
+from diagnostics.temporal import StillRuns
+
+LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
+CELLS, PRESENT = LAYOUT.n_cells, np.ones(LAYOUT.n_cells, bool)
+TOLERANCE = 0.005
+
+
+def touches(seed: int, recordings: int = 24, frames: int = 64) -> list[np.ndarray]:
+    """Presses that come and go somewhere in the upper half; what they do not reach reads exactly 0."""
+    rng, places = np.random.default_rng(seed), np.argwhere(np.ones((8, 8)))
+    found = []
+    for _ in range(recordings):
+        press = np.clip(1 - ((places - rng.uniform((0, 0), (3, 7))) ** 2).sum(axis=1) / 6, 0, None)
+        found.append(0.6 * np.clip(np.sin(np.linspace(0, 3 * np.pi, frames)), 0, None)[:, None] * press)
+    return found
+
+
+def noisy(recordings: list[np.ndarray], sigma: float, rest: float, seed: int = 9) -> list[np.ndarray]:
+    """The same from a skin with noise, whose cells rest at ``rest`` or somewhat more."""
+    rng = np.random.default_rng(seed)
+    offset = np.random.default_rng(1).uniform(rest, 1.5 * rest, CELLS)
+    return [np.clip(r + offset + sigma * rng.standard_normal(r.shape), 0, 1) for r in recordings]
+
+
+def test_a_skin_that_thresholds_rests_at_its_one_value():
+    most, least = resting(touches(0), PRESENT, TOLERANCE, 1.0)
+    np.testing.assert_array_equal(most, np.zeros(CELLS))
+    assert least == 0
+
+
+def test_noise_at_rest_is_no_load():
+    most, least = resting(noisy(touches(0), 0.01, 0.1), PRESENT, TOLERANCE, 1.0)
+    idle = noisy([np.zeros((2000, CELLS))], 0.01, 0.1, seed=3)[0]
+    assert (idle > most + 2 * TOLERANCE).mean() < 1e-3
+    assert most.max() < 0.25
+    assert least == 1.0  # no healthy cell holds still there
+
+
+def test_offsets_that_wander_between_recordings_are_no_load():
+    rng = np.random.default_rng(2)
+    offsets = rng.uniform(0, 0.02, 24)
+    most, _ = resting([r + offset for r, offset in zip(touches(0), offsets, strict=True)], PRESENT, TOLERANCE, 1.0)
+    assert (offsets <= most.min() + 2 * TOLERANCE).all()
+    assert most.max() < 0.03
+
+
+def test_cells_that_are_always_loaded_do_not_make_others_rest_higher():
+    held = touches(0)
+    for recording in held:
+        recording[:, 40:] = 0.03 + 0.2 * np.random.default_rng(0).random(CELLS - 40)
+    most, _ = resting(held, PRESENT, TOLERANCE, 1.0)
+    np.testing.assert_array_equal(most[:40], np.zeros(40))
+
+
+def test_a_cell_that_was_never_heard_rests_at_0():
+    log = np.full((30, 3), 0.4)
+    log[:, 1] = np.nan
+    log[::2, 2] = np.nan
+    most, _ = resting([log], np.ones(3, bool), TOLERANCE, 1.0)
+    assert most.tolist() == pytest.approx([0.4, 0, 0.4])
+
+
+def test_two_frames_tell_nothing_of_noise_and_no_cell_reads_less_than_they_show():
+    most, least = resting([np.full((2, 3), 0.4)], np.ones(3, bool), TOLERANCE, 1.0)
+    assert most.tolist() == [0.4] * 3
+    assert least == -np.inf
+
+
+def test_reading_less_than_any_healthy_cell_is_evidence_unless_half_of_them_do():
+    def of(low: int) -> np.ndarray:
+        frames = np.full((40, 10), 0.1)
+        frames[:, :low] = 0.0
+        runs = StillRuns.begin(10).extend(frames, np.arange(40), TOLERANCE)
+        return less_than_healthy(runs, 0.08, TOLERANCE, np.ones(10, bool))
+
+    assert (of(3) > 0).tolist() == [True] * 3 + [False] * 7
+    assert not of(6).any()
+
+
+@pytest.mark.parametrize(("sigma", "rest"), [(0.0, 0.08), (0.01, 0.1)])
+def test_an_open_cell_of_a_skin_that_rests_above_0_gives_itself_away_untouched(sigma, rest):
+    fitted = SelfDiagnosis(LAYOUT).fit(noisy(touches(0), sigma, rest))
+    log = noisy(touches(1, 3), sigma, rest, seed=11)
+    assert not fitted.diagnose(log).fault_set
+    untouched = LAYOUT.cell(0, 7, 4)
+    broken = [inject(r, [Fault(FaultKind.OPEN, (untouched,))], LAYOUT) for r in log]
+    probability = fitted.diagnose(broken).probability
+    assert probability[untouched] > 0.9
+    assert np.delete(probability, untouched).max() < 0.05
+
+
+def test_noise_alone_proves_no_cell_alive():
+    fitted = SelfDiagnosis(LAYOUT).fit(noisy(touches(0), 0.01, 0.1))
+    idle = noisy([np.zeros((200, CELLS))], 0.01, 0.1, seed=12)
+    assert set(fitted.diagnose(idle).verdicts) == {Verdict.UNTESTED}

@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+from test_resting import touches
+
+from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, SensorLayout, inject
+from diagnostics.tare import Offsets, Tare, usual_offsets
+from diagnostics.touches import Scale
+
+LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
+CELLS, PRESENT = LAYOUT.n_cells, np.ones(LAYOUT.n_cells, bool)
+USUAL = Offsets(0.005, 0.005)
+SCALE = Scale(np.zeros(CELLS), 0.01, 1.0)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> SelfDiagnosis:
+    return SelfDiagnosis(LAYOUT).fit(touches(0))
+
+
+def test_where_nothing_moved_the_scale_stays_as_it_is():
+    tare = Tare.begin(CELLS)
+    for frames in touches(1):
+        tare = tare.extend(frames, SCALE, PRESENT, USUAL)
+        assert tare.on(SCALE) is SCALE
+        assert tare.off(frames) is frames
+
+
+def test_what_moves_all_cells_is_taken_off_each_frame():
+    frames = touches(1)[0]
+    drift = np.linspace(0.01, 0.03, len(frames))[:, None]
+    tare = Tare.begin(CELLS).extend(frames + drift, SCALE, PRESENT, USUAL)
+    moved = tare.on(SCALE)
+    np.testing.assert_allclose(moved.resting, 0.03, atol=1e-12)
+    np.testing.assert_allclose(moved.root_load(tare.off(frames + drift)), SCALE.root_load(frames), atol=0.02)
+
+
+def test_an_offset_of_one_cell_is_its_lowest_reading_and_a_large_one_is_a_load():
+    frames = touches(1)[0].copy()
+    frames[:, 60], frames[:, 61] = frames[:, 60] + 0.015, 0.3
+    resting = Tare.begin(CELLS).extend(frames, SCALE, PRESENT, USUAL).on(SCALE).resting
+    assert np.flatnonzero(resting).tolist() == [60]
+    assert resting[60] == pytest.approx(0.015)
+
+
+def test_offsets_as_in_the_reference_are_usual():
+    assert usual_offsets(touches(0), SCALE, PRESENT) == USUAL
+    offsets = usual_offsets([r + 0.02 for r in touches(0)], SCALE, PRESENT)
+    assert offsets.common == pytest.approx(0.02)
+    assert offsets.own <= 0.02
+
+
+@pytest.mark.parametrize("offset", [0.007, 0.015, 0.03])
+def test_a_skin_that_has_warmed_up_has_no_fault_and_its_dead_cells_are_found_all_the_same(fitted, offset):
+    log = touches(1, 8)
+    assert not fitted.diagnose([r + offset for r in log]).fault_set
+    dead = LAYOUT.cell(0, 2, 3)
+    broken = [inject(r + offset, [Fault(FaultKind.OPEN, (dead,))], LAYOUT) for r in log]
+    assert fitted.diagnose(broken).fault_set == {dead}
+
+
+def test_offsets_of_single_cells_and_those_that_change_between_recordings_are_no_fault(fitted):
+    log, rng = touches(1, 8), np.random.default_rng(0)
+    assert not fitted.diagnose([r + 0.015 * np.linspace(0, 1, CELLS) for r in log]).fault_set
+    assert not fitted.diagnose([r + rng.uniform(0, 0.02) for r in log]).fault_set
+
+
+def test_a_little_noise_that_the_reference_did_not_have_is_no_fault(fitted):
+    rng = np.random.default_rng(0)
+    log = [np.clip(r + 0.002 * rng.standard_normal(r.shape), 0, 1) for r in touches(1, 8)]
+    assert not fitted.diagnose(log).fault_set
+
+
+def test_a_monitor_takes_off_the_same(fitted):
+    log = np.concatenate([r + 0.01 * i for i, r in enumerate(touches(1, 3))])
+    monitor = Monitor(fitted)
+    for frame in log:
+        monitor.update(frame)
+    np.testing.assert_array_equal(monitor.diagnosis().probability, fitted.diagnose(log).probability)

@@ -60,16 +60,13 @@ class Tare:
             present: bool ``[D]``.
             usual: offsets that are as in the reference.
         """
-        above = frames - scale.resting
-        lowest = np.fmin(self.lowest, np.fmin.reduce(above))
+        lowest = np.fmin(self.lowest, np.fmin.reduce(frames) - scale.resting)
         own = np.where((lowest > usual.own) & (lowest < _OWN * scale.full_scale), lowest, 0.0)
-        if own.any():
-            above -= own
         # Mostly all cells together have none: enough of them read no more than usual all through.
-        calm = np.fmax.reduce(above) <= usual.common
-        if (calm & present).sum() > _LEAST_LOADED * present.sum():
+        calm = present & (np.fmax.reduce(frames) - scale.resting - own <= usual.common)
+        if np.count_nonzero(calm) > _LEAST_LOADED * np.count_nonzero(present):
             return Tare(lowest, own, np.zeros(len(frames)))
-        common = np.array([_common(frame) for frame in above[:, present]])
+        common = np.array([_common(frame) for frame in (frames - scale.resting - own)[:, present]])
         common[(common <= usual.common) | (common >= _COMMON * scale.full_scale)] = 0.0
         return Tare(lowest, own, common)
 

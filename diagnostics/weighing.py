@@ -29,6 +29,7 @@ _LOGS, _LOGS_OF_LARGE = 96, 32  # drawn to fit the weights; large arrays have mo
 _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
 _DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
 _FEWEST_RECORDINGS = 8  # below that the reference cannot be split
+_FEWEST_CELLS = 10  # broken and healthy, that teach what evidence is worth
 _PIECE = 100  # frames; longer recordings are cut, so that a single long one can be split too
 _LEARNED_SHARE = 0.75  # of the recordings teach what healthy looks like, the others make the logs
 _MOST_TEMPORAL = 1.0  # what temporal evidence may be worth, whatever the logs say: a jump alone proves nothing
@@ -94,13 +95,13 @@ class Weights:
 
     @classmethod
     def _of(cls, trials: Sequence[_Trial]) -> Weights:
-        """Fit on trials; a kind of which they do not hold both broken and healthy cells keeps the defaults."""
+        """Fit on trials; a kind of which they hold too few broken or healthy cells keeps the defaults."""
         kind, ratio, temporal, dead = (np.concatenate(column) for column in zip(*trials, strict=True))
         evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
         found = list(zip(*vars(cls()).values(), strict=True))
         for k in range(_KINDS):
             of, alike = kind == k, (kind > 0) == (k > 0)
-            if dead[of].any() and (~dead[of]).any():
+            if min(dead[of].sum(), (~dead[of]).sum()) >= _FEWEST_CELLS:
                 fitted = _bounded_logistic(evidence[of], dead[of], float(logit(dead[alike].mean())))
                 if fitted[1] > 0:
                     found[k] = fitted

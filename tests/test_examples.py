@@ -26,12 +26,14 @@ ON_RECORDINGS = {
     "diagnosis_constants.py": ["1", "--only", "rim._RIDGE"],
     "diagnosis_figures.py": ["1", "--only", "cells"],
     "esp32_sender.py": ["--frames", "20"],
+    "other_sensors.py": ["1", "--only", "8 bits"],
     "simulated_vs_real.py": [],
     "wrong_fault_set.py": ["--draws", "1"],
 }
 LESS = {  # they take minutes
     "diagnosis_constants.py": ["--only", "rim._RIDGE"],
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
+    "other_sensors.py": ["--only", "8 bits", "all +3 %"],
 }
 SLOW = {  # more than 7 s of CPU time
     "adaptation_figures.py",
@@ -44,6 +46,7 @@ SLOW = {  # more than 7 s of CPU time
     "diagnosis_figures.py",
     "fleet_scaling.py",
     "kill_maintenance.py",
+    "other_sensors.py",
     "picture.py",
     "repair.py",
     "scale_curves.py",

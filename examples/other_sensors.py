@@ -1,0 +1,105 @@
+"""The same grasps, as other sensors would read them: python examples/other_sensors.py [RECORDINGS [LOGS]]
+
+Skins differ: some have noise, rest above 0, have few bits, or drift from one recording to the next. So recordings are
+remade as such a skin would have read them, and the first rows of ``diagnosis_figures.py`` measured again: dead cells
+from the start and from 60 % of the log on, and false alarms in healthy logs. *Sensors* are that way when the reference
+is recorded and when the log is; *drifts* came in between: the reference is the plain one. ``--only NAME ...`` picks
+rows. Without RECORDINGS a few simulated grasps must do.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from diagnosis_figures import Bench, dead_cells, small
+
+from adaptfault.recordings import Recordings, load
+from diagnostics import SelfDiagnosis, SensorLayout
+
+Frames = np.ndarray
+Change = Callable[[Frames, np.random.Generator], Frames]  # of readings as a share of full scale, 0..1
+
+
+def read_with(noise: float = 0.0, rest: float = 0.0, steps: int = 4095) -> Change:
+    """Read with noise, cells resting at 0.5 to 1.5 times ``rest``, and a converter of so many steps."""
+
+    def change(frames: Frames, rng: np.random.Generator) -> Frames:
+        offset = rest * np.random.default_rng(0).uniform(0.5, 1.5, frames.shape[1])  # the same in all recordings
+        read = frames * (1 - 1.5 * rest) + offset + noise * rng.standard_normal(frames.shape)
+        return np.clip(np.round(read * steps) / steps, 0, 1)
+
+    return change
+
+
+def of_each(spread: float) -> Frames:
+    return np.random.default_rng(1).uniform(0, spread, 1_000_000)  # the same cells in all recordings
+
+
+SENSORS: dict[str, Change] = {
+    "as it is": lambda x, rng: x,
+    "noise 0.2 %, rest 5 %": read_with(0.002, 0.05),
+    "noise 1 %, rest 10 %, 10 bits": read_with(0.01, 0.1, 1023),
+    "8 bits": read_with(steps=255),
+    "gains 0.5 to 1.5": lambda x, rng: np.minimum(x * (0.5 + of_each(1.0)[: x.shape[1]]), 1),
+    "root of the load": lambda x, rng: np.sqrt(x),
+    "every second frame": lambda x, rng: x[::2],
+    "all wander, 0 to 2 %": lambda x, rng: np.minimum(x + rng.uniform(0, 0.02), 1),
+    "each wanders, 0 to 2 %": lambda x, rng: np.minimum(x + rng.uniform(0, 0.02, x.shape[1]), 1),
+}
+DRIFTS: dict[str, Change] = {
+    "all +0.7 %": lambda x, rng: np.minimum(x + 0.007, 1),
+    "all +3 %": lambda x, rng: np.minimum(x + 0.03, 1),
+    "all -1.5 %": lambda x, rng: np.maximum(x - 0.015, 0),
+    "each +0 to 2 %": lambda x, rng: np.minimum(x + of_each(0.02)[: x.shape[1]], 1),
+    "other in each recording, 0 to 2 %": lambda x, rng: np.minimum(x + rng.uniform(0, 0.02), 1),
+    "noise 0.2 %": lambda x, rng: np.clip(x + 0.002 * rng.standard_normal(x.shape), 0, 1),
+    "gain 0.9": lambda x, rng: 0.9 * x,
+    "gain 1.15": lambda x, rng: np.minimum(1.15 * x, 1),
+}
+
+
+def remade(recordings: Recordings, change: Change) -> Recordings:
+    """Return what another sensor, of full scale 1, would have recorded."""
+    rng, full_scale = np.random.default_rng(0), recordings.layout.full_scale
+    old = recordings.layout
+    layout = SensorLayout(old.pads, old.rows, old.cols, full_scale=1.0, rate=old.rate, present=old.present)
+    frames = tuple(change(np.asarray(f, dtype=np.float64) / full_scale, rng) for f in recordings.frames)
+    return replace(recordings, frames=frames, layout=layout)
+
+
+def learned(bench: Bench) -> SelfDiagnosis:
+    return SelfDiagnosis(bench.layout).fit([bench.recordings.frames[i] for i in bench.reference])
+
+
+def measured(bench: Bench, fitted: SelfDiagnosis) -> str:
+    start, late = dead_cells(bench, fitted, 0.16), dead_cells(bench, fitted, 0.16, 0.6)
+    false = [int(fitted.diagnose(log).fault_set.mask.sum()) for _, log, _ in bench.logs()]
+    dead = "  ".join(f"{tally.precision:9.4f} {tally.recall:7.4f}" for tally in (start, late))
+    return f"{dead}  {sum(false):6d} cells in {np.count_nonzero(false)} of {len(false)} logs"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("recordings", nargs="?", help="of a healthy sensor")
+    parser.add_argument("logs", nargs="?", type=int, default=30)
+    parser.add_argument("--split", type=int, default=0, help="how the recordings are dealt into halves")
+    parser.add_argument("--only", nargs="+", choices=(*SENSORS, *DRIFTS), help="rows to measure")
+    options = parser.parse_args(argv)
+    recordings = load(options.recordings).recordings if options.recordings else small()
+    print(f"{'':45}{'from the start':>17}{'from 60 % on':>19}{'healthy':>10}")
+    print(f"{'':45}{'precision  recall':>17}{'precision  recall':>19}{'false':>8}")
+    plain = None
+    for name in options.only or (*SENSORS, *DRIFTS):
+        bench = Bench(remade(recordings, (SENSORS | DRIFTS)[name]), options.split, options.logs)
+        if name in SENSORS:
+            fitted = learned(bench)
+        else:
+            fitted = plain = plain or learned(replace(bench, recordings=remade(recordings, SENSORS["as it is"])))
+        print(f"{'sensor' if name in SENSORS else 'drift':9}{name:36}{measured(bench, fitted)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -60,7 +60,7 @@ class Weights:
             common faults are; of each kind.
     """
 
-    offset: tuple[float, ...] = (0.0, -2.0, -2.0)
+    offset: tuple[float, ...] = (0.0, -1.0, -1.0)
     slope: tuple[float, ...] = (0.6, 0.6, 0.6)
     temporal: tuple[float, ...] = (1.0, 0.5, 0.5)
 

@@ -61,7 +61,7 @@ def resting(
     offset = np.concatenate(offsets)
     light = offset[offset < _LIGHT * full_scale]
     noise = float(np.quantile(np.concatenate(bends), _CALM)) / (0.6745 * np.sqrt(6))
-    wander = 2 * max(0.0, float(np.median(light))) + _NOISE * noise
+    wander = 2 * max(0.0, float(np.median(light)) if len(light) else 0.0) + _NOISE * noise
     lowest = float(np.quantile(np.concatenate(least), _RARE, method="lower"))
     return low + max(0.0, wander - tolerance), full_scale if noise > tolerance else lowest
 

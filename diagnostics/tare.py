@@ -67,7 +67,10 @@ class Tare:
         if np.count_nonzero(calm) > _LEAST_LOADED * np.count_nonzero(present):
             return Tare(lowest, own, np.zeros(len(frames)))
         common = np.array([_common(frame) for frame in (frames - scale.resting - own)[:, present]])
-        common[(common <= usual.common) | (common >= _COMMON * scale.full_scale)] = 0.0
+        common[common <= usual.common] = 0.0
+        last = self.common[-1]
+        for t in np.flatnonzero(common >= _COMMON * scale.full_scale):  # nearly all cells are loaded: it stays
+            common[t] = common[t - 1] if t else last
         return Tare(lowest, own, common)
 
     def on(self, scale: Scale) -> Scale:

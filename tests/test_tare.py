@@ -76,3 +76,12 @@ def test_a_monitor_takes_off_the_same(fitted):
     for frame in log:
         monitor.update(frame)
     np.testing.assert_array_equal(monitor.diagnosis().probability, fitted.diagnose(log).probability)
+
+
+def test_while_nearly_all_cells_are_loaded_the_offset_stays():
+    frames = touches(1)[0] + 0.03
+    frames[20:40] += 0.4
+    tare = Tare.begin(CELLS).extend(frames[:32], SCALE, PRESENT, USUAL).extend(frames[32:], SCALE, PRESENT, USUAL)
+    assert tare.common.min() > 0.025
+    held = Tare.begin(CELLS).extend(np.full((40, CELLS), 0.5), SCALE, PRESENT, USUAL)
+    assert not held.common.any()

@@ -239,7 +239,7 @@ def draw(rows: list[dict], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.5), layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(13, 4.5), layout="constrained")
     for axis, what, name in zip(axes, ("cpu", "peak_mb"), ("CPU seconds", "peak memory, MB"), strict=True):
         for (pads, stage), slope in slopes(rows, what).items():
             points = sorted((r["cells"], r[what]) for r in rows if (r["pads"], r["stage"]) == (pads, stage))
@@ -247,7 +247,7 @@ def draw(rows: list[dict], path: Path) -> None:
                 style = {"color": f"C{STAGES.index(stage)}", "linestyle": "-" if pads == "one" else ":"}
                 axis.loglog(*zip(*points, strict=True), marker=".", label=f"{stage}, {pads}: {slope:.2f}", **style)
         axis.set(xlabel="cells", ylabel=name, title=f"{name} (slope from {SMALLEST} cells on)")
-        axis.legend(fontsize=6)
+        axis.legend(fontsize=6, loc="center left", bbox_to_anchor=(1, 0.5))
     figure.savefig(path, dpi=120)
 
 

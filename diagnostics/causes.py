@@ -28,7 +28,7 @@ class Findings:
 
     Attributes:
         faulty: those beyond doubt.
-        alive: those that proved to work.
+        alive: those that move, as no dead cell does.
         silent: those that never delivered a reading.
         rests: those that read what an untouched cell reads, and are still; full: the same with full scale.
         intermittent, noisy, drifting: those that move, but wrongly.

@@ -143,7 +143,7 @@ class SelfDiagnosis:
             layout=self.layout,
             faults=causes,
             probability=probability,
-            tested=found.alive | inferred,
+            tested=(found.alive & memory.touched) | inferred,  # noise alone proves nothing
             transport=memory.stream.faults(scale.resting + scale.near, working, self.layout.rate),
             evidence={
                 "spatial": spatial.evidence + spatial.offset,
@@ -184,8 +184,8 @@ class SelfDiagnosis:
         value, rests = runs.value, spatial.asked & memory.rests()
         return Findings(
             faulty=faulty,
-            # A cell that a load moved works, unless something speaks against what it does since.
-            alive=present & ~wrong & ~faulty & runs.moved & memory.touched & (probability < _DOUBTED),
+            # A cell that moved is not dead, unless something speaks against what it does since.
+            alive=present & ~wrong & ~faulty & runs.moved & (probability < _DOUBTED),
             silent=silent,
             rests=rests,
             full=spatial.asked & ~rests & (value >= self.layout.full_scale - 2 * reference.tolerance),

@@ -98,3 +98,11 @@ def test_noise_alone_proves_no_cell_alive():
     fitted = SelfDiagnosis(LAYOUT).fit(noisy(touches(0), 0.01, 0.1))
     idle = noisy([np.zeros((200, CELLS))], 0.01, 0.1, seed=12)
     assert set(fitted.diagnose(idle).verdicts) == {Verdict.UNTESTED}
+
+
+def test_cells_that_only_have_noise_are_not_put_down_to_a_broken_wire():
+    fitted = SelfDiagnosis(LAYOUT).fit(noisy(touches(0), 0.01, 0.1))
+    dead = list(range(20))
+    idle = noisy([np.zeros((200, CELLS))], 0.01, 0.1, seed=12)[0]
+    idle[:, dead] = 0
+    assert fitted.diagnose(idle).fault_set == set(dead)

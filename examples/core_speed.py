@@ -37,7 +37,7 @@ from adaptfault.compact import CompactNetwork
 from adaptfault.forest import Forest
 from adaptfault.reduction import ReducedModel, phi
 from adaptfault.store import load_model, save_model
-from diagnostics import FaultSet, Monitor, SelfDiagnosis, SensorLayout, contact
+from diagnostics import FaultSet, Monitor, SelfDiagnosis, SensorLayout, tiles
 
 N = 1024  # of the square matrices
 SECONDS = 0.1  # that quick jobs are repeated for in a round
@@ -179,14 +179,15 @@ def head_jobs(model: af.TactileTransformer, adapter: af.Adapter, faults: FaultSe
 def diagnosis_jobs(grasps: af.Recordings, faults: FaultSet, most: int) -> Iterator[Job]:
     healthy = list(grasps.frames[:: max(1, len(grasps) // most)])
     fitted, flop = SelfDiagnosis(grasps.layout), 0.0
-    inner = contact._logistic
+    inner = tiles._logistic
 
-    def watch(x: np.ndarray, y: np.ndarray, forbidden: np.ndarray) -> object:
+    def watch(x: np.ndarray, y: np.ndarray, own: np.ndarray) -> object:
         nonlocal flop
-        flop += 4 * len(x) * x.shape[1] * (contact._STEPS * y.shape[1] + 20)
-        return inner(x, y, forbidden)
+        (n, d), k = x.shape, y.shape[1]
+        flop += tiles._STEPS * (4 * n * d * k + 2 * d * d * k) + 2 * n * d * d + 2 * d**3
+        return inner(x, y, own)
 
-    with mock.patch("diagnostics.contact._logistic", watch):
+    with mock.patch("diagnostics.tiles._logistic", watch):
         fitted.fit(healthy)
     yield Job(f"diagnosis: fit on {len(healthy)} grasps", lambda: fitted.fit(healthy), flop, 0, "formula")
     log = [frames.copy() for frames in grasps.frames[:20]]

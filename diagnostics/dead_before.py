@@ -17,6 +17,7 @@ from scipy.ndimage import label
 from diagnostics.layout import SensorLayout
 from diagnostics.readings import Readings
 from diagnostics.resting import resting
+from diagnostics.rim import enclosed
 from diagnostics.verdicts import Diagnosis
 
 _PIECES, _FRAMES = 60, 200  # of the reference that are diagnosed, at most, spread evenly; frames of each
@@ -42,10 +43,8 @@ def dead_before(
     """
     present = layout.present.ravel()
     never_moved = present & _still(recordings, 2 * tolerance)
-    if not never_moved.any() or never_moved[present].mean() > _MOST:
-        return np.zeros(layout.n_cells)
-    suspects = _enclosed(never_moved, layout)
-    if not suspects.any():
+    suspects = _between(never_moved, layout)
+    if not suspects.any() or never_moved[present].mean() > _MOST:
         return np.zeros(layout.n_cells)
     rest, _ = resting(recordings, present & ~never_moved, tolerance, layout.full_scale)
     usual = rest[present & ~never_moved]
@@ -65,18 +64,12 @@ def _still(recordings: Readings, most: float) -> NDArray[np.bool_]:
     return still
 
 
-def _enclosed(never_moved: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.bool_]:
+def _between(never_moved: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.bool_]:
     """Return the groups of ``never_moved`` cells in which one lies between cells that moved, bool ``[D]``."""
-    moved = np.pad(layout.grid(~never_moved & layout.present.ravel()), ((0, 0), (1, 1), (1, 1)))
-    rows, cols = layout.rows, layout.cols
-
-    def at(r: int, c: int) -> NDArray[np.bool_]:
-        return moved[:, 1 + r : 1 + r + rows, 1 + c : 1 + c + cols]
-
-    between = np.logical_or.reduce([at(r, c) & at(-r, -c) for r, c in ((0, 1), (1, 0), (1, 1), (1, -1))])
+    moved = layout.grid(~never_moved & layout.present.ravel())
     groups, _ = label(layout.grid(never_moved), _TOUCHING)
-    enclosed: NDArray[np.bool_] = np.isin(groups, groups[between & (groups > 0)]).ravel()
-    return enclosed
+    between: NDArray[np.bool_] = np.isin(groups, groups[enclosed(moved[..., None])[..., 0] & (groups > 0)]).ravel()
+    return between
 
 
 def _sample(recordings: Readings) -> Readings:

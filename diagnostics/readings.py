@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 Recording = NDArray[np.float64]
 
 _MOST_VALUES = 1 << 23  # of a block of frames
+_RECORDINGS, _CELLS = 200, 2000  # of a sample, about
 
 
 class Readings(Sequence[Recording]):
@@ -45,6 +46,13 @@ class Readings(Sequence[Recording]):
             step = max(1, _MOST_VALUES // given.shape[1])
             for first in range(0, len(given), step):
                 yield np.asarray(given[first : first + step], dtype=np.float64)
+
+    def sample(self, present: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Iterator[Recording]]:
+        """Return some of the cells that are ``present`` (bool ``[D]``), and some recordings of these, spread evenly."""
+        cells = np.flatnonzero(present)
+        cells = cells[:: max(1, len(cells) // _CELLS)]
+        which = range(0, len(self), max(1, len(self) // _RECORDINGS))
+        return cells, (self.piece(i, slice(None), cells) for i in which)
 
     @classmethod
     def of(cls, recordings: Sequence[NDArray[Any]]) -> Readings:

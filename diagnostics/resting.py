@@ -25,7 +25,6 @@ _RARE = 0.001  # of the cells in recordings: what so few did is taken for none
 _WORTH = 12.0  # log likelihood ratio of reading less than any healthy cell
 _CROWD = 0.5  # share of the cells: when so many read less than ever, their offset has moved
 _BLOCK = 4096  # cells looked at together
-_RECORDINGS, _CELLS = 200, 2000  # that tell wander and noise, about
 
 Floats = NDArray[np.float64]
 
@@ -45,17 +44,15 @@ def resting(
         full_scale: of the layout.
     """
     low = _low(recordings)
-    readings, cells = Readings.of(recordings), np.flatnonzero(present)
-    cells = cells[:: max(1, len(cells) // _CELLS)]
+    cells, some = Readings.of(recordings).sample(present)
     offsets, bends, least = [], [], []
-    for i in range(0, len(readings), max(1, len(readings) // _RECORDINGS)):
-        frames = readings.piece(i, slice(None), cells)
+    for frames in some:
         heard = ~np.isnan(frames).any(axis=0)
         if len(frames) > 2 and heard.any():
-            frames = frames[:, heard]
-            offsets.append(np.quantile(frames, _LEAST, axis=0) - low[cells[heard]])
-            bends.append(np.median(np.abs(np.diff(frames, 2, axis=0)), axis=0))  # a load moves, but hardly bends
-            least.append(frames.min(axis=0))
+            whole = frames[:, heard]
+            offsets.append(np.quantile(whole, _LEAST, axis=0) - low[cells[heard]])
+            bends.append(np.median(np.abs(np.diff(whole, 2, axis=0)), axis=0))  # a load moves, but hardly bends
+            least.append(whole.min(axis=0))
     if not offsets:
         return low, -np.inf
     offset = np.concatenate(offsets)

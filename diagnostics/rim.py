@@ -10,6 +10,7 @@ it, which stay near to what the cell's own foresee.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,7 +146,7 @@ def around(
         cross[4],
         corners[4],
         of(_inside(layout)),
-        of(_enclosed(known[1])),
+        of(enclosed(known[1])),
     )
     np.divide(whole[:4], np.maximum(whole[4:], 1), out=overall)
     np.divide(pad[:4] + _EMPTY * overall, pad[4:] + _EMPTY, out=on_pad)
@@ -185,8 +186,8 @@ def _inside(layout: SensorLayout) -> Array:
     return inside[..., None].astype(np.float32)
 
 
-def _enclosed(load: Array) -> Array:
-    """Return how well the loads ``[pads, rows, cols, n]`` around each cell enclose it.
+def enclosed(load: NDArray[Any]) -> NDArray[Any]:
+    """Return how well the loads ``[pads, rows, cols, n]`` around each cell enclose it; of bool: whether they do.
 
     That is the smaller of two opposite ones; the best of four pairs counts.
     """

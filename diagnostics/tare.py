@@ -19,7 +19,7 @@ from diagnostics.touches import Scale
 _LEAST_LOADED = 0.25  # share of the cells that is hardly ever loaded all at once, and more than are open
 _COMMON, _OWN = 0.05, 0.02  # of full scale: the largest offset of all cells together, and of one beside that
 _USUAL = 0.95  # quantile of the offsets in the reference
-_RECORDINGS, _FRAMES, _CELLS = 200, 20, 2000  # that tell them, about; frames of each recording
+_FRAMES = 20  # of each recording that tell them, about
 
 Floats = NDArray[np.float64]
 
@@ -86,11 +86,9 @@ class Tare:
 
 def usual_offsets(recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_]) -> Offsets:
     """Return the largest offsets that are usual in a reference, recordings ``[T, D]`` each."""
-    readings, cells = Readings.of(recordings), np.flatnonzero(present)
-    cells = cells[:: max(1, len(cells) // _CELLS)]
+    cells, some = Readings.of(recordings).sample(present)
     common, own = [], []
-    for i in range(0, len(readings), max(1, len(readings) // _RECORDINGS)):
-        frames = readings.piece(i, slice(None), cells)
+    for frames in some:
         if len(frames):
             above = frames - scale.resting[cells]
             common += [_common(frame) for frame in above[:: max(1, len(above) // _FRAMES)]]

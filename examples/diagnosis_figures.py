@@ -139,9 +139,13 @@ class Bench:
     def fitted(self) -> SelfDiagnosis:
         """The diagnosis under test."""
         began = time.perf_counter()
-        fitted = SelfDiagnosis(self.layout).fit([self.recordings.frames[i] for i in self.reference])
+        fitted = self.learned()
         print(f"fitted on {len(self.reference)} recordings in {time.perf_counter() - began:.1f} s", flush=True)
         return fitted
+
+    def learned(self) -> SelfDiagnosis:
+        """Return what a diagnosis learns from the reference."""
+        return SelfDiagnosis(self.layout).fit([self.recordings.frames[i] for i in self.reference])
 
     def logs(self) -> Iterator[tuple[int, Log, np.random.Generator]]:
         """Yield seed, log and a generator for its faults."""

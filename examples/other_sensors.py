@@ -17,7 +17,7 @@ import numpy as np
 from diagnosis_figures import Bench, dead_cells, small
 
 from adaptfault.recordings import Recordings, load
-from diagnostics import SelfDiagnosis, SensorLayout
+from diagnostics import SelfDiagnosis
 
 Frames = np.ndarray
 Change = Callable[[Frames, np.random.Generator], Frames]  # of readings as a share of full scale, 0..1
@@ -34,8 +34,8 @@ def read_with(noise: float = 0.0, rest: float = 0.0, steps: int = 4095) -> Chang
     return change
 
 
-def of_each(spread: float) -> Frames:
-    return np.random.default_rng(1).uniform(0, spread, 1_000_000)  # the same cells in all recordings
+def of_each(spread: float, frames: Frames) -> Frames:
+    return np.random.default_rng(1).uniform(0, spread, frames.shape[1])  # the same in all recordings
 
 
 SENSORS: dict[str, Change] = {
@@ -43,7 +43,7 @@ SENSORS: dict[str, Change] = {
     "noise 0.2 %, rest 5 %": read_with(0.002, 0.05),
     "noise 1 %, rest 10 %, 10 bits": read_with(0.01, 0.1, 1023),
     "8 bits": read_with(steps=255),
-    "gains 0.5 to 1.5": lambda x, rng: np.minimum(x * (0.5 + of_each(1.0)[: x.shape[1]]), 1),
+    "gains 0.5 to 1.5": lambda x, rng: np.minimum(x * (0.5 + of_each(1.0, x)), 1),
     "root of the load": lambda x, rng: np.sqrt(x),
     "every second frame": lambda x, rng: x[::2],
     "all wander, 0 to 2 %": lambda x, rng: np.minimum(x + rng.uniform(0, 0.02), 1),
@@ -53,7 +53,7 @@ DRIFTS: dict[str, Change] = {
     "all +0.7 %": lambda x, rng: np.minimum(x + 0.007, 1),
     "all +3 %": lambda x, rng: np.minimum(x + 0.03, 1),
     "all -1.5 %": lambda x, rng: np.maximum(x - 0.015, 0),
-    "each +0 to 2 %": lambda x, rng: np.minimum(x + of_each(0.02)[: x.shape[1]], 1),
+    "each +0 to 2 %": lambda x, rng: np.minimum(x + of_each(0.02, x), 1),
     "other in each recording, 0 to 2 %": lambda x, rng: np.minimum(x + rng.uniform(0, 0.02), 1),
     "noise 0.2 %": lambda x, rng: np.clip(x + 0.002 * rng.standard_normal(x.shape), 0, 1),
     "gain 0.9": lambda x, rng: 0.9 * x,
@@ -64,14 +64,8 @@ DRIFTS: dict[str, Change] = {
 def remade(recordings: Recordings, change: Change) -> Recordings:
     """Return what another sensor, of full scale 1, would have recorded."""
     rng, full_scale = np.random.default_rng(0), recordings.layout.full_scale
-    old = recordings.layout
-    layout = SensorLayout(old.pads, old.rows, old.cols, full_scale=1.0, rate=old.rate, present=old.present)
     frames = tuple(change(np.asarray(f, dtype=np.float64) / full_scale, rng) for f in recordings.frames)
-    return replace(recordings, frames=frames, layout=layout)
-
-
-def learned(bench: Bench) -> SelfDiagnosis:
-    return SelfDiagnosis(bench.layout).fit([bench.recordings.frames[i] for i in bench.reference])
+    return replace(recordings, frames=frames, layout=replace(recordings.layout, full_scale=1.0))
 
 
 def measured(bench: Bench, fitted: SelfDiagnosis) -> str:
@@ -95,9 +89,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     for name in options.only or (*SENSORS, *DRIFTS):
         bench = Bench(remade(recordings, (SENSORS | DRIFTS)[name]), options.split, options.logs)
         if name in SENSORS:
-            fitted = learned(bench)
+            fitted = bench.learned()
         else:
-            fitted = plain = plain or learned(replace(bench, recordings=remade(recordings, SENSORS["as it is"])))
+            fitted = plain = plain or replace(bench, recordings=remade(recordings, SENSORS["as it is"])).learned()
         print(f"{'sensor' if name in SENSORS else 'drift':9}{name:36}{measured(bench, fitted)}", flush=True)
 
 

@@ -21,7 +21,7 @@ from diagnostics.stored import Arrays, reference_from_state, reference_state, we
 from diagnostics.verdicts import Diagnosis
 from diagnostics.weighing import Weights, faulty_at, kinds
 
-SCHEMA = "adaptfault.diagnoser/4"
+SCHEMA = "adaptfault.diagnoser/5"
 
 _SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
 _SUSPICIOUS_COLD = 3.0  # log evidence from which on a cell is not asked about the others, in a cold start

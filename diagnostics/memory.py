@@ -153,7 +153,7 @@ class Memory:
         self.heard = self.heard | np.isfinite(self.runs.last)
         # Evidence belongs to a stretch, and ends with it.
         self.settled = np.where(self.runs.start == start, self.settled, 0.0)
-        self._tare = self._tare.extend(frames, self.reference.scale, self.present, self.reference.offsets)
+        self._tare = self._tare.extend(frames, self.reference.scale, self.present, self.reference.offset)
         self.scale = scale = self._tare.on(self.reference.scale)
         root, still = scale.root_load(self._tare.off(frames)), self.runs.start <= numbers[0]
         self.touched = self.touched | root.any(axis=0)

@@ -12,7 +12,7 @@ from diagnostics.contact import ContactModel
 from diagnostics.layout import SensorLayout
 from diagnostics.patch_models import contact_model
 from diagnostics.resting import resting
-from diagnostics.tare import Offsets, usual_offsets
+from diagnostics.tare import usual_offset
 from diagnostics.temporal import Onsets, segments
 from diagnostics.touches import SEGMENT, Scale
 from diagnostics.transport import longest_repetition
@@ -35,7 +35,7 @@ class Reference:
         scale: what a reading means.
         onsets: how abruptly healthy cells come to rest.
         least: that a healthy cell reads, see ``resting``.
-        offsets: that are usual.
+        offset: of all cells together that is usual.
         patience: a frame that comes again more often than this says nothing new.
         usual: how restless healthy cells are.
         twins: how many witnesses two healthy lines ever had of being one.
@@ -47,7 +47,7 @@ class Reference:
     scale: Scale
     onsets: Onsets
     least: float
-    offsets: Offsets
+    offset: float
     patience: int
     usual: Usual
     twins: int
@@ -74,7 +74,7 @@ class Reference:
             scale,
             onsets,
             least,
-            usual_offsets(recordings, scale, present),
+            usual_offset(recordings, scale, present),
             patience,
             Usual.fit(recordings, scale),
             _most_twins(recordings, layout, scale),
@@ -93,7 +93,7 @@ class Reference:
             scale,
             Onsets.silent(),
             -np.inf,
-            Offsets(tolerance, tolerance),
+            tolerance,
             2 * _PATIENCE,
             Usual.unknown(scale),
             _TWINS,

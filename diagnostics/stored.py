@@ -12,7 +12,6 @@ from diagnostics.contact import ContactModel
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference, living
 from diagnostics.rim import INPUTS, Rim
-from diagnostics.tare import Offsets
 from diagnostics.temporal import Onsets
 from diagnostics.tiles import Tile
 from diagnostics.touches import Scale
@@ -53,7 +52,7 @@ def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
         "least": float(reference.least) if np.isfinite(reference.least) else None,
         "patience": int(reference.patience),
         "blinks": float(reference.usual.blinks),
-        "offsets": vars(reference.offsets),
+        "offset": float(reference.offset),
         "twins": int(reference.twins),
         "surest": None if reference.model is None else [float(tile.surest) for tile in reference.model.tiles],
         "rim": bool(reference.model and reference.model.rim),
@@ -90,7 +89,7 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
         scale,
         Onsets(read("onsets", unknown.onsets.log_ratio)),
         -np.inf if about["least"] is None else float(about["least"]),
-        Offsets(float(about["offsets"]["common"]), float(about["offsets"]["own"])),
+        float(about["offset"]),
         int(about["patience"]),
         Usual(float(about["blinks"]), read("noise", unknown.usual.noise)),
         int(about["twins"]),
@@ -100,8 +99,8 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
     positive = (reference.tolerance, scale.near, reference.patience, reference.usual.blinks)
     if not (np.isfinite(positive).all() and min(positive) > 0):
         raise ValueError(f"expected positive numbers for tolerance, near, patience and blinks, got {positive}")
-    if np.isnan([reference.least, *vars(reference.offsets).values()]).any():
-        raise ValueError("expected numbers for least and offsets, got NaN")
+    if np.isnan([reference.least, reference.offset]).any():
+        raise ValueError(f"expected numbers for least and offset, got {reference.least} and {reference.offset}")
     return reference
 
 

@@ -1,8 +1,8 @@
 """Offsets that have moved since the reference was recorded, as with temperature, told from touches and taken off.
 
 What moves all cells is seen at those that are loaded least; what moves a single one, at its own lowest reading in the
-log. Small offsets only, and larger ones than the reference itself shows: a cell that reads more all the time is loaded,
-or broken.
+log. Small offsets only, and of all cells together larger ones than the reference itself shows: a cell that reads more
+all the time is loaded, or broken.
 """
 
 from __future__ import annotations
@@ -19,17 +19,9 @@ from diagnostics.touches import Scale
 _LEAST_LOADED = 0.25  # share of the cells that is hardly ever loaded all at once, and more than are open
 _COMMON, _OWN = 0.05, 0.02  # of full scale: the largest offset of all cells together, and of one beside that
 _USUAL = 0.95  # quantile of the offsets in the reference
-_FRAMES = 20  # of each recording that tell them, about
+_FRAMES = 20  # of each recording that tell, about
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Offsets:
-    """Offsets that mean nothing: of all cells together, and of a single one."""
-
-    common: float
-    own: float
 
 
 @dataclass(frozen=True)
@@ -51,23 +43,23 @@ class Tare:
         """Nothing seen yet."""
         return cls(np.full(n_cells, np.inf), np.zeros(n_cells), np.zeros(1))
 
-    def extend(self, frames: Floats, scale: Scale, present: NDArray[np.bool_], usual: Offsets) -> Tare:
+    def extend(self, frames: Floats, scale: Scale, present: NDArray[np.bool_], usual: float) -> Tare:
         """Return the offsets after more frames.
 
         Args:
             frames: ``[t, D]``, NaN = missing.
             scale: where cells rested in the reference.
             present: bool ``[D]``.
-            usual: offsets that are as in the reference.
+            usual: an offset of all cells that is as in the reference.
         """
         lowest = np.fmin(self.lowest, np.fmin.reduce(frames) - scale.resting)
-        own = np.where((lowest > usual.own) & (lowest < _OWN * scale.full_scale), lowest, 0.0)
+        own = np.where((lowest > scale.near / 2) & (lowest < _OWN * scale.full_scale), lowest, 0.0)
         # Mostly all cells together have none: enough of them read no more than usual all through.
-        calm = present & (np.fmax.reduce(frames) - scale.resting - own <= usual.common)
+        calm = present & (np.fmax.reduce(frames) - scale.resting - own <= usual)
         if np.count_nonzero(calm) > _LEAST_LOADED * np.count_nonzero(present):
             return Tare(lowest, own, np.zeros(len(frames)))
         common = np.array([_common(frame) for frame in (frames - scale.resting - own)[:, present]])
-        common[common <= usual.common] = 0.0
+        common[common <= usual] = 0.0
         last = self.common[-1]
         for t in np.flatnonzero(common >= _COMMON * scale.full_scale):  # nearly all cells are loaded: it stays
             common[t] = common[t - 1] if t else last
@@ -84,22 +76,15 @@ class Tare:
         return frames - drift[:, None] if drift.any() else frames
 
 
-def usual_offsets(recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_]) -> Offsets:
-    """Return the largest offsets that are usual in a reference, recordings ``[T, D]`` each."""
+def usual_offset(recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_]) -> float:
+    """Return the largest offset of all cells that is usual in a reference, recordings ``[T, D]`` each."""
     cells, some = Readings.of(recordings).sample(present)
-    common, own = [], []
+    common: list[float] = []
     for frames in some:
         if len(frames):
             above = frames - scale.resting[cells]
             common += [_common(frame) for frame in above[:: max(1, len(above) // _FRAMES)]]
-            own.append(np.fmin.reduce(above))
-    light = np.concatenate(own) if own else np.zeros(0)
-    light = light[light < _OWN * scale.full_scale]
-    within = scale.near / 2
-    return Offsets(
-        max(within, float(np.quantile(common, _USUAL)) if common else 0.0),
-        max(within, float(np.quantile(light, _USUAL)) if len(light) else 0.0),
-    )
+    return max(scale.near / 2, float(np.quantile(common, _USUAL)) if common else 0.0)
 
 
 def _common(above: Floats) -> float:

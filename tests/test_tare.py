@@ -2,13 +2,14 @@ import numpy as np
 import pytest
 from test_resting import touches
 
+from adaptfault.grasps import simulate
 from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, SensorLayout, inject
-from diagnostics.tare import Offsets, Tare, usual_offsets
+from diagnostics.tare import Tare, usual_offset
 from diagnostics.touches import Scale
 
 LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
 CELLS, PRESENT = LAYOUT.n_cells, np.ones(LAYOUT.n_cells, bool)
-USUAL = Offsets(0.005, 0.005)
+USUAL = 0.005
 SCALE = Scale(np.zeros(CELLS), 0.01, 1.0)
 
 
@@ -42,11 +43,18 @@ def test_an_offset_of_one_cell_is_its_lowest_reading_and_a_large_one_is_a_load()
     assert resting[60] == pytest.approx(0.015)
 
 
-def test_offsets_as_in_the_reference_are_usual():
-    assert usual_offsets(touches(0), SCALE, PRESENT) == USUAL
-    offsets = usual_offsets([r + 0.02 for r in touches(0)], SCALE, PRESENT)
-    assert offsets.common == pytest.approx(0.02)
-    assert offsets.own <= 0.02
+def test_an_offset_as_in_the_reference_is_usual():
+    assert usual_offset(touches(0), SCALE, PRESENT) == USUAL
+    assert usual_offset([r + 0.02 for r in touches(0)], SCALE, PRESENT) == pytest.approx(0.02)
+
+
+def test_a_small_offset_of_one_cell_is_no_load_where_the_reference_held_light_loads_throughout():
+    recordings = [np.asarray(r, dtype=np.float64) for r in simulate(10, SensorLayout(2, 8, 6), n_frames=60).frames]
+    full_scale, cells = 5.0, 96
+    fitted = SelfDiagnosis(SensorLayout(2, 8, 6)).fit(recordings[::2])
+    offsets = np.linspace(0, 0.018, cells) * full_scale
+    for k in range(1, 13, 2):
+        assert not fitted.diagnose([np.minimum(r + offsets, full_scale) for r in recordings[k::12]]).fault_set
 
 
 @pytest.mark.parametrize("offset", [0.007, 0.015, 0.03])

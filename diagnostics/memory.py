@@ -28,7 +28,7 @@ from diagnostics.unrest import Unrest
 Result = TypeVar("Result")
 
 MOST_TOUCHES, KEPT_TOUCHES = 40, 32  # when there are more, all but the last so many are weighed and let go
-_PAUSE = SEGMENT // 2  # frames of a segment after which that happens: not all work falls into one frame
+_PAUSE = SEGMENT // 2  # frames of a segment after which that begins, a little with each frame: it ends with the segment
 
 
 class Memory:
@@ -63,6 +63,7 @@ class Memory:
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
         self._filled = 0
+        self._leaving: Iterator[None] = iter(())  # work at the touches that are let go
 
     def extend(self, frames: NDArray[np.float64]) -> bool:
         """Take in frames ``[t, D]``; return whether a segment was completed."""
@@ -70,9 +71,10 @@ class Memory:
         self.stream, told = self.stream.receive(frames, self.present, self.reference.patience)
         completed = False
         taken = 0
+        next(self._leaving, None)
         while taken < len(told):
             if self._filled == _PAUSE and self._crowded:
-                self._let_go()
+                self._leaving = self._let_go()
             n = min((_PAUSE if self._filled < _PAUSE else SEGMENT) - self._filled, len(told) - taken)
             chosen = told[taken : taken + n]
             self._buffer[self._filled : self._filled + n] = frames[chosen]
@@ -87,7 +89,7 @@ class Memory:
     @property
     def due(self) -> bool:
         """Whether the next frame brings more work than being kept."""
-        return self._filled in (_PAUSE, SEGMENT - 1)
+        return self._filled == SEGMENT - 1 or (self._filled >= _PAUSE and self._crowded)
 
     def miss(self, frames: int) -> None:
         """Count frames that never came, as the sender's clock tells."""
@@ -98,6 +100,7 @@ class Memory:
         """Return a memory in which the frames that wait for their segment have been looked at; this one stays."""
         if not self._filled:
             return self
+        self._gone()
         other = copy(self)
         other._close()  # reads the frames that wait, and changes none of them
         return other
@@ -146,6 +149,7 @@ class Memory:
         return Cells(self.runs, self.settled, self.temporal(), sudden, self.present & self.heard & ~wrong)
 
     def _close(self) -> None:
+        self._gone()
         frames, numbers = self._buffer[: self._filled], self._numbers[: self._filled]
         self._filled = 0
         start = self.runs.start
@@ -171,9 +175,15 @@ class Memory:
     def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
         return frames
 
-    def _let_go(self) -> None:
-        old, self.touches = self.touches.split(KEPT_TOUCHES)
-        self.settled = finished(self.spatial(touches=old)).surprise
+    def _gone(self) -> None:
+        """Weigh the touches that are let go to the end."""
+        for _ in self._leaving:
+            pass
+
+    def _let_go(self) -> Generator[None, None, None]:
+        old, kept = self.touches.split(KEPT_TOUCHES)
+        settled = (yield from self.spatial(touches=old)).surprise
+        self.touches, self.settled = kept, settled
 
 
 def finished(work: Generator[None, None, Result]) -> Result:

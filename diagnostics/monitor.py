@@ -63,11 +63,12 @@ class Monitor:
             if self._time is not None:
                 self._memory.miss(round((time - self._time) * layout.rate) - 1)
             self._time = time
-        with self._threads.limit(limits=1) if self._memory.due else nullcontext():
+        due = self._memory.due
+        with self._threads.limit(limits=1) if due else nullcontext():
             completed = self._memory.extend(reading[None])
         if self._work is None and completed:
             self._work = self._diagnoser.judge(copy(self._memory))
-        elif self._work is not None:
+        elif self._work is not None and not due:
             try:
                 with self._threads.limit(limits=1):
                     next(self._work)

@@ -126,14 +126,14 @@ class PatchedMemory(Memory):
         # On a line of a hundred cells one is always dead: what never moved does not tell two lines apart.
         return np.where(self.runs.moved, frames, np.nan)
 
-    def _let_go(self) -> None:
+    def _let_go(self) -> Generator[None, None, None]:
         old, kept = [], []
         for touches in self.local.of:
             crowded = len(touches.kept) > MOST_TOUCHES
             gone, left = touches.split(KEPT_TOUCHES) if crowded else (Touches(), touches)
             old.append(gone)
             kept.append(left)
-        settled = finished(self._judged(self.local.replaced(old), None, self.runs.moved)).surprise
+        settled = (yield from self._judged(self.local.replaced(old), None, self.runs.moved)).surprise
         self.local, self.settled = self.local.replaced(kept), settled
 
 

@@ -75,9 +75,9 @@ def test_it_is_the_same_however_the_frames_come_in(size: int):
 
 
 def test_looking_at_it_in_between_changes_nothing():
-    log = broken()[:900]
+    log = broken()[:1800]
     memory = Memory(LAYOUT, UNKNOWN, 2.0)
-    for first in range(0, 900, 13):
+    for first in range(0, 1800, 13):
         memory.extend(log[first : first + 13])
         finished(memory.complete().spatial())
     same(memory.complete(), remembered(log))

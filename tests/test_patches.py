@@ -105,9 +105,14 @@ def test_touches_that_are_let_go_leave_their_evidence(fitted, monkeypatch):
     monkeypatch.setattr("diagnostics.patched.KEPT_TOUCHES", 2)
     healthy, memory = log(SKIN, 600, 90), fitted.memory()
     dead = np.argsort((healthy > 0.5).sum(axis=0))[[-1, -100, -200]]  # often touched
-    memory.extend(inject(healthy, [Fault(FaultKind.OPEN, (int(cell),)) for cell in dead], SKIN))
+    frames = inject(healthy, [Fault(FaultKind.OPEN, (int(cell),)) for cell in dead], SKIN)
+    memory.extend(frames)
     assert max(len(touches.kept) for touches in memory.local.of) <= 5
     assert memory.settled[dead].min() > 3
+    frame_by_frame = fitted.memory()
+    for frame in frames:
+        frame_by_frame.extend(frame[None])
+    np.testing.assert_array_equal(frame_by_frame.complete().settled, memory.complete().settled)
 
 
 def test_a_dead_row_of_a_skin_of_10000_cells_is_found_without_a_reference():

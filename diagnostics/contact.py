@@ -113,7 +113,11 @@ class ContactModel:
                 corrected, always[some, judged] = (p.T for p in told)
                 # A cell that no touch of the reference reached may be out of reach, whatever those around it do.
                 never[some, judged] = np.where(np.isnan(spread[judged]), never[some, judged], corrected)
-        never, always = (np.where(known, np.clip(p, surest, 1 - surest), 1.0) for p in (never, always))
+        # Which cells a touch reaches is of a place; that no load is held without any around it, all touches teach.
+        held = surest if self.rim is None else np.minimum(surest, surest_of(float(self.rim.touches)))
+        never, always = (
+            np.where(known, np.clip(p, least, 1 - least), 1.0) for p, least in ((never, surest), (always, held))
+        )
         return Expected(never, always, foreseen.mean, spread)
 
 
@@ -163,7 +167,7 @@ def drawn(
     return np.stack(features), np.arange(len(features)) // draws
 
 
-def surest_of(n_touches: int) -> float:
+def surest_of(n_touches: float) -> float:
     """What never happened in n touches may happen in the next with a chance of about 1 in n (rule of succession)."""
     return max(_SUREST, 1 / (n_touches + 2))
 
@@ -171,5 +175,5 @@ def surest_of(n_touches: int) -> float:
 def _touches(recording: NDArray[np.float64], scale: Scale) -> tuple[Touch, ...]:
     touches = Touches()
     for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
-        touches = touches.extend(scale.root_load(frames), numbers, scale.root_near, still)
+        touches = touches.extend(scale.root_load(frames), numbers, scale.root_near, still, np.zeros_like(still))
     return touches.kept

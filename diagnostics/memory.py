@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference
 from diagnostics.resting import less_than_healthy
-from diagnostics.spatial import Cells, Model, Spatial, stuck_evidence
+from diagnostics.spatial import SUDDEN, Cells, Model, Spatial, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.tare import Tare
 from diagnostics.temporal import StillRuns
@@ -145,8 +145,11 @@ class Memory:
     def cells(self, wrong: NDArray[np.bool_] | None) -> Cells:
         """What is known of the cells before the others are asked, but those that are known to be ``wrong``."""
         wrong = self.unrest.intermittent | self.unrest.excess | (False if wrong is None else wrong)
-        sudden = self.reference.onsets.size(self.runs, self.layout.full_scale)
-        return Cells(self.runs, self.settled, self.temporal(), sudden, self.present & self.heard & ~wrong)
+        askable = self.present & self.heard & ~wrong
+        return Cells(self.runs, self.settled, self.temporal(), self._sudden(), askable, np.zeros_like(wrong))
+
+    def _sudden(self) -> NDArray[np.float64]:
+        return self.reference.onsets.size(self.runs, self.layout.full_scale)
 
     def _close(self) -> None:
         self._gone()
@@ -161,7 +164,7 @@ class Memory:
         self.scale = scale = self._tare.on(self.reference.scale)
         root, still = scale.root_load(self._tare.off(frames)), self.runs.start <= numbers[0]
         self.touched = self.touched | root.any(axis=0)
-        self._remember(root, numbers, still)
+        self._remember(root, numbers, still, still & (self._sudden() >= SUDDEN))
         self.unrest = self.unrest.extend(frames, root, numbers, scale, self.reference.usual, still)
         self.twins = self.twins.extend(self._comparable(frames), numbers, telling(frames, still, scale), scale.near)
 
@@ -169,8 +172,10 @@ class Memory:
     def _crowded(self) -> bool:
         return len(self.touches.kept) > MOST_TOUCHES
 
-    def _remember(self, root: Array, numbers: NDArray[np.intp], still: NDArray[np.bool_]) -> None:
-        self.touches = self.touches.extend(root, numbers, self.scale.root_near, still)
+    def _remember(
+        self, root: Array, numbers: NDArray[np.intp], still: NDArray[np.bool_], stuck: NDArray[np.bool_]
+    ) -> None:
+        self.touches = self.touches.extend(root, numbers, self.scale.root_near, still, stuck)
 
     def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
         return frames

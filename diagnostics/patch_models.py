@@ -62,7 +62,7 @@ class _Touched:
         for i, recording in enumerate(readings):
             touches = PatchTouches.begin(every)
             for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
-                touches = touches.extend(scale.root_load(frames), numbers, scale.root_near, still)
+                touches = touches.extend(scale.root_load(frames), numbers, scale.root_near, still, np.zeros_like(still))
             for k, of_patch in touches.kept():
                 ranges[k] += [(i, touch.first, sum(part.n for part in touch.parts)) for touch in of_patch.kept]
         return cls(readings, scale, every, ranges)

@@ -2,12 +2,14 @@
 
 A patch cannot tell which of the cells around it are broken: their own patches can. So all patches judge twice: at first
 each asks, of the cells around it, only those that moved; then it leaves out those that their own patch suspects.
+
+A cell that holds a load where nothing moves is put to the test by touches elsewhere on the skin: it outlasts them all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,7 @@ from diagnostics.layout import SensorLayout
 from diagnostics.memory import KEPT_TOUCHES, MOST_TOUCHES, Memory, finished
 from diagnostics.patches import MOST_CELLS, PatchTouches, Rectangle, patches
 from diagnostics.reference import Reference
-from diagnostics.spatial import Model, Spatial, stuck_evidence
+from diagnostics.spatial import Cells, Model, Spatial, lone_evidence, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.touches import Array, Touches
 
@@ -59,7 +61,8 @@ class PatchedMemory(Memory):
     """A :class:`~diagnostics.memory.Memory` of an array of several patches.
 
     Attributes:
-        local: the touches of each patch; ``touches`` stays empty.
+        local: the touches of each patch.
+        touches: those of the skin as a whole, bare.
     """
 
     def __init__(self, layout: SensorLayout, reference: Reference, needed: Mask | None = None) -> None:
@@ -72,9 +75,10 @@ class PatchedMemory(Memory):
         """See :meth:`Memory.spatial`."""
         assert touches is None, "touches belong to a patch here"
         # At first, of the cells around a patch, those that moved are asked.
-        first = yield from self._judged(self.local, wrong, self.runs.moved)
+        every = yield from self._outlasting(self.cells(wrong))
+        first = yield from self._judged(self.local, every, self.runs.moved)
         suspected = first.asked & (first.evidence + self.temporal() >= self.suspicious)
-        return (yield from self._judged(self.local, wrong, ~suspected))
+        return (yield from self._judged(self.local, every, ~suspected))
 
     def views(self, onset: int) -> Iterator[tuple[Array, NDArray[np.intp], NDArray[np.intp], Model]]:
         """See :meth:`Memory.views`."""
@@ -96,12 +100,34 @@ class PatchedMemory(Memory):
         model = ContactModel((known.tiles[i].at(own.cells),), own.layout, known.rim)
         return self._models.setdefault(i, _Alone(model, own))
 
-    def _judged(self, local: PatchTouches, wrong: Mask | None, around: Mask) -> Generator[None, None, Spatial]:
+    def _outlasting(self, every: Cells) -> Generator[None, None, Cells]:
+        """Return the cells, with what is known of those that hold a load where nothing has moved for some touches."""
+        if self.reference.model is None:
+            return every  # a log tells little of the healthy where nothing moved
+        asked = Spatial.before(every).asked & (self.scale.root_load(self.runs.value) > self.scale.root_near)
+        begun = np.array([touch.first for touch in self.touches.kept])
+        outlasted, settled = np.zeros(len(asked), np.intp), every.settled.copy()
+        for i in self.local.holding(asked):
+            patch, touches = self.local.patches[i], self.local.of[i]
+            cells = patch.inputs
+            since = np.maximum(self.runs.start[cells], touches.kept[-1].end if touches.kept else 0)
+            many = np.where(asked[cells], len(begun) - np.searchsorted(begun, since), 0)
+            if many[patch.place].any():
+                outlasted[patch.outputs] = many[patch.place]
+                model, scale = self.model_of(i, touches), self.scale.of(cells)
+                evidence = yield from lone_evidence(every.of(cells), many, model, scale, self.reference.tolerance)
+                settled[patch.outputs] += evidence[patch.place]
+                yield
+        return replace(every, settled=settled, outlasted=outlasted > 0)
+
+    def _judged(self, local: PatchTouches, every: Cells, around: Mask) -> Generator[None, None, Spatial]:
         """Judge all patches, each asking those of the cells ``around`` it (bool ``[D]``)."""
-        every = self.cells(wrong)
         total = Spatial(*(np.array(values) for values in vars(Spatial.before(every)).values()))
-        touched = list(local.kept())
-        for k, (i, touches) in enumerate(touched):
+        judged = [
+            (i, touches) for i, touches in enumerate(local.of)
+            if touches.kept or every.outlasted[local.patches[i].outputs].any()
+        ]  # fmt: skip
+        for k, (i, touches) in enumerate(judged):
             patch = local.patches[i]
             cells = patch.inputs
             asked = around[cells]
@@ -111,7 +137,7 @@ class PatchedMemory(Memory):
             of_patch = finished(stuck_evidence(touches.kept, every.of(cells), model, scale, tolerance, self.suspicious))
             for name, values in vars(of_patch).items():
                 getattr(total, name)[patch.outputs] = values[patch.place]
-            if k * _PAUSES // len(touched) != (k + 1) * _PAUSES // len(touched):
+            if k * _PAUSES // len(judged) != (k + 1) * _PAUSES // len(judged):
                 yield
         return total
 
@@ -119,8 +145,10 @@ class PatchedMemory(Memory):
     def _crowded(self) -> bool:
         return any(len(touches.kept) > MOST_TOUCHES for touches in self.local.of)
 
-    def _remember(self, root: Array, numbers: NDArray[np.intp], still: Mask) -> None:
-        self.local = self.local.extend(root, numbers, self.scale.root_near, still)
+    def _remember(self, root: Array, numbers: NDArray[np.intp], still: Mask, stuck: Mask) -> None:
+        self.local = self.local.extend(root, numbers, self.scale.root_near, still, stuck)
+        skin = self.touches.extend(root, numbers, self.scale.root_near, still, stuck)
+        self.touches = skin.split(KEPT_TOUCHES)[1].bare()  # more would say no more
 
     def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
         # On a line of a hundred cells one is always dead: what never moved does not tell two lines apart.
@@ -133,7 +161,7 @@ class PatchedMemory(Memory):
             gone, left = touches.split(KEPT_TOUCHES) if crowded else (Touches(), touches)
             old.append(gone)
             kept.append(left)
-        settled = (yield from self._judged(self.local.replaced(old), None, self.runs.moved)).surprise
+        settled = (yield from self._judged(self.local.replaced(old), self.cells(None), self.runs.moved)).surprise
         self.local, self.settled = self.local.replaced(kept), settled
 
 

@@ -130,18 +130,26 @@ class PatchTouches:
         of_each = tuple(needed is None or bool(needed[patch.outputs].any()) for patch in all_patches)
         return cls(all_patches, (Touches(),) * len(all_patches), _Inputs.of(all_patches), of_each)
 
-    def extend(self, root: Array, numbers: Cells, root_near: float, still: NDArray[np.bool_]) -> PatchTouches:
+    def extend(
+        self, root: Array, numbers: Cells, root_near: float, still: NDArray[np.bool_], stuck: NDArray[np.bool_]
+    ) -> PatchTouches:
         """Return the touches after more frames, see ``Touches.extend``; a patch in which nothing moves is as before."""
         of = list(self.of)
         for i in self._inputs.with_any(~still):
             if self._needed[i]:
                 cells = self.patches[i].inputs
-                of[i] = of[i].extend(root[:, cells], numbers, root_near, still[cells])
+                of[i] = of[i].extend(root[:, cells], numbers, root_near, still[cells], stuck[cells])
         return self.replaced(of)
 
     def replaced(self, of: Sequence[Touches]) -> PatchTouches:
         """Return the same patches with other touches."""
         return replace(self, of=tuple(of))
+
+    def holding(self, cells: NDArray[np.bool_]) -> Iterator[int]:
+        """Yield the patches that are needed and have one of the ``cells`` (bool ``[D]``) among their outputs."""
+        for i in self._inputs.with_any(cells):
+            if self._needed[i] and cells[self.patches[i].outputs].any():
+                yield i
 
     def kept(self) -> Iterator[tuple[int, Touches]]:
         """Yield the patches that were touched, and their touches."""

@@ -16,7 +16,7 @@ reads one value, but an arbitrary one, while the rails are where broken cells go
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -29,12 +29,13 @@ from diagnostics.touches import Array, Scale, Touch
 
 _ANYWHERE = 0.2  # of broken cells stick anywhere, of the rest as many to the low rail as to the high one
 _LEAST = 1e-4  # no touch is less likely than this: models err
-_SUDDEN = 1.0  # log ratio of a jump from which on a cell is no witness
+SUDDEN = 1.0  # log ratio of a jump from which on a cell is no witness
 _TELLING = 0.5  # log evidence from which on a touch counts as one that tested the cell
 _LEAST_OFFSET = 0.02  # of full scale, at the mean: a smaller one does no harm
 _MOST_OFFSET = 3.0  # log evidence of one touch that a moving cell does not come to rest
 _WORTHS = (0.25, 0.5, 0.75, 1.0)  # of the log odds of the model, in one touch or another
 _WITNESS_SHARE = 0.5  # of what the moving cells say of that counts: neighbours err together
+_ONE_LOAD = 0.5  # correlation of what touches elsewhere say of a load that outlasts them
 _MOST_ROUNDS = 8  # of judging, leaving suspects out and putting others back
 
 Floats = NDArray[np.float64]
@@ -58,6 +59,7 @@ class Cells:
         temporal: float, log likelihood ratio of what it holds and of the jump into it, where the cell jumped alone.
         sudden: float, that of the jump, wherever it jumped.
         askable: bool, where there is a cell that is not known to be faulty.
+        outlasted: bool, where a load is held since before something else was touched.
     """
 
     runs: StillRuns
@@ -65,12 +67,12 @@ class Cells:
     temporal: Floats
     sudden: Floats
     askable: Mask
+    outlasted: Mask
 
     def of(self, cells: NDArray[np.intp]) -> Cells:
         """Return the same of some cells."""
-        return Cells(
-            self.runs.of(cells), self.settled[cells], self.temporal[cells], self.sudden[cells], self.askable[cells]
-        )
+        rest = (values[cells] for name, values in vars(self).items() if name != "runs")
+        return Cells(self.runs.of(cells), *rest)
 
 
 @dataclass(frozen=True)
@@ -142,14 +144,14 @@ def stuck_evidence(
         suspicious: log evidence from which on a cell is left out when others are judged.
     """
     known, runs = Spatial.before(cells), cells.runs
-    if not touches:
-        return known
     values = _Values.of(np.where(known.asked, np.nan_to_num(runs.value), 0.0), scale, tolerance)
+    if not touches:
+        return replace(known, evidence=np.where(known.surprise > 0, values.prior + known.surprise, known.evidence))
     # A load that came all of a sudden, and is still held: a quick grasp, or many cells broken at once. While this touch
     # lasts nobody can tell, so such cells are neither judged by it nor asked about the others.
     fresh = runs.start >= touches[-1].first
-    jumped = cells.temporal >= _SUDDEN
-    unsure = known.asked & ~values.rests & runs.moved & fresh & (cells.sudden >= _SUDDEN) & ~jumped
+    jumped = cells.temporal >= SUDDEN
+    unsure = known.asked & ~values.rests & runs.moved & fresh & ~cells.outlasted & (cells.sudden >= SUDDEN) & ~jumped
     asked, askable = known.asked & ~unsure, cells.askable & ~unsure
     held = np.flatnonzero(asked & ~values.rests)
     features, begins, counted = _looked_at(touches, runs, asked)
@@ -171,6 +173,30 @@ def stuck_evidence(
     moving = cells.askable & runs.moved & fresh & ~np.isnan(expected.spread)
     told = (surprise > _TELLING).sum(axis=0)
     return Spatial(evidence, brought, asked, told, _offset(features, begins, expected, moving))
+
+
+def lone_evidence(
+    cells: Cells, outlasted: NDArray[np.intp], model: Model, scale: Scale, tolerance: float
+) -> Generator[None, None, Floats]:
+    """Return what it says that a load is held where nothing moves, a log likelihood ratio ``[D]``.
+
+    All cells have a say in that, so that a thing that lies there is no fault: its cells have each other.
+
+    Args:
+        cells: what is known of them.
+        outlasted: int ``[D]``, how many touches of other parts of the skin each load has outlasted.
+        model, scale, tolerance: as for :func:`stuck_evidence`.
+    """
+    value = np.nan_to_num(cells.runs.value)
+    values, root = _Values.of(value, scale, tolerance), scale.root_load(value)
+    held = np.flatnonzero(outlasted)
+    loaded = (root > scale.root_near).astype(np.float32)
+    expected = yield from model.expect(np.stack([root, root, loaded, loaded])[None], cells.askable)
+    likely = expected.always[0, held] * expected.within(values.low[held], values.high[held], held)[0]
+    # However often something else was touched, it is one load.
+    evidence = np.zeros(len(outlasted))
+    evidence[held] = -np.log(np.maximum(likely, _LEAST)) * outlasted[held] / (1 + _ONE_LOAD * (outlasted[held] - 1))
+    return evidence
 
 
 def _looked_at(touches: Sequence[Touch], runs: StillRuns, asked: Mask) -> tuple[Array, Mask, Mask]:

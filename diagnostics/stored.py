@@ -114,7 +114,7 @@ def _model(about: Mapping[str, Any], arrays: Mapping[str, ArrayLike], layout: Se
     units = np.shape(arrays["rim.hidden"])[1:2]
     shapes = {
         "mean": (INPUTS,), "scale": (INPUTS,), "weight": (INPUTS, 2), "bias": (2,),
-        "hidden": (INPUTS, *units), "threshold": units, "out": (*units, 2),
+        "hidden": (INPUTS, *units), "threshold": units, "out": (*units, 2), "touches": (),
     }  # fmt: skip
     kind = np.dtype(np.float64)
     rim = Rim(**{name: _checked(f"rim.{name}", arrays[f"rim.{name}"], shape, kind) for name, shape in shapes.items()})

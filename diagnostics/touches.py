@@ -22,6 +22,7 @@ _RELEASED = 0.3  # of its highest load: when less is left, a touch is over
 _LEAST = 0.1  # root load: what moved less in all has touched nothing
 _WEAKEST = 0.1  # of the strongest touch so far: less is unrest, not a touch that could end
 _MOVING = 0.25  # of a load must be going, and as much of it gone, when a touch is said to be over
+_ELSEWHERE = 0.2  # of the load must go in one frame, and as much come, when another touch begins with it
 _SAME_PLACE = 0.6  # cosine between loads of one touch; less alike, and it is another
 
 
@@ -114,9 +115,13 @@ class Touch:
         return self.parts[0].first
 
     @property
-    def swing(self) -> float:
-        """How far its load has moved, summed over the cells."""
-        return float((self.highest - self.lowest).sum())
+    def end(self) -> int:
+        """About the number of the first frame after it."""
+        return self.parts[-1].first + self.parts[-1].n
+
+    def swing(self, weigh: Array) -> float:
+        """How far its load has moved, summed over the cells with weights ``[D]``."""
+        return float((self.highest - self.lowest) @ weigh)
 
     def suffixes(self) -> list[Summary]:
         """Return the summary from each part on to the end, the whole touch first."""
@@ -141,7 +146,7 @@ class Touch:
         before = sum((p.total for p in self.parts[1:]), self.parts[0].total) / n - floor
         now = part.total / part.n - floor
         size = float(np.sqrt((before @ before) * (now @ now)))
-        return size == 0 or float(before @ now) >= _SAME_PLACE * size
+        return size <= _LEAST**2 or float(before @ now) >= _SAME_PLACE * size
 
 
 @dataclass(frozen=True)
@@ -160,7 +165,14 @@ class Touches:
     fading: bool = False
     last: Array | None = None
 
-    def extend(self, root: Array, numbers: NDArray[np.intp], root_near: float, still: NDArray[np.bool_]) -> Touches:
+    def extend(
+        self,
+        root: Array,
+        numbers: NDArray[np.intp],
+        root_near: float,
+        still: NDArray[np.bool_],
+        stuck: NDArray[np.bool_],
+    ) -> Touches:
         """Return the touches after more frames.
 
         Args:
@@ -169,12 +181,14 @@ class Touches:
             root_near: the root load from which on a cell counts as loaded.
             still: bool ``[D]``, cells that do not move in these frames. Whether a load is released is asked of the
                 others: broken cells hold their value for ever.
+            stuck: bool ``[D]``, those of them that jumped to where they are, and may be broken: how large a load is
+                that could be released is asked of the others.
         """
         kept, widest, fading, last = list(self.kept), self.widest, self.fading, self.last
         going_on = bool(kept) and not fading  # the next part belongs to the last touch
         begin = 0
-        weigh = np.ones((root.shape[1], 2), np.float32)  # a product sums over the cells that move, and over all
-        weigh[:, 0] = ~still
+        weigh = np.stack([~still, ~stuck], axis=1).astype(np.float32)  # a product sums over either
+        edges = [*self._begins(root, weigh[:, 0], root_near), len(root)]
         while begin < len(root):
             if fading:
                 # While the load is still going, frames say nothing new.
@@ -186,7 +200,10 @@ class Touches:
                     fading = going_on = False
                 else:
                     break
-            ahead = root[begin:]
+            if begin == edges[0]:
+                going_on = False
+            edges = [edge for edge in edges if edge > begin]
+            ahead = root[begin : edges[0]]
             lowest, highest = np.minimum.accumulate(ahead), np.maximum.accumulate(ahead)
             if going_on:
                 lowest = np.minimum(lowest, kept[-1].lowest)
@@ -204,14 +221,42 @@ class Touches:
                 if going_on and kept[-1].same_place(part, low):
                     kept[-1] = kept[-1].grown(part, low, high)
                 else:
+                    if kept:
+                        widest = max(widest, kept[-1].swing(weigh[:, 1]))
                     kept.append(Touch((part,), ahead[:end].min(axis=0), ahead[:end].max(axis=0)))
-                widest = max(widest, kept[-1].swing)
                 going_on = True
             begin += end
-            if begin < len(root):
+            if begin < edges[0]:
                 fading, last = True, root[begin]
                 begin += 1
         return Touches(tuple(kept), widest, fading, root[-1])
+
+    def _begins(self, root: Array, weigh: Array, root_near: float) -> list[int]:
+        """Return the frames in which the load is all at once elsewhere, as where another recording begins.
+
+        Args:
+            root: root loads ``[t, D]``.
+            weigh: float ``[D]``, 1 for the cells that move, 0 for the others.
+            root_near: smaller changes are unrest.
+        """
+        before = np.concatenate([root[:1] if self.last is None else self.last[None], root[:-1]])
+        step = root - before
+        step -= np.clip(step, -root_near, root_near)
+        exchanged = np.abs(step) @ weigh - np.abs(step @ weigh)  # what came as well as went, twice
+        enough = 2 * np.maximum(_ELSEWHERE * np.maximum(root @ weigh, before @ weigh), _LEAST)
+        begins: list[int] = np.flatnonzero(exchanged >= enough).tolist()
+        return begins
+
+    def bare(self) -> Touches:
+        """Return the same without what the cells did in the touches that are over: only when they were."""
+        nothing = np.zeros(0, np.float32)
+        over = [
+            Touch((Summary(t.first, t.end - t.first, nothing, nothing, nothing),), nothing, nothing)
+            if len(t.lowest)
+            else t
+            for t in self.kept[:-1]
+        ]
+        return replace(self, kept=(*over, *self.kept[-1:]))
 
     def split(self, keep: int) -> tuple[Touches, Touches]:
         """Return (all but the last ``keep`` touches, those)."""

@@ -20,7 +20,7 @@ _LOADED = 0.05  # of full scale: a load that a contact could lose
 _BLINK_RATE = 0.05  # blinks in a loaded frame of a loose contact
 _LONGEST_BLINK = 6  # frames
 _SHORTEST = 8  # frames of a segment in which noise can be told
-_ALIKE = 0.3  # of a load: as far as it may have moved on during a blink
+_ALIKE = 0.3  # of a load: as far as it may have moved on during a blink, which goes farther
 _RAREST = 2e-4  # healthy blinks in a loaded frame, at least
 _UNKNOWN_BLINKS = 2e-3  # where no reference tells
 _RESTLESS = 0.8  # of the segments of a noisy cell are noisier than healthy ones
@@ -166,7 +166,7 @@ def _measure(
     rests, full = x <= near, frames >= top
     moderate = loaded & ~full
 
-    def blinks(away: NDArray[np.bool_]) -> NDArray[np.intp]:
+    def blinks(moderate: NDArray[np.bool_], away: NDArray[np.bool_]) -> NDArray[np.intp]:
         # Gone in one step and back in one step, to about the load that was there: as no finger could.
         count = np.zeros(x.shape[1], np.intp)
         went = moderate[:-1] & away[1:]
@@ -188,7 +188,15 @@ def _measure(
     bend = np.abs(step[1:] - step[:-1]) if len(x) > 2 else np.zeros((1, x.shape[1]), np.float32)
     restless = _median(bend) / scale.full_scale
     level = np.searchsorted(_LEVELS, root.sum(axis=0) / np.float32(len(root)), side="right") - 1
-    return blinks(rests), blinks(full), loaded.sum(axis=0, dtype=np.float64), restless, np.maximum(level, 0)
+    # A load near to full scale is soon there by itself.
+    far = moderate & ((1 + _ALIKE) * x < np.float32(top))
+    return (
+        blinks(moderate, rests),
+        blinks(far, full),
+        loaded.sum(axis=0, dtype=np.float64),
+        restless,
+        np.maximum(level, 0),
+    )
 
 
 def _median(values: NDArray[np.float32]) -> Floats:

@@ -63,7 +63,7 @@ def test_a_patch_in_which_nothing_moves_costs_nothing():
     frames = np.zeros((32, SKIN.n_cells))
     frames[:, ~still] = np.linspace(0, 2, 32)[:, None]
     scale = Scale(np.zeros(SKIN.n_cells), 0.05, 5.0)
-    after = touches.extend(scale.root_load(frames), np.arange(32), scale.root_near, still)
+    after = touches.extend(scale.root_load(frames), np.arange(32), scale.root_near, still, np.zeros_like(still))
     touched = {i for i, patch in enumerate(touches.patches) if not still[patch.inputs].all()}
     assert {i for i, (a, b) in enumerate(zip(touches.of, after.of, strict=True)) if a is not b} == touched
     assert 0 < len(touched) < len(touches.patches)
@@ -89,6 +89,20 @@ def test_a_stuck_address_bit_is_named_even_where_cells_of_its_lines_are_dead(fit
 
 def test_a_healthy_log_raises_no_alarm(fitted):
     assert not fitted.diagnose([log(SKIN, 300, 70), log(SKIN, 300, 71)]).faults
+
+
+def test_a_cell_shorted_where_nothing_touches_is_found_and_what_lies_there_is_no_fault(fitted):
+    frames = log(SKIN, 400, 80)
+    frames.reshape(400, *SKIN.shape)[:, 1] = 0.0  # nothing touches pad 1
+    short = SKIN.cell(1, 12, 12)
+    found = fitted.diagnose(inject(frames, [Fault(FaultKind.SHORT, (short,))], SKIN)).fault_set
+    assert found == {short}
+    rows, cols = np.mgrid[:24, :24]
+    thing = np.clip(3 - 0.3 * ((rows - 5) ** 2 + (cols - 15) ** 2), 0, None)
+    for begin in (0, 33):
+        lies = frames.copy()
+        lies.reshape(400, *SKIN.shape)[begin:, 1] = thing
+        assert not fitted.diagnose(lies).fault_set
 
 
 def test_the_monitor_says_what_the_diagnosis_says(fitted):

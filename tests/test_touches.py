@@ -21,13 +21,15 @@ def idle(frames: int) -> np.ndarray:
     return np.zeros((frames, CELLS))
 
 
-def touches_of(log: np.ndarray, size: int = 32) -> Touches:
-    touches, runs = Touches(), StillRuns.begin(log.shape[1])
+def touches_of(log: np.ndarray, size: int = 32, stuck: tuple[int, ...] = ()) -> Touches:
+    """The touches of a log; cells that are ``stuck`` are known to have jumped to where they are."""
+    touches, runs, jumped = Touches(), StillRuns.begin(log.shape[1]), np.isin(np.arange(log.shape[1]), stuck)
     for first in range(0, len(log), size):
         frames = log[first : first + size]
         numbers = np.arange(first, first + len(frames))
         runs = runs.extend(frames, numbers, 0.025)
-        touches = touches.extend(SCALE.root_load(frames), numbers, SCALE.root_near, runs.start <= first)
+        still = runs.start <= first
+        touches = touches.extend(SCALE.root_load(frames), numbers, SCALE.root_near, still, still & jumped)
     return touches
 
 
@@ -51,6 +53,27 @@ def test_release_and_grasp_again_are_two(times: int):
 def test_a_load_that_moves_elsewhere_without_a_release_is_another_touch():
     log = np.concatenate([held(60, HAND * [1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0])[:64], held(60, ELSEWHERE)[4:]])
     assert len(touches_of(log).kept) == 2
+
+
+@pytest.mark.parametrize("frames", [50, 64, 77])
+def test_a_load_that_is_elsewhere_from_one_frame_to_the_next_begins_another_touch_with_that_frame(frames: int):
+    log = np.concatenate([np.tile(load, (frames, 1)) for load in (HAND, np.roll(HAND, 3), HAND, np.roll(HAND, -2))])
+    assert [t.first for t in touches_of(log).kept] == [0, frames, 2 * frames, 3 * frames]
+
+
+def test_cells_that_flicker_at_the_edge_of_a_contact_begin_no_touch():
+    log = np.concatenate([held(50), idle(20), held(300)])
+    usual = [t.first for t in touches_of(log).kept]
+    log[80:, 8:] = np.random.default_rng(1).choice([0.0, 0.07], (len(log) - 80, 4))
+    assert [t.first for t in touches_of(log).kept] == usual
+
+
+def test_cells_that_jump_to_full_scale_within_a_touch_do_not_hide_that_it_ends():
+    light, broken = HAND * [1, 1, 0.5, 0.3, 0, 0, 0, 0, 0, 0, 0, 0], (5, 6, 7, 8, 9, 10, 11)
+    log = np.concatenate([part for _ in range(4) for part in (held(50, light), idle(20))])
+    usual = touches_of(log).kept
+    log[30:, broken] = 5.0
+    assert len(touches_of(log, stuck=broken).kept) == len(usual) > len(touches_of(log).kept)
 
 
 @pytest.mark.parametrize("broken", [(0,), (0, 1), (0, 1, 9, 10)])

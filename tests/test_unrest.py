@@ -101,3 +101,10 @@ def test_noise_under_load_is_learned_from_the_reference():
     log[:, 7] += rng.normal(0, 0.4, 640)
     assert cells(unrest_of(log, Usual.fit(restless, SCALE)).excess) == []
     assert cells(unrest_of(log, Usual.fit([healthy(seed) for seed in range(10)], SCALE)).excess) == [7]
+
+
+def test_a_load_that_saturates_now_and_then_does_not_blink(usual):
+    log = healthy(35)
+    log[:, 3] = np.minimum(4.6 + 0.6 * np.sin(np.arange(len(log))), 5.0)
+    for reference in (usual, Usual.unknown(SCALE)):
+        assert cells(unrest_of(log, reference).intermittent) == []

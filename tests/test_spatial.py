@@ -55,8 +55,8 @@ def judged(
         touches.append(Touch(halves, root.min(axis=0), root.max(axis=0)))
     settled = np.zeros(CELLS) if settled is None else settled
     work: Generator[None, None, Spatial] = stuck_evidence(
-        touches, Cells(runs, settled, np.full(CELLS, jump), np.full(CELLS, jump), ~wrong, NONE), model or Copycat(), SCALE,
-        0.025, 2.0,
+        touches, Cells(runs, settled, np.full(CELLS, jump), np.full(CELLS, jump), ~wrong, NONE), model or Copycat(),
+        SCALE, 0.025, 2.0,
     )  # fmt: skip
     return finished(work)
 

@@ -114,7 +114,7 @@ class ContactModel:
                 # A cell that no touch of the reference reached may be out of reach, whatever those around it do.
                 never[some, judged] = np.where(np.isnan(spread[judged]), never[some, judged], corrected)
         # Which cells a touch reaches is of a place; that no load is held without any around it, all touches teach.
-        held = surest if self.rim is None else np.minimum(surest, surest_of(float(self.rim.touches)))
+        held = surest if self.rim is None else np.minimum(surest, surest_of(self.rim.touches))
         never, always = (
             np.where(known, np.clip(p, least, 1 - least), 1.0) for p, least in ((never, surest), (always, held))
         )
@@ -167,7 +167,7 @@ def drawn(
     return np.stack(features), np.arange(len(features)) // draws
 
 
-def surest_of(n_touches: float) -> float:
+def surest_of(n_touches: int) -> float:
     """What never happened in n touches may happen in the next with a chance of about 1 in n (rule of succession)."""
     return max(_SUREST, 1 / (n_touches + 2))
 

@@ -56,7 +56,7 @@ class Rim:
         mean, scale: of what goes in, ``[k]``.
         weight: ``[k, 2]``; bias: ``[2]``.
         hidden: ``[k, h]``, of the network's units; threshold: ``[h]``; out: ``[h, 2]``.
-        touches: ``[]``, that taught it.
+        touches: how many taught it.
     """
 
     mean: Floats
@@ -66,7 +66,7 @@ class Rim:
     hidden: Floats
     threshold: Floats
     out: Floats
-    touches: Floats
+    touches: int
 
     @classmethod
     def fit(
@@ -85,7 +85,7 @@ class Rim:
         hidden, threshold, out, net_bias = _network(z, np.stack([never, always], axis=1))
         share = touches / (touches + _FEW)
         weight, bias, out = (1 - share) * weight, (1 - share) * bias + share * net_bias, share * out
-        return cls(mean, scale, weight, bias, hidden, threshold, out, np.array(float(touches)))
+        return cls(mean, scale, weight, bias, hidden, threshold, out, touches)
 
     def believe(self, samples: Array) -> tuple[Floats, Floats]:
         """Return P(unloaded throughout) and P(loaded throughout), ``[...]`` each, of samples ``[k, ...]``."""

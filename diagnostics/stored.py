@@ -20,7 +20,11 @@ from diagnostics.weighing import Weights
 
 Arrays = dict[str, NDArray[Any]]
 
-_TOLD = ("surest", "place")  # fields of a tile that are not stored as arrays: in the dict, or following from others
+_TOLD = (
+    "surest",
+    "place",
+    "touches",
+)  # fields of a tile or rim that are no arrays: in the dict, or following from others
 _ENDLESS = ("scale",)  # arrays that may hold infinity: a feature that never changed is divided by it
 _UNKNOWN = ("spread",)  # arrays that may hold NaN: of cells that were never loaded
 
@@ -55,7 +59,7 @@ def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
         "offset": float(reference.offset),
         "twins": int(reference.twins),
         "surest": None if reference.model is None else [float(tile.surest) for tile in reference.model.tiles],
-        "rim": bool(reference.model and reference.model.rim),
+        "rim": reference.model.rim.touches if reference.model and reference.model.rim else None,
     }
     arrays: Arrays = {
         "resting": reference.scale.resting,
@@ -65,7 +69,7 @@ def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
     }
     if reference.model:
         rim = vars(reference.model.rim) if reference.model.rim else {}
-        arrays |= {f"rim.{name}": value for name, value in rim.items()}
+        arrays |= {f"rim.{name}": value for name, value in rim.items() if name not in _TOLD}
         for i, tile in enumerate(reference.model.tiles):
             arrays |= {f"tile{i}.{name}": value for name, value in vars(tile).items() if name not in _TOLD}
     return about, {name: np.array(value, order="C") for name, value in arrays.items()}
@@ -109,16 +113,16 @@ def _model(about: Mapping[str, Any], arrays: Mapping[str, ArrayLike], layout: Se
     outputs = np.sort(np.concatenate([tile.outputs for tile in tiles])) if tiles else np.zeros(0)
     if not np.array_equal(outputs, np.flatnonzero(layout.present)):
         raise ValueError(f"the models do not cover the cells of {layout}, each once")
-    if not about["rim"]:
+    if about["rim"] is None:
         return ContactModel(tiles, layout)
     units = np.shape(arrays["rim.hidden"])[1:2]
     shapes = {
         "mean": (INPUTS,), "scale": (INPUTS,), "weight": (INPUTS, 2), "bias": (2,),
-        "hidden": (INPUTS, *units), "threshold": units, "out": (*units, 2), "touches": (),
+        "hidden": (INPUTS, *units), "threshold": units, "out": (*units, 2),
     }  # fmt: skip
     kind = np.dtype(np.float64)
-    rim = Rim(**{name: _checked(f"rim.{name}", arrays[f"rim.{name}"], shape, kind) for name, shape in shapes.items()})
-    return ContactModel(tiles, layout, rim)
+    read = {name: _checked(f"rim.{name}", arrays[f"rim.{name}"], shape, kind) for name, shape in shapes.items()}
+    return ContactModel(tiles, layout, Rim(**read, touches=int(about["rim"])))
 
 
 def _tile(arrays: Mapping[str, ArrayLike], i: int, surest: float, layout: SensorLayout) -> Tile:

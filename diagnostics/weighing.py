@@ -30,6 +30,7 @@ _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
 _DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
 _FEWEST_RECORDINGS = 8  # below that the reference cannot be split
 _FEWEST_CELLS = 10  # broken and healthy, that teach what evidence is worth
+_ENOUGH = 100  # recordings that are held out, in turn where need be
 _PIECE = 100  # frames; longer recordings are cut, so that a single long one can be split too
 _LEARNED_SHARE = 0.75  # of the recordings teach what healthy looks like, the others make the logs
 _MOST_TEMPORAL = 1.0  # what temporal evidence may be worth, whatever the logs say: a jump alone proves nothing
@@ -75,21 +76,25 @@ class Weights:
             return cls()
         order = rng.permutation(len(recordings))
         learned = round(_LEARNED_SHARE * len(order))
-        reference = Reference.fit([recordings[i] for i in order[:learned]], layout)
+        held_out = len(order) - learned
+        # Where few are held out at a time, others are in turn: strange touches are among them the sooner.
+        turns = max(1, min(len(order), _ENOUGH) // held_out)
+        parts = [np.split(np.roll(order, k * held_out), [learned]) for k in range(turns)]
+        references = [Reference.fit([recordings[i] for i in those], layout) for those, _ in parts]
         logs = []
         for i in range(n_logs):
-            size = min(_LOG_SIZES[i % len(_LOG_SIZES)], len(order) - learned)
-            log = np.concatenate([recordings[j] for j in rng.choice(order[learned:], size, replace=False)])
+            turn = (i + i // len(_LOG_SIZES)) % turns
+            size = min(_LOG_SIZES[i % len(_LOG_SIZES)], held_out)
+            log = np.concatenate([recordings[j] for j in rng.choice(parts[turn][1], size, replace=False)])
             share = _DEAD_SHARES[i // len(_LOG_SIZES) % len(_DEAD_SHARES)]
             onset = int(rng.uniform(0, 0.8) * len(log)) if i % 2 else None
-            logs.append((log, _random_faults(layout, share, onset, rng)))
+            logs.append((log, _random_faults(layout, share, onset, rng), layout, references[turn]))
         # Evidence depends on who is suspected, and that on what evidence is worth: first roughly, then well.
         weights = usual = cls()
         for n in (n_logs // 3, n_logs):
-            weights = cls._of([_trial(*log, layout, reference, weights.suspicious) for log in logs[:n]])
-        held_out = len(order) - learned
+            weights = cls._of([_trial(*log, weights.suspicious) for log in logs[:n]])
         # Few meet the strange touches.
-        counts = 1 - _DOUBT / (1 + (held_out / _STRANGE) ** 2)
+        counts = 1 - _DOUBT / (1 + (turns * held_out / _STRANGE) ** 2)
         slopes = zip(weights.slope, usual.slope, strict=True)
         return replace(weights, slope=tuple(s if s == default else counts * s for s, default in slopes))
 

@@ -22,6 +22,7 @@ from diagnostics.unrest import Usual
 _TOLERANCE = 0.005  # of full scale: how far a stuck cell's reading may wander, a converter's dither
 _STEPS = 1.5  # and at least so many converter steps
 _TWINS = 5  # witnesses that two healthy lines may have, where no reference tells
+_TELLING = 250  # recordings that tell how many; with half as many, one more may be
 _SAMPLED = 2000  # cells, about, that tell the converter's step
 _PATIENCE = 32  # a frame may come again so often, and twice as often as it ever did in the reference
 
@@ -38,7 +39,7 @@ class Reference:
         offset: of all cells together that is usual.
         patience: a frame that comes again more often than this says nothing new.
         usual: how restless healthy cells are.
-        twins: how many witnesses two healthy lines ever had of being one.
+        twins: how many witnesses two healthy lines may have of being one.
         model: how a touch loads a cell; None: to be learned from the log at hand (cold start).
         dead: float ``[D]``, P(dead) of cells that were dead in it already, 0 for all others.
     """
@@ -77,7 +78,7 @@ class Reference:
             usual_offset(recordings, scale, present),
             patience,
             Usual.fit(recordings, scale),
-            _most_twins(recordings, layout, scale),
+            _usual_twins(recordings, layout, scale),
             model,
             dead,
         )
@@ -117,12 +118,12 @@ def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout
     return max(_TOLERANCE * layout.full_scale, min(_STEPS * step, 2 * _TOLERANCE * layout.full_scale))
 
 
-def _most_twins(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale) -> int:
-    """Return how many witnesses two healthy lines ever had of being one."""
+def _usual_twins(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale) -> int:
+    """Return how many witnesses two healthy lines may have of being one: as ever, more if few recordings tell."""
     most = 0
     for recording in recordings:
         twins = Twins.begin(layout)
         for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
             twins = twins.extend(frames, numbers, telling(frames, still, scale), scale.near)
         most = max(most, twins.most)
-    return most
+    return most + max(0, int(np.ceil(np.log2(_TELLING / len(recordings)))))

@@ -43,7 +43,6 @@ _CLIP = 6.0  # log ratios beyond this say "certain"; they must not steer the fit
 _SURE = 24.0  # and beyond this, not even more certain
 _EXPECTED, _EXPECTED_LATE = 0.02, 0.005  # share of faulty cells before a log is seen: from the start, and in it
 _EXPECTED_CELLS, _EXPECTED_CELLS_LATE = 35.0, 25.0  # worth so many cells
-_BEYOND = 1.5  # times as far beyond the stated rate as short of it is as good
 _MOVING_ODDS = -10.0  # log odds of a fault that holds one value, for a cell that moves
 
 Floats = NDArray[np.float64]
@@ -204,15 +203,15 @@ def faulty_at(probability: Floats, false_discovery_rate: float) -> NDArray[np.bo
     """Return the set of cells whose expected share of false alarms comes near to the rate, bool ``[D]``.
 
     Near, and not below: few cells are found in one log, each is a bigger step than the last, and to stop short of the
-    rate every time would be to keep to a fraction of it. But the first keeps to it: most robots are healthy. No cell
-    that is rather alive than faulty is in the set, however good the others look.
+    rate every time would be to keep to a fraction of it: as far beyond it is as good. But the first keeps to it: most
+    robots are healthy. No cell that is rather alive than faulty is in the set, however good the others look.
     """
     order = np.argsort(-probability, kind="stable")
     false = np.cumsum(1 - probability[order])  # expected among the first 1, 2, ...
     accepted = false_discovery_rate * np.arange(1, len(order) + 1)
     beyond, short = false - accepted, accepted - np.concatenate([[0.0], false[:-1]])
     short[:1] = 0.0
-    within = np.logical_and.accumulate(beyond <= _BEYOND * np.maximum(short, 0.0))
+    within = np.logical_and.accumulate(beyond <= np.maximum(short, 0.0))
     chosen = np.zeros(len(probability), bool)
     chosen[order[within]] = True
     return chosen & (probability > 0.5)

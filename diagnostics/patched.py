@@ -24,7 +24,7 @@ from diagnostics.surroundings import Surroundings
 from diagnostics.touches import Array, Touches
 
 _SUSPICIOUS = 3.0  # log evidence from which on a cell is left out when others are judged, here and by its neighbours
-_PAUSES = 8  # of each of the two judgements: a monitor waits for all of them
+_PAUSES = 8  # of each time that the patches are gone through: a monitor waits for all of them
 
 Mask = NDArray[np.bool_]
 
@@ -106,19 +106,23 @@ class PatchedMemory(Memory):
             return every  # a log tells little of the healthy where nothing moved
         asked = Spatial.before(every).asked & (self.scale.root_load(self.runs.value) > self.scale.root_near)
         begun = np.array([touch.first for touch in self.touches.kept])
-        outlasted, settled = np.zeros(len(asked), np.intp), every.settled.copy()
+        holding, outlasted, settled = [], np.zeros(len(asked), bool), every.settled.copy()
         for i in self.local.holding(asked):
-            patch, touches = self.local.patches[i], self.local.of[i]
-            cells = patch.inputs
-            since = np.maximum(self.runs.start[cells], touches.kept[-1].end if touches.kept else 0)
-            many = np.where(asked[cells], len(begun) - np.searchsorted(begun, since), 0)
-            if many[patch.place].any():
-                outlasted[patch.outputs] = many[patch.place]
-                model, scale = self.model_of(i, touches), self.scale.of(cells)
-                evidence = yield from lone_evidence(every.of(cells), many, model, scale, self.reference.tolerance)
-                settled[patch.outputs] += evidence[patch.place]
+            patch, own = self.local.patches[i], self.local.of[i].kept
+            since = np.maximum(self.runs.start[patch.inputs], own[-1].end if own else 0)
+            many = np.where(asked[patch.inputs], len(begun) - np.searchsorted(begun, since), 0)
+            outlasted[patch.outputs] = many[patch.place] > 0
+            if outlasted[patch.outputs].any():
+                holding.append((i, many))
+        for k, (i, many) in enumerate(holding):
+            patch = self.local.patches[i]
+            cells, scale = every.of(patch.inputs), self.scale.of(patch.inputs)
+            model = self.model_of(i, self.local.of[i])
+            evidence = finished(lone_evidence(cells, many, model, scale, self.reference.tolerance))
+            settled[patch.outputs] += evidence[patch.place]
+            if _pause_after(k, len(holding)):
                 yield
-        return replace(every, settled=settled, outlasted=outlasted > 0)
+        return replace(every, settled=settled, outlasted=outlasted)
 
     def _judged(self, local: PatchTouches, every: Cells, around: Mask) -> Generator[None, None, Spatial]:
         """Judge all patches, each asking those of the cells ``around`` it (bool ``[D]``)."""
@@ -137,7 +141,7 @@ class PatchedMemory(Memory):
             of_patch = finished(stuck_evidence(touches.kept, every.of(cells), model, scale, tolerance, self.suspicious))
             for name, values in vars(of_patch).items():
                 getattr(total, name)[patch.outputs] = values[patch.place]
-            if k * _PAUSES // len(judged) != (k + 1) * _PAUSES // len(judged):
+            if _pause_after(k, len(judged)):
                 yield
         return total
 
@@ -163,6 +167,10 @@ class PatchedMemory(Memory):
             kept.append(left)
         settled = (yield from self._judged(self.local.replaced(old), self.cells(None), self.runs.moved)).surprise
         self.local, self.settled = self.local.replaced(kept), settled
+
+
+def _pause_after(k: int, n: int) -> bool:
+    return k * _PAUSES // n != (k + 1) * _PAUSES // n
 
 
 def remembering(layout: SensorLayout, reference: Reference, suspicious: float, needed: Mask | None = None) -> Memory:

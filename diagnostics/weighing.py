@@ -92,8 +92,8 @@ class Weights:
         weights = usual = cls()
         for n in (n_logs // 3, n_logs):
             weights = cls._of([_trial(*log, weights.suspicious) for log in logs[:n]])
-        # Few meet the strange touches.
-        counts = 1 - _DOUBT / (1 + (turns * held_out / _STRANGE) ** 2)
+        # Few meet the strange touches; those held out in turn teach one another, and count for fewer.
+        counts = 1 - _DOUBT / (1 + turns * (held_out / _STRANGE) ** 2)
         slopes = zip(weights.slope, usual.slope, strict=True)
         return replace(weights, slope=tuple(s if s == default else counts * s for s, default in slopes))
 

@@ -85,7 +85,7 @@ def test_a_cell_that_was_repaired_is_no_longer_faulty(fitted):
 
 def test_new_faults_are_found_beside_them(worn, fitted):
     new = LAYOUT.cell(0, 4, 3)
-    log = [inject(frames, [Fault(FaultKind.SHORT, (new,))], LAYOUT) for frames in worn[1:12:2]]
+    log = [inject(frames, [Fault(FaultKind.SHORT, (new,))], LAYOUT) for frames in worn[1::2]]
     assert fitted.diagnose(log).fault_set == DEAD | {new}
 
 

@@ -115,9 +115,8 @@ class ContactModel:
                 never[some, judged] = np.where(np.isnan(spread[judged]), never[some, judged], corrected)
         # Which cells a touch reaches is of a place; that no load is held without any around it, all touches teach.
         held = surest if self.rim is None else np.minimum(surest, surest_of(self.rim.touches))
-        never, always = (
-            np.where(known, np.clip(p, least, 1 - least), 1.0) for p, least in ((never, surest), (always, held))
-        )
+        never = np.where(known, np.clip(never, surest, 1 - surest), 1.0)
+        always = np.where(known, np.clip(always, held, 1 - held), 1.0)
         return Expected(never, always, foreseen.mean, spread)
 
 

@@ -20,11 +20,8 @@ from diagnostics.weighing import Weights
 
 Arrays = dict[str, NDArray[Any]]
 
-_TOLD = (
-    "surest",
-    "place",
-    "touches",
-)  # fields of a tile or rim that are no arrays: in the dict, or following from others
+# Fields of a tile or of the rim that are not stored as arrays: in the dict, or following from others.
+_TOLD = ("surest", "place", "touches")
 _ENDLESS = ("scale",)  # arrays that may hold infinity: a feature that never changed is divided by it
 _UNKNOWN = ("spread",)  # arrays that may hold NaN: of cells that were never loaded
 
@@ -115,6 +112,9 @@ def _model(about: Mapping[str, Any], arrays: Mapping[str, ArrayLike], layout: Se
         raise ValueError(f"the models do not cover the cells of {layout}, each once")
     if about["rim"] is None:
         return ContactModel(tiles, layout)
+    touches = int(about["rim"])
+    if touches < 1:
+        raise ValueError(f"expected the number of touches that the rim was learned from, got {touches}")
     units = np.shape(arrays["rim.hidden"])[1:2]
     shapes = {
         "mean": (INPUTS,), "scale": (INPUTS,), "weight": (INPUTS, 2), "bias": (2,),
@@ -122,7 +122,7 @@ def _model(about: Mapping[str, Any], arrays: Mapping[str, ArrayLike], layout: Se
     }  # fmt: skip
     kind = np.dtype(np.float64)
     read = {name: _checked(f"rim.{name}", arrays[f"rim.{name}"], shape, kind) for name, shape in shapes.items()}
-    return ContactModel(tiles, layout, Rim(**read, touches=int(about["rim"])))
+    return ContactModel(tiles, layout, Rim(**read, touches=touches))
 
 
 def _tile(arrays: Mapping[str, ArrayLike], i: int, surest: float, layout: SensorLayout) -> Tile:

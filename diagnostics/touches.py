@@ -250,12 +250,10 @@ class Touches:
     def bare(self) -> Touches:
         """Return the same without what the cells did in the touches that are over: only when they were."""
         nothing = np.zeros(0, np.float32)
-        over = [
+        over = (
             Touch((Summary(t.first, t.end - t.first, nothing, nothing, nothing),), nothing, nothing)
-            if len(t.lowest)
-            else t
             for t in self.kept[:-1]
-        ]
+        )
         return replace(self, kept=(*over, *self.kept[-1:]))
 
     def split(self, keep: int) -> tuple[Touches, Touches]:

@@ -166,16 +166,16 @@ def _measure(
     rests, full = x <= near, frames >= top
     moderate = loaded & ~full
 
-    def blinks(moderate: NDArray[np.bool_], away: NDArray[np.bool_]) -> NDArray[np.intp]:
+    def blinks(at_first: NDArray[np.bool_], away: NDArray[np.bool_]) -> NDArray[np.intp]:
         # Gone in one step and back in one step, to about the load that was there: as no finger could.
         count = np.zeros(x.shape[1], np.intp)
-        went = moderate[:-1] & away[1:]
+        went = at_first[:-1] & away[1:]
         if not went.any():
             return count
-        some = np.flatnonzero(went.any(axis=0) & (away[:-1] & moderate[1:]).any(axis=0))
+        some = np.flatnonzero(went.any(axis=0) & (away[:-1] & at_first[1:]).any(axis=0))
         if not len(some):
             return count
-        there, gone, of = moderate[:, some], away[:, some], x[:, some]
+        there, gone, of = at_first[:, some], away[:, some], x[:, some]
         missing = gone
         for gap in range(1, min(_LONGEST_BLINK, len(x) - 2) + 1):
             before, after = of[: -gap - 1], of[gap + 1 :]
@@ -190,13 +190,8 @@ def _measure(
     level = np.searchsorted(_LEVELS, root.sum(axis=0) / np.float32(len(root)), side="right") - 1
     # A load near to full scale is soon there by itself.
     far = moderate & ((1 + _ALIKE) * x < np.float32(top))
-    return (
-        blinks(moderate, rests),
-        blinks(far, full),
-        loaded.sum(axis=0, dtype=np.float64),
-        restless,
-        np.maximum(level, 0),
-    )
+    low, high = blinks(moderate, rests), blinks(far, full)
+    return low, high, loaded.sum(axis=0, dtype=np.float64), restless, np.maximum(level, 0)
 
 
 def _median(values: NDArray[np.float32]) -> Floats:

@@ -134,6 +134,15 @@ def test_a_reference_whose_numbers_cannot_be_is_refused(field, value):
         SelfDiagnosis.from_state(about, arrays)
 
 
+@pytest.mark.parametrize("touches", [0, -1, "many"])
+def test_a_rim_learned_from_no_touch_is_refused(fitted, touches):
+    about, arrays = fitted.state()
+    assert about["reference"]["rim"] >= 1
+    about["reference"]["rim"] = touches
+    with pytest.raises(ValueError, match="damaged"):
+        SelfDiagnosis.from_state(about, arrays)
+
+
 def test_restoring_needs_no_torch():
     code = "import sys, diagnostics.stored, diagnostics; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -22,7 +22,7 @@ _LONGEST_BLINK = 6  # frames
 _SHORTEST = 8  # frames of a segment in which noise can be told
 _ALIKE = 0.3  # of a load: as far as it may have moved on during a blink, which goes farther
 _RAREST = 2e-4  # healthy blinks in a loaded frame, at least
-_UNKNOWN_BLINKS = 2e-3  # where no reference tells
+_UNKNOWN_BLINKS, _UNKNOWN_NOISE = 2e-3, 0.05  # of a loaded frame, and of full scale, where no reference tells
 _RESTLESS = 0.8  # of the segments of a noisy cell are noisier than healthy ones
 _NOISIER = 0.002  # of healthy segments are noisier than what is called noisy
 _LEVELS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8])  # of the mean root load: noise grows with load
@@ -60,9 +60,8 @@ class Usual:
                         noise[k].append(restless[level == k])
         limit = np.zeros(len(_LEVELS))
         for k, of_level in enumerate(noise):
-            values = np.concatenate(of_level) if of_level else np.zeros(0)
-            # Few samples do not tell what is rare: the next lower level is the least.
-            limit[k] = np.quantile(values, 1 - _NOISIER) if len(values) > 1 / _NOISIER else 0.0
+            # Few samples do not tell what is rare: with one more, as noisy as an unknown array may be.
+            limit[k] = np.quantile(np.concatenate([*of_level, [_UNKNOWN_NOISE]]), 1 - _NOISIER)
         limit = np.maximum.accumulate(np.maximum(limit, scale.near / scale.full_scale))
         # With one more blink, in as many frames as an unknown array would need for it: where little was loaded, little
         # is known.
@@ -71,7 +70,7 @@ class Usual:
     @classmethod
     def unknown(cls, scale: Scale) -> Usual:
         """Stand in for a reference: rather calm, so that only gross unrest counts."""
-        return cls(_UNKNOWN_BLINKS, np.full(len(_LEVELS), 0.05))
+        return cls(_UNKNOWN_BLINKS, np.full(len(_LEVELS), _UNKNOWN_NOISE))
 
 
 @dataclass(frozen=True)

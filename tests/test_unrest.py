@@ -103,6 +103,21 @@ def test_noise_under_load_is_learned_from_the_reference():
     assert cells(unrest_of(log, Usual.fit([healthy(seed) for seed in range(10)], SCALE)).excess) == [7]
 
 
+@pytest.mark.parametrize("recordings", [1, 2, 4])
+def test_a_few_recordings_do_not_tell_how_noisy_a_load_can_be(recordings: int):
+    # The harder a cell is pressed, the noisier; now and then, and seldom in so few frames, one far more than that.
+    def restless(seed: int, frames: int = 128) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        load = healthy(seed, frames)
+        noise = 0.02 * np.exp(rng.normal(0, 0.4, (frames // 32, CELLS))).repeat(32, axis=0)
+        return np.maximum(0, load * (1 + rng.normal(0, noise)))
+
+    usual = Usual.fit([restless(seed) for seed in range(recordings)], SCALE)
+    assert [cells(unrest_of(restless(seed, 640), usual).excess) for seed in range(50, 60)] == [[]] * 10
+    noisy = inject(restless(60, 640), [Fault("noisy", (7,), value=0.5)], LAYOUT, seed=0)
+    assert cells(unrest_of(noisy, usual).excess) == [7]
+
+
 def test_a_load_that_saturates_now_and_then_does_not_blink(usual):
     log = healthy(35)
     log[:, 3] = np.minimum(4.6 + 0.6 * np.sin(np.arange(len(log))), 5.0)

@@ -230,10 +230,16 @@ def _network(z: Floats, did: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats,
 
     # Not trained to the end, which would be to learn these few touches by heart.
     network = MLPClassifier(
-        (_HIDDEN,), alpha=_DECAY, batch_size=min(_BATCH, len(z)), learning_rate_init=_RATE, random_state=0
+        (_HIDDEN,),
+        alpha=_DECAY,
+        batch_size=min(_BATCH, len(z)),
+        learning_rate_init=_RATE,
+        shuffle=False,  # done here, for all batches at once: a third faster
+        random_state=0,
     )
-    inputs, targets = z.astype(np.float32), did.astype(int)
+    inputs, targets, rng = z.astype(np.float32), did.astype(int), np.random.default_rng(0)
     for _ in range(_EPOCHS):
-        network.partial_fit(inputs, targets, classes=[0, 1])
+        order = rng.permutation(len(z))
+        network.partial_fit(inputs[order], targets[order], classes=[0, 1])
     (hidden, out), (threshold, bias) = network.coefs_, network.intercepts_
     return hidden.astype(np.float64), threshold.astype(np.float64), out.astype(np.float64), bias.astype(np.float64)

@@ -45,7 +45,7 @@ class SelfDiagnosis:
     reference_: Reference | None = None
     weights_: Weights = Weights()
 
-    def __init__(self, layout: SensorLayout, *, false_discovery_rate: float = 0.005) -> None:
+    def __init__(self, layout: SensorLayout, *, false_discovery_rate: float = 0.006) -> None:
         self.layout = layout
         self.false_discovery_rate = false_discovery_rate
 

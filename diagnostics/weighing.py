@@ -76,7 +76,7 @@ class Weights:
         order = rng.permutation(len(recordings))
         learned = round(_LEARNED_SHARE * len(order))
         held_out = len(order) - learned
-        # Where few are held out at a time, others are in turn: strange touches are among them the sooner.
+        # Others are held out in turn, the more often the fewer there are: strange touches are among them the sooner.
         turns = max(2, min(len(order), _ENOUGH) // held_out)
         parts = [np.split(np.roll(order, k * held_out), [learned]) for k in range(turns)]
         references = [Reference.fit([recordings[i] for i in those], layout) for those, _ in parts]

@@ -164,7 +164,9 @@ class Memory:
         self.scale = scale = self._tare.on(self.reference.scale)
         root, still = scale.root_load(self._tare.off(frames)), self.runs.start <= numbers[0]
         self.touched = self.touched | root.any(axis=0)
-        self._remember(root, numbers, still, still & (self._sudden() >= SUDDEN))
+        sudden = self._sudden() >= SUDDEN
+        onset = np.where(sudden & self.runs.alone & ~still, self.runs.start, -1)
+        self._remember(root, numbers, still, still & sudden, onset)
         self.unrest = self.unrest.extend(frames, root, numbers, scale, self.reference.usual, still)
         self.twins = self.twins.extend(self._comparable(frames), numbers, telling(frames, still, scale), scale.near)
 
@@ -173,9 +175,14 @@ class Memory:
         return len(self.touches.kept) > MOST_TOUCHES
 
     def _remember(
-        self, root: Array, numbers: NDArray[np.intp], still: NDArray[np.bool_], stuck: NDArray[np.bool_]
+        self,
+        root: Array,
+        numbers: NDArray[np.intp],
+        still: NDArray[np.bool_],
+        stuck: NDArray[np.bool_],
+        onset: NDArray[np.intp],
     ) -> None:
-        self.touches = self.touches.extend(root, numbers, self.scale.root_near, still, stuck)
+        self.touches = self.touches.extend(root, numbers, self.scale.root_near, still, stuck, onset)
 
     def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
         return frames

@@ -131,14 +131,21 @@ class PatchTouches:
         return cls(all_patches, (Touches(),) * len(all_patches), _Inputs.of(all_patches), of_each)
 
     def extend(
-        self, root: Array, numbers: Cells, root_near: float, still: NDArray[np.bool_], stuck: NDArray[np.bool_]
+        self,
+        root: Array,
+        numbers: Cells,
+        root_near: float,
+        still: NDArray[np.bool_],
+        stuck: NDArray[np.bool_],
+        onset: Cells | None = None,
     ) -> PatchTouches:
         """Return the touches after more frames, see ``Touches.extend``; a patch in which nothing moves is as before."""
         of = list(self.of)
         for i in self._inputs.with_any(~still):
             if self._needed[i]:
                 cells = self.patches[i].inputs
-                of[i] = of[i].extend(root[:, cells], numbers, root_near, still[cells], stuck[cells])
+                began = None if onset is None else onset[cells]
+                of[i] = of[i].extend(root[:, cells], numbers, root_near, still[cells], stuck[cells], began)
         return self.replaced(of)
 
     def replaced(self, of: Sequence[Touches]) -> PatchTouches:

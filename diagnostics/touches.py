@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 
 SEGMENT = 32  # frames that are looked at together
-_PARTS = 4  # of a touch at most; neighbours are put together beyond that
+_PARTS = 6  # of a touch at most; neighbours are put together beyond that
 _RELEASED = 0.3  # of its highest load: when less is left, a touch is over
 _LEAST = 0.1  # root load: what moved less in all has touched nothing
 _WEAKEST = 0.1  # of the strongest touch so far: less is unrest, not a touch that could end
@@ -99,7 +99,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Touch:
-    """One touch: at most four parts, and the range of the root loads of each cell in it, ``[D]``.
+    """One touch: at most six parts, and the range of the root loads of each cell in it, ``[D]``.
 
     How far a load has risen within the touch tells when it is released. A cell that holds one value has no part in
     that, whatever it holds.
@@ -172,6 +172,7 @@ class Touches:
         root_near: float,
         still: NDArray[np.bool_],
         stuck: NDArray[np.bool_],
+        onset: NDArray[np.intp] | None = None,
     ) -> Touches:
         """Return the touches after more frames.
 
@@ -183,12 +184,16 @@ class Touches:
                 others: broken cells hold their value for ever.
             stuck: bool ``[D]``, those of them that jumped to where they are, and may be broken: how large a load is
                 that could be released is asked of the others.
+            onset: int ``[D]``, number of the frame in which each jumped to where it is, alone, -1 for the others; None:
+                none did. Another part of the touch begins where most did, so that they can be judged from there on.
         """
         kept, widest, fading, last = list(self.kept), self.widest, self.fading, self.last
         going_on = bool(kept) and not fading  # the next part belongs to the last touch
         begin = 0
         weigh = np.stack([~still, ~stuck], axis=1).astype(np.float32)  # a product sums over either
-        edges = [*self._begins(root, weigh[:, 0], root_near), len(root)]
+        begins = self._begins(root, weigh[:, 0], root_near)
+        broke = None if onset is None else _most_common(onset[onset >= 0])
+        edges = sorted({*begins, *np.flatnonzero(numbers == broke).tolist(), len(root)})
         while begin < len(root):
             if fading:
                 # While the load is still going, frames say nothing new.
@@ -200,7 +205,7 @@ class Touches:
                     fading = going_on = False
                 else:
                     break
-            if begin == edges[0]:
+            if begin in begins:
                 going_on = False
             edges = [edge for edge in edges if edge > begin]
             ahead = root[begin : edges[0]]
@@ -218,7 +223,8 @@ class Touches:
             if end:
                 part = Summary.of(ahead[:end], int(numbers[begin]), root_near)
                 low, high = lowest[end - 1], highest[end - 1]
-                if going_on and kept[-1].same_place(part, low):
+                # Cells that broke do not make another touch.
+                if going_on and (part.first == broke or kept[-1].same_place(part, low)):
                     kept[-1] = kept[-1].grown(part, low, high)
                 else:
                     if kept:
@@ -259,3 +265,8 @@ class Touches:
     def split(self, keep: int) -> tuple[Touches, Touches]:
         """Return (all but the last ``keep`` touches, those)."""
         return replace(self, kept=self.kept[:-keep]), replace(self, kept=self.kept[-keep:])
+
+
+def _most_common(numbers: NDArray[np.intp]) -> int | None:
+    found, times = np.unique(numbers, return_counts=True)
+    return int(found[times.argmax()]) if len(found) else None

@@ -29,7 +29,8 @@ def touches_of(log: np.ndarray, size: int = 32, stuck: tuple[int, ...] = ()) -> 
         numbers = np.arange(first, first + len(frames))
         runs = runs.extend(frames, numbers, 0.025)
         still = runs.start <= first
-        touches = touches.extend(SCALE.root_load(frames), numbers, SCALE.root_near, still, still & jumped)
+        onset = np.where(jumped & ~still, runs.start, -1)
+        touches = touches.extend(SCALE.root_load(frames), numbers, SCALE.root_near, still, still & jumped, onset)
     return touches
 
 
@@ -61,6 +62,18 @@ def test_a_load_that_is_elsewhere_from_one_frame_to_the_next_begins_another_touc
     assert [t.first for t in touches_of(log).kept] == [0, frames, 2 * frames, 3 * frames]
 
 
+@pytest.mark.parametrize("onset", [33, 50, 63, 70])
+@pytest.mark.parametrize("value", [0.0, 5.0])
+def test_cells_that_break_within_a_touch_can_be_judged_by_the_rest_of_it(onset: int, value: float):
+    broken = (3, 4, 5)
+    log = np.concatenate([idle(10), held(100), idle(20)])
+    log[onset:, broken] = value
+    found = touches_of(log, stuck=broken)
+    (touch,) = (t for t in found.kept if t.first <= onset < t.end)
+    (rest,) = (part for part in touch.suffixes() if part.first == onset)
+    assert (rest.features()[3, list(broken)] == (value > 0)).all()  # at that value all through
+
+
 def test_cells_that_flicker_at_the_edge_of_a_contact_begin_no_touch():
     log = np.concatenate([held(50), idle(20), held(300)])
     usual = [t.first for t in touches_of(log).kept]
@@ -90,10 +103,10 @@ def test_unrest_is_no_touch_beside_a_real_one():
     assert len(touches_of(log).kept) <= 4
 
 
-def test_a_touch_keeps_at_most_4_parts_and_they_add_up_to_all_its_frames():
+def test_a_touch_keeps_at_most_6_parts_and_they_add_up_to_all_its_frames():
     hold = held(490)[:-5]
     (touch,) = touches_of(hold).kept
-    assert 1 < len(touch.parts) <= 4
+    assert 1 < len(touch.parts) <= 6
     assert sum(part.n for part in touch.parts) == 495
     assert [part.first for part in touch.parts][1:] == np.cumsum([part.n for part in touch.parts])[:-1].tolist()
     whole, at_once = touch.suffixes()[0], Summary.of(SCALE.root_load(hold), 0, SCALE.root_near)

@@ -192,19 +192,14 @@ class Touches:
         begin = 0
         weigh = np.stack([~still, ~stuck], axis=1).astype(np.float32)  # a product sums over either
         begins = self._begins(root, weigh[:, 0], root_near)
-        broke = None if onset is None else _most_common(onset[onset >= 0])
+        broke = -1 if onset is None else _most_common(onset[onset >= 0])
         edges = sorted({*begins, *np.flatnonzero(numbers == broke).tolist(), len(root)})
         while begin < len(root):
             if fading:
-                # While the load is still going, frames say nothing new.
-                sums = root[begin:].sum(axis=1)
-                before = np.concatenate([[sums[0] if last is None else last.sum()], sums[:-1]])
-                still_going = int(np.logical_and.accumulate(sums < before).sum())
-                begin += still_going
-                if begin < len(root):
-                    fading = going_on = False
-                else:
+                begin += _still_going(root[begin:], last)
+                if begin == len(root):
                     break
+                fading = going_on = False
             if begin in begins:
                 going_on = False
             edges = [edge for edge in edges if edge > begin]
@@ -267,6 +262,14 @@ class Touches:
         return replace(self, kept=self.kept[:-keep]), replace(self, kept=self.kept[-keep:])
 
 
-def _most_common(numbers: NDArray[np.intp]) -> int | None:
+def _still_going(root: Array, last: Array | None) -> int:
+    """Return in how many frames of ``[t, D]`` a load that is going still goes on: they say nothing new."""
+    sums = root.sum(axis=1)
+    before = np.concatenate([[sums[0] if last is None else last.sum()], sums[:-1]])
+    return int(np.logical_and.accumulate(sums < before).sum())
+
+
+def _most_common(numbers: NDArray[np.intp]) -> int:
+    """Return the number of the frame that is named most often, -1 if there is none."""
     found, times = np.unique(numbers, return_counts=True)
-    return int(found[times.argmax()]) if len(found) else None
+    return int(found[times.argmax()]) if len(found) else -1

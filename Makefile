@@ -54,7 +54,7 @@ format: .venv/installed-dev
 .venv/installed: pyproject.toml constraints.txt
 	@echo 'installing into .venv (torch is large: a minute or more)'
 	@test -n "$(PYTHON)" || { echo "make: no working python3 (3.10 to 3.13) with venv found; name one: make PYTHON=/path/to/python3 ..."; exit 1; }
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear .venv  # also where it was cut off
 	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e .
 	@touch $@
 

@@ -2,7 +2,9 @@
 
     python examples/udp_soak.py [--packets 100000] [--rate 1000] [--garbage 0.1]
 
-The sender (esp32_sender.py) is a process of its own. Without arguments it runs for two seconds.
+The sender (esp32_sender.py) is a process of its own. Without arguments it runs for two seconds. On a machine so busy
+that this process gets no turn, the system's buffer fills, then the queue: such packets are counted and named, and only
+one that went without a word is a failure.
 """
 
 import argparse
@@ -56,13 +58,17 @@ async def soak(args: argparse.Namespace) -> int:
                 memory.append(resident())
         await ending
         seconds, busy = time.perf_counter() - began, time.process_time() - spent
-    print("sent:    ", sender.stdout.read().strip())
+    sent = sender.stdout.read().strip()
     sender.stdout.close()
     counters = receiver.counters
+    print("sent:    ", sent)
     print("received:", counters)
+    unread = int(sent.split(": ")[1].split()[0]) - counters.received
+    if unread:
+        print(f"unread:   {unread}: the system's buffer was full")
     print(f"kept {taken} of {good} good packets in {seconds:.1f} s; {busy / seconds:.0%} of a core")
     print(f"memory after each twentieth, MB: {' '.join(f'{one:.1f}' for one in memory)}")
-    return 0 if taken == good else 1
+    return 0 if good - unread - counters.dropped <= taken <= good and taken else 1
 
 
 def main() -> int:

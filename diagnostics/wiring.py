@@ -33,9 +33,11 @@ _RAREST, _MOST_COMMON = 0.005, 0.5  # bounds on the share of single faults, whic
 _FEWEST_WITNESSES, _WITNESS_SHARE = 2, 1 / 3
 _WITNESS = 2.5  # log ratio of a cell that counts as one
 _TRIED = 0.3  # log ratio of a cell that was put to the test
-_ALIKE = 0.2  # correlation of what doubtful cells on one wire say: at the edge of a contact they are wrong together
+# Correlation of what doubtful cells on one wire say, for each cell of its line, and at most: at the edge of a contact
+# they are wrong together, and the longer the line the more of them lie along one edge.
+_ALIKE, _MOST_ALIKE = 0.02, 0.3
 _LEAST = -1.0  # log ratio that one doubtful cell can bring
-_LEADERLESS_COST = np.log(50.0)  # more, where no cell is faulty beyond doubt: at an edge many are wrongly suspected
+_LEADERLESS_COST = np.log(10.0)  # more, where no cell is faulty beyond doubt: at an edge many are wrongly suspected
 _PROVEN = np.log(9.0)  # log odds from which on a wire is named: single cells are the safer guess
 _ROUNDS = 5
 _FEW = 8  # wires of which all sets are tried
@@ -134,7 +136,7 @@ def _explain_pad(
     found = np.flatnonzero(faulty & present)
     tested = int((against & present).sum()) + len(found)
     blamed: list[_Candidate] = []
-    counts = _counting(candidates, tried & ~faulty)
+    counts = _counting(candidates, tried & ~faulty, layout)
     support, cell_cost = weight, float(-np.log(_RAREST))
     singles = 0
     for _ in range(_ROUNDS if candidates else 0):
@@ -192,7 +194,7 @@ def _candidates(
     return found
 
 
-def _counting(candidates: Sequence[_Candidate], doubtful: Mask) -> NDArray[np.float64]:
+def _counting(candidates: Sequence[_Candidate], doubtful: Mask, layout: SensorLayout) -> NDArray[np.float64]:
     """Return what share of a doubtful cell's evidence counts, ``[D]``: the less, the more of them a wire serves.
 
     So many cells whose evidence correlates are worth as much as fewer independent ones (Kish's design effect).
@@ -200,7 +202,8 @@ def _counting(candidates: Sequence[_Candidate], doubtful: Mask) -> NDArray[np.fl
     counts = np.ones(len(doubtful))
     for c in candidates:
         n = int(doubtful[c.cells].sum())
-        counts[c.cells] = np.minimum(counts[c.cells], 1 / (1 + _ALIKE * max(n - 1, 0)))
+        alike = min(_ALIKE * len(layout.cells_on(c.line)), _MOST_ALIKE)
+        counts[c.cells] = np.minimum(counts[c.cells], 1 / (1 + alike * max(n - 1, 0)))
     return counts
 
 

@@ -52,7 +52,12 @@ SLOW = {  # more than 7 s of CPU time
     "scale_curves.py",
     "wrong_fault_set.py",
 }
-SLOW_ON_RECORDINGS = {"adaptation_figures.py", "compare_classification.py", "compare_keras.py"}
+SLOW_ON_RECORDINGS = {
+    "adaptation_figures.py",
+    "compare_classification.py",
+    "compare_keras.py",
+    "diagnosis_constants.py",
+}
 NEEDS = {"deploy_speed.py": "onnxruntime"}  # others do without, and say so
 
 

@@ -117,6 +117,16 @@ def test_a_long_line_of_weak_suspects_is_the_edge_of_a_contact_and_no_wire():
     assert explain(none, alike, ~alike, np.where(alike, 2.6, NOTHING), layout) == ()
 
 
+@pytest.mark.parametrize(("weight", "blamed"), [(2.65, False), (4.0, True)])
+def test_doubtful_cells_on_one_wire_count_for_less_than_as_many_independent_ones(weight: float, blamed: bool):
+    layout = SensorLayout(1, 4, 10)
+    alike = np.isin(np.arange(40), layout.cells_on(Line(0, "column", 5)))
+    none = np.zeros(40, bool)
+    # 10.6 by one cell alone would convict it.
+    causes = explain(none, alike, ~alike, np.where(alike, weight, NOTHING), layout)
+    assert bool(causes) == blamed
+
+
 def test_a_few_doubtful_cells_do_not_convict_a_wire():
     row = LAYOUT.cells_on(Line(0, "row", 3))
     alike = mask(row[:2])
@@ -201,7 +211,7 @@ def test_suspects_alone_need_more_than_a_certain_cell_does():
     for certain in (0, 1):
         faulty = mask(row[9:][:certain])
         against = ~mask(row[6:])
-        weight = np.where(mask(row[6:]), 4.0, NOTHING)
+        weight = np.where(mask(row[6:]), 3.0, NOTHING)
         causes = explained(faulty, against, weight=weight)
         assert any(cause.line is not None for cause in causes) == bool(certain)
 

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.running import highest_so_far, lowest_so_far
+
 Floats = NDArray[np.float64]
 
 SHORTEST_RUN = 5  # frames; shorter stillness is not worth a question
@@ -67,8 +69,7 @@ class StillRuns:
         if len(broke):
             start, length, jump, company = start.copy(), length.copy(), jump.copy(), company.copy()
             # Among these frames lies the first of the stretch that ends here: look for it from the end.
-            highest = np.maximum.accumulate(top[::-1, broke], axis=0)
-            lowest = np.minimum.accumulate(bottom[::-1, broke], axis=0)
+            highest, lowest = highest_so_far(top[::-1, broke]), lowest_so_far(bottom[::-1, broke])
             count = (highest - lowest <= 2 * tolerance).sum(axis=0)  # the spread only grows: a prefix of True
             at = np.arange(len(broke))
             first = len(frames) - count
@@ -180,6 +181,5 @@ class Onsets:
 
     def size(self, runs: StillRuns, full_scale: float) -> Floats:
         """Return what the size of each jump would say of a cell that jumped alone, ``[D]``; 0 where it never moved."""
-        share = np.clip(np.abs(runs.jump) / full_scale, 0, 1)
-        which = np.clip(np.searchsorted(_JUMPS, share, side="right") - 1, 0, len(_JUMPS) - 2)
+        which = np.searchsorted(_JUMPS[1:-1], np.abs(runs.jump) / full_scale, side="right")
         return np.where(runs.moved, self.log_ratio[(runs.jump > 0).astype(np.intp), which], 0.0)

@@ -14,6 +14,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.running import highest_so_far, lowest_so_far
+
 Array = NDArray[np.float32]
 
 SEGMENT = 32  # frames that are looked at together
@@ -52,7 +54,7 @@ class Scale:
 
     def of(self, cells: NDArray[np.intp]) -> Scale:
         """Return the scale of some cells."""
-        return replace(self, resting=self.resting[cells])
+        return Scale(self.resting[cells], self.near, self.full_scale)
 
     @property
     def root_near(self) -> float:
@@ -204,7 +206,7 @@ class Touches:
                 going_on = False
             edges = [edge for edge in edges if edge > begin]
             ahead = root[begin : edges[0]]
-            lowest, highest = np.minimum.accumulate(ahead), np.maximum.accumulate(ahead)
+            lowest, highest = lowest_so_far(ahead), highest_so_far(ahead)
             if going_on:
                 lowest = np.minimum(lowest, kept[-1].lowest)
                 highest = np.maximum(highest, kept[-1].highest)
@@ -271,5 +273,7 @@ def _still_going(root: Array, last: Array | None) -> int:
 
 def _most_common(numbers: NDArray[np.intp]) -> int:
     """Return the number of the frame that is named most often, -1 if there is none."""
+    if not len(numbers):
+        return -1
     found, times = np.unique(numbers, return_counts=True)
-    return int(found[times.argmax()]) if len(found) else -1
+    return int(found[times.argmax()])

@@ -10,7 +10,7 @@ is noise around zero, as of one cell read twice, or a small but steady differenc
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 
@@ -104,7 +104,7 @@ class _Pairs:
             witnesses = np.where(ever, 0, witnesses + both.sum(axis=2))
             told = np.where(agree & (self.witnesses == 0), numbers[-1], told)
             sums = self._summed(lines, both & ~ever[..., None], ever, tolerance)
-        return replace(self, since=since, told=told, witnesses=witnesses, sums=sums)
+        return _Pairs(self.first, self.second, self.there, since, told, witnesses, sums)
 
     def _summed(self, lines: NDArray[np.float32], both: Mask, anew: Mask, tolerance: float) -> NDArray[np.float32]:
         """Return the sums with what ``both`` cells of a pair tell; pairs that differ clearly begin ``anew``."""

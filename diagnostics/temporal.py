@@ -12,8 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.running import highest_so_far, lowest_so_far
-
 Floats = NDArray[np.float64]
 
 SHORTEST_RUN = 5  # frames; shorter stillness is not worth a question
@@ -69,7 +67,8 @@ class StillRuns:
         if len(broke):
             start, length, jump, company = start.copy(), length.copy(), jump.copy(), company.copy()
             # Among these frames lies the first of the stretch that ends here: look for it from the end.
-            highest, lowest = highest_so_far(top[::-1, broke]), lowest_so_far(bottom[::-1, broke])
+            highest = np.maximum.accumulate(top[::-1, broke], axis=0)
+            lowest = np.minimum.accumulate(bottom[::-1, broke], axis=0)
             count = (highest - lowest <= 2 * tolerance).sum(axis=0)  # the spread only grows: a prefix of True
             at = np.arange(len(broke))
             first = len(frames) - count

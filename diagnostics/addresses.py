@@ -131,6 +131,10 @@ def _level_ratio(line: Line, onset: int, memory: Memory) -> float:
 
 
 def _plausible(features: NDArray[np.float32], expected: Expected, cells: NDArray[np.intp]) -> float:
+    """Return how well it fits what is expected whether the cells are loaded, and how hard, a log likelihood."""
     loaded = features[:, 2, cells] > 0
     p = np.where(loaded, 1 - expected.never[:, cells], expected.never[:, cells])
-    return float(np.log(np.maximum(p, 1e-3)).mean(axis=0).sum())
+    # Student's t with 4 degrees of freedom, from its top; nothing where it is unknown how a cell reads under load.
+    z = np.where(loaded, (features[:, 1, cells] - expected.mean[:, cells]) / expected.spread[cells], 0.0)
+    hard = -2.5 * np.log1p(np.nan_to_num(z) ** 2 / 4)
+    return float((np.log(np.maximum(p, 1e-3)) + hard).mean(axis=0).sum())

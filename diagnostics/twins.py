@@ -18,11 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.layout import LineKind, SensorLayout, address_bits
-from diagnostics.touches import Scale
+from diagnostics.touches import SEGMENT, Scale
 
 _EVERY = 4  # frames; a lasting fault does not hide between them
-FEWEST_WITNESSES = 4  # and two more than healthy lines ever had
+_LOOKED_AT = SEGMENT // _EVERY  # frames behind each witness
+FEWEST_WITNESSES = 4  # and three more than healthy lines ever had
 _STEADY = 5.0  # squared z value of a difference, mean over the cells: 1 if it is noise around zero
+_SMOOTH = 3.0  # standard deviations of the correlation of a difference with the one before: 0 if it is noise
 _STEP = 0.1  # of the tolerance: so small a difference is none
 
 Mask = NDArray[np.bool_]
@@ -65,8 +67,9 @@ class _Pairs:
         first, second: int ``[pairs]``, the lines of each.
         there: bool ``[pads, pairs, positions]``, where both have a cell.
         since, told, witnesses: int ``[pads, pairs]``, see :class:`Joined`.
-        sums: of what the cells of a pair differed by while both told something: the difference, and its square, float
-            ``[2, pads, pairs, positions]``; above 0 where there were witnesses.
+        sums: of what the cells of a pair differed by while both told something: the difference, its square, and its
+            product with the one before, float ``[3, pads, pairs, positions]``; squares are above 0 where there were
+            witnesses.
     """
 
     first: NDArray[np.intp]
@@ -83,10 +86,10 @@ class _Pairs:
         first, second = np.array(pairs(present.shape[1]) or np.empty((0, 2)), dtype=np.intp).reshape(-1, 2).T
         there = present[:, first] & present[:, second]
         nothing = np.zeros(there.shape[:2], np.intp)
-        return cls(first, second, there, nothing, nothing, nothing, np.zeros((2, *there.shape), np.float32))
+        return cls(first, second, there, nothing, nothing, nothing, np.zeros((3, *there.shape), np.float32))
 
     def extend(self, lines: NDArray[np.float32], numbers: NDArray[np.intp], telling: Mask, tolerance: float) -> _Pairs:
-        """Return the pairs after readings ``[t, pads, lines, positions]`` of some of the frames with these numbers."""
+        """Return the pairs after readings ``[t, pads, lines, positions]`` of frames with these numbers."""
         # A missing reading differs from nothing; a position without a cell neither.
         difference = np.take(lines, self.first, axis=2)
         difference -= np.take(lines, self.second, axis=2)
@@ -95,7 +98,7 @@ class _Pairs:
         apart = np.asarray(differ.any(axis=3))  # [t, pads, pairs]
         ever = np.asarray(apart.any(axis=0))
         last = len(apart) - 1 - apart[::-1].argmax(axis=0)
-        since = np.where(ever, numbers[_EVERY * last] + 1, self.since)
+        since = np.where(ever, numbers[last] + 1, self.since)
         both: Mask = np.take(telling, self.first, axis=1)  # [pads, pairs, positions]
         both &= np.take(telling, self.second, axis=1)
         told, witnesses, sums = self.told, self.witnesses, self.sums
@@ -114,13 +117,22 @@ class _Pairs:
         difference[np.isnan(difference)] = 0
         after[0, pad, pair, position] += difference.sum(axis=0)
         after[1, pad, pair, position] += (difference**2).sum(axis=0) + len(lines) * np.float32(_STEP * tolerance) ** 2
+        after[2, pad, pair, position] += (difference[1:] * difference[:-1]).sum(axis=0)
         return after
 
-    def steady(self, pad: int, pair: int) -> bool:
-        """Whether two lines differ by little, but always the same: two cells under equal loads, not one read twice."""
-        difference, squares = self.sums[:, pad, pair]
+    def alike(self, needed: int) -> list[tuple[int, int]]:
+        """Return (pad, pair) of those with so many witnesses, 1 or more, that differ by nothing but noise."""
+        return [(pad, i) for pad, i in np.argwhere(self.witnesses >= needed).tolist() if not self._steady(pad, i)]
+
+    def _steady(self, pad: int, pair: int) -> bool:
+        """Whether two lines differ by little, but not by noise: two cells under equal loads, not one read twice.
+
+        The difference is then always the same, or goes from one value to another by and by.
+        """
+        difference, squares, products = self.sums[:, pad, pair]
         told = squares > 0
-        return bool((difference[told] ** 2 / squares[told]).mean() > _STEADY)
+        smooth = float(products[told].sum() / squares[told].sum()) * np.sqrt(_LOOKED_AT * self.witnesses[pad, pair])
+        return bool((difference[told] ** 2 / squares[told]).mean() > _STEADY or smooth > _SMOOTH)
 
 
 @dataclass(frozen=True)
@@ -130,7 +142,7 @@ class Twins:
     Attributes:
         layout: the array.
         of: the pairs of rows and of columns.
-        most: the most witnesses that any pair ever had.
+        most: the most witnesses that any pair ever had that differed by nothing but noise.
     """
 
     layout: SensorLayout
@@ -152,25 +164,25 @@ class Twins:
             telling: bool ``[D]``, cells that are loaded and move in these frames.
             tolerance: as far as two conversions of one cell may differ.
         """
-        grid, told = self.layout.grid(frames[::_EVERY].astype(np.float32)), self.layout.grid(telling)
+        some = slice((len(frames) - 1) % _EVERY, None, _EVERY)  # up to the last, in which ``telling`` cells are loaded
+        grid, told = self.layout.grid(frames[some].astype(np.float32)), self.layout.grid(telling)
         of: dict[LineKind, _Pairs] = {
-            "row": self.of["row"].extend(grid, numbers, told, tolerance),
-            "column": self.of["column"].extend(grid.swapaxes(2, 3), numbers, told.swapaxes(1, 2), tolerance),
+            "row": self.of["row"].extend(grid, numbers[some], told, tolerance),
+            "column": self.of["column"].extend(grid.swapaxes(2, 3), numbers[some], told.swapaxes(1, 2), tolerance),
         }
-        most = max(int(each.witnesses.max(initial=0)) for each in of.values())
-        return Twins(self.layout, of, max(self.most, most))
+        more = [int(each.witnesses[place]) for each in of.values() for place in each.alike(self.most + 1)]
+        return Twins(self.layout, of, max([self.most, *more]))
 
     def joined(self, usual: int) -> list[Joined]:
-        """Return the pairs without a steady difference that have more witnesses than healthy ones, up to ``usual``."""
-        needed = max(FEWEST_WITNESSES, usual + 2)
+        """Return the pairs that differ by noise and have more witnesses than healthy ones, up to ``usual``."""
+        needed = max(FEWEST_WITNESSES, usual + 3)
         return [
             Joined(
                 pad, kind, int(each.first[i]), int(each.second[i]),
                 *(int(values[pad, i]) for values in (each.since, each.told, each.witnesses)),
             )
             for kind, each in self.of.items()
-            for pad, i in np.argwhere(each.witnesses >= needed).tolist()
-            if not each.steady(pad, i)
+            for pad, i in each.alike(needed)
         ]  # fmt: skip
 
     def apart_since(self, pad: int, kind: LineKind, first: int, second: int) -> int:

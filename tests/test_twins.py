@@ -94,6 +94,32 @@ def test_lines_under_equal_loads_are_told_from_one_line_read_twice(seed: int):
     assert rows() == [(2, 3)]
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_lines_that_differ_by_what_comes_and_goes_slowly_are_told_from_one_line_read_twice(seed: int):
+    rng = np.random.default_rng(seed)
+    force = 1 + 0.2 * np.sin(np.arange(400) / 9)[:, None]
+    log = np.zeros((400, 2, 6, 5))
+    log[:, 0, 2] = force * rng.uniform(0.5, 0.8, 5)  # a thing that rocks on two rows: neither has more on the whole
+    log[:, 0, 3] = log[:, 0, 2] + 0.03 * np.sin(np.arange(400)[:, None] / 12 + rng.uniform(0, 6, 5))
+    noise = rng.normal(0, 0.004, log.shape) * (log > 0)
+
+    def rows() -> list[tuple[int, int]]:
+        return [(j.first, j.second) for j in joined((log + noise).reshape(400, 60)) if j.kind == "row"]
+
+    assert rows() == []
+    log[:, 0, 3] = log[:, 0, 2]
+    assert rows() == [(2, 3)]
+
+
+@pytest.mark.parametrize("first", range(29, 33))
+def test_a_load_that_comes_with_the_last_frames_of_a_segment_is_compared_before_it_is_a_witness(first: int):
+    log = np.zeros((32, 2, 6, 5))
+    log[first:, 0, 2], log[first:, 0, 3] = np.linspace(1.0, 2.0, 5), np.linspace(2.0, 3.0, 5)
+    memory = remembered(log.reshape(32, 60))
+    assert memory.twins.most == 0
+    assert memory.twins.apart_since(0, "row", 2, 3) == (32 if first < 32 else 0)
+
+
 def test_one_clear_difference_parts_two_lines_again():
     log = inject(pressed(1), [bridge(LAYOUT, Line(1, "row", 2))], LAYOUT, until=500)
     assert joined(log) == []
@@ -146,6 +172,17 @@ def test_a_stuck_address_bit_is_named_with_its_level_and_its_copies(kind: str, b
         across = 1 if kind == "row_address" else 2
         assert moved == {LAYOUT.position(cell)[across] for cell in fault.cells}
         assert all(j in (i | 1 << bit, i & ~(1 << bit), -1) for i, j in cause.copies)
+
+
+def test_its_level_is_told_by_how_hard_the_lines_that_read_themselves_are_loaded(grasps, fitted):
+    bits = [line for line in grasps.layout.lines if line.kind in ("row_address", "column_address")]
+    rng = np.random.default_rng(0)
+    for level in (0, 1):
+        for line in bits:
+            log = np.concatenate([grasps.frames[i] for i in rng.choice(np.arange(1, 140, 2), 6, replace=False)])
+            fault = line_fault(grasps.layout, line, FaultKind.ALIAS, value=level)
+            (found,) = fitted.diagnose(inject(log, [fault], grasps.layout)).faults
+            assert (found.line, found.value, found.alternatives) == (line, level, ())
 
 
 @pytest.mark.parametrize("line", [Line(0, "row", 1), Line(0, "row", 2), Line(1, "column", 1), Line(1, "column", 3)])

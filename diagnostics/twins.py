@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.layout import LineKind, SensorLayout, address_bits
-from diagnostics.touches import SEGMENT, Scale
+from diagnostics.touches import Scale
 
 _EVERY = 4  # frames; a lasting fault does not hide between them
-_LOOKED_AT = SEGMENT // _EVERY  # frames behind each witness
 FEWEST_WITNESSES = 4  # and three more than healthy lines ever had
+_MOST_AT_ONCE = 3  # of these in one segment: neighbours under one thing are alike
 _STEADY = 5.0  # squared z value of a difference, mean over the cells: 1 if it is noise around zero
 _SMOOTH = 3.0  # standard deviations of the correlation of a difference with the one before: 0 if it is noise
 _STEP = 0.1  # of the tolerance: so small a difference is none
@@ -67,9 +67,9 @@ class _Pairs:
         first, second: int ``[pairs]``, the lines of each.
         there: bool ``[pads, pairs, positions]``, where both have a cell.
         since, told, witnesses: int ``[pads, pairs]``, see :class:`Joined`.
-        sums: of what the cells of a pair differed by while both told something: the difference, its square, and its
-            product with the one before, float ``[3, pads, pairs, positions]``; squares are above 0 where there were
-            witnesses.
+        sums: of what the cells of a pair differed by while both told something: the difference, its square, its product
+            with the one before, and 1 for each of these, float ``[4, pads, pairs, positions]``; squares are above 0
+            where there were witnesses.
     """
 
     first: NDArray[np.intp]
@@ -86,7 +86,7 @@ class _Pairs:
         first, second = np.array(pairs(present.shape[1]) or np.empty((0, 2)), dtype=np.intp).reshape(-1, 2).T
         there = present[:, first] & present[:, second]
         nothing = np.zeros(there.shape[:2], np.intp)
-        return cls(first, second, there, nothing, nothing, nothing, np.zeros((3, *there.shape), np.float32))
+        return cls(first, second, there, nothing, nothing, nothing, np.zeros((4, *there.shape), np.float32))
 
     def extend(self, lines: NDArray[np.float32], numbers: NDArray[np.intp], telling: Mask, tolerance: float) -> _Pairs:
         """Return the pairs after readings ``[t, pads, lines, positions]`` of frames with these numbers."""
@@ -104,7 +104,7 @@ class _Pairs:
         told, witnesses, sums = self.told, self.witnesses, self.sums
         agree = both.any(axis=2) & ~ever
         if agree.any() or (ever & (witnesses > 0)).any():
-            witnesses = np.where(ever, 0, witnesses + both.sum(axis=2))
+            witnesses = np.where(ever, 0, witnesses + np.minimum(both.sum(axis=2), _MOST_AT_ONCE))
             told = np.where(agree & (self.witnesses == 0), numbers[-1], told)
             sums = self._summed(lines, both & ~ever[..., None], ever, tolerance)
         return _Pairs(self.first, self.second, self.there, since, told, witnesses, sums)
@@ -118,6 +118,7 @@ class _Pairs:
         after[0, pad, pair, position] += difference.sum(axis=0)
         after[1, pad, pair, position] += (difference**2).sum(axis=0) + len(lines) * np.float32(_STEP * tolerance) ** 2
         after[2, pad, pair, position] += (difference[1:] * difference[:-1]).sum(axis=0)
+        after[3, pad, pair, position] += len(lines) - 1
         return after
 
     def alike(self, needed: int) -> list[tuple[int, int]]:
@@ -129,9 +130,9 @@ class _Pairs:
 
         The difference is then always the same, or goes from one value to another by and by.
         """
-        difference, squares, products = self.sums[:, pad, pair]
+        difference, squares, products, count = self.sums[:, pad, pair]
         told = squares > 0
-        smooth = float(products[told].sum() / squares[told].sum()) * np.sqrt(_LOOKED_AT * self.witnesses[pad, pair])
+        smooth = products[told].sum() / squares[told].sum() * np.sqrt(count[told].sum())
         return bool((difference[told] ** 2 / squares[told]).mean() > _STEADY or smooth > _SMOOTH)
 
 

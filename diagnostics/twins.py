@@ -4,7 +4,8 @@ A stuck address bit selects the same line twice, a bridge joins two neighbours: 
 frame by frame, to within the converter's step. Healthy lines do that only while nothing touches them, or by chance when
 something lies evenly across both. So each pair of lines that one bit or one bridge could join is watched: since when
 they have not differed, how often they have agreed on a load that moved (a witness), and whether what they differ by
-is noise around zero, as of one cell read twice, or a small but steady difference, as of two cells under equal loads.
+is noise around zero, as of one cell read twice, or small but stays or comes and goes slowly, as of two cells under
+equal loads.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from diagnostics.layout import LineKind, SensorLayout, address_bits
 from diagnostics.touches import Scale
 
 _EVERY = 4  # frames; a lasting fault does not hide between them
-FEWEST_WITNESSES = 4  # and three more than healthy lines ever had
+_FEWEST_WITNESSES = 4  # and three more than healthy lines ever had
 _MOST_AT_ONCE = 3  # of these in one segment: neighbours under one thing are alike
 _STEADY = 5.0  # squared z value of a difference, mean over the cells: 1 if it is noise around zero
 _SMOOTH = 3.0  # standard deviations of the correlation of a difference with the one before: 0 if it is noise
@@ -176,7 +177,7 @@ class Twins:
 
     def joined(self, usual: int) -> list[Joined]:
         """Return the pairs that differ by noise and have more witnesses than healthy ones, up to ``usual``."""
-        needed = max(FEWEST_WITNESSES, usual + 3)
+        needed = max(_FEWEST_WITNESSES, usual + 3)
         return [
             Joined(
                 pad, kind, int(each.first[i]), int(each.second[i]),

@@ -70,6 +70,7 @@ class _Candidate:
     cells: NDArray[np.intp]  # behind the break
     cost: float
     whole: bool
+    on_line: int  # cells on the wire, on either side of the break
 
 
 def explain(
@@ -136,7 +137,7 @@ def _explain_pad(
     found = np.flatnonzero(faulty & present)
     tested = int((against & present).sum()) + len(found)
     blamed: list[_Candidate] = []
-    counts = _counting(candidates, tried & ~faulty, layout)
+    counts = _counting(candidates, tried & ~faulty)
     support, cell_cost = weight, float(-np.log(_RAREST))
     singles = 0
     for _ in range(_ROUNDS if candidates else 0):
@@ -181,7 +182,7 @@ def _candidates(
     contradictions = np.flatnonzero(against[cells])
     found = []
     if len(contradictions) <= _MOST_CONTRADICTIONS and convicted(cells):
-        found.append(_Candidate(line, cells, cost(cells) + _CONTRADICTION_COST * len(contradictions), True))
+        found.append(_Candidate(line, cells, cost(cells) + _CONTRADICTION_COST * len(contradictions), True, len(cells)))
     if line.kind == "converter" or not len(contradictions):
         return found
     # Beyond the last live cell seen from either end, from the first cell with evidence on.
@@ -190,11 +191,11 @@ def _candidates(
         if len(seen):
             dead = np.sort(behind[seen[0] :])
             if convicted(dead):
-                found.append(_Candidate(line, dead, cost(dead) + _CUT_COST, False))
+                found.append(_Candidate(line, dead, cost(dead) + _CUT_COST, False, len(cells)))
     return found
 
 
-def _counting(candidates: Sequence[_Candidate], doubtful: Mask, layout: SensorLayout) -> NDArray[np.float64]:
+def _counting(candidates: Sequence[_Candidate], doubtful: Mask) -> NDArray[np.float64]:
     """Return what share of a doubtful cell's evidence counts, ``[D]``: the less, the more of them a wire serves.
 
     So many cells whose evidence correlates are worth as much as fewer independent ones (Kish's design effect).
@@ -202,7 +203,7 @@ def _counting(candidates: Sequence[_Candidate], doubtful: Mask, layout: SensorLa
     counts = np.ones(len(doubtful))
     for c in candidates:
         n = int(doubtful[c.cells].sum())
-        alike = min(_ALIKE * len(layout.cells_on(c.line)), _MOST_ALIKE)
+        alike = min(_ALIKE * c.on_line, _MOST_ALIKE)
         counts[c.cells] = np.minimum(counts[c.cells], 1 / (1 + alike * max(n - 1, 0)))
     return counts
 

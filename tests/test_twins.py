@@ -42,6 +42,13 @@ def joined(log: np.ndarray) -> list[Joined]:
     return remembered(log).twins.joined(usual=2)
 
 
+def rows_joined(first: np.ndarray, second: np.ndarray, noise: np.ndarray) -> list[tuple[int, int]]:
+    """Return the rows that are joined where two of pad 0 read ``[t, 5]`` each, and nothing touches the others."""
+    log = np.zeros((len(first), 2, 6, 5))
+    log[:, 0, 2], log[:, 0, 3] = np.stack([first, second]) + noise
+    return [(j.first, j.second) for j in joined(log.reshape(len(log), 60)) if j.kind == "row"]
+
+
 # Pairs of lines
 
 
@@ -82,33 +89,20 @@ def test_lines_under_equal_loads_are_told_from_one_line_read_twice(seed: int):
     rng = np.random.default_rng(seed)
     force = 1 + 0.2 * np.sin(np.arange(400) / 9)[:, None]
     bar = rng.uniform(0.5, 0.8, 5)  # it lies evenly across two rows
-    log = np.zeros((400, 2, 6, 5))
-    log[:, 0, 2], log[:, 0, 3] = force * bar, force * (bar + rng.uniform(-0.02, 0.02, 5))
-    noise = rng.normal(0, 0.004, log.shape) * (log > 0)
-
-    def rows() -> list[tuple[int, int]]:
-        return [(j.first, j.second) for j in joined((log + noise).reshape(400, 60)) if j.kind == "row"]
-
-    assert rows() == []
-    log[:, 0, 3] = log[:, 0, 2]
-    assert rows() == [(2, 3)]
+    other, noise = force * (bar + rng.uniform(-0.02, 0.02, 5)), rng.normal(0, 0.004, (2, 400, 5))
+    assert rows_joined(force * bar, other, noise) == []
+    assert rows_joined(force * bar, force * bar, noise) == [(2, 3)]
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_lines_that_differ_by_what_comes_and_goes_slowly_are_told_from_one_line_read_twice(seed: int):
     rng = np.random.default_rng(seed)
     force = 1 + 0.2 * np.sin(np.arange(400) / 9)[:, None]
-    log = np.zeros((400, 2, 6, 5))
-    log[:, 0, 2] = force * rng.uniform(0.5, 0.8, 5)  # a thing that rocks on two rows: neither has more on the whole
-    log[:, 0, 3] = log[:, 0, 2] + 0.03 * np.sin(np.arange(400)[:, None] / 12 + rng.uniform(0, 6, 5))
-    noise = rng.normal(0, 0.004, log.shape) * (log > 0)
-
-    def rows() -> list[tuple[int, int]]:
-        return [(j.first, j.second) for j in joined((log + noise).reshape(400, 60)) if j.kind == "row"]
-
-    assert rows() == []
-    log[:, 0, 3] = log[:, 0, 2]
-    assert rows() == [(2, 3)]
+    thing = force * rng.uniform(0.5, 0.8, 5)  # it rocks on two rows: neither has more on the whole
+    other = thing + 0.03 * np.sin(np.arange(400)[:, None] / 12 + rng.uniform(0, 6, 5))
+    noise = rng.normal(0, 0.004, (2, 400, 5))
+    assert rows_joined(thing, other, noise) == []
+    assert rows_joined(thing, thing, noise) == [(2, 3)]
 
 
 @pytest.mark.parametrize("first", range(29, 33))

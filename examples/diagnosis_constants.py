@@ -1,8 +1,9 @@
 """Does the diagnosis hang on its constants? python examples/diagnosis_constants.py [RECORDINGS [LOGS]]
 
-Halves and doubles every number that `diagnostics` holds for itself, one at a time, fits anew, and measures the first
-row of `diagnosis_figures.py`: 16 % of the cells dead. Numbers that this array never meets (those of large skins, say)
-are told apart by watching which functions run. ``--out`` keeps what is measured: run again, it goes on from there.
+Halves and doubles every number that `diagnostics` holds for itself, one at a time, and measures the first row of
+`diagnosis_figures.py`: 16 % of the cells dead. Which numbers fitting meets, which judging meets, and which this array
+never does (those of large skins, say) is told by watching which functions run: it is fitted anew where fitting meets
+the number. ``--out`` keeps what is measured: run again, it goes on from there.
 
 Two bounds: what is wanted of the first row, and a looser one, 1 % off it, that shows what a constant breaks and what
 it only moves. ``--only spatial._LEAST ...`` picks constants. Without RECORDINGS: simulated grasps of a small array.
@@ -12,13 +13,14 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import inspect
 import pkgutil
 import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import FrameType
+from types import FrameType, ModuleType
 from typing import TypeVar
 
 import numpy as np
@@ -34,6 +36,7 @@ Result = TypeVar("Result")
 PRECISION, RECALL, SLACK = 0.995, 0.98, 0.01
 SHARE = 0.16
 NOT_DIAGNOSING = ("circuit", "injection", "picture")  # public tools and the injector
+COUNTS = ("FEATURES", "INPUTS", "_KINDS")  # of what there is: nobody chose them
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,24 @@ class Constant:
     changed: float
 
     def __str__(self) -> str:
-        return f"{self.module.removeprefix('diagnostics.')}.{self.name} {self.value:g} -> {self.changed:g}"
+        return f"{self.title} {self.value:g} -> {self.changed:g}"
+
+    @property
+    def title(self) -> str:
+        """Module and name."""
+        return f"{self.module.removeprefix('diagnostics.')}.{self.name}"
+
+    @property
+    def places(self) -> list[tuple[str, str]]:
+        """Module and name wherever it is known: what has a public name is imported by others."""
+        if self.name.startswith("_"):
+            return [(self.module, self.name)]
+        return [(module.__name__, self.name) for module in modules() if self.name in vars(module)]
+
+    def set(self, value: float) -> None:
+        """Change it, everywhere."""
+        for module, name in self.places:
+            setattr(importlib.import_module(module), name, value)
 
 
 @dataclass(frozen=True)
@@ -67,16 +87,21 @@ class Measured:
         return "near" if self.precision >= PRECISION - SLACK and self.recall >= RECALL - SLACK else "BREAKS"
 
 
+def modules() -> list[ModuleType]:
+    """Return those of `diagnostics` that find faults."""
+    names = [info.name for info in pkgutil.iter_modules(diagnostics.__path__) if info.name not in NOT_DIAGNOSING]
+    return [importlib.import_module(f"diagnostics.{name}") for name in names]
+
+
 def constants() -> Iterator[Constant]:
     """Yield all of them, halved and doubled."""
-    for info in pkgutil.iter_modules(diagnostics.__path__):
-        if info.name in NOT_DIAGNOSING:
-            continue
-        module = importlib.import_module(f"diagnostics.{info.name}")
+    for module in modules():
+        source = inspect.getsource(module)
         for name, value in sorted(vars(module).items()):
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if number and re.fullmatch(r"_[A-Z][A-Z0-9_]*", name):
-                for changed in (value / 2 if isinstance(value, float) else value // 2, 2 * value):
+            number = isinstance(value, int | float | np.floating) and not isinstance(value, bool)
+            own = re.search(rf"^(_?[A-Z0-9_]+, )*{name}(, [A-Z0-9_]+)* = ", source, re.MULTILINE)
+            if number and own and re.fullmatch(r"_?[A-Z][A-Z0-9_]*", name) and name not in COUNTS:
+                for changed in (value // 2 if isinstance(value, int) else value / 2, 2 * value):
                     if changed not in (0, value):
                         yield Constant(module.__name__, name, value, changed)
 
@@ -101,24 +126,24 @@ def mentioned(work: Callable[[], Result]) -> tuple[Result, set[tuple[str, str]]]
     return result, found
 
 
-def first_row(recordings: Recordings, split: int, count: int) -> tuple[float, float]:
-    """Fit, and return precision and recall of the first row."""
-    bench = Bench(recordings, split, count)
-    fitted = SelfDiagnosis(bench.layout).fit([recordings.frames[i] for i in bench.reference])
+def first_row(bench: Bench, fitted: SelfDiagnosis) -> tuple[float, float]:
+    """Return precision and recall of the first row."""
     tally = dead_cells(bench, fitted, SHARE)
     return float(np.nan_to_num(tally.precision)), tally.recall  # of nothing found no part is right
 
 
-def changed_row(constant: Constant, recordings: Recordings, split: int, count: int) -> Measured:
-    """Measure the first row with a constant changed."""
-    module = importlib.import_module(constant.module)
-    setattr(module, constant.name, constant.changed)
+def changed_row(
+    constant: Constant, recordings: Recordings, split: int, count: int, fitted: SelfDiagnosis | None
+) -> Measured:
+    """Measure the first row with a constant changed, of what was fitted already, or fitted anew."""
+    bench = Bench(recordings, split, count)
+    constant.set(constant.changed)
     try:
-        return Measured(str(constant), *first_row(recordings, split, count))
+        return Measured(str(constant), *first_row(bench, fitted or bench.learned()))
     except Exception as error:  # a constant that must not be changed: to be told, too
         return Measured(str(constant), 0.0, 0.0, f"{type(error).__name__}: {error}")
     finally:
-        setattr(module, constant.name, constant.value)
+        constant.set(constant.value)
 
 
 def show(row: Measured) -> None:
@@ -136,13 +161,14 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", metavar="MODULE.NAME", help="constants")
     options = parser.parse_args()
     recordings = load(options.recordings).recordings if options.recordings else small()
-    count = options.logs if options.recordings else 2
-    job = recordings, options.split, count
-    usual, met = mentioned(lambda: first_row(*job))
+    job = recordings, options.split, options.logs if options.recordings else 2
+    bench = Bench(*job)
+    fitted, met_fitting = mentioned(bench.learned)
+    usual, met_judging = mentioned(lambda: first_row(bench, fitted))
     show(Measured("as they are", *usual))
-    wanted = {f"diagnostics.{name}" for name in options.only or ()}
-    every = [c for c in constants() if not wanted or f"{c.module}.{c.name}" in wanted]
-    used = [c for c in every if (c.module, c.name) in met]
+    every = [c for c in constants() if not options.only or c.title in options.only]
+    met = met_fitting | met_judging
+    used = [c for c in every if not met.isdisjoint(c.places)]
     print(f"{len(every)} changes, {len(used)} of constants that this array meets")
     kept = Lines(options.out) if options.out else None
     rows = [Measured(**document) for document in kept.read()] if kept else []
@@ -152,7 +178,7 @@ def main() -> None:
     left = [c for c in used if str(c) not in done]
     with parallel_config(backend="loky", inner_max_num_threads=1):
         for row in Parallel(n_jobs=options.jobs, return_as="generator_unordered")(
-            delayed(changed_row)(c, *job) for c in left
+            delayed(changed_row)(c, *job, fitted if met_fitting.isdisjoint(c.places) else None) for c in left
         ):
             show(row)
             if kept:

@@ -89,6 +89,13 @@ class ContactModel:
             rim = Lessons.of(features, touch, layout, every, regressions, 1.0, rng).learned()
         return cls((Tile.fit(features, every, every, surest_of(n_touches)),), layout, rim)
 
+    def surest(self, n_cells: int) -> NDArray[np.float64]:
+        """Return the chance ``[D]`` of D cells that a touch does with one what none did before; 1: nothing is known."""
+        surest = np.ones(n_cells)
+        for tile in self.tiles:
+            surest[tile.outputs] = tile.surest
+        return surest
+
     def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Generator[None, None, Expected]:
         """Say what healthy cells would do. A generator that pauses on its way, for those who cannot wait.
 

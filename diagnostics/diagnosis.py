@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from diagnostics.spatial import Spatial
 from diagnostics.stored import Arrays, reference_from_state, reference_state, weights_from_state, weights_state
 from diagnostics.verdicts import Diagnosis
 from diagnostics.weighing import Weights, faulty_at, kinds
+from diagnostics.wiring import suspected
 
 SCHEMA = "adaptfault.diagnoser/5"
 
@@ -131,6 +133,7 @@ class SelfDiagnosis:
         spatial = yield from memory.spatial(wrong)
         found = self._found(memory, spatial, wrong)
         yield
+        found = yield from self._with_those_apart(found, memory, spatial, wrong)
         causes = yield from root_causes(found, aliased, self.layout)
         probability, inferred = found.probability.copy(), np.zeros(self.layout.n_cells, bool)
         for fault in causes:
@@ -199,7 +202,31 @@ class SelfDiagnosis:
             weight=np.where(known, _KNOWN, self.weights_.worth(spatial.surprise, temporal, kind)),
             touches=np.where(intermittent, unrest.blinks, spatial.touches),
             known=known,
+            strange=memory.strange(),
         )
+
+    def _with_those_apart(
+        self, found: Findings, memory: Memory, spatial: Spatial, wrong: NDArray[np.bool_]
+    ) -> Generator[None, None, Findings]:
+        """Return the same, with what speaks for broken wires if their cells do not vouch for each other.
+
+        The chain rule of probability would ask, for each of them in turn, those before it: half of them, that is about
+        the mean of asking all and asking none.
+        """
+        temporal, kind, alike = memory.temporal(), kinds(memory), found.rests & ~wrong
+
+        def mean_with(apart: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.maximum(found.weight, (found.weight + self.weights_.worth(apart, temporal, kind)) / 2)
+
+        against = found.alive | ~(found.rests | found.silent) & memory.present
+        groups = suspected(alike, against, mean_with(spatial.at_first), self.layout)
+        if not groups:
+            return found
+        apart = yield from memory.apart(spatial, wrong, groups)
+        weight = found.weight.copy()
+        for group, of_group in zip(groups, apart, strict=True):
+            weight[group] = np.maximum(weight[group], mean_with(of_group)[group])
+        return replace(found, weight=weight)
 
 
 def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> Readings:

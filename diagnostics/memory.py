@@ -6,17 +6,18 @@ touches. Older touches are weighed, and only their evidence stays.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from copy import copy
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.contact import surest_of
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference
 from diagnostics.resting import less_than_healthy
-from diagnostics.spatial import SUDDEN, Cells, Model, Spatial, stuck_evidence
+from diagnostics.spatial import SUDDEN, Cells, Model, Spatial, apart_evidence, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.tare import Tare
 from diagnostics.temporal import StillRuns
@@ -141,6 +142,34 @@ class Memory:
             touches.kept, self.cells(wrong), self.model(), self.scale, self.reference.tolerance,
             self.suspicious,
         )  # fmt: skip
+
+    def apart(
+        self, spatial: Spatial, wrong: NDArray[np.bool_], groups: Sequence[NDArray[np.intp]]
+    ) -> Generator[None, None, NDArray[np.float64]]:
+        """What touches say of cells if nobody is asked who may have broken with them, ``[groups, D]``.
+
+        Args:
+            spatial: what was found with all asked that are not suspected.
+            wrong: bool ``[D]``, known to be wrong.
+            groups: cells each, that may have broken together.
+        """
+        if not self.touches.kept:
+            return np.tile(self.settled, (len(groups), 1))
+        return (
+            yield from apart_evidence(
+                self.touches.kept, self.cells(wrong), self.model(), self.scale, self.reference.tolerance,
+                ~self._suspected(spatial), groups,
+            )
+        )  # fmt: skip
+
+    def strange(self) -> NDArray[np.float64]:
+        """The chance that a touch does with a cell what none did before, as far as is known, ``[D]``."""
+        if self.reference.model is None:
+            return np.full(self.layout.n_cells, surest_of(len(self.touches.kept)))
+        return self.reference.model.surest(self.layout.n_cells)
+
+    def _suspected(self, spatial: Spatial) -> NDArray[np.bool_]:
+        return spatial.asked & (spatial.evidence + self.temporal() >= self.suspicious)
 
     def cells(self, wrong: NDArray[np.bool_] | None) -> Cells:
         """What is known of the cells before the others are asked, but those that are known to be ``wrong``."""

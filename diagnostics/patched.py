@@ -8,7 +8,7 @@ A cell that holds a load where nothing moves is put to the test by touches elsew
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from diagnostics.layout import SensorLayout
 from diagnostics.memory import KEPT_TOUCHES, MOST_TOUCHES, Memory, finished
 from diagnostics.patches import MOST_CELLS, PatchTouches, Rectangle, patches
 from diagnostics.reference import Reference
-from diagnostics.spatial import Cells, Model, Spatial, lone_evidence, stuck_evidence
+from diagnostics.spatial import Cells, Model, Spatial, apart_evidence, lone_evidence, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.touches import Array, Touches
 
@@ -77,8 +77,29 @@ class PatchedMemory(Memory):
         # At first, of the cells around a patch, those that moved are asked.
         every = yield from self._outlasting(self.cells(wrong))
         first = yield from self._judged(self.local, every, self.runs.moved)
-        suspected = first.asked & (first.evidence + self.temporal() >= self.suspicious)
-        return (yield from self._judged(self.local, every, ~suspected))
+        return (yield from self._judged(self.local, every, ~self._suspected(first)))
+
+    def apart(
+        self, spatial: Spatial, wrong: Mask, groups: Sequence[NDArray[np.intp]]
+    ) -> Generator[None, None, NDArray[np.float64]]:
+        """See :meth:`Memory.apart`."""
+        every, trusted = self.cells(wrong), ~self._suspected(spatial)
+        total = np.tile(self.settled, (len(groups), 1))
+        for i, touches in enumerate(self.local.of):
+            cells, place = self.local.patches[i].inputs, self.local.patches[i].place
+            here = [k for k, group in enumerate(groups) if np.isin(group, cells[place]).any()]
+            if not touches.kept or not here:
+                continue
+            own = [np.flatnonzero(np.isin(cells, groups[k])) for k in here]
+            brought = finished(
+                apart_evidence(
+                    touches.kept, every.of(cells), self.model_of(i, touches), self.scale.of(cells),
+                    self.reference.tolerance, trusted[cells], own,
+                )
+            )  # fmt: skip
+            total[np.array(here)[:, None], cells[place]] = brought[:, place]
+            yield
+        return total
 
     def views(self, onset: int) -> Iterator[tuple[Array, NDArray[np.intp], NDArray[np.intp], Model]]:
         """See :meth:`Memory.views`."""

@@ -9,6 +9,9 @@ Every touch after s adds
 Now and then a touch is like none before, and then the model errs about many cells at once. The cells that move give
 that away, and the model is believed the less in that touch.
 
+Cells that broke together, as those on one wire, vouch for each other all the same: they are judged once more with none
+of them asked (see :func:`apart_evidence`).
+
 How likely a stuck cell is to be stuck at just this v is charged once: a cell held still under a constant load also
 reads one value, but an arbitrary one, while the rails are where broken cells go.
 """
@@ -82,6 +85,7 @@ class Spatial:
     Attributes:
         evidence: float ``[D]``, log likelihood ratio stuck : healthy; 0 where there is nothing to ask.
         surprise: float ``[D]``, the part of it that touches brought.
+        at_first: float ``[D]``, the same while only the cells that moved were asked.
         asked: bool ``[D]``, the cells that are still now.
         touches: int ``[D]``, how many touches each was judged by that said more than nothing.
         offset: float ``[D]``, log likelihood ratio of a cell that moves, but is loaded all through the last touches,
@@ -90,6 +94,7 @@ class Spatial:
 
     evidence: Floats
     surprise: Floats
+    at_first: Floats
     asked: Mask
     touches: NDArray[np.intp]
     offset: Floats
@@ -99,7 +104,7 @@ class Spatial:
         """Return what is known where nothing touched the cells since earlier touches were weighed."""
         asked = cells.askable & (cells.runs.length >= SHORTEST_RUN)
         settled, nothing = np.where(asked, cells.settled, 0.0), np.zeros(len(asked))
-        return cls(settled, settled, asked, np.zeros(len(asked), np.intp), nothing)
+        return cls(settled, settled, settled, asked, np.zeros(len(asked), np.intp), nothing)
 
 
 @dataclass(frozen=True)
@@ -127,6 +132,57 @@ class _Values:
         return cls(rests, low, high, np.log(np.where(rests | full, (1 - _ANYWHERE) / 2, anywhere)))
 
 
+@dataclass(frozen=True)
+class _Question:
+    """What is asked of the cells that are still now, whoever answers.
+
+    Attributes:
+        touches, cells, model: what happened, what is known of the cells, what healthy looks like.
+        known: what is known where nothing touched them.
+        values: what still cells read.
+        asked, askable: bool ``[D]``, the cells that are judged, and those that may be asked about others.
+        features, begins, counted: see :func:`_looked_at`.
+    """
+
+    touches: Sequence[Touch]
+    cells: Cells
+    model: Model
+    known: Spatial
+    values: _Values
+    asked: Mask
+    askable: Mask
+    features: Array
+    begins: Mask
+    counted: Mask
+
+    @classmethod
+    def of(cls, touches: Sequence[Touch], cells: Cells, model: Model, scale: Scale, tolerance: float) -> _Question:
+        """Ask about one touch or more."""
+        known, runs = Spatial.before(cells), cells.runs
+        values = _Values.of(np.where(known.asked, np.nan_to_num(runs.value), 0.0), scale, tolerance)
+        # A load that came all of a sudden, and is still held: a quick grasp, or many cells broken at once. While this
+        # touch lasts nobody can tell, so such cells are neither judged by it nor asked about the others.
+        held = known.asked & ~values.rests & runs.moved & (runs.start >= touches[-1].first) & ~cells.outlasted
+        unsure = held & (cells.sudden >= SUDDEN) & (cells.temporal < SUDDEN)
+        asked = known.asked & ~unsure
+        looked_at = _looked_at(touches, runs, asked)
+        return cls(touches, cells, model, known, values, asked, cells.askable & ~unsure, *looked_at)
+
+    def answered(self, trusted: Mask) -> Generator[None, None, tuple[Expected, Floats]]:
+        """Return what the ``trusted`` cells (bool ``[D]``) expect, and the surprise of each stretch ``[n, D]``."""
+        expected = yield from self.model.expect(self.features, trusted)
+        yield
+        held = np.flatnonzero(self.asked & ~self.values.rests)
+        likely = _believed(expected.never, self.features[:, 2] == 0, trusted & self.cells.runs.moved)
+        within = expected.within(self.values.low[held], self.values.high[held], held)
+        likely[:, held] = expected.always[:, held] * within
+        return expected, np.where(self.counted, -np.log(np.maximum(likely, _LEAST)), 0.0)
+
+    def brought(self, surprise: Floats) -> Floats:
+        """Return the evidence ``[D]`` of all touches, those before included."""
+        return np.where(self.asked, self.cells.settled + surprise.sum(axis=0), 0.0)
+
+
 def stuck_evidence(
     touches: Sequence[Touch], cells: Cells, model: Model, scale: Scale, tolerance: float, suspicious: float
 ) -> Generator[None, None, Spatial]:
@@ -143,36 +199,57 @@ def stuck_evidence(
         tolerance: how near to v counts as v.
         suspicious: log evidence from which on a cell is left out when others are judged.
     """
-    known, runs = Spatial.before(cells), cells.runs
-    values = _Values.of(np.where(known.asked, np.nan_to_num(runs.value), 0.0), scale, tolerance)
     if not touches:
-        return replace(known, evidence=np.where(known.surprise > 0, values.prior + known.surprise, known.evidence))
-    # A load that came all of a sudden, and is still held: a quick grasp, or many cells broken at once. While this touch
-    # lasts nobody can tell, so such cells are neither judged by it nor asked about the others.
-    fresh = runs.start >= touches[-1].first
-    jumped = cells.temporal >= SUDDEN
-    unsure = known.asked & ~values.rests & runs.moved & fresh & ~cells.outlasted & (cells.sudden >= SUDDEN) & ~jumped
-    asked, askable = known.asked & ~unsure, cells.askable & ~unsure
-    held = np.flatnonzero(asked & ~values.rests)
-    features, begins, counted = _looked_at(touches, runs, asked)
+        known = Spatial.before(cells)
+        prior = _Values.of(np.where(known.asked, np.nan_to_num(cells.runs.value), 0.0), scale, tolerance).prior
+        return replace(known, evidence=np.where(known.surprise > 0, prior + known.surprise, known.evidence))
+    question = _Question.of(touches, cells, model, scale, tolerance)
+    values, runs = question.values, cells.runs
     # At first those are asked that moved, unless their load has outlived a touch, or jumped alone. Of the cells at rest
     # few are broken.
-    trusted = askable & runs.moved & (values.rests | (fresh & ~jumped))
+    fresh = runs.start >= touches[-1].first
+    trusted = question.askable & runs.moved & (values.rests | (fresh & (cells.temporal < SUDDEN)))
+    at_first: Floats | None = None
     for _ in range(_MOST_ROUNDS):
         yield
-        expected = yield from model.expect(features, trusted)
-        yield
-        likely = _believed(expected.never, features[:, 2] == 0, trusted & runs.moved)
-        likely[:, held] = expected.always[:, held] * expected.within(values.low[held], values.high[held], held)
-        surprise = np.where(counted, -np.log(np.maximum(likely, _LEAST)), 0.0)
-        brought = np.where(asked, cells.settled + surprise.sum(axis=0), 0.0)
-        evidence = np.where(asked, values.prior + brought, 0.0)
-        asked_now, trusted = trusted, askable & (evidence + cells.temporal < suspicious)
+        expected, surprise = yield from question.answered(trusted)
+        brought = question.brought(surprise)
+        at_first = brought if at_first is None else at_first
+        evidence = np.where(question.asked, values.prior + brought, 0.0)
+        asked_now, trusted = trusted, question.askable & (evidence + cells.temporal < suspicious)
         if (trusted == asked_now).all():
             break
     moving = cells.askable & runs.moved & fresh & ~np.isnan(expected.spread)
     told = (surprise > _TELLING).sum(axis=0)
-    return Spatial(evidence, brought, asked, told, _offset(features, begins, expected, moving))
+    offset = _offset(question.features, question.begins, expected, moving)
+    assert at_first is not None
+    return Spatial(evidence, brought, at_first, question.asked, told, offset)
+
+
+def apart_evidence(
+    touches: Sequence[Touch],
+    cells: Cells,
+    model: Model,
+    scale: Scale,
+    tolerance: float,
+    trusted: Mask,
+    groups: Sequence[NDArray[np.intp]],
+) -> Generator[None, None, Floats]:
+    """Return what touches brought against cells with nobody asked who may have broken with them, ``[groups, D]``.
+
+    Args:
+        touches, cells, model, scale, tolerance: as for :func:`stuck_evidence`.
+        trusted: bool ``[D]``, those that were asked in the end.
+        groups: cells each, that may have broken together.
+    """
+    question = _Question.of(touches, cells, model, scale, tolerance)
+    brought = np.zeros((len(groups), len(trusted)))
+    for i, group in enumerate(groups):
+        others = trusted & question.askable
+        others[group] = False
+        _, surprise = yield from question.answered(others)
+        brought[i] = question.brought(surprise)
+    return brought
 
 
 def lone_evidence(

@@ -37,7 +37,9 @@ _TRIED = 0.3  # log ratio of a cell that was put to the test
 # they are wrong together, and the longer the line the more of them lie along one edge.
 _ALIKE, _MOST_ALIKE = 0.02, 0.3
 _LEAST = -1.0  # log ratio that one doubtful cell can bring
-_LEADERLESS_COST = np.log(10.0)  # more, where no cell is faulty beyond doubt: at an edge many are wrongly suspected
+# Where no cell is faulty beyond doubt a wire costs the more, the fewer touches are known: a strange one is soon met,
+# and makes many cells doubtful at once. So many log units more for each by which its chance is above one in 400.
+_STRANGE_COST, _RARELY_STRANGE = 4.0, 0.0025
 _PROVEN = np.log(9.0)  # log odds from which on a wire is named: single cells are the safer guess
 _ROUNDS = 5
 _FEW = 8  # wires of which all sets are tried
@@ -78,6 +80,7 @@ def explain(
     alike: NDArray[np.bool_],
     against: NDArray[np.bool_],
     weight: NDArray[np.float64],
+    strange: NDArray[np.float64],
     layout: SensorLayout,
     common: float = 0.0,
 ) -> tuple[Cause, ...]:
@@ -88,6 +91,7 @@ def explain(
         alike: bool ``[D]``, all that could be faulty in that way; holds ``faulty``.
         against: bool ``[D]``, the cells that contradict a broken wire. Cells that are neither may be inferred faulty.
         weight: float ``[D]``, log likelihood ratio faulty : healthy of each cell that is alike.
+        strange: float ``[D]``, the chance that a touch does with a cell what none did before.
         layout: the array.
         common: how common single faults of one kind are at least.
     """
@@ -99,9 +103,30 @@ def explain(
         own = _one_pad(layout.rows, layout.cols, layout.present[pad].tobytes())
         first = pad * own.n_cells
         on = slice(first, first + own.n_cells)
-        of_pad = _explain_pad(faulty[on], alike[on], against[on], weight[on], own, common)
+        of_pad = _explain_pad(faulty[on], alike[on], against[on], weight[on], strange[on], own, common)
         causes += [_moved(cause, pad, first) for cause in of_pad]
     return tuple(causes)
+
+
+def suspected(
+    alike: NDArray[np.bool_], against: NDArray[np.bool_], weight: NDArray[np.float64], layout: SensorLayout
+) -> list[NDArray[np.intp]]:
+    """Return the cells that a wire would explain, broken whole or at one end, where enough of them may bear witness.
+
+    Args:
+        alike, against: as for :func:`explain`.
+        weight: float ``[D]``, a log likelihood ratio that is rather too high.
+        layout: the array.
+    """
+    witness, groups = alike & (weight >= _WITNESS), []
+    pads = set(np.flatnonzero(layout.grid(witness).sum(axis=(1, 2)) >= _FEWEST_WITNESSES).tolist())
+    for line in layout.lines if pads else ():
+        if line.kind in ("row", "column", "converter") and line.pad in pads:
+            cells = layout.cells_on(line)
+            alive = np.flatnonzero(against[cells])
+            ends = (cells[: alive[0]], cells[alive[-1] + 1 :]) if len(alive) else (cells,)
+            groups += [end[alike[end]] for end in ends if witness[end].sum() >= _FEWEST_WITNESSES]
+    return groups
 
 
 @lru_cache(maxsize=64)
@@ -122,6 +147,7 @@ def _explain_pad(
     alike: NDArray[np.bool_],
     against: NDArray[np.bool_],
     weight: NDArray[np.float64],
+    strange: NDArray[np.float64],
     layout: SensorLayout,
     common: float,
 ) -> list[Cause]:
@@ -132,7 +158,7 @@ def _explain_pad(
     lines = layout.lines if witness.sum() >= 2 else ()
     for line in lines:
         if line.kind in ("row", "column", "converter"):
-            candidates += _candidates(line, layout.cells_on(line), against, witness, tried, faulty)
+            candidates += _candidates(line, layout.cells_on(line), against, witness, tried, faulty, strange)
     present = layout.present.ravel()
     found = np.flatnonzero(faulty & present)
     tested = int((against & present).sum()) + len(found)
@@ -170,6 +196,7 @@ def _candidates(
     witness: NDArray[np.bool_],
     tried: NDArray[np.bool_],
     faulty: NDArray[np.bool_],
+    strange: NDArray[np.float64],
 ) -> list[_Candidate]:
     """Return the wire as a whole, and broken in its middle with either end alive, as far as cells bear witness."""
 
@@ -177,7 +204,8 @@ def _candidates(
         return bool(witness[behind].sum() >= max(_FEWEST_WITNESSES, _WITNESS_SHARE * float(tried[behind].sum())))
 
     def cost(behind: NDArray[np.intp]) -> float:
-        return float(_LINE_COST if faulty[behind].any() else _LINE_COST + _LEADERLESS_COST)
+        leaderless = _STRANGE_COST * max(0.0, float(np.log(strange[behind].max() / _RARELY_STRANGE)))
+        return float(_LINE_COST + (0.0 if faulty[behind].any() else leaderless))
 
     contradictions = np.flatnonzero(against[cells])
     found = []

@@ -5,7 +5,7 @@ import pytest
 
 from diagnostics.contact import Expected
 from diagnostics.memory import finished
-from diagnostics.spatial import Cells, Model, Spatial, stuck_evidence
+from diagnostics.spatial import Cells, Model, Spatial, apart_evidence, stuck_evidence
 from diagnostics.temporal import StillRuns
 from diagnostics.touches import Array, Scale, Summary, Touch
 
@@ -38,6 +38,30 @@ class Presser:
         return Expected(0.02 * even, 0.02 * even, 0.5 * even, np.full(CELLS, 0.05))
 
 
+class Row:
+    """The last three cells lie in a row: each does what the other two do; without them it is loaded, more likely."""
+
+    def expect(self, features: Array, trusted: np.ndarray) -> Generator[None, None, Expected]:
+        expected = yield from Copycat().expect(features, trusted)
+        for cell in range(5, 8):
+            asked = [other for other in range(5, 8) if other != cell and trusted[other]]
+            unloaded = (features[:, 2, asked] == 0).all(axis=1)
+            expected.never[:, cell] = np.where(unloaded, 0.98, 0.02) if asked else 0.3
+        return expected
+
+
+def seen(log: np.ndarray) -> tuple[StillRuns, list[Touch]]:
+    """Look at a log that is made of touches of 20 frames each."""
+    runs, touches = StillRuns.begin(CELLS), []
+    for first in range(0, len(log), FRAMES):
+        frames = log[first : first + FRAMES]
+        runs = runs.extend(frames, np.arange(first, first + len(frames)), 0.025)
+        root = SCALE.root_load(frames)
+        halves = tuple(Summary.of(root[i : i + 10], first + i, SCALE.root_near) for i in (0, 10))
+        touches.append(Touch(halves, root.min(axis=0), root.max(axis=0)))
+    return runs, touches
+
+
 def judged(
     log: np.ndarray,
     wrong: np.ndarray = NONE,
@@ -46,13 +70,7 @@ def judged(
     model: Model | None = None,
 ) -> Spatial:
     """Judge a log that is made of touches of 20 frames each."""
-    runs, touches = StillRuns.begin(CELLS), []
-    for first in range(0, len(log), FRAMES):
-        frames = log[first : first + FRAMES]
-        runs = runs.extend(frames, np.arange(first, first + len(frames)), 0.025)
-        root = SCALE.root_load(frames)
-        halves = tuple(Summary.of(root[i : i + 10], first + i, SCALE.root_near) for i in (0, 10))
-        touches.append(Touch(halves, root.min(axis=0), root.max(axis=0)))
+    runs, touches = seen(log)
     settled = np.zeros(CELLS) if settled is None else settled
     work: Generator[None, None, Spatial] = stuck_evidence(
         touches, Cells(runs, settled, np.full(CELLS, jump), np.full(CELLS, jump), ~wrong, NONE), model or Copycat(),
@@ -102,6 +120,20 @@ def test_cells_that_move_are_not_asked_and_have_no_evidence():
     assert (spatial.evidence[~spatial.asked] == 0).all()
     assert spatial.touches[3] == 4
     assert spatial.touches[~spatial.asked].sum() == 0
+
+
+def test_cells_that_broke_together_do_not_vouch_for_each_other():
+    log = pressed(1)
+    log[:, 5:] = 0
+    assert (judged(log, model=Row()).surprise[5:] < 0.1).all()
+    runs, touches = seen(log)
+    zero, trusted = np.zeros(CELLS), np.ones(CELLS, bool)
+    cells = Cells(runs, zero, zero, zero, trusted, NONE)
+    groups = [np.array([5, 6, 7]), np.array([6])]
+    work: Generator[None, None, np.ndarray] = apart_evidence(touches, cells, Row(), SCALE, 0.025, trusted, groups)
+    together, alone = finished(work)
+    assert together[5:] == pytest.approx(-np.log(0.3), abs=0.1)
+    assert alone[6] < 0.1  # the others of its row are asked
 
 
 def test_only_what_came_after_the_onset_speaks_against_a_cell():

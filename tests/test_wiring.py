@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 
 from diagnostics import Line, SensorLayout
-from diagnostics.wiring import Cause, cheapest_of_few, cheapest_of_many, explain
+from diagnostics.wiring import Cause, cheapest_of_few, cheapest_of_many, explain, suspected
 
 LAYOUT = SensorLayout(2, 11, 10)
 SURE, DOUBTFUL, NOTHING = 8.0, 5.0, 0.0
+KNOWN = np.full(220, 0.0045)  # some two hundred touches are known
 
 
 def mask(*cells: np.ndarray | list[int]) -> np.ndarray:
@@ -18,7 +19,7 @@ def explained(
     """Explain ``faulty`` cells (bool); those that could be faulty too are the untested ones."""
     alike = ~against if alike is None else alike
     return explain(
-        faulty, alike | faulty, against, np.where(faulty, SURE, NOTHING) if weight is None else weight, LAYOUT
+        faulty, alike | faulty, against, np.where(faulty, SURE, NOTHING) if weight is None else weight, KNOWN, LAYOUT
     )
 
 
@@ -114,7 +115,7 @@ def test_a_long_line_of_weak_suspects_is_the_edge_of_a_contact_and_no_wire():
     layout = SensorLayout(1, 64, 32)
     alike = np.isin(np.arange(2048), layout.cells_on(Line(0, "row", 5)))
     none = np.zeros(2048, bool)
-    assert explain(none, alike, ~alike, np.where(alike, 2.6, NOTHING), layout) == ()
+    assert explain(none, alike, ~alike, np.where(alike, 2.6, NOTHING), np.full(2048, 0.0045), layout) == ()
 
 
 @pytest.mark.parametrize(("weight", "blamed"), [(2.65, False), (4.0, True)])
@@ -123,8 +124,24 @@ def test_doubtful_cells_on_one_wire_count_for_less_than_as_many_independent_ones
     alike = np.isin(np.arange(40), layout.cells_on(Line(0, "column", 5)))
     none = np.zeros(40, bool)
     # 10.6 by one cell alone would convict it.
-    causes = explain(none, alike, ~alike, np.where(alike, weight, NOTHING), layout)
+    causes = explain(none, alike, ~alike, np.where(alike, weight, NOTHING), np.full(40, 0.0045), layout)
     assert bool(causes) == blamed
+
+
+@pytest.mark.parametrize(("touches", "blamed"), [(20, False), (500, True), (5000, True)])
+def test_the_fewer_touches_are_known_the_more_it_takes_that_doubtful_cells_convict_a_wire(touches: int, blamed: bool):
+    alike = mask(LAYOUT.cells_on(Line(0, "row", 3))[:3])
+    strange = np.full(220, 1 / touches)
+    assert bool(explain(mask(), alike, mask(), np.where(alike, 5.0, NOTHING), strange, LAYOUT)) == blamed
+
+
+def test_cells_are_suspected_together_as_wires_would_explain_them():
+    row, column = LAYOUT.cells_on(Line(0, "row", 3)), LAYOUT.cells_on(Line(1, "column", 2))
+    alike = mask(row, column[4:])
+    weight = np.where(mask(row[[0, 5]], column[[6, 9]]), 3.0, NOTHING)
+    groups = suspected(alike, ~alike, weight, LAYOUT)
+    assert [group.tolist() for group in groups] == [row.tolist(), column[4:].tolist()]
+    assert suspected(alike, ~alike, np.where(mask(row[:1], column[-1:]), 3.0, NOTHING), LAYOUT) == []
 
 
 def test_a_few_doubtful_cells_do_not_convict_a_wire():
@@ -184,7 +201,7 @@ def test_positions_without_a_cell_are_never_blamed():
     row = layout.cells_on(Line(0, "row", 3))
     faulty = mask(row)
     against = ~faulty & present.ravel()
-    (cause,) = explain(faulty, faulty, against, np.where(faulty, SURE, NOTHING), layout)
+    (cause,) = explain(faulty, faulty, against, np.where(faulty, SURE, NOTHING), KNOWN, layout)
     assert (cause.line, cause.cells) == (Line(0, "row", 3), tuple(row))
 
 
@@ -202,7 +219,7 @@ def test_where_single_faults_are_common_two_neighbours_at_the_end_of_a_line_are_
     row = LAYOUT.cells_on(Line(1, "row", 4))
     faulty = mask(row[8:])
     for common, cut in ((0.0, True), (0.1, False)):
-        causes = explain(faulty, faulty, ~faulty, np.where(faulty, SURE, NOTHING), LAYOUT, common)
+        causes = explain(faulty, faulty, ~faulty, np.where(faulty, SURE, NOTHING), KNOWN, LAYOUT, common)
         assert any(cause.line is not None for cause in causes) == cut
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from diagnostics import Fault, FaultKind, Line, Monitor, SelfDiagnosis, SensorLayout, inject, line_fault
 from diagnostics.injection import bridge
+from diagnostics.memory import finished
 from diagnostics.patch_models import contact_model
 from diagnostics.patches import HALO, PATCH, PatchTouches, patches
 from diagnostics.readings import Readings
@@ -50,6 +51,18 @@ def test_each_cell_is_judged_in_one_patch_by_all_cells_near_it_on_its_pad():
             block = np.zeros(layout.shape, bool)
             block[pad, max(0, r - HALO) : r + HALO + 1, max(0, c - HALO) : c + HALO + 1] = True
             assert set(np.flatnonzero(block & present).tolist()) <= near
+
+
+def test_cells_of_a_row_that_runs_through_several_patches_are_judged_with_none_of_them_asked(fitted):
+    row = SKIN.cells_on(Line(0, "row", 11))
+    memory = fitted.memory()
+    memory.extend(inject(log(SKIN, 100, 40), [line_fault(SKIN, Line(0, "row", 11), FaultKind.OPEN)], SKIN))
+    memory = memory.complete()
+    spatial, none = finished(memory.spatial()), np.zeros(SKIN.n_cells, bool)
+    of_row, of_one = finished(memory.apart(spatial, none, [row, row[:1]]))
+    assert len({i for i, patch in enumerate(patches(SKIN)) if np.isin(row, patch.outputs).any()}) > 1
+    assert of_row[row].sum() > spatial.surprise[row].sum() + 3
+    assert of_one[row[0]] == pytest.approx(spatial.surprise[row[0]], abs=0.5)
 
 
 def test_an_array_of_a_few_hundred_cells_is_one_patch():

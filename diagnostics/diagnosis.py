@@ -29,6 +29,7 @@ _SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
 _SUSPICIOUS_COLD = 3.0  # log evidence from which on a cell is not asked about the others, in a cold start
 _OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is faulty: four touches
 _KNOWN = 9.0  # log likelihood ratio of a cell that was dead in the reference already
+_APART = 0.5  # of what speaks against cells of one wire, where none of them is asked about the others
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved before is no longer called alive
 
 
@@ -202,7 +203,7 @@ class SelfDiagnosis:
             weight=np.where(known, _KNOWN, self.weights_.worth(spatial.surprise, temporal, kind)),
             touches=np.where(intermittent, unrest.blinks, spatial.touches),
             known=known,
-            strange=memory.strange(),
+            unfamiliar=memory.unfamiliar(),
         )
 
     def _with_those_apart(
@@ -211,21 +212,26 @@ class SelfDiagnosis:
         """Return the same, with what speaks for broken wires if their cells do not vouch for each other.
 
         The chain rule of probability would ask, for each of them in turn, those before it: half of them, that is about
-        the mean of asking all and asking none.
+        the mean of asking all and asking none. But what is expected where few are asked has to be learned from many
+        touches.
         """
+        share = _APART * (1 - found.unfamiliar)
+        if not share.any():
+            return found
         temporal, kind, alike = memory.temporal(), kinds(memory), found.rests & ~wrong
 
-        def mean_with(apart: NDArray[np.float64]) -> NDArray[np.float64]:
-            return np.maximum(found.weight, (found.weight + self.weights_.worth(apart, temporal, kind)) / 2)
+        def weight_if(apart: NDArray[np.float64]) -> NDArray[np.float64]:
+            more = self.weights_.worth(apart, temporal, kind) - found.weight
+            return found.weight + share * np.maximum(more, 0.0)
 
         against = found.alive | ~(found.rests | found.silent) & memory.present
-        groups = suspected(alike, against, mean_with(spatial.at_first), self.layout)
+        groups = suspected(alike, against, weight_if(spatial.at_first), self.layout)
         if not groups:
             return found
         apart = yield from memory.apart(spatial, wrong, groups)
         weight = found.weight.copy()
         for group, of_group in zip(groups, apart, strict=True):
-            weight[group] = np.maximum(weight[group], mean_with(of_group)[group])
+            weight[group] = np.maximum(weight[group], weight_if(of_group)[group])
         return replace(found, weight=weight)
 
 

@@ -13,7 +13,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.contact import surest_of
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference
 from diagnostics.resting import less_than_healthy
@@ -29,6 +28,7 @@ from diagnostics.unrest import Unrest
 Result = TypeVar("Result")
 
 MOST_TOUCHES, KEPT_TOUCHES = 40, 32  # when there are more, all but the last so many are weighed and let go
+_FAMILIAR, _STRANGE = 1 / 400, 1 / 100  # chance that a touch does with a cell what none did before
 _PAUSE = SEGMENT // 2  # frames of a segment after which that begins, a little with each frame: it ends with the segment
 
 
@@ -162,11 +162,13 @@ class Memory:
             )
         )  # fmt: skip
 
-    def strange(self) -> NDArray[np.float64]:
-        """The chance that a touch does with a cell what none did before, as far as is known, ``[D]``."""
+    def unfamiliar(self) -> NDArray[np.float64]:
+        """How little is known of healthy touches, ``[D]``: 0 with 400 of them in the reference, 1 with 100 or fewer."""
         if self.reference.model is None:
-            return np.full(self.layout.n_cells, surest_of(len(self.touches.kept)))
-        return self.reference.model.surest(self.layout.n_cells)
+            return np.ones(self.layout.n_cells)
+        strange = self.reference.model.surest(self.layout.n_cells)
+        unfamiliar: NDArray[np.float64] = np.log(strange / _FAMILIAR) / np.log(_STRANGE / _FAMILIAR)
+        return np.clip(unfamiliar, 0.0, 1.0)
 
     def _suspected(self, spatial: Spatial) -> NDArray[np.bool_]:
         return spatial.asked & (spatial.evidence + self.temporal() >= self.suspicious)

@@ -137,17 +137,14 @@ class _Question:
     """What is asked of the cells that are still now, whoever answers.
 
     Attributes:
-        touches, cells, model: what happened, what is known of the cells, what healthy looks like.
-        known: what is known where nothing touched them.
+        cells, model: what is known of the cells, what healthy looks like.
         values: what still cells read.
         asked, askable: bool ``[D]``, the cells that are judged, and those that may be asked about others.
         features, begins, counted: see :func:`_looked_at`.
     """
 
-    touches: Sequence[Touch]
     cells: Cells
     model: Model
-    known: Spatial
     values: _Values
     asked: Mask
     askable: Mask
@@ -158,15 +155,14 @@ class _Question:
     @classmethod
     def of(cls, touches: Sequence[Touch], cells: Cells, model: Model, scale: Scale, tolerance: float) -> _Question:
         """Ask about one touch or more."""
-        known, runs = Spatial.before(cells), cells.runs
-        values = _Values.of(np.where(known.asked, np.nan_to_num(runs.value), 0.0), scale, tolerance)
+        still, runs = Spatial.before(cells).asked, cells.runs
+        values = _Values.of(np.where(still, np.nan_to_num(runs.value), 0.0), scale, tolerance)
         # A load that came all of a sudden, and is still held: a quick grasp, or many cells broken at once. While this
         # touch lasts nobody can tell, so such cells are neither judged by it nor asked about the others.
-        held = known.asked & ~values.rests & runs.moved & (runs.start >= touches[-1].first) & ~cells.outlasted
+        held = still & ~values.rests & runs.moved & (runs.start >= touches[-1].first) & ~cells.outlasted
         unsure = held & (cells.sudden >= SUDDEN) & (cells.temporal < SUDDEN)
-        asked = known.asked & ~unsure
-        looked_at = _looked_at(touches, runs, asked)
-        return cls(touches, cells, model, known, values, asked, cells.askable & ~unsure, *looked_at)
+        asked = still & ~unsure
+        return cls(cells, model, values, asked, cells.askable & ~unsure, *_looked_at(touches, runs, asked))
 
     def answered(self, trusted: Mask) -> Generator[None, None, tuple[Expected, Floats]]:
         """Return what the ``trusted`` cells (bool ``[D]``) expect, and the surprise of each stretch ``[n, D]``."""

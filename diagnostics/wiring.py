@@ -37,9 +37,8 @@ _TRIED = 0.3  # log ratio of a cell that was put to the test
 # they are wrong together, and the longer the line the more of them lie along one edge.
 _ALIKE, _MOST_ALIKE = 0.02, 0.3
 _LEAST = -1.0  # log ratio that one doubtful cell can bring
-# Where no cell is faulty beyond doubt a wire costs the more, the fewer touches are known: a strange one is soon met,
-# and makes many cells doubtful at once. So many log units more for each by which its chance is above one in 400.
-_STRANGE_COST, _RARELY_STRANGE = 4.0, 0.0025
+# More, where no cell is faulty beyond doubt and few touches are known: a strange one makes many cells doubtful at once.
+_LEADERLESS_COST = np.log(10.0)
 _PROVEN = np.log(9.0)  # log odds from which on a wire is named: single cells are the safer guess
 _ROUNDS = 5
 _FEW = 8  # wires of which all sets are tried
@@ -80,7 +79,7 @@ def explain(
     alike: NDArray[np.bool_],
     against: NDArray[np.bool_],
     weight: NDArray[np.float64],
-    strange: NDArray[np.float64],
+    unfamiliar: NDArray[np.float64],
     layout: SensorLayout,
     common: float = 0.0,
 ) -> tuple[Cause, ...]:
@@ -91,7 +90,7 @@ def explain(
         alike: bool ``[D]``, all that could be faulty in that way; holds ``faulty``.
         against: bool ``[D]``, the cells that contradict a broken wire. Cells that are neither may be inferred faulty.
         weight: float ``[D]``, log likelihood ratio faulty : healthy of each cell that is alike.
-        strange: float ``[D]``, the chance that a touch does with a cell what none did before.
+        unfamiliar: float ``[D]``, how little is known of healthy touches, 0 to 1.
         layout: the array.
         common: how common single faults of one kind are at least.
     """
@@ -103,7 +102,7 @@ def explain(
         own = _one_pad(layout.rows, layout.cols, layout.present[pad].tobytes())
         first = pad * own.n_cells
         on = slice(first, first + own.n_cells)
-        of_pad = _explain_pad(faulty[on], alike[on], against[on], weight[on], strange[on], own, common)
+        of_pad = _explain_pad(faulty[on], alike[on], against[on], weight[on], unfamiliar[on], own, common)
         causes += [_moved(cause, pad, first) for cause in of_pad]
     return tuple(causes)
 
@@ -147,7 +146,7 @@ def _explain_pad(
     alike: NDArray[np.bool_],
     against: NDArray[np.bool_],
     weight: NDArray[np.float64],
-    strange: NDArray[np.float64],
+    unfamiliar: NDArray[np.float64],
     layout: SensorLayout,
     common: float,
 ) -> list[Cause]:
@@ -158,7 +157,7 @@ def _explain_pad(
     lines = layout.lines if witness.sum() >= 2 else ()
     for line in lines:
         if line.kind in ("row", "column", "converter"):
-            candidates += _candidates(line, layout.cells_on(line), against, witness, tried, faulty, strange)
+            candidates += _candidates(line, layout.cells_on(line), against, witness, tried, faulty, unfamiliar)
     present = layout.present.ravel()
     found = np.flatnonzero(faulty & present)
     tested = int((against & present).sum()) + len(found)
@@ -196,7 +195,7 @@ def _candidates(
     witness: NDArray[np.bool_],
     tried: NDArray[np.bool_],
     faulty: NDArray[np.bool_],
-    strange: NDArray[np.float64],
+    unfamiliar: NDArray[np.float64],
 ) -> list[_Candidate]:
     """Return the wire as a whole, and broken in its middle with either end alive, as far as cells bear witness."""
 
@@ -204,8 +203,8 @@ def _candidates(
         return bool(witness[behind].sum() >= max(_FEWEST_WITNESSES, _WITNESS_SHARE * float(tried[behind].sum())))
 
     def cost(behind: NDArray[np.intp]) -> float:
-        leaderless = _STRANGE_COST * max(0.0, float(np.log(strange[behind].max() / _RARELY_STRANGE)))
-        return float(_LINE_COST + (0.0 if faulty[behind].any() else leaderless))
+        leaderless = 0.0 if faulty[behind].any() else _LEADERLESS_COST * np.median(unfamiliar[behind])
+        return float(_LINE_COST + leaderless)
 
     contradictions = np.flatnonzero(against[cells])
     found = []

@@ -16,7 +16,7 @@ ZERO = np.zeros(CELLS)
 HEALTHY = Findings(
     faulty=NONE, alive=~NONE, silent=NONE, rests=NONE, full=NONE, intermittent=NONE, noisy=NONE, drifting=NONE,
     value=np.full(CELLS, np.nan), since=np.zeros(CELLS, np.intp), probability=ZERO, weight=ZERO,
-    touches=np.zeros(CELLS, np.intp), known=NONE, strange=np.full(CELLS, 0.0045),
+    touches=np.zeros(CELLS, np.intp), known=NONE, unfamiliar=np.ones(CELLS),
 )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from diagnostics.wiring import Cause, cheapest_of_few, cheapest_of_many, explain
 
 LAYOUT = SensorLayout(2, 11, 10)
 SURE, DOUBTFUL, NOTHING = 8.0, 5.0, 0.0
-KNOWN = np.full(220, 0.0045)  # some two hundred touches are known
+UNFAMILIAR = np.ones(220)  # few touches are known
 
 
 def mask(*cells: np.ndarray | list[int]) -> np.ndarray:
@@ -19,7 +19,12 @@ def explained(
     """Explain ``faulty`` cells (bool); those that could be faulty too are the untested ones."""
     alike = ~against if alike is None else alike
     return explain(
-        faulty, alike | faulty, against, np.where(faulty, SURE, NOTHING) if weight is None else weight, KNOWN, LAYOUT
+        faulty,
+        alike | faulty,
+        against,
+        np.where(faulty, SURE, NOTHING) if weight is None else weight,
+        UNFAMILIAR,
+        LAYOUT,
     )
 
 
@@ -115,7 +120,7 @@ def test_a_long_line_of_weak_suspects_is_the_edge_of_a_contact_and_no_wire():
     layout = SensorLayout(1, 64, 32)
     alike = np.isin(np.arange(2048), layout.cells_on(Line(0, "row", 5)))
     none = np.zeros(2048, bool)
-    assert explain(none, alike, ~alike, np.where(alike, 2.6, NOTHING), np.full(2048, 0.0045), layout) == ()
+    assert explain(none, alike, ~alike, np.where(alike, 2.6, NOTHING), np.ones(2048), layout) == ()
 
 
 @pytest.mark.parametrize(("weight", "blamed"), [(2.65, False), (4.0, True)])
@@ -124,15 +129,17 @@ def test_doubtful_cells_on_one_wire_count_for_less_than_as_many_independent_ones
     alike = np.isin(np.arange(40), layout.cells_on(Line(0, "column", 5)))
     none = np.zeros(40, bool)
     # 10.6 by one cell alone would convict it.
-    causes = explain(none, alike, ~alike, np.where(alike, weight, NOTHING), np.full(40, 0.0045), layout)
+    causes = explain(none, alike, ~alike, np.where(alike, weight, NOTHING), np.ones(40), layout)
     assert bool(causes) == blamed
 
 
-@pytest.mark.parametrize(("touches", "blamed"), [(20, False), (500, True), (5000, True)])
-def test_the_fewer_touches_are_known_the_more_it_takes_that_doubtful_cells_convict_a_wire(touches: int, blamed: bool):
+@pytest.mark.parametrize(("unfamiliar", "blamed"), [(1.0, False), (0.8, False), (0.1, True), (0.0, True)])
+def test_the_fewer_touches_are_known_the_more_it_takes_that_doubtful_cells_convict_a_wire(
+    unfamiliar: float, blamed: bool
+):
     alike = mask(LAYOUT.cells_on(Line(0, "row", 3))[:3])
-    strange = np.full(220, 1 / touches)
-    assert bool(explain(mask(), alike, mask(), np.where(alike, 5.0, NOTHING), strange, LAYOUT)) == blamed
+    weight = np.where(alike, 4.6, NOTHING)
+    assert bool(explain(mask(), alike, mask(), weight, np.full(220, unfamiliar), LAYOUT)) == blamed
 
 
 def test_cells_are_suspected_together_as_wires_would_explain_them():
@@ -201,7 +208,7 @@ def test_positions_without_a_cell_are_never_blamed():
     row = layout.cells_on(Line(0, "row", 3))
     faulty = mask(row)
     against = ~faulty & present.ravel()
-    (cause,) = explain(faulty, faulty, against, np.where(faulty, SURE, NOTHING), KNOWN, layout)
+    (cause,) = explain(faulty, faulty, against, np.where(faulty, SURE, NOTHING), UNFAMILIAR, layout)
     assert (cause.line, cause.cells) == (Line(0, "row", 3), tuple(row))
 
 
@@ -219,7 +226,7 @@ def test_where_single_faults_are_common_two_neighbours_at_the_end_of_a_line_are_
     row = LAYOUT.cells_on(Line(1, "row", 4))
     faulty = mask(row[8:])
     for common, cut in ((0.0, True), (0.1, False)):
-        causes = explain(faulty, faulty, ~faulty, np.where(faulty, SURE, NOTHING), KNOWN, LAYOUT, common)
+        causes = explain(faulty, faulty, ~faulty, np.where(faulty, SURE, NOTHING), UNFAMILIAR, LAYOUT, common)
         assert any(cause.line is not None for cause in causes) == cut
 
 

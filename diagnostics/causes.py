@@ -36,9 +36,9 @@ class Findings:
         since: number of the first frame of what speaks for a fault.
         probability: P(faulty).
         weight: log likelihood ratio faulty : healthy.
+        doubt: whether a cell is faulty by itself: 0 beyond doubt, 1 far from it, see ``explain``.
         touches: how many touches tested the cell, or how often it blinked.
         known: those that were dead in the reference already.
-        unfamiliar: how little is known of healthy touches, 0 to 1.
     """
 
     faulty: Mask
@@ -53,9 +53,9 @@ class Findings:
     since: NDArray[np.intp]
     probability: Floats
     weight: Floats
+    doubt: Floats
     touches: NDArray[np.intp]
     known: Mask
-    unfamiliar: Floats
 
 
 def root_causes(
@@ -94,9 +94,7 @@ def _causes(
             begun = int(np.median(found.since[leading])) if leading.any() else 0
             against &= ~(alike & ~faulty & (found.since <= begun) & (begun > 0))
             against |= ~alike & ~found.silent
-        explained = explain(
-            faulty & ~aliased, alike & ~aliased, against, found.weight, found.unfamiliar, layout, common
-        )
+        explained = explain(faulty & ~aliased, alike & ~aliased, against, found.weight, found.doubt, layout, common)
         causes += [(kind, value, cause) for cause in explained]
         if faulty.sum() > 1:  # a single cell is soon explained
             yield

@@ -30,6 +30,9 @@ _SUSPICIOUS_COLD = 3.0  # log evidence from which on a cell is not asked about t
 _OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is faulty: four touches
 _KNOWN = 9.0  # log likelihood ratio of a cell that was dead in the reference already
 _APART = 0.5  # of what speaks against cells of one wire, where none of them is asked about the others
+# P(faulty) from which on a cell is likely to be faulty. So far such a cell leads others on its wire, and so far any does,
+# if many touches are known; where few are, strange ones make cells likely too.
+_LIKELY, _LEADING = 0.8, (0.75, 0.4)
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved before is no longer called alive
 
 
@@ -201,9 +204,9 @@ class SelfDiagnosis:
             probability=probability,
             # What the line hypothesis asks of a cell at rest is only whether touches speak against it.
             weight=np.where(known, _KNOWN, self.weights_.worth(spatial.surprise, temporal, kind)),
+            doubt=np.where(faulty, 0.0, 1 - (1 - memory.unfamiliar()) * np.where(probability > _LIKELY, *_LEADING)),
             touches=np.where(intermittent, unrest.blinks, spatial.touches),
             known=known,
-            unfamiliar=memory.unfamiliar(),
         )
 
     def _with_those_apart(
@@ -215,7 +218,7 @@ class SelfDiagnosis:
         the mean of asking all and asking none. But what is expected where few are asked has to be learned from many
         touches.
         """
-        share = _APART * (1 - found.unfamiliar)
+        share = _APART * (1 - memory.unfamiliar())
         if not share.any():
             return found
         temporal, kind, alike = memory.temporal(), kinds(memory), found.rests & ~wrong

@@ -37,8 +37,7 @@ _TRIED = 0.3  # log ratio of a cell that was put to the test
 # they are wrong together, and the longer the line the more of them lie along one edge.
 _ALIKE, _MOST_ALIKE = 0.02, 0.3
 _LEAST = -1.0  # log ratio that one doubtful cell can bring
-# More, where no cell is faulty beyond doubt and few touches are known: a strange one makes many cells doubtful at once.
-_LEADERLESS_COST = np.log(10.0)
+_LEADERLESS_COST = np.log(10.0)  # more, where each cell may as well be healthy: at an edge many are wrongly suspected
 _PROVEN = np.log(9.0)  # log odds from which on a wire is named: single cells are the safer guess
 _ROUNDS = 5
 _FEW = 8  # wires of which all sets are tried
@@ -79,7 +78,7 @@ def explain(
     alike: NDArray[np.bool_],
     against: NDArray[np.bool_],
     weight: NDArray[np.float64],
-    unfamiliar: NDArray[np.float64],
+    doubt: NDArray[np.float64],
     layout: SensorLayout,
     common: float = 0.0,
 ) -> tuple[Cause, ...]:
@@ -90,7 +89,7 @@ def explain(
         alike: bool ``[D]``, all that could be faulty in that way; holds ``faulty``.
         against: bool ``[D]``, the cells that contradict a broken wire. Cells that are neither may be inferred faulty.
         weight: float ``[D]``, log likelihood ratio faulty : healthy of each cell that is alike.
-        unfamiliar: float ``[D]``, how little is known of healthy touches, 0 to 1.
+        doubt: float ``[D]``, whether a cell is faulty by itself, 0 to 1; the least on a wire counts for all.
         layout: the array.
         common: how common single faults of one kind are at least.
     """
@@ -102,7 +101,7 @@ def explain(
         own = _one_pad(layout.rows, layout.cols, layout.present[pad].tobytes())
         first = pad * own.n_cells
         on = slice(first, first + own.n_cells)
-        of_pad = _explain_pad(faulty[on], alike[on], against[on], weight[on], unfamiliar[on], own, common)
+        of_pad = _explain_pad(faulty[on], alike[on], against[on], weight[on], doubt[on], own, common)
         causes += [_moved(cause, pad, first) for cause in of_pad]
     return tuple(causes)
 
@@ -146,18 +145,19 @@ def _explain_pad(
     alike: NDArray[np.bool_],
     against: NDArray[np.bool_],
     weight: NDArray[np.float64],
-    unfamiliar: NDArray[np.float64],
+    doubt: NDArray[np.float64],
     layout: SensorLayout,
     common: float,
 ) -> list[Cause]:
     weight = np.where(alike, np.maximum(weight, _LEAST), 0.0)
     witness = alike & (faulty | (weight >= _WITNESS))
     tried = alike & (faulty | (weight > _TRIED))
+    doubt = np.where(faulty, 0.0, np.where(alike, doubt, 1.0))
     candidates = []
     lines = layout.lines if witness.sum() >= 2 else ()
     for line in lines:
         if line.kind in ("row", "column", "converter"):
-            candidates += _candidates(line, layout.cells_on(line), against, witness, tried, faulty, unfamiliar)
+            candidates += _candidates(line, layout.cells_on(line), against, witness, tried, doubt)
     present = layout.present.ravel()
     found = np.flatnonzero(faulty & present)
     tested = int((against & present).sum()) + len(found)
@@ -194,8 +194,7 @@ def _candidates(
     against: NDArray[np.bool_],
     witness: NDArray[np.bool_],
     tried: NDArray[np.bool_],
-    faulty: NDArray[np.bool_],
-    unfamiliar: NDArray[np.float64],
+    doubt: NDArray[np.float64],
 ) -> list[_Candidate]:
     """Return the wire as a whole, and broken in its middle with either end alive, as far as cells bear witness."""
 
@@ -203,8 +202,7 @@ def _candidates(
         return bool(witness[behind].sum() >= max(_FEWEST_WITNESSES, _WITNESS_SHARE * float(tried[behind].sum())))
 
     def cost(behind: NDArray[np.intp]) -> float:
-        leaderless = 0.0 if faulty[behind].any() else _LEADERLESS_COST * np.median(unfamiliar[behind])
-        return float(_LINE_COST + leaderless)
+        return float(_LINE_COST + _LEADERLESS_COST * doubt[behind].min())
 
     contradictions = np.flatnonzero(against[cells])
     found = []

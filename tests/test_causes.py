@@ -15,8 +15,8 @@ ZERO = np.zeros(CELLS)
 
 HEALTHY = Findings(
     faulty=NONE, alive=~NONE, silent=NONE, rests=NONE, full=NONE, intermittent=NONE, noisy=NONE, drifting=NONE,
-    value=np.full(CELLS, np.nan), since=np.zeros(CELLS, np.intp), probability=ZERO, weight=ZERO,
-    touches=np.zeros(CELLS, np.intp), known=NONE, unfamiliar=np.ones(CELLS),
+    value=np.full(CELLS, np.nan), since=np.zeros(CELLS, np.intp), probability=ZERO, weight=ZERO, doubt=np.ones(CELLS),
+    touches=np.zeros(CELLS, np.intp), known=NONE,
 )  # fmt: skip
 
 
@@ -37,6 +37,7 @@ def dead(found: Findings, cells: object, value: float = 0.0, onset: int = 0) -> 
         since=np.where(which, onset, found.since),
         probability=np.where(which, 0.99, found.probability),
         weight=np.where(which, 9.0, found.weight),
+        doubt=np.where(which, 0.0, found.doubt),
         touches=np.where(which, 3, found.touches),
     )
 

@@ -6,7 +6,7 @@ from diagnostics.wiring import Cause, cheapest_of_few, cheapest_of_many, explain
 
 LAYOUT = SensorLayout(2, 11, 10)
 SURE, DOUBTFUL, NOTHING = 8.0, 5.0, 0.0
-UNFAMILIAR = np.ones(220)  # few touches are known
+DOUBT = np.ones(220)
 
 
 def mask(*cells: np.ndarray | list[int]) -> np.ndarray:
@@ -23,7 +23,7 @@ def explained(
         alike | faulty,
         against,
         np.where(faulty, SURE, NOTHING) if weight is None else weight,
-        UNFAMILIAR,
+        DOUBT,
         LAYOUT,
     )
 
@@ -133,13 +133,12 @@ def test_doubtful_cells_on_one_wire_count_for_less_than_as_many_independent_ones
     assert bool(causes) == blamed
 
 
-@pytest.mark.parametrize(("unfamiliar", "blamed"), [(1.0, False), (0.8, False), (0.1, True), (0.0, True)])
-def test_the_fewer_touches_are_known_the_more_it_takes_that_doubtful_cells_convict_a_wire(
-    unfamiliar: float, blamed: bool
-):
-    alike = mask(LAYOUT.cells_on(Line(0, "row", 3))[:3])
-    weight = np.where(alike, 4.6, NOTHING)
-    assert bool(explain(mask(), alike, mask(), weight, np.full(220, unfamiliar), LAYOUT)) == blamed
+@pytest.mark.parametrize(("doubt", "blamed"), [(1.0, False), (0.8, False), (0.1, True), (0.0, True)])
+def test_a_cell_that_is_likely_to_be_faulty_leads_doubtful_ones_on_its_wire(doubt: float, blamed: bool):
+    row = LAYOUT.cells_on(Line(0, "row", 3))
+    alike = mask(row[:3])
+    leading = np.where(mask(row[:1]), doubt, 1.0)
+    assert bool(explain(mask(), alike, mask(), np.where(alike, 4.6, NOTHING), leading, LAYOUT)) == blamed
 
 
 def test_cells_are_suspected_together_as_wires_would_explain_them():
@@ -208,7 +207,7 @@ def test_positions_without_a_cell_are_never_blamed():
     row = layout.cells_on(Line(0, "row", 3))
     faulty = mask(row)
     against = ~faulty & present.ravel()
-    (cause,) = explain(faulty, faulty, against, np.where(faulty, SURE, NOTHING), UNFAMILIAR, layout)
+    (cause,) = explain(faulty, faulty, against, np.where(faulty, SURE, NOTHING), DOUBT, layout)
     assert (cause.line, cause.cells) == (Line(0, "row", 3), tuple(row))
 
 
@@ -226,7 +225,7 @@ def test_where_single_faults_are_common_two_neighbours_at_the_end_of_a_line_are_
     row = LAYOUT.cells_on(Line(1, "row", 4))
     faulty = mask(row[8:])
     for common, cut in ((0.0, True), (0.1, False)):
-        causes = explain(faulty, faulty, ~faulty, np.where(faulty, SURE, NOTHING), UNFAMILIAR, LAYOUT, common)
+        causes = explain(faulty, faulty, ~faulty, np.where(faulty, SURE, NOTHING), DOUBT, LAYOUT, common)
         assert any(cause.line is not None for cause in causes) == cut
 
 

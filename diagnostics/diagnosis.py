@@ -30,8 +30,8 @@ _SUSPICIOUS_COLD = 3.0  # log evidence from which on a cell is not asked about t
 _OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is faulty: four touches
 _KNOWN = 9.0  # log likelihood ratio of a cell that was dead in the reference already
 _APART = 0.5  # of what speaks against cells of one wire, where none of them is asked about the others
-# P(faulty) from which on a cell is likely to be faulty. So far such a cell leads others on its wire, and so far any does,
-# if many touches are known; where few are, strange ones make cells likely too.
+# P(faulty) from which on a cell is likely to be faulty. So far such a cell leads the others on its wire, and any other
+# cell, where many touches are known; where few are, strange ones make cells likely too.
 _LIKELY, _LEADING = 0.8, (0.75, 0.4)
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved before is no longer called alive
 

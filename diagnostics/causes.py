@@ -36,7 +36,7 @@ class Findings:
         since: number of the first frame of what speaks for a fault.
         probability: P(faulty).
         weight: log likelihood ratio faulty : healthy.
-        doubt: whether a cell is faulty by itself: 0 beyond doubt, 1 far from it, see ``explain``.
+        doubt: how far a cell that is not beyond doubt is from being so, 0 to 1, see ``explain``.
         touches: how many touches tested the cell, or how often it blinked.
         known: those that were dead in the reference already.
     """

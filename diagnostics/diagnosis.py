@@ -204,7 +204,7 @@ class SelfDiagnosis:
             probability=probability,
             # What the line hypothesis asks of a cell at rest is only whether touches speak against it.
             weight=np.where(known, _KNOWN, self.weights_.worth(spatial.surprise, temporal, kind)),
-            doubt=np.where(faulty, 0.0, 1 - (1 - memory.unfamiliar()) * np.where(probability > _LIKELY, *_LEADING)),
+            doubt=1 - (1 - reference.unfamiliar) * np.where(probability > _LIKELY, *_LEADING),
             touches=np.where(intermittent, unrest.blinks, spatial.touches),
             known=known,
         )
@@ -218,7 +218,7 @@ class SelfDiagnosis:
         the mean of asking all and asking none. But what is expected where few are asked has to be learned from many
         touches.
         """
-        share = _APART * (1 - memory.unfamiliar())
+        share = _APART * (1 - memory.reference.unfamiliar)
         if not share.any():
             return found
         temporal, kind, alike = memory.temporal(), kinds(memory), found.rests & ~wrong

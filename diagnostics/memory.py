@@ -28,7 +28,6 @@ from diagnostics.unrest import Unrest
 Result = TypeVar("Result")
 
 MOST_TOUCHES, KEPT_TOUCHES = 40, 32  # when there are more, all but the last so many are weighed and let go
-_FAMILIAR, _STRANGE = 1 / 400, 1 / 100  # chance that a touch does with a cell what none did before
 _PAUSE = SEGMENT // 2  # frames of a segment after which that begins, a little with each frame: it ends with the segment
 
 
@@ -161,14 +160,6 @@ class Memory:
                 ~self._suspected(spatial), groups,
             )
         )  # fmt: skip
-
-    def unfamiliar(self) -> NDArray[np.float64]:
-        """How little is known of healthy touches, ``[D]``: 0 with 400 of them in the reference, 1 with 100 or fewer."""
-        if self.reference.model is None:
-            return np.ones(self.layout.n_cells)
-        strange = self.reference.model.surest(self.layout.n_cells)
-        unfamiliar: NDArray[np.float64] = np.log(strange / _FAMILIAR) / np.log(_STRANGE / _FAMILIAR)
-        return np.clip(unfamiliar, 0.0, 1.0)
 
     def _suspected(self, spatial: Spatial) -> NDArray[np.bool_]:
         return spatial.asked & (spatial.evidence + self.temporal() >= self.suspicious)

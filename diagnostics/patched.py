@@ -85,19 +85,20 @@ class PatchedMemory(Memory):
         """See :meth:`Memory.apart`."""
         every, trusted = self.cells(wrong), ~self._suspected(spatial)
         total = np.tile(self.settled, (len(groups), 1))
+        among = np.stack([np.isin(np.arange(len(trusted)), group) for group in groups])
         for i, touches in enumerate(self.local.of):
-            cells, place = self.local.patches[i].inputs, self.local.patches[i].place
-            here = [k for k, group in enumerate(groups) if np.isin(group, cells[place]).any()]
-            if not touches.kept or not here:
+            patch = self.local.patches[i]
+            here, cells = np.flatnonzero(among[:, patch.outputs].any(axis=1)), patch.inputs
+            if not touches.kept or not len(here):
                 continue
-            own = [np.flatnonzero(np.isin(cells, groups[k])) for k in here]
+            own = [np.flatnonzero(mask) for mask in among[here][:, cells]]
             brought = finished(
                 apart_evidence(
                     touches.kept, every.of(cells), self.model_of(i, touches), self.scale.of(cells),
                     self.reference.tolerance, trusted[cells], own,
                 )
             )  # fmt: skip
-            total[np.array(here)[:, None], cells[place]] = brought[:, place]
+            total[here[:, None], patch.outputs] = brought[:, patch.place]
             yield
         return total
 

@@ -123,6 +123,12 @@ class _Values:
     prior: Floats
 
     @classmethod
+    def now(cls, cells: Cells, scale: Scale, tolerance: float) -> _Values:
+        """Of the cells that are still now; the others count as 0."""
+        still = Spatial.before(cells).asked
+        return cls.of(np.where(still, np.nan_to_num(cells.runs.value), 0.0), scale, tolerance)
+
+    @classmethod
     def of(cls, value: Floats, scale: Scale, tolerance: float) -> _Values:
         rests = scale.root_load(value) <= scale.root_near
         full = value >= scale.full_scale - 2 * tolerance
@@ -155,8 +161,7 @@ class _Question:
     @classmethod
     def of(cls, touches: Sequence[Touch], cells: Cells, model: Model, scale: Scale, tolerance: float) -> _Question:
         """Ask about one touch or more."""
-        still, runs = Spatial.before(cells).asked, cells.runs
-        values = _Values.of(np.where(still, np.nan_to_num(runs.value), 0.0), scale, tolerance)
+        still, runs, values = Spatial.before(cells).asked, cells.runs, _Values.now(cells, scale, tolerance)
         # A load that came all of a sudden, and is still held: a quick grasp, or many cells broken at once. While this
         # touch lasts nobody can tell, so such cells are neither judged by it nor asked about the others.
         held = still & ~values.rests & runs.moved & (runs.start >= touches[-1].first) & ~cells.outlasted
@@ -196,8 +201,7 @@ def stuck_evidence(
         suspicious: log evidence from which on a cell is left out when others are judged.
     """
     if not touches:
-        known = Spatial.before(cells)
-        prior = _Values.of(np.where(known.asked, np.nan_to_num(cells.runs.value), 0.0), scale, tolerance).prior
+        known, prior = Spatial.before(cells), _Values.now(cells, scale, tolerance).prior
         return replace(known, evidence=np.where(known.surprise > 0, prior + known.surprise, known.evidence))
     question = _Question.of(touches, cells, model, scale, tolerance)
     values, runs = question.values, cells.runs
@@ -205,12 +209,12 @@ def stuck_evidence(
     # few are broken.
     fresh = runs.start >= touches[-1].first
     trusted = question.askable & runs.moved & (values.rests | (fresh & (cells.temporal < SUDDEN)))
-    at_first: Floats | None = None
-    for _ in range(_MOST_ROUNDS):
+    for turn in range(_MOST_ROUNDS):
         yield
         expected, surprise = yield from question.answered(trusted)
         brought = question.brought(surprise)
-        at_first = brought if at_first is None else at_first
+        if turn == 0:
+            at_first = brought
         evidence = np.where(question.asked, values.prior + brought, 0.0)
         asked_now, trusted = trusted, question.askable & (evidence + cells.temporal < suspicious)
         if (trusted == asked_now).all():
@@ -218,7 +222,6 @@ def stuck_evidence(
     moving = cells.askable & runs.moved & fresh & ~np.isnan(expected.spread)
     told = (surprise > _TELLING).sum(axis=0)
     offset = _offset(question.features, question.begins, expected, moving)
-    assert at_first is not None
     return Spatial(evidence, brought, at_first, question.asked, told, offset)
 
 

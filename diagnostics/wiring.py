@@ -40,6 +40,7 @@ _LEAST = -1.0  # log ratio that one doubtful cell can bring
 _LEADERLESS_COST = np.log(10.0)  # more, where each cell may as well be healthy: at an edge many are wrongly suspected
 _PROVEN = np.log(9.0)  # log odds from which on a wire is named: single cells are the safer guess
 _ROUNDS = 5
+_WIRES = "row", "column", "converter"  # that may be broken; address wires: see ``addresses``
 _FEW = 8  # wires of which all sets are tried
 
 Mask = NDArray[np.bool_]
@@ -89,7 +90,8 @@ def explain(
         alike: bool ``[D]``, all that could be faulty in that way; holds ``faulty``.
         against: bool ``[D]``, the cells that contradict a broken wire. Cells that are neither may be inferred faulty.
         weight: float ``[D]``, log likelihood ratio faulty : healthy of each cell that is alike.
-        doubt: float ``[D]``, whether a cell is faulty by itself, 0 to 1; the least on a wire counts for all.
+        doubt: float ``[D]``, how far a cell that is alike is from being faulty beyond doubt, 0 to 1; the least on a
+            wire counts for all of it.
         layout: the array.
         common: how common single faults of one kind are at least.
     """
@@ -119,12 +121,17 @@ def suspected(
     witness, groups = alike & (weight >= _WITNESS), []
     pads = set(np.flatnonzero(layout.grid(witness).sum(axis=(1, 2)) >= _FEWEST_WITNESSES).tolist())
     for line in layout.lines if pads else ():
-        if line.kind in ("row", "column", "converter") and line.pad in pads:
+        if line.kind in _WIRES and line.pad in pads:
             cells = layout.cells_on(line)
-            alive = np.flatnonzero(against[cells])
-            ends = (cells[: alive[0]], cells[alive[-1] + 1 :]) if len(alive) else (cells,)
+            ends = _ends(cells, against) or (cells,)
             groups += [end[alike[end]] for end in ends if witness[end].sum() >= _FEWEST_WITNESSES]
     return groups
+
+
+def _ends(cells: NDArray[np.intp], against: Mask) -> tuple[NDArray[np.intp], ...]:
+    """Return the cells of a line beyond the last live one seen from either end, from there on; none if none lives."""
+    live = np.flatnonzero(against[cells])
+    return (cells[live[-1] + 1 :], cells[: live[0]][::-1]) if len(live) else ()
 
 
 @lru_cache(maxsize=64)
@@ -156,7 +163,7 @@ def _explain_pad(
     candidates = []
     lines = layout.lines if witness.sum() >= 2 else ()
     for line in lines:
-        if line.kind in ("row", "column", "converter"):
+        if line.kind in _WIRES:
             candidates += _candidates(line, layout.cells_on(line), against, witness, tried, doubt)
     present = layout.present.ravel()
     found = np.flatnonzero(faulty & present)
@@ -204,14 +211,13 @@ def _candidates(
     def cost(behind: NDArray[np.intp]) -> float:
         return float(_LINE_COST + _LEADERLESS_COST * doubt[behind].min())
 
-    contradictions = np.flatnonzero(against[cells])
+    contradictions = int(against[cells].sum())
     found = []
-    if len(contradictions) <= _MOST_CONTRADICTIONS and convicted(cells):
-        found.append(_Candidate(line, cells, cost(cells) + _CONTRADICTION_COST * len(contradictions), True, len(cells)))
-    if line.kind == "converter" or not len(contradictions):
+    if contradictions <= _MOST_CONTRADICTIONS and convicted(cells):
+        found.append(_Candidate(line, cells, cost(cells) + _CONTRADICTION_COST * contradictions, True, len(cells)))
+    if line.kind == "converter":
         return found
-    # Beyond the last live cell seen from either end, from the first cell with evidence on.
-    for behind in (cells[contradictions[-1] + 1 :], cells[: contradictions[0]][::-1]):
+    for behind in _ends(cells, against):  # from the first cell with evidence on
         seen = np.flatnonzero(witness[behind])
         if len(seen):
             dead = np.sort(behind[seen[0] :])

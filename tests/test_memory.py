@@ -1,12 +1,8 @@
-from dataclasses import replace
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from adaptfault.recordings import Recordings
 from diagnostics import FaultKind, Line, SensorLayout, bridge, freeze_stream, inject, line_fault, lose_frames
-from diagnostics.contact import ContactModel, surest_of
 from diagnostics.faults import Fault
 from diagnostics.memory import Memory, finished
 from diagnostics.reference import Reference
@@ -85,15 +81,6 @@ def test_looking_at_it_in_between_changes_nothing():
         memory.extend(log[first : first + 13])
         finished(memory.complete().spatial())
     same(memory.complete(), remembered(log))
-
-
-@pytest.mark.parametrize(("touches", "unfamiliar"), [(20, 1.0), (98, 1.0), (198, 0.5), (398, 0.0), (5000, 0.0)])
-def test_healthy_touches_are_the_less_unfamiliar_the_more_the_reference_holds(touches: int, unfamiliar: float):
-    model = ContactModel((), LAYOUT)
-    tile = SimpleNamespace(outputs=np.arange(LAYOUT.n_cells), surest=surest_of(touches))
-    memory = Memory(LAYOUT, replace(UNKNOWN, model=replace(model, tiles=(tile,))), 2.0)
-    np.testing.assert_allclose(memory.unfamiliar(), unfamiliar, atol=1e-9)
-    assert (Memory(LAYOUT, UNKNOWN, 2.0).unfamiliar() == 1).all()  # without a reference
 
 
 def test_a_completed_memory_leaves_the_first_one_as_it_was():

@@ -1,7 +1,11 @@
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from diagnostics import SensorLayout, freeze_stream
+from diagnostics.contact import surest_of
 from diagnostics.memory import finished
 from diagnostics.reference import Reference
 
@@ -33,6 +37,14 @@ def test_a_fitted_reference_has_a_model_and_one_that_is_not_has_none(reference):
     assert reference.model is not None
     features = np.zeros((1, 4, CELLS), np.float32)
     assert finished(reference.model.expect(features, np.ones(CELLS, bool))).never.shape == (1, CELLS)
+
+
+@pytest.mark.parametrize(("touches", "unfamiliar"), [(20, 1.0), (98, 1.0), (198, 0.5), (398, 0.0), (5000, 0.0)])
+def test_healthy_touches_are_the_less_unfamiliar_the_more_the_reference_holds(reference, touches, unfamiliar):
+    tile = SimpleNamespace(outputs=np.arange(CELLS), surest=surest_of(touches))
+    known = replace(reference, model=replace(reference.model, tiles=(tile,)))
+    np.testing.assert_allclose(known.unfamiliar, unfamiliar, atol=1e-9)
+    assert (Reference.unknown(LAYOUT).unfamiliar == 1).all()
 
 
 def test_the_tolerance_grows_with_the_converters_step_up_to_a_bound():

@@ -123,15 +123,20 @@ def suspected(
     for line in layout.lines if pads else ():
         if line.kind in _WIRES and line.pad in pads:
             cells = layout.cells_on(line)
-            ends = _ends(cells, against) or (cells,)
+            ends = _ends(line, cells, against) if against[cells].any() else (cells,)
             groups += [end[alike[end]] for end in ends if witness[end].sum() >= _FEWEST_WITNESSES]
     return groups
 
 
-def _ends(cells: NDArray[np.intp], against: Mask) -> tuple[NDArray[np.intp], ...]:
-    """Return the cells of a line beyond the last live one seen from either end, from there on; none if none lives."""
+def _ends(line: Line, cells: NDArray[np.intp], against: Mask) -> tuple[NDArray[np.intp], ...]:
+    """Return the cells of a wire beyond the last live one seen from either end, from there on; none if none lives.
+
+    A converter has no middle to be broken in.
+    """
     live = np.flatnonzero(against[cells])
-    return (cells[live[-1] + 1 :], cells[: live[0]][::-1]) if len(live) else ()
+    if line.kind == "converter" or not len(live):
+        return ()
+    return cells[live[-1] + 1 :], cells[: live[0]][::-1]
 
 
 @lru_cache(maxsize=64)
@@ -215,9 +220,7 @@ def _candidates(
     found = []
     if contradictions <= _MOST_CONTRADICTIONS and convicted(cells):
         found.append(_Candidate(line, cells, cost(cells) + _CONTRADICTION_COST * contradictions, True, len(cells)))
-    if line.kind == "converter":
-        return found
-    for behind in _ends(cells, against):  # from the first cell with evidence on
+    for behind in _ends(line, cells, against):  # from the first cell with evidence on
         seen = np.flatnonzero(witness[behind])
         if len(seen):
             dead = np.sort(behind[seen[0] :])

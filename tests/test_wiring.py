@@ -150,6 +150,16 @@ def test_cells_are_suspected_together_as_wires_would_explain_them():
     assert suspected(alike, ~alike, np.where(mask(row[:1], column[-1:]), 3.0, NOTHING), LAYOUT) == []
 
 
+def test_cells_of_a_pad_with_a_live_one_are_not_suspected_together():
+    alike = mask(np.arange(110))  # a converter has no middle to be broken in
+    weight = np.where(alike, 3.0, NOTHING)
+    pad = np.arange(110).tolist()
+    assert pad in [group.tolist() for group in suspected(alike, mask(), weight, LAYOUT)]
+    alike[60] = False
+    groups = suspected(alike, mask([60]), weight, LAYOUT)
+    assert max(len(group) for group in groups) == 11  # no more than a column
+
+
 def test_a_few_doubtful_cells_do_not_convict_a_wire():
     row = LAYOUT.cells_on(Line(0, "row", 3))
     alike = mask(row[:2])

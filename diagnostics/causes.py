@@ -32,6 +32,7 @@ class Findings:
         silent: those that never delivered a reading.
         rests: those that read what an untouched cell reads, and are still; full: the same with full scale.
         intermittent, noisy, drifting: those that move, but wrongly.
+        gain: how many times their gain in the reference those read that drift in that; NaN: all others.
         value: what still cells read, and what blinking ones blink to; NaN: nothing.
         since: number of the first frame of what speaks for a fault.
         probability: P(faulty).
@@ -49,6 +50,7 @@ class Findings:
     intermittent: Mask
     noisy: Mask
     drifting: Mask
+    gain: Floats
     value: Floats
     since: NDArray[np.intp]
     probability: Floats
@@ -106,13 +108,15 @@ def _alike(found: Findings, full_scale: float) -> list[tuple[FaultKind, Mask, Ma
     faulty, value = found.faulty, found.value
     moving = found.intermittent | found.noisy | found.drifting
     still = faulty & ~found.silent & ~moving
+    of_gain = found.drifting & np.isfinite(found.gain)
+    of_offset = found.drifting & ~of_gain
     groups: list[tuple[FaultKind, Mask, Mask, float | None]] = [
         (FaultKind.OPEN, faulty & found.silent, found.silent, None),
         (FaultKind.OPEN, still & found.rests, found.rests, None),
         (FaultKind.SHORT, still & found.full, found.full, full_scale),
         (FaultKind.INTERMITTENT, faulty & found.intermittent, found.intermittent, None),
         (FaultKind.NOISY, faulty & found.noisy, found.noisy, None),
-        (FaultKind.DRIFT, faulty & found.drifting, found.drifting, None),
+        *((FaultKind.DRIFT, faulty & drifting, drifting, None) for drifting in (of_offset, of_gain)),
     ]
     between = np.flatnonzero(still & ~found.rests & ~found.full)
     between = between[np.argsort(value[between])]
@@ -177,6 +181,9 @@ _DOING = {
 
 
 def _does(fault: Fault, found: Findings, layout: SensorLayout) -> str:
+    gain = found.gain[list(fault.cells)]
+    if fault.kind is FaultKind.DRIFT and np.isfinite(gain).any():
+        return f"is loaded when the others are, but reads about {np.nanmedian(gain):.2g} times what it should"
     if fault.kind in _DOING:
         return _DOING[fault.kind].format(value=fault.value or 0.0, unit=layout.unit)
     if found.silent[fault.cells[0]]:

@@ -40,12 +40,19 @@ class Expected:
         always: float ``[n, D]``, P(loaded throughout).
         mean: float ``[n, D]``, expected mean root load.
         spread: float ``[D]``, scale of the error of ``mean``; NaN: cells of which nothing is known.
+        own: whether that is of the very cell, or of any that is surrounded alike.
     """
 
     never: NDArray[np.float64]
     always: NDArray[np.float64]
     mean: NDArray[np.float64]
     spread: NDArray[np.float64]
+    own: bool = True
+
+    def on(self, stretches: NDArray[np.bool_] | slice, cells: NDArray[np.intp] | slice = slice(None)) -> Expected:
+        """Return the same of some stretches and cells."""
+        never, always, mean = (values[stretches][:, cells] for values in (self.never, self.always, self.mean))
+        return Expected(never, always, mean, self.spread[cells], self.own)
 
     def within(
         self, low: NDArray[np.float64], high: NDArray[np.float64], cells: NDArray[np.intp]

@@ -27,7 +27,6 @@ SCHEMA = "adaptfault.diagnoser/5"
 
 _SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
 _SUSPICIOUS_COLD = 3.0  # log evidence from which on a cell is not asked about the others, in a cold start
-_OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is faulty: four touches
 _KNOWN = 9.0  # log likelihood ratio of a cell that was dead in the reference already
 _APART = 0.5  # of what speaks against cells of one wire, where none of them is asked about the others
 # P(faulty) from which on a cell is likely to be faulty. So far such a cell leads the others on its wire, and any other
@@ -153,7 +152,7 @@ class SelfDiagnosis:
             tested=(found.alive & memory.touched) | inferred,  # noise alone proves nothing
             transport=memory.stream.faults(scale.resting + scale.near, working, self.layout.rate),
             evidence={
-                "spatial": spatial.evidence + spatial.offset,
+                "spatial": spatial.evidence + spatial.offset + spatial.gain,
                 "temporal": np.where(spatial.asked, memory.temporal(), unrest.blinking + unrest.noisy),
                 "touches": spatial.touches.astype(np.float64),
             },
@@ -183,7 +182,7 @@ class SelfDiagnosis:
         still = self.weights_.probability(worth, kind, spatial.asked & ~known)
         still[known] = reference.dead[known]
         intermittent, noisy = unrest.intermittent & present & ~wrong, unrest.excess & present & ~wrong
-        drifting = present & ~wrong & ~intermittent & ~noisy & (spatial.offset >= _OFFSET)
+        drifting = present & ~wrong & ~intermittent & ~noisy & spatial.drifting
         counted_out = silent | intermittent | noisy | drifting
         probability = np.where(present, np.where(counted_out, _SURE, still), 0.0)
         faulty = faulty_at(np.where(counted_out, 0.0, probability), self.false_discovery_rate)
@@ -199,8 +198,11 @@ class SelfDiagnosis:
             intermittent=intermittent,
             noisy=noisy,
             drifting=drifting,
+            gain=np.where(drifting, spatial.factor, np.nan),
             value=np.where(intermittent, np.where(2 * unrest.high > unrest.blinks, self.layout.full_scale, 0.0), value),
-            since=np.select([intermittent, noisy, drifting], [unrest.blinks_since, unrest.noisy_since, 0], runs.start),
+            since=np.select(
+                [intermittent, noisy, drifting], [unrest.blinks_since, unrest.noisy_since, spatial.since], runs.start
+            ),
             probability=probability,
             # What the line hypothesis asks of a cell at rest is only whether touches speak against it.
             weight=np.where(known, _KNOWN, self.weights_.worth(spatial.surprise, temporal, kind)),

@@ -51,10 +51,7 @@ class _Alone:
     def expect(self, features: Array, trusted: Mask) -> Generator[None, None, Expected]:
         """See ``ContactModel.expect``."""
         e = yield from self.model.expect(self.own.on(features), self.own.on(trusted))
-        if self.own.full:
-            return e
-        cells = self.own.cells
-        return Expected(e.never[:, cells], e.always[:, cells], e.mean[:, cells], e.spread[cells])
+        return e if self.own.full else e.on(slice(None), self.own.cells)
 
 
 class PatchedMemory(Memory):

@@ -20,13 +20,14 @@ from __future__ import annotations
 
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit, softmax
 
 from diagnostics.contact import Expected
+from diagnostics.drift import drifting, gain_evidence, misleading, offset_evidence
 from diagnostics.temporal import SHORTEST_RUN, StillRuns
 from diagnostics.touches import Array, Scale, Touch
 
@@ -34,12 +35,11 @@ _ANYWHERE = 0.2  # of broken cells stick anywhere, of the rest as many to the lo
 _LEAST = 1e-4  # no touch is less likely than this: models err
 SUDDEN = 1.0  # log ratio of a jump from which on a cell is no witness
 _TELLING = 0.5  # log evidence from which on a touch counts as one that tested the cell
-_LEAST_OFFSET = 0.02  # of full scale, at the mean: a smaller one does no harm
-_MOST_OFFSET = 3.0  # log evidence of one touch that a moving cell does not come to rest
 _WORTHS = (0.25, 0.5, 0.75, 1.0)  # of the log odds of the model, in one touch or another
 _WITNESS_SHARE = 0.5  # of what the moving cells say of that counts: neighbours err together
 _ONE_LOAD = 0.5  # correlation of what touches elsewhere say of a load that outlasts them
 _MOST_ROUNDS = 8  # of judging, leaving suspects out and putting others back
+_MOST_DRIFTING = 16  # cells that are left out for their drift, one by one
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -90,6 +90,9 @@ class Spatial:
         touches: int ``[D]``, how many touches each was judged by that said more than nothing.
         offset: float ``[D]``, log likelihood ratio of a cell that moves, but is loaded all through the last touches,
             however little the others are; 0 for the others.
+        gain: float ``[D]``, log likelihood ratio of a cell that moves, but has another gain; 0 where no touch tells.
+        factor: float ``[D]``, how many times its gain in the reference, where it certainly is another; NaN elsewhere.
+        since: int ``[D]``, from about which frame on; 0: all along, or not known.
     """
 
     evidence: Floats
@@ -98,13 +101,22 @@ class Spatial:
     asked: Mask
     touches: NDArray[np.intp]
     offset: Floats
+    gain: Floats
+    factor: Floats
+    since: NDArray[np.intp]
+
+    @property
+    def drifting(self) -> Mask:
+        """The cells that move, but certainly not as healthy ones do, bool ``[D]``."""
+        return drifting(self.offset, self.gain)
 
     @classmethod
     def before(cls, cells: Cells) -> Spatial:
         """Return what is known where nothing touched the cells since earlier touches were weighed."""
         asked = cells.askable & (cells.runs.length >= SHORTEST_RUN)
         settled, nothing = np.where(asked, cells.settled, 0.0), np.zeros(len(asked))
-        return cls(settled, settled, settled, asked, np.zeros(len(asked), np.intp), nothing)
+        none = np.zeros(len(asked), np.intp)
+        return cls(settled, settled, settled, asked, none, nothing, nothing, np.full(len(asked), np.nan), none)
 
 
 @dataclass(frozen=True)
@@ -184,13 +196,40 @@ class _Question:
         return np.where(self.asked, self.cells.settled + surprise.sum(axis=0), 0.0)
 
 
+class _Agreed(NamedTuple):
+    """What the cells say that are asked in the end; ``at_first``: what was brought while those asked at first were."""
+
+    expected: Expected
+    surprise: Floats
+    brought: Floats
+    at_first: Floats
+    evidence: Floats
+    trusted: Mask
+
+
+def _agreed(question: _Question, trusted: Mask, suspicious: float) -> Generator[None, None, _Agreed]:
+    """Ask the ``trusted`` cells, leave out those that look stuck, put the others back, until none changes sides."""
+    trusted, brought = trusted & question.askable, []
+    for _ in range(_MOST_ROUNDS):
+        yield
+        expected, surprise = yield from question.answered(trusted)
+        brought.append(question.brought(surprise))
+        evidence = np.where(question.asked, question.values.prior + brought[-1], 0.0)
+        asked_now = trusted
+        trusted = question.askable & (evidence + question.cells.temporal < suspicious)
+        if (trusted == asked_now).all():
+            break
+    return _Agreed(expected, surprise, brought[-1], brought[0], evidence, trusted)
+
+
 def stuck_evidence(
     touches: Sequence[Touch], cells: Cells, model: Model, scale: Scale, tolerance: float, suspicious: float
 ) -> Generator[None, None, Spatial]:
     """Weigh stuck against healthy for each cell that is still now. A generator that pauses on its way.
 
     Cells that moved answer first; still cells whose value proved normal are then put back, and those that look
-    stuck are left out, until no cell changes sides: cells that died side by side vouch for each other at first.
+    stuck are left out, until no cell changes sides: cells that died side by side vouch for each other at first. Cells
+    that move, but not as healthy ones do (see ``drift``), are left out as well.
 
     Args:
         touches: what happened.
@@ -209,20 +248,31 @@ def stuck_evidence(
     # few are broken.
     fresh = runs.start >= touches[-1].first
     trusted = question.askable & runs.moved & (values.rests | (fresh & (cells.temporal < SUDDEN)))
-    for turn in range(_MOST_ROUNDS):
+    said = yield from _agreed(question, trusted, suspicious)
+    at_first, drifts, first = said.at_first, np.zeros(len(trusted), bool), np.array([touch.first for touch in touches])
+    moved = cells.askable & runs.moved & (first[:, None] <= runs.start)
+    for _ in range(_MOST_DRIFTING):
         yield
-        expected, surprise = yield from question.answered(trusted)
-        brought = question.brought(surprise)
-        if turn == 0:
-            at_first = brought
-        evidence = np.where(question.asked, values.prior + brought, 0.0)
-        asked_now, trusted = trusted, question.askable & (evidence + cells.temporal < suspicious)
-        if (trusted == asked_now).all():
+        whole, expected = question.features[question.begins], said.expected.on(question.begins)
+        offset = offset_evidence(whole, expected.always, moved[-1] & np.isfinite(expected.spread))
+        gain = gain_evidence(whole, expected, moved, scale.root_near)
+        more = misleading(offset, gain.evidence, drifts)
+        if not more.any():
             break
-    moving = cells.askable & runs.moved & fresh & ~np.isnan(expected.spread)
-    told = (surprise > _TELLING).sum(axis=0)
-    offset = _offset(question.features, question.begins, expected, moving)
-    return Spatial(evidence, brought, at_first, question.asked, told, offset)
+        drifts |= more
+        said = yield from _agreed(replace(question, askable=question.askable & ~drifts), said.trusted, suspicious)
+    of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
+    return Spatial(
+        said.evidence,
+        said.brought,
+        at_first,
+        question.asked,
+        np.where(of_gain, gain.touches, (said.surprise > _TELLING).sum(axis=0)),
+        offset,
+        gain.evidence,
+        factor=np.where(of_gain, gain.factor, np.nan),
+        since=np.where(of_gain & (gain.since > 0), first[gain.since], 0),
+    )
 
 
 def apart_evidence(
@@ -309,15 +359,3 @@ def _believed(never: Floats, unloaded: NDArray[np.bool_], witness: NDArray[np.bo
     doubted = np.sum([p[:, None] * expit(w * odds) for p, w in zip(share, _WORTHS, strict=True)], axis=0)
     believed: Floats = np.maximum(never, doubted)  # doubt is no evidence against cells expected to stay unloaded
     return believed
-
-
-def _offset(
-    features: Array, begins: NDArray[np.bool_], expected: Expected, moving: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """Return the log likelihood ratio that a moving cell never comes back to rest, ``[D]``, over the last touches."""
-    whole = features[begins]  # (touches, 4, D)
-    loaded = (whole[:, 3] == 1) & (whole[:, 1] ** 2 >= _LEAST_OFFSET)
-    lasting = np.logical_and.accumulate(loaded[::-1])[::-1]  # unbroken up to the end
-    # One surprise may be a residue of the last load: no touch says much alone.
-    surprise = np.minimum(-np.log(np.maximum(expected.always[begins], _LEAST)), _MOST_OFFSET)
-    return np.where(moving, np.where(lasting, surprise, 0.0).sum(axis=0), 0.0)

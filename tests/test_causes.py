@@ -15,8 +15,8 @@ ZERO = np.zeros(CELLS)
 
 HEALTHY = Findings(
     faulty=NONE, alive=~NONE, silent=NONE, rests=NONE, full=NONE, intermittent=NONE, noisy=NONE, drifting=NONE,
-    value=np.full(CELLS, np.nan), since=np.zeros(CELLS, np.intp), probability=ZERO, weight=ZERO, doubt=np.ones(CELLS),
-    touches=np.zeros(CELLS, np.intp), known=NONE,
+    gain=np.full(CELLS, np.nan), value=np.full(CELLS, np.nan), since=np.zeros(CELLS, np.intp), probability=ZERO,
+    weight=ZERO, doubt=np.ones(CELLS), touches=np.zeros(CELLS, np.intp), known=NONE,
 )  # fmt: skip
 
 
@@ -140,6 +140,15 @@ def test_cells_that_move_wrongly_are_named_by_how(name: str, kind: FaultKind, sa
     (fault,) = causes(moving(HEALTHY, name, [7]))
     assert (fault.kind, fault.cells) == (kind, (7,))
     assert says in fault.reason
+
+
+def test_cells_that_read_too_little_are_told_from_those_that_do_not_come_to_rest():
+    found = moving(HEALTHY, "drifting", [*row(1, 5), 7])
+    of_row, single = causes(replace(found, gain=np.where(at(row(1, 5)), 0.35, np.nan)))
+    assert (of_row.kind, of_row.line) == (FaultKind.DRIFT, Line(1, "row", 5))
+    assert "reads about 0.35 times what it should" in of_row.reason
+    assert (single.kind, single.cells) == (FaultKind.DRIFT, (7,))
+    assert "never comes back to rest" in single.reason
 
 
 def test_a_loose_wire_makes_its_whole_row_blink():

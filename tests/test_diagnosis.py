@@ -194,6 +194,20 @@ def test_a_cell_whose_offset_drifts_away_is_found(fitted, log):
     assert (fault.kind, fault.cells) == (FaultKind.DRIFT, (cell,))
 
 
+@pytest.mark.parametrize("onset", [None, 1200])
+def test_a_cell_that_has_lost_most_of_its_gain_is_found_and_says_so(fitted, grasps: Recordings, onset):
+    log = [grasps.frames[i] for i in range(1, 140, 6)]
+    assert not fitted.diagnose(log).faults
+    frames = np.concatenate(log)
+    cell = int(touched(log)[36])
+    frames[onset:, cell] *= 0.15
+    (fault,) = fitted.diagnose(frames).faults
+    assert (fault.kind, fault.cells) == (FaultKind.DRIFT, (cell,))
+    assert "is loaded when the others are, but reads about 0." in fault.reason
+    assert fault.onset == onset or abs(fault.onset - onset) <= 100
+    assert not COLD.diagnose(frames).faults  # what it was before, one log does not tell
+
+
 def test_a_fault_that_has_gone_is_not_in_the_diagnosis(fitted, log):
     faults = [Fault("short", (int(loaded(log)[10]),)), Fault("open", (int(loaded(log)[12]),))]
     frames = np.concatenate(log)

@@ -202,3 +202,20 @@ def test_an_offset_that_ended_is_forgotten():
     log[:100, 3] = 2 + 0.2 * log[:100, 3]
     log[:, 7] = 0
     assert judged(log).offset[3] == 0
+
+
+def test_beside_a_cell_with_a_wrong_gain_no_other_is_accused():
+    log = pressed(12)
+    log[:, 3] *= 0.1
+    told = judged(log)
+    assert np.flatnonzero(told.drifting).tolist() == [3]
+    assert told.factor[3] == 0.1
+    assert np.isnan(np.delete(told.factor, 3)).all()
+
+
+def test_a_cell_that_got_stuck_has_no_wrong_gain():
+    log = pressed(12)
+    log[60:, 3] = 0.3
+    told = judged(log)
+    assert told.evidence[3] > 4
+    assert not told.drifting.any()

@@ -1,0 +1,83 @@
+import numpy as np
+import pytest
+
+from diagnostics.contact import Expected
+from diagnostics.drift import drifting, gain_evidence, misleading
+
+CELLS, NEAR = 30, 0.1
+SPREAD = 0.05
+
+
+def touched(n: int, gain: np.ndarray | float = 1.0, *, error: float = SPREAD / 2, own: bool = True):
+    """Touches that load all cells, what is expected of them, and that all cells moved in each."""
+    rng = np.random.default_rng(0)
+    mean = rng.uniform(0.3, 0.8, (n, CELLS))
+    root = np.sqrt(gain) * mean + error * rng.standard_normal((n, CELLS))
+    ones = np.ones((n, CELLS))
+    expected = Expected(0.02 * ones, 0.5 * ones, mean, np.full(CELLS, SPREAD), own)
+    return np.stack([root, root, ones, ones], axis=1), expected, ones > 0
+
+
+def one_has(gain: float, cell: int = 4) -> np.ndarray:
+    return np.where(np.arange(CELLS) == cell, gain, 1.0)
+
+
+@pytest.mark.parametrize("gain", [0.15, 0.35, 0.5, 2.5])
+def test_a_wrong_gain_is_told_by_touches_and_no_other_cell_is_accused(gain: float):
+    told = gain_evidence(*touched(20, one_has(gain)), NEAR)
+    assert drifting(np.zeros(CELLS), told.evidence).nonzero()[0].tolist() == [4]
+    assert 0.6 < told.factor[4] / gain < 1.6
+    assert (told.since[4], told.touches[4]) == (0, 20)
+    assert (np.delete(told.evidence, 4) < 0).all()
+
+
+def test_it_says_from_which_touch_on():
+    gain = np.ones((12, CELLS))
+    gain[7:, 4] = 0.2
+    told = gain_evidence(*touched(12, gain), NEAR)
+    assert drifting(np.zeros(CELLS), told.evidence)[4]
+    assert told.since[4] == 7
+
+
+@pytest.mark.parametrize("gain", [0.8, 1.25])
+def test_a_gain_that_is_a_little_off_is_no_fault_however_many_touches_tell(gain: float):
+    assert (gain_evidence(*touched(60, one_has(gain)), NEAR).evidence < 0).all()
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_one_or_two_touches_prove_nothing(n: int):
+    assert not drifting(np.zeros(CELLS), gain_evidence(*touched(n, one_has(0.1)), NEAR).evidence).any()
+
+
+def test_where_all_that_is_expected_errs_no_cell_is_accused():
+    strange = gain_evidence(*touched(8, error=5 * SPREAD), NEAR)
+    assert not drifting(np.zeros(CELLS), strange.evidence).any()
+
+
+def test_touches_that_tell_nothing_of_a_gain_do_not_count():
+    whole, expected, moved = touched(8, one_has(0.2))
+    unloaded = whole.copy()
+    unloaded[:, :, 4] = 0.0  # another question
+    unmoved = moved.copy()
+    unmoved[:, 4] = False
+    unknown = Expected(expected.never, expected.always, expected.mean, np.where(one_has(0.0) == 0, np.nan, SPREAD))
+    faint = Expected(expected.never, expected.always, np.minimum(expected.mean, 1.9 * NEAR), expected.spread)
+    for told in (
+        gain_evidence(unloaded, expected, moved, NEAR),
+        gain_evidence(whole, expected, unmoved, NEAR),
+        gain_evidence(whole, unknown, moved, NEAR),
+        gain_evidence(whole, faint, moved, NEAR),
+        gain_evidence(*touched(8, one_has(0.2), own=False), NEAR),
+    ):
+        assert (told.evidence[4], told.factor[4], told.touches[4]) == (0.0, 1.0, 0)
+
+
+def test_cells_that_mislead_are_left_out_the_surest_gain_first_and_all_offsets_at_once():
+    offset, gain, known = np.zeros(CELLS), np.zeros(CELLS), np.zeros(CELLS, bool)
+    assert not misleading(offset, gain, known).any()
+    offset[[1, 2]], gain[[5, 6, 7]] = 20.0, (20.0, 30.0, 6.0)
+    order = []
+    while (more := misleading(offset, gain, known)).any():
+        order.append(np.flatnonzero(more).tolist())
+        known |= more
+    assert order == [[1, 2, 6], [5]]

@@ -28,6 +28,8 @@ _MOST_DRAWS = 8  # stretches of one touch: more of them say the same
 _SHORTEST = 6  # frames of a stretch
 _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
 _NOVEL = 0.1  # share of touches that resemble nothing known
+_FAMILIAR, _STRANGE = 1 / 400, 1 / 100  # chance that a touch does with a cell what none did before
+_SHARED = 0.4  # of what is said of a cell where few touches teach: that is true of the cells around it as well
 _AT_ONCE = 6144  # cells of stretches looked at between two pauses
 
 
@@ -40,19 +42,19 @@ class Expected:
         always: float ``[n, D]``, P(loaded throughout).
         mean: float ``[n, D]``, expected mean root load.
         spread: float ``[D]``, scale of the error of ``mean``; NaN: cells of which nothing is known.
-        own: whether that is of the very cell, or of any that is surrounded alike.
+        own: float ``[D]``, how far all that is of the very cell, and not of any that is surrounded alike, 0 to 1.
     """
 
     never: NDArray[np.float64]
     always: NDArray[np.float64]
     mean: NDArray[np.float64]
     spread: NDArray[np.float64]
-    own: bool = True
+    own: NDArray[np.float64]
 
     def on(self, stretches: NDArray[np.bool_] | slice, cells: NDArray[np.intp] | slice = slice(None)) -> Expected:
         """Return the same of some stretches and cells."""
         never, always, mean = (values[stretches][:, cells] for values in (self.never, self.always, self.mean))
-        return Expected(never, always, mean, self.spread[cells], self.own)
+        return Expected(never, always, mean, self.spread[cells], self.own[cells])
 
     def within(
         self, low: NDArray[np.float64], high: NDArray[np.float64], cells: NDArray[np.intp]
@@ -103,6 +105,11 @@ class ContactModel:
             surest[tile.outputs] = tile.surest
         return surest
 
+    def unfamiliar(self, n_cells: int) -> NDArray[np.float64]:
+        """Return how little is known of healthy touches of D cells, ``[D]``: 0 where it holds 400, 1 with up to 100."""
+        strange: NDArray[np.float64] = np.log(self.surest(n_cells) / _FAMILIAR) / np.log(_STRANGE / _FAMILIAR)
+        return np.clip(strange, 0.0, 1.0)
+
     def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Generator[None, None, Expected]:
         """Say what healthy cells would do. A generator that pauses on its way, for those who cannot wait.
 
@@ -131,7 +138,7 @@ class ContactModel:
         held = surest if self.rim is None else np.minimum(surest, surest_of(self.rim.touches))
         never = np.where(known, np.clip(never, surest, 1 - surest), 1.0)
         always = np.where(known, np.clip(always, held, 1 - held), 1.0)
-        return Expected(never, always, foreseen.mean, spread)
+        return Expected(never, always, foreseen.mean, spread, 1 - _SHARED * self.unfamiliar(shape))
 
 
 def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -65,7 +65,8 @@ def gain_evidence(whole: Array, expected: Expected, moved: Mask, root_near: floa
     """Look for cells that are loaded when the others say, but not as much.
 
     Whether a cell is loaded at all is another question (see ``spatial``): touches that leave it unloaded do not count.
-    What holds of cells in general (cold start) tells nothing of the gain of one.
+    What holds of cells in general (cold start) tells nothing of the gain of one; where few touches taught what to
+    expect of it, evidence counts for less.
 
     Args:
         whole: features ``[n, 4, D]`` of n touches (see ``Summary.features``), in time order.
@@ -73,8 +74,13 @@ def gain_evidence(whole: Array, expected: Expected, moved: Mask, root_near: floa
         moved: bool ``[n, D]``, the touches up to which each cell has moved.
         root_near: the root load from which on a cell counts as loaded.
     """
-    counts = moved & np.isfinite(expected.spread) & (whole[:, 2] > 0) & (expected.mean > _LOADED * root_near)
-    counts &= expected.own
+    counts = (
+        moved
+        & np.isfinite(expected.spread)
+        & (expected.own > 0)
+        & (whole[:, 2] > 0)
+        & (expected.mean > _LOADED * root_near)
+    )
     n, d = counts.shape
     result = Gain(np.zeros(d), np.ones(d), np.zeros(d, np.intp), np.zeros(d, np.intp))
     cells = np.flatnonzero(counts.any(axis=0))
@@ -95,7 +101,7 @@ def gain_evidence(whole: Array, expected: Expected, moved: Mask, root_near: floa
     wrong = np.stack([said(gain) for gain in _GAINS]) - np.max([said(gain) for gain in _AS_GOOD], axis=0)
     wrong += np.log(chance)[:, None] - np.log(len(_GAINS))  # (gains, n, k)
     likeliest = logsumexp(wrong, axis=1).argmax(axis=0)
-    result.evidence[cells] = logsumexp(wrong, axis=(0, 1))
+    result.evidence[cells] = expected.own[cells] * logsumexp(wrong, axis=(0, 1))
     result.factor[cells] = _GAINS[likeliest]
     result.since[cells] = since = wrong[likeliest, :, np.arange(len(cells))].argmax(axis=1)
     result.touches[cells] = (counts & (np.arange(n)[:, None] >= since)).sum(axis=0)

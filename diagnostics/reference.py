@@ -24,7 +24,6 @@ _STEPS = 1.5  # and at least so many converter steps
 _TWINS = 5  # witnesses that two healthy lines may have, where no reference tells
 _TELLING = 250  # recordings that tell how many; with half as many, one more may be
 _SAMPLED = 2000  # cells, about, that tell the converter's step
-_FAMILIAR, _STRANGE = 1 / 400, 1 / 100  # chance that a touch does with a cell what none did before
 _PATIENCE = 32  # a frame may come again so often, and twice as often as it ever did in the reference
 
 
@@ -59,11 +58,7 @@ class Reference:
     @property
     def unfamiliar(self) -> NDArray[np.float64]:
         """How little is known of healthy touches, float ``[D]``: 0 where it holds 400 of them, 1 with 100 or fewer."""
-        if self.model is None:
-            return np.ones(len(self.dead))
-        strange = self.model.surest(len(self.dead))
-        unfamiliar: NDArray[np.float64] = np.log(strange / _FAMILIAR) / np.log(_STRANGE / _FAMILIAR)
-        return np.clip(unfamiliar, 0.0, 1.0)
+        return np.ones(len(self.dead)) if self.model is None else self.model.unfamiliar(len(self.dead))
 
     @classmethod
     def fit(

@@ -50,7 +50,7 @@ class Surroundings:
         yield
         usable = np.flatnonzero(trusted & present & np.isfinite(known).all(axis=(0, 2)))
         if not len(usable):
-            return Expected(never, always, mean, spread, own=False)
+            return Expected(never, always, mean, spread, own=np.zeros(shape[1]))
         samples = known[:, usable].reshape(-1, known.shape[2])
         answers = np.moveaxis(self.log[:, :, usable], 1, -1).reshape(-1, self.log.shape[1])
         kept = np.linspace(0, len(samples) - 1, min(len(samples), _MOST_SAMPLES)).astype(int)
@@ -76,7 +76,7 @@ class Surroundings:
         always[:, judged] = share(near[..., 3] == 1, answers[:, 3] == 1)
         mean[:, judged] = near[..., 1].mean(axis=1)[which]
         spread[judged] = max(float(near[..., 1].std(axis=1)[which].mean()), _LEAST_SPREAD)
-        return Expected(never, always, mean, spread, own=False)
+        return Expected(never, always, mean, spread, own=np.zeros(shape[1]))
 
 
 def _surroundings(features: Array, trusted: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.float64]:

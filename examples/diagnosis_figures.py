@@ -36,6 +36,8 @@ SHOWN, ENOUGH = 0.05, 10  # of full scale; frames
 HELD, WINDOW = 300, 50  # frames of a static hold; of a window in which a cell can raise a false alarm
 REPEATED = 100  # frames of a frozen stream, beyond the longest repetition that is still taken for idleness
 MOVING = (FaultKind.INTERMITTENT, FaultKind.NOISY, FaultKind.DRIFT)
+GAINS, FADED = (0.2, 0.35, 0.5), 0.1  # times the load; what is left at the end
+MANY, SOME = 30, 8  # recordings that tell a gain; in so many of them the cell is loaded
 
 
 def draw_faults(layout: SensorLayout, share: float, kinds: tuple[str, ...], rng: np.random.Generator) -> list[Fault]:
@@ -379,6 +381,33 @@ def moving(bench: Bench) -> Iterator[Row]:
     yield Row("  other cells of these logs", "-", f"{false} false", bench.count)
 
 
+def gain(bench: Bench) -> Iterator[Row]:
+    """One touch says little of a gain: these logs are longer."""
+    layout, rest, drawn, named, false = bench.layout, bench.rest, Counter(), Counter(), 0
+    for seed in range(bench.count):
+        rng = np.random.default_rng(seed)
+        log = [bench.recordings.frames[i] for i in rng.choice(rest, min(MANY, len(rest)), replace=False)]
+        whole = np.concatenate(log).astype(np.float64)
+        loaded = sum((frames > SHOWN * layout.full_scale).any(axis=0).astype(int) for frames in log)
+        cells = rng.permutation(np.flatnonzero(loaded >= SOME)).tolist()
+        lasts = len(whole) / layout.rate  # seconds
+        fading = [Fault(FaultKind.DRIFT, (cell,), value=0.0) for cell in cells[:1]]
+        seen = inject(whole, fading, layout, gain=(FADED - 1) / lasts)
+        cases = dict(zip(cells, (f"gain fades to {FADED}", *(f"gain {g}" for g in GAINS)), strict=False))
+        for cell, times in zip(cells[1:], GAINS, strict=False):
+            seen[:, cell] *= times
+        diagnosis = bench.fitted.diagnose(np.split(seen, np.cumsum([len(frames) for frames in log])[:-1]))
+        told = {cell: fault.kind for fault in diagnosis.faults for cell in fault.cells}
+        for cell, case in cases.items():
+            drawn[case] += 1
+            named[case] += told.get(cell) is FaultKind.DRIFT
+        false += len(diagnosis.fault_set - set(cases))
+    for case in sorted(drawn):
+        measured = f"found and named {percent(named[case], drawn[case])} of {drawn[case]}"
+        yield Row(f"{case}, loaded in {SOME} of {MANY} recordings", "-", measured, bench.count)
+    yield Row("  other cells of these logs", "-", f"{false} false", bench.count)
+
+
 def transport(bench: Bench) -> Iterator[Row]:
     layout, told, blamed = bench.layout, Counter(), Counter()
     for seed, log, rng in bench.logs():
@@ -477,6 +506,7 @@ ROWS: dict[str, Callable[[Bench], Iterator[Row]]] = {
         kind,
         calibration,
         moving,
+        gain,
         transport,
         speed,
     )

@@ -194,12 +194,12 @@ def test_a_cell_whose_offset_drifts_away_is_found(fitted, log):
     assert (fault.kind, fault.cells) == (FaultKind.DRIFT, (cell,))
 
 
-@pytest.mark.parametrize("onset", [None, 1200])
+@pytest.mark.parametrize("onset", [None, 2000])
 def test_a_cell_that_has_lost_most_of_its_gain_is_found_and_says_so(fitted, grasps: Recordings, onset):
-    log = [grasps.frames[i] for i in range(1, 140, 6)]
+    log = [grasps.frames[i] for i in range(1, 140, 3)]
     assert not fitted.diagnose(log).faults
     frames = np.concatenate(log)
-    cell = int(touched(log)[36])
+    cell = int(touched(log)[24])
     frames[onset:, cell] *= 0.15
     (fault,) = fitted.diagnose(frames).faults
     assert (fault.kind, fault.cells) == (FaultKind.DRIFT, (cell,))

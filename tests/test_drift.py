@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,13 +10,13 @@ CELLS, NEAR = 30, 0.1
 SPREAD = 0.05
 
 
-def touched(n: int, gain: np.ndarray | float = 1.0, *, error: float = SPREAD / 2, own: bool = True):
+def touched(n: int, gain: np.ndarray | float = 1.0, *, error: float = SPREAD / 2, own: float = 1.0):
     """Touches that load all cells, what is expected of them, and that all cells moved in each."""
     rng = np.random.default_rng(0)
     mean = rng.uniform(0.3, 0.8, (n, CELLS))
     root = np.sqrt(gain) * mean + error * rng.standard_normal((n, CELLS))
     ones = np.ones((n, CELLS))
-    expected = Expected(0.02 * ones, 0.5 * ones, mean, np.full(CELLS, SPREAD), own)
+    expected = Expected(0.02 * ones, 0.5 * ones, mean, np.full(CELLS, SPREAD), np.full(CELLS, own))
     return np.stack([root, root, ones, ones], axis=1), expected, ones > 0
 
 
@@ -54,20 +56,25 @@ def test_where_all_that_is_expected_errs_no_cell_is_accused():
     assert not drifting(np.zeros(CELLS), strange.evidence).any()
 
 
+def test_the_fewer_touches_taught_what_to_expect_the_less_is_told():
+    sure, half = (gain_evidence(*touched(8, one_has(0.2), own=own), NEAR).evidence for own in (1.0, 0.5))
+    np.testing.assert_allclose(half, sure / 2)
+
+
 def test_touches_that_tell_nothing_of_a_gain_do_not_count():
     whole, expected, moved = touched(8, one_has(0.2))
     unloaded = whole.copy()
     unloaded[:, :, 4] = 0.0  # another question
     unmoved = moved.copy()
     unmoved[:, 4] = False
-    unknown = Expected(expected.never, expected.always, expected.mean, np.where(one_has(0.0) == 0, np.nan, SPREAD))
-    faint = Expected(expected.never, expected.always, np.minimum(expected.mean, 1.9 * NEAR), expected.spread)
+    unknown = replace(expected, spread=np.where(one_has(0.0) == 0, np.nan, SPREAD))
+    faint = replace(expected, mean=np.minimum(expected.mean, 1.9 * NEAR))
     for told in (
         gain_evidence(unloaded, expected, moved, NEAR),
         gain_evidence(whole, expected, unmoved, NEAR),
         gain_evidence(whole, unknown, moved, NEAR),
         gain_evidence(whole, faint, moved, NEAR),
-        gain_evidence(*touched(8, one_has(0.2), own=False), NEAR),
+        gain_evidence(*touched(8, one_has(0.2), own=0.0), NEAR),
     ):
         assert (told.evidence[4], told.factor[4], told.touches[4]) == (0.0, 1.0, 0)
 

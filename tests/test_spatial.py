@@ -26,7 +26,7 @@ class Copycat:
             of.mean(axis=1, keepdims=True) for of in (of_known[:, 2], of_known[:, 3] == 1, of_known[:, 1])
         )
         p = np.clip(np.broadcast_to(np.stack([1 - loaded, always]), (2, *shape)), 0.02, 0.98)
-        return Expected(p[0], p[1], np.broadcast_to(mean, shape), np.full(CELLS, 0.05))
+        return Expected(p[0], p[1], np.broadcast_to(mean, shape), np.full(CELLS, 0.05), np.ones(CELLS))
 
 
 class Presser:
@@ -35,7 +35,7 @@ class Presser:
     def expect(self, features: Array, trusted: np.ndarray) -> Generator[None, None, Expected]:
         yield
         even = np.ones(features[:, 0].shape)
-        return Expected(0.02 * even, 0.02 * even, 0.5 * even, np.full(CELLS, 0.05))
+        return Expected(0.02 * even, 0.02 * even, 0.5 * even, np.full(CELLS, 0.05), np.ones(CELLS))
 
 
 class Row:

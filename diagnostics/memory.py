@@ -177,13 +177,13 @@ class Memory:
         self._gone()
         frames, numbers = self._buffer[: self._filled], self._numbers[: self._filled]
         self._filled = 0
+        self._tare = self._tare.extend(frames, self.reference.scale, self.present, self.reference.offset)
+        self.scale = scale = self._tare.on(self.reference.scale)
         start = self.runs.start
-        self.runs = self.runs.extend(frames, numbers, self.reference.tolerance)
+        self.runs = self.runs.extend(frames, numbers, self.reference.tolerance, scale.resting)
         self.heard = self.heard | np.isfinite(self.runs.last)
         # Evidence belongs to a stretch, and ends with it.
         self.settled = np.where(self.runs.start == start, self.settled, 0.0)
-        self._tare = self._tare.extend(frames, self.reference.scale, self.present, self.reference.offset)
-        self.scale = scale = self._tare.on(self.reference.scale)
         root, still = scale.root_load(self._tare.off(frames)), self.runs.start <= numbers[0]
         self.touched = self.touched | root.any(axis=0)
         sudden = self._sudden() >= SUDDEN

@@ -72,7 +72,7 @@ class Reference:
         rest, least = resting(recordings, present, tolerance, layout.full_scale)
         rest[dead > 0] = np.median(rest[present])  # where they would rest
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
-        onsets = Onsets.fit(recordings, tolerance, layout.full_scale)
+        onsets = Onsets.fit(recordings, tolerance, layout.full_scale, rest)
         patience = max(_PATIENCE, 2 * max(longest_repetition(r) for r in recordings))
         model = contact_model(recordings, layout, scale)
         return cls(

@@ -48,13 +48,16 @@ class StillRuns:
         zero, nothing = np.zeros(n_cells, np.intp), np.full(n_cells, np.inf)
         return cls(zero, zero, nothing, -nothing, np.zeros(n_cells), np.zeros(n_cells), np.full(n_cells, np.nan))
 
-    def extend(self, frames: Floats, numbers: NDArray[np.intp], tolerance: float) -> StillRuns:
+    def extend(
+        self, frames: Floats, numbers: NDArray[np.intp], tolerance: float, resting: Floats | float = 0.0
+    ) -> StillRuns:
         """Return the runs after more frames. A cell is still while it stays within +- ``tolerance`` of one value.
 
         Args:
             frames: ``[t, D]``, t >= 1; NaN = missing, which neither breaks nor proves a run.
             numbers: int ``[t]``, of the frames, ascending.
             tolerance: as far as a converter's dither goes.
+            resting: float ``[D]``, what untouched cells read.
         """
         missing = np.isnan(frames)
         any_missing = bool(missing.any())
@@ -79,7 +82,7 @@ class StillRuns:
             which = np.searchsorted(steps, first)
             before = np.where(steps[:, None] > 0, frames[steps - 1], self.last)
             step = frames[steps] - before
-            size = np.fmax(frames[steps], before)
+            size = np.fmax(frames[steps], before) - resting
             drastic = np.maximum(0.5 * size, 4 * tolerance)
             # Broken cells hold their value all along: only cells that moved lately could have jumped too.
             lately = high - low > 2 * tolerance
@@ -153,14 +156,16 @@ class Onsets:
     log_ratio: Floats
 
     @classmethod
-    def fit(cls, recordings: Sequence[Floats], tolerance: float, full_scale: float) -> Onsets:
-        """Count the jumps of healthy cells, recordings ``[T, D]`` each."""
+    def fit(
+        cls, recordings: Sequence[Floats], tolerance: float, full_scale: float, resting: Floats | float = 0.0
+    ) -> Onsets:
+        """Count the jumps of healthy cells, recordings ``[T, D]`` each; untouched ones read ``resting`` (``[D]``)."""
         healthy = np.ones((2, len(_JUMPS) - 1))
         for recording in recordings:
             runs = StillRuns.begin(recording.shape[1])
             for first in range(0, len(recording), SHORTEST_RUN):
                 frames = recording[first : first + SHORTEST_RUN]
-                runs = runs.extend(frames, np.arange(first, first + len(frames)), tolerance)
+                runs = runs.extend(frames, np.arange(first, first + len(frames)), tolerance, resting)
                 fresh = runs.moved & (runs.length >= SHORTEST_RUN) & (runs.length < 2 * SHORTEST_RUN) & runs.alone
                 for up in (0, 1):
                     jumps = runs.jump[fresh & ((runs.jump > 0) == up)]

@@ -7,12 +7,12 @@ TOLERANCE = 0.02
 FULL_SCALE = 5.0
 
 
-def runs_of(log: np.ndarray, *sizes: int) -> StillRuns:
+def runs_of(log: np.ndarray, *sizes: int, resting: np.ndarray | float = 0.0) -> StillRuns:
     """Feed ``log`` in chunks of the sizes, the rest in one."""
     runs, first = StillRuns.begin(log.shape[1]), 0
     for size in (*sizes, len(log) - sum(sizes)):
         if size:
-            runs = runs.extend(log[first : first + size], np.arange(first, first + size), TOLERANCE)
+            runs = runs.extend(log[first : first + size], np.arange(first, first + size), TOLERANCE, resting)
         first += size
     return runs
 
@@ -83,6 +83,14 @@ def test_a_jump_alone_has_no_company_and_the_release_of_a_grasp_has():
     released[12:] = 0.0
     assert runs_of(alone).company[3] < 0.2
     assert runs_of(released).company.min() > 0.8
+
+
+@pytest.mark.parametrize("rest", [0.0, 0.15, 0.6])
+def test_cells_that_rest_are_not_loaded_wherever_they_rest(rest: float):
+    resting = np.full(40, rest)
+    log = np.tile(resting, (20, 1))
+    log[:12, :10] += np.linspace(1, 2, 12)[:, None]
+    assert runs_of(log, resting=resting).company[:10].tolist() == [1.0] * 10
 
 
 def test_cells_that_rise_are_no_company_for_one_that_falls():

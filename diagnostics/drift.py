@@ -19,6 +19,7 @@ _OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is
 _LEAST_OFFSET = 0.02  # of full scale, at the mean: a smaller one does no harm
 _MOST_OFFSET = 3.0  # log evidence of one touch that a moving cell does not come to rest
 _GAIN = 7.0  # log evidence from which on a cell with another gain is faulty: three touches
+_FEWEST = 3  # touches: fewer cannot prove it
 _STRANGE = 0.05  # share of touches that tell nothing of a gain: so none says more than log 20
 _GAINS = np.array([0.1, 0.2, 0.35, 0.5, 2.0, 3.0])  # that are tried, times what it was
 _AS_GOOD = np.array([0.75, 1.0, 1.33])  # that are no fault, or what is expected of this cell may be off by as much
@@ -49,7 +50,7 @@ class Gain(NamedTuple):
     """How cells read a load, ``[D]`` each.
 
     Attributes:
-        evidence: float, log likelihood ratio of another gain than in the reference; 0: no touch tells.
+        evidence: float, log likelihood ratio of another gain than in the reference; 0: too few touches tell.
         factor: float, how many times the gain of the reference it is most likely to be.
         since: int, the touch from which on.
         touches: int, how many tell, from that one on.
@@ -83,24 +84,25 @@ def gain_evidence(whole: Array, expected: Expected, moved: Mask, root_near: floa
     )
     n, d = counts.shape
     result = Gain(np.zeros(d), np.ones(d), np.zeros(d, np.intp), np.zeros(d, np.intp))
-    cells = np.flatnonzero(counts.any(axis=0))
+    cells = np.flatnonzero(counts.sum(axis=0) >= _FEWEST)
     if not len(cells):
         return result
-    counts, root, mean, spread = counts[:, cells], whole[:, 1, cells], expected.mean[:, cells], expected.spread[cells]
+    counts, root = counts[:, cells], whole[:, 1, cells]
+    mean, spread = (of.astype(np.float32) for of in (expected.mean[:, cells], expected.spread[cells]))
     # How far what is expected errs in this log, all cells tell together.
-    spread = spread * max(1.0, float(np.median(np.abs((root - mean) / spread)[counts])) / _MEDIAN)
+    spread *= max(1.0, float(np.median(np.abs((root - mean) / spread)[counts])) / _MEDIAN)
 
-    def said(gain: float) -> Floats:
+    def said(gain: float) -> Array:
         """Return what each touch and those after it say for a gain, ``[n, k]``."""
-        error = (root - np.sqrt(gain) * mean) / spread
-        of_touch = np.log((1 - _STRANGE) * (1 + error**2 / 4) ** -2.5 + _STRANGE)  # as Student's t with 4 degrees
+        u = 1 + ((root - np.float32(np.sqrt(gain)) * mean) / (2 * spread)) ** 2
+        of_touch = np.log((1 - _STRANGE) / (u * u * np.sqrt(u)) + _STRANGE)  # as Student's t with 4 degrees
         return np.where(counts, of_touch, 0.0)[::-1].cumsum(axis=0)[::-1]
 
     chance = np.full(n, (1 - _ALL_THROUGH) / max(n - 1, 1))
     chance[0] = _ALL_THROUGH
     wrong = np.stack([said(gain) for gain in _GAINS]) - np.max([said(gain) for gain in _AS_GOOD], axis=0)
-    wrong += np.log(chance)[:, None] - np.log(len(_GAINS))  # (gains, n, k)
-    likeliest = logsumexp(wrong, axis=1).argmax(axis=0)
+    wrong += np.log(chance / len(_GAINS)).astype(np.float32)[:, None]  # (gains, n, k)
+    likeliest = wrong.max(axis=1).argmax(axis=0)
     result.evidence[cells] = expected.own[cells] * logsumexp(wrong, axis=(0, 1))
     result.factor[cells] = _GAINS[likeliest]
     result.since[cells] = since = wrong[likeliest, :, np.arange(len(cells))].argmax(axis=1)

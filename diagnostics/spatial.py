@@ -90,7 +90,7 @@ class Spatial:
         touches: int ``[D]``, how many touches each was judged by that said more than nothing.
         offset: float ``[D]``, log likelihood ratio of a cell that moves, but is loaded all through the last touches,
             however little the others are; 0 for the others.
-        gain: float ``[D]``, log likelihood ratio of a cell that moves, but has another gain; 0 where no touch tells.
+        gain: float ``[D]``, log likelihood ratio of a cell that moves, but has another gain; 0: too few touches tell.
         factor: float ``[D]``, how many times its gain in the reference, where it certainly is another; NaN elsewhere.
         since: int ``[D]``, from about which frame on; 0: all along, or not known.
     """

@@ -48,7 +48,7 @@ def test_a_gain_that_is_a_little_off_is_no_fault_however_many_touches_tell(gain:
 
 @pytest.mark.parametrize("n", [1, 2])
 def test_one_or_two_touches_prove_nothing(n: int):
-    assert not drifting(np.zeros(CELLS), gain_evidence(*touched(n, one_has(0.1)), NEAR).evidence).any()
+    assert (gain_evidence(*touched(n, one_has(0.1)), NEAR).evidence == 0).all()
 
 
 def test_where_all_that_is_expected_errs_no_cell_is_accused():

@@ -111,7 +111,9 @@ def explain(
 def suspected(
     alike: NDArray[np.bool_], against: NDArray[np.bool_], weight: NDArray[np.float64], layout: SensorLayout
 ) -> list[NDArray[np.intp]]:
-    """Return the cells that a wire would explain, broken whole or at one end, where enough of them may bear witness.
+    """Return the cells that one fault would explain, where enough of them may bear witness.
+
+    A wire that is broken, whole or at one end, or an address wire that is stuck: what it moves may read lines at rest.
 
     Args:
         alike, against: as for :func:`explain`.
@@ -125,6 +127,11 @@ def suspected(
             cells = layout.cells_on(line)
             ends = _ends(line, cells, against) if against[cells].any() else (cells,)
             groups += [end[alike[end]] for end in ends if witness[end].sum() >= _FEWEST_WITNESSES]
+        elif line.pad in pads:
+            for level in (0, 1):
+                moved, _ = layout.misaddressed(line, level)
+                if not against[moved].any() and witness[moved].sum() >= _FEWEST_WITNESSES:
+                    groups.append(moved[alike[moved]])
     return groups
 
 

@@ -150,14 +150,25 @@ def test_cells_are_suspected_together_as_wires_would_explain_them():
     assert suspected(alike, ~alike, np.where(mask(row[:1], column[-1:]), 3.0, NOTHING), LAYOUT) == []
 
 
+def test_lines_are_suspected_together_that_a_stuck_address_would_move_if_none_lives():
+    moved, _ = LAYOUT.misaddressed(Line(0, "row_address", 3), 0)
+    alike = mask(moved)
+    weight = np.where(mask(moved[[0, 15]]), 3.0, NOTHING)  # one cell each of two rows: no row is suspected
+    (group,) = suspected(alike, ~alike, weight, LAYOUT)
+    assert group.tolist() == moved.tolist()
+    against = ~alike | mask(moved[-1:])
+    assert all(len(g) < len(moved) for g in suspected(alike, against, weight, LAYOUT))
+
+
 def test_cells_of_a_pad_with_a_live_one_are_not_suspected_together():
     alike = mask(np.arange(110))  # a converter has no middle to be broken in
     weight = np.where(alike, 3.0, NOTHING)
     pad = np.arange(110).tolist()
     assert pad in [group.tolist() for group in suspected(alike, mask(), weight, LAYOUT)]
     alike[60] = False
-    groups = suspected(alike, mask([60]), weight, LAYOUT)
-    assert max(len(group) for group in groups) == 11  # no more than a column
+    groups = [group.tolist() for group in suspected(alike, mask([60]), weight, LAYOUT)]
+    assert pad[:60] not in groups
+    assert pad[61:] not in groups
 
 
 def test_a_few_doubtful_cells_do_not_convict_a_wire():

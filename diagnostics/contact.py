@@ -107,8 +107,7 @@ class ContactModel:
 
     def unfamiliar(self, n_cells: int) -> NDArray[np.float64]:
         """Return how little is known of healthy touches of D cells, ``[D]``: 0 where it holds 400, 1 with up to 100."""
-        strange: NDArray[np.float64] = np.log(self.surest(n_cells) / _FAMILIAR) / np.log(_STRANGE / _FAMILIAR)
-        return np.clip(strange, 0.0, 1.0)
+        return _unfamiliar(self.surest(n_cells))
 
     def expect(self, features: Array, trusted: NDArray[np.bool_]) -> Generator[None, None, Expected]:
         """Say what healthy cells would do. A generator that pauses on its way, for those who cannot wait.
@@ -138,7 +137,12 @@ class ContactModel:
         held = surest if self.rim is None else np.minimum(surest, surest_of(self.rim.touches))
         never = np.where(known, np.clip(never, surest, 1 - surest), 1.0)
         always = np.where(known, np.clip(always, held, 1 - held), 1.0)
-        return Expected(never, always, foreseen.mean, spread, 1 - _SHARED * self.unfamiliar(shape))
+        return Expected(never, always, foreseen.mean, spread, 1 - _SHARED * _unfamiliar(surest))
+
+
+def _unfamiliar(surest: NDArray[np.float64]) -> NDArray[np.float64]:
+    unfamiliar: NDArray[np.float64] = np.log(surest / _FAMILIAR) / np.log(_STRANGE / _FAMILIAR)
+    return np.clip(unfamiliar, 0.0, 1.0)
 
 
 def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:

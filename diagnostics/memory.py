@@ -162,7 +162,7 @@ class Memory:
         )  # fmt: skip
 
     def _suspected(self, spatial: Spatial) -> NDArray[np.bool_]:
-        return spatial.asked & (spatial.evidence + self.temporal() >= self.suspicious) | spatial.drifting
+        return (spatial.asked & (spatial.evidence + self.temporal() >= self.suspicious)) | spatial.drifting
 
     def cells(self, wrong: NDArray[np.bool_] | None) -> Cells:
         """What is known of the cells before the others are asked, but those that are known to be ``wrong``."""

@@ -246,14 +246,15 @@ def stuck_evidence(
     values, runs = question.values, cells.runs
     # At first those are asked that moved, unless their load has outlived a touch, or jumped alone. Of the cells at rest
     # few are broken.
-    fresh = runs.start >= touches[-1].first
+    first = np.array([touch.first for touch in touches])
+    moved = cells.askable & runs.moved & (first[:, None] <= runs.start)
+    fresh = runs.start >= first[-1]
     trusted = question.askable & runs.moved & (values.rests | (fresh & (cells.temporal < SUDDEN)))
     said = yield from _agreed(question, trusted, suspicious)
-    at_first, drifts, first = said.at_first, np.zeros(len(trusted), bool), np.array([touch.first for touch in touches])
-    moved = cells.askable & runs.moved & (first[:, None] <= runs.start)
+    at_first, drifts, whole = said.at_first, np.zeros(len(trusted), bool), question.features[question.begins]
     for _ in range(_MOST_DRIFTING):
         yield
-        whole, expected = question.features[question.begins], said.expected.on(question.begins)
+        expected = said.expected.on(question.begins)
         offset = offset_evidence(whole, expected.always, moved[-1] & np.isfinite(expected.spread))
         gain = gain_evidence(whole, expected, moved, scale.root_near)
         more = misleading(offset, gain.evidence, drifts)

@@ -123,16 +123,22 @@ def suspected(
     witness, groups = alike & (weight >= _WITNESS), []
     pads = set(np.flatnonzero(layout.grid(witness).sum(axis=(1, 2)) >= _FEWEST_WITNESSES).tolist())
     for line in layout.lines if pads else ():
-        if line.kind in _WIRES and line.pad in pads:
-            cells = layout.cells_on(line)
-            ends = _ends(line, cells, against) if against[cells].any() else (cells,)
-            groups += [end[alike[end]] for end in ends if witness[end].sum() >= _FEWEST_WITNESSES]
-        elif line.pad in pads:
-            for level in (0, 1):
-                moved, _ = layout.misaddressed(line, level)
-                if not against[moved].any() and witness[moved].sum() >= _FEWEST_WITNESSES:
-                    groups.append(moved[alike[moved]])
+        if line.pad in pads:
+            groups += [
+                cells[alike[cells]]
+                for cells in _silenced(line, against, layout)
+                if witness[cells].sum() >= _FEWEST_WITNESSES
+            ]
     return groups
+
+
+def _silenced(line: Line, against: Mask, layout: SensorLayout) -> Sequence[NDArray[np.intp]]:
+    """Return the cells of which none would live, and none does, for each way in which a wire may be at fault."""
+    if line.kind in _WIRES:
+        cells = layout.cells_on(line)
+        return _ends(line, cells, against) if against[cells].any() else (cells,)
+    moved = [layout.misaddressed(line, level)[0] for level in (0, 1)]
+    return [cells for cells in moved if not against[cells].any()]
 
 
 def _ends(line: Line, cells: NDArray[np.intp], against: Mask) -> tuple[NDArray[np.intp], ...]:

@@ -70,6 +70,15 @@ def differs(a: np.ndarray, b: np.ndarray, layout: SensorLayout) -> np.ndarray:
     return np.abs(a - b) > SHOWN * layout.full_scale
 
 
+def parted(whole: np.ndarray, log: Log) -> Log:
+    """Return frames ``[T, D]`` of all of a log as its recordings."""
+    return np.split(whole, np.cumsum([len(frames) for frames in log])[:-1])
+
+
+def kind_of_cells(faults: Sequence[Fault]) -> dict[int, FaultKind]:
+    return {cell: fault.kind for fault in faults for cell in fault.cells}
+
+
 @dataclass(frozen=True)
 class Row:
     """One line of the table."""
@@ -109,7 +118,7 @@ class Tally:
         layout, found = diagnosis.layout, diagnosis.fault_set
         before, after = np.concatenate(log), np.concatenate(seen)
         can = set(np.flatnonzero(differs(before, after, layout).sum(axis=0) >= ENOUGH).tolist())
-        kinds = {cell: fault.kind for fault in faults for cell in fault.cells}
+        kinds = kind_of_cells(faults)
         told = {cell: fault for fault in diagnosis.faults for cell in fault.cells}
         self.true, self.false = self.true + len(found & kinds.keys()), self.false + len(found - kinds.keys())
         self.testable, self.hit = self.testable + len(can), self.hit + len(found & can)
@@ -368,8 +377,8 @@ def moving(bench: Bench) -> Iterator[Row]:
         faults = [Fault(MOVING[i % len(MOVING)], (cell,)) for i, cell in enumerate(cells)]
         # In one piece: a drift goes on from recording to recording.
         seen = inject(whole, faults, layout, seed=seed)
-        diagnosis = bench.fitted.diagnose(np.split(seen, np.cumsum([len(frames) for frames in log])[:-1]))
-        told = {cell: fault.kind for fault in diagnosis.faults for cell in fault.cells}
+        diagnosis = bench.fitted.diagnose(parted(seen, log))
+        told = kind_of_cells(diagnosis.faults)
         for fault in faults:
             drawn[fault.kind] += 1
             found[fault.kind] += fault.cells[0] in told
@@ -396,15 +405,15 @@ def gain(bench: Bench) -> Iterator[Row]:
         cases = dict(zip(cells, (f"gain fades to {FADED}", *(f"gain {g}" for g in GAINS)), strict=False))
         for cell, times in zip(cells[1:], GAINS, strict=False):
             seen[:, cell] *= times
-        diagnosis = bench.fitted.diagnose(np.split(seen, np.cumsum([len(frames) for frames in log])[:-1]))
-        told = {cell: fault.kind for fault in diagnosis.faults for cell in fault.cells}
+        diagnosis = bench.fitted.diagnose(parted(seen, log))
+        told = kind_of_cells(diagnosis.faults)
         for cell, case in cases.items():
             drawn[case] += 1
             named[case] += told.get(cell) is FaultKind.DRIFT
         false += len(diagnosis.fault_set - set(cases))
     for case in sorted(drawn):
         measured = f"found and named {percent(named[case], drawn[case])} of {drawn[case]}"
-        yield Row(f"{case}, loaded in {SOME} of {MANY} recordings", "-", measured, bench.count)
+        yield Row(f"{case}, in {SOME} of {MANY} recordings", "-", measured, bench.count)
     yield Row("  other cells of these logs", "-", f"{false} false", bench.count)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +22,13 @@ from diagnostics.lessons import FOLDS, Lessons, Regressions
 from diagnostics.rim import Foreseen, Rim, around
 from diagnostics.temporal import segments
 from diagnostics.tiles import Tile, foreseen_by
-from diagnostics.touches import SEGMENT, Array, Scale, Summary, Touch, Touches
+from diagnostics.touches import SEGMENT, Array, Scale, Summary, Touch, Touches, repeated
 
 _SAMPLES = 3000  # stretches of touches that the model is fitted on, about
 _MOST_DRAWS = 8  # stretches of one touch: more of them say the same
 _SHORTEST = 6  # frames of a stretch
 _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
+_SOURCES = 12  # recordings: of fewer each touch is a source of its own
 _NOVEL = 0.1  # share of touches that resemble nothing known
 _FAMILIAR, _STRANGE = 1 / 400, 1 / 100  # chance that a touch does with a cell what none did before
 _SHARED = 0.4  # of what is said of a cell where few touches teach: that is true of the cells around it as well
@@ -86,8 +88,7 @@ class ContactModel:
     ) -> ContactModel:
         """Fit on fault-free recordings, ``[T, D]`` each, all cells together; large arrays: ``patch_models``."""
         rng = np.random.default_rng(seed)
-        features, touch = stretches(recordings, scale, rng)
-        n_touches = int(touch.max()) + 1
+        features, source, n_touches = stretches(recordings, scale, rng)
         every = np.flatnonzero(layout.present)
 
         def regressions(of: Array) -> Regressions:
@@ -95,7 +96,7 @@ class ContactModel:
 
         rim = None
         if n_touches >= FOLDS:
-            rim = Lessons.of(features, touch, layout, every, regressions, 1.0, rng).learned()
+            rim = Lessons.of(features, source, n_touches, layout, every, regressions, 1.0, rng).learned()
         return cls((Tile.fit(features, every, every, surest_of(n_touches)),), layout, rim)
 
     def surest(self, n_cells: int) -> NDArray[np.float64]:
@@ -155,40 +156,69 @@ def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return 0.5 + 0.375 * u * (1 - u**2 / 12)
 
 
+class Seen(NamedTuple):
+    """Where a touch was seen in fault-free recordings.
+
+    Attributes:
+        recording: its number; first: that of the first frame; frames: how many.
+        again: it loads what an earlier one of the recording did, and tells little new: a pat, again and again.
+    """
+
+    recording: int
+    first: int
+    frames: int
+    again: bool
+
+    @classmethod
+    def of(cls, touches: Sequence[Touch], recording: int) -> list[Seen]:
+        """Return where the touches of a recording were seen."""
+        return [
+            cls(recording, touch.first, sum(part.n for part in touch.parts), again)
+            for touch, again in zip(touches, repeated(touches), strict=True)
+        ]
+
+
+def number_of(seen: Sequence[Seen]) -> int:
+    """How many touches these are worth, those seen again not counted."""
+    return sum(not touch.again for touch in seen)
+
+
 def stretches(
     recordings: Sequence[NDArray[np.float64]], scale: Scale, rng: np.random.Generator
-) -> tuple[Array, NDArray[np.intp]]:
-    """Return features ``[n, 4, D]`` of random stretches of touches in fault-free recordings, and of which touch."""
-    ranges = []
-    for i, recording in enumerate(recordings):
-        for touch in _touches(recording, scale):
-            ranges.append((i, touch.first, sum(part.n for part in touch.parts)))
-    return drawn(ranges, lambda i, frames: recordings[i][frames], scale, rng, _SAMPLES)
+) -> tuple[Array, NDArray[np.intp], int]:
+    """Return features ``[n, 4, D]`` of random stretches of touches in fault-free recordings, and their sources.
+
+    And how many touches those are worth.
+    """
+    seen = [touch for i, recording in enumerate(recordings) for touch in Seen.of(_touches(recording, scale), i)]
+    return *drawn(seen, lambda i, frames: recordings[i][frames], scale, rng, _SAMPLES), number_of(seen)
 
 
 def drawn(
-    ranges: list[tuple[int, int, int]],
+    seen: list[Seen],
     read: Callable[[int, slice], NDArray[np.float64]],
     scale: Scale,
     rng: np.random.Generator,
     most: int,
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Return features ``[n, 4, D]`` of random stretches of touches: (recording, first frame, frames) each.
+    """Return features ``[n, 4, D]`` of random stretches of touches, and the source ``[n]`` of each.
 
-    And ``[n]``, which touch each is of, among those that were drawn.
+    The touches of one recording are alike, and one source, unless there are too few recordings to tell them apart.
     """
-    draws = int(np.clip(round(most / len(ranges)), 1, _MOST_DRAWS))
-    if len(ranges) > most:
-        ranges = [ranges[i] for i in np.sort(rng.choice(len(ranges), most, replace=False))]
+    draws = int(np.clip(round(most / len(seen)), 1, _MOST_DRAWS))
+    if len(seen) > most:
+        seen = [seen[i] for i in np.sort(rng.choice(len(seen), most, replace=False))]
     features = []
-    for i, first, n in ranges:
+    for i, first, n, _ in seen:
         root = scale.root_load(read(i, slice(first, first + n)))
         n = len(root)
         for draw in range(draws):
             length = int(rng.integers(min(_SHORTEST, n), n + 1)) if draw else n
             at = int(rng.integers(0, n - length + 1))
             features.append(Summary.of(root[at : at + length], first + at, scale.root_near).features())
-    return np.stack(features), np.arange(len(features)) // draws
+    recording = np.unique([touch.recording for touch in seen], return_inverse=True)[1]
+    source = recording if recording[-1] >= _SOURCES - 1 else np.arange(len(seen))
+    return np.stack(features), source.repeat(draws)
 
 
 def surest_of(n_touches: int) -> float:

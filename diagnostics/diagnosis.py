@@ -17,13 +17,13 @@ from diagnostics.memory import Memory, finished
 from diagnostics.patched import remembering
 from diagnostics.readings import Readings
 from diagnostics.reference import Reference, living, tolerance_of
-from diagnostics.spatial import Spatial
+from diagnostics.spatial import Caution, Spatial
 from diagnostics.stored import Arrays, reference_from_state, reference_state, weights_from_state, weights_state
 from diagnostics.verdicts import Diagnosis
 from diagnostics.weighing import Weights, faulty_at, kinds
 from diagnostics.wiring import suspected
 
-SCHEMA = "adaptfault.diagnoser/5"
+SCHEMA = "adaptfault.diagnoser/6"
 
 _SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
 _SUSPICIOUS_COLD = 3.0  # log evidence from which on a cell is not asked about the others, in a cold start
@@ -115,8 +115,8 @@ class SelfDiagnosis:
     def memory(self, needed: NDArray[np.bool_] | None = None) -> Memory:
         """Return an empty memory, to be fed with a log and judged; see ``patched.remembering``."""
         reference = self.reference_ or Reference.unknown(self.layout)
-        suspicious = self.weights_.suspicious if reference.model else _SUSPICIOUS_COLD
-        return remembering(self.layout, reference, suspicious, needed)
+        caution = self.weights_.caution if reference.model else Caution(_SUSPICIOUS_COLD)
+        return remembering(self.layout, reference, caution, needed)
 
     def judge(self, memory: Memory, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
         """Judge every cell from what is remembered of a log.

@@ -20,6 +20,7 @@ _LEAST_OFFSET = 0.02  # of full scale, at the mean: a smaller one does no harm
 _MOST_OFFSET = 3.0  # log evidence of one touch that a moving cell does not come to rest
 _GAIN = 7.0  # log evidence from which on a cell with another gain is faulty: three touches
 _FEWEST = 3  # touches: fewer cannot prove it
+_MARGIN = 1.5  # so many times what any healthy cell reached, to be faulty
 _STRANGE = 0.05  # share of touches that tell nothing of a gain: so none says more than log 20
 _GAINS = np.array([0.1, 0.2, 0.35, 0.5, 2.0, 3.0])  # that are tried, times what it was
 _AS_GOOD = np.array([0.75, 1.0, 1.33])  # that are no fault, or what is expected of this cell may be off by as much
@@ -62,7 +63,7 @@ class Gain(NamedTuple):
     touches: NDArray[np.intp]
 
 
-def gain_evidence(whole: Array, expected: Expected, moved: Mask, root_near: float) -> Gain:
+def gain_evidence(whole: Array, expected: Expected, moved: Mask, root_near: float, counts: float = 1.0) -> Gain:
     """Look for cells that are loaded when the others say, but not as much.
 
     Whether a cell is loaded at all is another question (see ``spatial``): touches that leave it unloaded do not count.
@@ -74,40 +75,49 @@ def gain_evidence(whole: Array, expected: Expected, moved: Mask, root_near: floa
         expected: what healthy cells would have done in them.
         moved: bool ``[n, D]``, the touches up to which each cell has moved.
         root_near: the root load from which on a cell counts as loaded.
+        counts: share of the evidence that counts, see :func:`gains_count`.
     """
-    counts = (
+    tells = (
         moved
         & np.isfinite(expected.spread)
         & (expected.own > 0)
         & (whole[:, 2] > 0)
         & (expected.mean > _LOADED * root_near)
     )
-    n, d = counts.shape
+    n, d = tells.shape
     result = Gain(np.zeros(d), np.ones(d), np.zeros(d, np.intp), np.zeros(d, np.intp))
-    cells = np.flatnonzero(counts.sum(axis=0) >= _FEWEST)
+    cells = np.flatnonzero(tells.sum(axis=0) >= _FEWEST)
     if not len(cells):
         return result
-    counts, root = counts[:, cells], whole[:, 1, cells]
+    tells, root = tells[:, cells], whole[:, 1, cells]
     mean, spread = (of.astype(np.float32) for of in (expected.mean[:, cells], expected.spread[cells]))
     # How far what is expected errs in this log, all cells tell together.
-    spread *= max(1.0, float(np.median(np.abs((root - mean) / spread)[counts])) / _MEDIAN)
+    spread *= max(1.0, float(np.median(np.abs((root - mean) / spread)[tells])) / _MEDIAN)
 
     def said(gain: float) -> Array:
         """Return what each touch and those after it say for a gain, ``[n, k]``."""
         u = 1 + ((root - np.float32(np.sqrt(gain)) * mean) / (2 * spread)) ** 2
         of_touch = np.log((1 - _STRANGE) / (u * u * np.sqrt(u)) + _STRANGE)  # as Student's t with 4 degrees
-        return np.where(counts, of_touch, 0.0)[::-1].cumsum(axis=0)[::-1]
+        return np.where(tells, of_touch, 0.0)[::-1].cumsum(axis=0)[::-1]
 
     chance = np.full(n, (1 - _ALL_THROUGH) / max(n - 1, 1))
     chance[0] = _ALL_THROUGH
     wrong = np.stack([said(gain) for gain in _GAINS]) - np.max([said(gain) for gain in _AS_GOOD], axis=0)
     wrong += np.log(chance / len(_GAINS)).astype(np.float32)[:, None]  # (gains, n, k)
     likeliest = wrong.max(axis=1).argmax(axis=0)
-    result.evidence[cells] = expected.own[cells] * logsumexp(wrong, axis=(0, 1))
+    result.evidence[cells] = counts * expected.own[cells] * logsumexp(wrong, axis=(0, 1))
     result.factor[cells] = _GAINS[likeliest]
     result.since[cells] = since = wrong[likeliest, :, np.arange(len(cells))].argmax(axis=1)
-    result.touches[cells] = (counts & (np.arange(n)[:, None] >= since)).sum(axis=0)
+    result.touches[cells] = (tells & (np.arange(n)[:, None] >= since)).sum(axis=0)
     return result
+
+
+def gains_count(reached: float) -> float:
+    """Return what share of the evidence of gains counts where healthy cells reached so much of it.
+
+    Touches may be alike, or a contact so small that its neighbours do not tell how hard a cell is pressed.
+    """
+    return _GAIN / max(_GAIN, _MARGIN * reached)
 
 
 def drifting(offset: Floats, gain: Floats | float = 0.0) -> Mask:

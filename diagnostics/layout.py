@@ -152,6 +152,15 @@ class SensorLayout:
             raise IndexError(f"{line} is not a wire of {self}") from None
 
     @cached_property
+    def beside(self) -> NDArray[np.intp]:
+        """The eight cells around each on its pad, row by row, int ``[D, 8]``; -1: there is none."""
+        index = np.full((self.pads, self.rows + 2, self.cols + 2), -1, dtype=np.intp)
+        index[:, 1:-1, 1:-1] = np.where(self.present, self._grid, -1)
+        steps = [(down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1)]
+        around = [index[:, down : down + self.rows, across : across + self.cols] for down, across in steps]
+        return np.stack(around, axis=-1).reshape(self.n_cells, len(steps))
+
+    @cached_property
     def _served(self) -> dict[Line, NDArray[np.intp]]:
         present = self.present.ravel()
         served = {}

@@ -15,7 +15,7 @@ from diagnostics.layout import SensorLayout
 from diagnostics.rim import Foreseen, Rim, around
 from diagnostics.touches import Array
 
-FOLDS = 4  # of the touches: each teaches how far to believe what the others taught
+FOLDS = 4  # of what there is to learn from: each teaches how far to believe what the others taught
 _LEFT_OUT = (0.03, 0.06, 0.12, 0.2, 0.4, 0.7, 0.95)  # of the cells, in turn: so many may be dead, or not moved yet
 _LOOKED_AT = 0.12  # of the cells at most, among those left out
 _SAMPLES = 100_000  # cells left out of a stretch that are looked at in all, about
@@ -44,17 +44,19 @@ class Lessons:
     def of(
         cls,
         features: Array,
-        touch: Cells,
+        source: Cells,
+        touches: int,
         layout: SensorLayout,
         outputs: Cells,
         fit: Callable[[Array], Regressions],
         share: float,
         rng: np.random.Generator,
     ) -> Lessons:
-        """Draw from stretches of touches of an array, cross-fitted in folds of the touches.
+        """Draw from stretches of touches of an array, cross-fitted in folds of the sources.
 
         Args:
-            features: ``[n, 4, D]``; touch: int ``[n]``, the touch that each stretch is of.
+            features: ``[n, 4, D]``; source: int ``[n]``, stretches of one source teach nothing of each other.
+            touches: that they are of.
             layout: the array.
             outputs: the cells that regressions are for.
             fit: returns the regressions of the ``outputs``, fitted on features ``[m, 4, D]``.
@@ -64,7 +66,7 @@ class Lessons:
         present = np.flatnonzero(layout.present)
         looked_at = sum(min(left, _LOOKED_AT) for left in _LEFT_OUT) * len(outputs)
         most = max(1, round(share * _SAMPLES / (FOLDS * looked_at)))  # stretches in each round
-        fold = rng.permutation(touch.max() + 1)[touch] % FOLDS
+        fold = rng.permutation(source.max() + 1)[source] % FOLDS
         found = []
         for k in range(FOLDS):
             foreseen, held = fit(features[fold != k]), features[fold == k]
@@ -78,7 +80,7 @@ class Lessons:
                 told = around(foreseen(some, trusted), some, trusted, layout, out)
                 samples = told.reshape(len(told), -1).T.astype(np.float64)
                 found.append(cls(samples, (some[:, 2, out] == 0).T.ravel(), (some[:, 3, out] == 1).T.ravel(), 0))
-        return replace(cls.together(found), touches=int(touch.max()) + 1)
+        return replace(cls.together(found), touches=touches)
 
     @classmethod
     def together(cls, parts: Sequence[Lessons]) -> Lessons:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference
 from diagnostics.resting import less_than_healthy
-from diagnostics.spatial import SUDDEN, Cells, Model, Spatial, apart_evidence, stuck_evidence
+from diagnostics.spatial import SUDDEN, Caution, Cells, Model, Spatial, apart_evidence, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.tare import Tare
 from diagnostics.temporal import StillRuns
@@ -36,7 +36,7 @@ class Memory:
 
     Attributes:
         layout, reference: as given.
-        suspicious: log likelihood ratio from which on a cell is not asked about the others.
+        caution: what evidence is worth.
         stream: what is known of the transport.
         runs: the still stretch of each cell.
         touches: the last ones.
@@ -47,14 +47,14 @@ class Memory:
         scale: what a reading means, as offsets are now.
     """
 
-    def __init__(self, layout: SensorLayout, reference: Reference, suspicious: float) -> None:
-        self.layout, self.reference, self.suspicious = layout, reference, suspicious
+    def __init__(self, layout: SensorLayout, reference: Reference, caution: Caution) -> None:
+        self.layout, self.reference, self.caution = layout, reference, caution
         self.present = layout.present.ravel()
         self.stream = Stream()
         self.runs = StillRuns.begin(layout.n_cells)
         self.touches = Touches()
         self.settled = np.zeros(layout.n_cells)
-        self.unrest = Unrest.begin(layout.n_cells)
+        self.unrest = Unrest.begin(layout)
         self.twins = Twins.begin(layout)
         self.heard = np.zeros(layout.n_cells, bool)
         self.touched = np.zeros(layout.n_cells, bool)
@@ -139,7 +139,7 @@ class Memory:
         touches = self.touches if touches is None else touches
         return stuck_evidence(
             touches.kept, self.cells(wrong), self.model(), self.scale, self.reference.tolerance,
-            self.suspicious,
+            self.caution,
         )  # fmt: skip
 
     def apart(
@@ -162,7 +162,7 @@ class Memory:
         )  # fmt: skip
 
     def _suspected(self, spatial: Spatial) -> NDArray[np.bool_]:
-        return (spatial.asked & (spatial.evidence + self.temporal() >= self.suspicious)) | spatial.drifting
+        return (spatial.asked & (spatial.evidence + self.temporal() >= self.caution.suspicious)) | spatial.drifting
 
     def cells(self, wrong: NDArray[np.bool_] | None) -> Cells:
         """What is known of the cells before the others are asked, but those that are known to be ``wrong``."""

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.contact import ContactModel, drawn, surest_of
+from diagnostics.contact import ContactModel, Seen, drawn, number_of, surest_of
 from diagnostics.layout import SensorLayout
 from diagnostics.lessons import FOLDS, Lessons, Regressions
 from diagnostics.nearby import Nearby, Samples
@@ -47,41 +47,41 @@ def contact_model(recordings: Sequence[NDArray[np.float64]], layout: SensorLayou
 
 @dataclass(frozen=True)
 class _Touched:
-    """The touches of each patch: recording, first frame and frames of each."""
+    """The touches of each patch."""
 
     readings: Readings
     scale: Scale
     patches: tuple[Patch, ...]
-    ranges: list[list[tuple[int, int, int]]]
+    seen: list[list[Seen]]
 
     @classmethod
     def of(cls, readings: Readings, layout: SensorLayout, scale: Scale) -> _Touched:
         """Find them in fault-free recordings."""
         every = patches(layout)
-        ranges: list[list[tuple[int, int, int]]] = [[] for _ in every]
+        seen: list[list[Seen]] = [[] for _ in every]
         for i, recording in enumerate(readings):
             touches = PatchTouches.begin(every)
             for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
                 touches = touches.extend(scale.root_load(frames), numbers, scale.root_near, still, np.zeros_like(still))
             for k, of_patch in touches.kept():
-                ranges[k] += [(i, touch.first, sum(part.n for part in touch.parts)) for touch in of_patch.kept]
-        return cls(readings, scale, every, ranges)
+                seen[k] += Seen.of(of_patch.kept, i)
+        return cls(readings, scale, every, seen)
 
     def number(self, k: int) -> int:
-        """How often patch k was touched."""
-        return len(self.ranges[k])
+        """How many touches taught patch k."""
+        return number_of(self.seen[k])
 
     def drawn(self, k: int, most: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.intp]]:
-        """Return random stretches of the touches of patch k, features ``[n, 4, inputs]``, and the touch of each."""
+        """Return random stretches of the touches of patch k, features ``[n, 4, inputs]``, and their sources."""
         cells = self.patches[k].inputs
-        if not self.ranges[k]:  # nothing is known of a patch that was never touched but what all have in common
+        if not self.seen[k]:  # nothing is known of a patch that was never touched but what all have in common
             return np.zeros((2, FEATURES, len(cells)), np.float32), np.zeros(2, np.intp)
-        return drawn(self.ranges[k], partial(self.readings.piece, cells=cells), self.scale.of(cells), rng, most)
+        return drawn(self.seen[k], partial(self.readings.piece, cells=cells), self.scale.of(cells), rng, most)
 
 
 def _nearby(touched: _Touched, layout: SensorLayout, rng: np.random.Generator) -> Nearby | None:
     """Return what all patches have in common; None if none was touched."""
-    some = rng.permutation(np.flatnonzero([bool(of) for of in touched.ranges]))[:_ASKED].tolist()
+    some = rng.permutation(np.flatnonzero([bool(of) for of in touched.seen]))[:_ASKED].tolist()
     parts = [
         Samples.of(touched.drawn(k, _OF_EACH, rng)[0], touched.patches[k], layout, rng, _MOST_OF_EACH) for k in some
     ]
@@ -110,13 +110,15 @@ def _lessons(
     """Return what patch k teaches the rim."""
     patch = touched.patches[k]
     own = patch.rectangle(layout)
-    features, touch = touched.drawn(k, _SAMPLES, rng)
-    taught = touched.number(k) * (FOLDS - 1) // FOLDS
+    features, source = touched.drawn(k, _SAMPLES, rng)
+    number = touched.number(k)
+    taught = number * (FOLDS - 1) // FOLDS
 
     def regressions(of: Array) -> Regressions:
         return partial(foreseen_by, (_tile(of[:, :, own.cells], taught, patch, nearby, layout).at(own.cells),))
 
-    return Lessons.of(own.on(features), touch, own.layout, own.cells[patch.place], regressions, share, rng)
+    cells = own.cells[patch.place]
+    return Lessons.of(own.on(features), source, number, own.layout, cells, regressions, share, rng)
 
 
 def _taper(patch: Patch, layout: SensorLayout) -> NDArray[np.float64]:

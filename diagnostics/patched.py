@@ -19,7 +19,7 @@ from diagnostics.layout import SensorLayout
 from diagnostics.memory import KEPT_TOUCHES, MOST_TOUCHES, Memory, finished
 from diagnostics.patches import MOST_CELLS, PatchTouches, Rectangle, patches
 from diagnostics.reference import Reference
-from diagnostics.spatial import Cells, Model, Spatial, apart_evidence, lone_evidence, stuck_evidence
+from diagnostics.spatial import Caution, Cells, Model, Spatial, apart_evidence, lone_evidence, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.touches import Array, Touches
 
@@ -62,8 +62,10 @@ class PatchedMemory(Memory):
         touches: those of the skin as a whole, bare.
     """
 
-    def __init__(self, layout: SensorLayout, reference: Reference, needed: Mask | None = None) -> None:
-        super().__init__(layout, reference, _SUSPICIOUS)
+    def __init__(
+        self, layout: SensorLayout, reference: Reference, caution: Caution, needed: Mask | None = None
+    ) -> None:
+        super().__init__(layout, reference, caution._replace(suspicious=_SUSPICIOUS))
         tiles = reference.model.tiles if reference.model else None
         self.local = PatchTouches.begin(patches(layout) if tiles is None else tuple(t.patch for t in tiles), needed)
         self._models: dict[int, Model] = {}  # of the patches that were touched, as the reference has them
@@ -157,7 +159,7 @@ class PatchedMemory(Memory):
             asked[patch.place] = True
             model = _Trusting(self.model_of(i, touches), asked)
             scale, tolerance = self.scale.of(cells), self.reference.tolerance
-            of_patch = finished(stuck_evidence(touches.kept, every.of(cells), model, scale, tolerance, self.suspicious))
+            of_patch = finished(stuck_evidence(touches.kept, every.of(cells), model, scale, tolerance, self.caution))
             for name, values in vars(of_patch).items():
                 getattr(total, name)[patch.outputs] = values[patch.place]
             if _pause_after(k, len(judged)):
@@ -194,12 +196,12 @@ def _pause_after(k: int, n: int) -> bool:
     return k * _PAUSES // n != (k + 1) * _PAUSES // n
 
 
-def remembering(layout: SensorLayout, reference: Reference, suspicious: float, needed: Mask | None = None) -> Memory:
+def remembering(layout: SensorLayout, reference: Reference, caution: Caution, needed: Mask | None = None) -> Memory:
     """Return an empty memory of the kind that an array needs: large ones are remembered patch by patch.
 
-    From log evidence ``suspicious`` on a cell of a small array is not asked about the others. The touches of a patch
-    without a cell that is ``needed`` (bool ``[D]``; None: all) are not remembered.
+    ``caution`` says what evidence is worth; when a cell of a large array is suspicious, this module says. The touches
+    of a patch without a cell that is ``needed`` (bool ``[D]``; None: all) are not remembered.
     """
     if layout.present.sum() > MOST_CELLS:
-        return PatchedMemory(layout, reference, needed)
-    return Memory(layout, reference, suspicious)
+        return PatchedMemory(layout, reference, caution, needed)
+    return Memory(layout, reference, caution)

@@ -82,7 +82,7 @@ class Reference:
             least,
             usual_offset(recordings, scale, present),
             patience,
-            Usual.fit(recordings, scale),
+            Usual.fit(recordings, scale, layout),
             _usual_twins(recordings, layout, scale),
             model,
             dead,

@@ -58,9 +58,21 @@ def resting(
     offset = np.concatenate(offsets)
     light = offset[offset < _LIGHT * full_scale]
     noise = float(np.quantile(np.concatenate(bends), _CALM)) / (0.6745 * np.sqrt(6))
-    wander = 2 * max(0.0, float(np.median(light)) if len(light) else 0.0) + _NOISE * noise
+    wander = _highest(light) + _NOISE * noise
     lowest = float(np.quantile(np.concatenate(least), _RARE, method="lower"))
     return low + max(0.0, wander - tolerance), full_scale if noise > tolerance else lowest
+
+
+def _highest(offset: Floats) -> float:
+    """Return how far untouched cells wander up, from how far they wander down: light loads hide the other end.
+
+    As far as from the lowest to the median again, if there is a sharp lowest; tails may reach half as far again.
+    """
+    if not len(offset):
+        return 0.0
+    usual = max(0.0, float(np.median(offset)))
+    below = usual - float(np.quantile(offset, _RARE, method="lower"))
+    return usual + min(max(below, usual), 2 * usual)
 
 
 def less_than_healthy(runs: StillRuns, least: float, tolerance: float, present: NDArray[np.bool_]) -> Floats:

@@ -45,6 +45,18 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
+class Caution(NamedTuple):
+    """What evidence is worth, as far as it matters while it is gathered.
+
+    Attributes:
+        suspicious: log evidence from which on a cell is left out when others are judged.
+        gains: share of the evidence of another gain that counts.
+    """
+
+    suspicious: float
+    gains: float = 1.0
+
+
 class Model(Protocol):
     """Knows what healthy cells would do in a touch."""
 
@@ -223,7 +235,7 @@ def _agreed(question: _Question, trusted: Mask, suspicious: float) -> Generator[
 
 
 def stuck_evidence(
-    touches: Sequence[Touch], cells: Cells, model: Model, scale: Scale, tolerance: float, suspicious: float
+    touches: Sequence[Touch], cells: Cells, model: Model, scale: Scale, tolerance: float, caution: Caution
 ) -> Generator[None, None, Spatial]:
     """Weigh stuck against healthy for each cell that is still now. A generator that pauses on its way.
 
@@ -237,7 +249,7 @@ def stuck_evidence(
         model: what healthy looks like.
         scale: what a reading means.
         tolerance: how near to v counts as v.
-        suspicious: log evidence from which on a cell is left out when others are judged.
+        caution: what evidence is worth.
     """
     if not touches:
         known, prior = Spatial.before(cells), _Values.now(cells, scale, tolerance).prior
@@ -250,18 +262,19 @@ def stuck_evidence(
     moved = cells.askable & runs.moved & (first[:, None] <= runs.start)
     fresh = runs.start >= first[-1]
     trusted = question.askable & runs.moved & (values.rests | (fresh & (cells.temporal < SUDDEN)))
-    said = yield from _agreed(question, trusted, suspicious)
+    said = yield from _agreed(question, trusted, caution.suspicious)
     at_first, drifts, whole = said.at_first, np.zeros(len(trusted), bool), question.features[question.begins]
     for _ in range(_MOST_DRIFTING):
         yield
         expected = said.expected.on(question.begins)
         offset = offset_evidence(whole, expected.always, moved[-1] & np.isfinite(expected.spread))
-        gain = gain_evidence(whole, expected, moved, scale.root_near)
+        gain = gain_evidence(whole, expected, moved, scale.root_near, caution.gains)
         more = misleading(offset, gain.evidence, drifts)
         if not more.any():
             break
         drifts |= more
-        said = yield from _agreed(replace(question, askable=question.askable & ~drifts), said.trusted, suspicious)
+        without = replace(question, askable=question.askable & ~drifts)
+        said = yield from _agreed(without, said.trusted, caution.suspicious)
     of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
     return Spatial(
         said.evidence,

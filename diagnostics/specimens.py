@@ -23,13 +23,14 @@ _TOUCHED = 0.05  # of full scale, above a cell's lowest reading
 Recordings = Sequence[NDArray[np.float64]]
 
 
-def specimen(recordings: Recordings, layout: SensorLayout, piece: int) -> tuple[Recordings, SensorLayout]:
+def specimen(recordings: Recordings, layout: SensorLayout) -> tuple[Recordings, SensorLayout]:
     """Return recordings of the blocks of an array that were touched most, as an array of their own; a small one as is.
+
+    Of a large one those recordings are left out in which nothing touches these blocks.
 
     Args:
         recordings: ``[T, D]`` each.
         layout: the array.
-        piece: frames of a piece of a recording; only those in which something touches a block are returned.
     """
     rows, cols = min(layout.rows, _SIDE), min(layout.cols, _SIDE)
     wanted = max(2, -(-_CELLS // (rows * cols)))
@@ -51,17 +52,16 @@ def specimen(recordings: Recordings, layout: SensorLayout, piece: int) -> tuple[
         wanted, rows, cols, full_scale=layout.full_scale, unit=layout.unit, rate=layout.rate,
         present=layout.present.ravel()[cells],
     )  # fmt: skip
-    return _pieces(readings, cells, piece, _TOUCHED * layout.full_scale), own
+    return _moving(readings, cells, _TOUCHED * layout.full_scale), own
 
 
-def _pieces(readings: Readings, cells: NDArray[np.intp], piece: int, least: float) -> list[NDArray[np.float64]]:
-    """Return the pieces in which one of the cells moves by over ``least``."""
+def _moving(readings: Readings, cells: NDArray[np.intp], least: float) -> list[NDArray[np.float64]]:
+    """Return the recordings, of these cells, in which one of them moves by over ``least``."""
     found = []
     for i in range(len(readings)):
         frames = readings.piece(i, slice(None), cells)
-        for part in np.array_split(frames, max(1, len(frames) // piece)):
-            if np.fmax.reduce(np.fmax.reduce(part) - np.fmin.reduce(part)) > least:
-                found.append(part)
+        if np.fmax.reduce(np.fmax.reduce(frames) - np.fmin.reduce(frames)) > least:
+            found.append(frames)
     return found
 
 

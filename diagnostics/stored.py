@@ -28,7 +28,7 @@ _UNKNOWN = ("spread",)  # arrays that may hold NaN: of cells that were never loa
 
 def weights_state(weights: Weights) -> dict[str, Any]:
     """Return the weights, JSON-safe, as :func:`weights_from_state` reads them."""
-    return {name: list(values) for name, values in vars(weights).items()}
+    return {name: list(v) if isinstance(v, tuple) else float(v) for name, v in vars(weights).items()}
 
 
 def weights_from_state(about: Mapping[str, Any]) -> Weights:
@@ -38,11 +38,14 @@ def weights_from_state(about: Mapping[str, Any]) -> Weights:
         KeyError, TypeError, ValueError: a field is missing or of a wrong kind.
     """
     usual = vars(Weights())
-    read = {name: tuple(float(value) for value in about[name]) for name in usual}
+    read = {name: tuple(float(value) for value in about[name]) for name in usual if name != "gains"}
     for name, values in read.items():
         if len(values) != len(usual[name]) or not np.isfinite(values).all():
             raise ValueError(f"expected {len(usual[name])} numbers for {name}, got {list(values)}")
-    return Weights(**read)
+    gains = float(about["gains"])
+    if not 0 < gains <= 1:
+        raise ValueError(f"expected a share for gains, got {gains}")
+    return Weights(**read, gains=gains)
 
 
 def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
@@ -53,6 +56,8 @@ def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
         "least": float(reference.least) if np.isfinite(reference.least) else None,
         "patience": int(reference.patience),
         "blinks": float(reference.usual.blinks),
+        "blinks_count": float(reference.usual.blinks_count),
+        "noise_counts": float(reference.usual.noise_counts),
         "offset": float(reference.offset),
         "twins": int(reference.twins),
         "surest": None if reference.model is None else [float(tile.surest) for tile in reference.model.tiles],
@@ -92,14 +97,22 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
         -np.inf if about["least"] is None else float(about["least"]),
         float(about["offset"]),
         int(about["patience"]),
-        Usual(float(about["blinks"]), read("noise", unknown.usual.noise)),
+        Usual(
+            float(about["blinks"]),
+            read("noise", unknown.usual.noise),
+            float(about["blinks_count"]),
+            float(about["noise_counts"]),
+        ),
         int(about["twins"]),
         None if about["surest"] is None else _model(about, arrays, living(layout, dead)),
         dead,
     )
-    positive = (reference.tolerance, scale.near, reference.patience, reference.usual.blinks)
+    usual = reference.usual
+    shares = (usual.blinks, usual.blinks_count, usual.noise_counts)
+    positive = (reference.tolerance, scale.near, reference.patience, *shares)
     if not (np.isfinite(positive).all() and min(positive) > 0):
-        raise ValueError(f"expected positive numbers for tolerance, near, patience and blinks, got {positive}")
+        wanted = "tolerance, near, patience, blinks, blinks_count and noise_counts"
+        raise ValueError(f"expected positive numbers for {wanted}, got {positive}")
     if np.isnan([reference.least, reference.offset]).any():
         raise ValueError(f"expected numbers for least and offset, got {reference.least} and {reference.offset}")
     return reference

@@ -8,6 +8,7 @@ that a cell that fails in the middle of one can be judged by what came after.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -144,11 +145,13 @@ class Touch:
     def same_place(self, part: Summary, lowest: Array) -> bool:
         """Whether ``part`` loads about the same cells; no load lies anywhere."""
         floor = np.minimum(self.lowest, lowest)
-        n = sum(p.n for p in self.parts)
-        before = sum((p.total for p in self.parts[1:]), self.parts[0].total) / n - floor
-        now = part.total / part.n - floor
+        before, now = self.mean() - floor, part.total / part.n - floor
         size = float(np.sqrt((before @ before) * (now @ now)))
         return size <= _LEAST**2 or float(before @ now) >= _SAME_PLACE * size
+
+    def mean(self) -> Array:
+        """Return the mean root load of each cell, ``[D]``."""
+        return sum((p.total for p in self.parts[1:]), self.parts[0].total) / np.float32(sum(p.n for p in self.parts))
 
 
 @dataclass(frozen=True)
@@ -262,6 +265,17 @@ class Touches:
     def split(self, keep: int) -> tuple[Touches, Touches]:
         """Return (all but the last ``keep`` touches, those)."""
         return replace(self, kept=self.kept[:-keep]), replace(self, kept=self.kept[-keep:])
+
+
+def repeated(touches: Sequence[Touch]) -> list[bool]:
+    """Return which touches load about the same cells as one before them."""
+    if not touches:
+        return []
+    means = np.stack([touch.mean() for touch in touches])
+    sizes = np.linalg.norm(means, axis=1)
+    alike = means @ means.T >= _SAME_PLACE * np.maximum(sizes[:, None] * sizes, _LEAST**2)
+    again: list[bool] = np.tril(alike, -1).any(axis=1).tolist()
+    return again
 
 
 def _still_going(root: Array, last: Array | None) -> int:

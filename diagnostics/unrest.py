@@ -7,11 +7,13 @@ below 0: so a fault is found whenever it begins, and forgotten when it has gone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.layout import SensorLayout
+from diagnostics.temporal import segments
 from diagnostics.touches import SEGMENT, Array, Scale
 
 Floats = NDArray[np.float64]
@@ -19,7 +21,10 @@ Floats = NDArray[np.float64]
 _LOADED = 0.05  # of full scale: a load that a contact could lose
 _BLINK_RATE = 0.05  # blinks in a loaded frame of a loose contact
 _LONGEST_BLINK = 6  # frames
+_ON_ROW, _ON_COLUMN = [3, 4], [1, 6]  # of the cells beside one, see SensorLayout
 _SHORTEST = 8  # frames of a segment in which noise can be told
+# Of the unrest of a cell: so much of it those beside it have as well, where a finger is lifted or slides.
+_SHARED = 0.3
 _ALIKE = 0.3  # of a load: as far as it may have moved on during a blink, which goes farther
 _RAREST = 2e-4  # healthy blinks in a loaded frame, at least
 _UNKNOWN_BLINKS, _UNKNOWN_NOISE = 2e-3, 0.05  # of a loaded frame, and of full scale, where no reference tells
@@ -30,29 +35,39 @@ _ALONE = 0.3  # share of the loaded cells that may be as restless: more, and it 
 _CROWD = 0.2  # of all cells: so many are not noisy by themselves
 _ENOUGH = 14.0  # summed log ratio from which on a cell is faulty: one in a thousand cells, and proven
 _FULL = 40.0  # more than that is not kept: a cell that works again must be able to show it
+# To be faulty it takes so many times what healthy cells reached in the reference: all but one in a hundred of them,
+# which may be faulty there already.
+_MARGIN, _HEALTHY = 1.5, 0.99
 
 
 @dataclass(frozen=True)
 class Usual:
     """How restless healthy cells are.
 
+    Unrest comes in bursts: where fingers scratch, one cell blinks again and again. So evidence counts for less, the
+    more of it healthy cells have reached (a quasi-likelihood, as of counts that are dispersed more than Poisson's).
+
     Attributes:
         blinks: in a loaded frame.
         noise: float ``[levels]``, share of full scale: healthy segments are hardly ever noisier.
+        blinks_count, noise_counts: share of the evidence of either that counts.
     """
 
     blinks: float
     noise: Floats
+    blinks_count: float = 1.0
+    noise_counts: float = 1.0
 
     @classmethod
-    def fit(cls, recordings: Sequence[Floats], scale: Scale) -> Usual:
+    def fit(cls, recordings: Sequence[Floats], scale: Scale, layout: SensorLayout) -> Usual:
         """Count over fault-free recordings, ``[T, D]`` each."""
+        every = np.arange(layout.n_cells)
         blinks = loaded = 0.0
         noise: list[list[Floats]] = [[] for _ in _LEVELS]
         for recording in recordings:
             for first in range(0, len(recording), SEGMENT):
                 frames = recording[first : first + SEGMENT]
-                low, high, under_load, restless, level = _measure(frames, scale.root_load(frames), scale)
+                low, high, under_load, restless, level = _measure(frames, scale.root_load(frames), scale, every, layout)
                 blinks += float((low + high).sum())
                 loaded += float(under_load.sum())
                 if len(frames) >= _SHORTEST:
@@ -65,7 +80,15 @@ class Usual:
         limit = np.maximum.accumulate(np.maximum(limit, scale.near / scale.full_scale))
         # With one more blink, in as many frames as an unknown array would need for it: where little was loaded, little
         # is known.
-        return cls(max(_RAREST, (blinks + 1) / (loaded + 1 / _UNKNOWN_BLINKS)), limit)
+        usual = cls(max(_RAREST, (blinks + 1) / (loaded + 1 / _UNKNOWN_BLINKS)), limit)
+        unrest = Unrest.begin(layout)
+        reached = np.stack([unrest.blinking, unrest.noisy])
+        for recording in recordings:
+            for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
+                unrest = unrest.extend(frames, scale.root_load(frames), numbers, scale, usual, still, np.inf)
+                reached = np.maximum(reached, [unrest.blinking, unrest.noisy])
+        counts = _ENOUGH / np.maximum(_ENOUGH, _MARGIN * np.quantile(reached, _HEALTHY, axis=1))
+        return replace(usual, blinks_count=float(counts[0]), noise_counts=float(counts[1]))
 
     @classmethod
     def unknown(cls, scale: Scale) -> Usual:
@@ -78,11 +101,13 @@ class Unrest:
     """The cumulated evidence.
 
     Attributes:
+        layout: the array.
         blinking, noisy: float ``[D]``, log likelihood ratios against healthy.
         blinks: int ``[D]``, since ``blinking`` was last 0; high: how many of them to full scale.
         blinks_since, noisy_since: int ``[D]``, number of the frame at which each sum was last 0.
     """
 
+    layout: SensorLayout
     blinking: Floats
     noisy: Floats
     blinks: NDArray[np.intp]
@@ -91,10 +116,10 @@ class Unrest:
     noisy_since: NDArray[np.intp]
 
     @classmethod
-    def begin(cls, n_cells: int) -> Unrest:
+    def begin(cls, layout: SensorLayout) -> Unrest:
         """Nothing seen yet."""
-        zero, none = np.zeros(n_cells), np.zeros(n_cells, np.intp)
-        return cls(zero, zero, none, none, none, none)
+        zero, none = np.zeros(layout.n_cells), np.zeros(layout.n_cells, np.intp)
+        return cls(layout, zero, zero, none, none, none, none)
 
     def extend(
         self,
@@ -104,34 +129,41 @@ class Unrest:
         scale: Scale,
         usual: Usual,
         still: NDArray[np.bool_],
+        full: float = _FULL,
     ) -> Unrest:
         """Return the evidence after more frames, ``[t, D]``, and their root loads, likewise.
 
-        ``still`` cells (bool ``[D]``) have no part in it.
+        ``still`` cells (bool ``[D]``) have no part in it. More evidence than ``full`` is not kept.
         """
         if len(frames) < _SHORTEST or still.all():
             return self
         moving = np.flatnonzero(~still)
-        low, high, loaded, restless, level = _measure(frames[:, moving], root[:, moving], scale.of(moving))
+        low, high, loaded, restless, level = _measure(frames, root, scale, moving, self.layout)
         events = low + high
         crowd = max(1.0, _ALONE * float((loaded > 0).sum()))
         if (events > 0).sum() > crowd:
             events = np.zeros_like(events)
         gain = events * np.log(_BLINK_RATE / usual.blinks) - loaded * (_BLINK_RATE - usual.blinks)
         blinking = self.blinking.copy()
-        blinking[moving] = np.clip(blinking[moving] + gain, 0.0, _FULL)
+        blinking[moving] = np.clip(blinking[moving] + usual.blinks_count * gain, 0.0, full)
         noisier = restless > usual.noise[level]
+        if noisier.any():
+            every, which = np.zeros(len(still)), np.flatnonzero(noisier)
+            every[moving] = restless
+            around = self.layout.beside[moving[which]]
+            noisier[which] = ~_shared(around, every[around], restless[which])
         if noisier.sum() > max(crowd, _CROWD * len(still)):
             noisier[:] = False
         gain = np.where(noisier, np.log(_RESTLESS / _NOISIER), 0.0)
         gain[events > 1] = 0.0  # what blinks is restless too
-        noisy = self.noisy + np.log((1 - _RESTLESS) / (1 - _NOISIER))
-        noisy[moving] = np.where(noisier, self.noisy[moving] + gain, noisy[moving])
-        noisy = np.clip(noisy, 0.0, _FULL)
+        noisy = self.noisy + usual.noise_counts * np.log((1 - _RESTLESS) / (1 - _NOISIER))
+        noisy[moving] = np.where(noisier, self.noisy[moving] + usual.noise_counts * gain, noisy[moving])
+        noisy = np.clip(noisy, 0.0, full)
         blinks, to_full = np.zeros(len(still), np.intp), np.zeros(len(still), np.intp)
         blinks[moving], to_full[moving] = events, np.where(events > 0, high, 0)
         calm, quiet = self.blinking == 0, self.noisy == 0
         return Unrest(
+            self.layout,
             blinking,
             noisy,
             np.where(calm, 0, self.blinks) + blinks,
@@ -154,9 +186,10 @@ class Unrest:
 
 
 def _measure(
-    frames: Floats, root: Array, scale: Scale
+    frames: Floats, root: Array, scale: Scale, cells: NDArray[np.intp], layout: SensorLayout
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, Floats, NDArray[np.intp]]:
-    """Return for each cell ``[D]``: blinks to rest, blinks to full scale, loaded frames, noise, level of load."""
+    """Return for each of the ``cells``: blinks to rest, blinks to full scale, loaded frames, noise, level of load."""
+    every, frames, root, scale = frames, frames[:, cells], root[:, cells], scale.of(cells)
     x = (frames - scale.resting).astype(np.float32)
     if np.isnan(x).any():
         x = np.nan_to_num(x)
@@ -179,7 +212,12 @@ def _measure(
         for gap in range(1, min(_LONGEST_BLINK, len(x) - 2) + 1):
             before, after = of[: -gap - 1], of[gap + 1 :]
             alike = np.abs(after - before) <= _ALIKE * before
-            count[some] += (there[: -gap - 1] & missing[1:-1] & there[gap + 1 :] & alike).sum(axis=0)
+            when, which = np.nonzero(there[: -gap - 1] & missing[1:-1] & there[gap + 1 :] & alike)
+            if len(when):
+                which = some[which]
+                around = layout.beside[cells[which]]
+                change = np.abs(every[when[:, None] + 1, around] - every[when[:, None], around])
+                np.add.at(count, which[~_shared(around, change, x[when, which])], 1)
             missing = missing[:-1] & gone[gap:]
         return count
 
@@ -191,6 +229,18 @@ def _measure(
     far = moderate & ((1 + _ALIKE) * x < np.float32(top))
     low, high = blinks(moderate, rests), blinks(far, full)
     return low, high, loaded.sum(axis=0, dtype=np.float64), restless, np.maximum(level, 0)
+
+
+def _shared(around: NDArray[np.intp], change: Floats, own: Floats | Array) -> NDArray[np.bool_]:
+    """Return which changes of single cells, ``[n]``, those beside them share, but for both neighbours on a bad wire.
+
+    Args:
+        around: the cells beside each, int ``[n, 8]``, see ``SensorLayout.beside``.
+        change: how much those change, ``[n, 8]``; NaN: not known. own: how much the cells themselves do, ``[n]``.
+    """
+    much = (around >= 0) & (change >= _SHARED * own[:, None])
+    of_wire = [much[:, on].all(axis=1) & (much.sum(axis=1) == 2) for on in (_ON_ROW, _ON_COLUMN)]
+    return np.asarray(much.any(axis=1) & ~of_wire[0] & ~of_wire[1])
 
 
 def _median(values: NDArray[np.float32]) -> Floats:

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
+from diagnostics.drift import gains_count
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.injection import inject
 from diagnostics.layout import SensorLayout
@@ -23,6 +25,7 @@ from diagnostics.memory import Memory, finished
 from diagnostics.patched import remembering
 from diagnostics.patches import MOST_CELLS
 from diagnostics.reference import Reference
+from diagnostics.spatial import Caution
 from diagnostics.specimens import specimen
 
 _LOGS, _LOGS_OF_LARGE = 96, 32  # drawn to fit the weights; large arrays have more cells in each
@@ -31,7 +34,9 @@ _DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
 _FEWEST_RECORDINGS = 8  # below that the reference cannot be split
 _FEWEST_CELLS = 10  # broken and healthy, that teach what evidence is worth
 _ENOUGH = 100  # recordings that are held out, in turn where need be
-_PIECE = 100  # frames; longer recordings are cut, so that a single long one can be split too
+_FEW = 32  # recordings: fewer are cut, so that a single long one can be split too
+_PIECE = 100  # frames that are left of one, at least
+_MOST_FRAMES = 600  # of a recording in one log
 _LEARNED_SHARE = 0.75  # of the recordings teach what healthy looks like, the others make the logs
 _MOST_TEMPORAL = 1.0  # what temporal evidence may be worth, whatever the logs say: a jump alone proves nothing
 _KINDS = 3
@@ -46,7 +51,16 @@ _EXPECTED_CELLS, _EXPECTED_CELLS_LATE = 35.0, 25.0  # worth so many cells
 _MOVING_ODDS = -10.0  # log odds of a fault that holds one value, for a cell that moves
 
 Floats = NDArray[np.float64]
-_Trial = tuple[NDArray[np.intp], Floats, Floats, NDArray[np.bool_]]
+
+
+class _Trial(NamedTuple):
+    """What a log with known faults says of its still cells, ``[n]`` each, and of the gains of all that work."""
+
+    kind: NDArray[np.intp]
+    ratio: Floats
+    temporal: Floats
+    broken: NDArray[np.bool_]
+    gain: float  # the highest log evidence of another gain
 
 
 @dataclass(frozen=True)
@@ -58,22 +72,30 @@ class Weights:
     Attributes:
         offset, slope, temporal: log odds = ``offset + slope * spatial ratio + temporal * temporal ratio``, before how
             common faults are; of each kind.
+        gains: share of the evidence of another gain that counts.
     """
 
     offset: tuple[float, ...] = (0.0, -1.0, -1.0)
     slope: tuple[float, ...] = (0.6, 0.6, 0.6)
     temporal: tuple[float, ...] = (1.0, 0.5, 0.5)
+    gains: float = 1.0
 
     @classmethod
     def fit(cls, recordings: Sequence[Floats], layout: SensorLayout, *, seed: int = 0) -> Weights:
         """Fit on fault-free recordings, ``[T, D]`` each; too few of them give the defaults."""
         rng = np.random.default_rng(seed)
         n_logs = _LOGS if layout.present.sum() <= MOST_CELLS else _LOGS_OF_LARGE
-        recordings, layout = specimen(recordings, layout, _PIECE)
-        recordings = [piece for r in recordings for piece in np.array_split(r, max(1, len(r) // _PIECE))]
+        recordings, layout = specimen(recordings, layout)
+        cuts = -(-_FEW // len(recordings)) if recordings else 0
+        # What one recording holds is alike: its pieces stay together, here as when others are held out.
+        recordings = [
+            piece
+            for i in rng.permutation(len(recordings)).tolist()
+            for piece in np.array_split(recordings[i], np.clip(len(recordings[i]) // _PIECE, 1, cuts))
+        ]
         if len(recordings) < _FEWEST_RECORDINGS:
             return cls()
-        order = rng.permutation(len(recordings))
+        order = np.arange(len(recordings))
         learned = round(_LEARNED_SHARE * len(order))
         held_out = len(order) - learned
         # Others are held out in turn, the more often the fewer there are: strange touches are among them the sooner.
@@ -84,14 +106,15 @@ class Weights:
         for i in range(n_logs):
             turn = (i + i // len(_LOG_SIZES)) % turns
             size = min(_LOG_SIZES[i % len(_LOG_SIZES)], held_out)
-            log = np.concatenate([recordings[j] for j in rng.choice(parts[turn][1], size, replace=False)])
+            drawn = rng.choice(parts[turn][1], size, replace=False).tolist()
+            log = np.concatenate([_stretch(recordings[j], rng) for j in drawn])
             share = _DEAD_SHARES[i // len(_LOG_SIZES) % len(_DEAD_SHARES)]
             onset = int(rng.uniform(0, 0.8) * len(log)) if i % 2 else None
             logs.append((log, _random_faults(layout, share, onset, rng), layout, references[turn]))
         # Evidence depends on who is suspected, and that on what evidence is worth: first roughly, then well.
         weights = usual = cls()
         for n in (n_logs // 3, n_logs):
-            weights = cls._of([_trial(*log, weights.suspicious) for log in logs[:n]])
+            weights = cls._of([_trial(*log, weights.caution._replace(gains=1.0)) for log in logs[:n]])
         # Few meet the strange touches; those held out in turn teach one another, and count for fewer.
         counts = 1 - _DOUBT / (1 + turns * (held_out / _STRANGE) ** 2)
         slopes = zip(weights.slope, usual.slope, strict=True)
@@ -100,21 +123,25 @@ class Weights:
     @classmethod
     def _of(cls, trials: Sequence[_Trial]) -> Weights:
         """Fit on trials; a kind of which they hold too few broken or healthy cells keeps the defaults."""
-        kind, ratio, temporal, dead = (np.concatenate(column) for column in zip(*trials, strict=True))
+        *told, gain = zip(*trials, strict=True)
+        kind, ratio, temporal, dead = (np.concatenate(column) for column in told)
         evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
-        found = list(zip(*vars(cls()).values(), strict=True))
+        usual = cls()
+        found = list(zip(usual.offset, usual.slope, usual.temporal, strict=True))
         for k in range(_KINDS):
             of, alike = kind == k, (kind > 0) == (k > 0)
             if min(dead[of].sum(), (~dead[of]).sum()) >= _FEWEST_CELLS:
                 fitted = _bounded_logistic(evidence[of], dead[of], float(logit(dead[alike].mean())))
                 if fitted[1] > 0:
                     found[k] = fitted
-        return cls(*zip(*found, strict=True))
+        offset, slope, temporal_share = zip(*found, strict=True)
+        return cls(offset, slope, temporal_share, gains_count(max(gain)))
 
     @property
-    def suspicious(self) -> float:
-        """The ratio from which on a cell is no longer asked about the others."""
-        return float(np.clip((_SUSPICIOUS - self.offset[0]) / self.slope[0], *_SUSPICIOUS_BOUNDS))
+    def caution(self) -> Caution:
+        """The ratio from which on a cell is no longer asked about the others, and what gains are worth."""
+        suspicious = (_SUSPICIOUS - self.offset[0]) / self.slope[0]
+        return Caution(float(np.clip(suspicious, *_SUSPICIOUS_BOUNDS)), self.gains)
 
     def worth(self, ratio: Floats, temporal: Floats, kind: NDArray[np.intp]) -> Floats:
         """Return the calibrated log likelihood ratio faulty : healthy, ``[D]``.
@@ -180,23 +207,29 @@ def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) ->
     return offset, slope, temporal
 
 
+def _stretch(recording: Floats, rng: np.random.Generator) -> Floats:
+    """Return a recording, ``[T, D]``, or part of a long one."""
+    begin = int(rng.integers(len(recording) - _MOST_FRAMES)) if len(recording) > _MOST_FRAMES else 0
+    return recording[begin : begin + _MOST_FRAMES]
+
+
 def kinds(memory: Memory) -> NDArray[np.intp]:
     """Return the kind of each cell, ``[D]``, see :class:`Weights`."""
     return np.where(memory.runs.moved, np.where(memory.rests(), 1, 2), 0)
 
 
 def _trial(
-    log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference, suspicious: float
+    log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference, caution: Caution
 ) -> _Trial:
-    """Return kind and ratios of each still cell ``[n]`` when ``faults`` are in a log, and which are broken."""
-    memory = remembering(layout, reference, suspicious)
+    """Return what is said when ``faults`` are in a log."""
+    memory = remembering(layout, reference, caution)
     memory.extend(inject(log, faults, layout))
     memory = memory.complete()
     spatial = finished(memory.spatial())
     broken = np.zeros(layout.n_cells, bool)
     broken[[c for fault in faults for c in fault.cells]] = True
-    asked = spatial.asked
-    return kinds(memory)[asked], spatial.evidence[asked], memory.temporal()[asked], broken[asked]
+    asked, gain = spatial.asked, float(np.where(broken, 0.0, spatial.gain).max())
+    return _Trial(kinds(memory)[asked], spatial.evidence[asked], memory.temporal()[asked], broken[asked], gain)
 
 
 def faulty_at(probability: Floats, false_discovery_rate: float) -> NDArray[np.bool_]:

@@ -6,6 +6,7 @@ from diagnostics import FaultKind, Line, SensorLayout, bridge, freeze_stream, in
 from diagnostics.faults import Fault
 from diagnostics.memory import Memory, finished
 from diagnostics.reference import Reference
+from diagnostics.spatial import Caution
 
 LAYOUT = SensorLayout(2, 6, 5)
 ROW, COLUMN = np.divmod(np.arange(30), 5)
@@ -27,7 +28,7 @@ def pressed(presses: int, seed: int = 0) -> np.ndarray:
 
 
 def remembered(log: np.ndarray, size: int | None = None, reference: Reference = UNKNOWN) -> Memory:
-    memory = Memory(LAYOUT, reference, 2.0)
+    memory = Memory(LAYOUT, reference, Caution(2.0))
     for first in range(0, len(log), size or len(log)):
         memory.extend(log[first : first + (size or len(log))])
     return memory.complete()
@@ -76,7 +77,7 @@ def test_it_is_the_same_however_the_frames_come_in(size: int):
 
 def test_looking_at_it_in_between_changes_nothing():
     log = broken()[:1800]
-    memory = Memory(LAYOUT, UNKNOWN, 2.0)
+    memory = Memory(LAYOUT, UNKNOWN, Caution(2.0))
     for first in range(0, 1800, 13):
         memory.extend(log[first : first + 13])
         finished(memory.complete().spatial())
@@ -85,7 +86,7 @@ def test_looking_at_it_in_between_changes_nothing():
 
 def test_a_completed_memory_leaves_the_first_one_as_it_was():
     log = pressed(3)[:50]
-    memory = Memory(LAYOUT, UNKNOWN, 2.0)
+    memory = Memory(LAYOUT, UNKNOWN, Caution(2.0))
     memory.extend(log)
     before = memory.runs
     assert memory.complete().runs.length.max() == 50
@@ -95,7 +96,7 @@ def test_a_completed_memory_leaves_the_first_one_as_it_was():
 
 def test_it_stays_of_constant_size_over_a_long_log():
     log = pressed(40)
-    memory, most = Memory(LAYOUT, UNKNOWN, 2.0), []
+    memory, most = Memory(LAYOUT, UNKNOWN, Caution(2.0)), []
     for _ in range(20):
         memory.extend(log)
         most.append(len(memory.touches.kept))
@@ -127,7 +128,7 @@ def test_settled_evidence_ends_with_the_stretch_that_it_belongs_to():
 
 def test_missed_frames_are_counted_and_say_nothing_of_cells():
     log = pressed(10)
-    memory = Memory(LAYOUT, UNKNOWN, 2.0)
+    memory = Memory(LAYOUT, UNKNOWN, Caution(2.0))
     memory.extend(log[:100])
     memory.miss(5)
     memory.miss(0)
@@ -147,7 +148,7 @@ def test_a_cell_that_delivers_a_reading_now_and_then_was_heard():
 def test_a_frozen_stream_makes_no_cell_still(grasps: Recordings):
     layout = grasps.layout
     log = np.concatenate([grasps.frames[i] for i in (30, 50, 70)]).astype(float)
-    memory = Memory(layout, Reference.unknown(layout), 2.0)
+    memory = Memory(layout, Reference.unknown(layout), Caution(2.0))
     frozen = np.concatenate([log, np.repeat(log[-1:], 3000, axis=0)])
     memory.extend(frozen)
     assert memory.complete().runs.length[log[-1] > 0.3].max() < 200

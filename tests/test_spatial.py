@@ -5,7 +5,7 @@ import pytest
 
 from diagnostics.contact import Expected
 from diagnostics.memory import finished
-from diagnostics.spatial import Cells, Model, Spatial, apart_evidence, stuck_evidence
+from diagnostics.spatial import Caution, Cells, Model, Spatial, apart_evidence, stuck_evidence
 from diagnostics.temporal import StillRuns
 from diagnostics.touches import Array, Scale, Summary, Touch
 
@@ -74,7 +74,7 @@ def judged(
     settled = np.zeros(CELLS) if settled is None else settled
     work: Generator[None, None, Spatial] = stuck_evidence(
         touches, Cells(runs, settled, np.full(CELLS, jump), np.full(CELLS, jump), ~wrong, NONE), model or Copycat(),
-        SCALE, 0.025, 2.0,
+        SCALE, 0.025, Caution(2.0),
     )  # fmt: skip
     return finished(work)
 

@@ -7,6 +7,7 @@ from diagnostics import Fault, FaultKind, Line, SensorLayout, bridge, inject, li
 from diagnostics.addresses import Aliasing, aliasings
 from diagnostics.memory import Memory
 from diagnostics.reference import Reference
+from diagnostics.spatial import Caution
 from diagnostics.twins import Joined, Twins, pairs, telling
 
 LAYOUT = SensorLayout(2, 6, 5)
@@ -29,7 +30,7 @@ def pressed(seed: int, presses: int = 25) -> np.ndarray:
 
 
 def remembered(log: np.ndarray) -> Memory:
-    memory = Memory(LAYOUT, Reference.unknown(LAYOUT), 2.0)
+    memory = Memory(LAYOUT, Reference.unknown(LAYOUT), Caution(2.0))
     memory.extend(log)
     return memory.complete()
 
@@ -128,7 +129,7 @@ def test_a_missing_reading_differs_from_nothing_and_a_position_without_a_cell_ne
     present[1, 2, 2] = False
     layout = SensorLayout(2, 6, 5, present=present)
     log[:, layout.cell(1, 2, 2)] = 5.0
-    memory = Memory(layout, Reference.unknown(layout), 2.0)
+    memory = Memory(layout, Reference.unknown(layout), Caution(2.0))
     memory.extend(log)
     assert len(memory.complete().twins.joined(usual=2)) == 1
 

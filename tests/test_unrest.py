@@ -21,11 +21,11 @@ def healthy(seed: int, frames: int = 640) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def usual() -> Usual:
-    return Usual.fit([healthy(seed) for seed in range(10)], SCALE)
+    return Usual.fit([healthy(seed) for seed in range(10)], SCALE, LAYOUT)
 
 
 def unrest_of(log: np.ndarray, usual: Usual, still: np.ndarray = STILL) -> Unrest:
-    unrest = Unrest.begin(CELLS)
+    unrest = Unrest.begin(LAYOUT)
     for first in range(0, len(log), 32):
         frames = log[first : first + 32]
         numbers = np.arange(first, first + len(frames))
@@ -99,8 +99,8 @@ def test_noise_under_load_is_learned_from_the_reference():
     restless = [healthy(seed) + rng.normal(0, 0.4, (640, CELLS)) for seed in range(10)]
     log = healthy(36)
     log[:, 7] += rng.normal(0, 0.4, 640)
-    assert cells(unrest_of(log, Usual.fit(restless, SCALE)).excess) == []
-    assert cells(unrest_of(log, Usual.fit([healthy(seed) for seed in range(10)], SCALE)).excess) == [7]
+    assert cells(unrest_of(log, Usual.fit(restless, SCALE, LAYOUT)).excess) == []
+    assert cells(unrest_of(log, Usual.fit([healthy(seed) for seed in range(10)], SCALE, LAYOUT)).excess) == [7]
 
 
 @pytest.mark.parametrize("recordings", [1, 2, 4])
@@ -112,7 +112,7 @@ def test_a_few_recordings_do_not_tell_how_noisy_a_load_can_be(recordings: int):
         noise = 0.02 * np.exp(rng.normal(0, 0.4, (frames // 32, CELLS))).repeat(32, axis=0)
         return np.maximum(0, load * (1 + rng.normal(0, noise)))
 
-    usual = Usual.fit([restless(seed) for seed in range(recordings)], SCALE)
+    usual = Usual.fit([restless(seed) for seed in range(recordings)], SCALE, LAYOUT)
     assert [cells(unrest_of(restless(seed, 640), usual).excess) for seed in range(50, 60)] == [[]] * 10
     noisy = inject(restless(60, 640), [Fault("noisy", (7,), value=0.5)], LAYOUT, seed=0)
     assert cells(unrest_of(noisy, usual).excess) == [7]

@@ -173,8 +173,8 @@ class Seen(NamedTuple):
     def of(cls, touches: Sequence[Touch], recording: int) -> list[Seen]:
         """Return where the touches of a recording were seen."""
         return [
-            cls(recording, touch.first, sum(part.n for part in touch.parts), again)
-            for touch, again in zip(touches, repeated(touches), strict=True)
+            cls(recording, touch.first, sum(part.n for part in touch.parts), again > 0)
+            for touch, again in zip(touches, repeated(touches).tolist(), strict=True)
         ]
 
 

@@ -63,7 +63,9 @@ class Gain(NamedTuple):
     touches: NDArray[np.intp]
 
 
-def gain_evidence(whole: Array, expected: Expected, moved: Mask, root_near: float, counts: float = 1.0) -> Gain:
+def gain_evidence(
+    whole: Array, expected: Expected, moved: Mask, root_near: float, counts: Floats | float = 1.0
+) -> Gain:
     """Look for cells that are loaded when the others say, but not as much.
 
     Whether a cell is loaded at all is another question (see ``spatial``): touches that leave it unloaded do not count.
@@ -75,7 +77,7 @@ def gain_evidence(whole: Array, expected: Expected, moved: Mask, root_near: floa
         expected: what healthy cells would have done in them.
         moved: bool ``[n, D]``, the touches up to which each cell has moved.
         root_near: the root load from which on a cell counts as loaded.
-        counts: share of the evidence that counts, see :func:`gains_count`.
+        counts: ``[n, 1]``, share of what each says that counts, see :func:`gains_count`.
     """
     tells = (
         moved
@@ -98,14 +100,14 @@ def gain_evidence(whole: Array, expected: Expected, moved: Mask, root_near: floa
         """Return what each touch and those after it say for a gain, ``[n, k]``."""
         u = 1 + ((root - np.float32(np.sqrt(gain)) * mean) / (2 * spread)) ** 2
         of_touch = np.log((1 - _STRANGE) / (u * u * np.sqrt(u)) + _STRANGE)  # as Student's t with 4 degrees
-        return np.where(tells, of_touch, 0.0)[::-1].cumsum(axis=0)[::-1]
+        return np.where(tells, counts * of_touch, 0.0)[::-1].cumsum(axis=0)[::-1]
 
     chance = np.full(n, (1 - _ALL_THROUGH) / max(n - 1, 1))
     chance[0] = _ALL_THROUGH
     wrong = np.stack([said(gain) for gain in _GAINS]) - np.max([said(gain) for gain in _AS_GOOD], axis=0)
     wrong += np.log(chance / len(_GAINS)).astype(np.float32)[:, None]  # (gains, n, k)
     likeliest = wrong.max(axis=1).argmax(axis=0)
-    result.evidence[cells] = counts * expected.own[cells] * logsumexp(wrong, axis=(0, 1))
+    result.evidence[cells] = expected.own[cells] * logsumexp(wrong, axis=(0, 1))
     result.factor[cells] = _GAINS[likeliest]
     result.since[cells] = since = wrong[likeliest, :, np.arange(len(cells))].argmax(axis=1)
     result.touches[cells] = (tells & (np.arange(n)[:, None] >= since)).sum(axis=0)

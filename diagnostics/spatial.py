@@ -29,7 +29,7 @@ from scipy.special import expit, logit, softmax
 from diagnostics.contact import Expected
 from diagnostics.drift import drifting, gain_evidence, misleading, offset_evidence
 from diagnostics.temporal import SHORTEST_RUN, StillRuns
-from diagnostics.touches import Array, Scale, Touch
+from diagnostics.touches import Array, Scale, Touch, repeated
 
 _ANYWHERE = 0.2  # of broken cells stick anywhere, of the rest as many to the low rail as to the high one
 _LEAST = 1e-4  # no touch is less likely than this: models err
@@ -38,6 +38,7 @@ _TELLING = 0.5  # log evidence from which on a touch counts as one that tested t
 _WORTHS = (0.25, 0.5, 0.75, 1.0)  # of the log odds of the model, in one touch or another
 _WITNESS_SHARE = 0.5  # of what the moving cells say of that counts: neighbours err together
 _ONE_LOAD = 0.5  # correlation of what touches elsewhere say of a load that outlasts them
+_REPEATS, _THE_SAME = 0.15, 0.95  # correlation of what touches say that load the cells alike, and the cosine of such
 _MOST_ROUNDS = 8  # of judging, leaving suspects out and putting others back
 _MOST_DRIFTING = 16  # cells that are left out for their drift, one by one
 
@@ -171,6 +172,7 @@ class _Question:
         values: what still cells read.
         asked, askable: bool ``[D]``, the cells that are judged, and those that may be asked about others.
         features, begins, counted: see :func:`_looked_at`.
+        worth: float ``[n, 1]``, of what each stretch says so much is new.
     """
 
     cells: Cells
@@ -181,6 +183,7 @@ class _Question:
     features: Array
     begins: Mask
     counted: Mask
+    worth: Floats
 
     @classmethod
     def of(cls, touches: Sequence[Touch], cells: Cells, model: Model, scale: Scale, tolerance: float) -> _Question:
@@ -191,7 +194,9 @@ class _Question:
         held = still & ~values.rests & runs.moved & (runs.start >= touches[-1].first) & ~cells.outlasted
         unsure = held & (cells.sudden >= SUDDEN) & (cells.temporal < SUDDEN)
         asked = still & ~unsure
-        return cls(cells, model, values, asked, cells.askable & ~unsure, *_looked_at(touches, runs, asked))
+        features, begins, counted = _looked_at(touches, runs, asked)
+        worth = 1 / (1 + _REPEATS * repeated(touches, _THE_SAME, values.rests | ~still)[begins.cumsum() - 1, None])
+        return cls(cells, model, values, asked, cells.askable & ~unsure, features, begins, counted, worth)
 
     def answered(self, trusted: Mask) -> Generator[None, None, tuple[Expected, Floats]]:
         """Return what the ``trusted`` cells (bool ``[D]``) expect, and the surprise of each stretch ``[n, D]``."""
@@ -201,7 +206,7 @@ class _Question:
         likely = _believed(expected.never, self.features[:, 2] == 0, trusted & self.cells.runs.moved)
         within = expected.within(self.values.low[held], self.values.high[held], held)
         likely[:, held] = expected.always[:, held] * within
-        return expected, np.where(self.counted, -np.log(np.maximum(likely, _LEAST)), 0.0)
+        return expected, np.where(self.counted, -self.worth * np.log(np.maximum(likely, _LEAST)), 0.0)
 
     def brought(self, surprise: Floats) -> Floats:
         """Return the evidence ``[D]`` of all touches, those before included."""
@@ -268,7 +273,7 @@ def stuck_evidence(
         yield
         expected = said.expected.on(question.begins)
         offset = offset_evidence(whole, expected.always, moved[-1] & np.isfinite(expected.spread))
-        gain = gain_evidence(whole, expected, moved, scale.root_near, caution.gains)
+        gain = gain_evidence(whole, expected, moved, scale.root_near, caution.gains * question.worth[question.begins])
         more = misleading(offset, gain.evidence, drifts)
         if not more.any():
             break

@@ -267,15 +267,20 @@ class Touches:
         return replace(self, kept=self.kept[:-keep]), replace(self, kept=self.kept[-keep:])
 
 
-def repeated(touches: Sequence[Touch]) -> list[bool]:
-    """Return which touches load about the same cells as one before them."""
+def repeated(
+    touches: Sequence[Touch], least: float = _SAME_PLACE, among: NDArray[np.bool_] | slice = slice(None)
+) -> NDArray[np.intp]:
+    """Return how many touches before each load about the same cells, int ``[n]``.
+
+    With a cosine of at least so much, ``among`` all cells or some (bool ``[D]``): those stuck under load are in every
+    touch.
+    """
     if not touches:
-        return []
-    means = np.stack([touch.mean() for touch in touches])
+        return np.zeros(0, np.intp)
+    means = np.stack([touch.mean()[among] for touch in touches])
     sizes = np.linalg.norm(means, axis=1)
-    alike = means @ means.T >= _SAME_PLACE * np.maximum(sizes[:, None] * sizes, _LEAST**2)
-    again: list[bool] = np.tril(alike, -1).any(axis=1).tolist()
-    return again
+    alike = means @ means.T >= least * np.maximum(sizes[:, None] * sizes, _LEAST**2)
+    return np.asarray(np.tril(alike, -1).sum(axis=1))
 
 
 def _still_going(root: Array, last: Array | None) -> int:

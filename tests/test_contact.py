@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from diagnostics import SensorLayout
-from diagnostics.contact import ContactModel, Expected, stretches
+from diagnostics.contact import ContactModel, Expected, stretches, surest_of
 from diagnostics.memory import finished
 from diagnostics.patch_models import contact_model
 from diagnostics.touches import Scale
@@ -131,3 +131,24 @@ def test_large_arrays_are_modelled_in_tiles_that_know_every_cell():
     loaded = features[:, 2] > 0
     assert expected.never[loaded].mean() < 0.3
     assert expected.never[~loaded].mean() > 0.9
+
+
+def patted(recordings: int, times: int) -> list[np.ndarray]:
+    """Recordings of one press each, that comes again and again."""
+    return [np.tile(np.concatenate([np.zeros((8, 12)), press]), (times, 1))[8:-4] for press in blobs(3, recordings)]
+
+
+def test_a_press_that_comes_again_and_again_teaches_as_much_as_once():
+    rng = np.random.default_rng(0)
+    *_, once = stretches(patted(20, 1), SCALE, rng)
+    features, source, again = stretches(patted(20, 6), SCALE, rng)
+    assert once == again == 20
+    assert len(features) == len(source) > 6 * 20
+    model = ContactModel.fit(patted(20, 6), LAYOUT, SCALE)
+    assert model.surest(12).max() == surest_of(20)
+
+
+@pytest.mark.parametrize(("recordings", "sources"), [(20, 20), (3, 18)])
+def test_a_recording_is_one_source_unless_there_are_few(recordings: int, sources: int):
+    _, source, _ = stretches(patted(recordings, 6), SCALE, np.random.default_rng(0))
+    assert sorted(set(source.tolist())) == list(range(sources))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from diagnostics.contact import Expected
-from diagnostics.drift import drifting, gain_evidence, misleading
+from diagnostics.drift import drifting, gain_evidence, gains_count, misleading
 
 CELLS, NEAR = 30, 0.1
 SPREAD = 0.05
@@ -88,3 +88,16 @@ def test_cells_that_mislead_are_left_out_the_surest_gain_first_and_all_offsets_a
         order.append(np.flatnonzero(more).tolist())
         known |= more
     assert order == [[1, 2, 6], [5]]
+
+
+def test_what_counts_for_less_proves_less_and_what_healthy_cells_reached_proves_nothing():
+    whole, expected, moved = touched(20, one_has(0.35))
+    full, some, none = (
+        gain_evidence(whole, expected, moved, NEAR, np.full((20, 1), counts)).evidence[4] for counts in (1.0, 0.5, 0.0)
+    )
+    assert full > some > none
+    assert none < 0
+    assert gains_count(0.0) == gains_count(3.0) == 1
+    for reached in (8.0, 30.0):
+        assert not drifting(np.zeros(1), np.array([reached * gains_count(reached)])).any()
+        assert drifting(np.zeros(1), np.array([2 * reached * gains_count(reached)])).all()

@@ -33,6 +33,7 @@ ON_RECORDINGS = {
 LESS = {  # they take minutes
     "diagnosis_constants.py": ["--only", "rim._RIDGE"],
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
+    "gestures.py": ["--recordings", "24", "--logs", "2", "--only", "no crosstalk"],
     "other_sensors.py": ["--only", "8 bits", "all +3 %"],
 }
 SLOW = {  # more than 7 s of CPU time
@@ -45,6 +46,7 @@ SLOW = {  # more than 7 s of CPU time
     "diagnosis_constants.py",
     "diagnosis_figures.py",
     "fleet_scaling.py",
+    "gestures.py",
     "kill_maintenance.py",
     "other_sensors.py",
     "picture.py",

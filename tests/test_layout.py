@@ -93,3 +93,11 @@ def test_a_place_outside_the_layout_is_an_index_error():
     ):
         with pytest.raises(IndexError):
             ask()
+
+
+def test_the_cells_beside_one_lie_on_its_pad_and_exist():
+    layout = SensorLayout(2, 3, 3, present=np.arange(18).reshape(2, 3, 3) != 1)
+    assert layout.beside[4].tolist() == [0, -1, 2, 3, 5, 6, 7, 8]
+    assert layout.beside[9].tolist() == [-1, -1, -1, -1, 10, -1, 12, 13]
+    for cell in (0, 4, 8, 13):
+        assert all(cell in layout.beside[other] for other in layout.beside[cell] if other >= 0)

@@ -43,7 +43,7 @@ def lessons(spy: Spy) -> Lessons:
     features[:, 0, 20] = touch / 100
     features[:, 2] = features[:, 2] > 0.5
     features[:, 3] = (features[:, 3] > 0.5) & (features[:, 2] > 0)
-    return Lessons.of(features, touch, LAYOUT, OUTPUTS, spy.fit, 1.0, np.random.default_rng(1))
+    return Lessons.of(features, touch, TOUCHES, LAYOUT, OUTPUTS, spy.fit, 1.0, np.random.default_rng(1))
 
 
 def test_each_touch_is_foreseen_by_regressions_that_were_taught_by_the_other_folds():

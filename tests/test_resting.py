@@ -49,6 +49,16 @@ def test_offsets_that_wander_between_recordings_are_no_load():
     assert most.max() < 0.03
 
 
+def test_offsets_that_each_cell_changes_for_itself_from_one_recording_to_the_next_are_no_load():
+    rng = np.random.default_rng(2)
+    recordings = touches(0, 60)
+    offsets = 0.1 + 0.006 * rng.standard_normal((60, CELLS))  # now and then far from the usual
+    most, _ = resting([r + offset for r, offset in zip(recordings, offsets, strict=True)], PRESENT, TOLERANCE, 1.0)
+    later = 0.1 + 0.006 * np.random.default_rng(3).standard_normal((1000, CELLS))
+    assert (later > most + 2 * TOLERANCE).mean() < 2e-4
+    assert most.max() < 0.14
+
+
 def test_cells_that_are_always_loaded_do_not_make_others_rest_higher():
     held = touches(0)
     for recording in held:

@@ -1,8 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from diagnostics.temporal import StillRuns
-from diagnostics.touches import Scale, Summary, Touches
+from diagnostics.touches import Scale, Summary, Touches, repeated
 
 CELLS = 12
 SCALE = Scale(np.zeros(CELLS), 0.05, 5.0)
@@ -135,3 +137,18 @@ def test_splitting_parts_the_touches_in_time_order():
     assert len(new.kept) == 2
     assert [t.first for t in old.kept + new.kept] == [t.first for t in touches.kept]
     assert old.kept[-1].first < new.kept[0].first
+
+
+def test_touches_that_load_the_same_cells_are_counted_as_repeats_wherever_others_lie_between():
+    far = np.roll(HAND, 5)
+    pats = [part for load in (HAND, HAND, far, HAND, far) for part in (held(50, load), idle(20))]
+    touches = [touch for touch in touches_of(np.concatenate(pats)).kept if touch.mean().any()]
+    assert repeated(touches).tolist() == [0, 1, 0, 2, 1]
+    stuck = np.isin(np.arange(CELLS), [0, 11])
+    broken = [
+        replace(touch, parts=tuple(replace(p, total=p.total + 2 * p.n * stuck) for p in touch.parts))
+        for touch in touches
+    ]
+    assert repeated(broken).tolist() == [0, 1, 2, 3, 4]
+    assert repeated(broken, among=~stuck).tolist() == [0, 1, 0, 2, 1]
+    assert repeated(()).tolist() == []

@@ -123,3 +123,47 @@ def test_a_load_that_saturates_now_and_then_does_not_blink(usual):
     log[:, 3] = np.minimum(4.6 + 0.6 * np.sin(np.arange(len(log))), 5.0)
     for reference in (usual, Usual.unknown(SCALE)):
         assert cells(unrest_of(log, reference).intermittent) == []
+
+
+def tapped(seed: int, cells: list[int], frames: int = 640, rate: float = 5.0) -> np.ndarray:
+    """A finger that taps on some cells in the middle of slow loads: gone and back within a few frames."""
+    rng = np.random.default_rng(seed)
+    log = healthy(seed, frames)
+    up = np.sin(2 * np.pi * rate * np.arange(frames) / 54 + rng.uniform(0, 6)) < -0.5
+    log[np.ix_(up, cells)] = 0
+    log[:, cells] = np.where(log[:, cells] > 0, 1.5, 0)
+    return log
+
+
+@pytest.mark.parametrize("finger", [[6, 7, 11, 12], [0, 1], [4, 9], [7, 13]])
+def test_a_tapping_finger_is_no_loose_contact(usual, finger: list[int]):
+    for reference in (usual, Usual.unknown(SCALE)):
+        unrest = unrest_of(tapped(40, finger), reference)
+        assert cells(unrest.intermittent | unrest.excess) == []
+
+
+def test_a_wire_with_a_loose_contact_is_told_from_a_finger_by_the_cells_beside_it(usual):
+    unrest = unrest_of(tapped(41, [5, 6, 7, 8, 9]), usual)  # a row; of its ends only one side is known
+    assert {6, 7, 8} <= set(cells(unrest.intermittent))
+    assert cells(unrest.intermittent | unrest.excess)[0] >= 5
+    assert cells(unrest.intermittent | unrest.excess)[-1] <= 9
+
+
+def test_noise_that_the_cells_beside_share_is_the_touch(usual):
+    rng, finger = np.random.default_rng(1), [6, 7, 11, 12]
+    log = healthy(42)
+    log[:, finger] += rng.normal(0, 0.5, (640, 1)) * rng.uniform(0.7, 1, 4)
+    assert cells(unrest_of(log, usual).excess) == []
+    alone = healthy(42)
+    alone[:, 7] += rng.normal(0, 0.5, 640)
+    assert cells(unrest_of(alone, usual).excess) == [7]
+
+
+def test_where_healthy_cells_blink_in_bursts_it_takes_more_to_be_faulty():
+    blinking = [tapped(seed, [seed % CELLS], 96, rate=8.0) for seed in range(30)]  # on one cell: nothing beside tells
+    calm = [healthy(seed, 320) for seed in range(100, 130)]
+    bursts = Usual.fit([*blinking, *calm], SCALE, LAYOUT)
+    assert bursts.blinks_count < 1
+    for seed in range(50, 60):
+        assert cells(unrest_of(tapped(seed, [seed % CELLS], 96, rate=8.0), bursts).intermittent) == []
+    assert Usual.fit(calm, SCALE, LAYOUT).blinks_count == 1

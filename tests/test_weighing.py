@@ -6,7 +6,7 @@ from scipy.special import expit
 from sklearn.linear_model import LogisticRegression
 
 from adaptfault.recordings import Recordings
-from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
+from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject, weighing
 from diagnostics.weighing import Weights, _bounded_logistic, faulty_at
 
 ASKED = np.ones(100, bool)
@@ -93,6 +93,37 @@ def test_too_few_recordings_to_split_give_the_defaults():
     layout = SensorLayout(1, 3, 3)
     rng = np.random.default_rng(0)
     assert Weights.fit([rng.uniform(0, 3, (50, 9))] * 3, layout) == Weights()
+
+
+@pytest.mark.parametrize(("recordings", "frames"), [(40, 1000), (4, 3000)])
+def test_no_log_is_explained_by_what_its_own_recordings_taught(monkeypatch, recordings: int, frames: int):
+    taught: dict[int, set[int]] = {}
+    used: list[tuple[set[int], set[int], int]] = []  # recordings of a log and of its reference, frames of the log
+
+    class Stop(Exception):
+        pass
+
+    def fit(cls: type, given: list[np.ndarray], layout: SensorLayout) -> object:
+        reference = object()
+        taught[id(reference)] = {int(r[0, 8] // 1) for r in given}
+        kept.append(reference)
+        return reference
+
+    def trial(log: np.ndarray, faults: object, layout: object, reference: object, caution: object) -> None:
+        used.append((set(np.unique(log[:, 8] // 1).astype(int).tolist()), taught[id(reference)], len(log)))
+        if len(used) == 20:
+            raise Stop
+
+    kept: list[object] = []
+    monkeypatch.setattr(weighing.Reference, "fit", classmethod(fit))
+    monkeypatch.setattr(weighing, "_trial", trial)
+    rng = np.random.default_rng(0)
+    reference = [np.column_stack([rng.uniform(0, 3, (frames, 8)), np.full(frames, i + 0.5)]) for i in range(recordings)]
+    with pytest.raises(Stop):
+        Weights.fit(reference, SensorLayout(1, 3, 3))
+    assert max(frames for *_, frames in used) <= 8 * 600
+    # Of few recordings one may be parted, and no more.
+    assert max(len(log & known) for log, known, _ in used) <= (recordings < 32)
 
 
 def test_what_is_called_likely_is_as_often_true(fitted: SelfDiagnosis, grasps: Recordings):

@@ -1,0 +1,153 @@
+"""Diagnosis on skins that people stroke, pat and scratch: python examples/gestures.py [--logs N]
+
+Social touch is not a grasp: one recording holds the same pat again and again, fingers leave a cell and are back within
+a tenth of a second, contacts are a cell or two wide. So gestures on soft fabric skins are simulated, with the noise,
+crosstalk and wandering rest of such skins, and the rows of ``diagnosis_figures.py`` measured on them: false alarms in
+healthy logs, dead cells from the start and from 60 % of the log on, broken lines. ``--only NAME ...`` picks skins.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from diagnosis_figures import Bench, cells, lines, onset, show
+
+from adaptfault.recordings import Recordings
+from diagnostics import SelfDiagnosis, SensorLayout
+
+GESTURES = ("nothing", "press", "pat", "rub", "stroke", "scratch", "tickle")
+STEPS = 1023
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Skin:
+    """A fabric skin; shares are of full scale.
+
+    Attributes:
+        side: rows, and columns.
+        noise: standard deviation.
+        rest: of untouched cells, 0.3 to 1.7 times that.
+        wander: of each cell's rest from one recording to the next, standard deviation; half as much within one.
+        crosstalk: of the mean load of a line that its other cells read.
+    """
+
+    side: int = 10
+    noise: float = 0.002
+    rest: float = 0.02
+    wander: float = 0.002
+    crosstalk: float = 0.05
+
+    rate, seconds = 54.0, 8.0
+
+    def recordings(self, count: int, seed: int) -> Recordings:
+        """Simulate so many gestures."""
+        rng, own = np.random.default_rng(seed), np.random.default_rng(99)
+        shape = self.side, self.side
+        gain, rest = own.uniform(0.7, 1.3, shape), self.rest * own.uniform(0.3, 1.7, shape)
+        frames = int(self.seconds * self.rate)
+        labels = rng.integers(len(GESTURES), size=count)
+        read = []
+        for label in labels.tolist():
+            load = np.minimum(touched(GESTURES[label], self.side, frames, self.rate, rng), 1.1)
+            load += self.crosstalk * (load.mean(axis=1, keepdims=True) + load.mean(axis=2, keepdims=True))
+            now, later = self.wander * rng.standard_normal((2, *shape))
+            wander = now + 0.5 * later * np.linspace(0, 1, frames)[:, None, None]
+            value = load * gain + rest + wander + self.noise * rng.standard_normal(load.shape)
+            read.append(np.clip(np.round(value * STEPS), 0, STEPS).reshape(frames, -1))
+        layout = SensorLayout(1, *shape, full_scale=float(STEPS), rate=self.rate, unit="count")
+        return Recordings(tuple(read), layout, labels, GESTURES)
+
+
+SKINS = {
+    "10 x 10": Skin(),
+    "no crosstalk": Skin(crosstalk=0.0),
+    "noise 0.4 %, crosstalk 15 %": Skin(noise=0.004, rest=0.05, crosstalk=0.15),
+    "rest wanders by 0.6 %": Skin(noise=0.001, rest=0.1, wander=0.006),
+    "16 x 16": Skin(16),
+}
+
+
+def touched(gesture: str, side: int, frames: int, rate: float, rng: np.random.Generator) -> Array:
+    """Return the load ``[frames, side, side]`` of a gesture, somewhere, in any direction, as hard as it happens."""
+    t, size = np.arange(frames) / rate, side / 10
+    load = np.zeros((frames, side, side))
+    places = np.moveaxis(np.indices((side, side)), 0, -1)
+    centre, angle, force = rng.uniform(0.15, 0.85, 2) * side, rng.uniform(0, np.pi), rng.uniform(0.3, 1)
+    along = np.array([np.cos(angle), np.sin(angle)])
+    across = np.array([-along[1], along[0]])
+    fingers = int(rng.integers(2, 6))
+
+    def press(where: Array, force: Array, length: float, width: float) -> None:
+        """Press an ellipse, long across the row of fingers, at ``where`` (``[frames, 2]``)."""
+        away = places - where[:, None, None]
+        far = (away @ across / length) ** 2 + (away @ along / width) ** 2
+        load[:] += force[:, None, None] * np.maximum(0, 1 - far)
+
+    still = np.zeros((frames, 2)) + centre
+    period = rng.uniform(1, 3.5)
+    jitter = rng.normal(0, 0.5 * size, (int(period * t[-1]) + 2, 2))[(period * t).astype(int)]  # of each pat
+    sway = np.sin(2 * np.pi * rng.uniform(0.5, 2) * t)
+    sweep = 2 * ((rng.uniform(0.3, 0.8) * t + rng.random()) % 1) - 1
+    fast = rng.uniform(2, 6)
+    for k in range(fingers):
+        own = force * rng.uniform(0.5, 1)
+        at = still + 1.8 * size * (k - fingers / 2) * along
+        if gesture == "press":
+            breath = 1 + 0.03 * np.sin(2 * np.pi * rng.uniform(0.1, 0.5) * t)
+            press(at, own * np.clip(t / 0.5, 0, 1) * breath, 2.6 * size, 1.3 * size)
+        elif gesture == "pat":
+            press(at + jitter, own * np.maximum(0, np.sin(2 * np.pi * period * t)) ** 2, 2.8 * size, 1.1 * size)
+        elif gesture == "rub":
+            press(at + 2 * size * sway[:, None] * across, 0.6 * own * np.ones(frames), 2.2 * size, 1.2 * size)
+        elif gesture == "stroke":
+            lifted = np.clip(1.3 - 1.2 * np.abs(sweep), 0, 1)
+            press(at + 3.5 * size * sweep[:, None] * across, 0.6 * own * lifted, 2.2 * size, 1.2 * size)
+        elif gesture in ("scratch", "tickle"):
+            phase = 2 * np.pi * fast * rng.uniform(0.9, 1.1) * t + rng.uniform(0, 6)
+            scratches = gesture == "scratch"
+            down = np.clip(0.6 + 0.6 * np.cos(phase), 0, 1) if scratches else np.maximum(0, np.sin(phase + 1))
+            drift = np.cumsum(rng.normal(0, 0.03 * size, (frames, 2)), axis=0)
+            tip = 0.9 * size + 0.4
+            where = at + 0.8 * size * np.sin(phase)[:, None] * across + drift
+            press(where, (0.5 if scratches else 0.3) * own * down, tip, tip)
+    load[: int(rng.uniform(0, 0.12) * frames)] = 0
+    load[int(rng.uniform(0.88, 1) * frames) :] = 0
+    return load
+
+
+def blamed(bench: Bench, fitted: SelfDiagnosis) -> str:
+    """Return what is called faulty in healthy logs."""
+    kinds, logs, windows = Counter[str](), 0, 0
+    for _, log, _ in bench.logs():
+        diagnosis = fitted.diagnose(log)
+        logs += bool(diagnosis.faults)
+        windows += sum(len(frames) // 50 for frames in log) * diagnosis.layout.n_cells
+        for fault in diagnosis.faults:
+            kinds[str(fault.kind)] += len(fault.cells)
+    which = ", ".join(f"{n} {kind}" for kind, n in kinds.most_common()) or "no cell"
+    return f"healthy: {which} in {logs} of {bench.count} logs ({windows} windows of 50 frames)"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--recordings", type=int, default=120, help="half of them teach")
+    parser.add_argument("--logs", type=int, default=60, help="of six recordings each")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="+", choices=SKINS, metavar="SKIN", help=f"of {', '.join(SKINS)}")
+    options = parser.parse_args(argv)
+    for name in options.only or SKINS:
+        print(f"skin: {name}")
+        bench = Bench(SKINS[name].recordings(options.recordings, options.seed), 0, options.logs)
+        print(blamed(bench, bench.fitted), flush=True)
+        for rows in (cells, onset, lines):
+            for row in rows(bench):
+                show(row)
+
+
+if __name__ == "__main__":
+    main()

@@ -51,23 +51,35 @@ class Usual:
         blinks: in a loaded frame.
         noise: float ``[levels]``, share of full scale: healthy segments are hardly ever noisier.
         blinks_count, noise_counts: share of the evidence of either that counts.
+        alone: only unrest counts that the cells beside do not share, as where fingers scratch.
     """
 
     blinks: float
     noise: Floats
     blinks_count: float = 1.0
     noise_counts: float = 1.0
+    alone: bool = True
 
     @classmethod
     def fit(cls, recordings: Sequence[Floats], scale: Scale, layout: SensorLayout) -> Usual:
         """Count over fault-free recordings, ``[T, D]`` each."""
+        usual = cls._counted(recordings, scale, layout, alone=False)
+        if usual.blinks_count == usual.noise_counts == 1:
+            return usual
+        # Much of it is the touch. To ask the cells beside costs faults that lie side by side: not without need.
+        return cls._counted(recordings, scale, layout, alone=True)
+
+    @classmethod
+    def _counted(cls, recordings: Sequence[Floats], scale: Scale, layout: SensorLayout, alone: bool) -> Usual:
         every = np.arange(layout.n_cells)
         blinks = loaded = 0.0
         noise: list[list[Floats]] = [[] for _ in _LEVELS]
         for recording in recordings:
             for first in range(0, len(recording), SEGMENT):
                 frames = recording[first : first + SEGMENT]
-                low, high, under_load, restless, level = _measure(frames, scale.root_load(frames), scale, every, layout)
+                low, high, under_load, restless, level = _measure(
+                    frames, scale.root_load(frames), scale, every, layout, alone
+                )
                 blinks += float((low + high).sum())
                 loaded += float(under_load.sum())
                 if len(frames) >= _SHORTEST:
@@ -80,7 +92,7 @@ class Usual:
         limit = np.maximum.accumulate(np.maximum(limit, scale.near / scale.full_scale))
         # With one more blink, in as many frames as an unknown array would need for it: where little was loaded, little
         # is known.
-        usual = cls(max(_RAREST, (blinks + 1) / (loaded + 1 / _UNKNOWN_BLINKS)), limit)
+        usual = cls(max(_RAREST, (blinks + 1) / (loaded + 1 / _UNKNOWN_BLINKS)), limit, alone=alone)
         unrest = Unrest.begin(layout)
         reached = np.stack([unrest.blinking, unrest.noisy])
         for recording in recordings:
@@ -138,7 +150,7 @@ class Unrest:
         if len(frames) < _SHORTEST or still.all():
             return self
         moving = np.flatnonzero(~still)
-        low, high, loaded, restless, level = _measure(frames, root, scale, moving, self.layout)
+        low, high, loaded, restless, level = _measure(frames, root, scale, moving, self.layout, usual.alone)
         events = low + high
         crowd = max(1.0, _ALONE * float((loaded > 0).sum()))
         if (events > 0).sum() > crowd:
@@ -147,7 +159,7 @@ class Unrest:
         blinking = self.blinking.copy()
         blinking[moving] = np.clip(blinking[moving] + usual.blinks_count * gain, 0.0, full)
         noisier = restless > usual.noise[level]
-        if noisier.any():
+        if usual.alone and noisier.any():
             every, which = np.zeros(len(still)), np.flatnonzero(noisier)
             every[moving] = restless
             around = self.layout.beside[moving[which]]
@@ -186,9 +198,12 @@ class Unrest:
 
 
 def _measure(
-    frames: Floats, root: Array, scale: Scale, cells: NDArray[np.intp], layout: SensorLayout
+    frames: Floats, root: Array, scale: Scale, cells: NDArray[np.intp], layout: SensorLayout, alone: bool
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, Floats, NDArray[np.intp]]:
-    """Return for each of the ``cells``: blinks to rest, blinks to full scale, loaded frames, noise, level of load."""
+    """Return for each of the ``cells``: blinks to rest, blinks to full scale, loaded frames, noise, level of load.
+
+    Where ``alone``, blinks that the cells beside share do not count.
+    """
     every, frames, root, scale = frames, frames[:, cells], root[:, cells], scale.of(cells)
     x = (frames - scale.resting).astype(np.float32)
     if np.isnan(x).any():
@@ -213,11 +228,12 @@ def _measure(
             before, after = of[: -gap - 1], of[gap + 1 :]
             alike = np.abs(after - before) <= _ALIKE * before
             when, which = np.nonzero(there[: -gap - 1] & missing[1:-1] & there[gap + 1 :] & alike)
-            if len(when):
-                which = some[which]
+            which = some[which]
+            if alone and len(which):
                 around = layout.beside[cells[which]]
                 change = np.abs(every[when[:, None] + 1, around] - every[when[:, None], around])
-                np.add.at(count, which[~_shared(around, change, x[when, which])], 1)
+                which = which[~_shared(around, change, x[when, which])]
+            np.add.at(count, which, 1)
             missing = missing[:-1] & gone[gap:]
         return count
 

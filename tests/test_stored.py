@@ -113,6 +113,7 @@ def test_an_array_that_is_missing_misshapen_or_not_finite_is_refused_by_name(arr
         ({"false_discovery_rate": None}, "damaged"),
         ({"weights": {}}, "offset"),
         ({"weights": {"offset": [0, 0], "slope": [1, 1, 1], "temporal": [0, 0, 0]}}, "offset"),
+        ({"weights": {"offset": [0] * 3, "slope": [1] * 3, "temporal": [0] * 3, "gains": 2}}, "gains"),
         ({"reference": {}}, "missing"),
         ({"reference": 3}, "damaged"),
     ],

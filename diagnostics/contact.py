@@ -28,7 +28,7 @@ _SAMPLES = 3000  # stretches of touches that the model is fitted on, about
 _MOST_DRAWS = 8  # stretches of one touch: more of them say the same
 _SHORTEST = 6  # frames of a stretch
 _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
-_SOURCES = 12  # recordings: of fewer each touch is a source of its own
+_SOURCES = 12  # recordings: of fewer each touch is a source of its own, and counts
 _NOVEL = 0.1  # share of touches that resemble nothing known
 _FAMILIAR, _STRANGE = 1 / 400, 1 / 100  # chance that a touch does with a cell what none did before
 _SHARED = 0.4  # of what is said of a cell where few touches teach: that is true of the cells around it as well
@@ -179,8 +179,9 @@ class Seen(NamedTuple):
 
 
 def number_of(seen: Sequence[Seen]) -> int:
-    """How many touches these are worth, those seen again not counted."""
-    return sum(not touch.again for touch in seen)
+    """How many touches these are worth, those seen again not counted; all of them where there are few recordings."""
+    few = len({touch.recording for touch in seen}) < _SOURCES
+    return sum(few or not touch.again for touch in seen)
 
 
 def stretches(

@@ -150,5 +150,6 @@ def test_a_press_that_comes_again_and_again_teaches_as_much_as_once():
 
 @pytest.mark.parametrize(("recordings", "sources"), [(20, 20), (3, 18)])
 def test_a_recording_is_one_source_unless_there_are_few(recordings: int, sources: int):
-    _, source, _ = stretches(patted(recordings, 6), SCALE, np.random.default_rng(0))
+    _, source, number = stretches(patted(recordings, 6), SCALE, np.random.default_rng(0))
     assert sorted(set(source.tolist())) == list(range(sources))
+    assert number == sources

@@ -173,15 +173,20 @@ class Seen(NamedTuple):
     def of(cls, touches: Sequence[Touch], recording: int) -> list[Seen]:
         """Return where the touches of a recording were seen."""
         return [
-            cls(recording, touch.first, sum(part.n for part in touch.parts), again > 0)
+            cls(recording, touch.first, touch.n, again > 0)
             for touch, again in zip(touches, repeated(touches).tolist(), strict=True)
         ]
 
 
 def number_of(seen: Sequence[Seen]) -> int:
     """How many touches these are worth, those seen again not counted; all of them where there are few recordings."""
-    few = len({touch.recording for touch in seen}) < _SOURCES
+    few = _of_few(seen)
     return sum(few or not touch.again for touch in seen)
+
+
+def _of_few(seen: Sequence[Seen]) -> bool:
+    """Whether there are too few recordings to take each for one source."""
+    return len({touch.recording for touch in seen}) < _SOURCES
 
 
 def stretches(
@@ -217,9 +222,8 @@ def drawn(
             length = int(rng.integers(min(_SHORTEST, n), n + 1)) if draw else n
             at = int(rng.integers(0, n - length + 1))
             features.append(Summary.of(root[at : at + length], first + at, scale.root_near).features())
-    recording = np.unique([touch.recording for touch in seen], return_inverse=True)[1]
-    source = recording if recording[-1] >= _SOURCES - 1 else np.arange(len(seen))
-    return np.stack(features), source.repeat(draws)
+    sources = range(len(seen)) if _of_few(seen) else [touch.recording for touch in seen]
+    return np.stack(features), np.unique(sources, return_inverse=True)[1].repeat(draws)
 
 
 def surest_of(n_touches: int) -> float:

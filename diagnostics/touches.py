@@ -122,6 +122,11 @@ class Touch:
         """About the number of the first frame after it."""
         return self.parts[-1].first + self.parts[-1].n
 
+    @property
+    def n(self) -> int:
+        """How many frames it was looked at in."""
+        return sum(part.n for part in self.parts)
+
     def swing(self, weigh: Array) -> float:
         """How far its load has moved, summed over the cells with weights ``[D]``."""
         return float((self.highest - self.lowest) @ weigh)
@@ -151,7 +156,7 @@ class Touch:
 
     def mean(self) -> Array:
         """Return the mean root load of each cell, ``[D]``."""
-        return sum((p.total for p in self.parts[1:]), self.parts[0].total) / np.float32(sum(p.n for p in self.parts))
+        return sum((p.total for p in self.parts[1:]), self.parts[0].total) / np.float32(self.n)
 
 
 @dataclass(frozen=True)

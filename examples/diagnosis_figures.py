@@ -315,6 +315,11 @@ def held(log: Log, layout: SensorLayout, rng: np.random.Generator) -> Log:
     return seen
 
 
+def windows_of(log: Log, layout: SensorLayout) -> int:
+    """Return in how many windows a cell could raise a false alarm."""
+    return round(layout.present.sum() * sum(map(len, log)) / WINDOW)
+
+
 def healthy(bench: Bench) -> Iterator[Row]:
     layout, total_false, total_windows = bench.layout, 0, 0
     results = []
@@ -323,7 +328,7 @@ def healthy(bench: Bench) -> Iterator[Row]:
         for _, log, rng in bench.logs():
             seen = log if case == "healthy logs" else held(log, layout, rng)
             false += len(bench.fitted.diagnose(seen).fault_set)
-            windows += round(layout.present.sum() * sum(map(len, seen)) / WINDOW)
+            windows += windows_of(seen, layout)
         results.append((f"  {case}", false, windows, bench.count))
         total_false, total_windows = total_false + false, total_windows + windows
     results.insert(0, ("healthy, static holds included", total_false, total_windows, 2 * bench.count))

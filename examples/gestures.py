@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from diagnosis_figures import Bench, cells, lines, onset, show
+from diagnosis_figures import WINDOW, Bench, cells, lines, onset, show, windows_of
 
 from adaptfault.recordings import Recordings
 from diagnostics import SelfDiagnosis, SensorLayout
@@ -126,11 +126,11 @@ def blamed(bench: Bench, fitted: SelfDiagnosis) -> str:
     for _, log, _ in bench.logs():
         diagnosis = fitted.diagnose(log)
         logs += bool(diagnosis.faults)
-        windows += sum(len(frames) // 50 for frames in log) * diagnosis.layout.n_cells
+        windows += windows_of(log, bench.layout)
         for fault in diagnosis.faults:
             kinds[str(fault.kind)] += len(fault.cells)
     which = ", ".join(f"{n} {kind}" for kind, n in kinds.most_common()) or "no cell"
-    return f"healthy: {which} in {logs} of {bench.count} logs ({windows} windows of 50 frames)"
+    return f"healthy: {which} in {logs} of {bench.count} logs ({windows} windows of {WINDOW} frames)"
 
 
 def main(argv: Sequence[str] | None = None) -> None:

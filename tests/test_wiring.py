@@ -169,6 +169,9 @@ def test_cells_of_a_pad_with_a_live_one_are_not_suspected_together():
     groups = [group.tolist() for group in suspected(alike, mask([60]), weight, LAYOUT)]
     assert pad[:60] not in groups
     assert pad[61:] not in groups
+    addresses = [line for line in LAYOUT.lines if line.kind.endswith("address")]
+    moved = [LAYOUT.misaddressed(line, level)[0].tolist() for line in addresses for level in (0, 1)]
+    assert max(len(group) for group in groups if group not in moved) == 11  # no more than a column
 
 
 def test_a_few_doubtful_cells_do_not_convict_a_wire():

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference
-from diagnostics.resting import less_than_healthy
 from diagnostics.spatial import SUDDEN, Caution, Cells, Model, Spatial, apart_evidence, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.tare import Tare
@@ -112,7 +111,7 @@ class Memory:
     def temporal(self) -> NDArray[np.float64]:
         """What each cell's still stretch says, and the jump into it, a log likelihood ratio ``[D]``."""
         reference = self.reference
-        low = less_than_healthy(self.runs, reference.least, reference.tolerance, self.present)
+        low = reference.least.evidence(self.runs, self.rests(), reference.tolerance, self.present)
         return reference.onsets.evidence(self.runs, self.layout.full_scale) + low
 
     def model(self) -> Model:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from diagnostics.contact import ContactModel
 from diagnostics.layout import SensorLayout
 from diagnostics.patch_models import contact_model
-from diagnostics.resting import resting
-from diagnostics.tare import usual_offset
+from diagnostics.resting import Least, resting
+from diagnostics.tare import UsualOffset
 from diagnostics.temporal import Onsets, segments
 from diagnostics.touches import SEGMENT, Scale
 from diagnostics.transport import longest_repetition
@@ -35,7 +35,7 @@ class Reference:
         tolerance: how near to a value counts as that value, in the layout's unit.
         scale: what a reading means.
         onsets: how abruptly healthy cells come to rest.
-        least: that a healthy cell reads, see ``resting``.
+        least: that healthy cells read.
         offset: of all cells together that is usual.
         patience: a frame that comes again more often than this says nothing new.
         usual: how restless healthy cells are.
@@ -47,8 +47,8 @@ class Reference:
     tolerance: float
     scale: Scale
     onsets: Onsets
-    least: float
-    offset: float
+    least: Least
+    offset: UsualOffset
     patience: int
     usual: Usual
     twins: int
@@ -80,7 +80,7 @@ class Reference:
             scale,
             onsets,
             least,
-            usual_offset(recordings, scale, present),
+            UsualOffset.fit(recordings, scale, present),
             patience,
             Usual.fit(recordings, scale, layout),
             _usual_twins(recordings, layout, scale),
@@ -98,8 +98,8 @@ class Reference:
             tolerance,
             scale,
             Onsets.silent(),
-            -np.inf,
-            tolerance,
+            Least.unknown(layout.n_cells),
+            UsualOffset(0.0, tolerance),
             2 * _PATIENCE,
             Usual.unknown(scale),
             _TWINS,

@@ -1,13 +1,15 @@
-"""Where cells rest, how far an untouched one wanders from there, and the least that any reads.
+"""Where cells rest, how far an untouched one wanders from there, and the least that each reads.
 
 Skins that threshold their readings rest at one value. Others have noise, and their offsets wander from one recording to
 the next: neither is to be taken for a touch. And on a skin whose cells rest above 0, or are never quite calm, a cell
-that lost its wire gives itself away untouched, by a steady 0.
+that lost its wire gives itself away untouched, by a steady 0, and one that reads what it always did has most likely not
+lost it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,20 +24,82 @@ _LIGHT = 0.05  # of full scale: a cell that never read less above its rest than 
 _CALM = 0.25  # quantile of the noise of cells in recordings: touched cells have more
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
 _RARE = 0.001  # of the cells in recordings: what so few did is taken for none
+_OFTEN, _FEWEST = 0.5, 8  # share and number of recordings: what a cell reads in so many is its rest, not a load
+_BEYOND = 1.5  # times as far as ever from the usual: no healthy cell reads that little
 _WORTH = 12.0  # log likelihood ratio of reading less than any healthy cell
+_AS_EVER = -2.0  # and of what the cell itself always read, where that is not what an open one reads
 _CROWD = 0.5  # share of the cells: when so many read less than ever, their offset has moved
 _BLOCK = 4096  # cells looked at together
 
 Floats = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class Least:
+    """The least that each healthy cell reads at its highest, while it holds still.
+
+    Attributes:
+        reading: float ``[D]``; full scale where the noise lets no cell hold still; -inf: not known.
+        usual: so far above it most cells rest; -inf: not known.
+    """
+
+    reading: Floats
+    usual: float
+
+    @classmethod
+    def unknown(cls, n_cells: int) -> Least:
+        """Without a reference nothing is less than healthy."""
+        return cls(np.full(n_cells, -np.inf), -np.inf)
+
+    @classmethod
+    def fit(
+        cls, low: Floats, usual: Floats, peaks: Floats, present: NDArray[np.bool_], tolerance: float, full_scale: float
+    ) -> Least:
+        """Learn from what :func:`_low` returns of a reference."""
+        told = peaks[:, present]
+        reading = np.full(len(low), np.quantile(told[np.isfinite(told)], _RARE, method="lower") - 2 * tolerance)
+        # Where most cells rest at 0, one that always reads more is loaded.
+        if len(peaks) >= _FEWEST and np.median(low[present]) > tolerance:
+            peak = peaks - low
+            unloaded = peak < _LIGHT * full_scale
+            often = np.count_nonzero(unloaded, axis=0) >= _OFTEN * len(peaks)
+            told = peak[unloaded & present]
+            rare = float(np.quantile(told, _RARE, method="lower"))
+            beyond = max((_BEYOND - 1) * (float(np.median(told)) - rare), tolerance)
+            reading = np.where(often, np.maximum(reading, low + rare - beyond), reading)
+        return cls(reading, float(np.median((usual - reading)[present])))
+
+    def evidence(
+        self, runs: StillRuns, rests: NDArray[np.bool_], tolerance: float, present: NDArray[np.bool_]
+    ) -> Floats:
+        """Return what a still stretch says of being open, whatever touches the cell, a log likelihood ratio ``[D]``.
+
+        Args:
+            runs: the still stretches.
+            rests: bool ``[D]``, cells that read what an untouched one does, or less.
+            tolerance: a reading wanders so far around 0, the low rail.
+            present: bool ``[D]``.
+        """
+        value = runs.value
+        heard = present & np.isfinite(value)
+        # All of them together may rest lower by now.
+        above = value[heard] - self.reading[heard]
+        lower = min(0.0, float(np.median(above)) - self.usual) if np.isfinite(self.usual) and heard.any() else 0.0
+        least = self.reading + lower
+        less = heard & (runs.length >= SEGMENT) & (runs.high < least)
+        if less.sum() > _CROWD * present.sum():
+            return np.zeros(len(least))
+        open_ = (runs.high <= 2 * tolerance) | (runs.high < least[present].min())
+        as_ever = rests & heard & (runs.high >= least) & (least > tolerance)
+        return np.where(less & open_, _WORTH, np.where(as_ever, _AS_EVER, 0.0))
+
+
 def resting(
     recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance: float, full_scale: float
-) -> tuple[Floats, float]:
-    """Return the most that each cell reads untouched, ``[D]``, and the least that any healthy one reads.
+) -> tuple[Floats, Least]:
+    """Return the most that each cell reads untouched, ``[D]``, and the least that healthy ones read.
 
-    A cell without any reading rests at 0. Where the noise lets no cell hold still, the least is full scale; -inf: not
-    known.
+    A cell without any reading rests at 0.
 
     Args:
         recordings: ``[T, D]`` each.
@@ -43,24 +107,24 @@ def resting(
         tolerance: a cell is still while it stays within +- this; a wander within it counts as rest anyway.
         full_scale: of the layout.
     """
-    low = _low(recordings)
+    low, usual, peaks = _low(recordings)
     cells, some = Readings.of(recordings).sample(present)
-    offsets, bends, least = [], [], []
+    offsets, bends = [], []
     for frames in some:
         heard = ~np.isnan(frames).any(axis=0)
         if len(frames) > 2 and heard.any():
             whole = frames[:, heard]
             offsets.append(np.quantile(whole, _LEAST, axis=0) - low[cells[heard]])
             bends.append(np.median(np.abs(np.diff(whole, 2, axis=0)), axis=0))  # a load moves, but hardly bends
-            least.append(whole.min(axis=0))
     if not offsets:
-        return low, -np.inf
+        return low, Least.unknown(len(low))
     offset = np.concatenate(offsets)
     light = offset[offset < _LIGHT * full_scale]
     noise = float(np.quantile(np.concatenate(bends), _CALM)) / (0.6745 * np.sqrt(6))
-    wander = _highest(light) + _NOISE * noise
-    lowest = float(np.quantile(np.concatenate(least), _RARE, method="lower"))
-    return low + max(0.0, wander - tolerance), full_scale if noise > tolerance else lowest
+    most = low + max(0.0, _highest(light) + _NOISE * noise - tolerance)
+    if noise > tolerance:
+        return most, Least(np.full(len(low), full_scale), -np.inf)
+    return most, Least.fit(low, usual, peaks, present, tolerance, full_scale)
 
 
 def _highest(offset: Floats) -> float:
@@ -75,20 +139,27 @@ def _highest(offset: Floats) -> float:
     return usual + min(max(below, usual), 2 * usual)
 
 
-def less_than_healthy(runs: StillRuns, least: float, tolerance: float, present: NDArray[np.bool_]) -> Floats:
-    """Return what holding less than the ``least`` of any healthy cell says, a log likelihood ratio ``[D]``."""
-    value = np.nan_to_num(runs.value, nan=np.inf)
-    less = present & (runs.length >= SEGMENT) & (value < least - 2 * tolerance)
-    return np.where(less & (less.sum() <= _CROWD * present.sum()), _WORTH, 0.0)
+def _low(recordings: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
+    """Return a low quantile and the median of each cell's readings, ``[D]``; 0 for a cell without any.
 
-
-def _low(recordings: Sequence[Floats]) -> Floats:
-    """Return a low quantile of each cell's readings, ``[D]``; 0 for a cell without any."""
+    And the lowest that it read at its highest in half a segment of each recording, ``[recordings, D]``.
+    """
     readings, n_cells = Readings.of(recordings), recordings[0].shape[1]
-    low = np.zeros(n_cells)
+    low, usual, peaks = np.zeros(n_cells), np.zeros(n_cells), np.full((len(readings), n_cells), np.nan)
     for first in range(0, n_cells, _BLOCK):
         cells = np.arange(first, min(first + _BLOCK, n_cells))
-        frames = np.concatenate([readings.piece(i, slice(None), cells) for i in range(len(readings))])
+        pieces = [readings.piece(i, slice(None), cells) for i in range(len(readings))]
+        for i, frames in enumerate(pieces):
+            peaks[i, cells] = _lowest_peak(frames)
+        frames = np.concatenate(pieces)
         heard = ~np.isnan(frames).all(axis=0)
-        low[cells[heard]] = np.nanquantile(frames[:, heard], _LOW, axis=0)
-    return low
+        low[cells[heard]], usual[cells[heard]] = np.nanquantile(frames[:, heard], [_LOW, 0.5], axis=0)
+    return low, usual, peaks
+
+
+def _lowest_peak(frames: Floats) -> Floats:
+    """Return the lowest of the highest readings in half a segment, ``[D]``: a still stretch of one shows as much."""
+    length = min(SEGMENT // 2, len(frames))
+    whole = len(frames) // length * length
+    lowest: Floats = np.fmin.reduce(np.fmax.reduce(frames[:whole].reshape(-1, length, frames.shape[1]), axis=1), axis=0)
+    return lowest

@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from diagnostics.contact import ContactModel
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference, living
+from diagnostics.resting import Least
 from diagnostics.rim import INPUTS, Rim
+from diagnostics.tare import UsualOffset
 from diagnostics.temporal import Onsets
 from diagnostics.tiles import Tile
 from diagnostics.touches import Scale
@@ -22,7 +24,8 @@ Arrays = dict[str, NDArray[Any]]
 
 # Fields of a tile or of the rim that are not stored as arrays: in the dict, or following from others.
 _TOLD = ("surest", "place", "touches")
-_ENDLESS = ("scale",)  # arrays that may hold infinity: a feature that never changed is divided by it
+# Arrays that may hold infinity: a feature that never changed is divided by it, and nothing is less than not known.
+_ENDLESS = ("scale", "least")
 _UNKNOWN = ("spread",)  # arrays that may hold NaN: of cells that were never loaded
 
 
@@ -53,19 +56,20 @@ def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
     about = {
         "tolerance": float(reference.tolerance),
         "near": float(reference.scale.near),
-        "least": float(reference.least) if np.isfinite(reference.least) else None,
+        "usual": float(reference.least.usual) if np.isfinite(reference.least.usual) else None,
         "patience": int(reference.patience),
         "blinks": float(reference.usual.blinks),
         "blinks_count": float(reference.usual.blinks_count),
         "noise_counts": float(reference.usual.noise_counts),
         "alone": bool(reference.usual.alone),
-        "offset": float(reference.offset),
+        "offset": [float(value) for value in reference.offset],
         "twins": int(reference.twins),
         "surest": None if reference.model is None else [float(tile.surest) for tile in reference.model.tiles],
         "rim": reference.model.rim.touches if reference.model and reference.model.rim else None,
     }
     arrays: Arrays = {
         "resting": reference.scale.resting,
+        "least": reference.least.reading,
         "onsets": reference.onsets.log_ratio,
         "noise": reference.usual.noise,
         "dead": reference.dead,
@@ -95,8 +99,11 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
         float(about["tolerance"]),
         scale,
         Onsets(read("onsets", unknown.onsets.log_ratio)),
-        -np.inf if about["least"] is None else float(about["least"]),
-        float(about["offset"]),
+        Least(
+            read("least", unknown.least.reading),
+            -np.inf if about["usual"] is None else float(about["usual"]),
+        ),
+        UsualOffset(*(float(value) for value in about["offset"])),
         int(about["patience"]),
         Usual(
             float(about["blinks"]),
@@ -115,8 +122,8 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
     if not (np.isfinite(positive).all() and min(positive) > 0):
         wanted = "tolerance, near, patience, blinks, blinks_count and noise_counts"
         raise ValueError(f"expected positive numbers for {wanted}, got {positive}")
-    if np.isnan([reference.least, reference.offset]).any():
-        raise ValueError(f"expected numbers for least and offset, got {reference.least} and {reference.offset}")
+    if np.isnan([reference.least.usual, *reference.offset]).any():
+        raise ValueError(f"expected numbers for usual and offset, got {reference.least.usual}, {reference.offset}")
     return reference
 
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.readings import Readings
 from diagnostics.touches import Scale
@@ -24,13 +25,43 @@ _FRAMES = 20  # of each recording that tell, about
 Floats = NDArray[np.float64]
 
 
+class UsualOffset(NamedTuple):
+    """Offsets of all cells together that healthy skins show.
+
+    Attributes:
+        mostly: below 0 where cells mostly rest lower than they may, as their offsets wander.
+        most: an offset that is as in the reference.
+    """
+
+    mostly: float
+    most: float
+
+    @classmethod
+    def fit(cls, recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_]) -> UsualOffset:
+        """Look at a reference, recordings ``[T, D]`` each."""
+        cells, some = Readings.of(recordings).sample(present)
+        common: list[float] = []
+        for frames in some:
+            if len(frames):
+                above = frames - scale.resting[cells]
+                common += [_least_loaded(frame) for frame in above[:: max(1, len(above) // _FRAMES)]]
+        common = common or [0.0]
+        mostly = min(0.0, float(np.median(common)))
+        return cls(mostly, max(mostly + scale.near / 2, float(np.quantile(common, _USUAL))))
+
+    def beyond(self, offset: ArrayLike) -> Floats:
+        """Return how far offsets ``[...]`` lie above where cells mostly rest; 0 for those that are usual."""
+        offset = np.asarray(offset, dtype=np.float64)
+        return np.where(offset > self.most, offset - self.mostly, 0.0)
+
+
 @dataclass(frozen=True)
 class Tare:
     """How far untouched cells now read above where they rested in the reference.
 
     Attributes:
         lowest: float ``[D]``, the lowest reading of each cell in the log, above that; inf where there was none.
-        own: float ``[D]``, the offset of each cell that follows from it.
+        own: float ``[D]``, the offset of each cell that follows from it, beside that of all.
         common: that of all cells together, beside their own, in each of the last frames ``[t]``.
     """
 
@@ -43,23 +74,24 @@ class Tare:
         """Nothing seen yet."""
         return cls(np.full(n_cells, np.inf), np.zeros(n_cells), np.zeros(1))
 
-    def extend(self, frames: Floats, scale: Scale, present: NDArray[np.bool_], usual: float) -> Tare:
+    def extend(self, frames: Floats, scale: Scale, present: NDArray[np.bool_], usual: UsualOffset) -> Tare:
         """Return the offsets after more frames.
 
         Args:
             frames: ``[t, D]``, NaN = missing.
             scale: where cells rested in the reference.
             present: bool ``[D]``.
-            usual: an offset of all cells that is as in the reference.
+            usual: what the reference shows.
         """
         lowest = np.fmin(self.lowest, np.fmin.reduce(frames) - scale.resting)
-        own = np.where((lowest > scale.near / 2) & (lowest < _OWN * scale.full_scale), lowest, 0.0)
+        together = usual.beyond(_least_loaded(lowest[present]))
+        alone = lowest - np.where(together < _COMMON * scale.full_scale, together, 0.0)
+        own = np.where((alone > scale.near / 2) & (alone < _OWN * scale.full_scale), alone, 0.0)
         # Mostly all cells together have none: enough of them read no more than usual all through.
-        calm = present & (np.fmax.reduce(frames) - scale.resting - own <= usual)
+        calm = present & (np.fmax.reduce(frames) - scale.resting - own <= usual.most)
         if np.count_nonzero(calm) > _LEAST_LOADED * np.count_nonzero(present):
             return Tare(lowest, own, np.zeros(len(frames)))
-        common = np.array([_common(frame) for frame in (frames - scale.resting - own)[:, present]])
-        common[common <= usual] = 0.0
+        common = usual.beyond([_least_loaded(frame) for frame in (frames - scale.resting - own)[:, present]])
         last = self.common[-1]
         for t in np.flatnonzero(common >= _COMMON * scale.full_scale):  # nearly all cells are loaded: it stays
             common[t] = common[t - 1] if t else last
@@ -76,18 +108,7 @@ class Tare:
         return frames - drift[:, None] if drift.any() else frames
 
 
-def usual_offset(recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_]) -> float:
-    """Return the largest offset of all cells that is usual in a reference, recordings ``[T, D]`` each."""
-    cells, some = Readings.of(recordings).sample(present)
-    common: list[float] = []
-    for frames in some:
-        if len(frames):
-            above = frames - scale.resting[cells]
-            common += [_common(frame) for frame in above[:: max(1, len(above) // _FRAMES)]]
-    return max(scale.near / 2, float(np.quantile(common, _USUAL)) if common else 0.0)
-
-
-def _common(above: Floats) -> float:
+def _least_loaded(above: Floats) -> float:
     """Return how far the cells that are loaded least are above their rest, from that of all, ``[n]``."""
     heard = above[np.isfinite(above)]
     k = int(_LEAST_LOADED * (len(heard) - 1))

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from diagnostics import Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
-from diagnostics.resting import less_than_healthy, resting
+from diagnostics.resting import Least, resting
 from diagnostics.temporal import StillRuns
 
 LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
@@ -30,7 +30,7 @@ def noisy(recordings: list[np.ndarray], sigma: float, rest: float, seed: int = 9
 def test_a_skin_that_thresholds_rests_at_its_one_value():
     most, least = resting(touches(0), PRESENT, TOLERANCE, 1.0)
     np.testing.assert_array_equal(most, np.zeros(CELLS))
-    assert least == 0
+    assert (least.reading < 0).all()  # nothing is less than 0
 
 
 def test_noise_at_rest_is_no_load():
@@ -38,7 +38,7 @@ def test_noise_at_rest_is_no_load():
     idle = noisy([np.zeros((2000, CELLS))], 0.01, 0.1, seed=3)[0]
     assert (idle > most + 2 * TOLERANCE).mean() < 1e-3
     assert most.max() < 0.25
-    assert least == 1.0  # no healthy cell holds still there
+    np.testing.assert_array_equal(least.reading, np.ones(CELLS))  # no healthy cell holds still there
 
 
 def test_offsets_that_wander_between_recordings_are_no_load():
@@ -78,18 +78,53 @@ def test_a_cell_that_was_never_heard_rests_at_0():
 def test_two_frames_tell_nothing_of_noise_and_no_cell_reads_less_than_they_show():
     most, least = resting([np.full((2, 3), 0.4)], np.ones(3, bool), TOLERANCE, 1.0)
     assert most.tolist() == [0.4] * 3
-    assert least == -np.inf
+    assert (least.reading == -np.inf).all()
 
 
-def test_reading_less_than_any_healthy_cell_is_evidence_unless_half_of_them_do():
-    def of(low: int) -> np.ndarray:
-        frames = np.full((40, 10), 0.1)
-        frames[:, :low] = 0.0
-        runs = StillRuns.begin(10).extend(frames, np.arange(40), TOLERANCE)
-        return less_than_healthy(runs, 0.08, TOLERANCE, np.ones(10, bool))
+def said(readings: np.ndarray, least: Least) -> np.ndarray:
+    """What 40 frames of these readings say."""
+    frames, every = np.tile(readings, (40, 1)), np.ones(len(readings), bool)
+    runs = StillRuns.begin(len(readings)).extend(frames, np.arange(40), TOLERANCE)
+    return least.evidence(runs, every, TOLERANCE, every)
 
-    assert (of(3) > 0).tolist() == [True] * 3 + [False] * 7
-    assert not of(6).any()
+
+def test_reading_less_than_ever_is_evidence_unless_half_of_the_cells_do():
+    least = Least(np.full(10, 0.08), 0.02)
+    assert (said(np.repeat([0.0, 0.1], [3, 7]), least) > 0).tolist() == [True] * 3 + [False] * 7
+    assert not (said(np.repeat([0.0, 0.1], [6, 4]), least) > 0).any()
+
+
+def test_reading_what_it_always_did_speaks_for_a_cell_that_rests_above_the_rail():
+    least = Least(np.array([0.08, 0.08, 0.004, -0.01]), 0.02)
+    assert (said(np.array([0.1, 0.09, 0.01, 0.0]), least) < 0).tolist() == [True, True, False, False]
+
+
+def test_where_all_rest_lower_by_now_less_is_not_less_than_healthy():
+    least = Least(np.full(10, 0.04), 0.01)
+    warm = np.full(10, 0.05)
+    warm[:2] = 0
+    assert (said(warm, least) > 0).tolist() == [True] * 2 + [False] * 8
+    assert (said(np.maximum(warm - 0.03, 0), least) > 0).tolist() == [True] * 2 + [False] * 8
+    assert not (said(np.maximum(warm - 0.045, 0), least) > 0).any()  # healthy ones read next to nothing, too
+
+
+def test_each_cell_has_a_least_of_its_own():
+    recordings = noisy(touches(0), 0.001, 0.04)
+    _, least = resting(recordings, PRESENT, TOLERANCE, 1.0)
+    fresh = noisy(touches(1), 0.001, 0.04, seed=4)
+    assert (np.min([r[a : a + 32].max(axis=0) for r in fresh for a in (0, 32)], axis=0) > least.reading).all()
+    untouched = np.median(np.concatenate(recordings), axis=0)[48:]
+    assert (untouched - least.reading[48:] < 3 * TOLERANCE).all()
+    assert (least.reading > 2 * TOLERANCE).all()
+
+
+def test_a_cell_that_is_always_loaded_has_no_rest_to_fall_short_of():
+    held = noisy(touches(0), 0.001, 0.04)
+    rng = np.random.default_rng(0)
+    for recording in held:
+        recording[:, 60] += rng.uniform(0.1, 0.4)
+    _, least = resting(held, PRESENT, TOLERANCE, 1.0)
+    assert least.reading[60] < 0.04 < held[0][:, 60].min()
 
 
 @pytest.mark.parametrize(("sigma", "rest"), [(0.0, 0.08), (0.01, 0.1)])

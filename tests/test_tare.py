@@ -4,12 +4,12 @@ from test_resting import touches
 
 from adaptfault.grasps import simulate
 from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, SensorLayout, inject
-from diagnostics.tare import Tare, usual_offset
+from diagnostics.tare import Tare, UsualOffset
 from diagnostics.touches import Scale
 
 LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
 CELLS, PRESENT = LAYOUT.n_cells, np.ones(LAYOUT.n_cells, bool)
-USUAL = 0.005
+USUAL = UsualOffset(0.0, 0.005)
 SCALE = Scale(np.zeros(CELLS), 0.01, 1.0)
 
 
@@ -44,8 +44,27 @@ def test_an_offset_of_one_cell_is_its_lowest_reading_and_a_large_one_is_a_load()
 
 
 def test_an_offset_as_in_the_reference_is_usual():
-    assert usual_offset(touches(0), SCALE, PRESENT) == USUAL
-    assert usual_offset([r + 0.02 for r in touches(0)], SCALE, PRESENT) == pytest.approx(0.02)
+    assert UsualOffset.fit(touches(0), SCALE, PRESENT) == USUAL
+    assert UsualOffset.fit([r + 0.02 for r in touches(0)], SCALE, PRESENT) == pytest.approx((0, 0.02))
+
+
+def test_where_rests_wander_an_offset_counts_from_where_cells_mostly_rest():
+    rng = np.random.default_rng(0)
+    wander = [r + 0.006 * rng.standard_normal(CELLS) for r in touches(0)]
+    highest = Scale(np.full(CELLS, 0.02), 0.01, 1.0)
+    usual = UsualOffset.fit(wander, highest, PRESENT)
+    assert usual.mostly == pytest.approx(-0.024, abs=0.005)  # a quarter of the cells rests lower still
+    assert usual.mostly < usual.most < -0.01
+    warmer = Tare.begin(CELLS).extend(wander[0] + 0.015, highest, PRESENT, usual)
+    assert warmer.common == pytest.approx(0.015, abs=0.003)
+
+
+def test_a_large_offset_of_all_cells_is_not_taken_for_one_of_each():
+    rng = np.random.default_rng(0)
+    frames = touches(1)[0] + 0.001 * rng.standard_normal(CELLS)
+    tare = Tare.begin(CELLS).extend(frames + 0.019, SCALE, PRESENT, USUAL)  # of single cells up to 0.02
+    assert tare.common == pytest.approx(0.019, abs=0.003)
+    assert not tare.own.any()
 
 
 def test_a_small_offset_of_one_cell_is_no_load_where_the_reference_held_light_loads_throughout():

@@ -112,7 +112,9 @@ class Memory:
         """What each cell's still stretch says, and the jump into it, a log likelihood ratio ``[D]``."""
         reference = self.reference
         low = reference.least.evidence(self.runs, self.rests(), reference.tolerance, self.present)
-        return reference.onsets.evidence(self.runs, self.layout.full_scale) + low
+        noise = reference.flicker.evidence(self.runs, self.rests(), self.present)
+        untouched = np.where(np.abs(noise) > np.abs(low), noise, low)
+        return reference.onsets.evidence(self.runs, self.layout.full_scale) + untouched
 
     def model(self) -> Model:
         """What healthy cells would do; without a reference, as far as this log tells."""

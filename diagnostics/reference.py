@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.contact import ContactModel
+from diagnostics.flicker import Flicker
 from diagnostics.layout import SensorLayout
 from diagnostics.patch_models import contact_model
 from diagnostics.resting import Least, resting
@@ -36,6 +37,7 @@ class Reference:
         scale: what a reading means.
         onsets: how abruptly healthy cells come to rest.
         least: that healthy cells read.
+        flicker: how long they read the same.
         offset: of all cells together that is usual.
         patience: a frame that comes again more often than this says nothing new.
         usual: how restless healthy cells are.
@@ -48,6 +50,7 @@ class Reference:
     scale: Scale
     onsets: Onsets
     least: Least
+    flicker: Flicker
     offset: UsualOffset
     patience: int
     usual: Usual
@@ -80,6 +83,7 @@ class Reference:
             scale,
             onsets,
             least,
+            Flicker.fit(recordings, present),
             UsualOffset.fit(recordings, scale, present),
             patience,
             Usual.fit(recordings, scale, layout),
@@ -99,6 +103,7 @@ class Reference:
             scale,
             Onsets.silent(),
             Least.unknown(layout.n_cells),
+            Flicker.unknown(layout.n_cells),
             UsualOffset(0.0, tolerance),
             2 * _PATIENCE,
             Usual.unknown(scale),

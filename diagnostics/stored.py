@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.contact import ContactModel
+from diagnostics.flicker import Flicker
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference, living
 from diagnostics.resting import Least
@@ -25,7 +26,7 @@ Arrays = dict[str, NDArray[Any]]
 # Fields of a tile or of the rim that are not stored as arrays: in the dict, or following from others.
 _TOLD = ("surest", "place", "touches")
 # Arrays that may hold infinity: a feature that never changed is divided by it, and nothing is less than not known.
-_ENDLESS = ("scale", "least")
+_ENDLESS = ("scale", "least", "longest")
 _UNKNOWN = ("spread",)  # arrays that may hold NaN: of cells that were never loaded
 
 
@@ -57,6 +58,7 @@ def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
         "tolerance": float(reference.tolerance),
         "near": float(reference.scale.near),
         "usual": float(reference.least.usual) if np.isfinite(reference.least.usual) else None,
+        "recording": float(reference.flicker.recording),
         "patience": int(reference.patience),
         "blinks": float(reference.usual.blinks),
         "blinks_count": float(reference.usual.blinks_count),
@@ -70,6 +72,7 @@ def reference_state(reference: Reference) -> tuple[dict[str, Any], Arrays]:
     arrays: Arrays = {
         "resting": reference.scale.resting,
         "least": reference.least.reading,
+        "longest": reference.flicker.longest,
         "onsets": reference.onsets.log_ratio,
         "noise": reference.usual.noise,
         "dead": reference.dead,
@@ -103,6 +106,7 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
             read("least", unknown.least.reading),
             -np.inf if about["usual"] is None else float(about["usual"]),
         ),
+        Flicker(read("longest", unknown.flicker.longest), float(about["recording"])),
         UsualOffset(*(float(value) for value in about["offset"])),
         int(about["patience"]),
         Usual(
@@ -118,9 +122,9 @@ def reference_from_state(about: Mapping[str, Any], arrays: Mapping[str, ArrayLik
     )
     usual = reference.usual
     shares = (usual.blinks, usual.blinks_count, usual.noise_counts)
-    positive = (reference.tolerance, scale.near, reference.patience, *shares)
+    positive = (reference.tolerance, scale.near, reference.flicker.recording, reference.patience, *shares)
     if not (np.isfinite(positive).all() and min(positive) > 0):
-        wanted = "tolerance, near, patience, blinks, blinks_count and noise_counts"
+        wanted = "tolerance, near, recording, patience, blinks, blinks_count and noise_counts"
         raise ValueError(f"expected positive numbers for {wanted}, got {positive}")
     if np.isnan([reference.least.usual, *reference.offset]).any():
         raise ValueError(f"expected numbers for usual and offset, got {reference.least.usual}, {reference.offset}")

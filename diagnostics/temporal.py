@@ -32,6 +32,7 @@ class StillRuns:
         jump: float ``[D]``, by how much the reading changed in the step before it; 0 where it never moved.
         company: float ``[D]``, share of the loaded cells that fell, or rose, as drastically in that very step.
         last: float ``[D]``, the last reading.
+        same: int ``[D]``, how many frames on end have had exactly that reading.
     """
 
     start: NDArray[np.intp]
@@ -41,12 +42,13 @@ class StillRuns:
     jump: Floats
     company: Floats
     last: Floats
+    same: NDArray[np.intp]
 
     @classmethod
     def begin(cls, n_cells: int) -> StillRuns:
         """Nothing seen yet."""
         zero, nothing = np.zeros(n_cells, np.intp), np.full(n_cells, np.inf)
-        return cls(zero, zero, nothing, -nothing, np.zeros(n_cells), np.zeros(n_cells), np.full(n_cells, np.nan))
+        return cls(zero, zero, nothing, -nothing, np.zeros(n_cells), np.zeros(n_cells), np.full(n_cells, np.nan), zero)
 
     def extend(
         self, frames: Floats, numbers: NDArray[np.intp], tolerance: float, resting: Floats | float = 0.0
@@ -99,7 +101,7 @@ class StillRuns:
         if any_missing:
             backwards = (~missing[::-1]).argmax(axis=0)
             last = np.where(heard > 0, frames[len(frames) - 1 - backwards, np.arange(len(last))], self.last)
-        return StillRuns(start, length, low, high, jump, company, last)
+        return StillRuns(start, length, low, high, jump, company, last, same_for(frames, self.last, self.same)[-1])
 
     def of(self, cells: NDArray[np.intp]) -> StillRuns:
         """Return the runs of some cells."""
@@ -121,6 +123,22 @@ class StillRuns:
         """bool ``[D]``, False where a cell jumped into its stretch as many others did, as when a grasp ends."""
         alone: NDArray[np.bool_] = self.company < _COMPANY
         return alone
+
+
+def same_for(frames: Floats, last: Floats, before: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return for how many frames on end each cell has read the same, by the end of each frame, ``[t, D]``.
+
+    Args:
+        frames: ``[t, D]``; NaN = missing, which is no change.
+        last: ``[D]``, the reading before them; NaN: none yet.
+        before: int ``[D]``, for how many frames on end it had been that.
+    """
+    changed = np.empty(frames.shape, bool)
+    changed[0] = np.abs(frames[0] - last) > 0
+    changed[1:] = np.abs(frames[1:] - frames[:-1]) > 0
+    number = np.arange(1, len(frames) + 1)[:, None]
+    since = np.maximum.accumulate(np.where(changed, number - 1, -before), axis=0)
+    return np.asarray(number - since)
 
 
 def _in_each(which: NDArray[np.bool_]) -> NDArray[np.int32]:

@@ -40,10 +40,12 @@ _MOST_FRAMES = 600  # of a recording in one log
 _LEARNED_SHARE = 0.75  # of the recordings teach what healthy looks like, the others make the logs
 _MOST_TEMPORAL = 1.0  # what temporal evidence may be worth, whatever the logs say: a jump alone proves nothing
 _KINDS = 3
+_LOADED_THROUGHOUT = 3  # a cell that never moved and holds a load: weighed as kind 0, but for what is beyond
 _SUSPICIOUS = 2.8  # log likelihood ratio from which on a cell is left out when others are judged
 _SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw one
 _DOUBT, _STRANGE = 0.5, 22.0  # so much of the evidence does not count where few recordings were held out, and how few
 _LOOSE = 10.0  # variance of the weights before any log is seen
+_ODD = 3  # healthy cells that are held for certain to be faulty: fewer tell nothing
 _CLIP = 6.0  # log ratios beyond this say "certain"; they must not steer the fit
 _SURE = 24.0  # and beyond this, not even more certain
 _EXPECTED, _EXPECTED_LATE = 0.02, 0.005  # share of faulty cells before a log is seen: from the start, and in it
@@ -72,12 +74,15 @@ class Weights:
     Attributes:
         offset, slope, temporal: log odds = ``offset + slope * spatial ratio + temporal * temporal ratio``, before how
             common faults are; of each kind.
+        beyond: the slope for as much of the spatial ratio as says "certain"; of cells of kind 0 that hold a load it
+            is the slope, as ever: what expects too many loads is no reason to doubt them.
         gains: share of the evidence of another gain that counts.
     """
 
     offset: tuple[float, ...] = (0.0, -1.0, -1.0)
     slope: tuple[float, ...] = (0.6, 0.6, 0.6)
     temporal: tuple[float, ...] = (1.0, 0.5, 0.5)
+    beyond: tuple[float, ...] = (0.6, 0.6, 0.6)
     gains: float = 1.0
 
     @classmethod
@@ -117,8 +122,9 @@ class Weights:
             weights = cls._of([_trial(*log, weights.caution._replace(gains=1.0)) for log in logs[:n]])
         # Few meet the strange touches; those held out in turn teach one another, and count for fewer.
         counts = 1 - _DOUBT / (1 + turns * (held_out / _STRANGE) ** 2)
-        slopes = zip(weights.slope, usual.slope, strict=True)
-        return replace(weights, slope=tuple(s if s == default else counts * s for s, default in slopes))
+        told = np.array(weights.slope) != usual.slope
+        slope, beyond = (np.where(told, counts * np.array(of), of) for of in (weights.slope, weights.beyond))
+        return replace(weights, slope=tuple(slope.tolist()), beyond=tuple(beyond.tolist()))
 
     @classmethod
     def _of(cls, trials: Sequence[_Trial]) -> Weights:
@@ -127,20 +133,27 @@ class Weights:
         kind, ratio, temporal, dead = (np.concatenate(column) for column in told)
         evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
         usual = cls()
-        found = list(zip(usual.offset, usual.slope, usual.temporal, strict=True))
+        found = list(zip(usual.offset, usual.slope, usual.temporal, usual.beyond, strict=True))
         for k in range(_KINDS):
-            of, alike = kind == k, (kind > 0) == (k > 0)
+            of, alike = kind % _KINDS == k, (kind % _KINDS > 0) == (k > 0)
             if min(dead[of].sum(), (~dead[of]).sum()) >= _FEWEST_CELLS:
-                fitted = _bounded_logistic(evidence[of], dead[of], float(logit(dead[alike].mean())))
+                base = float(logit(dead[alike].mean()))
+                fitted = _bounded_logistic(evidence[of], dead[of], base)
                 if fitted[1] > 0:
-                    found[k] = fitted
-        offset, slope, temporal_share = zip(*found, strict=True)
-        return cls(offset, slope, temporal_share, gains_count(max(gain)))
+                    certain = (kind == k) & (ratio > _CLIP)
+                    odds = base + np.column_stack([np.ones(len(ratio)), evidence])[certain] @ fitted
+                    found[k] = (
+                        *fitted,
+                        _slope(np.minimum(ratio[certain], _SURE) - _CLIP, odds, dead[certain], fitted[1]),
+                    )
+        offset, slope, temporal_share, beyond = zip(*found, strict=True)
+        return cls(offset, slope, temporal_share, beyond, gains_count(max(gain)))
 
     @property
     def caution(self) -> Caution:
         """The ratio from which on a cell is no longer asked about the others, and what gains are worth."""
-        suspicious = (_SUSPICIOUS - self.offset[0]) / self.slope[0]
+        missing = _SUSPICIOUS - self.offset[0] - self.slope[0] * _CLIP  # where evidence says "certain"
+        suspicious = _CLIP + missing / (self.slope[0] if missing < 0 else max(self.beyond[0], 1e-9))
         return Caution(float(np.clip(suspicious, *_SUSPICIOUS_BOUNDS)), self.gains)
 
     def worth(self, ratio: Floats, temporal: Floats, kind: NDArray[np.intp]) -> Floats:
@@ -151,8 +164,11 @@ class Weights:
             temporal: float ``[D]``, temporal log likelihood ratio.
             kind: int ``[D]``, see the class.
         """
-        offset, slope, share = (np.array(of)[kind] for of in (self.offset, self.slope, self.temporal))
-        worth: Floats = offset + slope * np.clip(ratio, -_SURE, _SURE) + share * temporal
+        weights = self.offset, self.slope, self.temporal, self.beyond
+        offset, slope, share, beyond = (np.array(of)[kind % _KINDS] for of in weights)
+        beyond = np.where(kind == _LOADED_THROUGHOUT, slope, beyond)
+        certain = np.clip(ratio - _CLIP, 0.0, _SURE - _CLIP)
+        worth: Floats = offset + slope * np.clip(ratio, -_SURE, _CLIP) + beyond * certain + share * temporal
         return worth
 
     def probability(self, worth: Floats, kind: NDArray[np.intp], asked: NDArray[np.bool_]) -> Floats:
@@ -161,10 +177,11 @@ class Weights:
         Only the cells that were ``asked`` (bool ``[D]``) are still; the others move, and are as good as alive.
         """
         probability = np.full(len(worth), float(expit(_MOVING_ODDS)))
-        late, early = asked & (kind > 0), asked & (kind == 0)
+        began = kind % _KINDS > 0  # to be still
+        late, early = asked & began, asked & ~began
         probability[late] = _posterior(worth[late], _EXPECTED_LATE, _EXPECTED_CELLS_LATE)
         # Of the cells that never moved as many broke in the log as of those that did, or they were broken before.
-        broke = probability[late].sum() / ((kind > 0).sum() + _EXPECTED_CELLS)
+        broke = probability[late].sum() / (began.sum() + _EXPECTED_CELLS)
         probability[early] = _posterior(worth[early], _EXPECTED + float(broke), _EXPECTED_CELLS)
         return probability
 
@@ -207,6 +224,32 @@ def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) ->
     return offset, slope, temporal
 
 
+def _slope(beyond: Floats, odds: Floats, dead: NDArray[np.bool_], usual: float) -> float:
+    """Return what evidence ``[n]`` is worth that goes so far ``beyond`` what is held for certain, 0 to ``usual``.
+
+    Where hardly a healthy cell goes there, as much as ``usual``.
+
+    Args:
+        beyond: ratio.
+        odds: log odds of all that the ratio does not tell, ``[n]``.
+        dead: bool ``[n]``.
+        usual: what a ratio is worth up to there.
+    """
+    from scipy.optimize import minimize
+
+    if np.count_nonzero(~dead) < _ODD:
+        return usual
+    x = np.column_stack([np.ones(len(beyond)), beyond])
+
+    def loss(weights: Floats) -> tuple[float, Floats]:
+        told = odds + x @ weights
+        return float(np.logaddexp(0, told).sum() - told[dead].sum()), x.T @ (expit(told) - dead)
+
+    # That what is held for certain is not is another matter than what more of it is worth.
+    _, slope = minimize(loss, np.zeros(2), jac=True, bounds=[(None, 0.0), (0.0, usual)]).x.tolist()
+    return float(slope)
+
+
 def _stretch(recording: Floats, rng: np.random.Generator) -> Floats:
     """Return a recording, ``[T, D]``, or part of a long one."""
     begin = int(rng.integers(len(recording) - _MOST_FRAMES)) if len(recording) > _MOST_FRAMES else 0
@@ -215,7 +258,8 @@ def _stretch(recording: Floats, rng: np.random.Generator) -> Floats:
 
 def kinds(memory: Memory) -> NDArray[np.intp]:
     """Return the kind of each cell, ``[D]``, see :class:`Weights`."""
-    return np.where(memory.runs.moved, np.where(memory.rests(), 1, 2), 0)
+    rests = memory.rests()
+    return np.where(memory.runs.moved, np.where(rests, 1, 2), np.where(rests, 0, _LOADED_THROUGHOUT))
 
 
 def _trial(

@@ -68,6 +68,8 @@ SKINS = {
     "no crosstalk": Skin(crosstalk=0.0),
     "noise 0.4 %, crosstalk 15 %": Skin(noise=0.004, rest=0.05, crosstalk=0.15),
     "rest wanders by 0.6 %": Skin(noise=0.001, rest=0.1, wander=0.006),
+    "rest wanders by 1 %": Skin(rest=0.05, wander=0.01),
+    "rests at 0": Skin(rest=0.0, wander=0.0),
     "16 x 16": Skin(16),
 }
 

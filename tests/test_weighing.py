@@ -7,7 +7,7 @@ from sklearn.linear_model import LogisticRegression
 
 from adaptfault.recordings import Recordings
 from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject, weighing
-from diagnostics.weighing import Weights, _bounded_logistic, faulty_at
+from diagnostics.weighing import Weights, _bounded_logistic, _slope, faulty_at
 
 ASKED = np.ones(100, bool)
 EARLY = np.zeros(100, int)  # of the kind that never moved
@@ -163,3 +163,20 @@ def test_within_the_bounds_it_is_a_logistic_regression():
     free = LogisticRegression(C=10.0).fit(evidence, dead)
     expected = (free.intercept_[0] + 0.5, *free.coef_[0])
     assert _bounded_logistic(evidence, dead, base=-0.5) == pytest.approx(expected, abs=2e-3)
+
+
+def test_more_evidence_than_is_held_for_certain_is_worth_the_less_the_farther_healthy_cells_go():
+    beyond = np.concatenate([np.linspace(0, 18, 40), np.linspace(0, 18, 40)])
+    odds, dead = np.full(80, 3.0), np.arange(80) < 40
+    assert _slope(beyond, odds, dead, 1.5) < 0.1  # so far healthy ones go as the others
+    beyond[~dead] /= 20
+    assert _slope(beyond, odds, dead, 1.5) == pytest.approx(1.5)  # all of them err by little
+    few = dead | (np.arange(80) > 77)
+    assert _slope(beyond, odds, few, 1.5) == 1.5
+
+
+def test_such_evidence_of_a_cell_that_holds_a_load_all_along_is_worth_as_much_as_any():
+    weights = Weights(beyond=(0.1, 0.1, 0.1))
+    resting, loaded = (weights.worth(np.array([6.0, 16.0]), np.zeros(2), np.full(2, kind)) for kind in (0, 3))
+    assert resting[0] == loaded[0] == pytest.approx(3.6)
+    assert (resting[1], loaded[1]) == pytest.approx((4.6, 9.6))

@@ -1,0 +1,85 @@
+"""Temporal evidence of missing noise: where even untouched cells flicker, one that does not any more is broken.
+
+So a cell gives itself away untouched, whatever it holds. A skin that thresholds its readings has no such noise, nor has
+one whose converter is coarser than its noise: there it depends on a hair where a cell flickers, and nothing is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.readings import Readings
+from diagnostics.temporal import StillRuns, same_for
+
+_FEWEST = 8  # recordings: fewer do not tell how rests change from one to the next
+_CALM = 0.25  # of a recording: a cell that ever reads the same for longer does not flicker
+# Of the cells so many flicker at least, and of those that do not so many at most are elsewhere than at the rails.
+_FLICKERING, _QUIET = 0.5, 0.02
+# So often as long as ever is too long to read the same, and so often as long as a recording: rests change in between.
+_LONGER, _RECORDINGS = 2.0, 1.5
+_WORTH = 12.0  # log likelihood ratio of not flickering any more
+_AS_EVER = -2.0  # and of flickering as ever
+_CROWD = 0.5  # share of the cells: when so many do not flicker any more, the noise has gone
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Flicker:
+    """How long healthy cells read exactly the same.
+
+    Attributes:
+        longest: float ``[D]``, frames on end in which each cell had the same reading; inf: it does not flicker, or not
+            known.
+        recording: frames of a recording.
+    """
+
+    longest: Floats
+    recording: float
+
+    @classmethod
+    def fit(cls, recordings: Sequence[Floats], present: NDArray[np.bool_]) -> Flicker:
+        """Learn from fault-free recordings, ``[T, D]`` each, of the cells that are ``present`` (bool ``[D]``)."""
+        every = np.arange(len(present))
+        longest, same = np.zeros(len(present), np.intp), np.zeros(len(present), np.intp)
+        value, last = np.full((2, len(present)), np.nan)
+        lowest, highest = np.inf, -np.inf
+        for frames in Readings.of(recordings).blocks():
+            of_each = same_for(frames, last, same)
+            at = of_each.argmax(axis=0)
+            longer = of_each[at, every] > longest
+            longest, value = np.where(longer, of_each[at, every], longest), np.where(longer, frames[at, every], value)
+            same, last = of_each[-1], frames[-1]
+            lowest, highest = (
+                np.fmin.reduce(frames, None, initial=lowest),
+                np.fmax.reduce(frames, None, initial=highest),
+            )
+        recording = float(np.median([len(r) for r in recordings]))
+        flickers = longest <= _CALM * recording
+        quiet = ~flickers & (value > lowest) & (value < highest)
+        few = len(recordings) < _FEWEST or flickers[present].mean() < _FLICKERING or quiet[present].mean() > _QUIET
+        return cls.unknown(len(present)) if few else cls(np.where(flickers, longest, np.inf), recording)
+
+    @classmethod
+    def unknown(cls, n_cells: int) -> Flicker:
+        """Without a reference no cell is known to flicker."""
+        return cls(np.full(n_cells, np.inf), 1.0)
+
+    def evidence(self, runs: StillRuns, rests: NDArray[np.bool_], present: NDArray[np.bool_]) -> Floats:
+        """Return what it says of a fault that a cell flickers, or does not, a log likelihood ratio ``[D]``.
+
+        Args:
+            runs: the still stretches.
+            rests: bool ``[D]``, cells that read what an untouched one does, or less.
+            present: bool ``[D]``.
+        """
+        too_long = np.maximum(_LONGER * self.longest, _RECORDINGS * self.recording)
+        calm = present & (runs.length > 0) & (runs.same >= too_long)
+        if calm.sum() > _CROWD * present.sum():
+            return np.zeros(len(calm))
+        as_ever = present & rests & (runs.length >= too_long) & (runs.same <= self.longest)
+        return np.where(calm, _WORTH, np.where(as_ever, _AS_EVER, 0.0))

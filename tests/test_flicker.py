@@ -1,0 +1,79 @@
+import numpy as np
+import pytest
+from test_resting import touches
+
+from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, SensorLayout, inject
+from diagnostics.flicker import Flicker
+from diagnostics.temporal import StillRuns, same_for
+
+LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
+CELLS, PRESENT = LAYOUT.n_cells, np.ones(LAYOUT.n_cells, bool)
+STEP = 1 / 1023
+NOISE = 2 * STEP
+
+
+def flickering(seed: int, recordings: int = 24, noise: float = NOISE, rest: float = 0.0) -> list[np.ndarray]:
+    """Presses on a skin with noise, and a converter whose readings end at 0."""
+    rng = np.random.default_rng(seed)
+    rests = rest + np.random.default_rng(99).uniform(0, STEP, CELLS)
+    read = [r + rests + noise * rng.standard_normal(r.shape) for r in touches(seed, recordings)]
+    return [np.clip(np.round(r / STEP), 0, 1023) * STEP for r in read]
+
+
+def runs_of(frames: np.ndarray) -> StillRuns:
+    return StillRuns.begin(CELLS).extend(frames, np.arange(len(frames)), 0.005)
+
+
+def test_for_how_long_a_cell_has_read_the_same_does_not_depend_on_how_frames_come_in():
+    frames = np.array([[1, 5, np.nan], [1, 5, 2], [2, np.nan, 2], [2, 5, 2], [2, 6, 2]])
+    none = np.zeros(3, np.intp)
+    whole = same_for(frames, np.full(3, np.nan), none)
+    assert whole.tolist() == [[1, 1, 1], [2, 2, 2], [1, 3, 3], [2, 4, 4], [3, 1, 5]]
+    first = same_for(frames[:2], np.full(3, np.nan), none)
+    np.testing.assert_array_equal(same_for(frames[2:], frames[1], first[-1]), whole[2:])
+
+
+def test_the_longest_time_that_a_cell_read_the_same_is_found():
+    recordings = flickering(0)
+    flicker = Flicker.fit(recordings, PRESENT)
+    frames, cell = np.concatenate(recordings), 60
+    changed = np.flatnonzero(np.diff(frames[:, cell]))
+    assert flicker.longest[cell] == np.diff([-1, *changed, len(frames) - 1]).max()
+    assert flicker.recording == 64
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1 * STEP])
+def test_skins_without_noise_or_with_less_than_a_converter_step_tell_nothing(noise):
+    assert np.isinf(Flicker.fit(flickering(0, noise=noise, rest=0.05), PRESENT).longest).all()
+
+
+def test_few_recordings_tell_nothing():
+    assert np.isinf(Flicker.fit(flickering(0, recordings=7), PRESENT).longest).all()
+
+
+def test_a_cell_that_does_not_flicker_any_more_is_broken_unless_half_of_them_do_not():
+    flicker = Flicker.fit(flickering(0), PRESENT)
+    idle = np.concatenate(flickering(5, 4))[:200]
+
+    def said(dead: int) -> np.ndarray:
+        frames = idle.copy()
+        frames[:, CELLS - dead :] = 0.0
+        return flicker.evidence(runs_of(frames), PRESENT, PRESENT)
+
+    assert np.flatnonzero(said(10) > 0).tolist() == list(range(CELLS - 10, CELLS))
+    assert not (said(40) > 0).any()
+
+
+def test_dead_cells_that_nothing_touches_are_found_for_want_of_noise_by_a_monitor_too():
+    fitted = SelfDiagnosis(LAYOUT).fit(flickering(0))
+    log = flickering(1, 4)
+    assert not fitted.diagnose(log).fault_set
+    dead = {LAYOUT.cell(0, 7, 4): None, LAYOUT.cell(0, 7, 7): 0.4}
+    faults = [Fault(FaultKind.STUCK if v else FaultKind.OPEN, (cell,), value=v) for cell, v in dead.items()]
+    broken = [inject(r, faults, LAYOUT) for r in log]
+    diagnosis = fitted.diagnose(broken)
+    assert diagnosis.fault_set == dead.keys()
+    monitor = Monitor(fitted)
+    for frame in np.concatenate(broken):
+        monitor.update(frame)
+    np.testing.assert_array_equal(monitor.diagnosis().probability, diagnosis.probability)

@@ -45,7 +45,9 @@ _SUSPICIOUS = 2.8  # log likelihood ratio from which on a cell is left out when 
 _SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw one
 _DOUBT, _STRANGE = 0.5, 22.0  # so much of the evidence does not count where few recordings were held out, and how few
 _LOOSE = 10.0  # variance of the weights before any log is seen
-_ODD = 3  # healthy cells that are held for certain to be faulty: fewer tell nothing
+_ODD = (
+    0.003  # of the healthy cells are held for certain to be faulty, and no more: a better model than theirs errs less
+)
 _CLIP = 6.0  # log ratios beyond this say "certain"; they must not steer the fit
 _SURE = 24.0  # and beyond this, not even more certain
 _EXPECTED, _EXPECTED_LATE = 0.02, 0.005  # share of faulty cells before a log is seen: from the start, and in it
@@ -140,12 +142,9 @@ class Weights:
                 base = float(logit(dead[alike].mean()))
                 fitted = _bounded_logistic(evidence[of], dead[of], base)
                 if fitted[1] > 0:
-                    certain = (kind == k) & (ratio > _CLIP)
-                    odds = base + np.column_stack([np.ones(len(ratio)), evidence])[certain] @ fitted
-                    found[k] = (
-                        *fitted,
-                        _slope(np.minimum(ratio[certain], _SURE) - _CLIP, odds, dead[certain], fitted[1]),
-                    )
+                    these = kind == k
+                    odds = base + np.column_stack([np.ones(len(ratio)), evidence])[these] @ fitted
+                    found[k] = (*fitted, _slope_beyond(ratio[these], odds, dead[these], fitted[1]))
         offset, slope, temporal_share, beyond = zip(*found, strict=True)
         return cls(offset, slope, temporal_share, beyond, gains_count(max(gain)))
 
@@ -224,28 +223,28 @@ def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) ->
     return offset, slope, temporal
 
 
-def _slope(beyond: Floats, odds: Floats, dead: NDArray[np.bool_], usual: float) -> float:
-    """Return what evidence ``[n]`` is worth that goes so far ``beyond`` what is held for certain, 0 to ``usual``.
-
-    Where hardly a healthy cell goes there, as much as ``usual``.
+def _slope_beyond(ratio: Floats, odds: Floats, dead: NDArray[np.bool_], usual: float) -> float:
+    """Return what as much of a ratio is worth as says more than "certain", 0 to ``usual``.
 
     Args:
-        beyond: ratio.
-        odds: log odds of all that the ratio does not tell, ``[n]``.
+        ratio: ``[n]``, of cells of one kind.
+        odds: log odds of a fault by all that is said up to there, ``[n]``.
         dead: bool ``[n]``.
         usual: what a ratio is worth up to there.
     """
     from scipy.optimize import minimize
 
-    if np.count_nonzero(~dead) < _ODD:
+    certain = ratio > _CLIP
+    if np.count_nonzero(certain & ~dead) <= _ODD * np.count_nonzero(~dead):
         return usual
-    x = np.column_stack([np.ones(len(beyond)), beyond])
+    odds, dead = odds[certain], dead[certain]
+    x = np.column_stack([np.ones(len(odds)), np.minimum(ratio[certain], _SURE) - _CLIP])
 
     def loss(weights: Floats) -> tuple[float, Floats]:
         told = odds + x @ weights
         return float(np.logaddexp(0, told).sum() - told[dead].sum()), x.T @ (expit(told) - dead)
 
-    # That what is held for certain is not is another matter than what more of it is worth.
+    # That it is less certain than said is another matter than what more of it is worth.
     _, slope = minimize(loss, np.zeros(2), jac=True, bounds=[(None, 0.0), (0.0, usual)]).x.tolist()
     return float(slope)
 

@@ -7,7 +7,7 @@ from sklearn.linear_model import LogisticRegression
 
 from adaptfault.recordings import Recordings
 from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject, weighing
-from diagnostics.weighing import Weights, _bounded_logistic, _slope, faulty_at
+from diagnostics.weighing import Weights, _bounded_logistic, _slope_beyond, faulty_at
 
 ASKED = np.ones(100, bool)
 EARLY = np.zeros(100, int)  # of the kind that never moved
@@ -166,13 +166,15 @@ def test_within_the_bounds_it_is_a_logistic_regression():
 
 
 def test_more_evidence_than_is_held_for_certain_is_worth_the_less_the_farther_healthy_cells_go():
-    beyond = np.concatenate([np.linspace(0, 18, 40), np.linspace(0, 18, 40)])
-    odds, dead = np.full(80, 3.0), np.arange(80) < 40
-    assert _slope(beyond, odds, dead, 1.5) < 0.1  # so far healthy ones go as the others
-    beyond[~dead] /= 20
-    assert _slope(beyond, odds, dead, 1.5) == pytest.approx(1.5)  # all of them err by little
-    few = dead | (np.arange(80) > 77)
-    assert _slope(beyond, odds, few, 1.5) == 1.5
+    far = np.linspace(0, 18, 40)
+    dead = np.arange(80) < 40
+    odds = np.full(80, 3.0)
+    assert (
+        _slope_beyond(6.1 + np.concatenate([far, far]), odds, dead, 1.5) < 0.1
+    )  # healthy ones go as far as the others
+    assert _slope_beyond(6.1 + np.concatenate([far, far / 20]), odds, dead, 1.5) == pytest.approx(1.5)
+    few = np.concatenate([6.1 + far, 6.1 + far[:3], np.zeros(1500)])  # of so many a model errs about some
+    assert _slope_beyond(few, np.full(len(few), 3.0), np.arange(len(few)) < 40, 1.5) == 1.5
 
 
 def test_such_evidence_of_a_cell_that_holds_a_load_all_along_is_worth_as_much_as_any():

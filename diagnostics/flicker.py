@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.readings import Readings
-from diagnostics.temporal import StillRuns, same_for
+from diagnostics.temporal import StillRuns, held, same_for
 
 _FEWEST = 8  # recordings: fewer do not tell how rests change from one to the next
 _CALM = 0.25  # of a recording: a cell that ever reads the same for longer does not flicker
@@ -49,15 +49,17 @@ class Flicker:
         value, last = np.full((2, len(present)), np.nan)
         lowest, highest = np.inf, -np.inf
         for frames in Readings.of(recordings).blocks():
-            of_each = same_for(frames, last, same)
+            readings = held(frames, last)
+            of_each = same_for(readings, same)
             at = of_each.argmax(axis=0)
             longer = of_each[at, every] > longest
-            longest, value = np.where(longer, of_each[at, every], longest), np.where(longer, frames[at, every], value)
-            same, last = of_each[-1], frames[-1]
-            lowest, highest = (
-                np.fmin.reduce(frames, None, initial=lowest),
-                np.fmax.reduce(frames, None, initial=highest),
+            longest, value = (
+                np.where(longer, of_each[at, every], longest),
+                np.where(longer, readings[at + 1, every], value),
             )
+            same, last = of_each[-1], readings[-1]
+            lowest = np.fmin.reduce(frames, None, initial=lowest)
+            highest = np.fmax.reduce(frames, None, initial=highest)
         recording = float(np.median([len(r) for r in recordings]))
         flickers = longest <= _CALM * recording
         quiet = ~flickers & (value > lowest) & (value < highest)
@@ -78,7 +80,7 @@ class Flicker:
             present: bool ``[D]``.
         """
         too_long = np.maximum(_LONGER * self.longest, _RECORDINGS * self.recording)
-        calm = present & (runs.length > 0) & (runs.same >= too_long)
+        calm = present & (np.minimum(runs.same, runs.length) >= too_long)  # frames without a reading prove nothing
         if calm.sum() > _CROWD * present.sum():
             return np.zeros(len(calm))
         as_ever = present & rests & (runs.length >= too_long) & (runs.same <= self.longest)

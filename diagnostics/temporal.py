@@ -97,11 +97,10 @@ class StillRuns:
             into = step[which, broke]
             jump[broke] = np.where(np.isnan(into), 0.0, into)
             company[broke] = share[(jump[broke] > 0).astype(np.intp), which]
-        last = frames[-1].copy()
-        if any_missing:
-            backwards = (~missing[::-1]).argmax(axis=0)
-            last = np.where(heard > 0, frames[len(frames) - 1 - backwards, np.arange(len(last))], self.last)
-        return StillRuns(start, length, low, high, jump, company, last, same_for(frames, self.last, self.same)[-1])
+        readings = held(frames, self.last)
+        changed = _changed(readings)
+        same = np.where(changed.any(axis=0), 1 + changed[::-1].argmax(axis=0), self.same + len(frames))
+        return StillRuns(start, length, low, high, jump, company, readings[-1].copy(), same)
 
     def of(self, cells: NDArray[np.intp]) -> StillRuns:
         """Return the runs of some cells."""
@@ -125,20 +124,36 @@ class StillRuns:
         return alone
 
 
-def same_for(frames: Floats, last: Floats, before: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return for how many frames on end each cell has read the same, by the end of each frame, ``[t, D]``.
+def held(frames: Floats, last: Floats) -> Floats:
+    """Return the last reading of each cell before ``frames`` and by the end of each, ``[1 + t, D]``; NaN: none yet.
 
     Args:
-        frames: ``[t, D]``; NaN = missing, which is no change.
-        last: ``[D]``, the reading before them; NaN: none yet.
-        before: int ``[D]``, for how many frames on end it had been that.
+        frames: ``[t, D]``; NaN = missing.
+        last: ``[D]``, the last reading before them.
     """
-    changed = np.empty(frames.shape, bool)
-    changed[0] = np.abs(frames[0] - last) > 0
-    changed[1:] = np.abs(frames[1:] - frames[:-1]) > 0
-    number = np.arange(1, len(frames) + 1)[:, None]
-    since = np.maximum.accumulate(np.where(changed, number - 1, -before), axis=0)
+    whole = np.concatenate([last[None], frames])
+    missing = np.isnan(whole)
+    if missing.any():
+        at = np.maximum.accumulate(np.where(missing, 0, np.arange(len(whole))[:, None]), axis=0)
+        whole = np.take_along_axis(whole, at, axis=0)
+    return whole
+
+
+def same_for(readings: Floats, before: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return for how many frames on end each cell has read exactly the same, by the end of each frame, ``[t, D]``.
+
+    Args:
+        readings: ``[1 + t, D]``, see :func:`held`.
+        before: int ``[D]``, for how many frames on end it had been the first of these.
+    """
+    number = np.arange(1, len(readings))[:, None]
+    since = np.maximum.accumulate(np.where(_changed(readings), number - 1, -before), axis=0)
     return np.asarray(number - since)
+
+
+def _changed(readings: Floats) -> NDArray[np.bool_]:
+    """Return where a reading differs from the one before it, bool ``[t, D]``."""
+    return np.asarray((readings[1:] != readings[:-1]) & ~np.isnan(readings[:-1]))
 
 
 def _in_each(which: NDArray[np.bool_]) -> NDArray[np.int32]:

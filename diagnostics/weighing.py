@@ -45,9 +45,7 @@ _SUSPICIOUS = 2.8  # log likelihood ratio from which on a cell is left out when 
 _SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw one
 _DOUBT, _STRANGE = 0.5, 22.0  # so much of the evidence does not count where few recordings were held out, and how few
 _LOOSE = 10.0  # variance of the weights before any log is seen
-_ODD = (
-    0.003  # of the healthy cells are held for certain to be faulty, and no more: a better model than theirs errs less
-)
+_ODD = 0.003  # of the healthy cells may be held for certain to be faulty: with all recordings the model errs less
 _CLIP = 6.0  # log ratios beyond this say "certain"; they must not steer the fit
 _SURE = 24.0  # and beyond this, not even more certain
 _EXPECTED, _EXPECTED_LATE = 0.02, 0.005  # share of faulty cells before a log is seen: from the start, and in it

@@ -4,7 +4,7 @@ from test_resting import touches
 
 from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, SensorLayout, inject
 from diagnostics.flicker import Flicker
-from diagnostics.temporal import StillRuns, same_for
+from diagnostics.temporal import StillRuns
 
 LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
 CELLS, PRESENT = LAYOUT.n_cells, np.ones(LAYOUT.n_cells, bool)
@@ -22,15 +22,6 @@ def flickering(seed: int, recordings: int = 24, noise: float = NOISE, rest: floa
 
 def runs_of(frames: np.ndarray) -> StillRuns:
     return StillRuns.begin(CELLS).extend(frames, np.arange(len(frames)), 0.005)
-
-
-def test_for_how_long_a_cell_has_read_the_same_does_not_depend_on_how_frames_come_in():
-    frames = np.array([[1, 5, np.nan], [1, 5, 2], [2, np.nan, 2], [2, 5, 2], [2, 6, 2]])
-    none = np.zeros(3, np.intp)
-    whole = same_for(frames, np.full(3, np.nan), none)
-    assert whole.tolist() == [[1, 1, 1], [2, 2, 2], [1, 3, 3], [2, 4, 4], [3, 1, 5]]
-    first = same_for(frames[:2], np.full(3, np.nan), none)
-    np.testing.assert_array_equal(same_for(frames[2:], frames[1], first[-1]), whole[2:])
 
 
 def test_the_longest_time_that_a_cell_read_the_same_is_found():
@@ -62,6 +53,13 @@ def test_a_cell_that_does_not_flicker_any_more_is_broken_unless_half_of_them_do_
 
     assert np.flatnonzero(said(10) > 0).tolist() == list(range(CELLS - 10, CELLS))
     assert not (said(40) > 0).any()
+
+
+def test_a_cell_that_is_not_heard_for_long_is_not_said_to_read_the_same():
+    flicker = Flicker.fit(flickering(0), PRESENT)
+    frames = np.concatenate(flickering(5, 5))
+    frames[50:, 60] = np.nan
+    assert not (flicker.evidence(runs_of(frames), PRESENT, PRESENT) > 0).any()
 
 
 def test_dead_cells_that_nothing_touches_are_found_for_want_of_noise_by_a_monitor_too():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from diagnostics.temporal import Onsets, StillRuns
+from diagnostics.temporal import Onsets, StillRuns, held, same_for
 
 TOLERANCE = 0.02
 FULL_SCALE = 5.0
@@ -130,3 +130,18 @@ def test_without_a_reference_no_jump_says_anything():
     log = np.tile(np.linspace(1, 2, 20)[:, None], 10)
     log[12:, 3] = 5.0
     assert (Onsets.silent().evidence(runs_of(log), FULL_SCALE) == 0).all()
+
+
+def test_how_long_a_cell_has_read_the_same_is_counted_over_blocks_and_gaps():
+    rng = np.random.default_rng(0)
+    log = rng.integers(0, 2, (60, 5)).astype(float)
+    log[:, 4] = 1.0
+    log[rng.random(log.shape) < 0.3] = np.nan
+    whole = same_for(held(log, np.full(5, np.nan)), np.zeros(5, np.intp))
+    assert whole[-1, 4] == 60
+    for size in (1, 7, 32):
+        runs = StillRuns.begin(5)
+        for first in range(0, 60, size):
+            frames = log[first : first + size]
+            runs = runs.extend(frames, np.arange(first, first + len(frames)), 0.005)
+            np.testing.assert_array_equal(runs.same, whole[first + len(frames) - 1])

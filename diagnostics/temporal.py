@@ -98,8 +98,8 @@ class StillRuns:
             jump[broke] = np.where(np.isnan(into), 0.0, into)
             company[broke] = share[(jump[broke] > 0).astype(np.intp), which]
         readings = held(frames, self.last)
-        changed = _changed(readings)
-        same = np.where(changed.any(axis=0), 1 + changed[::-1].argmax(axis=0), self.same + len(frames))
+        latest = (_changed(readings) * np.arange(1, len(readings), dtype=np.int32)[:, None]).max(axis=0)
+        same = np.where(latest > 0, len(readings) - latest, self.same + len(frames))
         return StillRuns(start, length, low, high, jump, company, readings[-1].copy(), same)
 
     def of(self, cells: NDArray[np.intp]) -> StillRuns:
@@ -153,7 +153,10 @@ def same_for(readings: Floats, before: NDArray[np.intp]) -> NDArray[np.intp]:
 
 def _changed(readings: Floats) -> NDArray[np.bool_]:
     """Return where a reading differs from the one before it, bool ``[t, D]``."""
-    return np.asarray((readings[1:] != readings[:-1]) & ~np.isnan(readings[:-1]))
+    changed = np.asarray(readings[1:] != readings[:-1])
+    if np.isnan(readings[0]).any():
+        changed &= ~np.isnan(readings[:-1])
+    return changed
 
 
 def _in_each(which: NDArray[np.bool_]) -> NDArray[np.int32]:

@@ -84,9 +84,11 @@ class Tare:
             usual: what the reference shows.
         """
         lowest = np.fmin(self.lowest, np.fmin.reduce(frames) - scale.resting)
-        together = usual.beyond(_least_loaded(lowest[present]))
-        alone = lowest - np.where(together < _COMMON * scale.full_scale, together, 0.0)
-        own = np.where((alone > scale.near / 2) & (alone < _OWN * scale.full_scale), alone, 0.0)
+        own = np.zeros(len(lowest))
+        if (lowest > scale.near / 2).any():
+            together = usual.beyond(_least_loaded(lowest[present]))
+            alone = lowest - np.where(together < _COMMON * scale.full_scale, together, 0.0)
+            own = np.where((alone > scale.near / 2) & (alone < _OWN * scale.full_scale), alone, 0.0)
         # Mostly all cells together have none: enough of them read no more than usual all through.
         calm = present & (np.fmax.reduce(frames) - scale.resting - own <= usual.most)
         if np.count_nonzero(calm) > _LEAST_LOADED * np.count_nonzero(present):

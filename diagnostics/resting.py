@@ -69,6 +69,14 @@ class Least:
             reading = np.where(often, np.maximum(reading, low + rare - beyond), reading)
         return cls(reading, float(np.median((usual - reading)[present])))
 
+    def lower(self, runs: StillRuns, present: NDArray[np.bool_]) -> float:
+        """Return by how much all cells together read other than they mostly did, if that is less; else 0."""
+        value = runs.value
+        heard = present & np.isfinite(value)
+        if not (np.isfinite(self.usual) and heard.any()):
+            return 0.0
+        return min(0.0, float(np.median(value[heard] - self.reading[heard])) - self.usual)
+
     def evidence(
         self, runs: StillRuns, rests: NDArray[np.bool_], tolerance: float, present: NDArray[np.bool_]
     ) -> Floats:
@@ -80,12 +88,8 @@ class Least:
             tolerance: a reading wanders so far around 0, the low rail.
             present: bool ``[D]``.
         """
-        value = runs.value
-        heard = present & np.isfinite(value)
-        # All of them together may rest lower by now.
-        above = value[heard] - self.reading[heard]
-        lower = min(0.0, float(np.median(above)) - self.usual) if np.isfinite(self.usual) and heard.any() else 0.0
-        least = self.reading + lower
+        heard = present & np.isfinite(runs.value)
+        least = self.reading + self.lower(runs, present)
         less = heard & (runs.length >= SEGMENT) & (runs.high < least)
         if less.sum() > _CROWD * present.sum():
             return np.zeros(len(least))

@@ -62,6 +62,26 @@ def test_a_cell_that_is_not_heard_for_long_is_not_said_to_read_the_same():
     assert not (flicker.evidence(runs_of(frames), PRESENT, PRESENT) > 0).any()
 
 
+def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_blamed_for_want_of_noise():
+    rng = np.random.default_rng(4)
+    rests = np.linspace(0.004, 0.04, CELLS)
+
+    def read(seed: int, recordings: int, sunk: float = 0.0) -> list[np.ndarray]:
+        idle = [
+            np.maximum(r + rests - sunk + NOISE * rng.standard_normal(r.shape), 0) for r in touches(seed, recordings)
+        ]
+        return [np.round(r / STEP) * STEP for r in idle]
+
+    fitted = SelfDiagnosis(LAYOUT).fit(read(0, 24))
+    memory = fitted.memory()
+    for frames in read(1, 6, sunk=0.015):
+        memory.extend(frames)
+    memory = memory.complete()
+    same = fitted.reference_.flicker.evidence(memory.runs, memory.rests(), PRESENT)
+    assert (same > 0).any()  # they read 0, and nothing else
+    assert not (memory.temporal() > 10).any()
+
+
 def test_dead_cells_that_nothing_touches_are_found_for_want_of_noise_by_a_monitor_too():
     fitted = SelfDiagnosis(LAYOUT).fit(flickering(0))
     log = flickering(1, 4)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diagnostics import SensorLayout
+from diagnostics.readings import held
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,11 +75,7 @@ def hold_missing(frames: NDArray[Any]) -> NDArray[Any]:
 
     A lost frame then looks like a held one instead of turning the network's whole output into NaN.
     """
-    missing = np.isnan(frames)
-    if not missing.any():
-        return frames
-    last = np.maximum.accumulate(np.where(missing, -1, np.arange(len(frames))[:, None]), axis=0)  # [T, D]
-    return np.where(last < 0, 0, np.take_along_axis(frames, np.maximum(last, 0), axis=0)).astype(frames.dtype)
+    return held(frames, np.zeros(frames.shape[1], frames.dtype))[1:] if np.isnan(frames).any() else frames
 
 
 def make_windows(

@@ -12,18 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.readings import Readings
-from diagnostics.temporal import StillRuns, held, same_for
+from diagnostics.readings import Readings, held
+from diagnostics.resting import FEWEST, unlike_ever
+from diagnostics.temporal import StillRuns, same_for
 
-_FEWEST = 8  # recordings: fewer do not tell how rests change from one to the next
 _CALM = 0.25  # of a recording: a cell that ever reads the same for longer does not flicker
 # Of the cells so many flicker at least, and of those that do not so many at most are elsewhere than at the rails.
 _FLICKERING, _QUIET = 0.5, 0.02
 # So often as long as ever is too long to read the same, and so often as long as a recording: rests change in between.
 _LONGER, _RECORDINGS = 2.0, 1.5
-_WORTH = 12.0  # log likelihood ratio of not flickering any more
-_AS_EVER = -2.0  # and of flickering as ever
-_CROWD = 0.5  # share of the cells: when so many do not flicker any more, the noise has gone
 
 Floats = NDArray[np.float64]
 
@@ -52,18 +49,15 @@ class Flicker:
             readings = held(frames, last)
             of_each = same_for(readings, same)
             at = of_each.argmax(axis=0)
-            longer = of_each[at, every] > longest
-            longest, value = (
-                np.where(longer, of_each[at, every], longest),
-                np.where(longer, readings[at + 1, every], value),
-            )
+            value = np.where(of_each[at, every] > longest, readings[at + 1, every], value)
+            longest = np.maximum(longest, of_each[at, every])
             same, last = of_each[-1], readings[-1]
             lowest = np.fmin.reduce(frames, None, initial=lowest)
             highest = np.fmax.reduce(frames, None, initial=highest)
         recording = float(np.median([len(r) for r in recordings]))
         flickers = longest <= _CALM * recording
         quiet = ~flickers & (value > lowest) & (value < highest)
-        few = len(recordings) < _FEWEST or flickers[present].mean() < _FLICKERING or quiet[present].mean() > _QUIET
+        few = len(recordings) < FEWEST or flickers[present].mean() < _FLICKERING or quiet[present].mean() > _QUIET
         return cls.unknown(len(present)) if few else cls(np.where(flickers, longest, np.inf), recording)
 
     @classmethod
@@ -71,17 +65,16 @@ class Flicker:
         """Without a reference no cell is known to flicker."""
         return cls(np.full(n_cells, np.inf), 1.0)
 
-    def evidence(self, runs: StillRuns, rests: NDArray[np.bool_], present: NDArray[np.bool_]) -> Floats:
+    def evidence(self, runs: StillRuns, rests: NDArray[np.bool_], present: NDArray[np.bool_], sunk: bool) -> Floats:
         """Return what it says of a fault that a cell flickers, or does not, a log likelihood ratio ``[D]``.
 
         Args:
             runs: the still stretches.
             rests: bool ``[D]``, cells that read what an untouched one does, or less.
             present: bool ``[D]``.
+            sunk: all cells read less than they mostly did: at the low rail they do not flicker.
         """
         too_long = np.maximum(_LONGER * self.longest, _RECORDINGS * self.recording)
         calm = present & (np.minimum(runs.same, runs.length) >= too_long)  # frames without a reading prove nothing
-        if calm.sum() > _CROWD * present.sum():
-            return np.zeros(len(calm))
         as_ever = present & rests & (runs.length >= too_long) & (runs.same <= self.longest)
-        return np.where(calm, _WORTH, np.where(as_ever, _AS_EVER, 0.0))
+        return unlike_ever(calm, calm & ~(rests & sunk), as_ever, present)

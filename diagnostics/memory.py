@@ -111,11 +111,9 @@ class Memory:
     def temporal(self) -> NDArray[np.float64]:
         """What each cell's still stretch says, and the jump into it, a log likelihood ratio ``[D]``."""
         reference = self.reference
-        rests = self.rests()
-        low = reference.least.evidence(self.runs, rests, reference.tolerance, self.present)
-        noise = reference.flicker.evidence(self.runs, rests, self.present)
-        if reference.least.lower(self.runs, self.present) < -reference.tolerance:
-            noise[rests & (noise > 0)] = 0.0  # cells that have sunk to the low rail do not flicker there
+        rests, lower = self.rests(), reference.least.lower(self.runs, self.present)
+        low = reference.least.evidence(self.runs, rests, reference.tolerance, self.present, lower)
+        noise = reference.flicker.evidence(self.runs, rests, self.present, lower < -reference.tolerance)
         untouched = np.where(np.abs(noise) > np.abs(low), noise, low)
         return reference.onsets.evidence(self.runs, self.layout.full_scale) + untouched
 

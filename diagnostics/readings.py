@@ -58,3 +58,18 @@ class Readings(Sequence[Recording]):
     def of(cls, recordings: Sequence[NDArray[Any]]) -> Readings:
         """Return ``recordings`` if they are that already."""
         return recordings if isinstance(recordings, Readings) else cls(recordings)
+
+
+def held(frames: NDArray[Any], last: NDArray[Any]) -> NDArray[Any]:
+    """Return the last reading of each cell before ``frames`` and by the end of each, ``[1 + t, D]``; NaN: none yet.
+
+    Args:
+        frames: ``[t, D]``; NaN = missing.
+        last: ``[D]``, the last reading before them.
+    """
+    whole = np.concatenate([last[None], frames])
+    missing = np.isnan(whole)
+    if missing.any():
+        at = np.maximum.accumulate(np.where(missing, 0, np.arange(len(whole))[:, None]), axis=0)
+        whole = np.take_along_axis(whole, at, axis=0)
+    return whole

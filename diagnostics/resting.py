@@ -24,11 +24,12 @@ _LIGHT = 0.05  # of full scale: a cell that never read less above its rest than 
 _CALM = 0.25  # quantile of the noise of cells in recordings: touched cells have more
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
 _RARE = 0.001  # of the cells in recordings: what so few did is taken for none
-_OFTEN, _FEWEST = 0.5, 8  # share and number of recordings: what a cell reads in so many is its rest, not a load
+FEWEST = 8  # recordings: fewer do not tell how rests change from one to the next
+_OFTEN = 0.5  # share of the recordings: what a cell reads in so many is its rest, not a load
 _BEYOND = 1.5  # times as far as ever from the usual: no healthy cell reads that little
-_WORTH = 12.0  # log likelihood ratio of reading less than any healthy cell
-_AS_EVER = -2.0  # and of what the cell itself always read, where that is not what an open one reads
-_CROWD = 0.5  # share of the cells: when so many read less than ever, their offset has moved
+_WORTH = 12.0  # log likelihood ratio of reading what no healthy cell does
+_AS_EVER = -2.0  # and of what the cell itself always did, where that is not what a broken one reads
+_CROWD = 0.5  # share of the cells: when so many are unlike ever, it is the skin that has changed
 _BLOCK = 4096  # cells looked at together
 
 Floats = NDArray[np.float64]
@@ -59,7 +60,7 @@ class Least:
         told = peaks[:, present]
         reading = np.full(len(low), np.quantile(told[np.isfinite(told)], _RARE, method="lower") - 2 * tolerance)
         # Where most cells rest at 0, one that always reads more is loaded.
-        if len(peaks) >= _FEWEST and np.median(low[present]) > tolerance:
+        if len(peaks) >= FEWEST and np.median(low[present]) > tolerance:
             peak = peaks - low
             unloaded = peak < _LIGHT * full_scale
             often = np.count_nonzero(unloaded, axis=0) >= _OFTEN * len(peaks)
@@ -70,7 +71,7 @@ class Least:
         return cls(reading, float(np.median((usual - reading)[present])))
 
     def lower(self, runs: StillRuns, present: NDArray[np.bool_]) -> float:
-        """Return by how much all cells together read other than they mostly did, if that is less; else 0."""
+        """Return by how much all cells together read less than they mostly did, 0 or below."""
         value = runs.value
         heard = present & np.isfinite(value)
         if not (np.isfinite(self.usual) and heard.any()):
@@ -78,7 +79,7 @@ class Least:
         return min(0.0, float(np.median(value[heard] - self.reading[heard])) - self.usual)
 
     def evidence(
-        self, runs: StillRuns, rests: NDArray[np.bool_], tolerance: float, present: NDArray[np.bool_]
+        self, runs: StillRuns, rests: NDArray[np.bool_], tolerance: float, present: NDArray[np.bool_], lower: float
     ) -> Floats:
         """Return what a still stretch says of being open, whatever touches the cell, a log likelihood ratio ``[D]``.
 
@@ -87,15 +88,30 @@ class Least:
             rests: bool ``[D]``, cells that read what an untouched one does, or less.
             tolerance: a reading wanders so far around 0, the low rail.
             present: bool ``[D]``.
+            lower: see :meth:`lower`.
         """
         heard = present & np.isfinite(runs.value)
-        least = self.reading + self.lower(runs, present)
+        least = self.reading + lower
         less = heard & (runs.length >= SEGMENT) & (runs.high < least)
-        if less.sum() > _CROWD * present.sum():
-            return np.zeros(len(least))
         open_ = (runs.high <= 2 * tolerance) | (runs.high < least[present].min())
         as_ever = rests & heard & (runs.high >= least) & (least > tolerance)
-        return np.where(less & open_, _WORTH, np.where(as_ever, _AS_EVER, 0.0))
+        return unlike_ever(less, less & open_, as_ever, present)
+
+
+def unlike_ever(
+    unlike: NDArray[np.bool_], broken: NDArray[np.bool_], as_ever: NDArray[np.bool_], present: NDArray[np.bool_]
+) -> Floats:
+    """Return what untouched cells give away, a log likelihood ratio ``[D]``; nothing where too many do.
+
+    Args:
+        unlike: bool ``[D]``, cells that do what they never did.
+        broken: those of them that can only be broken.
+        as_ever: bool ``[D]``, cells that do what they always did, and broken ones do not.
+        present: bool ``[D]``.
+    """
+    if unlike.sum() > _CROWD * present.sum():
+        return np.zeros(len(present))
+    return np.where(broken, _WORTH, np.where(as_ever, _AS_EVER, 0.0))
 
 
 def resting(

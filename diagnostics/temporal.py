@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.readings import held
+
 Floats = NDArray[np.float64]
 
 SHORTEST_RUN = 5  # frames; shorter stillness is not worth a question
@@ -124,26 +126,11 @@ class StillRuns:
         return alone
 
 
-def held(frames: Floats, last: Floats) -> Floats:
-    """Return the last reading of each cell before ``frames`` and by the end of each, ``[1 + t, D]``; NaN: none yet.
-
-    Args:
-        frames: ``[t, D]``; NaN = missing.
-        last: ``[D]``, the last reading before them.
-    """
-    whole = np.concatenate([last[None], frames])
-    missing = np.isnan(whole)
-    if missing.any():
-        at = np.maximum.accumulate(np.where(missing, 0, np.arange(len(whole))[:, None]), axis=0)
-        whole = np.take_along_axis(whole, at, axis=0)
-    return whole
-
-
 def same_for(readings: Floats, before: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return for how many frames on end each cell has read exactly the same, by the end of each frame, ``[t, D]``.
 
     Args:
-        readings: ``[1 + t, D]``, see :func:`held`.
+        readings: ``[1 + t, D]``, see ``readings.held``.
         before: int ``[D]``, for how many frames on end it had been the first of these.
     """
     number = np.arange(1, len(readings))[:, None]

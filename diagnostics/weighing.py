@@ -141,7 +141,7 @@ class Weights:
                 fitted = _bounded_logistic(evidence[of], dead[of], base)
                 if fitted[1] > 0:
                     these = kind == k
-                    odds = base + np.column_stack([np.ones(len(ratio)), evidence])[these] @ fitted
+                    odds = base + fitted[0] + evidence[these] @ fitted[1:]
                     found[k] = (*fitted, _slope_beyond(ratio[these], odds, dead[these], fitted[1]))
         offset, slope, temporal_share, beyond = zip(*found, strict=True)
         return cls(offset, slope, temporal_share, beyond, gains_count(max(gain)))
@@ -206,18 +206,8 @@ def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) ->
         dead: bool ``[n]``.
         base: log odds of a fault, before the evidence; how common faults were in these logs.
     """
-    from scipy.optimize import minimize
-
-    x = np.column_stack([np.ones(len(evidence)), evidence])
-
-    def loss(weights: Floats) -> tuple[float, Floats]:
-        odds = base + x @ weights
-        slack = expit(odds) - dead
-        value = np.logaddexp(0, odds).sum() - odds[dead].sum() + 0.5 * (weights[1:] @ weights[1:]) / _LOOSE
-        return float(value), x.T @ slack + np.array([0, *weights[1:]]) / _LOOSE
-
     bounds = [(None, 0.0), (0.0, None), (0.0, _MOST_TEMPORAL)]
-    offset, slope, temporal = minimize(loss, np.array([0.0, 1.0, 0.5]), jac=True, bounds=bounds).x.tolist()
+    offset, slope, temporal = _logistic(evidence, dead, base, np.array([0.0, 1.0, 0.5]), bounds, _LOOSE)
     return offset, slope, temporal
 
 
@@ -230,21 +220,45 @@ def _slope_beyond(ratio: Floats, odds: Floats, dead: NDArray[np.bool_], usual: f
         dead: bool ``[n]``.
         usual: what a ratio is worth up to there.
     """
-    from scipy.optimize import minimize
-
     certain = ratio > _CLIP
     if np.count_nonzero(certain & ~dead) <= _ODD * np.count_nonzero(~dead):
         return usual
-    odds, dead = odds[certain], dead[certain]
-    x = np.column_stack([np.ones(len(odds)), np.minimum(ratio[certain], _SURE) - _CLIP])
+    more = np.minimum(ratio[certain, None], _SURE) - _CLIP
+    # That it is less certain than said is another matter than what more of it is worth.
+    _, slope = _logistic(more, dead[certain], odds[certain], np.zeros(2), [(None, 0.0), (0.0, usual)])
+    return slope
+
+
+def _logistic(
+    evidence: Floats,
+    dead: NDArray[np.bool_],
+    base: Floats | float,
+    start: Floats,
+    bounds: Sequence[tuple[float | None, float | None]],
+    loose: float = np.inf,
+) -> list[float]:
+    """Return offset and weights of a logistic regression, within ``bounds``.
+
+    Args:
+        evidence: ``[n, k]``.
+        dead: bool ``[n]``.
+        base: log odds before the evidence, of all or of each ``[n]``.
+        start: ``[1 + k]``, where to begin.
+        bounds: of each of these.
+        loose: variance of the weights before any of it is seen.
+    """
+    from scipy.optimize import minimize
+
+    x = np.column_stack([np.ones(len(evidence)), evidence])
 
     def loss(weights: Floats) -> tuple[float, Floats]:
-        told = odds + x @ weights
-        return float(np.logaddexp(0, told).sum() - told[dead].sum()), x.T @ (expit(told) - dead)
+        odds = base + x @ weights
+        slack = expit(odds) - dead
+        value = np.logaddexp(0, odds).sum() - odds[dead].sum() + 0.5 * (weights[1:] @ weights[1:]) / loose
+        return float(value), x.T @ slack + np.array([0, *weights[1:]]) / loose
 
-    # That it is less certain than said is another matter than what more of it is worth.
-    _, slope = minimize(loss, np.zeros(2), jac=True, bounds=[(None, 0.0), (0.0, usual)]).x.tolist()
-    return float(slope)
+    found: list[float] = minimize(loss, start, jac=True, bounds=bounds).x.tolist()
+    return found
 
 
 def _stretch(recording: Floats, rng: np.random.Generator) -> Floats:

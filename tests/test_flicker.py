@@ -49,7 +49,7 @@ def test_a_cell_that_does_not_flicker_any_more_is_broken_unless_half_of_them_do_
     def said(dead: int) -> np.ndarray:
         frames = idle.copy()
         frames[:, CELLS - dead :] = 0.0
-        return flicker.evidence(runs_of(frames), PRESENT, PRESENT)
+        return flicker.evidence(runs_of(frames), PRESENT, PRESENT, sunk=False)
 
     assert np.flatnonzero(said(10) > 0).tolist() == list(range(CELLS - 10, CELLS))
     assert not (said(40) > 0).any()
@@ -59,7 +59,7 @@ def test_a_cell_that_is_not_heard_for_long_is_not_said_to_read_the_same():
     flicker = Flicker.fit(flickering(0), PRESENT)
     frames = np.concatenate(flickering(5, 5))
     frames[50:, 60] = np.nan
-    assert not (flicker.evidence(runs_of(frames), PRESENT, PRESENT) > 0).any()
+    assert not (flicker.evidence(runs_of(frames), PRESENT, PRESENT, sunk=False) > 0).any()
 
 
 def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_blamed_for_want_of_noise():
@@ -77,7 +77,7 @@ def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_blamed_for_wa
     for frames in read(1, 6, sunk=0.015):
         memory.extend(frames)
     memory = memory.complete()
-    same = fitted.reference_.flicker.evidence(memory.runs, memory.rests(), PRESENT)
+    same = fitted.reference_.flicker.evidence(memory.runs, memory.rests(), PRESENT, sunk=False)
     assert (same > 0).any()  # they read 0, and nothing else
     assert not (memory.temporal() > 10).any()
 

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from diagnostics.temporal import Onsets, StillRuns, held, same_for
+from diagnostics.readings import held
+from diagnostics.temporal import Onsets, StillRuns, same_for
 
 TOLERANCE = 0.02
 FULL_SCALE = 5.0

@@ -169,9 +169,7 @@ def test_more_evidence_than_is_held_for_certain_is_worth_the_less_the_farther_he
     far = np.linspace(0, 18, 40)
     dead = np.arange(80) < 40
     odds = np.full(80, 3.0)
-    assert (
-        _slope_beyond(6.1 + np.concatenate([far, far]), odds, dead, 1.5) < 0.1
-    )  # healthy ones go as far as the others
+    assert _slope_beyond(6.1 + np.concatenate([far, far]), odds, dead, 1.5) < 0.1  # healthy ones go as far
     assert _slope_beyond(6.1 + np.concatenate([far, far / 20]), odds, dead, 1.5) == pytest.approx(1.5)
     few = np.concatenate([6.1 + far, 6.1 + far[:3], np.zeros(1500)])  # of so many a model errs about some
     assert _slope_beyond(few, np.full(len(few), 3.0), np.arange(len(few)) < 40, 1.5) == 1.5

@@ -233,6 +233,6 @@ def surest_of(n_touches: int) -> float:
 
 def _touches(recording: NDArray[np.float64], scale: Scale) -> tuple[Touch, ...]:
     touches = Touches()
-    for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
-        touches = touches.extend(scale.root_load(frames), numbers, scale.root_near, still, np.zeros_like(still))
+    for frames, numbers, start in segments(recording, SEGMENT, scale.near / 2):
+        touches = touches.extend(scale.root_load(frames), numbers, scale.root_near, start, np.zeros(len(start), bool))
     return touches.kept

@@ -188,9 +188,7 @@ class Memory:
         self.settled = np.where(self.runs.start == start, self.settled, 0.0)
         root, still = scale.root_load(self._tare.off(frames)), self.runs.start <= numbers[0]
         self.touched = self.touched | root.any(axis=0)
-        sudden = self._sudden() >= SUDDEN
-        onset = np.where(sudden & self.runs.alone & ~still, self.runs.start, -1)
-        self._remember(root, numbers, still, still & sudden, onset)
+        self._remember(root, numbers, (self._sudden() >= SUDDEN) & (self.runs.alone | still))
         self.unrest = self.unrest.extend(frames, root, numbers, scale, self.reference.usual, still)
         self.twins = self.twins.extend(self._comparable(frames), numbers, telling(frames, still, scale), scale.near)
 
@@ -198,15 +196,8 @@ class Memory:
     def _crowded(self) -> bool:
         return len(self.touches.kept) > MOST_TOUCHES
 
-    def _remember(
-        self,
-        root: Array,
-        numbers: NDArray[np.intp],
-        still: NDArray[np.bool_],
-        stuck: NDArray[np.bool_],
-        onset: NDArray[np.intp],
-    ) -> None:
-        self.touches = self.touches.extend(root, numbers, self.scale.root_near, still, stuck, onset)
+    def _remember(self, root: Array, numbers: NDArray[np.intp], jumped: NDArray[np.bool_]) -> None:
+        self.touches = self.touches.extend(root, numbers, self.scale.root_near, self.runs.start, jumped)
 
     def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
         return frames

@@ -61,8 +61,9 @@ class _Touched:
         seen: list[list[Seen]] = [[] for _ in every]
         for i, recording in enumerate(readings):
             touches = PatchTouches.begin(every)
-            for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
-                touches = touches.extend(scale.root_load(frames), numbers, scale.root_near, still, np.zeros_like(still))
+            for frames, numbers, start in segments(recording, SEGMENT, scale.near / 2):
+                none = np.zeros(len(start), bool)
+                touches = touches.extend(scale.root_load(frames), numbers, scale.root_near, start, none)
             for k, of_patch in touches.kept():
                 seen[k] += Seen.of(of_patch.kept, i)
         return cls(readings, scale, every, seen)

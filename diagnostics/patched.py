@@ -170,11 +170,10 @@ class PatchedMemory(Memory):
     def _crowded(self) -> bool:
         return any(len(touches.kept) > MOST_TOUCHES for touches in self.local.of)
 
-    def _remember(
-        self, root: Array, numbers: NDArray[np.intp], still: Mask, stuck: Mask, onset: NDArray[np.intp]
-    ) -> None:
-        self.local = self.local.extend(root, numbers, self.scale.root_near, still, stuck, onset)
-        skin = self.touches.extend(root, numbers, self.scale.root_near, still, stuck)
+    def _remember(self, root: Array, numbers: NDArray[np.intp], jumped: Mask) -> None:
+        start = self.runs.start
+        self.local = self.local.extend(root, numbers, self.scale.root_near, start, jumped)
+        skin = self.touches.extend(root, numbers, self.scale.root_near, start, jumped)
         self.touches = skin.split(KEPT_TOUCHES)[1].bare()  # more would say no more
 
     def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -135,17 +135,15 @@ class PatchTouches:
         root: Array,
         numbers: Cells,
         root_near: float,
-        still: NDArray[np.bool_],
-        stuck: NDArray[np.bool_],
-        onset: Cells | None = None,
+        start: Cells,
+        jumped: NDArray[np.bool_],
     ) -> PatchTouches:
         """Return the touches after more frames, see ``Touches.extend``; a patch in which nothing moves is as before."""
         of = list(self.of)
-        for i in self._inputs.with_any(~still):
+        for i in self._inputs.with_any(start > numbers[0]):
             if self._needed[i]:
                 cells = self.patches[i].inputs
-                began = None if onset is None else onset[cells]
-                of[i] = of[i].extend(root[:, cells], numbers, root_near, still[cells], stuck[cells], began)
+                of[i] = of[i].extend(root[:, cells], numbers, root_near, start[cells], jumped[cells])
         return self.replaced(of)
 
     def replaced(self, of: Sequence[Touches]) -> PatchTouches:

@@ -133,7 +133,7 @@ def _usual_twins(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout
     most = 0
     for recording in recordings:
         twins = Twins.begin(layout)
-        for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
-            twins = twins.extend(frames, numbers, telling(frames, still, scale), scale.near)
+        for frames, numbers, start in segments(recording, SEGMENT, scale.near / 2):
+            twins = twins.extend(frames, numbers, telling(frames, start <= numbers[0], scale), scale.near)
         most = max(most, twins.most)
     return most + max(0, int(np.ceil(np.log2(_TELLING / len(recordings)))))

@@ -88,10 +88,10 @@ class StillRuns:
             step = frames[steps] - before
             size = np.fmax(frames[steps], before) - resting
             drastic = np.maximum(0.5 * size, 4 * tolerance)
-            # Broken cells hold their value all along: only cells that moved lately could have jumped too.
-            lately = high - low > 2 * tolerance
-            lately |= self.length < _LATELY
-            loaded = np.maximum(_in_each((size > 4 * tolerance) & lately), 1)
+            # Cells broken from the start hold their value all along: only others could have jumped too.
+            able = (high - low > 2 * tolerance) | self.moved
+            able |= self.length < _LATELY
+            loaded = np.maximum(_in_each((size > 4 * tolerance) & able), 1)
             # A release lets cells fall together and none rise, a grasp the other way round: only cells that go the same
             # way are company. When many break at once, some fall and some rise.
             share = np.stack([_in_each(step < -drastic), _in_each(step > drastic)]) / loaded
@@ -154,14 +154,14 @@ def _in_each(which: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 def segments(
     recording: Floats, length: int, tolerance: float
-) -> Iterator[tuple[Floats, NDArray[np.intp], NDArray[np.bool_]]]:
-    """Yield a recording ``[T, D]`` in pieces: frames, their numbers, and which cells ``[D]`` are still all through."""
+) -> Iterator[tuple[Floats, NDArray[np.intp], NDArray[np.intp]]]:
+    """Yield a recording ``[T, D]`` in pieces: frames, their numbers, and from which on each cell ``[D]`` is still."""
     runs = StillRuns.begin(recording.shape[1])
     for first in range(0, len(recording), length):
         frames = recording[first : first + length]
         numbers = np.arange(first, first + len(frames))
         runs = runs.extend(frames, numbers, tolerance)
-        yield frames, numbers, runs.start <= first
+        yield frames, numbers, runs.start
 
 
 @dataclass(frozen=True)

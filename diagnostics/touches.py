@@ -26,6 +26,9 @@ _LEAST = 0.1  # root load: what moved less in all has touched nothing
 _WEAKEST = 0.1  # of the strongest touch so far: less is unrest, not a touch that could end
 _MOVING = 0.25  # of a load must be going, and as much of it gone, when a touch is said to be over
 _ELSEWHERE = 0.2  # of the load must go in one frame, and as much come, when another touch begins with it
+# Or so much, if that is so often what goes and comes in nine of ten frames: in static holds nothing else moves.
+_STIRS, _STIRRED, _MOSTLY = 0.06, 3.0, 0.9
+_STAYS = 0.65  # of the cells it loads stay as they are: then it is the same touch, whatever else changes
 _SAME_PLACE = 0.6  # cosine between loads of one touch; less alike, and it is another
 
 
@@ -180,9 +183,8 @@ class Touches:
         root: Array,
         numbers: NDArray[np.intp],
         root_near: float,
-        still: NDArray[np.bool_],
-        stuck: NDArray[np.bool_],
-        onset: NDArray[np.intp] | None = None,
+        start: NDArray[np.intp],
+        jumped: NDArray[np.bool_],
     ) -> Touches:
         """Return the touches after more frames.
 
@@ -190,19 +192,20 @@ class Touches:
             root: root loads ``[t, D]`` of the frames, t >= 1.
             numbers: int ``[t]``, of the frames, ascending.
             root_near: the root load from which on a cell counts as loaded.
-            still: bool ``[D]``, cells that do not move in these frames. Whether a load is released is asked of the
-                others: broken cells hold their value for ever.
-            stuck: bool ``[D]``, those of them that jumped to where they are, and may be broken: how large a load is
-                that could be released is asked of the others.
-            onset: int ``[D]``, number of the frame in which each jumped to where it is, alone, -1 for the others; None:
-                none did. Another part of the touch begins where most did, so that they can be judged from there on.
+            start: int ``[D]``, number of the frame from which on each cell is still. Whether a load is released is
+                asked of those that move in these frames: broken cells hold their value for ever.
+            jumped: bool ``[D]``, cells that jumped to where they are, and may be broken: how large a load is that could
+                be released is asked of the others. Where most of them did in these frames another part of the touch
+                begins, so that they can be judged from there on.
         """
         kept, widest, fading, last = list(self.kept), self.widest, self.fading, self.last
         going_on = bool(kept) and not fading  # the next part belongs to the last touch
         begin = 0
-        weigh = np.stack([~still, ~stuck], axis=1).astype(np.float32)  # a product sums over either
-        begins = self._begins(root, weigh[:, 0], root_near)
-        broke = -1 if onset is None else _most_common(onset[onset >= 0])
+        still = start <= numbers[0]
+        weigh = np.stack([~still, ~(still & jumped)], axis=1).astype(np.float32)  # a product sums over either
+        before = np.concatenate([root[:1] if last is None else last[None], root[:-1]])
+        begins = self._begins(root, before, numbers, root_near, start)
+        broke = _most_common(start[jumped & ~still])
         edges = sorted({*begins, *np.flatnonzero(numbers == broke).tolist(), len(root)})
         while begin < len(root):
             if fading:
@@ -210,12 +213,14 @@ class Touches:
                 if begin == len(root):
                     break
                 fading = going_on = False
-            if begin in begins:
-                going_on = False
             edges = [edge for edge in edges if edge > begin]
             ahead = root[begin : edges[0]]
             lowest, highest = lowest_so_far(ahead), highest_so_far(ahead)
-            if going_on:
+            if begin in begins:
+                going_on = False
+                # What lay there before is where the load of this touch has come from, all at once.
+                lowest = np.minimum(lowest, before[begin])
+            elif going_on:
                 lowest = np.minimum(lowest, kept[-1].lowest)
                 highest = np.maximum(highest, kept[-1].highest)
             (floor, lowest_of_all), (peak, highest_of_all) = (lowest @ weigh).T, (highest @ weigh).T
@@ -234,7 +239,7 @@ class Touches:
                 else:
                     if kept:
                         widest = max(widest, kept[-1].swing(weigh[:, 1]))
-                    kept.append(Touch((part,), ahead[:end].min(axis=0), ahead[:end].max(axis=0)))
+                    kept.append(Touch((part,), low, high))
                 going_on = True
             begin += end
             if begin < edges[0]:
@@ -242,20 +247,23 @@ class Touches:
                 begin += 1
         return Touches(tuple(kept), widest, fading, root[-1])
 
-    def _begins(self, root: Array, weigh: Array, root_near: float) -> list[int]:
-        """Return the frames in which the load is all at once elsewhere, as where another recording begins.
-
-        Args:
-            root: root loads ``[t, D]``.
-            weigh: float ``[D]``, 1 for the cells that move, 0 for the others.
-            root_near: smaller changes are unrest.
-        """
-        before = np.concatenate([root[:1] if self.last is None else self.last[None], root[:-1]])
+    def _begins(
+        self, root: Array, before: Array, numbers: NDArray[np.intp], root_near: float, start: NDArray[np.intp]
+    ) -> list[int]:
+        """Return the frames in which the load is all at once elsewhere, as where another recording begins."""
         step = root - before
-        step -= np.clip(step, -root_near, root_near)
-        exchanged = np.abs(step) @ weigh - np.abs(step @ weigh)  # what came as well as went, twice
-        enough = 2 * np.maximum(_ELSEWHERE * np.maximum(root @ weigh, before @ weigh), _LEAST)
-        begins: list[int] = np.flatnonzero(exchanged >= enough).tolist()
+        step -= np.clip(step, -root_near, root_near)  # what is less is unrest
+        moving = ((start >= numbers[0]) & (start > 0)).astype(np.float32)
+        exchanged = (np.abs(step) @ moving - np.abs(step @ moving)) / 2  # what came as well as went
+        share = exchanged / np.maximum(np.maximum(root @ moving, before @ moving), np.float32(1e-9))
+        at = np.flatnonzero((share >= _STIRS) & (exchanged >= _LEAST))
+        if not len(at):
+            return []
+        at = at[share[at] >= min(_ELSEWHERE, _STIRRED * float(np.quantile(share, _MOSTLY)))]
+        # What has not moved since the last touch began may be held by it; what has held still for longer is not.
+        own = (before[at] > root_near) & (start + 1 >= (self.kept[-1].first if self.kept else 0))
+        stays = own & (start < numbers[at, None])
+        begins: list[int] = at[stays.sum(axis=1) <= _STAYS * own.sum(axis=1)].tolist()
         return begins
 
     def bare(self) -> Touches:

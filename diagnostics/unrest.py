@@ -96,7 +96,8 @@ class Usual:
         unrest = Unrest.begin(layout)
         reached = np.stack([unrest.blinking, unrest.noisy])
         for recording in recordings:
-            for frames, numbers, still in segments(recording, SEGMENT, scale.near / 2):
+            for frames, numbers, start in segments(recording, SEGMENT, scale.near / 2):
+                still = start <= numbers[0]
                 unrest = unrest.extend(frames, scale.root_load(frames), numbers, scale, usual, still, np.inf)
                 reached = np.maximum(reached, [unrest.blinking, unrest.noisy])
         counts = _ENOUGH / np.maximum(_ENOUGH, _MARGIN * np.quantile(reached, _HEALTHY, axis=1))

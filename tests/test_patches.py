@@ -71,12 +71,12 @@ def test_an_array_of_a_few_hundred_cells_is_one_patch():
 
 
 def test_a_patch_in_which_nothing_moves_costs_nothing():
-    touches, still = PatchTouches.begin(patches(SKIN)), np.ones(SKIN.n_cells, bool)
+    touches, still, numbers = PatchTouches.begin(patches(SKIN)), np.ones(SKIN.n_cells, bool), np.arange(32)
     still[SKIN.cell(1, 12, 12)] = False
     frames = np.zeros((32, SKIN.n_cells))
     frames[:, ~still] = np.linspace(0, 2, 32)[:, None]
     scale = Scale(np.zeros(SKIN.n_cells), 0.05, 5.0)
-    after = touches.extend(scale.root_load(frames), np.arange(32), scale.root_near, still, np.zeros_like(still))
+    after = touches.extend(scale.root_load(frames), numbers, scale.root_near, np.where(still, 0, 31), still < 0)
     touched = {i for i, patch in enumerate(touches.patches) if not still[patch.inputs].all()}
     assert {i for i, (a, b) in enumerate(zip(touches.of, after.of, strict=True)) if a is not b} == touched
     assert 0 < len(touched) < len(touches.patches)

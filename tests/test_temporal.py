@@ -86,6 +86,12 @@ def test_a_jump_alone_has_no_company_and_the_release_of_a_grasp_has():
     assert runs_of(released).company.min() > 0.8
 
 
+def test_a_jump_while_the_others_hold_a_load_still_has_no_company():
+    log = np.concatenate([np.zeros((20, 10)), np.ones((200, 10))])
+    log[150:, 3] = 5.0
+    assert runs_of(log, 32, 32, 32, 32, 32).company[3] < 0.2
+
+
 @pytest.mark.parametrize("rest", [0.0, 0.15, 0.6])
 def test_cells_that_rest_are_not_loaded_wherever_they_rest(rest: float):
     resting = np.full(40, rest)

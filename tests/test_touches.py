@@ -30,9 +30,7 @@ def touches_of(log: np.ndarray, size: int = 32, stuck: tuple[int, ...] = ()) -> 
         frames = log[first : first + size]
         numbers = np.arange(first, first + len(frames))
         runs = runs.extend(frames, numbers, 0.025)
-        still = runs.start <= first
-        onset = np.where(jumped & ~still, runs.start, -1)
-        touches = touches.extend(SCALE.root_load(frames), numbers, SCALE.root_near, still, still & jumped, onset)
+        touches = touches.extend(SCALE.root_load(frames), numbers, SCALE.root_near, runs.start, jumped)
     return touches
 
 
@@ -62,6 +60,30 @@ def test_a_load_that_moves_elsewhere_without_a_release_is_another_touch():
 def test_a_load_that_is_elsewhere_from_one_frame_to_the_next_begins_another_touch_with_that_frame(frames: int):
     log = np.concatenate([np.tile(load, (frames, 1)) for load in (HAND, np.roll(HAND, 3), HAND, np.roll(HAND, -2))])
     assert [t.first for t in touches_of(log).kept] == [0, frames, 2 * frames, 3 * frames]
+
+
+SEATED = np.array([0, 1, 2, 3, 3, 2, 1, 0, 0, 2, 3, 2], float)
+
+
+@pytest.mark.parametrize("frames", [50, 64, 77])
+def test_another_posture_of_one_who_sits_still_begins_another_touch(frames: int):
+    postures = SEATED, 0.2 * SEATED + 0.8 * np.roll(SEATED, 2), SEATED
+    log = np.concatenate([np.tile(load, (frames, 1)) for load in postures])
+    assert [t.first for t in touches_of(log).kept] == [0, frames, 2 * frames]
+
+
+@pytest.mark.parametrize("onset", [120, 128, 150])
+def test_cells_that_break_all_at_once_under_a_static_hold_begin_no_touch(onset: int):
+    log = np.concatenate([np.tile(load, (100, 1)) for load in (np.roll(SEATED, 3), SEATED)])
+    log[onset:, [3, 10]] = 0.0, 5.0
+    assert [t.first for t in touches_of(log).kept] == [0, 100]
+
+
+def test_the_breath_of_one_who_sits_still_ends_no_touch():
+    breath = np.zeros((200, CELLS))
+    breath[:, [1, 6]] = 0.2 * np.sin(np.arange(200) / 4)[:, None]
+    log = np.concatenate([np.tile(np.roll(SEATED, 3), (100, 1)), SEATED + breath])
+    assert [t.first for t in touches_of(log).kept] == [0, 100]
 
 
 @pytest.mark.parametrize("onset", [33, 50, 63, 70])

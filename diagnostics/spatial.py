@@ -39,6 +39,7 @@ _WORTHS = (0.25, 0.5, 0.75, 1.0)  # of the log odds of the model, in one touch o
 _WITNESS_SHARE = 0.5  # of what the moving cells say of that counts: neighbours err together
 _ONE_LOAD = 0.5  # correlation of what touches elsewhere say of a load that outlasts them
 _REPEATS, _THE_SAME = 0.15, 0.95  # correlation of what touches say that load the cells alike, and the cosine of such
+_CROWD = 0.5  # of the cells that hold a load look stuck: then it may be one touch that they all hold
 _MOST_ROUNDS = 8  # of judging, leaving suspects out and putting others back
 _MOST_DRIFTING = 16  # cells that are left out for their drift, one by one
 
@@ -191,7 +192,7 @@ class _Question:
         still, runs, values = Spatial.before(cells).asked, cells.runs, _Values.now(cells, scale, tolerance)
         # A load that came all of a sudden, and is still held: a quick grasp, or many cells broken at once. While this
         # touch lasts nobody can tell, so such cells are neither judged by it nor asked about the others.
-        held = still & ~values.rests & runs.moved & (runs.start >= touches[-1].first) & ~cells.outlasted
+        held = still & ~values.rests & runs.moved & (runs.start >= touches[-1].since) & ~cells.outlasted
         unsure = held & (cells.sudden >= SUDDEN) & (cells.temporal < SUDDEN)
         asked = still & ~unsure
         features, begins, counted = _looked_at(touches, runs, asked)
@@ -222,6 +223,11 @@ class _Agreed(NamedTuple):
     at_first: Floats
     evidence: Floats
     trusted: Mask
+
+    def length(self, question: _Question, suspicious: float) -> float:
+        """How long it is to describe what is seen: by what is expected, or by naming a cell stuck and its value."""
+        named = suspicious - question.values.prior
+        return float(np.minimum(self.brought, named)[question.asked].sum())
 
 
 def _agreed(question: _Question, trusted: Mask, suspicious: float) -> Generator[None, None, _Agreed]:
@@ -265,10 +271,17 @@ def stuck_evidence(
     # few are broken.
     first = np.array([touch.first for touch in touches])
     moved = cells.askable & runs.moved & (first[:, None] <= runs.start)
-    fresh = runs.start >= first[-1]
+    fresh = runs.start >= touches[-1].since
     trusted = question.askable & runs.moved & (values.rests | (fresh & (cells.temporal < SUDDEN)))
     said = yield from _agreed(question, trusted, caution.suspicious)
-    at_first, drifts, whole = said.at_first, np.zeros(len(trusted), bool), question.features[question.begins]
+    at_first = said.at_first
+    held = question.asked & ~values.rests & question.askable
+    suspects = held & ~said.trusted
+    if suspects.sum() > _CROWD * held.sum():
+        # All that hold a load may have each other: one touch that goes on, and not as many cells broken at once.
+        other = yield from _agreed(question, said.trusted | suspects, caution.suspicious)
+        said = min(said, other, key=lambda said: said.length(question, caution.suspicious))
+    drifts, whole = np.zeros(len(trusted), bool), question.features[question.begins]
     for _ in range(_MOST_DRIFTING):
         yield
         expected = said.expected.on(question.begins)

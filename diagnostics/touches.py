@@ -24,6 +24,7 @@ _PARTS = 6  # of a touch at most; neighbours are put together beyond that
 _RELEASED = 0.3  # of its highest load: when less is left, a touch is over
 _LEAST = 0.1  # root load: what moved less in all has touched nothing
 _WEAKEST = 0.1  # of the strongest touch so far: less is unrest, not a touch that could end
+_SLIGHT = 0.05  # of a load that holds still: less is a breath, not its release
 _MOVING = 0.25  # of a load must be going, and as much of it gone, when a touch is said to be over
 _ELSEWHERE = 0.2  # of the load must go in one frame, and as much come, when another touch begins with it
 # Or so much, if that is so often what goes and comes in nine of ten frames: in static holds nothing else moves.
@@ -107,6 +108,8 @@ class Summary:
 class Touch:
     """One touch: at most six parts, and the range of the root loads of each cell in it, ``[D]``.
 
+    What has held still ``since`` that frame, or later, has not outlasted the touch before: it may belong to this one.
+
     How far a load has risen within the touch tells when it is released. A cell that holds one value has no part in
     that, whatever it holds.
     """
@@ -114,6 +117,7 @@ class Touch:
     parts: tuple[Summary, ...]
     lowest: Array
     highest: Array
+    since: int
 
     @property
     def first(self) -> int:
@@ -148,7 +152,7 @@ class Touch:
             sizes = [a.n + b.n for a, b in pairwise(parts)]
             i = int(np.argmin(sizes))
             parts[i : i + 2] = [parts[i] + parts[i + 1]]
-        return Touch(tuple(parts), np.minimum(self.lowest, lowest), np.maximum(self.highest, highest))
+        return Touch(tuple(parts), np.minimum(self.lowest, lowest), np.maximum(self.highest, highest), self.since)
 
     def same_place(self, part: Summary, lowest: Array) -> bool:
         """Whether ``part`` loads about the same cells; no load lies anywhere."""
@@ -225,7 +229,10 @@ class Touches:
                 highest = np.maximum(highest, kept[-1].highest)
             (floor, lowest_of_all), (peak, highest_of_all) = (lowest @ weigh).T, (highest @ weigh).T
             now, moving = (ahead @ weigh)[:, 0], peak - floor
-            enough = np.maximum(_MOVING * (highest_of_all - lowest_of_all), max(_WEAKEST * widest, _LEAST))
+            # What holds still since the touch began is the load that would have to go.
+            held = still & (start >= (kept[-1].since if going_on else numbers[begin]))
+            weakest = max(_WEAKEST * widest, _LEAST, _SLIGHT * float(ahead[0] @ held))
+            enough = np.maximum(_MOVING * (highest_of_all - lowest_of_all), weakest)
             # A load that only relaxes is lowest in the end too, but most of it is still there.
             gone = peak - now >= _MOVING * peak
             released = (now - floor <= _RELEASED * moving) & (moving > enough) & gone
@@ -239,7 +246,12 @@ class Touches:
                 else:
                     if kept:
                         widest = max(widest, kept[-1].swing(weigh[:, 1]))
-                    kept.append(Touch((part,), low, high))
+                    since = part.first
+                    if going_on:  # it came somewhen in the segment before
+                        since = max(since - SEGMENT, kept[-1].first) + 1
+                    elif kept and begin not in begins:  # with the release
+                        since = min(since, kept[-1].end)
+                    kept.append(Touch((part,), low, high, since))
                 going_on = True
             begin += end
             if begin < edges[0]:
@@ -261,7 +273,7 @@ class Touches:
             return []
         at = at[share[at] >= min(_ELSEWHERE, _STIRRED * float(np.quantile(share, _MOSTLY)))]
         # What has not moved since the last touch began may be held by it; what has held still for longer is not.
-        own = (before[at] > root_near) & (start + 1 >= (self.kept[-1].first if self.kept else 0))
+        own = (before[at] > root_near) & (start >= (self.kept[-1].since if self.kept else 0))
         stays = own & (start < numbers[at, None])
         begins: list[int] = at[stays.sum(axis=1) <= _STAYS * own.sum(axis=1)].tolist()
         return begins
@@ -270,7 +282,7 @@ class Touches:
         """Return the same without what the cells did in the touches that are over: only when they were."""
         nothing = np.zeros(0, np.float32)
         over = (
-            Touch((Summary(t.first, t.end - t.first, nothing, nothing, nothing),), nothing, nothing)
+            Touch((Summary(t.first, t.end - t.first, nothing, nothing, nothing),), nothing, nothing, t.since)
             for t in self.kept[:-1]
         )
         return replace(self, kept=(*over, *self.kept[-1:]))

@@ -58,7 +58,7 @@ def seen(log: np.ndarray) -> tuple[StillRuns, list[Touch]]:
         runs = runs.extend(frames, np.arange(first, first + len(frames)), 0.025)
         root = SCALE.root_load(frames)
         halves = tuple(Summary.of(root[i : i + 10], first + i, SCALE.root_near) for i in (0, 10))
-        touches.append(Touch(halves, root.min(axis=0), root.max(axis=0)))
+        touches.append(Touch(halves, root.min(axis=0), root.max(axis=0), halves[0].first))
     return runs, touches
 
 

@@ -17,7 +17,7 @@ def touch(rng: np.random.Generator) -> Touch:
     r, c = rng.uniform(1, 7, 2)
     load = np.maximum(0, 2 - ((ROW - r) ** 2 + (COLUMN - c) ** 2) / 4)
     root = SCALE.root_load(load * np.linspace(0.5, 1, 20)[:, None])
-    return Touch((Summary.of(root, 0, SCALE.root_near),), root.min(axis=0), root.max(axis=0))
+    return Touch((Summary.of(root, 0, SCALE.root_near),), root.min(axis=0), root.max(axis=0), 0)
 
 
 @pytest.fixture(scope="module")

@@ -59,10 +59,17 @@ class Expected:
         return Expected(never, always, mean, self.spread[cells], self.own[cells])
 
     def within(
-        self, low: NDArray[np.float64], high: NDArray[np.float64], cells: NDArray[np.intp]
+        self,
+        low: NDArray[np.float64],
+        high: NDArray[np.float64],
+        cells: NDArray[np.intp],
+        strange: NDArray[np.float64] | float = 1.0,
     ) -> NDArray[np.float64]:
-        """Return P(mean root load from ``low`` to ``high``), ``[n, k]``, of k ``cells``; the bounds are ``[k]``."""
-        mean, spread = self.mean[:, cells], self.spread[cells]
+        """Return P(mean root load from ``low`` to ``high``), ``[n, k]``, of k ``cells``; the bounds are ``[k]``.
+
+        ``strange``: how many times as far as usual loads are off in each stretch, ``[n]``.
+        """
+        mean, spread = self.mean[:, cells], self.spread[cells] * np.reshape(strange, (-1, 1))
         likely = _student_t((high - mean) / spread) - _student_t((low - mean) / spread)
         # Now and then a touch is like none before: then any load is as likely as any other.
         p = (1 - _NOVEL) * likely + _NOVEL * (np.minimum(high, 1.0) - low)

@@ -37,6 +37,8 @@ SUDDEN = 1.0  # log ratio of a jump from which on a cell is no witness
 _TELLING = 0.5  # log evidence from which on a touch counts as one that tested the cell
 _WORTHS = (0.25, 0.5, 0.75, 1.0)  # of the log odds of the model, in one touch or another
 _WITNESS_SHARE = 0.5  # of what the moving cells say of that counts: neighbours err together
+_USUALLY = 0.741  # spreads: half of all loads are farther off what is expected (Student's t, 4 degrees of freedom)
+_AS_USUAL, _STRANGEST = 4, 4.0  # cells that are off as usual, beside those seen in a touch; times as far, at most
 _ONE_LOAD = 0.5  # correlation of what touches elsewhere say of a load that outlasts them
 _REPEATS, _THE_SAME = 0.15, 0.95  # correlation of what touches say that load the cells alike, and the cosine of such
 _CROWD = 0.5  # of the cells that hold a load look stuck: then it may be one touch that they all hold
@@ -205,7 +207,8 @@ class _Question:
         yield
         held = np.flatnonzero(self.asked & ~self.values.rests)
         likely = _believed(expected.never, self.features[:, 2] == 0, trusted & self.cells.runs.moved)
-        within = expected.within(self.values.low[held], self.values.high[held], held)
+        strange = _strange(expected, self.features, trusted)
+        within = expected.within(self.values.low[held], self.values.high[held], held, strange)
         likely[:, held] = expected.always[:, held] * within
         return expected, np.where(self.counted, -self.worth * np.log(np.maximum(likely, _LEAST)), 0.0)
 
@@ -371,6 +374,20 @@ def _looked_at(touches: Sequence[Touch], runs: StillRuns, asked: Mask) -> tuple[
     counted = within & ~earlier & asked
     needed = np.flatnonzero(begins | counted.any(axis=1))
     return np.stack([suffixes[i].features() for i in needed]), begins[needed], counted[needed]
+
+
+def _strange(expected: Expected, features: Array, witness: Mask) -> Floats:
+    """Return how many times as far as usual loads are off what is expected, ``[n]``, 1 to 4.
+
+    So far off are half of those of the ``witness`` (bool ``[D]``), cells that are known to work.
+    """
+    known = witness & np.isfinite(expected.spread)
+    loaded = features[:, 2, known] > 0
+    error = np.abs(features[:, 1, known] - expected.mean[:, known]) / expected.spread[known]
+    error = np.column_stack([np.where(loaded, error, np.inf), np.full((len(features), _AS_USUAL), _USUALLY)])
+    middle = (loaded.sum(axis=1) + _AS_USUAL) // 2
+    half: Floats = np.sort(error, axis=1)[np.arange(len(features)), middle]
+    return np.clip(half / _USUALLY, 1.0, _STRANGEST)
 
 
 def _believed(never: Floats, unloaded: NDArray[np.bool_], witness: NDArray[np.bool_]) -> Floats:

@@ -41,7 +41,6 @@ _USUALLY = 0.741  # spreads: half of all loads are farther off what is expected 
 _AS_USUAL, _STRANGEST = 4, 4.0  # cells that are off as usual, beside those seen in a touch; times as far, at most
 _ONE_LOAD = 0.5  # correlation of what touches elsewhere say of a load that outlasts them
 _REPEATS, _THE_SAME = 0.15, 0.95  # correlation of what touches say that load the cells alike, and the cosine of such
-_CROWD = 0.5  # of the cells that hold a load look stuck: then it may be one touch that they all hold
 _MOST_ROUNDS = 8  # of judging, leaving suspects out and putting others back
 _MOST_DRIFTING = 16  # cells that are left out for their drift, one by one
 
@@ -227,11 +226,6 @@ class _Agreed(NamedTuple):
     evidence: Floats
     trusted: Mask
 
-    def length(self, question: _Question, suspicious: float) -> float:
-        """How long it is to describe what is seen: by what is expected, or by naming a cell stuck and its value."""
-        named = suspicious - question.values.prior
-        return float(np.minimum(self.brought, named)[question.asked].sum())
-
 
 def _agreed(question: _Question, trusted: Mask, suspicious: float) -> Generator[None, None, _Agreed]:
     """Ask the ``trusted`` cells, leave out those that look stuck, put the others back, until none changes sides."""
@@ -277,14 +271,7 @@ def stuck_evidence(
     fresh = runs.start >= touches[-1].since
     trusted = question.askable & runs.moved & (values.rests | (fresh & (cells.temporal < SUDDEN)))
     said = yield from _agreed(question, trusted, caution.suspicious)
-    at_first = said.at_first
-    held = question.asked & ~values.rests & question.askable
-    suspects = held & ~said.trusted
-    if suspects.sum() > _CROWD * held.sum():
-        # All that hold a load may have each other: one touch that goes on, and not as many cells broken at once.
-        other = yield from _agreed(question, said.trusted | suspects, caution.suspicious)
-        said = min(said, other, key=lambda said: said.length(question, caution.suspicious))
-    drifts, whole = np.zeros(len(trusted), bool), question.features[question.begins]
+    at_first, drifts, whole = said.at_first, np.zeros(len(trusted), bool), question.features[question.begins]
     for _ in range(_MOST_DRIFTING):
         yield
         expected = said.expected.on(question.begins)

@@ -38,6 +38,15 @@ class Presser:
         return Expected(0.02 * even, 0.02 * even, 0.5 * even, np.full(CELLS, 0.05), np.ones(CELLS))
 
 
+class Holder:
+    """Is sure that all cells hold a root load of one half throughout."""
+
+    def expect(self, features: Array, trusted: np.ndarray) -> Generator[None, None, Expected]:
+        expected = yield from Presser().expect(features, trusted)
+        expected.always[:] = 0.98
+        return expected
+
+
 class Row:
     """The last three cells lie in a row: each does what the other two do; without them it is loaded, more likely."""
 
@@ -104,6 +113,15 @@ def test_how_seldom_cells_stick_to_a_value_in_between_is_charged_once():
         charged.append((spatial.surprise - spatial.evidence)[[3, 4]])
     assert charged[0][1] > charged[0][0] + 2
     assert charged[1] == pytest.approx(charged[0])
+
+
+def test_a_value_that_was_not_expected_says_less_in_touches_in_which_all_loads_are_off():
+    said = []
+    for force in (1.0, 0.1):
+        log = force * pressed(4)
+        log[:, 3] = 4.5
+        said.append(judged(log, model=Holder()).surprise[3])
+    assert 0 < said[1] < said[0] - 2
 
 
 def test_a_cell_at_rest_is_not_suspected_while_nothing_touches_the_array():

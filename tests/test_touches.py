@@ -86,6 +86,16 @@ def test_the_breath_of_one_who_sits_still_ends_no_touch():
     assert [t.first for t in touches_of(log).kept] == [0, 100]
 
 
+@pytest.mark.parametrize("end", [100, 113, 126])
+@pytest.mark.parametrize("then", [np.roll(SEATED, 5), 0.2 * SEATED])
+def test_what_is_held_since_a_slow_change_of_posture_has_not_outlasted_the_touch_before(end: int, then: np.ndarray):
+    share = np.clip((np.arange(250)[:, None] - end + 15) / 15, 0, 1)
+    log = (1 - share) * SEATED + share * then
+    touches = touches_of(log).kept
+    assert len(touches) == 2
+    assert touches[1].since <= end
+
+
 @pytest.mark.parametrize("onset", [33, 50, 63, 70])
 @pytest.mark.parametrize("value", [0.0, 5.0])
 def test_cells_that_break_within_a_touch_can_be_judged_by_the_rest_of_it(onset: int, value: float):

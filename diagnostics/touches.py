@@ -161,6 +161,15 @@ class Touch:
         size = float(np.sqrt((before @ before) * (now @ now)))
         return size <= _LEAST**2 or float(before @ now) >= _SAME_PLACE * size
 
+    def stays(self, part: Summary, root_near: float, start: NDArray[np.intp], jumped: NDArray[np.bool_]) -> bool:
+        """Whether most of the cells that it loads hold in ``part`` what they held in it; see ``Touches.extend``.
+
+        Cells that have never moved may have been broken all along, and those that hold still for longer than it lasts.
+        """
+        own = (self.mean() > root_near) & (start >= self.since) & ~jumped
+        held = own & (start > 0) & (start < self.end) & (part.most > root_near)
+        return int(held.sum()) > _STAYS * int(own.sum())
+
     def mean(self) -> Array:
         """Return the mean root load of each cell, ``[D]``."""
         return sum((p.total for p in self.parts[1:]), self.parts[0].total) / np.float32(self.n)
@@ -241,7 +250,8 @@ class Touches:
                 part = Summary.of(ahead[:end], int(numbers[begin]), root_near)
                 low, high = lowest[end - 1], highest[end - 1]
                 # Cells that broke do not make another touch.
-                if going_on and (part.first == broke or kept[-1].same_place(part, low)):
+                same = going_on and (part.first == broke or kept[-1].same_place(part, low))
+                if same or (kept and begin not in begins and kept[-1].stays(part, root_near, start, jumped)):
                     kept[-1] = kept[-1].grown(part, low, high)
                 else:
                     if kept:

@@ -79,9 +79,10 @@ def test_cells_that_break_all_at_once_under_a_static_hold_begin_no_touch(onset: 
     assert [t.first for t in touches_of(log).kept] == [0, 100]
 
 
-def test_the_breath_of_one_who_sits_still_ends_no_touch():
+@pytest.mark.parametrize("amplitude", [0.2, 0.5, 1.0])
+def test_the_breath_of_one_who_sits_still_ends_no_touch(amplitude: float):
     breath = np.zeros((200, CELLS))
-    breath[:, [1, 6]] = 0.2 * np.sin(np.arange(200) / 4)[:, None]
+    breath[:, [1, 6]] = amplitude * np.sin(np.arange(200) / 4)[:, None]
     log = np.concatenate([np.tile(np.roll(SEATED, 3), (100, 1)), SEATED + breath])
     assert [t.first for t in touches_of(log).kept] == [0, 100]
 

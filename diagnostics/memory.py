@@ -111,7 +111,8 @@ class Memory:
     def temporal(self) -> NDArray[np.float64]:
         """What each cell's still stretch says, and the jump into it, a log likelihood ratio ``[D]``."""
         reference = self.reference
-        rests, lower = self.rests(), reference.least.lower(self.runs, self.present)
+        rests = self.rests()
+        lower = reference.least.lower(self.runs, rests & self.present)
         low = reference.least.evidence(self.runs, rests, reference.tolerance, self.present, lower)
         noise = reference.flicker.evidence(self.runs, rests, self.present, lower < -reference.tolerance)
         untouched = np.where(np.abs(noise) > np.abs(low), noise, low)

@@ -41,7 +41,7 @@ class Least:
 
     Attributes:
         reading: float ``[D]``; full scale where the noise lets no cell hold still; -inf: not known.
-        usual: so far above it most cells rest; -inf: not known.
+        usual: so far above it most untouched cells read at least; -inf: not known.
     """
 
     reading: Floats
@@ -54,9 +54,16 @@ class Least:
 
     @classmethod
     def fit(
-        cls, low: Floats, usual: Floats, peaks: Floats, present: NDArray[np.bool_], tolerance: float, full_scale: float
+        cls,
+        low: Floats,
+        last: Floats,
+        peaks: Floats,
+        most: Floats,
+        present: NDArray[np.bool_],
+        tolerance: float,
+        full_scale: float,
     ) -> Least:
-        """Learn from what :func:`_low` returns of a reference."""
+        """Learn from what :func:`_low` returns of a reference in which untouched cells read ``most`` (``[D]``)."""
         told = peaks[:, present]
         reading = np.full(len(low), np.quantile(told[np.isfinite(told)], _RARE, method="lower") - 2 * tolerance)
         # Where most cells rest at 0, one that always reads more is loaded.
@@ -68,15 +75,14 @@ class Least:
             rare = float(np.quantile(told, _RARE, method="lower"))
             beyond = max((_BEYOND - 1) * (float(np.median(told)) - rare), tolerance)
             reading = np.where(often, np.maximum(reading, low + rare - beyond), reading)
-        return cls(reading, float(np.median((usual - reading)[present])))
+        above = (np.median((row - reading)[rests]) for row in last if (rests := present & (row <= most)).any())
+        return cls(reading, float(min(above, default=-np.inf)))
 
-    def lower(self, runs: StillRuns, present: NDArray[np.bool_]) -> float:
-        """Return by how much all cells together read less than they mostly did, 0 or below."""
-        value = runs.value
-        heard = present & np.isfinite(value)
-        if not (np.isfinite(self.usual) and heard.any()):
+    def lower(self, runs: StillRuns, rests: NDArray[np.bool_]) -> float:
+        """Return by how much those that rest (bool ``[D]``) all read less than they ever did, 0 or below."""
+        if not (np.isfinite(self.usual) and rests.any()):
             return 0.0
-        return min(0.0, float(np.median(value[heard] - self.reading[heard])) - self.usual)
+        return min(0.0, float(np.median((runs.value - self.reading)[rests])) - self.usual)
 
     def evidence(
         self, runs: StillRuns, rests: NDArray[np.bool_], tolerance: float, present: NDArray[np.bool_], lower: float
@@ -127,7 +133,7 @@ def resting(
         tolerance: a cell is still while it stays within +- this; a wander within it counts as rest anyway.
         full_scale: of the layout.
     """
-    low, usual, peaks = _low(recordings)
+    low, last, peaks = _low(recordings)
     cells, some = Readings.of(recordings).sample(present)
     offsets, bends = [], []
     for frames in some:
@@ -144,7 +150,7 @@ def resting(
     most = low + max(0.0, _highest(light) + _NOISE * noise - tolerance)
     if noise > tolerance:
         return most, Least(np.full(len(low), full_scale), -np.inf)
-    return most, Least.fit(low, usual, peaks, present, tolerance, full_scale)
+    return most, Least.fit(low, last, peaks, most, present, tolerance, full_scale)
 
 
 def _highest(offset: Floats) -> float:
@@ -160,21 +166,21 @@ def _highest(offset: Floats) -> float:
 
 
 def _low(recordings: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return a low quantile and the median of each cell's readings, ``[D]``; 0 for a cell without any.
+    """Return a low quantile of each cell's readings, ``[D]``; 0 for a cell without any.
 
-    And the lowest that it read at its highest in half a segment of each recording, ``[recordings, D]``.
+    And the last in each recording, and the lowest that it read at its highest in half a segment, ``[recordings, D]``.
     """
     readings, n_cells = Readings.of(recordings), recordings[0].shape[1]
-    low, usual, peaks = np.zeros(n_cells), np.zeros(n_cells), np.full((len(readings), n_cells), np.nan)
+    low, (last, peaks) = np.zeros(n_cells), np.full((2, len(readings), n_cells), np.nan)
     for first in range(0, n_cells, _BLOCK):
         cells = np.arange(first, min(first + _BLOCK, n_cells))
         pieces = [readings.piece(i, slice(None), cells) for i in range(len(readings))]
         for i, frames in enumerate(pieces):
-            peaks[i, cells] = _lowest_peak(frames)
+            last[i, cells], peaks[i, cells] = frames[-1], _lowest_peak(frames)
         frames = np.concatenate(pieces)
         heard = ~np.isnan(frames).all(axis=0)
-        low[cells[heard]], usual[cells[heard]] = np.nanquantile(frames[:, heard], [_LOW, 0.5], axis=0)
-    return low, usual, peaks
+        low[cells[heard]] = np.nanquantile(frames[:, heard], _LOW, axis=0)
+    return low, last, peaks
 
 
 def _lowest_peak(frames: Floats) -> Floats:

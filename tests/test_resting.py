@@ -108,6 +108,17 @@ def test_where_all_rest_lower_by_now_less_is_not_less_than_healthy():
     assert not (said(np.maximum(warm - 0.045, 0), least) > 0).any()  # healthy ones read next to nothing, too
 
 
+def test_cells_that_wander_as_ever_have_not_all_sunk():
+    rng = np.random.default_rng(5)
+    recordings = [r + rng.normal(0, 0.01, CELLS) for r in noisy(touches(0), 0.001, 0.06)]
+    most, least = resting(recordings, PRESENT, TOLERANCE, 1.0)
+    for frames in recordings:
+        runs = StillRuns.begin(CELLS).extend(frames, np.arange(len(frames)), TOLERANCE)
+        assert least.lower(runs, runs.value <= most) > -TOLERANCE / 2
+    sunk = StillRuns.begin(CELLS).extend(recordings[0] - 0.03, np.arange(len(recordings[0])), TOLERANCE)
+    assert least.lower(sunk, sunk.value <= most) < -2 * TOLERANCE
+
+
 def test_each_cell_has_a_least_of_its_own():
     recordings = noisy(touches(0), 0.001, 0.04)
     _, least = resting(recordings, PRESENT, TOLERANCE, 1.0)

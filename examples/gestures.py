@@ -135,6 +135,15 @@ def blamed(bench: Bench, fitted: SelfDiagnosis) -> str:
     return f"healthy: {which} in {logs} of {bench.count} logs ({windows} windows of {WINDOW} frames)"
 
 
+def measure(name: str, bench: Bench) -> None:
+    """Print the rows of a skin."""
+    print(f"skin: {name}")
+    print(blamed(bench, bench.fitted), flush=True)
+    for rows in (cells, onset, lines):
+        for row in rows(bench):
+            show(row)
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--recordings", type=int, default=120, help="half of them teach")
@@ -143,12 +152,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", nargs="+", choices=SKINS, metavar="SKIN", help=f"of {', '.join(SKINS)}")
     options = parser.parse_args(argv)
     for name in options.only or SKINS:
-        print(f"skin: {name}")
-        bench = Bench(SKINS[name].recordings(options.recordings, options.seed), 0, options.logs)
-        print(blamed(bench, bench.fitted), flush=True)
-        for rows in (cells, onset, lines):
-            for row in rows(bench):
-                show(row)
+        measure(name, Bench(SKINS[name].recordings(options.recordings, options.seed), 0, options.logs))
 
 
 if __name__ == "__main__":

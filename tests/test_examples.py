@@ -35,6 +35,7 @@ LESS = {  # they take minutes
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
     "gestures.py": ["--recordings", "24", "--logs", "2", "--only", "no crosstalk"],
     "other_sensors.py": ["--only", "8 bits", "all +3 %"],
+    "static_holds.py": ["--recordings", "24", "--logs", "2", "--only", "seat"],
 }
 SLOW = {  # more than 7 s of CPU time
     "adaptation_figures.py",
@@ -52,6 +53,7 @@ SLOW = {  # more than 7 s of CPU time
     "picture.py",
     "repair.py",
     "scale_curves.py",
+    "static_holds.py",
     "wrong_fault_set.py",
 }
 SLOW_ON_RECORDINGS = {

@@ -23,7 +23,7 @@ from diagnostics.verdicts import Diagnosis
 from diagnostics.weighing import Weights, faulty_at, kinds
 from diagnostics.wiring import suspected
 
-SCHEMA = "adaptfault.diagnoser/7"
+SCHEMA = "adaptfault.diagnoser/8"
 
 _SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
 _SUSPICIOUS_COLD = 3.0  # log evidence from which on a cell is not asked about the others, in a cold start

@@ -20,9 +20,10 @@ from scipy.special import expit
 from diagnostics.layout import SensorLayout
 from diagnostics.lessons import FOLDS, Lessons, Regressions
 from diagnostics.rim import Foreseen, Rim, around
+from diagnostics.scale import Array, Scale
 from diagnostics.temporal import segments
 from diagnostics.tiles import Tile, foreseen_by
-from diagnostics.touches import SEGMENT, Array, Scale, Summary, Touch, Touches, repeated
+from diagnostics.touches import SEGMENT, Summary, Touch, Touches, repeated
 
 _SAMPLES = 3000  # stretches of touches that the model is fitted on, about
 _MOST_DRAWS = 8  # stretches of one touch: more of them say the same

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from diagnostics.contact import Expected
-from diagnostics.touches import Array
+from diagnostics.scale import Array
 
 _OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is faulty: four touches
 _LEAST_OFFSET = 0.02  # of full scale, at the mean: a smaller one does no harm

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
 from diagnostics.rim import Foreseen, Rim, around
-from diagnostics.touches import Array
+from diagnostics.scale import Array
 
 FOLDS = 4  # of what there is to learn from: each teaches how far to believe what the others taught
 _LEFT_OUT = (0.03, 0.06, 0.12, 0.2, 0.4, 0.7, 0.95)  # of the cells, in turn: so many may be dead, or not moved yet

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference
+from diagnostics.scale import Array, Scale
 from diagnostics.spatial import SUDDEN, Caution, Cells, Model, Spatial, apart_evidence, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.tare import Tare
 from diagnostics.temporal import StillRuns
-from diagnostics.touches import SEGMENT, Array, Scale, Touches
+from diagnostics.touches import SEGMENT, Touches
 from diagnostics.transport import Stream
 from diagnostics.twins import Twins, telling
 from diagnostics.unrest import Unrest

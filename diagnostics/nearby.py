@@ -16,7 +16,7 @@ from scipy.special import expit
 
 from diagnostics.layout import SensorLayout
 from diagnostics.patches import Patch
-from diagnostics.touches import Array
+from diagnostics.scale import Array
 
 REACH = 3  # rows and columns
 _FEATURES = 4  # see Summary.features

@@ -20,9 +20,10 @@ from diagnostics.nearby import Nearby, Samples
 from diagnostics.patches import MOST_CELLS, Patch, PatchTouches, patches
 from diagnostics.readings import Readings
 from diagnostics.rim import Rim
+from diagnostics.scale import Array, Scale
 from diagnostics.temporal import segments
 from diagnostics.tiles import FEATURES, RIDGE, Start, Tile, foreseen_by
-from diagnostics.touches import SEGMENT, Array, Scale
+from diagnostics.touches import SEGMENT
 
 _SAMPLES = 256  # stretches for the model of one patch out of many
 _RIDGE = 30.0  # of a patch, per touch: it sees far fewer of them than a whole array

@@ -19,9 +19,10 @@ from diagnostics.layout import SensorLayout
 from diagnostics.memory import KEPT_TOUCHES, MOST_TOUCHES, Memory, finished
 from diagnostics.patches import MOST_CELLS, PatchTouches, Rectangle, patches
 from diagnostics.reference import Reference
+from diagnostics.scale import Array
 from diagnostics.spatial import Caution, Cells, Model, Spatial, apart_evidence, lone_evidence, stuck_evidence
 from diagnostics.surroundings import Surroundings
-from diagnostics.touches import Array, Touches
+from diagnostics.touches import Touches
 
 _SUSPICIOUS = 3.0  # log evidence from which on a cell is left out when others are judged, here and by its neighbours
 _PAUSES = 8  # of each time that the patches are gone through: a monitor waits for all of them

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
-from diagnostics.touches import Array, Touches
+from diagnostics.scale import Array
+from diagnostics.touches import Touches
 
 PATCH, HALO = 8, 4  # cells: a patch, and how far what surrounds it reaches
 MOST_CELLS = 400  # that are judged as one; beyond that, patches

@@ -13,9 +13,10 @@ from diagnostics.flicker import Flicker
 from diagnostics.layout import SensorLayout
 from diagnostics.patch_models import contact_model
 from diagnostics.resting import Least, resting
+from diagnostics.scale import Scale
 from diagnostics.tare import UsualOffset
 from diagnostics.temporal import Onsets, segments
-from diagnostics.touches import SEGMENT, Scale
+from diagnostics.touches import SEGMENT
 from diagnostics.transport import longest_repetition
 from diagnostics.twins import Twins, telling
 from diagnostics.unrest import Usual

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import expit, logit
 
 from diagnostics.layout import SensorLayout
-from diagnostics.touches import Array
+from diagnostics.scale import Array
 
 _SURE = 8.0  # log odds that a cell's own regressions are taken for at most
 # Of a ring's cells: so much the mean of the whole array counts, all there is where none is trusted.

@@ -28,8 +28,9 @@ from scipy.special import expit, logit, softmax
 
 from diagnostics.contact import Expected
 from diagnostics.drift import drifting, gain_evidence, misleading, offset_evidence
+from diagnostics.scale import Array, Scale
 from diagnostics.temporal import SHORTEST_RUN, StillRuns
-from diagnostics.touches import Array, Scale, Touch, repeated
+from diagnostics.touches import Touch, repeated
 
 _ANYWHERE = 0.2  # of broken cells stick anywhere, of the rest as many to the low rail as to the high one
 _LEAST = 1e-4  # no touch is less likely than this: models err

@@ -14,10 +14,10 @@ from diagnostics.layout import SensorLayout
 from diagnostics.reference import Reference, living
 from diagnostics.resting import Least
 from diagnostics.rim import INPUTS, Rim
+from diagnostics.scale import Scale
 from diagnostics.tare import UsualOffset
 from diagnostics.temporal import Onsets
 from diagnostics.tiles import Tile
-from diagnostics.touches import Scale
 from diagnostics.unrest import Usual
 from diagnostics.weighing import Weights
 

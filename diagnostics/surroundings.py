@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from diagnostics.contact import Expected
 from diagnostics.layout import SensorLayout
-from diagnostics.touches import Array, Touch
+from diagnostics.scale import Array
+from diagnostics.touches import Touch
 
 _NEIGHBOURS = 20
 _PRIOR_WEIGHT = 1.0  # neighbours that the share over all samples counts for: few neighbours prove little

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.readings import Readings
-from diagnostics.touches import Scale
+from diagnostics.scale import Scale
 
 _LEAST_LOADED = 0.25  # share of the cells that is hardly ever loaded all at once, and more than are open
 _COMMON, _OWN = 0.05, 0.02  # of full scale: the largest offset of all cells together, and of one beside that

@@ -18,7 +18,7 @@ from diagnostics.few import covariance_and_precision
 from diagnostics.few import logistic as logistic_of_few
 from diagnostics.patches import Patch
 from diagnostics.rim import Foreseen
-from diagnostics.touches import Array
+from diagnostics.scale import Array
 
 FEATURES = 4  # of a cell in a touch, see Summary.features
 RIDGE = 0.03  # on standardised inputs, per sample

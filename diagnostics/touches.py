@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.running import highest_so_far, lowest_so_far
-
-Array = NDArray[np.float32]
+from diagnostics.scale import Array
 
 SEGMENT = 32  # frames that are looked at together
 _PARTS = 6  # of a touch at most; neighbours are put together beyond that
@@ -31,40 +30,6 @@ _ELSEWHERE = 0.2  # of the load must go in one frame, and as much come, when ano
 _STIRS, _STIRRED, _MOSTLY = 0.06, 3.0, 0.9
 _STAYS = 0.65  # of the cells it loads stay as they are: then it is the same touch, whatever else changes
 _SAME_PLACE = 0.6  # cosine between loads of one touch; less alike, and it is another
-
-
-@dataclass(frozen=True)
-class Scale:
-    """What a reading means: where a cell rests, and from where on it is loaded.
-
-    Attributes:
-        resting: float ``[D]``, reading of an untouched cell.
-        near: how far from that still counts as resting.
-        full_scale: of the layout.
-    """
-
-    resting: NDArray[np.float64]
-    near: float
-    full_scale: float
-
-    def root_load(self, frames: NDArray[np.float64]) -> Array:
-        """Return the square root of the load, 0..1, ``[..., D]``: noise grows with load, its root does not.
-
-        A missing reading counts as resting.
-        """
-        load = ((frames - self.resting) / self.full_scale).astype(np.float32)
-        # What rests is no load at all, so that a little noise at rest means nothing. Not a number counts as none.
-        root: Array = np.sqrt(np.where(load > np.float32(self.near / self.full_scale), load, np.float32(0)))
-        return root
-
-    def of(self, cells: NDArray[np.intp]) -> Scale:
-        """Return the scale of some cells."""
-        return Scale(self.resting[cells], self.near, self.full_scale)
-
-    @property
-    def root_near(self) -> float:
-        """The root load from which on a cell counts as loaded."""
-        return float(np.sqrt(self.near / self.full_scale))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.layout import LineKind, SensorLayout, address_bits
-from diagnostics.touches import Scale
+from diagnostics.scale import Scale
 
 _EVERY = 4  # frames; a lasting fault does not hide between them
 _FEWEST_WITNESSES = 4  # and three more than healthy lines ever had

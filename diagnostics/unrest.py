@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
+from diagnostics.scale import Array, Scale
 from diagnostics.temporal import segments
-from diagnostics.touches import SEGMENT, Array, Scale
+from diagnostics.touches import SEGMENT
 
 Floats = NDArray[np.float64]
 

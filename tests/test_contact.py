@@ -5,7 +5,7 @@ from diagnostics import SensorLayout
 from diagnostics.contact import ContactModel, Expected, stretches, surest_of
 from diagnostics.memory import finished
 from diagnostics.patch_models import contact_model
-from diagnostics.touches import Scale
+from diagnostics.scale import Scale
 
 LAYOUT = SensorLayout(1, 1, 12)
 SCALE = Scale(np.zeros(12), 0.05, 5.0)

@@ -12,8 +12,9 @@ from diagnostics.contact import ContactModel
 from diagnostics.memory import finished
 from diagnostics.patch_models import contact_model
 from diagnostics.patches import Patch
+from diagnostics.scale import Scale
 from diagnostics.tiles import Tile
-from diagnostics.touches import Scale, Touches
+from diagnostics.touches import Touches
 
 PRESENT = np.ones((1, 24, 20), bool)
 PRESENT[0, :3, :3] = PRESENT[0, 10, 7] = False

@@ -9,7 +9,7 @@ from diagnostics.memory import finished
 from diagnostics.patch_models import contact_model
 from diagnostics.patches import HALO, PATCH, PatchTouches, patches
 from diagnostics.readings import Readings
-from diagnostics.touches import Scale
+from diagnostics.scale import Scale
 
 SKIN = SensorLayout(2, 24, 24, rate=20.0)
 

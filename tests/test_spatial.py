@@ -5,9 +5,10 @@ import pytest
 
 from diagnostics.contact import Expected
 from diagnostics.memory import finished
+from diagnostics.scale import Array, Scale
 from diagnostics.spatial import Caution, Cells, Model, Spatial, apart_evidence, stuck_evidence
 from diagnostics.temporal import StillRuns
-from diagnostics.touches import Array, Scale, Summary, Touch
+from diagnostics.touches import Summary, Touch
 
 CELLS, FRAMES = 8, 20
 SCALE = Scale(np.zeros(CELLS), 0.05, 5.0)

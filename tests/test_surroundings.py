@@ -3,8 +3,9 @@ import pytest
 
 from diagnostics import SensorLayout
 from diagnostics.memory import finished
+from diagnostics.scale import Scale
 from diagnostics.surroundings import Surroundings
-from diagnostics.touches import Scale, Summary, Touch
+from diagnostics.touches import Summary, Touch
 
 LAYOUT = SensorLayout(1, 9, 9)
 SCALE = Scale(np.zeros(81), 0.05, 5.0)

@@ -4,8 +4,8 @@ from test_resting import touches
 
 from adaptfault.grasps import simulate
 from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, SensorLayout, inject
+from diagnostics.scale import Scale
 from diagnostics.tare import Tare, UsualOffset
-from diagnostics.touches import Scale
 
 LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
 CELLS, PRESENT = LAYOUT.n_cells, np.ones(LAYOUT.n_cells, bool)

@@ -3,8 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from diagnostics.scale import Scale
 from diagnostics.temporal import StillRuns
-from diagnostics.touches import Scale, Summary, Touches, repeated
+from diagnostics.touches import Summary, Touches, repeated
 
 CELLS = 12
 SCALE = Scale(np.zeros(CELLS), 0.05, 5.0)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from diagnostics import Fault, SensorLayout, inject
-from diagnostics.touches import Scale
+from diagnostics.scale import Scale
 from diagnostics.unrest import Unrest, Usual
 
 LAYOUT = SensorLayout(1, 4, 5)

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
+from diagnostics.question import SUDDEN, Cells, Model
 from diagnostics.reference import Reference
 from diagnostics.scale import Array, Scale
-from diagnostics.spatial import SUDDEN, Caution, Cells, Model, Spatial, apart_evidence, stuck_evidence
+from diagnostics.spatial import Caution, Spatial, apart_evidence, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.tare import Tare
 from diagnostics.temporal import StillRuns

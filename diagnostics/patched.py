@@ -18,9 +18,10 @@ from diagnostics.contact import ContactModel, Expected
 from diagnostics.layout import SensorLayout
 from diagnostics.memory import KEPT_TOUCHES, MOST_TOUCHES, Memory, finished
 from diagnostics.patches import MOST_CELLS, PatchTouches, Rectangle, patches
+from diagnostics.question import Cells, Model
 from diagnostics.reference import Reference
 from diagnostics.scale import Array
-from diagnostics.spatial import Caution, Cells, Model, Spatial, apart_evidence, lone_evidence, stuck_evidence
+from diagnostics.spatial import Caution, Spatial, apart_evidence, lone_evidence, stuck_evidence
 from diagnostics.surroundings import Surroundings
 from diagnostics.touches import Touches
 

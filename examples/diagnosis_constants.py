@@ -6,7 +6,7 @@ never does (those of large skins, say) is told by watching which functions run: 
 the number. ``--out`` keeps what is measured: run again, it goes on from there.
 
 Two bounds: what is wanted of the first row, and a looser one, 1 % off it, that shows what a constant breaks and what
-it only moves. ``--only spatial._LEAST ...`` picks constants. Without RECORDINGS: simulated grasps of a small array.
+it only moves. ``--only question.LEAST ...`` picks constants. Without RECORDINGS: simulated grasps of a small array.
 """
 
 from __future__ import annotations

@@ -5,8 +5,9 @@ import pytest
 
 from diagnostics.contact import Expected
 from diagnostics.memory import finished
+from diagnostics.question import Cells, Model
 from diagnostics.scale import Array, Scale
-from diagnostics.spatial import Caution, Cells, Model, Spatial, apart_evidence, stuck_evidence
+from diagnostics.spatial import Caution, Spatial, apart_evidence, stuck_evidence
 from diagnostics.temporal import StillRuns
 from diagnostics.touches import Summary, Touch
 

@@ -72,7 +72,7 @@ class Flicker:
             runs: the still stretches.
             rests: bool ``[D]``, cells that read what an untouched one does, or less.
             present: bool ``[D]``.
-            sunk: all cells read less than they mostly did: at the low rail they do not flicker.
+            sunk: all cells at rest read less than they ever did: at the low rail they do not flicker.
         """
         too_long = np.maximum(_LONGER * self.longest, _RECORDINGS * self.recording)
         calm = present & (np.minimum(runs.same, runs.length) >= too_long)  # frames without a reading prove nothing

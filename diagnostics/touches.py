@@ -135,6 +135,13 @@ class Touch:
         held = own & (start > 0) & (start < self.end) & (part.most > root_near)
         return int(held.sum()) > _STAYS * int(own.sum())
 
+    def left_for(self, part: Summary, going_on: bool) -> int:
+        """Return since which frame its load may have been going, if another touch begins with ``part``.
+
+        One that was ``going_on`` was left somewhen in the segment before, else it had been released.
+        """
+        return max(part.first - SEGMENT, self.first) + 1 if going_on else min(part.first, self.end)
+
     def mean(self) -> Array:
         """Return the mean root load of each cell, ``[D]``."""
         return sum((p.total for p in self.parts[1:]), self.parts[0].total) / np.float32(self.n)
@@ -216,16 +223,13 @@ class Touches:
                 low, high = lowest[end - 1], highest[end - 1]
                 # Cells that broke do not make another touch.
                 same = going_on and (part.first == broke or kept[-1].same_place(part, low))
-                if same or (kept and begin not in begins and kept[-1].stays(part, root_near, start, jumped)):
+                follows = bool(kept) and begin not in begins
+                if same or (follows and kept[-1].stays(part, root_near, start, jumped)):
                     kept[-1] = kept[-1].grown(part, low, high)
                 else:
                     if kept:
                         widest = max(widest, kept[-1].swing(weigh[:, 1]))
-                    since = part.first
-                    if going_on:  # it came somewhen in the segment before
-                        since = max(since - SEGMENT, kept[-1].first) + 1
-                    elif kept and begin not in begins:  # with the release
-                        since = min(since, kept[-1].end)
+                    since = kept[-1].left_for(part, going_on) if follows else part.first
                     kept.append(Touch((part,), low, high, since))
                 going_on = True
             begin += end

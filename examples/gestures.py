@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from diagnosis_figures import WINDOW, Bench, cells, lines, onset, show, windows_of
@@ -135,24 +136,32 @@ def blamed(bench: Bench, fitted: SelfDiagnosis) -> str:
     return f"healthy: {which} in {logs} of {bench.count} logs ({windows} windows of {WINDOW} frames)"
 
 
-def measure(name: str, bench: Bench) -> None:
-    """Print the rows of a skin."""
-    print(f"skin: {name}")
-    print(blamed(bench, bench.fitted), flush=True)
-    for rows in (cells, onset, lines):
-        for row in rows(bench):
-            show(row)
+class Simulated(Protocol):
+    """A skin of which recordings can be simulated."""
+
+    def recordings(self, count: int, seed: int) -> Recordings:
+        """Simulate so many."""
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+def measure(skins: Mapping[str, Simulated], about: str, argv: Sequence[str] | None) -> None:
+    """Print the rows of the skins that the command line picks."""
+    parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--recordings", type=int, default=120, help="half of them teach")
     parser.add_argument("--logs", type=int, default=60, help="of six recordings each")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", nargs="+", choices=SKINS, metavar="SKIN", help=f"of {', '.join(SKINS)}")
+    parser.add_argument("--only", nargs="+", choices=skins, metavar="SKIN", help=f"of {', '.join(skins)}")
     options = parser.parse_args(argv)
-    for name in options.only or SKINS:
-        measure(name, Bench(SKINS[name].recordings(options.recordings, options.seed), 0, options.logs))
+    for name in options.only or skins:
+        print(f"skin: {name}")
+        bench = Bench(skins[name].recordings(options.recordings, options.seed), 0, options.logs)
+        print(blamed(bench, bench.fitted), flush=True)
+        for rows in (cells, onset, lines):
+            for row in rows(bench):
+                show(row)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    measure(SKINS, __doc__.split("\n")[0], argv)
 
 
 if __name__ == "__main__":

@@ -9,12 +9,10 @@ NAME ...`` picks skins.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from diagnosis_figures import Bench
 from gestures import measure
 
 from adaptfault.recordings import Recordings
@@ -134,14 +132,7 @@ def lying(label: int, size: float, rng: np.random.Generator) -> list[Ellipse]:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--recordings", type=int, default=120, help="half of them teach")
-    parser.add_argument("--logs", type=int, default=60, help="of six recordings each")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", nargs="+", choices=SKINS, metavar="SKIN", help=f"of {', '.join(SKINS)}")
-    options = parser.parse_args(argv)
-    for name in options.only or SKINS:
-        measure(name, Bench(SKINS[name].recordings(options.recordings, options.seed), 0, options.logs))
+    measure(SKINS, __doc__.split("\n")[0], argv)
 
 
 if __name__ == "__main__":

@@ -76,7 +76,8 @@ def test_a_patch_in_which_nothing_moves_costs_nothing():
     frames = np.zeros((32, SKIN.n_cells))
     frames[:, ~still] = np.linspace(0, 2, 32)[:, None]
     scale = Scale(np.zeros(SKIN.n_cells), 0.05, 5.0)
-    after = touches.extend(scale.root_load(frames), numbers, scale.root_near, np.where(still, 0, 31), still < 0)
+    start, none = np.where(still, 0, 31), np.zeros_like(still)
+    after = touches.extend(scale.root_load(frames), numbers, scale.root_near, start, none)
     touched = {i for i, patch in enumerate(touches.patches) if not still[patch.inputs].all()}
     assert {i for i, (a, b) in enumerate(zip(touches.of, after.of, strict=True)) if a is not b} == touched
     assert 0 < len(touched) < len(touches.patches)

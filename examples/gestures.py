@@ -149,7 +149,8 @@ def measure(skins: Mapping[str, Simulated], about: str, argv: Sequence[str] | No
     parser.add_argument("--recordings", type=int, default=120, help="half of them teach")
     parser.add_argument("--logs", type=int, default=60, help="of six recordings each")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", nargs="+", choices=skins, metavar="SKIN", help=f"of {', '.join(skins)}")
+    names = ", ".join(skins).replace("%", "%%")
+    parser.add_argument("--only", nargs="+", choices=skins, metavar="SKIN", help=f"of {names}")
     options = parser.parse_args(argv)
     for name in options.only or skins:
         print(f"skin: {name}")

@@ -79,6 +79,11 @@ def marked(names: Iterable[str], slow: set[str]) -> list[ParameterSet]:
     return [pytest.param(name, marks=pytest.mark.slow if name in slow else (), id=name) for name in names]
 
 
+@pytest.mark.parametrize("name", [path.name for path in EXAMPLES if '"--only"' in path.read_text()])
+def test_an_example_says_what_it_can_be_told_to_pick(name: str, tmp_path: Path):
+    run(HOME / name, tmp_path, "--help")
+
+
 @pytest.mark.parametrize("name", marked([path.name for path in EXAMPLES], SLOW))
 def test_the_example_runs(name: str, tmp_path: Path):
     run(HOME / name, tmp_path, *LESS.get(name, []))

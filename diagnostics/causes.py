@@ -29,7 +29,7 @@ class Findings:
     Attributes:
         faulty: those beyond doubt.
         alive: those that move, as no dead cell does.
-        silent: those that never delivered a reading.
+        silent: those that deliver no reading, or none any more.
         rests: those that read what an untouched cell reads, and are still; full: the same with full scale.
         intermittent, noisy, drifting: those that move, but wrongly.
         gain: how many times their gain in the reference those read that drift in that; NaN: all others.

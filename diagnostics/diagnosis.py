@@ -60,9 +60,9 @@ class SelfDiagnosis:
         Cells that are dead in them all the same are found first, and called so in every log in which they do not move.
 
         Raises:
-            ValueError: recordings that do not fit the layout, or hold no frame.
+            ValueError: recordings that do not fit the layout, or hold no frame with a reading.
         """
-        healthy = _recordings(recordings, self.layout)
+        healthy = _recordings(recordings, self.layout).whole(self.layout.present.ravel())
         dead = dead_before(healthy, self.layout, tolerance_of(healthy, self.layout), self._diagnosed_cold)
         self.reference_ = Reference.fit(healthy, self.layout, dead)
         self.weights_ = Weights.fit(healthy, living(self.layout, dead))
@@ -175,14 +175,15 @@ class SelfDiagnosis:
     def _found(self, memory: Memory, spatial: Spatial, wrong: NDArray[np.bool_]) -> Findings:
         """Weigh the evidence, and cut F; cells that are ``wrong`` (bool ``[D]``) have been explained already."""
         reference, runs, unrest = memory.reference, memory.runs, memory.unrest
-        present, silent = memory.present, memory.present & ~memory.heard
+        present, silent = memory.present, memory.silent & ~wrong
         temporal, kind = memory.temporal(), kinds(memory)
         known = spatial.asked & ~runs.moved & (reference.dead > 0)
         worth = self.weights_.worth(spatial.evidence, temporal, kind)
         still = self.weights_.probability(worth, kind, spatial.asked & ~known)
         still[known] = reference.dead[known]
-        intermittent, noisy = unrest.intermittent & present & ~wrong, unrest.excess & present & ~wrong
-        drifting = present & ~wrong & ~intermittent & ~noisy & spatial.drifting
+        heard = present & ~wrong & ~silent
+        intermittent, noisy = unrest.intermittent & heard, unrest.excess & heard
+        drifting = heard & ~intermittent & ~noisy & spatial.drifting
         counted_out = silent | intermittent | noisy | drifting
         probability = np.where(present, np.where(counted_out, _SURE, still), 0.0)
         faulty = faulty_at(np.where(counted_out, 0.0, probability), self.false_discovery_rate)
@@ -201,7 +202,9 @@ class SelfDiagnosis:
             gain=np.where(drifting, spatial.factor, np.nan),
             value=np.where(intermittent, np.where(2 * unrest.high > unrest.blinks, self.layout.full_scale, 0.0), value),
             since=np.select(
-                [intermittent, noisy, drifting], [unrest.blinks_since, unrest.noisy_since, spatial.since], runs.start
+                [silent, intermittent, noisy, drifting],
+                [runs.missed_since, unrest.blinks_since, unrest.noisy_since, spatial.since],
+                runs.start,
             ),
             probability=probability,
             # What the line hypothesis asks of a cell at rest is only whether touches speak against it.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
 from diagnostics.question import SUDDEN, Cells, Model
+from diagnostics.readings import held
 from diagnostics.reference import Reference
 from diagnostics.scale import Array, Scale
 from diagnostics.spatial import Caution, Spatial, apart_evidence, stuck_evidence
@@ -29,6 +30,7 @@ from diagnostics.unrest import Unrest
 Result = TypeVar("Result")
 
 MOST_TOUCHES, KEPT_TOUCHES = 40, 32  # when there are more, all but the last so many are weighed and let go
+_SILENT, _NEVER_HEARD = 2 * SEGMENT, SEGMENT // 2  # frames on end without a reading: that is no chance any more
 _PAUSE = SEGMENT // 2  # frames of a segment after which that begins, a little with each frame: it ends with the segment
 
 
@@ -106,6 +108,11 @@ class Memory:
         other._close()  # reads the frames that wait, and changes none of them
         return other
 
+    @property
+    def silent(self) -> NDArray[np.bool_]:
+        """Which cells deliver no reading, or none any more, bool ``[D]``."""
+        return self.present & (self.runs.missed >= np.where(self.heard, _SILENT, _NEVER_HEARD))
+
     def rests(self) -> NDArray[np.bool_]:
         """Where a cell reads now, or held still at, what an untouched one reads, bool ``[D]``."""
         return np.isfinite(self.runs.value) & (self.scale.root_load(self.runs.value) <= self.scale.root_near)
@@ -172,7 +179,7 @@ class Memory:
     def cells(self, wrong: NDArray[np.bool_] | None) -> Cells:
         """What is known of the cells before the others are asked, but those that are known to be ``wrong``."""
         wrong = self.unrest.intermittent | self.unrest.excess | (False if wrong is None else wrong)
-        askable = self.present & self.heard & ~wrong
+        askable = self.present & self.heard & ~self.silent & ~wrong
         return Cells(self.runs, self.settled, self.temporal(), self._sudden(), askable, np.zeros_like(wrong))
 
     def _sudden(self) -> NDArray[np.float64]:
@@ -184,15 +191,15 @@ class Memory:
         self._filled = 0
         self._tare = self._tare.extend(frames, self.reference.scale, self.present, self.reference.offset)
         self.scale = scale = self._tare.on(self.reference.scale)
-        start = self.runs.start
+        start, known = self.runs.start, _known(frames, self.runs.last)
         self.runs = self.runs.extend(frames, numbers, self.reference.tolerance, scale.resting)
         self.heard = self.heard | np.isfinite(self.runs.last)
         # Evidence belongs to a stretch, and ends with it.
         self.settled = np.where(self.runs.start == start, self.settled, 0.0)
-        root, still = scale.root_load(self._tare.off(frames)), self.runs.start <= numbers[0]
+        root, still = scale.root_load(self._tare.off(known)), self.runs.start <= numbers[0]
         self.touched = self.touched | root.any(axis=0)
         self._remember(root, numbers, (self._sudden() >= SUDDEN) & (self.runs.alone | still))
-        self.unrest = self.unrest.extend(frames, root, numbers, scale, self.reference.usual, still)
+        self.unrest = self.unrest.extend(known, root, numbers, scale, self.reference.usual, still)
         self.twins = self.twins.extend(self._comparable(frames), numbers, telling(frames, still, scale), scale.near)
 
     @property
@@ -214,6 +221,15 @@ class Memory:
         old, kept = self.touches.split(KEPT_TOUCHES)
         settled = (yield from self.spatial(touches=old)).surprise
         self.touches, self.settled = kept, settled
+
+
+def _known(frames: NDArray[np.float64], last: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``frames`` with the last reading of a cell, before them ``last``, for each that is missing.
+
+    Not of a cell that delivers none in all of them: what was long ago is no load now.
+    """
+    missing = np.isnan(frames)
+    return np.where(missing.all(axis=0), np.nan, held(frames, last)[1:]) if missing.any() else frames
 
 
 def finished(work: Generator[None, None, Result]) -> Result:

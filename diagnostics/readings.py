@@ -54,6 +54,20 @@ class Readings(Sequence[Recording]):
         which = range(0, len(self), max(1, len(self) // _RECORDINGS))
         return cells, (self.piece(i, slice(None), cells) for i in which)
 
+    def whole(self, present: NDArray[np.bool_]) -> Readings:
+        """Return the recordings with the last reading of a cell for each that is missing, without lost frames.
+
+        NaN is left where a cell delivered nothing yet. What misses nothing of the cells that are ``present`` (bool
+        ``[D]``) is not copied.
+
+        Raises:
+            ValueError: no frame with a reading.
+        """
+        whole = [recording for recording in (_whole(given, present) for given in self._given) if len(recording)]
+        if not whole:
+            raise ValueError("the recordings hold no frame with a reading: nothing to learn from")
+        return Readings(whole)
+
     @classmethod
     def of(cls, recordings: Sequence[NDArray[Any]]) -> Readings:
         """Return ``recordings`` if they are that already."""
@@ -73,3 +87,10 @@ def held(frames: NDArray[Any], last: NDArray[Any]) -> NDArray[Any]:
         at = np.maximum.accumulate(np.where(missing, 0, np.arange(len(whole))[:, None]), axis=0)
         whole = np.take_along_axis(whole, at, axis=0)
     return whole
+
+
+def _whole(given: NDArray[Any], present: NDArray[np.bool_]) -> NDArray[Any]:
+    if not np.isnan(given.min(axis=0)[present]).any():
+        return given
+    came = given[~np.isnan(given).all(axis=1, where=present)]
+    return held(came, np.full(given.shape[1], np.nan))[1:]

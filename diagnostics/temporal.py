@@ -35,6 +35,8 @@ class StillRuns:
         company: float ``[D]``, share of the loaded cells that fell, or rose, as drastically in that very step.
         last: float ``[D]``, the last reading.
         same: int ``[D]``, how many frames on end have had exactly that reading.
+        missed: int ``[D]``, how many frames on end have had none by now.
+        missed_since: int ``[D]``, number of the first of these; meaningless where there is none.
     """
 
     start: NDArray[np.intp]
@@ -45,12 +47,15 @@ class StillRuns:
     company: Floats
     last: Floats
     same: NDArray[np.intp]
+    missed: NDArray[np.intp]
+    missed_since: NDArray[np.intp]
 
     @classmethod
     def begin(cls, n_cells: int) -> StillRuns:
         """Nothing seen yet."""
         zero, nothing = np.zeros(n_cells, np.intp), np.full(n_cells, np.inf)
-        return cls(zero, zero, nothing, -nothing, np.zeros(n_cells), np.zeros(n_cells), np.full(n_cells, np.nan), zero)
+        jump, last = np.zeros(n_cells), np.full(n_cells, np.nan)
+        return cls(zero, zero, nothing, -nothing, jump, jump, last, zero, zero, zero)
 
     def extend(
         self, frames: Floats, numbers: NDArray[np.intp], tolerance: float, resting: Floats | float = 0.0
@@ -69,6 +74,7 @@ class StillRuns:
         bottom = np.where(missing, np.inf, frames) if any_missing else frames
         low, high = np.minimum(self.low, bottom.min(axis=0)), np.maximum(self.high, top.max(axis=0))
         heard = (~missing).sum(axis=0) if any_missing else np.full(len(self.low), len(frames))
+        readings = held(frames, self.last)
         start, length, jump, company = self.start, self.length + heard, self.jump, self.company
         broke = np.flatnonzero(high - low > 2 * tolerance)
         if len(broke):
@@ -79,14 +85,15 @@ class StillRuns:
             count = (highest - lowest <= 2 * tolerance).sum(axis=0)  # the spread only grows: a prefix of True
             at = np.arange(len(broke))
             first = len(frames) - count
+            if any_missing:  # it begins with a reading
+                first = (~missing[:, broke] & (np.arange(len(frames))[:, None] >= first)).argmax(axis=0)
             start[broke] = numbers[first]
             length[broke] = np.minimum(count, heard[broke])
             # What the cells did in the steps into those stretches.
             steps = np.flatnonzero(np.bincount(first))
             which = np.searchsorted(steps, first)
-            before = np.where(steps[:, None] > 0, frames[steps - 1], self.last)
-            step = frames[steps] - before
-            size = np.fmax(frames[steps], before) - resting
+            before, after = readings[steps], readings[steps + 1]
+            step, size = after - before, np.fmax(after, before) - resting
             drastic = np.maximum(0.5 * size, 4 * tolerance)
             # Cells broken from the start hold their value all along: only others could have jumped too.
             able = (high - low > 2 * tolerance) | self.moved
@@ -99,10 +106,19 @@ class StillRuns:
             into = step[which, broke]
             jump[broke] = np.where(np.isnan(into), 0.0, into)
             company[broke] = share[(jump[broke] > 0).astype(np.intp), which]
-        readings = held(frames, self.last)
         latest = (_changed(readings) * np.arange(1, len(readings), dtype=np.int32)[:, None]).max(axis=0)
         same = np.where(latest > 0, len(readings) - latest, self.same + len(frames))
-        return StillRuns(start, length, low, high, jump, company, readings[-1].copy(), same)
+        missed, since = self._missed(missing, numbers) if any_missing else (np.zeros_like(same), self.missed_since)
+        return StillRuns(start, length, low, high, jump, company, readings[-1].copy(), same, missed, since)
+
+    def _missed(
+        self, missing: NDArray[np.bool_], numbers: NDArray[np.intp]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return how many frames on end each cell has missed, and the number of the first of these."""
+        all_of_them = missing.all(axis=0)
+        missed = np.where(all_of_them, self.missed + len(missing), (~missing[::-1]).argmax(axis=0))
+        since = numbers[len(missing) - np.clip(missed, 1, len(missing))]
+        return missed, np.where(all_of_them & (self.missed > 0), self.missed_since, since)
 
     def of(self, cells: NDArray[np.intp]) -> StillRuns:
         """Return the runs of some cells."""

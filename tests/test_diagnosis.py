@@ -37,6 +37,12 @@ def broken(log: Sequence[np.ndarray], faults: Sequence[Fault], **how: object) ->
     return [inject(r, faults, LAYOUT, seed=i, **how) for i, r in enumerate(log)]
 
 
+def gappy(log: Sequence[np.ndarray], share: float) -> list[np.ndarray]:
+    """A log of which single readings are missing."""
+    rng = np.random.default_rng(0)
+    return [np.where(rng.random(r.shape) < share, np.nan, r) for r in log]
+
+
 def loaded(log: Sequence[np.ndarray]) -> np.ndarray:
     """The 40 cells that carry the most load, 20 of each pad."""
     most = np.mean([np.minimum(r.max(axis=0), 1) for r in log], axis=0).reshape(2, 110)
@@ -375,11 +381,33 @@ def test_a_few_frames_prove_nothing_but_do_not_crash_it(fitted, log, frames: int
     assert json.dumps(diagnosis.to_dict(), allow_nan=False)
 
 
+@pytest.mark.parametrize("share", [0.1, 0.4])
 @pytest.mark.parametrize("cold", [False, True])
-def test_readings_that_are_missing_here_and_there_are_no_fault(fitted, log, cold: bool):
-    rng = np.random.default_rng(0)
-    gappy = [np.where(rng.random(r.shape) < 0.1, np.nan, r) for r in log]
-    assert not (COLD if cold else fitted).diagnose(gappy).faults
+def test_readings_that_are_missing_here_and_there_are_no_fault(fitted, log, cold: bool, share: float):
+    assert not (COLD if cold else fitted).diagnose(gappy(log, share)).faults
+
+
+def test_what_is_missing_from_the_reference_teaches_no_rest(grasps, log):
+    learned = SelfDiagnosis(LAYOUT).fit(gappy(grasps.frames[::4], 0.4))
+    cells = loaded(log)[::8].tolist()
+    faults = [Fault("short" if i % 2 else "open", (cell,)) for i, cell in enumerate(cells)]
+    assert learned.diagnose(broken(log, faults)).fault_set == set(cells)
+
+
+def test_a_cell_that_falls_silent_under_load_is_open_from_then_on(fitted, log):
+    frames = np.concatenate(log)
+    cell = int(loaded(log)[10])
+    onset = int(frames[: len(frames) // 2, cell].argmax())
+    frames[onset:, cell] = np.nan
+    (fault,) = fitted.diagnose(frames).faults
+    assert (fault.kind, fault.cells, fault.value, fault.onset) == (FaultKind.OPEN, (cell,), None, onset)
+    assert f"delivers no reading from frame {onset} on" in fault.reason
+    frames[-1, cell] = 0.0  # it is back
+    assert not fitted.diagnose(frames).fault_set
+
+
+def test_a_few_frames_with_gaps_are_no_silence(fitted, log):
+    assert not fitted.diagnose(gappy([log[3][:3]], 0.5)).faults
 
 
 def test_a_cell_that_delivers_most_of_its_readings_is_not_open(fitted, log):
@@ -449,6 +477,15 @@ def test_a_log_that_cannot_be_diagnosed_is_refused_in_one_line(recordings, messa
     with pytest.raises(ValueError, match=message) as error:
         SelfDiagnosis(LAYOUT).diagnose(recordings)
     assert "\n" not in str(error.value)
+
+
+def test_recordings_without_a_reading_teach_nothing(log):
+    lost = np.full((5, 220), np.nan)
+    with pytest.raises(ValueError, match="no frame with a reading: nothing to learn"):
+        SelfDiagnosis(LAYOUT).fit([lost])
+    few = [r[::4] for r in log]
+    ours, theirs = (SelfDiagnosis(LAYOUT).fit(reference).state()[1] for reference in ([lost, *few], few))
+    assert all(np.array_equal(ours[name], theirs[name], equal_nan=True) for name in theirs)
 
 
 def test_importing_diagnostics_loads_neither_torch_nor_adaptfault():

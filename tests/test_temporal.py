@@ -51,6 +51,25 @@ def test_a_missing_reading_neither_breaks_nor_proves_stillness():
     assert runs.last[[0, 2]].tolist() == [1, 2]
 
 
+def test_a_stretch_starts_with_a_reading_and_the_jump_into_it_spans_a_gap():
+    log = np.array([[3, 3], [3, np.nan], [np.nan, np.nan], [0, 3], [np.nan, 3], [0, 0]])
+    for size in range(1, 6):
+        runs = runs_of(log, size)
+        assert runs.start.tolist() == [3, 5]
+        assert runs.jump.tolist() == [-3, -3]
+
+
+def test_how_long_a_cell_has_been_silent_is_counted_over_blocks():
+    log = np.array([[1, np.nan, 1], [np.nan, np.nan, 1], [1, np.nan, np.nan], [1, np.nan, np.nan], [1, 0, np.nan]])
+    for size in range(1, 5):
+        runs = runs_of(log, size)
+        assert runs.missed.tolist() == [0, 0, 3]
+        assert runs.missed_since[2] == 2
+        silent = runs_of(log[:4], min(size, 4))
+        assert silent.missed.tolist() == [0, 4, 2]
+        assert silent.missed_since[1:].tolist() == [0, 2]
+
+
 def test_dither_is_stillness_and_a_slow_drift_is_not():
     t = np.arange(200)
     log = np.column_stack([2 + TOLERANCE * np.sin(t), 2 + 0.002 * t])

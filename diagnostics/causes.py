@@ -96,11 +96,32 @@ def _causes(
             begun = int(np.median(found.since[leading])) if leading.any() else 0
             against &= ~(alike & ~faulty & (found.since <= begun) & (begun > 0))
             against |= ~alike & ~found.silent
-        explained = explain(faulty & ~aliased, alike & ~aliased, against, found.weight, found.doubt, layout, common)
+        explained = _explained(faulty & ~aliased, alike & ~aliased, against, found, layout, common)
         causes += [(kind, value, cause) for cause in explained]
         if faulty.sum() > 1:  # a single cell is soon explained
             yield
     return causes
+
+
+def _explained(
+    faulty: Mask, alike: Mask, against: Mask, found: Findings, layout: SensorLayout, common: float
+) -> tuple[Cause, ...]:
+    """Explain cells that misbehave in the same way; see ``explain``.
+
+    Those that were dead in the reference already bear no witness of a wire that has broken since, though it may serve
+    them as well; and of one that was broken then, all cells were dead.
+    """
+    known = found.known & faulty
+
+    def of(faulty: Mask, alike: Mask, against: Mask) -> tuple[Cause, ...]:
+        return explain(faulty, alike, against, found.weight, found.doubt, layout, common)
+
+    if not known.any():
+        return of(faulty, alike, against)
+    causes = of(faulty & ~known, alike & ~known, against & ~known)
+    served = np.zeros(len(known), bool)
+    served[[cell for cause in causes for cell in cause.cells]] = True
+    return causes + of(known & ~served, known & ~served, ~known | served)
 
 
 def _alike(found: Findings, full_scale: float) -> list[tuple[FaultKind, Mask, Mask, float | None]]:
@@ -194,16 +215,16 @@ def _does(fault: Fault, found: Findings, layout: SensorLayout) -> str:
 def _reason(fault: Fault, cause: Cause, found: Findings, layout: SensorLayout) -> str:
     """Say what was seen and what to check."""
     does = _does(fault, found, layout)
+    already = ", and did so in the reference already" if found.known[list(cause.seen)].all() else ""
     since = "" if fault.onset is None else f" from frame {fault.onset} on ({fault.onset / layout.rate:.1f} s)"
     if fault.line is None:
         pad, row, column = layout.position(fault.cells[0])
         whatever = "" if fault.kind in _DOING else ", whatever touches it"
-        already = ", and did so in the reference already" if found.known[fault.cells[0]] else ""
         return f"pad {pad}, row {row}, column {column} is {fault.kind}: it {does}{since}{whatever}{already}"
     inferred = len(cause.cells) - len(cause.seen)
     also = f"; {inferred} more, not tested, are inferred from the wire" if inferred else ""
     where = "" if cause.whole else _span(fault, layout)
-    seen = f"each of {len(cause.seen)} cells on it {does}{since}{also}"
+    seen = f"each of {len(cause.seen)} cells on it {does}{since}{already}{also}"
     return f"{fault.line} is {fault.kind}{where}: {seen}; check {_wire(fault.line)}"
 
 

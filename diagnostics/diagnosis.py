@@ -226,7 +226,7 @@ class SelfDiagnosis:
         share = _APART * (1 - memory.reference.unfamiliar)
         if not share.any():
             return found
-        temporal, kind, alike = memory.temporal(), kinds(memory), found.rests & ~wrong
+        temporal, kind, alike = memory.temporal(), kinds(memory), found.rests & ~found.known & ~wrong
 
         def weight_if(apart: NDArray[np.float64]) -> NDArray[np.float64]:
             more = self.weights_.worth(apart, temporal, kind) - found.weight

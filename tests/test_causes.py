@@ -223,3 +223,23 @@ def test_each_faulty_cell_is_in_a_cause_and_no_live_one(seed: int):
     named = {c for fault in causes(found) for c in fault.cells}
     assert set(order[:28].tolist()) <= named
     assert not named & set(np.flatnonzero(found.alive).tolist())
+
+
+def test_cells_that_were_dead_before_convict_no_wire_of_cells_that_lived_then():
+    on = row(0, 3)
+    found = untested(HEALTHY, on)
+    found = replace(dead(found, on[-3:-1]), known=at(on[-3:-1]))
+    assert [(fault.line, fault.cells) for fault in causes(found)] == [(None, (cell,)) for cell in on[-3:-1].tolist()]
+    found = dead(found, on[-1:])  # and one that died since
+    assert all(fault.line is None for fault in causes(found))
+
+
+def test_a_wire_that_was_broken_before_is_named_and_one_that_breaks_now_serves_a_cell_that_was_dead():
+    on = row(0, 3)
+    (fault,) = causes(replace(dead(HEALTHY, on), known=at(on)))
+    assert (fault.line, fault.cells) == (Line(0, "row", 3), tuple(on.tolist()))
+    assert "did so in the reference already" in fault.reason
+    (fault,) = causes(replace(dead(HEALTHY, on), known=at(on[2])))
+    assert (fault.line, fault.cells) == (Line(0, "row", 3), tuple(on.tolist()))
+    assert "already" not in fault.reason
+    assert "; 1 more, not tested, are inferred" in fault.reason

@@ -28,7 +28,7 @@ from diagnostics.reference import Reference
 from diagnostics.spatial import Caution
 from diagnostics.specimens import specimen
 
-_LOGS, _LOGS_OF_LARGE = 96, 32  # drawn to fit the weights; large arrays have more cells in each
+_LOGS, _LOGS_OF_LARGE = 192, 32  # drawn to fit the weights; large arrays have more cells in each
 _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
 _DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
 _FEWEST_RECORDINGS = 8  # below that the reference cannot be split

@@ -35,7 +35,7 @@ _WITNESS = 2.5  # log ratio of a cell that counts as one
 _TRIED = 0.3  # log ratio of a cell that was put to the test
 # Correlation of what doubtful cells on one wire say, for each cell of its line, and at most: at the edge of a contact
 # they are wrong together, and the longer the line the more of them lie along one edge.
-_ALIKE, _MOST_ALIKE = 0.02, 0.3
+_ALIKE, _MOST_ALIKE = 0.0125, 0.3
 _LEAST = -1.0  # log ratio that one doubtful cell can bring
 _LEADERLESS_COST = np.log(10.0)  # more, where each cell may as well be healthy: at an edge many are wrongly suspected
 _PROVEN = np.log(9.0)  # log odds from which on a wire is named: single cells are the safer guess

@@ -151,6 +151,27 @@ def test_a_frame_may_be_a_grid_and_hold_missing_readings(fitted, log):
     assert said(flat.diagnosis()) == said(grid.diagnosis())
 
 
+def test_a_cell_that_falls_silent_is_told_soon_and_so_is_that_it_is_back(fitted, log, middle):
+    frames, cell = log[:800].copy(), middle[10]
+    frames[300:600, cell] = np.nan
+    monitor, news = watched(fitted, frames)
+    (silent, first), (back, last) = [(i, fault) for i, fault in news if fault.cells == (cell,)]
+    assert first.kind is FaultKind.OPEN
+    assert "delivers no reading from frame 300 on" in first.reason
+    assert 300 + 64 <= silent < 300 + 64 + 2 * 32
+    assert "gone since about frame" in last.reason
+    assert 600 <= back < 600 + 2 * 32
+    assert said(monitor.diagnosis()) == said(fitted.diagnose(frames))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4])
+def test_online_equals_batch_where_readings_are_missing(fitted, log, middle, share: float):
+    frames = inject(log, mixes(middle)["cells"], LAYOUT)
+    frames[np.random.default_rng(0).random(frames.shape) < share] = np.nan
+    monitor, _ = watched(fitted, frames)
+    assert said(monitor.diagnosis()) == said(fitted.diagnose(frames))
+
+
 @pytest.mark.parametrize("size", [0, 219, 221])
 def test_a_frame_of_the_wrong_size_says_what_came_and_what_was_expected(size: int):
     with pytest.raises(ValueError, match=rf"expected a frame of 220 readings .*, got {size}"):

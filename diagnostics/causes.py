@@ -116,12 +116,9 @@ def _explained(
     def of(faulty: Mask, alike: Mask, against: Mask) -> tuple[Cause, ...]:
         return explain(faulty, alike, against, found.weight, found.doubt, layout, common)
 
-    if not known.any():
-        return of(faulty, alike, against)
     causes = of(faulty & ~known, alike & ~known, against & ~known)
-    served = np.zeros(len(known), bool)
-    served[[cell for cause in causes for cell in cause.cells]] = True
-    return causes + of(known & ~served, known & ~served, ~known | served)
+    known[[cell for cause in causes for cell in cause.cells]] = False
+    return causes + of(known, known, ~known)
 
 
 def _alike(found: Findings, full_scale: float) -> list[tuple[FaultKind, Mask, Mask, float | None]]:

@@ -181,9 +181,9 @@ class SelfDiagnosis:
         worth = self.weights_.worth(spatial.evidence, temporal, kind)
         still = self.weights_.probability(worth, kind, spatial.asked & ~known)
         still[known] = reference.dead[known]
-        heard = present & ~wrong & ~silent
-        intermittent, noisy = unrest.intermittent & heard, unrest.excess & heard
-        drifting = heard & ~intermittent & ~noisy & spatial.drifting
+        delivers = present & ~wrong & ~silent
+        intermittent, noisy = unrest.intermittent & delivers, unrest.excess & delivers
+        drifting = delivers & ~intermittent & ~noisy & spatial.drifting
         counted_out = silent | intermittent | noisy | drifting
         probability = np.where(present, np.where(counted_out, _SURE, still), 0.0)
         faulty = faulty_at(np.where(counted_out, 0.0, probability), self.false_discovery_rate)

@@ -46,7 +46,7 @@ class Memory:
         settled: float ``[D]``, evidence from touches that are gone, of the stretches that still go on.
         unrest: blinks and noise.
         twins: lines that read alike.
-        heard, touched: bool ``[D]``, cells that read something, and more than untouched ones do.
+        touched: bool ``[D]``, cells that read more than untouched ones do.
         scale: what a reading means, as offsets are now.
     """
 
@@ -59,7 +59,6 @@ class Memory:
         self.settled = np.zeros(layout.n_cells)
         self.unrest = Unrest.begin(layout)
         self.twins = Twins.begin(layout)
-        self.heard = np.zeros(layout.n_cells, bool)
         self.touched = np.zeros(layout.n_cells, bool)
         self.scale: Scale = reference.scale
         self._tare = Tare.begin(layout.n_cells)
@@ -107,6 +106,11 @@ class Memory:
         other = copy(self)
         other._close()  # reads the frames that wait, and changes none of them
         return other
+
+    @property
+    def heard(self) -> NDArray[np.bool_]:
+        """Which cells ever delivered a reading, bool ``[D]``."""
+        return np.isfinite(self.runs.last)
 
     @property
     def silent(self) -> NDArray[np.bool_]:
@@ -193,7 +197,6 @@ class Memory:
         self.scale = scale = self._tare.on(self.reference.scale)
         start, known = self.runs.start, _known(frames, self.runs.last)
         self.runs = self.runs.extend(frames, numbers, self.reference.tolerance, scale.resting)
-        self.heard = self.heard | np.isfinite(self.runs.last)
         # Evidence belongs to a stretch, and ends with it.
         self.settled = np.where(self.runs.start == start, self.settled, 0.0)
         root, still = scale.root_load(self._tare.off(known)), self.runs.start <= numbers[0]

@@ -127,7 +127,7 @@ class PatchedMemory(Memory):
         """Return the cells, with what is known of those that hold a load where nothing has moved for some touches."""
         if self.reference.model is None:
             return every  # a log tells little of the healthy where nothing moved
-        asked = Spatial.before(every).asked & (self.scale.root_load(self.runs.value) > self.scale.root_near)
+        asked = every.asked & (self.scale.root_load(self.runs.value) > self.scale.root_near)
         begun = np.array([touch.first for touch in self.touches.kept])
         holding, outlasted, settled = [], np.zeros(len(asked), bool), every.settled.copy()
         for i in self.local.holding(asked):

@@ -65,7 +65,7 @@ def test_how_long_a_cell_has_been_silent_is_counted_over_blocks():
         runs = runs_of(log, size)
         assert runs.missed.tolist() == [0, 0, 3]
         assert runs.missed_since[2] == 2
-        silent = runs_of(log[:4], min(size, 4))
+        silent = runs_of(log[:4], size)
         assert silent.missed.tolist() == [0, 4, 2]
         assert silent.missed_since[1:].tolist() == [0, 2]
 

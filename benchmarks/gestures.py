@@ -1,24 +1,17 @@
-"""Diagnosis on skins that people stroke, pat and scratch: python examples/gestures.py [--logs N]
+"""Simulated social touch on fabric skins: presses, pats, strokes and scratches.
 
-Social touch is not a grasp: one recording holds the same pat again and again, fingers leave a cell and are back within
-a tenth of a second, contacts are a cell or two wide. So gestures on soft fabric skins are simulated, with the noise,
-crosstalk and wandering rest of such skins, and the rows of ``diagnosis_figures.py`` measured on them: false alarms in
-healthy logs, dead cells from the start and from 60 % of the log on, broken lines. ``--only NAME ...`` picks skins.
+One recording repeats the same pat many times, fingers leave a cell and return within a tenth of a second, and contacts
+are one or two cells wide. The skins have noise, crosstalk and rest levels that wander.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections import Counter
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from diagnosis_figures import WINDOW, Bench, cells, lines, onset, show, windows_of
 
 from adaptfault.recordings import Recordings
-from diagnostics import SelfDiagnosis, SensorLayout
+from diagnostics import SensorLayout
 
 GESTURES = ("nothing", "press", "pat", "rub", "stroke", "scratch", "tickle")
 STEPS = 1023
@@ -121,49 +114,3 @@ def touched(gesture: str, side: int, frames: int, rate: float, rng: np.random.Ge
     load[: int(rng.uniform(0, 0.12) * frames)] = 0
     load[int(rng.uniform(0.88, 1) * frames) :] = 0
     return load
-
-
-def blamed(bench: Bench, fitted: SelfDiagnosis) -> str:
-    """Return what is called faulty in healthy logs."""
-    kinds, logs, windows = Counter[str](), 0, 0
-    for _, log, _ in bench.logs():
-        diagnosis = fitted.diagnose(log)
-        logs += bool(diagnosis.faults)
-        windows += windows_of(log, bench.layout)
-        for fault in diagnosis.faults:
-            kinds[str(fault.kind)] += len(fault.cells)
-    which = ", ".join(f"{n} {kind}" for kind, n in kinds.most_common()) or "no cell"
-    return f"healthy: {which} in {logs} of {bench.count} logs ({windows} windows of {WINDOW} frames)"
-
-
-class Simulated(Protocol):
-    """A skin of which recordings can be simulated."""
-
-    def recordings(self, count: int, seed: int) -> Recordings:
-        """Simulate so many."""
-
-
-def measure(skins: Mapping[str, Simulated], about: str, argv: Sequence[str] | None) -> None:
-    """Print the rows of the skins that the command line picks."""
-    parser = argparse.ArgumentParser(description=about)
-    parser.add_argument("--recordings", type=int, default=120, help="half of them teach")
-    parser.add_argument("--logs", type=int, default=60, help="of six recordings each")
-    parser.add_argument("--seed", type=int, default=0)
-    names = ", ".join(skins).replace("%", "%%")
-    parser.add_argument("--only", nargs="+", choices=skins, metavar="SKIN", help=f"of {names}")
-    options = parser.parse_args(argv)
-    for name in options.only or skins:
-        print(f"skin: {name}")
-        bench = Bench(skins[name].recordings(options.recordings, options.seed), 0, options.logs)
-        print(blamed(bench, bench.fitted), flush=True)
-        for rows in (cells, onset, lines):
-            for row in rows(bench):
-                show(row)
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    measure(SKINS, __doc__.split("\n")[0], argv)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,19 +1,14 @@
-"""Diagnosis where loads lie still: python examples/static_holds.py [--logs N]
+"""Simulated people who sit on a seat or lie on a mat, so that loads stay for a whole recording.
 
-Who sits on a seat or lies on a mat hardly moves: a cell holds its load for as long as the posture lasts, as a broken
-one does, and the next recording begins with another posture. So people are simulated who sit and lie, a posture to each
-recording; some breathe visibly, some shift their weight on the way. The rows of ``diagnosis_figures.py`` are measured
-on that: false alarms in healthy logs, dead cells from the start and from 60 % of the log on, broken lines. ``--only
-NAME ...`` picks skins.
+A healthy cell holds its load for as long as the posture lasts, as a broken cell does, and the next recording begins
+with another posture. Some people breathe visibly, some shift their weight.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from gestures import measure
 
 from adaptfault.recordings import Recordings
 from diagnostics import SensorLayout
@@ -129,11 +124,3 @@ def lying(label: int, size: float, rng: np.random.Generator) -> list[Ellipse]:
         (0.78 * size, x + 0.2 * side, 0.14, 0.06, 0.4, -0.4 * side),
         (0.33 * size, x + 0.3 * side, 0.05, 0.15, 0.3, rng.normal(0, 0.3)),
     ]
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    measure(SKINS, __doc__.split("\n")[0], argv)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,103 @@
+"""The arrays that the benchmark measures: real ones where their recordings are at hand, remade ones, simulated ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import gestures
+import static_holds
+from other_sensors import DRIFTS, SENSORS, remade
+from rows import Bench
+
+from adaptfault.grasps import simulate
+from adaptfault.recordings import Recordings, load
+from diagnostics import SensorLayout
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+HAND, FINGERTIPS, SOLES = "sdh2x13x6_grasps36.npz", "icub5x1x12_grasps11.npz", "insole2x33x15.npz"
+MAIN = ("cells", "onset", "healthy")
+EVERY = (
+    "cells", "onset", "dither", "missing", "many", "cold", "reference_faults", "lines", "cut", "address", "healthy",
+    "holds", "untouched", "kind", "calibration", "changing", "gain", "transport",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Array:
+    """One array.
+
+    Attributes:
+        name: as the table prints it; rows: of it, by name.
+        bench: builds it from split, repeat and number of logs; None where its recordings are absent.
+        logs, repeats: of a full run; quick: logs of a quick one, 0: left out.
+        quick_rows: of a quick run.
+    """
+
+    name: str
+    rows: tuple[str, ...]
+    bench: Callable[[int, int, int], Bench]
+    logs: int
+    repeats: int = 1
+    quick: int = 0
+    quick_rows: tuple[str, ...] = MAIN
+    file: str | None = None
+
+    @property
+    def available(self) -> bool:
+        """Whether its recordings are at hand."""
+        return self.file is None or (DATA / self.file).exists()
+
+
+def real(file: str) -> Callable[[int, int, int], Bench]:
+    return lambda split, repeat, logs: Bench(load(DATA / file).recordings, split, logs, repeat)
+
+
+def sensor(name: str) -> Callable[[int, int, int], Bench]:
+    def bench(split: int, repeat: int, logs: int) -> Bench:
+        plain = load(DATA / HAND).recordings
+        trained = remade(plain, SENSORS["as it is"]) if name in DRIFTS else None
+        return Bench(remade(plain, (SENSORS | DRIFTS)[name]), split, logs, repeat, trained)
+
+    return bench
+
+
+def simulated(record: Callable[[int, int], Recordings], count: int = 120) -> Callable[[int, int, int], Bench]:
+    """Return a builder of benches, with recordings of their own for each split and repeat."""
+    return lambda split, repeat, logs: Bench(record(count, 1000 * split + repeat), split, logs, repeat)
+
+
+def grasps(layout: SensorLayout) -> Callable[[int, int], Recordings]:
+    return lambda count, seed: simulate(-(-count // 7), layout, n_frames=60, seed=seed)
+
+
+ARRAYS = [
+    Array("hand", EVERY, real(HAND), 50, 2, 40, (*MAIN, "lines", "calibration", "cold"), HAND),
+    Array(
+        "fingertips",
+        (*MAIN, "many", "cold", "reference_faults", "holds", "untouched", "calibration", "transport"),
+        real(FINGERTIPS), 60, 2, 40, (*MAIN, "cold"), FINGERTIPS,
+    ),
+    Array(
+        "soles",
+        (*MAIN, "many", "cold", "reference_faults", "lines", "cut", "holds", "untouched", "calibration", "changing"),
+        real(SOLES), 30, 2, 12, (*MAIN, "cold"), SOLES,
+    ),
+    *(Array(f"hand, {name}", MAIN, sensor(name), 30, file=HAND) for name in (*SENSORS, *DRIFTS) if name != "as it is"),
+    *(
+        Array(f"fabric, {name}", (*MAIN, "lines", "cold"), simulated(skin.recordings), 30, 1, 12 * (name == "10 x 10"))
+        for name, skin in gestures.SKINS.items()
+    ),
+    *(
+        Array(f"posture, {name}", (*MAIN, "lines", "cold"), simulated(skin.recordings), 20, 1, 12 * (name == "seat"))
+        for name, skin in static_holds.SKINS.items()
+    ),
+    Array("grasps, 2 x 11 x 10", (*MAIN, "lines", "cold"), simulated(grasps(SensorLayout.paper())), 30),
+    Array("grasps, 1 x 12 x 12", (*MAIN, "lines", "address"), simulated(grasps(SensorLayout(1, 12, 12))), 30),
+]  # fmt: skip
+SPEED = [
+    Array("hand", ("speed",), real(HAND), 1, 3, 1, ("speed",), HAND),
+    Array("grasps, 2 x 11 x 10", ("speed",), simulated(grasps(SensorLayout.paper()), 42), 1, 3, 1, ("speed",)),
+    Array("grasps, 1 x 64 x 32", ("speed",), simulated(grasps(SensorLayout(1, 64, 32)), 21), 1, 3),
+]

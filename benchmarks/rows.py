@@ -1,0 +1,460 @@
+"""The rows of the benchmark: each injects known faults into healthy logs and counts what the diagnosis says of them.
+
+Half of an array's recordings are the reference, from which :class:`SelfDiagnosis` learns what healthy looks like. A log
+is six recordings of the other half. A faulty cell is *testable* if its true reading differs from what it reads by more
+than 5 % of full scale in at least 10 frames of the log.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+
+import numpy as np
+
+from adaptfault.recordings import Recordings
+from diagnostics import (
+    Diagnosis,
+    Fault,
+    FaultKind,
+    Line,
+    Monitor,
+    SelfDiagnosis,
+    SensorLayout,
+    Verdict,
+    inject,
+    line_fault,
+    lose_frames,
+)
+
+Log = list[np.ndarray]
+STUCK_KINDS = ("open", "short", "stuck")
+VISIBLE, TESTABLE = 0.05, 10  # of full scale; frames
+HELD, WINDOW = 300, 50  # frames of a static hold; of a window in which a cell can raise a false alarm
+REPEATED = 100  # frames of a frozen stream, beyond the longest repetition that still counts as idle
+CHANGING = (FaultKind.INTERMITTENT, FaultKind.NOISY, FaultKind.DRIFT)
+GAINS, FADED = (0.2, 0.35, 0.5), 0.1  # times the load; what is left at the end
+LONG, LOADED = 30, 8  # recordings of a log that shows a gain; in so many of them the cell is loaded
+DEAD_BEFORE = 0.04  # share of the cells that were dead when the reference was recorded
+
+
+@dataclass(frozen=True)
+class Count:
+    """One figure: ``of`` cases, ``part`` of them; ``unit``: how the ratio reads; ``higher``: whether more is better."""
+
+    row: str
+    part: float
+    of: float
+    unit: str = ""
+    higher: bool = True
+
+
+@dataclass
+class Tally:
+    """What was found of the dead cells of some logs."""
+
+    true: int = 0
+    false: int = 0
+    testable: int = 0
+    hit: int = 0
+    right_kind: int = 0
+    late: list[int] = field(default_factory=list)  # observable frames between the true and the reported onset
+    probability: list[np.ndarray] = field(default_factory=list)
+    dead: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, log: Log, seen: Log, faults: Sequence[Fault], diagnosis: Diagnosis, start: int) -> None:
+        """Count one log: true readings, readings with the faults, and the diagnosis; ``start``: the onset."""
+        layout, found = diagnosis.layout, diagnosis.fault_set
+        before, after = np.concatenate(log), np.concatenate(seen)
+        can = set(np.flatnonzero(differs(before, after, layout).sum(axis=0) >= TESTABLE).tolist())
+        kinds = kind_of_cells(faults)
+        told = {cell: fault for fault in diagnosis.faults for cell in fault.cells}
+        self.true, self.false = self.true + len(found & kinds.keys()), self.false + len(found - kinds.keys())
+        self.testable, self.hit = self.testable + len(can), self.hit + len(found & can)
+        self.right_kind += sum(kinds.get(cell) == fault.kind for cell, fault in told.items())
+        for cell in found & can:
+            between = slice(*sorted((start, told[cell].onset or 0)))
+            self.late.append(int(differs(before[between, cell], after[-1, cell], layout).sum()))
+        present = layout.present.ravel()
+        self.probability.append(diagnosis.probability[present])
+        self.dead.append(np.isin(np.flatnonzero(present), list(kinds)))
+
+    def counts(self, case: str) -> Iterator[Count]:
+        """Yield precision, and recall of the testable."""
+        yield Count(f"{case}: precision", self.true, self.true + self.false)
+        yield Count(f"{case}: recall", self.hit, self.testable)
+
+
+@dataclass
+class Bench:
+    """The recordings of one array, dealt into reference and rest.
+
+    Attributes:
+        split: which half is the reference; repeat: shuffles the reference and draws other logs and faults.
+        count: logs of a row.
+        trained: recordings that the diagnosis learns from in place of ``recordings``: before a drift.
+    """
+
+    recordings: Recordings
+    split: int
+    count: int
+    repeat: int = 0
+    trained: Recordings | None = None
+
+    def __post_init__(self) -> None:
+        self.layout = self.recordings.layout
+        order = np.random.default_rng(self.split).permutation(len(self.recordings))
+        half = len(order) // 2
+        self.reference, self.rest = order[:half], order[half:]
+        if self.repeat:
+            np.random.default_rng(self.repeat).shuffle(self.reference)
+        self.case = cache(self._case)
+
+    @cached_property
+    def fitted(self) -> SelfDiagnosis:
+        """The diagnosis under test."""
+        frames = (self.trained or self.recordings).frames
+        return SelfDiagnosis(self.layout).fit([frames[i] for i in self.reference])
+
+    def logs(self, length: int = 6) -> Iterator[tuple[int, Log, np.random.Generator]]:
+        """Yield seed, log and a generator for its faults."""
+        for seed in range(10_000 * self.repeat, 10_000 * self.repeat + self.count):
+            rng = np.random.default_rng(seed)
+            drawn = rng.choice(self.rest, min(length, len(self.rest)), replace=False)
+            yield seed, [np.asarray(self.recordings.frames[i], dtype=np.float64) for i in drawn], rng
+
+    def _case(
+        self,
+        share: float,
+        onset: float = 0.0,
+        kinds: tuple[str, ...] = STUCK_KINDS,
+        dither: float = 0.0,
+        missing: float = 0.0,
+        cold: bool = False,
+    ) -> Tally:
+        tally, diagnoser = Tally(), SelfDiagnosis(self.layout) if cold else self.fitted
+        for seed, log, rng in self.logs():
+            faults = draw_faults(self.layout, share, kinds, rng)
+            seen = list(broken(log, faults, self.layout, onset, dither, seed))
+            if missing:
+                seen = [np.where(rng.random(frames.shape) < missing, np.nan, frames) for frames in seen]
+            tally.add(log, seen, faults, diagnoser.diagnose(seen), round(onset * sum(map(len, log))))
+        return tally
+
+
+def draw_faults(layout: SensorLayout, share: float, kinds: tuple[str, ...], rng: np.random.Generator) -> list[Fault]:
+    present = np.flatnonzero(layout.present)
+    cells = rng.choice(present, round(share * len(present)), replace=False)
+    return [
+        Fault(kind, (int(cell),), value=rng.uniform(0.1, 0.9) * layout.full_scale if kind == "stuck" else None)
+        for cell, kind in zip(cells, rng.choice([FaultKind(k) for k in kinds], len(cells)), strict=True)
+    ]
+
+
+def broken(log: Log, faults: list[Fault], layout: SensorLayout, onset: float, dither: float, seed: int):
+    """Yield the recordings of a log that breaks after a share ``onset`` of its frames."""
+    start = round(onset * sum(map(len, log)))
+    for i, frames in enumerate(log):
+        here = [Fault(f.kind, f.cells, line=f.line, value=f.value, onset=max(0, start)) for f in faults]
+        yield inject(frames, here, layout, seed=1000 * seed + i, dither=dither)
+        start -= len(frames)
+
+
+def differs(a: np.ndarray, b: np.ndarray, layout: SensorLayout) -> np.ndarray:
+    return np.abs(np.nan_to_num(a - b)) > VISIBLE * layout.full_scale
+
+
+def parted(whole: np.ndarray, log: Log) -> Log:
+    """Return the frames ``[T, D]`` of a whole log as its recordings."""
+    return np.split(whole, np.cumsum([len(frames) for frames in log])[:-1])
+
+
+def kind_of_cells(faults: Sequence[Fault]) -> dict[int, FaultKind]:
+    return {cell: fault.kind for fault in faults for cell in fault.cells}
+
+
+def cells(bench: Bench) -> Iterator[Count]:
+    yield from bench.case(0.16).counts("16 % dead")
+
+
+def onset(bench: Bench) -> Iterator[Count]:
+    tally = bench.case(0.16, onset=0.6)
+    yield from tally.counts("16 % dead from 60 % of the log on")
+    yield Count("  its onset, mean error", sum(tally.late), len(tally.late), "frames", higher=False)
+
+
+def dither(bench: Bench) -> Iterator[Count]:
+    yield from bench.case(0.16, kinds=("stuck",), dither=0.004).counts("mid-range, dither 0.4 %")
+
+
+def missing(bench: Bench) -> Iterator[Count]:
+    yield from bench.case(0.16, missing=0.3).counts("16 % dead, 30 % of the readings missing")
+
+
+def many(bench: Bench) -> Iterator[Count]:
+    for share in (0.4, 1.0):
+        yield from bench.case(share).counts(f"{share:.0%} dead".replace("%", " %"))
+
+
+def cold(bench: Bench) -> Iterator[Count]:
+    """Without a reference."""
+    yield from bench.case(0.16, cold=True).counts("no reference, 16 % dead")
+    diagnoser, false, windows = SelfDiagnosis(bench.layout), 0, 0
+    for _, log, _ in bench.logs():
+        false, windows = false + len(diagnoser.diagnose(log).fault_set), windows + windows_of(log, bench.layout)
+    yield Count("no reference, healthy: false alarms", 1e6 * false, windows, "in 1e6 windows", higher=False)
+
+
+def reference_faults(bench: Bench) -> Iterator[Count]:
+    """Cells that were dead already when the reference was recorded."""
+    layout, rng = bench.layout, np.random.default_rng(1000 + bench.repeat)
+    faults = draw_faults(layout, DEAD_BEFORE, STUCK_KINDS, rng)
+    cells = [cell for fault in faults for cell in fault.cells]
+    frames = [np.asarray(bench.recordings.frames[i], dtype=np.float64) for i in bench.reference]
+    fitted = SelfDiagnosis(layout).fit([inject(f, faults, layout, seed=i) for i, f in enumerate(frames)])
+    hidden = differs(np.concatenate(frames), inject(np.concatenate(frames), faults, layout), layout).sum(axis=0)
+    testable = [cell for cell in cells if hidden[cell] >= TESTABLE]
+    assert fitted.reference_ is not None
+    known = np.flatnonzero(fitted.reference_.dead > 0)
+    yield Count("4 % dead in the reference: found", len(np.intersect1d(known, testable)), len(testable))
+    false = true = windows = 0
+    for seed, log, _ in bench.logs():
+        seen = list(broken(log, faults, layout, 0.0, 0.0, seed))
+        found = fitted.diagnose(seen).fault_set
+        false, true = false + len(found - set(cells)), true + len(found & set(cells))
+        windows += windows_of(log, layout)
+    yield Count("4 % dead in the reference: false alarms", 1e6 * false, windows, "in 1e6 windows", higher=False)
+
+
+def wires(layout: SensorLayout) -> list[Line]:
+    return [line for line in layout.lines if line.kind in ("row", "column") and len(layout.cells_on(line)) > 2]
+
+
+def lines(bench: Bench) -> Iterator[Count]:
+    layout, exact, invented, missed = bench.layout, [], 0, 0
+    for seed, log, rng in bench.logs():
+        choice = wires(layout)
+        while True:
+            a, b = (choice[i] for i in rng.choice(len(choice), 2, replace=False))
+            if a.pad != b.pad or a.kind == b.kind:  # they do not cross
+                break
+        kinds = rng.choice([FaultKind.OPEN, FaultKind.SHORT], 2)
+        on_lines = [line_fault(layout, line, FaultKind(kind)) for line, kind in zip((a, b), kinds, strict=True)]
+        behind = {cell for fault in on_lines for cell in fault.cells}
+        single = [fault for fault in draw_faults(layout, 0.04, STUCK_KINDS, rng) if behind.isdisjoint(fault.cells)]
+        seen = list(broken(log, on_lines + single, layout, 0.0, 0.0, seed))
+        testable = differs(np.concatenate(log), np.concatenate(seen), layout).sum(axis=0) >= TESTABLE
+        found = {(f.line, f.kind) for f in bench.fitted.diagnose(seen).faults if f.line is not None}
+        true = {(fault.line, fault.kind) for fault in on_lines}
+        invented, missed = invented + len(found - true), missed + len(true - found)
+        if all(testable[list(f.cells)].sum() >= 3 for f in on_lines if f.kind is FaultKind.OPEN):
+            exact.append(found == true)
+    yield Count("2 broken lines + 4 % of the cells: exact lines", sum(exact), len(exact))
+    yield Count("  lines invented in a log", invented, bench.count, higher=False)
+
+
+def cut(bench: Bench) -> Iterator[Count]:
+    layout, exact, asked = bench.layout, 0, 0
+    for seed, log, rng in bench.logs():
+        touched = differs(np.concatenate(log), np.zeros(layout.n_cells), layout).sum(axis=0) >= TESTABLE
+        choice = []
+        for line in wires(layout):
+            across = 2 if line.kind == "row" else 1
+            on_line = layout.cells_on(line)
+            place = [layout.position(cell)[across] for cell in on_line.tolist()]
+            for i in range(1, len(on_line)):
+                # Both cells beside the break were loaded, and another one behind it.
+                if touched[on_line[[i - 1, i]]].all():
+                    if touched[on_line[i:]].sum() >= 2:
+                        choice.append((line, place[i], "first"))
+                    if touched[on_line[:i]].sum() >= 2:
+                        choice.append((line, place[i - 1] + 1, "last"))
+        if choice:
+            line, at, end = choice[rng.integers(len(choice))]
+            fault = line_fault(layout, line, FaultKind.OPEN, break_at=at, driven_from=end)
+            found = bench.fitted.diagnose(list(broken(log, [fault], layout, 0.0, 0.0, seed))).faults
+            asked, exact = asked + 1, exact + any(f.line == line and f.cells == fault.cells for f in found)
+    yield Count("a break inside a line: exact position", exact, asked)
+
+
+def address(bench: Bench) -> Iterator[Count]:
+    layout, asked, right, blamed = bench.layout, 0, 0, 0
+    choice = [line for line in layout.lines if line.kind in ("row_address", "column_address")]
+    for seed, log, rng in bench.logs():
+        line, level = choice[rng.integers(len(choice))], int(rng.integers(2))
+        fault = line_fault(layout, line, FaultKind.ALIAS, value=level)
+        seen = list(broken(log, [fault], layout, 0.0, 0.0, seed))
+        if differs(np.concatenate(log), np.concatenate(seen), layout).any(axis=1).sum() < TESTABLE:
+            continue
+        diagnosis = bench.fitted.diagnose(seen)
+        asked += 1
+        right += any(f.kind is FaultKind.ALIAS and f.line == line and f.value == level for f in diagnosis.faults)
+        blamed += len(diagnosis.fault_set - set(fault.cells))
+    yield Count("stuck address bit: bit and level named", right, asked)
+    yield Count("  other cells blamed in a log", blamed, asked, higher=False)
+
+
+def held(log: Log, layout: SensorLayout, rng: np.random.Generator) -> Log:
+    """Return a log in which the last frame of each recording is held, the loaded cells within +-1 converter count."""
+    count, seen = layout.full_scale / 4095, []
+    for frames in log:
+        jitter = count * rng.integers(-1, 2, (HELD, layout.n_cells)) * (frames[-1] > count)
+        seen.append(np.concatenate([frames, np.clip(frames[-1] + jitter, 0.0, layout.full_scale)]))
+    return seen
+
+
+def windows_of(log: Log, layout: SensorLayout) -> int:
+    """Return in how many windows a cell could raise a false alarm."""
+    return round(layout.present.sum() * sum(map(len, log)) / WINDOW)
+
+
+def healthy(bench: Bench) -> Iterator[Count]:
+    false = windows = 0
+    for _, log, _ in bench.logs():
+        false, windows = false + len(bench.fitted.diagnose(log).fault_set), windows + windows_of(log, bench.layout)
+    yield Count("healthy: false alarms", 1e6 * false, windows, "in 1e6 windows", higher=False)
+
+
+def holds(bench: Bench) -> Iterator[Count]:
+    false = windows = 0
+    for _, log, rng in bench.logs():
+        seen = held(log, bench.layout, rng)
+        false, windows = false + len(bench.fitted.diagnose(seen).fault_set), windows + windows_of(seen, bench.layout)
+    yield Count("healthy, held: false alarms", 1e6 * false, windows, "in 1e6 windows", higher=False)
+
+
+def untouched(bench: Bench) -> Iterator[Count]:
+    asked = wrong = 0
+    for _, log, _ in bench.logs():
+        never = (np.ptp(np.concatenate(log), axis=0) == 0) & bench.layout.present.ravel()
+        asked += int(never.sum())
+        wrong += int((bench.fitted.diagnose(log).verdicts[never] != Verdict.UNTESTED).sum())
+    yield Count("cells that never moved, healthy: not UNTESTED", wrong, asked, higher=False)
+
+
+def kind(bench: Bench) -> Iterator[Count]:
+    tallies = [bench.case(0.16), bench.case(0.16, onset=0.6)]
+    yield Count("kind of fault right", sum(t.right_kind for t in tallies), sum(t.true for t in tallies))
+
+
+def calibration(bench: Bench) -> Iterator[Count]:
+    tallies = [bench.case(0.16), bench.case(0.16, onset=0.6)]
+    p, y = (np.concatenate([x for t in tallies for x in getattr(t, name)]) for name in ("probability", "dead"))
+    where = np.minimum((10 * p).astype(int), 9)
+    error = sum(abs(p[where == b].sum() - y[where == b].sum()) for b in range(10))
+    yield Count("P(faulty): calibration error", error, len(p), higher=False)
+
+
+def changing(bench: Bench) -> Iterator[Count]:
+    layout, drawn, right, false = bench.layout, Counter(), Counter(), 0
+    for seed, log, rng in bench.logs():
+        whole = np.concatenate(log)
+        loaded = np.flatnonzero((whole > VISIBLE * layout.full_scale).sum(axis=0) > 40)
+        chosen = rng.permutation(loaded)[: 3 * len(CHANGING)].tolist()
+        faults = [Fault(CHANGING[i % len(CHANGING)], (cell,)) for i, cell in enumerate(chosen)]
+        # In one piece: a drift goes on from recording to recording.
+        diagnosis = bench.fitted.diagnose(parted(inject(whole, faults, layout, seed=seed), log))
+        told = kind_of_cells(diagnosis.faults)
+        for fault in faults:
+            drawn[fault.kind] += 1
+            right[fault.kind] += told.get(fault.cells[0]) is fault.kind
+        false += len(diagnosis.fault_set - set(chosen))
+    for k in CHANGING:
+        yield Count(f"{k}: found and named", right[k], drawn[k])
+    yield Count("  other cells blamed in a log", false, bench.count, higher=False)
+
+
+def gain(bench: Bench) -> Iterator[Count]:
+    """One contact says little of a gain: these logs are longer."""
+    layout, drawn, named, false = bench.layout, Counter(), Counter(), 0
+    for _, log, rng in bench.logs(LONG):
+        whole = np.concatenate(log)
+        loaded = sum((frames > VISIBLE * layout.full_scale).any(axis=0).astype(int) for frames in log)
+        chosen = rng.permutation(np.flatnonzero(loaded >= LOADED)).tolist()
+        lasts = len(whole) / layout.rate  # seconds
+        fading = [Fault(FaultKind.DRIFT, (cell,), value=0.0) for cell in chosen[:1]]
+        seen = inject(whole, fading, layout, gain=(FADED - 1) / lasts)
+        cases = dict(zip(chosen, (f"gain fades to {FADED}", *(f"gain {g}" for g in GAINS)), strict=False))
+        for cell, times in zip(chosen[1:], GAINS, strict=False):
+            seen[:, cell] *= times
+        diagnosis = bench.fitted.diagnose(parted(seen, log))
+        told = kind_of_cells(diagnosis.faults)
+        for cell, case in cases.items():
+            drawn[case] += 1
+            named[case] += told.get(cell) is FaultKind.DRIFT
+        false += len(diagnosis.fault_set - set(cases))
+    for case in sorted(drawn):
+        yield Count(f"{case}: found and named", named[case], drawn[case])
+    yield Count("  other cells blamed in a log", false, bench.count, higher=False)
+
+
+def transport(bench: Bench) -> Iterator[Count]:
+    layout, told, blamed = bench.layout, 0, 0
+    for seed, log, rng in bench.logs():
+        seen = {"lost": [lose_frames(frames, 0.2, seed=1000 * seed + i) for i, frames in enumerate(log)]}
+        lost = sum(int(np.isnan(frames).all(axis=1).sum()) for frames in seen["lost"])
+        whole = np.concatenate(log)
+        loaded = (whole > VISIBLE * layout.full_scale).sum(axis=1)
+        at = int(rng.choice(np.flatnonzero(loaded >= np.quantile(loaded, 0.75))))
+        assert bench.fitted.reference_ is not None
+        again = bench.fitted.reference_.patience + REPEATED
+        seen["frozen"] = [np.insert(whole, at, np.repeat(whole[at : at + 1], again, axis=0), axis=0)]
+        for name, frames in seen.items():
+            diagnosis = bench.fitted.diagnose(frames)
+            of_it = [fault for fault in diagnosis.transport if fault.kind == name]
+            told += len(of_it) == len(diagnosis.transport) == 1 and (name == "frozen" or of_it[0].frames == lost)
+            blamed += len(diagnosis.fault_set)
+    yield Count("lost frames, frozen stream: reported", told, 2 * bench.count)
+    yield Count("  cells blamed in a log", blamed, 2 * bench.count, higher=False)
+
+
+def matrix_product() -> float:
+    """Return how many ms this machine needs for the product of two 500 x 500 matrices of float32: its speed today."""
+    a, seconds = np.random.default_rng(0).random((500, 500), dtype=np.float32), []
+    for _ in range(30):
+        began = time.perf_counter()
+        a @ a
+        seconds.append(time.perf_counter() - began)
+    return 1000 * float(np.median(seconds))
+
+
+def long_log(frames: Sequence[np.ndarray], length: int) -> np.ndarray:
+    whole = np.concatenate([np.asarray(f, dtype=np.float64) for f in frames])
+    return np.tile(whole, (-(-length // len(whole)), 1))[:length]
+
+
+def speed(bench: Bench) -> Iterator[Count]:
+    """Times are given in matrix products (see :func:`matrix_product`), measured in turn with the work."""
+    began = time.perf_counter()
+    fitted = SelfDiagnosis(bench.layout).fit([bench.recordings.frames[i] for i in bench.reference])
+    yield Count("fit", 1000 * (time.perf_counter() - began), matrix_product(), "products", higher=False)
+    log = long_log([bench.recordings.frames[i] for i in bench.rest], 20_000 if bench.layout.n_cells < 500 else 4_000)
+    ratios = []
+    for _ in range(5):
+        began = time.perf_counter()
+        fitted.diagnose(log)
+        ratios.append(1000 * (time.perf_counter() - began) / matrix_product())
+    size = log.size / bench.layout.n_cells * bench.layout.present.sum() / 1e6
+    yield Count("batch, a million cell-frames", float(np.median(ratios)), size, "products", higher=False)
+    runs = np.empty((3, min(len(log), 3000)))
+    for run in runs:  # what a frame takes each time is the code, what it takes once is the machine
+        monitor = Monitor(fitted)
+        for i, frame in enumerate(log[: runs.shape[1]]):
+            began = time.perf_counter()
+            monitor.update(frame)
+            run[i] = 1000 * (time.perf_counter() - began)
+    ms, product = runs[:, 200:].min(axis=0), matrix_product()
+    for name, value in (("mean", ms.mean()), ("slowest in 100", np.quantile(ms, 0.99)), ("slowest", ms.max())):
+        yield Count(f"Monitor.update, {name}", float(value), product, "products", higher=False)
+
+
+ROWS: dict[str, Callable[[Bench], Iterator[Count]]] = {
+    row.__name__: row
+    for row in (
+        cells, onset, dither, missing, many, cold, reference_faults, lines, cut, address, healthy, holds, untouched,
+        kind, calibration, changing, gain, transport, speed,
+    )
+}  # fmt: skip

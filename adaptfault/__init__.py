@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from adaptfault.ros import diagnostic_array, write_diagnostics
     from adaptfault.single_faults import Sensitivity, analyse, sensitivity
     from adaptfault.store import load_model, save_model
-    from adaptfault.together import adapt_many
     from adaptfault.training import train
     from adaptfault.windows import Windows, make_windows, split
 
@@ -63,7 +62,6 @@ __all__ = [
     "Station",
     "TactileTransformer",
     "Windows",
-    "adapt_many",
     "add_onnx",
     "analyse",
     "correct",
@@ -109,7 +107,6 @@ _HOMES = {
     "Sensitivity": "single_faults",
     "TactileTransformer": "network",
     "Windows": "windows",
-    "adapt_many": "together",
     "add_onnx": "export",
     "analyse": "single_faults",
     "correct": "baselines.correction",

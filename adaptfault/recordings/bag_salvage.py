@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from adaptfault.recordings.bag_fields import Topic
-from adaptfault.recordings.sqlite_pages import rows
 
 Found = tuple[Topic, int, bytes]
 """Topic, time of arrival in nanoseconds, the message."""
@@ -78,13 +77,17 @@ class Salvage:
             with closing(sqlite3.connect(f"{self.path.resolve().as_uri()}?immutable=1", uri=True)) as base:
                 base.execute("PRAGMA writable_schema=ON")  # else SQLite refuses a file shorter than its header says
                 topics = _sqlite_topics(base)
+                before = 0
+                for row in base.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id"):
+                    match row:
+                        case [int(number), int(topic), int(time), bytes(data)] if topic in topics:
+                            if before and number != before + 1:  # the pages between were cut off
+                                self.reason = f"message {before + 1} is missing"
+                                return
+                            before = number
+                            yield topics[topic], time, data
         except sqlite3.Error as error:
             self.reason = str(error)
-            return
-        for row in rows(self.path):
-            match row:
-                case [_, int(topic), int(time), bytes(data)] if topic in topics:  # id, topic_id, timestamp, data
-                    yield topics[topic], time, data
 
 
 def _topic(channel: Any, schema: Any) -> Topic:

@@ -1,5 +1,6 @@
 # make demo       the main job on simulated grasps, with a report     make test         lint, formatting, types and tests
 # make examples   every script of examples/, and every block of code in the docs, small; the quick ones are in make test
+# make benchmark  the diagnosis on every array, against the committed table (BENCHMARK=--quick: minutes)
 # make docs       the site, in build/site: pages and API reference    make wheel-check  the wheel, installed somewhere else
 # They make their own .venv. PYTHON=/path/to/python3 chooses the interpreter.
 
@@ -9,7 +10,7 @@ PYTHON ?= $(shell for p in python3.11 /usr/bin/python3.11 python3.12 python3.13 
 	$$p -c 'import ensurepip, venv, sys; sys.exit(sys.version_info < (3, 10))' >/dev/null 2>&1 && echo $$p && break; done)
 BIN := .venv/bin
 
-.PHONY: demo test examples docs wheel-check test-pythons format clean
+.PHONY: demo test examples benchmark docs wheel-check test-pythons format clean
 
 demo: .venv/installed
 	$(BIN)/adaptfault demo
@@ -22,6 +23,10 @@ test: .venv/installed-dev
 
 examples: .venv/installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal -vv -rs tests/test_examples.py tests/test_docs.py
+
+# Real arrays are read from ../shared/data where it exists.
+benchmark: .venv/installed-dev
+	$(BIN)/python benchmarks/diagnosis.py --against benchmarks/table.jsonl $(BENCHMARK)
 
 # Warnings are errors: links and names that lead nowhere, public names that are on no page.
 docs: .venv/installed-docs

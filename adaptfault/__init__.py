@@ -10,32 +10,32 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from adaptfault.acquisition import Receiver, Recorder, Station
-    from adaptfault.adaptation import Adaptation
-    from adaptfault.adapter import Adapter
-    from adaptfault.baselines.correction import CausalCorrection, correct
-    from adaptfault.baselines.fault_aware import train_fault_aware
-    from adaptfault.calibration import Calibration
-    from adaptfault.evaluation import Scores, evaluate
-    from adaptfault.export import add_onnx
+    from adaptfault.acquisition.ros import diagnostic_array, write_diagnostics
+    from adaptfault.adaptation.adapter import Adapter
+    from adaptfault.adaptation.adapter_files import load_adapter, save_adapter
+    from adaptfault.adaptation.baselines.correction import CausalCorrection, correct
+    from adaptfault.adaptation.baselines.fault_aware import train_fault_aware
+    from adaptfault.adaptation.forecast import Forecast
+    from adaptfault.adaptation.reduced_model import ReducedModel
+    from adaptfault.adaptation.result import Adaptation
+    from adaptfault.data.calibration import Calibration
+    from adaptfault.data.recordings import Recordings, load, save_npz
+    from adaptfault.data.simulated_grasps import simulate
+    from adaptfault.data.windows import Windows, make_windows, split
+    from adaptfault.evaluation.scores import Scores, evaluate
+    from adaptfault.evaluation.sensitivity import Sensitivity, analyse, sensitivity
     from adaptfault.fleet.listing import Fleet
-    from adaptfault.fleet.report import FleetReport
     from adaptfault.fleet.run import maintain_fleet
-    from adaptfault.forecast import Forecast
-    from adaptfault.grasps import simulate
-    from adaptfault.history import History
-    from adaptfault.inference import Inference
-    from adaptfault.network import TactileTransformer
-    from adaptfault.recordings import Recordings, load, save_npz
-    from adaptfault.reduction import ReducedModel
-    from adaptfault.replay import load_adapter, save_adapter
+    from adaptfault.fleet.summary import FleetReport
+    from adaptfault.models.export import add_onnx
+    from adaptfault.models.history import History
+    from adaptfault.models.inference import Inference
+    from adaptfault.models.network import TactileTransformer
+    from adaptfault.models.store import load_model, save_model
+    from adaptfault.models.training import train
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.maintenance import MaintenanceReport, maintain
     from adaptfault.robot.predictor import Predictor, Reading
-    from adaptfault.ros import diagnostic_array, write_diagnostics
-    from adaptfault.single_faults import Sensitivity, analyse, sensitivity
-    from adaptfault.store import load_model, save_model
-    from adaptfault.training import train
-    from adaptfault.windows import Windows, make_windows, split
 
 __version__ = "0.1.0"
 
@@ -85,48 +85,48 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Adaptation": "adaptation",
-    "Adapter": "adapter",
+    "Adaptation": "adaptation.result",
+    "Adapter": "adaptation.adapter",
     "Bundle": "robot.bundle",
-    "Calibration": "calibration",
-    "CausalCorrection": "baselines.correction",
+    "Calibration": "data.calibration",
+    "CausalCorrection": "adaptation.baselines.correction",
     "Fleet": "fleet.listing",
-    "FleetReport": "fleet.report",
-    "Forecast": "forecast",
-    "History": "history",
-    "Inference": "inference",
+    "FleetReport": "fleet.summary",
+    "Forecast": "adaptation.forecast",
+    "History": "models.history",
+    "Inference": "models.inference",
     "MaintenanceReport": "robot.maintenance",
     "Predictor": "robot.predictor",
     "Reading": "robot.predictor",
     "Receiver": "acquisition",
     "Recorder": "acquisition",
-    "Recordings": "recordings",
-    "ReducedModel": "reduction",
+    "Recordings": "data.recordings",
+    "ReducedModel": "adaptation.reduced_model",
     "Station": "acquisition",
-    "Scores": "evaluation",
-    "Sensitivity": "single_faults",
-    "TactileTransformer": "network",
-    "Windows": "windows",
-    "add_onnx": "export",
-    "analyse": "single_faults",
-    "correct": "baselines.correction",
-    "diagnostic_array": "ros",
-    "evaluate": "evaluation",
-    "load": "recordings",
-    "load_adapter": "replay",
-    "load_model": "store",
+    "Scores": "evaluation.scores",
+    "Sensitivity": "evaluation.sensitivity",
+    "TactileTransformer": "models.network",
+    "Windows": "data.windows",
+    "add_onnx": "models.export",
+    "analyse": "evaluation.sensitivity",
+    "correct": "adaptation.baselines.correction",
+    "diagnostic_array": "acquisition.ros",
+    "evaluate": "evaluation.scores",
+    "load": "data.recordings",
+    "load_adapter": "adaptation.adapter_files",
+    "load_model": "models.store",
     "maintain": "robot.maintenance",
     "maintain_fleet": "fleet.run",
-    "make_windows": "windows",
-    "save_adapter": "replay",
-    "save_model": "store",
-    "save_npz": "recordings",
-    "sensitivity": "single_faults",
-    "simulate": "grasps",
-    "split": "windows",
-    "train": "training",
-    "train_fault_aware": "baselines.fault_aware",
-    "write_diagnostics": "ros",
+    "make_windows": "data.windows",
+    "save_adapter": "adaptation.adapter_files",
+    "save_model": "models.store",
+    "save_npz": "data.recordings",
+    "sensitivity": "evaluation.sensitivity",
+    "simulate": "data.simulated_grasps",
+    "split": "data.windows",
+    "train": "models.training",
+    "train_fault_aware": "adaptation.baselines.fault_aware",
+    "write_diagnostics": "acquisition.ros",
 }
 
 

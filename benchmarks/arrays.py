@@ -11,8 +11,8 @@ import static_holds
 from other_sensors import DRIFTS, SENSORS, remade
 from rows import Bench
 
-from adaptfault.grasps import simulate
-from adaptfault.recordings import Recordings, load
+from adaptfault.data.recordings import Recordings, load
+from adaptfault.data.simulated_grasps import simulate
 from diagnostics import SensorLayout
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adaptfault.recordings import Recordings
+from adaptfault.data.recordings import Recordings
 from diagnostics import SensorLayout
 
 GESTURES = ("nothing", "press", "pat", "rub", "stroke", "scratch", "tickle")

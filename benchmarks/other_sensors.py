@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from adaptfault.recordings import Recordings
+from adaptfault.data.recordings import Recordings
 
 Frames = np.ndarray
 Change = Callable[[Frames, np.random.Generator], Frames]  # of readings as a share of full scale, 0..1

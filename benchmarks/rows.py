@@ -15,7 +15,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from adaptfault.recordings import Recordings
+from adaptfault.data.recordings import Recordings
 from diagnostics import (
     Diagnosis,
     Fault,

@@ -3,14 +3,14 @@
 Needs numpy, scipy, statsmodels and scikit-learn; never torch, so that a robot can monitor its skin without it.
 """
 
-from diagnostics.coverage import Coverage
+from diagnostics.decision.coverage import Coverage
+from diagnostics.decision.result import Diagnosis, Verdict
 from diagnostics.diagnosis import SelfDiagnosis
 from diagnostics.faults import Fault, FaultKind, FaultSet
-from diagnostics.injection import bridge, freeze_stream, inject, line_fault, lose_frames
 from diagnostics.layout import Line, SensorLayout
 from diagnostics.monitor import Monitor
-from diagnostics.transport import TransportFault
-from diagnostics.verdicts import Diagnosis, Verdict
+from diagnostics.preprocessing.transport import TransportFault
+from diagnostics.simulation.injection import bridge, freeze_stream, inject, line_fault, lose_frames
 
 __all__ = [
     "Coverage",

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.addresses import aliasings
-from diagnostics.causes import Findings, root_causes
-from diagnostics.dead_before import dead_before
+from diagnostics.decision import version_8
+from diagnostics.decision.address_aliasing import find_aliasing
+from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
+from diagnostics.decision.line_cover import candidate_groups
+from diagnostics.decision.result import Diagnosis
+from diagnostics.decision.root_causes import CellFindings, root_causes
+from diagnostics.decision.serialization import Arrays, from_state, to_state
+from diagnostics.evidence.spatial import Exclusion, Spatial
+from diagnostics.evidence.stream_state import StreamState, run_to_end
+from diagnostics.evidence.tiled_state import new_stream
+from diagnostics.healthy.reference import Reference, living, tolerance_of
+from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
-from diagnostics.memory import Memory, finished
-from diagnostics.patched import remembering
-from diagnostics.readings import Readings
-from diagnostics.reference import Reference, living, tolerance_of
-from diagnostics.spatial import Caution, Spatial
-from diagnostics.stored import Arrays, reference_from_state, reference_state, weights_from_state, weights_state
-from diagnostics.verdicts import Diagnosis
-from diagnostics.weighing import Weights, faulty_at, kinds
-from diagnostics.wiring import suspected
+from diagnostics.preprocessing.readings import RecordingBlocks
 
-SCHEMA = "adaptfault.diagnoser/8"
+SCHEMA = "adaptfault.diagnoser/9"
 
 _SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
 _SUSPICIOUS_COLD = 3.0  # log evidence from which on a cell is not asked about the others, in a cold start
@@ -33,6 +34,16 @@ _APART = 0.5  # of what speaks against cells of one wire, where none of them is 
 # cell, where many touches are known; where few are, strange ones make cells likely too.
 _LIKELY, _LEADING = 0.8, (0.75, 0.4)
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved before is no longer called alive
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What is stored of a fitted diagnosis."""
+
+    layout: SensorLayout
+    false_discovery_rate: float
+    calibrator: Calibrator
+    reference: Reference | None
 
 
 class SelfDiagnosis:
@@ -48,7 +59,7 @@ class SelfDiagnosis:
     """
 
     reference_: Reference | None = None
-    weights_: Weights = Weights()
+    calibrator_: Calibrator = Calibrator()
 
     def __init__(self, layout: SensorLayout, *, false_discovery_rate: float = 0.006) -> None:
         self.layout = layout
@@ -63,9 +74,9 @@ class SelfDiagnosis:
             ValueError: recordings that do not fit the layout, or hold no frame with a reading.
         """
         healthy = _recordings(recordings, self.layout).whole(self.layout.present.ravel())
-        dead = dead_before(healthy, self.layout, tolerance_of(healthy, self.layout), self._diagnosed_cold)
+        dead = find_reference_faults(healthy, self.layout, tolerance_of(healthy, self.layout), self._diagnosed_cold)
         self.reference_ = Reference.fit(healthy, self.layout, dead)
-        self.weights_ = Weights.fit(healthy, living(self.layout, dead))
+        self.calibrator_ = Calibrator.fit(healthy, living(self.layout, dead))
         return self
 
     def diagnose(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Diagnosis:
@@ -79,46 +90,41 @@ class SelfDiagnosis:
         return self._diagnosed(_recordings(recordings, self.layout))
 
     def state(self) -> tuple[dict[str, Any], Arrays]:
-        """Return all that it knows: a JSON-safe dict, and arrays by name, as :meth:`from_state` reads them."""
-        about = {
-            "schema": SCHEMA,
-            "layout": self.layout.to_dict(),
-            "false_discovery_rate": self.false_discovery_rate,
-            "weights": weights_state(self.weights_),
-        }
-        if self.reference_ is None:
-            return {**about, "reference": None}, {}
-        reference, arrays = reference_state(self.reference_)
-        return {**about, "reference": reference}, arrays
+        """Return everything that was fitted: a JSON-safe dict and arrays by name, as :meth:`from_state` reads them."""
+        fitted, arrays = to_state(Fitted(self.layout, self.false_discovery_rate, self.calibrator_, self.reference_))
+        return {"schema": SCHEMA, **fitted}, arrays
 
     @classmethod
     def from_state(cls, about: Mapping[str, Any], arrays: Mapping[str, ArrayLike]) -> SelfDiagnosis:
-        """Rebuild from :meth:`state` one that says the same of every log, to the last bit.
+        """Rebuild a diagnosis from :meth:`state`; its answers are the same to the last bit.
 
         Raises:
             ValueError: another schema; a field or an array is missing, or of a wrong kind or shape.
         """
-        if about.get("schema") != SCHEMA:
-            raise ValueError(f"expected schema {SCHEMA!r}, got {about.get('schema')!r}")
+        schema = about.get("schema")
+        if schema not in (SCHEMA, version_8.SCHEMA):
+            raise ValueError(f"expected schema {SCHEMA!r}, got {schema!r}")
         try:
-            layout = SensorLayout.from_dict(about["layout"])
-            diagnoser = cls(layout, false_discovery_rate=float(about["false_discovery_rate"]))
-            diagnoser.weights_ = weights_from_state(about["weights"])
-            if about["reference"] is not None:
-                diagnoser.reference_ = reference_from_state(about["reference"], arrays, layout)
+            if schema == version_8.SCHEMA:
+                about, arrays = version_8.converted(about, arrays)
+            fitted = from_state(Fitted, about, arrays)
+            diagnoser = cls(fitted.layout, false_discovery_rate=fitted.false_discovery_rate)
+            diagnoser.calibrator_, diagnoser.reference_ = fitted.calibrator, fitted.reference
+            if fitted.reference is not None:
+                fitted.reference.check(fitted.layout)
         except KeyError as error:
             raise ValueError(f"the stored diagnosis is damaged: {error} is missing") from None
         except (TypeError, ValueError, AttributeError) as error:
             raise ValueError(f"the stored diagnosis is damaged: {error}") from None
         return diagnoser
 
-    def memory(self, needed: NDArray[np.bool_] | None = None) -> Memory:
-        """Return an empty memory, to be fed with a log and judged; see ``patched.remembering``."""
+    def stream(self, needed: NDArray[np.bool_] | None = None) -> StreamState:
+        """Return an empty memory, to be fed with a log and judged; see ``patched.new_stream``."""
         reference = self.reference_ or Reference.unknown(self.layout)
-        caution = self.weights_.caution if reference.model else Caution(_SUSPICIOUS_COLD)
-        return remembering(self.layout, reference, caution, needed)
+        exclusion = self.calibrator_.exclusion if reference.model else Exclusion(_SUSPICIOUS_COLD)
+        return new_stream(self.layout, reference, exclusion, needed)
 
-    def judge(self, memory: Memory, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
+    def evaluate(self, stream: StreamState, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
         """Judge every cell from what is remembered of a log.
 
         A generator that pauses every few milliseconds, for those who cannot wait; it returns the diagnosis.
@@ -126,124 +132,128 @@ class SelfDiagnosis:
         Raises:
             ValueError: no frame with a reading has come yet.
         """
-        memory = memory.complete()
-        if not memory.heard.any():
+        stream = stream.complete()
+        if not stream.received.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
-        aliased = aliasings(memory)
+        aliased = find_aliasing(stream)
         yield
         wrong = np.zeros(self.layout.n_cells, bool)
         wrong[[cell for aliasing in aliased for cell in (*aliasing.cells, *aliasing.doubtful)]] = True
-        spatial = yield from memory.spatial(wrong)
-        found = self._found(memory, spatial, wrong)
+        spatial = yield from stream.spatial(wrong)
+        found = self._found(stream, spatial, wrong)
         yield
-        found = yield from self._with_those_apart(found, memory, spatial, wrong)
+        found = yield from self._with_those_apart(found, stream, spatial, wrong)
         causes = yield from root_causes(found, aliased, self.layout)
         probability, inferred = found.probability.copy(), np.zeros(self.layout.n_cells, bool)
         for fault in causes:
             cells = list(fault.cells)
             probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
             inferred[cells] = True
-        scale, unrest = memory.scale, memory.unrest
+        scale, intermittency = stream.scale, stream.intermittency
         working = found.alive & ~inferred
         return Diagnosis(
             layout=self.layout,
             faults=causes,
             probability=probability,
-            tested=(found.alive & memory.touched) | inferred,  # noise alone proves nothing
-            transport=memory.stream.faults(scale.resting + scale.near, working, self.layout.rate),
+            tested=(found.alive & stream.touched) | inferred,  # noise alone proves nothing
+            transport=stream.transport.faults(scale.baseline + scale.near, working, self.layout.rate),
             evidence={
                 "spatial": spatial.evidence + spatial.offset + spatial.gain,
-                "temporal": np.where(spatial.asked, memory.temporal(), unrest.blinking + unrest.noisy),
-                "touches": spatial.touches.astype(np.float64),
+                "temporal": np.where(spatial.scored, stream.temporal(), intermittency.blinking + intermittency.noisy),
+                "touches": spatial.events.astype(np.float64),
             },
-            n_frames=memory.stream.seen,
+            n_frames=stream.transport.seen,
             n_recordings=n_recordings,
         )
 
-    def _diagnosed(self, log: Readings, needed: NDArray[np.bool_] | None = None) -> Diagnosis:
-        memory = self.memory(needed)
+    def _diagnosed(self, log: RecordingBlocks, needed: NDArray[np.bool_] | None = None) -> Diagnosis:
+        stream = self.stream(needed)
         for frames in log.blocks():
-            memory.extend(frames)
-        return finished(self.judge(memory, n_recordings=len(log)))
+            stream.extend(frames)
+        return run_to_end(self.evaluate(stream, n_recordings=len(log)))
 
-    def _diagnosed_cold(self, log: Readings, needed: NDArray[np.bool_], rest: NDArray[np.float64]) -> Diagnosis:
+    def _diagnosed_cold(self, log: RecordingBlocks, needed: NDArray[np.bool_], rest: NDArray[np.float64]) -> Diagnosis:
         """Judge cells that are ``needed`` by those around them, as far as the log tells; they ``rest`` there."""
         cold = SelfDiagnosis(self.layout)
         cold.reference_ = Reference.unknown(self.layout, rest)
         return cold._diagnosed(log, needed)
 
-    def _found(self, memory: Memory, spatial: Spatial, wrong: NDArray[np.bool_]) -> Findings:
+    def _found(self, stream: StreamState, spatial: Spatial, wrong: NDArray[np.bool_]) -> CellFindings:
         """Weigh the evidence, and cut F; cells that are ``wrong`` (bool ``[D]``) have been explained already."""
-        reference, runs, unrest = memory.reference, memory.runs, memory.unrest
-        present, silent = memory.present, memory.silent & ~wrong
-        temporal, kind = memory.temporal(), kinds(memory)
-        known = spatial.asked & ~runs.moved & (reference.dead > 0)
-        worth = self.weights_.worth(spatial.evidence, temporal, kind)
-        still = self.weights_.probability(worth, kind, spatial.asked & ~known)
+        reference, runs, intermittency = stream.reference, stream.runs, stream.intermittency
+        present, silent = stream.present, stream.silent & ~wrong
+        temporal, kind = stream.temporal(), kinds(stream)
+        known = spatial.scored & ~runs.moved & (reference.dead > 0)
+        calibrate = self.calibrator_.calibrate(spatial.evidence, temporal, kind)
+        still = self.calibrator_.probability(calibrate, kind, spatial.scored & ~known)
         still[known] = reference.dead[known]
         delivers = present & ~wrong & ~silent
-        intermittent, noisy = unrest.intermittent & delivers, unrest.excess & delivers
+        intermittent, noisy = intermittency.intermittent & delivers, intermittency.excess & delivers
         drifting = delivers & ~intermittent & ~noisy & spatial.drifting
         counted_out = silent | intermittent | noisy | drifting
         probability = np.where(present, np.where(counted_out, _SURE, still), 0.0)
         faulty = faulty_at(np.where(counted_out, 0.0, probability), self.false_discovery_rate)
         faulty = (faulty | counted_out) & present & ~wrong
-        value, rests = runs.value, spatial.asked & memory.rests()
-        return Findings(
+        value, rests = runs.value, spatial.scored & stream.rests()
+        return CellFindings(
             faulty=faulty,
             # A cell that moved is not dead, unless something speaks against what it does since.
             alive=present & ~wrong & ~faulty & runs.moved & (probability < _DOUBTED),
             silent=silent,
             rests=rests,
-            full=spatial.asked & ~rests & (value >= self.layout.full_scale - 2 * reference.tolerance),
+            full=spatial.scored & ~rests & (value >= self.layout.full_scale - 2 * reference.tolerance),
             intermittent=intermittent,
             noisy=noisy,
             drifting=drifting,
             gain=np.where(drifting, spatial.factor, np.nan),
-            value=np.where(intermittent, np.where(2 * unrest.high > unrest.blinks, self.layout.full_scale, 0.0), value),
+            value=np.where(
+                intermittent,
+                np.where(2 * intermittency.high > intermittency.blinks, self.layout.full_scale, 0.0),
+                value,
+            ),
             since=np.select(
                 [silent, intermittent, noisy, drifting],
-                [runs.missed_since, unrest.blinks_since, unrest.noisy_since, spatial.since],
+                [runs.missed_since, intermittency.blinks_since, intermittency.noisy_since, spatial.since],
                 runs.start,
             ),
             probability=probability,
             # What the line hypothesis asks of a cell at rest is only whether touches speak against it.
-            weight=np.where(known, _KNOWN, self.weights_.worth(spatial.surprise, temporal, kind)),
-            doubt=1 - (1 - reference.unfamiliar) * np.where(probability > _LIKELY, *_LEADING),
-            touches=np.where(intermittent, unrest.blinks, spatial.touches),
+            weight=np.where(known, _KNOWN, self.calibrator_.calibrate(spatial.surprisal, temporal, kind)),
+            doubt=1 - (1 - reference.inexperience) * np.where(probability > _LIKELY, *_LEADING),
+            events=np.where(intermittent, intermittency.blinks, spatial.events),
             known=known,
         )
 
     def _with_those_apart(
-        self, found: Findings, memory: Memory, spatial: Spatial, wrong: NDArray[np.bool_]
-    ) -> Generator[None, None, Findings]:
+        self, found: CellFindings, stream: StreamState, spatial: Spatial, wrong: NDArray[np.bool_]
+    ) -> Generator[None, None, CellFindings]:
         """Return the same, with what speaks for broken wires if their cells do not vouch for each other.
 
         The chain rule of probability would ask, for each of them in turn, those before it: half of them, that is about
         the mean of asking all and asking none. But what is expected where few are asked has to be learned from many
         touches.
         """
-        share = _APART * (1 - memory.reference.unfamiliar)
+        share = _APART * (1 - stream.reference.inexperience)
         if not share.any():
             return found
-        temporal, kind, alike = memory.temporal(), kinds(memory), found.rests & ~found.known & ~wrong
+        temporal, kind, matching = stream.temporal(), kinds(stream), found.rests & ~found.known & ~wrong
 
-        def weight_if(apart: NDArray[np.float64]) -> NDArray[np.float64]:
-            more = self.weights_.worth(apart, temporal, kind) - found.weight
+        def weight_if(group_excluded: NDArray[np.float64]) -> NDArray[np.float64]:
+            more = self.calibrator_.calibrate(group_excluded, temporal, kind) - found.weight
             return found.weight + share * np.maximum(more, 0.0)
 
-        against = found.alive | ~(found.rests | found.silent) & memory.present
-        groups = suspected(alike, against, weight_if(spatial.at_first), self.layout)
+        contradicting = found.alive | ~(found.rests | found.silent) & stream.present
+        groups = candidate_groups(matching, contradicting, weight_if(spatial.initial), self.layout)
         if not groups:
             return found
-        apart = yield from memory.apart(spatial, wrong, groups)
+        group_excluded = yield from stream.group_excluded(spatial, wrong, groups)
         weight = found.weight.copy()
-        for group, of_group in zip(groups, apart, strict=True):
+        for group, of_group in zip(groups, group_excluded, strict=True):
             weight[group] = np.maximum(weight[group], weight_if(of_group)[group])
         return replace(found, weight=weight)
 
 
-def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> Readings:
+def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> RecordingBlocks:
     """Return recordings, each ``[T, D]``, T >= 1."""
     given: Any = recordings
     single = isinstance(given, np.ndarray) and (given.shape[1:] == layout.shape or given.ndim <= 2)
@@ -251,7 +261,7 @@ def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayou
     checked = [r for r in checked if len(r)]
     if not checked:
         raise ValueError("no frames: expected recordings [T, D] with T >= 1")
-    return Readings(checked)
+    return RecordingBlocks(checked)
 
 
 def _checked(recording: ArrayLike, name: str, layout: SensorLayout) -> NDArray[Any]:

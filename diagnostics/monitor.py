@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diagnostics.decision.result import Diagnosis
 from diagnostics.diagnosis import SelfDiagnosis
+from diagnostics.evidence.stream_state import run_to_end
 from diagnostics.faults import Fault
 from diagnostics.layout import Line
-from diagnostics.memory import finished
-from diagnostics.verdicts import Diagnosis
 
 Key = tuple[Line | None, int]
 
@@ -37,7 +37,7 @@ class Monitor:
         # Threads that wait for each other on a busy robot cost far more than they save on such small matrices.
         self._threads = ThreadpoolController()
         self._diagnoser = fitted
-        self._memory = fitted.memory()
+        self._stream = fitted.stream()
         self._work: Generator[None, None, Diagnosis] | None = None
         self._known: dict[Key, Fault] = {}
         self._time: float | None = None
@@ -61,13 +61,13 @@ class Monitor:
             raise ValueError(f"expected a frame of {layout.n_cells} readings ({layout}), got {reading.size}")
         if time is not None:
             if self._time is not None:
-                self._memory.miss(round((time - self._time) * layout.rate) - 1)
+                self._stream.miss(round((time - self._time) * layout.rate) - 1)
             self._time = time
-        due = self._memory.due
+        due = self._stream.due
         with self._threads.limit(limits=1) if due else nullcontext():
-            completed = self._memory.extend(reading[None])
+            completed = self._stream.extend(reading[None])
         if self._work is None and completed:
-            self._work = self._diagnoser.judge(copy(self._memory))
+            self._work = self._diagnoser.evaluate(copy(self._stream))
         elif self._work is not None and not due:
             try:
                 with self._threads.limit(limits=1):
@@ -83,7 +83,7 @@ class Monitor:
         Raises:
             ValueError: no frame with a reading has come yet.
         """
-        return finished(self._diagnoser.judge(self._memory))
+        return run_to_end(self._diagnoser.evaluate(self._stream))
 
     def _news(self, diagnosis: Diagnosis) -> tuple[Fault, ...]:
         now = {(fault.line, fault.cells[0] if fault.line is None else -1): fault for fault in diagnosis.faults}

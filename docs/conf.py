@@ -79,7 +79,7 @@ def missing_names(app: Sphinx, env: BuildEnvironment) -> None:
 
 
 def public_name(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: TextElement) -> Element | None:
-    """Lead a name as other modules have it, ``FaultSet`` or ``adaptfault.store.save_model``, to the public one."""
+    """Lead a name of a module, ``FaultSet`` or ``adaptfault.models.store.save_model``, to the public one."""
     domain, parts = env.get_domain("py"), node.get("reftarget", "").split(".")
     for package in PUBLIC if node.get("refdomain") == "py" else ():
         for full in (f"{package}.{parts[-1]}", ".".join([package, *parts[-2:]])):

@@ -26,10 +26,10 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 import adaptfault as af
-from adaptfault.fills import CellStatistics
-from adaptfault.network import logits_of
-from adaptfault.reduction import ReducedModel, phi, reduce_windows
-from adaptfault.repairable import random_fault_set
+from adaptfault.adaptation.reduced_model import ReducedModel, phi, reduce_windows
+from adaptfault.imputation.dropout import random_fault_set
+from adaptfault.imputation.linear import CellStatistics
+from adaptfault.models.network import logits_of
 from diagnostics import FaultSet, SensorLayout
 
 Parts = tuple[af.Windows, af.Windows, af.Windows]

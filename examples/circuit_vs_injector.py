@@ -11,8 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adaptfault.grasps import simulate
-from diagnostics.circuit import (
+from adaptfault.data.simulated_grasps import simulate
+from diagnostics.faults import Fault, FaultKind
+from diagnostics.layout import Line, SensorLayout
+from diagnostics.simulation.circuit import (
     BridgedLines,
     Circuit,
     CutLine,
@@ -23,9 +25,7 @@ from diagnostics.circuit import (
     StuckCell,
     StuckConverter,
 )
-from diagnostics.faults import Fault, FaultKind
-from diagnostics.injection import bridge, inject, line_fault
-from diagnostics.layout import Line, SensorLayout
+from diagnostics.simulation.injection import bridge, inject, line_fault
 
 
 def cases(circuit: Circuit) -> dict[str, tuple[NetlistFault, Fault]]:

@@ -30,7 +30,7 @@ import numpy as np
 from compare.stacks import OURS, STACKS, Failure, Setup, serve
 
 import adaptfault as af
-from adaptfault.windows import evenly
+from adaptfault.data.windows import evenly
 from diagnostics import SensorLayout
 
 BATCHES = (1, 256)

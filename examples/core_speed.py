@@ -32,11 +32,12 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 import adaptfault as af
-from adaptfault import heads, training
-from adaptfault.compact import CompactNetwork
-from adaptfault.forest import Forest
-from adaptfault.reduction import ReducedModel, phi
-from adaptfault.store import load_model, save_model
+from adaptfault.adaptation import heads
+from adaptfault.adaptation.forest import Forest
+from adaptfault.adaptation.reduced_model import ReducedModel, phi
+from adaptfault.models import training
+from adaptfault.models.compact import CompactNetwork
+from adaptfault.models.store import load_model, save_model
 from diagnostics import FaultSet, Monitor, SelfDiagnosis, SensorLayout, tiles
 
 N = 1024  # of the square matrices
@@ -158,7 +159,7 @@ def head_jobs(model: af.TactileTransformer, adapter: af.Adapter, faults: FaultSe
     def whole() -> object:
         return adapter.adapt(faults, method="head", progress=False)
 
-    with mock.patch("adaptfault.stages.fit_head", side_effect=heads.fit_head) as watched:
+    with mock.patch("adaptfault.adaptation.stages.fit_head", side_effect=heads.fit_head) as watched:
         counted = count(whole)
     first, second, targets, held_targets, folds = watched.call_args.args
     both = [torch.cat(pair) for pair in zip(first, second, strict=True)]
@@ -187,7 +188,7 @@ def diagnosis_jobs(grasps: af.Recordings, faults: FaultSet, most: int) -> Iterat
         flop += tiles._STEPS * (4 * n * d * k + 2 * d * d * k) + 2 * n * d * d + 2 * d**3
         return inner(x, y, own)
 
-    with mock.patch("diagnostics.tiles._logistic", watch):
+    with mock.patch("diagnostics.healthy.local_regression._logistic", watch):
         fitted.fit(healthy)
     yield Job(f"diagnosis: fit on {len(healthy)} grasps", lambda: fitted.fit(healthy), flop, 0, "formula")
     log = [frames.copy() for frames in grasps.frames[:20]]
@@ -212,7 +213,7 @@ def diagnosis_jobs(grasps: af.Recordings, faults: FaultSet, most: int) -> Iterat
 
 
 def prediction_jobs(model: af.TactileTransformer, adapter: af.Adapter, folder: Path) -> Iterator[Job]:
-    from adaptfault.export import add_onnx
+    from adaptfault.models.export import add_onnx
 
     x = adapter.validation.x[:256].copy()
     for n in (1, len(x)):

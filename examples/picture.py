@@ -14,9 +14,9 @@ from matplotlib.patches import Patch
 
 import adaptfault as af
 from adaptfault.cli.demo import QUICK, SIMULATED_PER_CLASS
-from adaptfault.demo import DemoResult, run_demo
+from adaptfault.evaluation.demo import DemoResult, run_demo
 from diagnostics import Diagnosis, FaultKind, SensorLayout
-from diagnostics.picture import draw_forces
+from diagnostics.decision.plot import draw_forces
 
 VERDICTS = {"untested": "#d5d8dc", "alive": "#a9d3a5", "faulty": "#c0392b"}
 LETTERS = {FaultKind.OPEN: "O", FaultKind.SHORT: "S", FaultKind.STUCK: "K"}

@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-from adaptfault.ros import diagnostic_array, stale_array
+from adaptfault.acquisition.ros import diagnostic_array, stale_array
 from diagnostics import Monitor, SelfDiagnosis, SensorLayout
 
 SILENCE = 2.0  # seconds without a frame, after which everything is STALE

@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 
 from diagnostics import Fault, FaultKind, Line, SensorLayout, inject
-from diagnostics.injection import bridge, line_fault
+from diagnostics.simulation.injection import bridge, line_fault
 
 STAGES = ("fit", "diagnose", "monitor update", "monitor mean", "fill build", "fill apply")
 FULL_SCALE, STEPS = 5.0, 4095
@@ -110,9 +110,9 @@ def measure(layout: SensorLayout, frames: int) -> None:
     """Measure all stages in this process; memory is what comes on top of an empty process."""
     import sklearn.covariance  # noqa: F401
 
-    from adaptfault.fills import CellStatistics
-    from adaptfault.patch_fills import LARGE, PatchStatistics
-    from adaptfault.windows import make_windows
+    from adaptfault.data.windows import make_windows
+    from adaptfault.imputation.linear import CellStatistics
+    from adaptfault.imputation.tiled import LARGE, PatchStatistics
     from diagnostics import FaultSet, Monitor, SelfDiagnosis
 
     empty = peak()

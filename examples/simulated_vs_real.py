@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from adaptfault.grasps import simulate
+from adaptfault.data.simulated_grasps import simulate
 
 
 def statistics(recordings: Iterable[NDArray], present: NDArray[np.bool_], full_scale: float) -> dict[str, float]:

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from adaptfault.cli import main
-from adaptfault.grasps import simulate
-from adaptfault.recordings import Recordings, load, save_npz
+from adaptfault.data.recordings import Recordings, load, save_npz
+from adaptfault.data.simulated_grasps import simulate
 from adaptfault.robot.bundle import Bundle
 from diagnostics import Fault, FaultSet, Line, SelfDiagnosis, SensorLayout, line_fault
 
@@ -84,7 +84,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
 
 @pytest.fixture(scope="session")
 def fitted(grasps: Recordings, made_once) -> SelfDiagnosis:
-    """Fitted on every other of the simulated grasps; test_stored.py proves that files lose nothing of it."""
+    """Fitted on every other of the simulated grasps; test_serialization.py proves that files lose nothing of it."""
 
     def make(folder: Path) -> None:
         about, arrays = SelfDiagnosis(grasps.layout).fit(grasps.frames[::2]).state()
@@ -136,14 +136,14 @@ def versions(made_once) -> dict[str, Path]:
 def export_versions(home: Path) -> None:
     import torch
 
-    from adaptfault.adaptation import Adaptation, Stage
-    from adaptfault.export import add_onnx
-    from adaptfault.fills import CellStatistics
-    from adaptfault.forest import Forest
-    from adaptfault.heads import Blend, KernelHead
-    from adaptfault.network import TactileTransformer
-    from adaptfault.reduction import ReducedModel, phi
-    from adaptfault.windows import Windows
+    from adaptfault.adaptation.forest import Forest
+    from adaptfault.adaptation.heads import Blend, KernelHead
+    from adaptfault.adaptation.reduced_model import ReducedModel, phi
+    from adaptfault.adaptation.result import Adaptation, Stage
+    from adaptfault.data.windows import Windows
+    from adaptfault.imputation.linear import CellStatistics
+    from adaptfault.models.export import add_onnx
+    from adaptfault.models.network import TactileTransformer
 
     network = TactileTransformer(SMALL, 3, length=5).eval()
     windows = Windows(small_windows(60), np.arange(60) % 3, np.arange(60))
@@ -176,7 +176,7 @@ class Clock:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The clock that budgets go by in this test."""
     clock = Clock()
-    for module in ("clock", "stages", "training"):
+    for module in ("models.time_budget", "adaptation.stages", "models.training"):
         monkeypatch.setattr(f"adaptfault.{module}.time", clock)
     return clock
 
@@ -205,7 +205,7 @@ def without_export() -> Iterator[None]:
         raise ImportError("left out in this test")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("adaptfault.export.add_onnx", missing)
+        patch.setattr("adaptfault.models.export.add_onnx", missing)
         yield
 
 

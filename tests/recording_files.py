@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptfault.recordings import InputError, load
+from adaptfault.data.recordings import InputError, load
 from diagnostics import SensorLayout
 
 SDH = Path(__file__).parents[2] / "shared/data/sdh2x13x6_grasps36.npz"

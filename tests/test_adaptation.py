@@ -6,15 +6,16 @@ import pytest
 import torch
 from conftest import Clock
 
-from adaptfault import compact, forest, stages
-from adaptfault.adaptation import Adaptation
-from adaptfault.adapter import Adapter
-from adaptfault.evaluation import evaluate
-from adaptfault.fills import AffineFill
-from adaptfault.forecast import Forecast
-from adaptfault.network import TactileTransformer
-from adaptfault.reduction import ReducedModel, phi
-from adaptfault.windows import Windows
+from adaptfault.adaptation import forest, stages
+from adaptfault.adaptation.adapter import Adapter
+from adaptfault.adaptation.forecast import Forecast
+from adaptfault.adaptation.reduced_model import ReducedModel, phi
+from adaptfault.adaptation.result import Adaptation
+from adaptfault.data.windows import Windows
+from adaptfault.evaluation.scores import evaluate
+from adaptfault.imputation.linear import AffineFill
+from adaptfault.models import compact
+from adaptfault.models.network import TactileTransformer
 from diagnostics import FaultSet, SensorLayout
 
 LAYOUT = SensorLayout(2, 4, 4)
@@ -36,7 +37,7 @@ def blobs(n: int, seed: int) -> Windows:
 
 @pytest.fixture(scope="module")
 def adapter() -> Adapter:
-    from adaptfault.training import train
+    from adaptfault.models.training import train
 
     training, validation = blobs(300, 0), blobs(120, 1)
     model = TactileTransformer(LAYOUT, 3)

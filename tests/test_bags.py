@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adaptfault.cli import main
-from adaptfault.recordings import InputError, load
+from adaptfault.data.recordings import InputError, load
 from diagnostics import SensorLayout
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2")

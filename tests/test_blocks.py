@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from adaptfault.cli import main
-from adaptfault.recordings import InputError, Recordings, blocks, load, save_npz
-from adaptfault.recordings.blocks import Stream, is_large
-from adaptfault.recordings.csv_folder import csv_pieces, read_csv
+from adaptfault.data.recordings import InputError, Recordings, blocks, load, save_npz
+from adaptfault.data.recordings.blocks import Stream, is_large
+from adaptfault.data.recordings.csv_folder import csv_pieces, read_csv
 from diagnostics import SensorLayout
 
 LAYOUT = SensorLayout.paper()
@@ -137,7 +137,7 @@ def test_a_file_that_does_not_fit_is_an_input_error(tmp_path, spoil):
 def test_memory_does_not_grow_with_the_recording(tmp_path):
     code = (
         "import resource, sys\n"
-        "from adaptfault.recordings.blocks import Stream\n"
+        "from adaptfault.data.recordings.blocks import Stream\n"
         "print(sum(len(block) for block in Stream(sys.argv[1])))\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )

@@ -5,13 +5,13 @@ import sys
 import numpy as np
 import pytest
 
-from adaptfault.adaptation import Adaptation
-from adaptfault.adapter import Adapter
-from adaptfault.network import TactileTransformer
+from adaptfault.adaptation.adapter import Adapter
+from adaptfault.adaptation.result import Adaptation
+from adaptfault.data.windows import make_windows
+from adaptfault.models.network import TactileTransformer
 from adaptfault.robot.bundle import Bundle
+from adaptfault.robot.checksummed_json import Damaged
 from adaptfault.robot.lock import Busy
-from adaptfault.robot.sealed import Damaged
-from adaptfault.windows import make_windows
 from diagnostics import FaultSet, SelfDiagnosis
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from adaptfault.calibration import Calibration
-from adaptfault.recordings import InputError
+from adaptfault.data.calibration import Calibration
+from adaptfault.data.recordings import InputError
 from diagnostics import SensorLayout
 
 

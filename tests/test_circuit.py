@@ -6,7 +6,9 @@
 import numpy as np
 import pytest
 
-from diagnostics.circuit import (
+from diagnostics.faults import Fault
+from diagnostics.layout import Line, SensorLayout
+from diagnostics.simulation.circuit import (
     BridgedLines,
     Circuit,
     CutLine,
@@ -15,9 +17,7 @@ from diagnostics.circuit import (
     StuckCell,
     StuckConverter,
 )
-from diagnostics.faults import Fault
-from diagnostics.injection import bridge, inject, line_fault
-from diagnostics.layout import Line, SensorLayout
+from diagnostics.simulation.injection import bridge, inject, line_fault
 
 READOUTS = ("grounded", "floating", "floating_rows", "floating_columns")
 LAYOUT = SensorLayout(1, 7, 6)
@@ -34,7 +34,7 @@ def some_forces(layout: SensorLayout = LAYOUT, frames: int = 40) -> np.ndarray:
 FORCES = some_forces()
 
 
-def apart(circuit: Circuit, netlist, fault: Fault) -> tuple[float, float]:
+def group_excluded(circuit: Circuit, netlist, fault: Fault) -> tuple[float, float]:
     """Return the 99th percentile of |circuit - injector| on the faulty cells and on the others, in % of full scale."""
     injected = inject(circuit.read(FORCES), [fault], LAYOUT)
     difference = np.abs(circuit.with_faults(netlist).read(FORCES) - injected) * 100 / LAYOUT.full_scale
@@ -50,8 +50,8 @@ def test_a_floating_2x2_array_reads_the_cell_beside_the_three_others_in_series()
     layout = SensorLayout(1, 2, 2)
     force = np.array([0.5, 1.0, 2.0, 0.8])
     g = 1 / 10e6 + force / 5 / 10e3
-    around = g[0] + 1 / (1 / g[1] + 1 / g[3] + 1 / g[2])  # row 0, column 1, row 1, column 0
-    by_hand = (around - 1 / 10e6) * 10e3 * 5
+    neighbourhood = g[0] + 1 / (1 / g[1] + 1 / g[3] + 1 / g[2])  # row 0, column 1, row 1, column 0
+    by_hand = (neighbourhood - 1 / 10e6) * 10e3 * 5
     assert Circuit(layout, "floating").read(force[None])[0, 0] == pytest.approx(by_hand, rel=1e-6)
 
 
@@ -78,9 +78,9 @@ def test_what_flows_into_a_wire_flows_out_of_it_with_faults_too(readout):
     row, col = 4, 1
     volts = circuit.wire_voltages(FORCES, 0, row, col)
     assert volts.shape == (40, 7 + 6 + 1)
-    rows, cols, beyond = volts[:, :7], volts[:, 7:13], volts[:, 13]
+    rows, cols, tail_slope = volts[:, :7], volts[:, 7:13], volts[:, 13]
     at_cell = np.repeat(rows[:, :, None], 6, axis=2)
-    at_cell[:, 3, 2:] = beyond[:, None]
+    at_cell[:, 3, 2:] = tail_slope[:, None]
     g = 1 / 10e6 + LAYOUT.grid(FORCES)[:, 0] / 5 / 10e3
     current = g * (at_cell - cols[:, None, :])  # from row to column [T, rows, cols]
     np.testing.assert_allclose(current[:, 3, 2:].sum(1), 0, atol=1e-12)
@@ -202,14 +202,14 @@ AGREES = {
 
 @pytest.mark.parametrize(("netlist", "fault", "on_faulty", "on_others"), AGREES.values(), ids=AGREES)
 def test_with_grounded_lines_the_injector_reads_what_the_circuit_reads(netlist, fault, on_faulty, on_others):
-    faulty, others = apart(Circuit(LAYOUT, "grounded"), netlist, fault)
+    faulty, others = group_excluded(Circuit(LAYOUT, "grounded"), netlist, fault)
     assert faulty <= on_faulty
     assert others <= on_others
 
 
 @pytest.mark.parametrize(("line", "readout"), [(ROW, "floating_rows"), (COLUMN, "floating_columns")])
 def test_bridged_lines_read_the_sum_where_the_one_not_selected_floats(line, readout):
-    faulty, others = apart(Circuit(LAYOUT, readout), BridgedLines(line), bridge(LAYOUT, line))
+    faulty, others = group_excluded(Circuit(LAYOUT, readout), BridgedLines(line), bridge(LAYOUT, line))
     assert faulty < 1
     assert others < 0.1
 
@@ -260,9 +260,9 @@ def test_with_floating_lines_a_shorted_cell_drags_its_row_and_column_up():
 @pytest.mark.parametrize("line", [ROW, COLUMN])
 def test_with_floating_lines_the_cells_beyond_a_cut_read_what_sneaks_to_them(line):
     cut = CutLine(line, 2)
-    beyond = line_fault(LAYOUT, line, "open", break_at=2).cells
-    grounded = Circuit(LAYOUT, "grounded", (cut,)).read(FORCES)[:, beyond]
-    floating = Circuit(LAYOUT, "floating", (cut,)).read(FORCES)[:, beyond]
+    tail_slope = line_fault(LAYOUT, line, "open", break_at=2).cells
+    grounded = Circuit(LAYOUT, "grounded", (cut,)).read(FORCES)[:, tail_slope]
+    floating = Circuit(LAYOUT, "floating", (cut,)).read(FORCES)[:, tail_slope]
     assert grounded.max() == 0
     assert np.median(floating) > 0.02 * LAYOUT.full_scale
 

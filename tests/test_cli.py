@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from adaptfault.cli import COMMANDS, main
-from adaptfault.grasps import simulate
-from adaptfault.recordings import Recordings, save_npz
+from adaptfault.data.recordings import Recordings, save_npz
+from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Diagnosis, Line, SensorLayout, inject, line_fault
 
 SMALL = SensorLayout(2, 6, 5)

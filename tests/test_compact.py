@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from adaptfault import compact
-from adaptfault.compact import CompactNetwork
-from adaptfault.network import TactileTransformer
+from adaptfault.models import compact
+from adaptfault.models.compact import CompactNetwork
+from adaptfault.models.network import TactileTransformer
 from diagnostics import SensorLayout
 
 MASKED = SensorLayout(2, 6, 5, present=np.arange(60) % 7 != 3)

@@ -162,6 +162,6 @@ def test_the_network_in_keras_is_the_network(examples, monkeypatch: pytest.Monke
     assert theirs.count_params() == sum(p.numel() for p in ours.parameters())
     theirs.set_weights(as_keras({name: w.numpy() for name, w in ours.state_dict().items()}, layout, theirs))
     x = np.random.default_rng(0).random((5, 6, 40), np.float32)
-    from adaptfault.network import logits_of
+    from adaptfault.models.network import logits_of
 
     np.testing.assert_allclose(theirs.predict(x, verbose=0), logits_of(ours, x).numpy(), atol=1e-5)

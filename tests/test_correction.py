@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from adaptfault.baselines.correction import STEP, CausalCorrection, correct
-from adaptfault.fills import CellStatistics
-from adaptfault.windows import Windows, make_windows
+from adaptfault.adaptation.baselines.correction import STEP, CausalCorrection, correct
+from adaptfault.data.windows import Windows, make_windows
+from adaptfault.imputation.linear import CellStatistics
 from diagnostics import FaultSet
 
 

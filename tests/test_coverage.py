@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from diagnostics import SensorLayout
-from diagnostics.coverage import coverage
+from diagnostics.decision.coverage import coverage
 
 LAYOUT = SensorLayout(2, 4, 5)
 NONE = np.zeros(40, bool)

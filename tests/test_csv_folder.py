@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from recording_files import PAPER, messages, newtons, refusal, rng, text, write
 
-from adaptfault.recordings import load
+from adaptfault.data.recordings import load
 
 
 def test_a_csv_of_100_rows_and_220_columns_is_the_papers_sensor(tmp_path):

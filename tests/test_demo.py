@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from adaptfault.demo import default_faults, run_demo
-from adaptfault.recordings import Recordings
+from adaptfault.data.recordings import Recordings
+from adaptfault.evaluation.demo import default_faults, run_demo
 from diagnostics import FaultKind, SensorLayout
 
 

@@ -10,16 +10,16 @@ from torch import nn
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_map_only
 
-from adaptfault.adapter import Adapter
-from adaptfault.baselines.fault_aware import train_fault_aware
-from adaptfault.grasps import simulate
-from adaptfault.network import TactileTransformer
+from adaptfault.adaptation.adapter import Adapter
+from adaptfault.adaptation.baselines.fault_aware import train_fault_aware
+from adaptfault.data.simulated_grasps import simulate
+from adaptfault.data.windows import Windows, make_windows
+from adaptfault.evaluation.sensitivity import analyse
+from adaptfault.models.network import TactileTransformer
+from adaptfault.models.store import load_model, save_model
+from adaptfault.models.training import train
 from adaptfault.paper.bench import Bench, Setup
 from adaptfault.paper.settings import Settings, Task, aware
-from adaptfault.single_faults import analyse
-from adaptfault.store import load_model, save_model
-from adaptfault.training import train
-from adaptfault.windows import Windows, make_windows
 from diagnostics import FaultSet, SensorLayout
 
 LAYOUT = SensorLayout(1, 5, 6, present=np.arange(30).reshape(1, 5, 6) > 0)

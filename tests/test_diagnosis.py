@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from adaptfault.grasps import simulate
-from adaptfault.recordings import Recordings
+from adaptfault.data.recordings import Recordings
+from adaptfault.data.simulated_grasps import simulate
 from diagnostics import (
     Diagnosis,
     Fault,
@@ -388,10 +388,10 @@ def test_readings_that_are_missing_here_and_there_are_no_fault(fitted, log, cold
 
 
 def test_what_is_missing_from_the_reference_teaches_no_rest(grasps, log):
-    learned = SelfDiagnosis(LAYOUT).fit(gappy(grasps.frames[::4], 0.4))
+    fit_stacking = SelfDiagnosis(LAYOUT).fit(gappy(grasps.frames[::4], 0.4))
     cells = loaded(log)[::8].tolist()
     faults = [Fault("short" if i % 2 else "open", (cell,)) for i, cell in enumerate(cells)]
-    assert learned.diagnose(broken(log, faults)).fault_set == set(cells)
+    assert fit_stacking.diagnose(broken(log, faults)).fault_set == set(cells)
 
 
 def test_a_cell_that_falls_silent_under_load_is_open_from_then_on(fitted, log):

@@ -14,7 +14,7 @@ from conftest import without_export
 
 import adaptfault as af
 from adaptfault.cli import COMMANDS, main
-from adaptfault.recordings import Recordings, save_npz
+from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.robot.bundle import Bundle
 from diagnostics import FaultSet, inject
 

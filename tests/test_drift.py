@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from diagnostics.contact import Expected
-from diagnostics.drift import drifting, gain_evidence, gains_count, misleading
+from diagnostics.evidence.drift import drifting, gain_evidence, gains_count, misleading
+from diagnostics.healthy.model import Prediction
 
 CELLS, NEAR = 30, 0.1
 SPREAD = 0.05
@@ -16,7 +16,7 @@ def touched(n: int, gain: np.ndarray | float = 1.0, *, error: float = SPREAD / 2
     mean = rng.uniform(0.3, 0.8, (n, CELLS))
     root = np.sqrt(gain) * mean + error * rng.standard_normal((n, CELLS))
     ones = np.ones((n, CELLS))
-    expected = Expected(0.02 * ones, 0.5 * ones, mean, np.full(CELLS, SPREAD), np.full(CELLS, own))
+    expected = Prediction(0.02 * ones, 0.5 * ones, mean, np.full(CELLS, SPREAD), np.full(CELLS, own))
     return np.stack([root, root, ones, ones], axis=1), expected, ones > 0
 
 
@@ -26,19 +26,19 @@ def one_has(gain: float, cell: int = 4) -> np.ndarray:
 
 @pytest.mark.parametrize("gain", [0.15, 0.35, 0.5, 2.5])
 def test_a_wrong_gain_is_told_by_touches_and_no_other_cell_is_accused(gain: float):
-    told = gain_evidence(*touched(20, one_has(gain)), NEAR)
-    assert drifting(np.zeros(CELLS), told.evidence).nonzero()[0].tolist() == [4]
-    assert 0.6 < told.factor[4] / gain < 1.6
-    assert (told.since[4], told.touches[4]) == (0, 20)
-    assert (np.delete(told.evidence, 4) < 0).all()
+    known_values = gain_evidence(*touched(20, one_has(gain)), NEAR)
+    assert drifting(np.zeros(CELLS), known_values.evidence).nonzero()[0].tolist() == [4]
+    assert 0.6 < known_values.factor[4] / gain < 1.6
+    assert (known_values.since[4], known_values.events[4]) == (0, 20)
+    assert (np.delete(known_values.evidence, 4) < 0).all()
 
 
 def test_it_says_from_which_touch_on():
     gain = np.ones((12, CELLS))
     gain[7:, 4] = 0.2
-    told = gain_evidence(*touched(12, gain), NEAR)
-    assert drifting(np.zeros(CELLS), told.evidence)[4]
-    assert told.since[4] == 7
+    known_values = gain_evidence(*touched(12, gain), NEAR)
+    assert drifting(np.zeros(CELLS), known_values.evidence)[4]
+    assert known_values.since[4] == 7
 
 
 @pytest.mark.parametrize("gain", [0.8, 1.25])
@@ -52,8 +52,8 @@ def test_one_or_two_touches_prove_nothing(n: int):
 
 
 def test_where_all_that_is_expected_errs_no_cell_is_accused():
-    strange = gain_evidence(*touched(8, error=5 * SPREAD), NEAR)
-    assert not drifting(np.zeros(CELLS), strange.evidence).any()
+    inflation = gain_evidence(*touched(8, error=5 * SPREAD), NEAR)
+    assert not drifting(np.zeros(CELLS), inflation.evidence).any()
 
 
 def test_the_fewer_touches_taught_what_to_expect_the_less_is_told():
@@ -69,14 +69,14 @@ def test_touches_that_tell_nothing_of_a_gain_do_not_count():
     unmoved[:, 4] = False
     unknown = replace(expected, spread=np.where(one_has(0.0) == 0, np.nan, SPREAD))
     faint = replace(expected, mean=np.minimum(expected.mean, 1.9 * NEAR))
-    for told in (
+    for known_values in (
         gain_evidence(unloaded, expected, moved, NEAR),
         gain_evidence(whole, expected, unmoved, NEAR),
         gain_evidence(whole, unknown, moved, NEAR),
         gain_evidence(whole, faint, moved, NEAR),
         gain_evidence(*touched(8, one_has(0.2), own=0.0), NEAR),
     ):
-        assert (told.evidence[4], told.factor[4], told.touches[4]) == (0.0, 1.0, 0)
+        assert (known_values.evidence[4], known_values.factor[4], known_values.events[4]) == (0.0, 1.0, 0)
 
 
 def test_cells_that_mislead_are_left_out_the_surest_gain_first_and_all_offsets_at_once():

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import nn
 
-from adaptfault.evaluation import Scores, accuracy_interval, evaluate
-from adaptfault.windows import Windows
+from adaptfault.data.windows import Windows
+from adaptfault.evaluation.scores import Scores, accuracy_interval, evaluate
 
 TRUE, PREDICTED = [0, 0, 0, 1, 1, 2], [0, 0, 1, 1, 0, 0]
 
@@ -86,7 +86,8 @@ def test_the_confusion_can_be_drawn():
 
 
 def test_scoring_a_plain_classifier_needs_no_torch():
-    code = "import sys, adaptfault.evaluation, adaptfault.windows, adaptfault.store; sys.exit('torch' in sys.modules)"
+    modules = "adaptfault.evaluation.scores, adaptfault.data.windows, adaptfault.models.store"
+    code = f"import sys, {modules}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from _pytest.mark import ParameterSet
 
-from adaptfault.recordings import Recordings, save_npz
+from adaptfault.data.recordings import Recordings, save_npz
 
 HOME = Path(__file__).parents[1] / "examples"
 EXAMPLES = sorted(HOME.glob("*.py"))
@@ -21,46 +21,31 @@ EXAMPLES = sorted(HOME.glob("*.py"))
 ON_RECORDINGS = {
     "adaptation_figures.py": ["--epochs", "1", "--cases", "1", "--only", "fill"],
     "compare_classification.py": ["--small", "--only", "adaptfault"],
-    "compare_diagnosis.py": ["--logs", "1"],
     "compare_keras.py": ["--epochs", "1", "--windows", "32"],
-    "diagnosis_constants.py": ["1", "--only", "rim._RIDGE"],
-    "diagnosis_figures.py": ["1", "--only", "cells"],
     "esp32_sender.py": ["--frames", "20"],
-    "other_sensors.py": ["1", "--only", "8 bits"],
     "simulated_vs_real.py": [],
     "wrong_fault_set.py": ["--draws", "1"],
 }
 LESS = {  # they take minutes
-    "diagnosis_constants.py": ["--only", "rim._RIDGE"],
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
-    "gestures.py": ["--recordings", "24", "--logs", "2", "--only", "no crosstalk"],
-    "other_sensors.py": ["--only", "8 bits", "all +3 %"],
-    "static_holds.py": ["--recordings", "24", "--logs", "2", "--only", "seat"],
 }
 SLOW = {  # more than 7 s of CPU time
     "adaptation_figures.py",
     "compare_classification.py",
-    "compare_diagnosis.py",
     "compare_keras.py",
     "core_speed.py",
     "deploy_speed.py",
-    "diagnosis_constants.py",
-    "diagnosis_figures.py",
     "fleet_scaling.py",
-    "gestures.py",
     "kill_maintenance.py",
-    "other_sensors.py",
     "picture.py",
     "repair.py",
     "scale_curves.py",
-    "static_holds.py",
     "wrong_fault_set.py",
 }
 SLOW_ON_RECORDINGS = {
     "adaptation_figures.py",
     "compare_classification.py",
     "compare_keras.py",
-    "diagnosis_constants.py",
 }
 NEEDS = {"deploy_speed.py": "onnxruntime"}  # others do without, and say so
 

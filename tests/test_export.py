@@ -7,10 +7,10 @@ import pytest
 import torch
 from conftest import DROPPED, small_windows
 
-from adaptfault import export
-from adaptfault.adaptation import Adaptation
-from adaptfault.export import ExportError, add_onnx, to_onnx
-from adaptfault.inference import open_session, run_session
+from adaptfault.adaptation.result import Adaptation
+from adaptfault.models import export
+from adaptfault.models.export import ExportError, add_onnx, to_onnx
+from adaptfault.models.inference import open_session, run_session
 
 
 @pytest.mark.parametrize("name", DROPPED)

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from adaptfault.baselines.fault_aware import FaultySamples, train_fault_aware
-from adaptfault.network import TactileTransformer
-from adaptfault.windows import Windows
+from adaptfault.adaptation.baselines.fault_aware import FaultySamples, train_fault_aware
+from adaptfault.data.windows import Windows
+from adaptfault.models.network import TactileTransformer
 from diagnostics import SensorLayout
 
 PRESENT = np.ones((2, 4, 5), bool)

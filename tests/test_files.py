@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from recording_files import messages, newtons, refusal, write
 
-from adaptfault.recordings import load
+from adaptfault.data.recordings import load
 
 
 def test_a_path_that_is_not_there_is_refused(tmp_path):

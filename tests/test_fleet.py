@@ -12,13 +12,13 @@ import pytest
 import adaptfault.fleet.run as running
 import adaptfault.fleet.work as working
 from adaptfault.cli import main
+from adaptfault.data.json_lines import Lines
+from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.fleet.listing import Fleet, Robot
 from adaptfault.fleet.outcome import Cause, Outcome
-from adaptfault.fleet.report import FleetReport
 from adaptfault.fleet.run import maintain_fleet
+from adaptfault.fleet.summary import FleetReport
 from adaptfault.fleet.work import maintain_robot
-from adaptfault.lines import Lines
-from adaptfault.recordings import Recordings, save_npz
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.lock import Busy, locked
 from diagnostics import SensorLayout, inject

@@ -2,7 +2,7 @@ import numpy as np
 import torch
 from sklearn.ensemble import ExtraTreesClassifier
 
-from adaptfault.forest import Forest
+from adaptfault.adaptation.forest import Forest
 
 
 def data(n: int = 200) -> tuple[torch.Tensor, np.ndarray]:

@@ -9,8 +9,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from adaptfault.grasps import CLASS_NAMES, Readout, hysteresis, relaxing_pressure, simulate
-from adaptfault.recordings import Recordings
+from adaptfault.data.recordings import Recordings
+from adaptfault.data.simulated_grasps import CLASS_NAMES, Readout, hysteresis, relaxing_pressure, simulate
 from diagnostics import SensorLayout
 
 ROOT = Path(__file__).parents[1]
@@ -238,6 +238,6 @@ def test_the_example_prints_one_column_without_a_file(
     ],
 )
 def test_bad_arguments_are_told_in_one_line(arguments: dict, message: str):
-    with pytest.raises(ValueError, match=message) as told:
+    with pytest.raises(ValueError, match=message) as known_values:
         simulate(**{"n_per_class": 1, "n_frames": 2, **arguments})
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(known_values.value)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from adaptfault.heads import KernelFit, KernelHead, calibrate, linear_head, summarise
+from adaptfault.adaptation.heads import KernelFit, KernelHead, calibrate, linear_head, summarise
 
 
 def windows(n: int = 90) -> tuple[list[torch.Tensor], np.ndarray]:

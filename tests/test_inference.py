@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from conftest import DROPPED, SMALL, small_windows
 
-from adaptfault.inference import Inference, open_session
+from adaptfault.models.inference import Inference, open_session
 
 WITHOUT_TORCH = """
 import sys
 import numpy as np
 import adaptfault
-import adaptfault.store, adaptfault.windows
-from adaptfault.inference import Inference
+import adaptfault.models.store, adaptfault.data.windows
+from adaptfault.models.inference import Inference
 model = Inference.load(sys.argv[1])
 assert model.runtime == "onnx"
 assert model.predict(np.load(sys.argv[2])).tolist() == np.load(sys.argv[3]).tolist()
@@ -27,7 +27,7 @@ WITHOUT_ONNX_RUNTIME = """
 import sys
 sys.modules["onnxruntime"] = None
 import numpy as np
-from adaptfault.inference import Inference
+from adaptfault.models.inference import Inference
 model = Inference.load(sys.argv[1])
 assert model.runtime == "torch"
 assert model.predict(np.load(sys.argv[2])).tolist() == np.load(sys.argv[3]).tolist()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from diagnostics import Fault, FaultKind, Line, SensorLayout, inject, line_fault
-from diagnostics.injection import bridge, freeze_stream, lose_frames
+from diagnostics.simulation.injection import bridge, freeze_stream, lose_frames
 
 LAYOUT = SensorLayout(2, 11, 10)
 

@@ -3,7 +3,7 @@
 import pytest
 from recording_files import messages, newtons, refusal, write
 
-from adaptfault.recordings import load
+from adaptfault.data.recordings import load
 
 
 def test_a_label_table_in_the_folder_gives_the_classes(tmp_path):

@@ -5,7 +5,7 @@ import json
 import pytest
 from recording_files import SMALL, archive, counts, messages, newtons, refusal, write
 
-from adaptfault.recordings import InputError, load, parse_shape, read_layout
+from adaptfault.data.recordings import InputError, load, parse_shape, read_layout
 from diagnostics import SensorLayout
 
 

@@ -21,7 +21,7 @@ from adaptfault.acquisition import Recorder, Session, Station, format_packet, pa
 from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.session import CONFIRMED_AFTER, SILENCE
 from adaptfault.cli import main
-from adaptfault.recordings import load
+from adaptfault.data.recordings import load
 from diagnostics import Fault, FaultSet, SensorLayout
 
 SMALL = SensorLayout(1, 2, 3)
@@ -202,7 +202,7 @@ def test_with_a_bundle_classes_are_told(tmp_path, capsys, monkeypatch):
 
 
 def test_without_what_a_bundle_needs_the_user_is_told_so(bundle, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "adaptfault.adaptation", None)
+    monkeypatch.setitem(sys.modules, "adaptfault.adaptation.result", None)
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert main(["listen", str(bundle.path), "--port", "0"]) == 3
     assert "classifying needs" in capsys.readouterr().err

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from adaptfault.robot.bundle import Bundle
-from adaptfault.robot.judgement import Judgement
+from adaptfault.robot.deployment_test import Judgement
 from adaptfault.robot.lock import Busy
 from adaptfault.robot.maintenance import maintain
 from diagnostics import FaultKind, Line, SensorLayout, inject, line_fault

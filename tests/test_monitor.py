@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from adaptfault.recordings import Recordings
+from adaptfault.data.recordings import Recordings
 from diagnostics import (
     Fault,
     FaultKind,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from adaptfault.network import Dropout, TactileTransformer, logits_of
+from adaptfault.models.network import Dropout, TactileTransformer, logits_of
 from diagnostics import SensorLayout
 
 SMALL = SensorLayout(1, 4, 4)

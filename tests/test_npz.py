@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from recording_files import PAPER, SDH, SMALL, archive, counts, messages, newtons, refusal, rng, write
 
-from adaptfault.recordings import InputError, Recordings, load, save_npz
+from adaptfault.data.recordings import InputError, Recordings, load, save_npz
 from diagnostics import SensorLayout
 
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from adaptfault.cli import main
-from adaptfault.evaluation import accuracy_interval
-from adaptfault.grasps import simulate
+from adaptfault.data.recordings import Recordings, save_npz
+from adaptfault.data.simulated_grasps import simulate
+from adaptfault.data.windows import Windows, make_windows, split
+from adaptfault.evaluation.scores import accuracy_interval
 from adaptfault.paper.bench import Bench, Setup
 from adaptfault.paper.claims import judge
 from adaptfault.paper.ledger import Ledger, Result, mean
 from adaptfault.paper.settings import PAPER_CELLS, Settings, Task, aware, is_aware
-from adaptfault.recordings import Recordings, save_npz
-from adaptfault.windows import Windows, make_windows, split
 from diagnostics import SensorLayout
 
 SMALL = SensorLayout(2, 6, 5)

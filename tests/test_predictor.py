@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from conftest import DROPPED, SMALL, small_windows
 
-from adaptfault.atomic import atomic_write
-from adaptfault.inference import Inference
+from adaptfault.data.atomic import atomic_write
+from adaptfault.data.windows import make_windows
+from adaptfault.models.inference import Inference
 from adaptfault.robot import predictor as module
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.predictor import Predictor, Reading
 from adaptfault.robot.versions import Version
-from adaptfault.windows import make_windows
 from diagnostics import Fault, FaultSet, Monitor, SelfDiagnosis, inject
 
 D = SMALL.n_cells
@@ -312,7 +312,7 @@ from pathlib import Path
 from types import SimpleNamespace
 import numpy as np
 from adaptfault import Predictor
-from adaptfault.store import ADAPTATION, read_manifest
+from adaptfault.models.store import ADAPTATION, read_manifest
 from diagnostics import SelfDiagnosis, SensorLayout
 folder = Path(sys.argv[1])
 layout = SensorLayout.from_dict(read_manifest(folder, ADAPTATION)["network"]["layout"])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from adaptfault.acquisition import Contact, Recorder, Switch, parse_when
-from adaptfault.recordings import load
+from adaptfault.data.recordings import load
 from diagnostics import SensorLayout
 
 SMALL = SensorLayout(1, 2, 3, full_scale=4095, unit="count", rate=10.0)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from recording_files import archive, counts, messages, refusal
 
-from adaptfault.recordings import load
+from adaptfault.data.recordings import load
 from diagnostics import SensorLayout
 
 
@@ -26,7 +26,7 @@ def test_counts_are_calibrated_while_they_are_read(tmp_path):
 
 
 def test_importing_the_readers_is_quick_and_loads_no_torch():
-    code = "import sys, adaptfault.calibration, adaptfault.recordings; sys.exit('torch' in sys.modules)"
+    code = "import sys, adaptfault.data.calibration, adaptfault.data.recordings; sys.exit('torch' in sys.modules)"
     root = Path(__file__).parents[1]
-    for script in (code, code.replace("adaptfault.calibration, ", "")):
+    for script in (code, code.replace("adaptfault.data.calibration, ", "")):
         assert subprocess.run([sys.executable, "-c", script], cwd=root, check=False).returncode == 0

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from diagnostics import SensorLayout, freeze_stream
-from diagnostics.contact import surest_of
-from diagnostics.memory import finished
-from diagnostics.reference import Reference
+from diagnostics.evidence.stream_state import run_to_end
+from diagnostics.healthy.model import p_floor_of
+from diagnostics.healthy.reference import Reference
 
 LAYOUT = SensorLayout(1, 4, 4)
 CELLS = 16
@@ -33,18 +33,18 @@ def reference() -> Reference:
 def test_a_fitted_reference_has_a_model_and_one_that_is_not_has_none(reference):
     unknown = Reference.unknown(LAYOUT)
     assert unknown.model is None
-    assert (unknown.scale.resting == 0).all()
+    assert (unknown.scale.baseline == 0).all()
     assert reference.model is not None
     features = np.zeros((1, 4, CELLS), np.float32)
-    assert finished(reference.model.expect(features, np.ones(CELLS, bool))).never.shape == (1, CELLS)
+    assert run_to_end(reference.model.predict(features, np.ones(CELLS, bool))).never.shape == (1, CELLS)
 
 
-@pytest.mark.parametrize(("touches", "unfamiliar"), [(20, 1.0), (98, 1.0), (198, 0.5), (398, 0.0), (5000, 0.0)])
-def test_healthy_touches_are_the_less_unfamiliar_the_more_the_reference_holds(reference, touches, unfamiliar):
-    tile = SimpleNamespace(outputs=np.arange(CELLS), surest=surest_of(touches))
-    known = replace(reference, model=replace(reference.model, tiles=(tile,)))
-    np.testing.assert_allclose(known.unfamiliar, unfamiliar, atol=1e-9)
-    assert (Reference.unknown(LAYOUT).unfamiliar == 1).all()
+@pytest.mark.parametrize(("events", "inexperience"), [(20, 1.0), (98, 1.0), (198, 0.5), (398, 0.0), (5000, 0.0)])
+def test_healthy_touches_are_the_less_unfamiliar_the_more_the_reference_holds(reference, events, inexperience):
+    regression = SimpleNamespace(outputs=np.arange(CELLS), p_floor=p_floor_of(events))
+    known = replace(reference, model=replace(reference.model, local_regressions=(regression,)))
+    np.testing.assert_allclose(known.inexperience, inexperience, atol=1e-9)
+    assert (Reference.unknown(LAYOUT).inexperience == 1).all()
 
 
 def test_the_tolerance_grows_with_the_converters_step_up_to_a_bound():
@@ -57,7 +57,7 @@ def test_the_tolerance_grows_with_the_converters_step_up_to_a_bound():
 def test_cells_rest_where_they_rest_in_the_reference():
     offset = np.linspace(0, 1, CELLS)
     reference = Reference.fit([r + offset for r in healthy(0)], LAYOUT)
-    np.testing.assert_allclose(reference.scale.resting, offset, atol=0.02)
+    np.testing.assert_allclose(reference.scale.baseline, offset, atol=0.02)
 
 
 def test_who_often_repeats_a_frame_is_given_more_patience(reference):
@@ -67,10 +67,10 @@ def test_who_often_repeats_a_frame_is_given_more_patience(reference):
 
 
 def test_lines_that_often_agree_when_healthy_need_more_witnesses_to_be_joined(reference):
-    alike = [r.copy() for r in healthy(0)]
-    for r in alike:
+    matching = [r.copy() for r in healthy(0)]
+    for r in matching:
         r[:, 4:8] = r[:, 0:4]
-    assert Reference.fit(alike, LAYOUT).twins > reference.twins
+    assert Reference.fit(matching, LAYOUT).duplicates > reference.duplicates
 
 
 def test_missing_readings_and_lost_frames_in_the_reference_do_no_harm():
@@ -79,6 +79,6 @@ def test_missing_readings_and_lost_frames_in_the_reference_do_no_harm():
         r[::7, 3] = np.nan
         r[20:22] = np.nan
     reference = Reference.fit(gappy, LAYOUT)
-    assert np.isfinite(reference.scale.resting).all()
+    assert np.isfinite(reference.scale.baseline).all()
     assert np.isfinite(reference.tolerance)
     assert np.isfinite(reference.usual.noise).all()

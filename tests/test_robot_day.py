@@ -11,10 +11,10 @@ import numpy as np
 
 from adaptfault.acquisition import format_packet
 from adaptfault.cli import main
-from adaptfault.recordings import Recordings, save_npz
+from adaptfault.data.recordings import Recordings, save_npz
+from adaptfault.data.windows import make_windows
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.predictor import Predictor
-from adaptfault.windows import make_windows
 from diagnostics import FaultKind, Line, SensorLayout, inject, line_fault
 
 LAYOUT = SensorLayout(2, 6, 5)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptfault.ros import Level, diagnostic_array, stale_array, write_diagnostics
+from adaptfault.acquisition.ros import Level, diagnostic_array, stale_array, write_diagnostics
 from diagnostics import Fault, FaultKind, Line, SelfDiagnosis, SensorLayout, inject, line_fault, lose_frames
 
 LAYOUT = SensorLayout.paper()

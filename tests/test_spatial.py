@@ -3,13 +3,13 @@ from collections.abc import Generator
 import numpy as np
 import pytest
 
-from diagnostics.contact import Expected
-from diagnostics.memory import finished
-from diagnostics.question import Cells, Model
-from diagnostics.scale import Array, Scale
-from diagnostics.spatial import Caution, Spatial, apart_evidence, stuck_evidence
-from diagnostics.temporal import StillRuns
-from diagnostics.touches import Summary, Touch
+from diagnostics.events.constant_runs import ConstantRuns
+from diagnostics.events.contact_events import ContactEvent, Summary
+from diagnostics.evidence.conditional_test import CellState, Model
+from diagnostics.evidence.spatial import Exclusion, Spatial, group_excluded_evidence, spatial_evidence
+from diagnostics.evidence.stream_state import run_to_end
+from diagnostics.healthy.model import Prediction
+from diagnostics.preprocessing.scale import Array, Scale
 
 CELLS, FRAMES = 8, 20
 SCALE = Scale(np.zeros(CELLS), 0.05, 5.0)
@@ -19,32 +19,32 @@ NONE = np.zeros(CELLS, bool)
 class Copycat:
     """A skin on which all cells are always loaded alike: each does what the trusted ones do on average."""
 
-    def expect(self, features: Array, trusted: np.ndarray) -> Generator[None, None, Expected]:
+    def predict(self, features: Array, predictors: np.ndarray) -> Generator[None, None, Prediction]:
         yield
         shape = features[:, 0].shape
-        known = trusted if trusted.any() else np.ones(CELLS, bool)
+        known = predictors if predictors.any() else np.ones(CELLS, bool)
         of_known = features[:, :, known]
         loaded, always, mean = (
             of.mean(axis=1, keepdims=True) for of in (of_known[:, 2], of_known[:, 3] == 1, of_known[:, 1])
         )
         p = np.clip(np.broadcast_to(np.stack([1 - loaded, always]), (2, *shape)), 0.02, 0.98)
-        return Expected(p[0], p[1], np.broadcast_to(mean, shape), np.full(CELLS, 0.05), np.ones(CELLS))
+        return Prediction(p[0], p[1], np.broadcast_to(mean, shape), np.full(CELLS, 0.05), np.ones(CELLS))
 
 
 class Presser:
     """Is sure that every touch loads all cells."""
 
-    def expect(self, features: Array, trusted: np.ndarray) -> Generator[None, None, Expected]:
+    def predict(self, features: Array, predictors: np.ndarray) -> Generator[None, None, Prediction]:
         yield
         even = np.ones(features[:, 0].shape)
-        return Expected(0.02 * even, 0.02 * even, 0.5 * even, np.full(CELLS, 0.05), np.ones(CELLS))
+        return Prediction(0.02 * even, 0.02 * even, 0.5 * even, np.full(CELLS, 0.05), np.ones(CELLS))
 
 
 class Holder:
     """Is sure that all cells hold a root load of one half throughout."""
 
-    def expect(self, features: Array, trusted: np.ndarray) -> Generator[None, None, Expected]:
-        expected = yield from Presser().expect(features, trusted)
+    def predict(self, features: Array, predictors: np.ndarray) -> Generator[None, None, Prediction]:
+        expected = yield from Presser().predict(features, predictors)
         expected.always[:] = 0.98
         return expected
 
@@ -52,55 +52,56 @@ class Holder:
 class Row:
     """The last three cells lie in a row: each does what the other two do; without them it is loaded, more likely."""
 
-    def expect(self, features: Array, trusted: np.ndarray) -> Generator[None, None, Expected]:
-        expected = yield from Copycat().expect(features, trusted)
+    def predict(self, features: Array, predictors: np.ndarray) -> Generator[None, None, Prediction]:
+        expected = yield from Copycat().predict(features, predictors)
         for cell in range(5, 8):
-            asked = [other for other in range(5, 8) if other != cell and trusted[other]]
-            unloaded = (features[:, 2, asked] == 0).all(axis=1)
-            expected.never[:, cell] = np.where(unloaded, 0.98, 0.02) if asked else 0.3
+            scored = [other for other in range(5, 8) if other != cell and predictors[other]]
+            unloaded = (features[:, 2, scored] == 0).all(axis=1)
+            expected.never[:, cell] = np.where(unloaded, 0.98, 0.02) if scored else 0.3
         return expected
 
 
-def seen(log: np.ndarray) -> tuple[StillRuns, list[Touch]]:
+def seen(log: np.ndarray) -> tuple[ConstantRuns, list[ContactEvent]]:
     """Look at a log that is made of touches of 20 frames each."""
-    runs, touches = StillRuns.begin(CELLS), []
+    runs, events = ConstantRuns.begin(CELLS), []
     for first in range(0, len(log), FRAMES):
         frames = log[first : first + FRAMES]
         runs = runs.extend(frames, np.arange(first, first + len(frames)), 0.025)
         root = SCALE.root_load(frames)
         halves = tuple(Summary.of(root[i : i + 10], first + i, SCALE.root_near) for i in (0, 10))
-        touches.append(Touch(halves, root.min(axis=0), root.max(axis=0), halves[0].first))
-    return runs, touches
+        events.append(ContactEvent(halves, root.min(axis=0), root.max(axis=0), halves[0].first))
+    return runs, events
 
 
 def judged(
     log: np.ndarray,
     wrong: np.ndarray = NONE,
-    settled: np.ndarray | None = None,
+    accumulated: np.ndarray | None = None,
     jump: float = 0.0,
     model: Model | None = None,
 ) -> Spatial:
     """Judge a log that is made of touches of 20 frames each."""
-    runs, touches = seen(log)
-    settled = np.zeros(CELLS) if settled is None else settled
-    work: Generator[None, None, Spatial] = stuck_evidence(
-        touches, Cells(runs, settled, np.full(CELLS, jump), np.full(CELLS, jump), ~wrong, NONE), model or Copycat(),
-        SCALE, 0.025, Caution(2.0),
+    runs, events = seen(log)
+    accumulated = np.zeros(CELLS) if accumulated is None else accumulated
+    work: Generator[None, None, Spatial] = spatial_evidence(
+        events, CellState(runs, accumulated, np.full(CELLS, jump), np.full(CELLS, jump), ~wrong, NONE),
+        model or Copycat(),
+        SCALE, 0.025, Exclusion(2.0),
     )  # fmt: skip
-    return finished(work)
+    return run_to_end(work)
 
 
-def pressed(touches: int) -> np.ndarray:
+def pressed(events: int) -> np.ndarray:
     """All cells are loaded in each touch, from rest to 2 N and back."""
     force = 2 * np.sin(np.linspace(0, np.pi, FRAMES))
-    return np.tile(np.repeat(force[:, None], CELLS, axis=1), (touches, 1))
+    return np.tile(np.repeat(force[:, None], CELLS, axis=1), (events, 1))
 
 
 @pytest.mark.parametrize("value", [0.0, 5.0])
 def test_each_touch_adds_evidence_against_a_cell_that_holds_its_value_through_it(value: float):
     said = []
-    for touches in (1, 2, 4, 8):
-        log = pressed(touches)
+    for events in (1, 2, 4, 8):
+        log = pressed(events)
         log[:, 3] = value
         said.append(judged(log).evidence[3])
     assert (np.diff(said) > 2).all()
@@ -108,11 +109,11 @@ def test_each_touch_adds_evidence_against_a_cell_that_holds_its_value_through_it
 
 def test_how_seldom_cells_stick_to_a_value_in_between_is_charged_once():
     charged = []
-    for touches in (3, 6):
-        log = pressed(touches)
+    for events in (3, 6):
+        log = pressed(events)
         log[:, 3], log[:, 4] = 0.0, 2.5
         spatial = judged(log)
-        charged.append((spatial.surprise - spatial.evidence)[[3, 4]])
+        charged.append((spatial.surprisal - spatial.evidence)[[3, 4]])
     assert charged[0][1] > charged[0][0] + 2
     assert charged[1] == pytest.approx(charged[0])
 
@@ -122,13 +123,13 @@ def test_a_value_that_was_not_expected_says_less_in_touches_in_which_all_loads_a
     for force in (1.0, 0.1):
         log = force * pressed(4)
         log[:, 3] = 4.5
-        said.append(judged(log, model=Holder()).surprise[3])
+        said.append(judged(log, model=Holder()).surprisal[3])
     assert 0 < said[1] < said[0] - 2
 
 
 def test_a_cell_at_rest_is_not_suspected_while_nothing_touches_the_array():
     spatial = judged(np.zeros((100, CELLS)))
-    assert spatial.asked.all()
+    assert spatial.scored.all()
     assert (spatial.evidence <= 0).all()
 
 
@@ -136,23 +137,25 @@ def test_cells_that_move_are_not_asked_and_have_no_evidence():
     log = pressed(4)
     log[:, 3] = 0
     spatial = judged(log)
-    assert spatial.asked.tolist() == [cell == 3 for cell in range(CELLS)]
-    assert (spatial.evidence[~spatial.asked] == 0).all()
-    assert spatial.touches[3] == 4
-    assert spatial.touches[~spatial.asked].sum() == 0
+    assert spatial.scored.tolist() == [cell == 3 for cell in range(CELLS)]
+    assert (spatial.evidence[~spatial.scored] == 0).all()
+    assert spatial.events[3] == 4
+    assert spatial.events[~spatial.scored].sum() == 0
 
 
 def test_cells_that_broke_together_do_not_vouch_for_each_other():
     log = pressed(1)
     log[:, 5:] = 0
-    assert (judged(log, model=Row()).surprise[5:] < 0.1).all()
-    runs, touches = seen(log)
-    zero, trusted = np.zeros(CELLS), np.ones(CELLS, bool)
-    cells = Cells(runs, zero, zero, zero, trusted, NONE)
+    assert (judged(log, model=Row()).surprisal[5:] < 0.1).all()
+    runs, events = seen(log)
+    zero, predictors = np.zeros(CELLS), np.ones(CELLS, bool)
+    cells = CellState(runs, zero, zero, zero, predictors, NONE)
     groups = [np.array([5, 6, 7]), np.array([6])]
-    work: Generator[None, None, np.ndarray] = apart_evidence(touches, cells, Row(), SCALE, 0.025, trusted, groups)
-    together, alone = finished(work)
-    assert (together[5:] > 1).all()
+    work: Generator[None, None, np.ndarray] = group_excluded_evidence(
+        events, cells, Row(), SCALE, 0.025, predictors, groups
+    )
+    joined, alone = run_to_end(work)
+    assert (joined[5:] > 1).all()
     assert alone[6] < 0.1  # the others of its row are asked
 
 
@@ -161,14 +164,14 @@ def test_only_what_came_after_the_onset_speaks_against_a_cell():
     early[:, 3] = 0
     late[80:, 3] = 0
     assert judged(late).evidence[3] < judged(early).evidence[3] - 4
-    assert judged(late).touches[3] == 2
+    assert judged(late).events[3] == 2
 
 
 def test_a_cell_that_fails_in_the_middle_of_a_touch_is_judged_by_what_came_after():
     log = pressed(1)
     log[8:, 3] = 0
-    assert judged(log).touches[3] == 1
-    assert judged(log).surprise[3] > 1
+    assert judged(log).events[3] == 1
+    assert judged(log).surprisal[3] > 1
 
 
 def test_two_broken_cells_do_not_excuse_each_other():
@@ -185,15 +188,15 @@ def test_cells_known_to_be_wrong_are_neither_asked_nor_judged():
     log[:, 6] = 4 - log[:, 6]
     wrong = np.arange(CELLS) == 3
     spatial = judged(log, wrong)
-    assert not spatial.asked[3]
+    assert not spatial.scored[3]
     assert spatial.evidence[3] == 0
 
 
 def test_evidence_of_earlier_touches_is_kept():
     log = pressed(2)
     log[:, 3] = 0
-    settled = np.full(CELLS, 7.0)
-    assert judged(log, settled=settled).evidence[3] == pytest.approx(judged(log).evidence[3] + 7)
+    accumulated = np.full(CELLS, 7.0)
+    assert judged(log, accumulated=accumulated).evidence[3] == pytest.approx(judged(log).evidence[3] + 7)
 
 
 def test_a_touch_that_surprises_the_cells_that_move_says_little_about_the_others():
@@ -202,7 +205,7 @@ def test_a_touch_that_surprises_the_cells_that_move_says_little_about_the_others
         log = pressed(2) * np.repeat([slope, slope[::-1]], FRAMES, axis=0)  # no touch repeats the other
         log[:, 3] = 0.0
         log[FRAMES:, 4 : 4 + surprised] = 0.0
-        said.append(judged(log, model=Presser()).surprise[3])
+        said.append(judged(log, model=Presser()).surprisal[3])
     assert said[0] > said[1] + 0.4 > said[2] + 0.6
 
 
@@ -227,15 +230,15 @@ def test_an_offset_that_ended_is_forgotten():
 def test_beside_a_cell_with_a_wrong_gain_no_other_is_accused():
     log = pressed(12)
     log[:, 3] *= 0.1
-    told = judged(log)
-    assert np.flatnonzero(told.drifting).tolist() == [3]
-    assert told.factor[3] == 0.1
-    assert np.isnan(np.delete(told.factor, 3)).all()
+    known_values = judged(log)
+    assert np.flatnonzero(known_values.drifting).tolist() == [3]
+    assert known_values.factor[3] == 0.1
+    assert np.isnan(np.delete(known_values.factor, 3)).all()
 
 
 def test_a_cell_that_got_stuck_has_no_wrong_gain():
     log = pressed(12)
     log[60:, 3] = 0.3
-    told = judged(log)
-    assert told.evidence[3] > 4
-    assert not told.drifting.any()
+    known_values = judged(log)
+    assert known_values.evidence[3] > 4
+    assert not known_values.drifting.any()

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from adaptfault.atomic import atomic_write
-from adaptfault.network import TactileTransformer
-from adaptfault.store import SCHEMA, load_model, read_manifest, save_model
+from adaptfault.data.atomic import atomic_write
+from adaptfault.models.network import TactileTransformer
+from adaptfault.models.store import SCHEMA, load_model, read_manifest, save_model
 from diagnostics import SensorLayout
 
 

@@ -13,10 +13,10 @@ import torch
 from conftest import Clock
 from torch import Tensor, nn
 
-from adaptfault.history import History
-from adaptfault.network import TactileTransformer, logits_of
-from adaptfault.training import train
-from adaptfault.windows import Windows
+from adaptfault.data.windows import Windows
+from adaptfault.models.history import History
+from adaptfault.models.network import TactileTransformer, logits_of
+from adaptfault.models.training import train
 from diagnostics import SensorLayout
 
 LAYOUT = SensorLayout(1, 4, 4)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from diagnostics import TransportFault, freeze_stream, lose_frames
-from diagnostics.transport import Stream, longest_repetition
+from diagnostics.preprocessing.transport import TransportState, longest_repetition
 
 CELLS = 10
 PRESENT = np.ones(CELLS, bool)
@@ -15,32 +15,32 @@ def log() -> np.ndarray:
     return np.random.default_rng(0).uniform(0.5, 3, (200, CELLS))
 
 
-def received(frames: np.ndarray, size: int = 1000, present: np.ndarray = PRESENT) -> tuple[Stream, list[int]]:
+def received(frames: np.ndarray, size: int = 1000, present: np.ndarray = PRESENT) -> tuple[TransportState, list[int]]:
     """Feed the frames in chunks; return the stream and the numbers of the frames that say something."""
-    stream, told = Stream(), []
+    transport, known_values = TransportState(), []
     for first in range(0, len(frames), size):
-        stream, some = stream.receive(frames[first : first + size], present, PATIENCE)
-        told += (some + first).tolist()
-    return stream, told
+        transport, some = transport.receive(frames[first : first + size], present, PATIENCE)
+        known_values += (some + first).tolist()
+    return transport, known_values
 
 
-def faults(stream: Stream, working: np.ndarray = PRESENT) -> tuple[TransportFault, ...]:
-    return stream.faults(LOADED_FROM, working, rate=10)
+def faults(transport: TransportState, working: np.ndarray = PRESENT) -> tuple[TransportFault, ...]:
+    return transport.faults(LOADED_FROM, working, rate=10)
 
 
 def test_frames_that_all_arrive_all_say_something_and_there_is_no_fault(log):
-    stream, told = received(log)
-    assert told == list(range(200))
-    assert stream.seen == 200
-    assert faults(stream) == ()
+    transport, known_values = received(log)
+    assert known_values == list(range(200))
+    assert transport.seen == 200
+    assert faults(transport) == ()
 
 
 def test_a_frozen_stream_is_dated_and_counted_and_its_frames_say_nothing_new(log):
-    stream, told = received(freeze_stream(log, 60, 160))
-    (fault,) = faults(stream)
+    transport, known_values = received(freeze_stream(log, 60, 160))
+    (fault,) = faults(transport)
     assert (fault.kind, fault.onset, fault.frames) == ("frozen", 60, 100)
     assert "frozen" in fault.reason
-    assert told == [*range(60 + PATIENCE + 1), *range(160, 200)]
+    assert known_values == [*range(60 + PATIENCE + 1), *range(160, 200)]
 
 
 def test_an_idle_pad_that_repeats_zeros_is_no_fault(log):
@@ -51,37 +51,37 @@ def test_an_idle_pad_that_repeats_zeros_is_no_fault(log):
 def test_full_scale_cells_that_are_themselves_broken_do_not_make_an_idle_pad_frozen(log):
     log[60:160] = 0
     log[:, :4] = 5
-    stream = received(log)[0]
-    assert faults(stream, np.arange(CELLS) >= 4) == ()
-    assert [fault.kind for fault in faults(stream)] == ["frozen"]
+    transport = received(log)[0]
+    assert faults(transport, np.arange(CELLS) >= 4) == ()
+    assert [fault.kind for fault in faults(transport)] == ["frozen"]
 
 
 def test_a_frame_that_comes_again_a_few_times_is_no_fault(log):
-    stream, told = received(freeze_stream(log, 60, 60 + PATIENCE))
-    assert faults(stream) == ()
-    assert len(told) == 200
+    transport, known_values = received(freeze_stream(log, 60, 60 + PATIENCE))
+    assert faults(transport) == ()
+    assert len(known_values) == 200
 
 
 def test_lost_frames_are_counted_and_the_first_is_named(log):
     lossy = lose_frames(log, 0.1, seed=0)
-    stream, told = received(lossy)
+    transport, known_values = received(lossy)
     lost = np.flatnonzero(np.isnan(lossy).all(axis=1))
-    (fault,) = faults(stream)
+    (fault,) = faults(transport)
     assert (fault.kind, fault.onset, fault.frames) == ("lost", lost[0], 20)
-    assert told == sorted(set(range(200)) - set(lost.tolist()))
+    assert known_values == sorted(set(range(200)) - set(lost.tolist()))
 
 
 def test_a_position_without_a_cell_does_not_make_a_lost_frame_arrive(log):
     log[50:60, 1:] = np.nan
-    stream, _ = received(log, present=np.arange(CELLS) > 0)
-    assert [(fault.kind, fault.frames) for fault in faults(stream)] == [("lost", 10)]
+    transport, _ = received(log, present=np.arange(CELLS) > 0)
+    assert [(fault.kind, fault.frames) for fault in faults(transport)] == [("lost", 10)]
     assert faults(received(log)[0]) == ()
 
 
 def test_frames_that_never_came_count_as_lost(log):
-    stream, _ = received(log[:50])
-    stream, _ = stream.without(3).receive(log[50:], PRESENT, PATIENCE)
-    (fault,) = faults(stream.without(2))
+    transport, _ = received(log[:50])
+    transport, _ = transport.without(3).receive(log[50:], PRESENT, PATIENCE)
+    (fault,) = faults(transport.without(2))
     assert (fault.kind, fault.onset, fault.frames) == ("lost", 50, 5)
 
 

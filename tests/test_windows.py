@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adaptfault.windows import Windows, hold_missing, make_windows, scale, split
+from adaptfault.data.windows import Windows, hold_missing, make_windows, scale, split
 from diagnostics import SensorLayout
 
 LAYOUT = SensorLayout(1, 2, 3, full_scale=4.0)

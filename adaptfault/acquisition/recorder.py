@@ -16,8 +16,8 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.atomic import atomic_write
-from adaptfault.recordings.layout_file import read_layout
+from adaptfault.data.atomic import atomic_write
+from adaptfault.data.recordings.layout_file import read_layout
 from diagnostics import SensorLayout
 
 INTERVAL = 1.0

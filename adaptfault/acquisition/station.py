@@ -22,7 +22,7 @@ from adaptfault.acquisition.switch import Rule, parse_when
 from diagnostics import Monitor, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
-    from adaptfault.calibration import Calibration
+    from adaptfault.data.calibration import Calibration
 
 SCHEMA = "adaptfault.listen/1"
 

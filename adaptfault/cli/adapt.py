@@ -19,7 +19,7 @@ from adaptfault.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from adaptfault.adapter import Adapter
+    from adaptfault.adaptation.adapter import Adapter
     from diagnostics import FaultSet
 
 _EXAMPLE = """  adaptfault adapt model grasps/ --faults diagnosis.json --out adapted
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     result: dict[str, Any] = {"schema": "adaptfault.adapt/1"}
     lines: list[str] = []
     if args.keep is not None:
-        from adaptfault.replay import save_adapter
+        from adaptfault.adaptation.adapter_files import save_adapter
 
         save_adapter(args.keep, adapter)
         result["kept"] = args.keep
@@ -85,14 +85,14 @@ def run(args: argparse.Namespace) -> int:
 
 def _adapter(args: argparse.Namespace) -> Adapter:
     """Return the adapter that was kept, or one for the model and its recordings."""
-    from adaptfault.replay import SCHEMA, load_adapter
-    from adaptfault.store import schema_of
+    from adaptfault.adaptation.adapter_files import SCHEMA, load_adapter
+    from adaptfault.models.store import schema_of
 
     if schema_of(args.model) == SCHEMA:
         if args.recordings:
             raise ValueError(f"{args.model} holds its own windows: leave the recordings out")
         return load_adapter(args.model)
-    from adaptfault.adapter import Adapter
+    from adaptfault.adaptation.adapter import Adapter
     from adaptfault.cli.data import open_model, parts_of
 
     model, manifest = open_model(args.model)

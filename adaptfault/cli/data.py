@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from adaptfault.network import TactileTransformer
-from adaptfault.recordings import Recordings
-from adaptfault.store import SCHEMA, load_model, read_manifest
-from adaptfault.windows import Windows, make_windows, split
+from adaptfault.data.recordings import Recordings
+from adaptfault.data.windows import Windows, make_windows, split
+from adaptfault.models.network import TactileTransformer
+from adaptfault.models.store import SCHEMA, load_model, read_manifest
 
 
 def open_model(folder: str) -> tuple[TactileTransformer, dict[str, Any]]:

@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     if args.recordings:
         recordings = load_recordings(args, args.recordings, labelled=True)
     else:
-        from adaptfault.grasps import simulate
+        from adaptfault.data.simulated_grasps import simulate
 
         recordings = simulate(SIMULATED_PER_CLASS, seed=args.seed)
     faults = None
@@ -46,8 +46,8 @@ def run(args: argparse.Namespace) -> int:
         faults = parse_faults(args.inject, recordings.layout, np.random.default_rng(args.seed))
     say(args, "loading torch")
 
-    from adaptfault.demo import run_demo
-    from adaptfault.report import write_report
+    from adaptfault.evaluation.demo import run_demo
+    from adaptfault.evaluation.html_report import write_report
 
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from adaptfault.cli.options import Commands, add_recordings, command, emit, load_recordings, say, stream_recordings
 
 if TYPE_CHECKING:
-    from adaptfault.recordings import Recordings
-    from adaptfault.recordings.blocks import Stream
+    from adaptfault.data.recordings import Recordings
+    from adaptfault.data.recordings.blocks import Stream
     from diagnostics import Diagnosis, SelfDiagnosis
 
 _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.json --picture diagnosis.png
@@ -31,7 +31,7 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Diagnose; the exit code says how bad it is."""
-    from adaptfault.recordings.blocks import is_large
+    from adaptfault.data.recordings.blocks import is_large
 
     large = args.frames is None and is_large(args.recordings)
     log = stream_recordings(args, args.recordings) if large else load_recordings(args, args.recordings)
@@ -59,13 +59,13 @@ def _judged(diagnoser: SelfDiagnosis, log: Recordings | Stream) -> Diagnosis:
     """Look at one piece of the log after another: what is remembered of them does not grow."""
     import numpy as np
 
-    from adaptfault.recordings import Recordings
-    from diagnostics.memory import finished
+    from adaptfault.data.recordings import Recordings
+    from diagnostics.evidence.stream_state import run_to_end
 
-    memory = diagnoser.memory()
+    stream = diagnoser.stream()
     for frames in log:
-        memory.extend(np.asarray(frames, dtype=np.float64))
+        stream.extend(np.asarray(frames, dtype=np.float64))
     if not isinstance(log, Recordings):
         for problem in log.problems:
             print(problem, file=sys.stderr)
-    return finished(diagnoser.judge(memory, n_recordings=len(log)))
+    return run_to_end(diagnoser.evaluate(stream, n_recordings=len(log)))

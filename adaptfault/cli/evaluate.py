@@ -28,9 +28,9 @@ def run(args: argparse.Namespace) -> int:
     """Score."""
     import numpy as np
 
-    from adaptfault.adaptation import Adaptation
+    from adaptfault.adaptation.result import Adaptation
     from adaptfault.cli.data import open_model, parts_of, windows_of
-    from adaptfault.evaluation import Scores, accuracy_interval
+    from adaptfault.evaluation.scores import Scores, accuracy_interval
     from diagnostics import inject
 
     model, manifest = open_model(args.model)
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
             inject(r, faults, recordings.layout, seed=args.seed + i) if i in which else r
             for i, r in enumerate(recordings.frames)
         ]
-        from adaptfault.windows import make_windows
+        from adaptfault.data.windows import make_windows
 
         every = make_windows(broken, recordings.labels, recordings.layout, length=model.length)
         windows = every.select(np.isin(every.recording, which))

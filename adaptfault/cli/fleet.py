@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     import json
     from pathlib import Path
 
-    from adaptfault.atomic import atomic_write
+    from adaptfault.data.atomic import atomic_write
     from adaptfault.fleet.listing import Fleet
     from adaptfault.fleet.run import maintain_fleet
 

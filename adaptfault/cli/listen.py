@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _station(args: argparse.Namespace) -> Station:
     from adaptfault.acquisition import Station
-    from adaptfault.calibration import Calibration
+    from adaptfault.data.calibration import Calibration
 
     if args.when and not args.record:
         raise ValueError("--when says when to record: give --record FOLDER, too")
@@ -84,7 +84,7 @@ def _layout(args: argparse.Namespace, newtons: float | None) -> SensorLayout:
     """Return the array that the options describe: the paper's where they say nothing."""
     from dataclasses import replace
 
-    from adaptfault.recordings.settle import given_array
+    from adaptfault.data.recordings.settle import given_array
     from diagnostics import SensorLayout
 
     if args.layout and args.shape:

@@ -27,8 +27,8 @@ def run(args: argparse.Namespace) -> int:
     import sys
 
     from adaptfault.robot.bundle import Bundle
-    from adaptfault.robot.incoming import load_incoming
     from adaptfault.robot.maintenance import maintain
+    from adaptfault.robot.new_recordings import load_incoming
 
     bundle = Bundle.open(args.bundle)
     incoming = load_incoming(bundle, args.recordings)
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         say=lambda text: say(args, text),
     )
     if args.report:
-        from adaptfault.robot.technician import write_report
+        from adaptfault.robot.technician_report import write_report
 
         write_report(args.report, bundle, report.diagnosis)
     emit(args, report.to_dict(), str(report))

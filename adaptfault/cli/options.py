@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from adaptfault.recordings import Recordings
-    from adaptfault.recordings.blocks import Stream
+    from adaptfault.data.recordings import Recordings
+    from adaptfault.data.recordings.blocks import Stream
     from diagnostics import FaultSet, SensorLayout
 
 Commands = Any  # argparse's private type of subparsers
@@ -91,7 +91,7 @@ def load_recordings(args: argparse.Namespace, paths: Sequence[str], *, labelled:
     Raises:
         ValueError: nothing could be read, or labels are needed and missing.
     """
-    from adaptfault.recordings import load
+    from adaptfault.data.recordings import load
 
     _one_layout(args)
     loaded = load(
@@ -122,7 +122,7 @@ def stream_recordings(args: argparse.Namespace, paths: Sequence[str]) -> Stream:
     Raises:
         ValueError: nothing could be read.
     """
-    from adaptfault.recordings.blocks import Stream
+    from adaptfault.data.recordings.blocks import Stream
 
     _one_layout(args)
     return Stream(

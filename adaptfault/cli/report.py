@@ -19,7 +19,7 @@ def add(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write it."""
     from adaptfault.robot.bundle import Bundle
-    from adaptfault.robot.technician import write_report
+    from adaptfault.robot.technician_report import write_report
 
     path = write_report(args.out, Bundle.open(args.bundle))
     emit(args, {"schema": "adaptfault.report/1", "report": str(path)}, f"report: {path}")

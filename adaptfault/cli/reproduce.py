@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         samples=tuple(sorted(set(args.samples or settings.samples))),
     )
     if not args.recordings:
-        from adaptfault.grasps import simulate
+        from adaptfault.data.simulated_grasps import simulate
 
         say(args, f"simulating {settings.grasps} grasps of each class")
         recordings, source = simulate(settings.grasps), "simulated grasps"

@@ -20,9 +20,9 @@ from adaptfault.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from adaptfault.network import TactileTransformer
-    from adaptfault.recordings import Recordings
-    from adaptfault.windows import Windows
+    from adaptfault.data.recordings import Recordings
+    from adaptfault.data.windows import Windows
+    from adaptfault.models.network import TactileTransformer
 
 _EXAMPLE = """  adaptfault train grasps/ --out model --epochs 20
       grasps/<class>/<recording>.csv; run it again after a crash and it goes on where it was
@@ -51,11 +51,11 @@ def run(args: argparse.Namespace) -> int:
     """Train, evaluate on the test recordings, save."""
     recordings, where = load_recordings(args, args.recordings, labelled=True), device(args)
 
-    from adaptfault.evaluation import evaluate
-    from adaptfault.network import TactileTransformer
-    from adaptfault.store import save_model
-    from adaptfault.training import train
-    from adaptfault.windows import make_windows, split
+    from adaptfault.data.windows import make_windows, split
+    from adaptfault.evaluation.scores import evaluate
+    from adaptfault.models.network import TactileTransformer
+    from adaptfault.models.store import save_model
+    from adaptfault.models.training import train
 
     windows = make_windows(recordings.frames, recordings.labels, recordings.layout, length=args.length)
     parts = split(windows, seed=args.seed)
@@ -108,8 +108,8 @@ def _bundle(
     """Make the bundle: the test recordings become the windows that new versions are judged on."""
     import numpy as np
 
-    from adaptfault.adapter import Adapter
-    from adaptfault.calibration import Calibration
+    from adaptfault.adaptation.adapter import Adapter
+    from adaptfault.data.calibration import Calibration
     from adaptfault.robot.bundle import Bundle
     from diagnostics import SelfDiagnosis
 

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from adaptfault.data.json_lines import Lines
 from adaptfault.fleet.engines import engine
 from adaptfault.fleet.guard import Task
 from adaptfault.fleet.listing import Fleet, Robot
 from adaptfault.fleet.outcome import Outcome
 from adaptfault.fleet.work import maintain_robot, ready
-from adaptfault.lines import Lines
 from adaptfault.robot.bundle import now
 from adaptfault.robot.lock import locked
 
 if TYPE_CHECKING:
-    from adaptfault.fleet.report import FleetReport
+    from adaptfault.fleet.summary import FleetReport
 
 SCHEMA = "adaptfault.fleet-ledger/1"
 LEDGER = "ledger.jsonl"
@@ -61,7 +61,7 @@ def maintain_fleet(
         Busy: another process maintains the fleet in this folder.
         OSError: the scheduler does not answer.
     """
-    from adaptfault.fleet.report import FleetReport
+    from adaptfault.fleet.summary import FleetReport
 
     if jobs is not None and (jobs < 1 or dask is not None):
         raise ValueError(f"jobs {jobs}: expected at least 1, and none with a Dask cluster, which has its own workers")

@@ -15,10 +15,6 @@ _PATIENCE, _PAUSE = 120, 0.5  # s to wait for a robot that another process maint
 
 def ready() -> None:
     """Load what maintenance needs."""
-    import adaptfault.adaptation
-    import adaptfault.robot.incoming
-    import adaptfault.robot.maintenance
-    import adaptfault.training  # noqa: F401
 
 
 def maintain_robot(robot: Robot, *, dry_run: bool = False, budget: float | None = None) -> Outcome:
@@ -52,8 +48,8 @@ def _patiently(robot: Robot, dry_run: bool, budget: float | None, began: float) 
 
 def _maintained(robot: Robot, dry_run: bool, budget: float | None, began: float) -> Outcome:
     from adaptfault.robot.bundle import Bundle
-    from adaptfault.robot.incoming import load_incoming
     from adaptfault.robot.maintenance import maintain
+    from adaptfault.robot.new_recordings import load_incoming
 
     bundle = Bundle.open(robot.bundle)
     incoming = load_incoming(bundle, robot.paths())

@@ -12,18 +12,18 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.adaptation import Adaptation
-from adaptfault.adapter import Adapter
-from adaptfault.baselines.correction import CausalCorrection, correct
-from adaptfault.baselines.fault_aware import train_fault_aware
-from adaptfault.baselines.random_faults import FaultPattern, RandomFaults
-from adaptfault.network import TactileTransformer, logits_of
+from adaptfault.adaptation.adapter import Adapter
+from adaptfault.adaptation.baselines.correction import CausalCorrection, correct
+from adaptfault.adaptation.baselines.fault_aware import train_fault_aware
+from adaptfault.adaptation.baselines.random_faults import FaultPattern, RandomFaults
+from adaptfault.adaptation.reduced_model import ReducedModel, phi, reduce_windows
+from adaptfault.adaptation.result import Adaptation
+from adaptfault.data.recordings import Recordings
+from adaptfault.data.windows import Windows, evenly, make_windows, split
+from adaptfault.models.network import TactileTransformer, logits_of
+from adaptfault.models.store import MANIFEST, load_model, save_model
+from adaptfault.models.training import train
 from adaptfault.paper.settings import WIRING, Settings, Task, is_aware
-from adaptfault.recordings import Recordings
-from adaptfault.reduction import ReducedModel, phi, reduce_windows
-from adaptfault.store import MANIFEST, load_model, save_model
-from adaptfault.training import train
-from adaptfault.windows import Windows, evenly, make_windows, split
 from diagnostics import Fault, FaultKind, FaultSet, SelfDiagnosis, inject
 
 _LOG, _REFERENCE = 20, 200  # recordings of the broken sensor that the diagnosis sees; healthy ones that it learns from

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from adaptfault.paper.ledger import Ledger, Mean, mean
 from adaptfault.paper.settings import WIRING, Task, is_aware
 from diagnostics import SensorLayout
-from diagnostics.picture import draw_forces, pads_figure
+from diagnostics.decision.plot import draw_forces, pads_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.evaluation import Scores, accuracy_interval
-from adaptfault.lines import Lines
+from adaptfault.data.json_lines import Lines
+from adaptfault.data.windows import Windows
+from adaptfault.evaluation.scores import Scores, accuracy_interval
 from adaptfault.paper.settings import Task
-from adaptfault.windows import Windows
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from adaptfault.atomic import atomic_write
+from adaptfault.data.atomic import atomic_write
 from adaptfault.paper.bench import Bench, Setup
 from adaptfault.paper.claims import judge
 from adaptfault.paper.figures import TITLES, Row, draw, force_maps, rows, table
@@ -114,7 +114,7 @@ def _markdown(found: Sequence[Row]) -> list[str]:
 
 def _single_faults(setup: Setup) -> list[str]:
     """Write the map of which cell must not fail, unless it is there, for the first seed; return its part."""
-    from adaptfault.single_faults import analyse
+    from adaptfault.evaluation.sensitivity import analyse
 
     summary = setup.folder / "single_faults.txt"
     if not summary.exists():

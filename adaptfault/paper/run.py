@@ -12,13 +12,13 @@ from typing import Any
 
 from tqdm import tqdm
 
-from adaptfault.atomic import atomic_write
-from adaptfault.checkpoint import fingerprint_windows
+from adaptfault.data.atomic import atomic_write
+from adaptfault.data.recordings import Recordings
+from adaptfault.data.windows import make_windows
+from adaptfault.models.checkpoint import fingerprint_windows
 from adaptfault.paper.bench import Bench, Setup
 from adaptfault.paper.ledger import Ledger, Result
 from adaptfault.paper.settings import Settings
-from adaptfault.recordings import Recordings
-from adaptfault.windows import make_windows
 
 SCHEMA = "adaptfault.reproduce/1"
 FIGURES = (2, 3, 4, 5, 6, 7)

@@ -14,14 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-from adaptfault.robot.journal import Journal
-from adaptfault.robot.knowledge import Knowledge
-from adaptfault.robot.lock import locked
-from adaptfault.robot.parts import Parts
-from adaptfault.robot.pointer import NAME as POINTER
-from adaptfault.robot.pointer import SCHEMA as POINTER_SCHEMA
-from adaptfault.robot.pointer import STARTS, Pointer
-from adaptfault.robot.sealed import (
+from adaptfault.robot.checksummed_json import (
     Damaged,
     damage,
     hash_files,
@@ -30,15 +23,22 @@ from adaptfault.robot.sealed import (
     sync_tree,
     write_twice,
 )
+from adaptfault.robot.journal import Journal
+from adaptfault.robot.known_faults import Knowledge
+from adaptfault.robot.lock import locked
+from adaptfault.robot.parts import Parts
+from adaptfault.robot.pointer import NAME as POINTER
+from adaptfault.robot.pointer import SCHEMA as POINTER_SCHEMA
+from adaptfault.robot.pointer import STARTS, Pointer
 from adaptfault.robot.versions import Version, Versions
 from diagnostics import SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
-    from adaptfault.adaptation import Adaptation
-    from adaptfault.adapter import Adapter
-    from adaptfault.calibration import Calibration
-    from adaptfault.network import TactileTransformer
-    from adaptfault.windows import Windows
+    from adaptfault.adaptation.adapter import Adapter
+    from adaptfault.adaptation.result import Adaptation
+    from adaptfault.data.calibration import Calibration
+    from adaptfault.data.windows import Windows
+    from adaptfault.models.network import TactileTransformer
 
 SCHEMA = "adaptfault.bundle/1"
 
@@ -282,7 +282,7 @@ def now() -> str:
 
 def _save(adaptation: Adaptation, folder: Path) -> None:
     """Write an adaptation, and beside it the ONNX file: where that cannot be made, it runs on torch."""
-    from adaptfault.export import ExportError, add_onnx
+    from adaptfault.models.export import ExportError, add_onnx
 
     adaptation.save(folder)
     try:
@@ -293,8 +293,8 @@ def _save(adaptation: Adaptation, folder: Path) -> None:
 
 def _fault_free(model: TactileTransformer, validation: Windows) -> Adaptation:
     """Return the model as an adaptation to no fault: the same logits, bit for bit."""
-    from adaptfault.adaptation import Adaptation
-    from adaptfault.reduction import ReducedModel
+    from adaptfault.adaptation.reduced_model import ReducedModel
+    from adaptfault.adaptation.result import Adaptation
     from diagnostics import FaultSet
 
     none = FaultSet((), model.layout.n_cells)

@@ -9,9 +9,9 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from adaptfault.atomic import atomic_write
+from adaptfault.data.atomic import atomic_write
+from adaptfault.robot.checksummed_json import hash_file
 from adaptfault.robot.lock import locked
-from adaptfault.robot.sealed import hash_file
 
 NAME, _SEAL, _LOCK = "journal.sqlite", "journal.sha256", "journal.lock"
 _ASIDE = "journal.damaged.sqlite"

@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptfault.robot.bundle import Bundle, now
-from adaptfault.robot.judgement import Judgement, judge, with_faults
-from adaptfault.robot.knowledge import Knowledge
-from adaptfault.robot.plausible import contradiction, implausible
+from adaptfault.robot.deployment_test import Judgement, judge, with_faults
+from adaptfault.robot.known_faults import Knowledge
+from adaptfault.robot.plausibility import contradiction, implausible
 from adaptfault.robot.pointer import Pointer
 from diagnostics import Diagnosis, Fault, FaultSet
 
 if TYPE_CHECKING:
-    from adaptfault.adaptation import Adaptation
-    from adaptfault.adapter import Adapter
+    from adaptfault.adaptation.adapter import Adapter
+    from adaptfault.adaptation.result import Adaptation
 
 SCHEMA = "adaptfault.maintenance/1"
 Decision = Literal["unchanged", "deployed", "kept", "refused"]
@@ -241,7 +241,7 @@ class _Maintenance:
 
     def _adapt(self, adapter: Adapter, known: Knowledge, found: dict[str, Any]) -> MaintenanceReport:
         """Adapt and judge: the cheapest stage that is enough, and if a class collapses in it, the fill alone."""
-        from adaptfault.adaptation import Adaptation
+        from adaptfault.adaptation.result import Adaptation
 
         faulty = known.fault_set
         windows = self.bundle.parts.check_windows()

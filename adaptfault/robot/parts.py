@@ -7,14 +7,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from adaptfault.robot.sealed import check_files
-from adaptfault.store import load_arrays, save_arrays
+from adaptfault.models.store import load_arrays, save_arrays
+from adaptfault.robot.checksummed_json import check_files
 from diagnostics import SelfDiagnosis
 
 if TYPE_CHECKING:
-    from adaptfault.adapter import Adapter
-    from adaptfault.calibration import Calibration
-    from adaptfault.windows import Windows
+    from adaptfault.adaptation.adapter import Adapter
+    from adaptfault.data.calibration import Calibration
+    from adaptfault.data.windows import Windows
 
 _ADAPTER, _REFERENCE, _CHECK, _CALIBRATION = "adapter", "reference", "check", "calibration.csv"
 _SCHEMA = "adaptfault.reference/1"
@@ -44,7 +44,7 @@ class Parts:
         Raises:
             ValueError: the diagnoser is not fitted, or there are too few windows.
         """
-        from adaptfault.replay import save_adapter, save_windows
+        from adaptfault.adaptation.adapter_files import save_adapter, save_windows
 
         if diagnoser.reference_ is None:
             raise ValueError("a bundle needs a diagnoser that is fitted on fault-free recordings: call fit first")
@@ -74,13 +74,13 @@ class Parts:
 
     def adapter(self) -> Adapter:
         """Return the adapter, with the fault-free model and windows."""
-        from adaptfault.replay import load_adapter
+        from adaptfault.adaptation.adapter_files import load_adapter
 
         return load_adapter(self._checked / _ADAPTER)
 
     def check_windows(self) -> Windows:
         """Return the windows that no model learns from, which new versions are judged on."""
-        from adaptfault.replay import load_windows
+        from adaptfault.adaptation.adapter_files import load_windows
 
         return load_windows(self._checked / _CHECK)
 
@@ -95,7 +95,7 @@ def _give_up_half(adapter: Adapter) -> tuple[Adapter, Windows]:
     """Return an adapter with every second validation recording of each class, and the windows of the others."""
     import numpy as np
 
-    from adaptfault.adapter import Adapter
+    from adaptfault.adaptation.adapter import Adapter
 
     windows = adapter.validation
     recordings, first = np.unique(windows.recording, return_index=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from adaptfault.robot.sealed import read_either, write_twice
+from adaptfault.robot.checksummed_json import read_either, write_twice
 
 SCHEMA = "adaptfault.current/1"
 NAME = "current.json"

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.inference import Inference
+from adaptfault.data.windows import scale
+from adaptfault.models.inference import Inference
 from adaptfault.robot.bundle import PROCESS
-from adaptfault.windows import scale
 from diagnostics import Fault, FaultSet, Monitor, SensorLayout
 
 if TYPE_CHECKING:

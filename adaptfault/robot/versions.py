@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from adaptfault.robot.sealed import check_files, hash_files, read_sealed, sync, sync_tree, write_sealed
+from adaptfault.robot.checksummed_json import check_files, hash_files, read_sealed, sync, sync_tree, write_sealed
 from diagnostics import FaultSet, SensorLayout
 
 SCHEMA = "adaptfault.version/1"

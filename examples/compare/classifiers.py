@@ -19,8 +19,8 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 import adaptfault as af
-from adaptfault.repairable import random_fault_set
-from adaptfault.windows import evenly
+from adaptfault.data.windows import evenly
+from adaptfault.imputation.dropout import random_fault_set
 from diagnostics import FaultSet, SensorLayout
 
 Predict = Callable[[np.ndarray], np.ndarray]  # windows [N, T, D] -> classes [N]

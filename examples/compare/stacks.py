@@ -59,7 +59,7 @@ class Ours:
 
     def logits(self, x: np.ndarray) -> np.ndarray:
         """Return the logits of windows."""
-        from adaptfault.network import logits_of
+        from adaptfault.models.network import logits_of
 
         return logits_of(self.model, x).numpy()
 
@@ -75,9 +75,9 @@ class Ours:
         """Return the ways to predict."""
         ways: Ways = {"predict": self.model.predict}
         if not self.setup.small and find_spec("onnxruntime") and find_spec("onnxscript"):
-            from adaptfault.export import to_onnx
-            from adaptfault.inference import open_session, run_session
-            from adaptfault.reduction import ReducedModel
+            from adaptfault.adaptation.reduced_model import ReducedModel
+            from adaptfault.models.export import to_onnx
+            from adaptfault.models.inference import open_session, run_session
 
             none = FaultSet((), self.setup.layout.n_cells)
             session = open_session(to_onnx(ReducedModel(self.model, none, None).eval()))

@@ -1,0 +1,1 @@
+"""The adapter: reduced models, their stages, forecasts, files and baselines."""

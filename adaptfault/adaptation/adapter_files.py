@@ -1,0 +1,199 @@
+"""The adapter on disk, small enough for a robot: weights, and fault-free windows in converter steps. No pickle."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from adaptfault.adaptation.adapter import Adapter
+from adaptfault.data.windows import Windows, evenly
+from adaptfault.imputation.linear import CellStatistics
+from adaptfault.models.network import TactileTransformer
+from adaptfault.models.store import load_tensors, save_tensors
+
+SCHEMA = "adaptfault.adapter/1"
+WINDOWS_SCHEMA = "adaptfault.windows/1"
+LIMIT = 20_000_000  # bytes: what the paper's layout must fit into
+
+_SHARE = 0.5  # of the limit is the most that windows take if the weights then still fit
+_FINEST = 1 / 4095  # step for readings that show no converter steps: a 12-bit converter's
+_MOST_STEPS = 65_535
+_OVERHEAD = 100_000  # bytes for names, labels and JSON
+
+
+def save_adapter(path: str | Path, adapter: Adapter, *, limit: int = LIMIT) -> None:
+    """Write all that an adaptation needs into a folder of at most ``limit`` bytes.
+
+    Readings are kept exactly where they are whole converter steps, else to 12 bits. If the windows need more than half
+    of the room, they are thinned evenly. The weights take what is left: 32-bit floats, or 16-bit ones, or 8-bit
+    integers with a scale for each row, the first that fits. What was kept is told in ``manifest.json``.
+
+    Raises:
+        ValueError: it does not fit, even so.
+    """
+    statistics = adapter.statistics
+    upper = np.triu_indices(len(statistics.mean))
+    tensors: dict[str, Tensor] = {
+        "statistics.mean": torch.from_numpy(statistics.mean),
+        "statistics.covariance": torch.from_numpy(statistics.covariance[upper].astype(np.float32)),
+    }
+    room = limit - _OVERHEAD - _bytes(tensors)
+    about: dict[str, Any] = {"network": adapter.model.config}
+    parts = {"train": (adapter.train, adapter.targets), "validation": (adapter.validation, adapter.validation_targets)}
+    n = sum(len(windows) for windows, _ in parts.values())
+    for name, (windows, targets) in parts.items():
+        packed, told = _pack_thinned(windows, targets, int(_SHARE * room * len(windows) / n))
+        tensors |= {f"{name}.{key}": value for key, value in packed.items()}
+        about[name] = told
+    room = limit - _OVERHEAD - _bytes(tensors)
+    choices = {"float32": _whole, "float16": _half, "int8": _eighth}
+    for about["weights_as"], shrink in choices.items():
+        weights = shrink(adapter.model.state_dict())
+        if _bytes(weights) <= room:
+            break
+    else:
+        raise ValueError(
+            f"the adapter does not fit into {limit:,} bytes: the weights alone take {_bytes(weights):,} of 8 bits;"
+            " raise limit"
+        )
+    save_tensors(path, SCHEMA, about, {**tensors, **{f"model.{k}": v for k, v in weights.items()}})
+
+
+def save_windows(path: str | Path, windows: Windows, *, limit: int = LIMIT // 4) -> None:
+    """Write windows into a folder as :func:`save_adapter` does, thinned evenly to ``limit`` bytes."""
+    packed, told = _pack_thinned(windows, np.zeros((len(windows), 0), np.float32), limit)
+    save_tensors(path, WINDOWS_SCHEMA, {"windows": told}, {f"windows.{key}": value for key, value in packed.items()})
+
+
+def load_windows(path: str | Path) -> Windows:
+    """Read what :func:`save_windows` wrote; raises what :func:`load_adapter` raises."""
+    about, tensors = load_tensors(path, WINDOWS_SCHEMA)
+    try:
+        return _unpack(about["windows"], tensors, "windows")
+    except (KeyError, TypeError, ValueError, zlib.error) as error:
+        raise ValueError(f"the windows in {path} are damaged: {str(error).splitlines()[0]}") from None
+
+
+def load_adapter(path: str | Path) -> Adapter:
+    """Read what :func:`save_adapter` wrote.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is damaged or of another kind.
+    """
+    about, tensors = load_tensors(path, SCHEMA)
+    try:
+        model = TactileTransformer.from_config(about["network"])
+        model.load_state_dict(_restore({k.removeprefix("model."): v for k, v in tensors.items() if k[:6] == "model."}))
+        adapter = Adapter(model.eval(), *(_unpack(about[name], tensors, name) for name in ("train", "validation")))
+        adapter.targets, adapter.validation_targets = (
+            tensors[f"{name}.targets"].float().numpy() for name in ("train", "validation")
+        )
+        d = model.layout.n_cells
+        covariance = np.zeros((d, d))
+        covariance[np.triu_indices(d)] = tensors["statistics.covariance"].numpy()
+        covariance = np.triu(covariance) + np.triu(covariance, 1).T
+        frames = CellStatistics.reference(adapter.train)
+        adapter.statistics = CellStatistics(tensors["statistics.mean"].numpy(), covariance, frames)
+    except (KeyError, TypeError, ValueError, RuntimeError, zlib.error) as error:
+        raise ValueError(f"the adapter in {path} is damaged: {str(error).splitlines()[0]}") from None
+    return adapter
+
+
+def _bytes(tensors: dict[str, Tensor]) -> int:
+    return sum(t.numel() * t.element_size() for t in tensors.values())
+
+
+def _pack_thinned(windows: Windows, targets: NDArray[Any], room: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Pack windows, as many as fit, and say how they are packed."""
+    keep = len(windows)
+    while True:
+        which = evenly(len(windows), keep)
+        packed, told = _pack(windows.select(which), targets[which])
+        if (size := _bytes(packed)) <= room or keep == 1:
+            return packed, {**told, "of": len(windows)}
+        keep = max(1, min(keep - 1, int(keep * room / size)))
+
+
+def _pack(windows: Windows, targets: NDArray[Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    low, step = _steps(windows.x)
+    counts = np.rint((windows.x.astype(np.float64) - low) / step).astype(np.uint16)
+    # Differences between frames and then all low bytes before all high ones: mostly zeros, which deflate well.
+    counts[:, 1:] -= counts[:, :-1].copy()  # modulo 2^16, undone by a cumulative sum modulo 2^16
+    data = zlib.compress(counts.view(np.uint8).reshape(-1, 2).T.tobytes(), 6)
+    packed = {
+        "x": torch.frombuffer(bytearray(data), dtype=torch.uint8),
+        "y": torch.from_numpy(windows.y),
+        "recording": torch.from_numpy(windows.recording),
+        "targets": torch.from_numpy(targets).half(),
+    }
+    return packed, {"shape": list(windows.x.shape), "low": low, "step": step}
+
+
+def _unpack(told: dict[str, Any], tensors: dict[str, Tensor], name: str) -> Windows:
+    n, t, d = told["shape"]
+    size = 2 * n * t * d
+    data = zlib.decompressobj().decompress(tensors[f"{name}.x"].numpy().tobytes(), size)  # never more than it should be
+    counts = np.frombuffer(data, np.uint8).reshape(2, -1).T.copy().view(np.uint16).reshape(n, t, d)
+    counts = np.cumsum(counts, axis=1, dtype=np.uint16)
+    x = (told["low"] + counts * told["step"]).astype(np.float32)
+    return Windows(x, tensors[f"{name}.y"].numpy(), tensors[f"{name}.recording"].numpy())
+
+
+def _steps(x: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the lowest reading and the converter's step, or a fine enough one where the readings show none."""
+    values = np.unique(x).astype(np.float64)
+    low, width = float(values[0]), float(values[-1] - values[0])
+    gaps = np.diff(values)
+    gaps = gaps[gaps > 1e-6]  # below that, single precision
+    if not len(gaps):
+        return low, 1.0
+    steps = max(1, round(width / gaps.min()))
+    if steps <= _MOST_STEPS:
+        step = width / steps
+        off = (values - low) / step
+        if np.abs(off - np.rint(off)).max() < 0.01:
+            return low, step
+    return low, max(_FINEST, width / _MOST_STEPS)
+
+
+def _whole(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    return dict(state)
+
+
+def _half(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor.half() for name, tensor in state.items()}
+
+
+def _eighth(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return matrices as int8 with a scale for each row, the rest as 16-bit floats."""
+    small: dict[str, Tensor] = {}
+    for name, tensor in state.items():
+        if tensor.dim() < 2:
+            small[name] = tensor.half()
+            continue
+        rows = tensor.flatten(1)
+        scale = (rows.abs().amax(1, keepdim=True) / 127).clamp_min(torch.finfo(torch.float32).tiny)
+        small[name] = (rows / scale).round().to(torch.int8).view_as(tensor)
+        small[f"{name}{_SCALE}"] = scale.flatten()
+    return small
+
+
+_SCALE = ":scale"
+
+
+def _restore(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Undo :func:`_half` or :func:`_eighth`, as far as can be."""
+    whole = {}
+    for name, tensor in state.items():
+        if name.endswith(_SCALE):
+            continue
+        scale = state.get(name + _SCALE)
+        whole[name] = tensor.float() if scale is None else tensor * scale.view(-1, *[1] * (tensor.dim() - 1))
+    return whole

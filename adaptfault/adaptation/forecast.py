@@ -1,0 +1,104 @@
+"""What accuracy to expect after a repair, said before it is made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.evaluation.scores import accuracy_interval
+from diagnostics import FaultSet
+
+SCHEMA = "adaptfault.forecast/1"
+
+
+@dataclass(frozen=True)
+class Expected:
+    """An accuracy to expect.
+
+    Attributes:
+        accuracy: on the validation windows.
+        low, high: 95 % interval for as many *new* recordings as validation has: theirs vary as much as these, so it is
+            wider by the root of 2 than the interval of the mean, which is clustered by recording.
+    """
+
+    accuracy: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.accuracy:.3f} ({self.low:.3f} to {self.high:.3f})"
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What accuracy to expect of each stage of a repair, in the order of their cost.
+
+    Attributes:
+        fault_set: F.
+        stages: "fault-free", "fill" and "head", measured on validation windows with F taken away; "finetune" and
+            "scratch", which only training could measure: the head's accuracy, with an interval that reaches up to the
+            fault-free one's. With F empty, "fault-free" alone.
+        worst_class: the class that loses most at the best measured stage; None with F empty.
+        worst_loss: of its recall, 0..1.
+        n_recordings: that it rests on.
+    """
+
+    fault_set: FaultSet
+    stages: dict[str, Expected]
+    worst_class: int | None
+    worst_loss: float
+    n_recordings: int
+
+    @classmethod
+    def of(
+        cls,
+        fault_set: FaultSet,
+        y: NDArray[np.int64],
+        recording: NDArray[np.int64],
+        predicted: Mapping[str, NDArray[np.int64]],
+    ) -> Forecast:
+        """Build a forecast from the classes ``[N]`` that each measured stage predicted for validation windows."""
+        stages = {name: _expected(classes == y, recording) for name, classes in predicted.items()}
+        count = len(np.unique(recording))
+        if len(predicted) == 1:
+            return cls(fault_set, stages, None, 0.0, count)
+        best = max(stages["fill"], stages["head"], key=lambda e: e.accuracy)
+        trained = Expected(best.accuracy, best.low, max(best.high, stages["fault-free"].high))
+        stages |= {"finetune": trained, "scratch": trained}
+        last = predicted["fill" if best is stages["fill"] else "head"]
+        classes = np.unique(y)
+        lost = [((predicted["fault-free"] == y) * 1.0 - (last == y))[y == c].mean() for c in classes]
+        worst = int(np.argmax(lost))
+        return cls(fault_set, stages, int(classes[worst]), float(lost[worst]), count)
+
+    def __str__(self) -> str:
+        k = len(self.fault_set)
+        lines = [f"expected accuracy without {k} cells, from {self.n_recordings} recordings (95 % of such samples):"]
+        lines += [f"  {name:10s} {expected}" for name, expected in self.stages.items()]
+        if self.worst_class is not None:
+            lines.append(f"  class {self.worst_class} suffers most: its recall falls by {self.worst_loss:.2f}")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict."""
+        return {
+            "schema": SCHEMA,
+            "fault_set": list(self.fault_set),
+            "stages": {name: asdict(expected) for name, expected in self.stages.items()},
+            "worst_class": self.worst_class,
+            "worst_loss": self.worst_loss,
+            "n_recordings": self.n_recordings,
+        }
+
+
+def _expected(right: NDArray[np.bool_], recording: NDArray[np.int64]) -> Expected:
+    accuracy = float(right.mean())
+    low, high = accuracy_interval(right, recording)
+    wider = np.sqrt(2)
+    return Expected(
+        accuracy, max(0.0, accuracy - wider * (accuracy - low)), min(1.0, accuracy + wider * (high - accuracy))
+    )

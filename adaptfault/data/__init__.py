@@ -1,0 +1,1 @@
+"""Recordings, calibration, windows and simulated grasps; files written whole."""

@@ -1,0 +1,121 @@
+"""Judges the readings of one file against the array: what cannot be used is left out, what is odd is told."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.data.recordings.content import Content
+from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.guess import GIVE_LAYOUT, SLACK, describe_width
+from diagnostics import SensorLayout
+
+
+def check_width(content: Content, layout: SensorLayout) -> None:
+    """Raise InputError if the frames of a file do not fit the layout."""
+    if content.shape is not None and content.shape != layout.shape:
+        came, expected = (" x ".join(map(str, shape)) for shape in (content.shape, layout.shape))
+        what = f"frames of {came} (pads x rows x cols) where the layout has {expected}; {GIVE_LAYOUT}"
+        raise InputError.at(content.path, what)
+    if content.width != layout.n_cells:
+        expected = " x ".join(map(str, layout.shape))
+        what = f"{describe_width(content, layout.n_cells)}; the layout has {expected} cells, masked ones included"
+        raise content.error(what, frame=0 if content.lines is not None else None)
+
+
+def check_readings(content: Content, layout: SensorLayout, length: int | None) -> tuple[list[int], list[Problem]]:
+    """Return the recordings of a file that can be used, and what was noticed.
+
+    Left out with an error: recordings without frames, of another length than ``length``, or with infinite readings.
+    Kept with a warning: missing readings, counted over the cells that the layout has.
+    """
+    kept: list[int] = []
+    problems: list[Problem] = []
+    missing, first = 0, ""
+    present = layout.present.ravel()
+    for i, frames in enumerate(content.frames):
+        error = ""
+        if not len(frames):
+            error = "holds no frames; record it again or remove it"
+        elif length is not None and len(frames) != length:
+            error = f"{len(frames)} {_rows(content)} where {length} were expected; record it again or change the number"
+        if error:
+            problems.append(Problem("error", str(content.error(error, i))))
+            continue
+        kept.append(i)
+        if frames.dtype.kind != "f":
+            continue
+        if np.isinf(frames).any():
+            frame, cell = np.argwhere(np.isinf(frames))[0]
+            what = f"value {cell + 1} is infinite or too large; write the reading, or 'nan' if it is missing"
+            problems.append(Problem("error", str(content.error(what, i, int(frame)))))
+            kept.pop()
+            continue
+        gaps = np.isnan(frames) & present
+        if gaps.any():
+            missing += int(gaps.sum())
+            first = first or content.where(i, int(np.flatnonzero(gaps.any(axis=1))[0]))
+    if missing:
+        readings = f"{missing} missing reading{'s' * (missing != 1)}"
+        problems.append(Problem("warning", located(content.path, f"{readings}, first in {first}: kept as missing")))
+    return kept, problems
+
+
+def check_range(
+    content: Content, kept: Sequence[int], frames: Sequence[NDArray[np.float32]], layout: SensorLayout
+) -> Problem | None:
+    """Return a warning that counts the readings of a file outside 0..full scale, None if all fit."""
+    slack = (SLACK - 1) * layout.full_scale
+    present = layout.present.ravel()
+    count, first, extreme = 0, "", 0.0
+    for i, recording in zip(kept, frames, strict=True):
+        outside = ((recording < -slack) | (recording > layout.full_scale + slack)) & present
+        if outside.any():
+            count += int(outside.sum())
+            first = first or content.where(i, int(np.flatnonzero(outside.any(axis=1))[0]))
+            extreme = max(extreme, *recording[outside].tolist(), key=abs)
+    if not count:
+        return None
+    what = (
+        f"{count} reading{'s' * (count != 1)} outside 0..{layout.full_scale:g} {layout.unit}, first in {first},"
+        f" the farthest {extreme:g}: kept; if they are real, the layout's full scale is wrong"
+    )
+    return Problem("warning", located(content.path, what))
+
+
+@dataclass(frozen=True)
+class Odd:
+    """A file whose length departs from what nearly all others share."""
+
+    content: Content
+    common: int
+
+    def problem(self) -> Problem:
+        """Say so."""
+        length = len(self.content.frames[0])
+        what = (
+            f"{length} {_rows(self.content)} where the others have {self.common}: kept; windows use whole windows only"
+        )
+        return Problem("warning", located(self.content.path, what))
+
+
+def odd_lengths(contents: Sequence[Content]) -> list[Odd]:
+    """Return the files of another length, if there are at least 3 and at least 9 in 10 share one.
+
+    Only files of one recording count: archives hold recordings of different lengths by design.
+    """
+    single = [content for content in contents if len(content.frames) == 1]
+    if len(single) < 3:
+        return []
+    common, shared = Counter(len(content.frames[0]) for content in single).most_common(1)[0]
+    if shared < 0.9 * len(single):
+        return []
+    return [Odd(content, common) for content in single if len(content.frames[0]) != common]
+
+
+def _rows(content: Content) -> str:
+    return "rows" if content.lines is not None else "frames"

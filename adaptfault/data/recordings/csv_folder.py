@@ -1,0 +1,184 @@
+"""Reads the paper's CSV files: one recording a file, one frame a line, one cell a column."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.data.recordings.content import Content
+from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.text import decoded, numbered_lines, read_bytes, shown
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+def read_csv(path: Path) -> Content:
+    """Read a CSV file of T lines x D readings, comma separated, with or without a header line.
+
+    An empty cell and ``nan`` are missing readings and become NaN. Blank lines are passed over. A last line without an
+    end, cut off when the power went, is left out with a warning, and so are the zero bytes that may follow it; if the
+    cut went through its last number, nobody can tell.
+
+    Raises:
+        InputError: not text, no readings, lines of different lengths, a cell that is no number.
+    """
+    parsed = _parse(path, read_bytes(path), _Before())
+    if parsed.values is None:
+        raise InputError.at(path, "holds no readings; record it again or remove it")
+    with np.errstate(invalid="ignore"):
+        counts = bool(np.all((parsed.values == np.rint(parsed.values)) | np.isnan(parsed.values)))
+    return Content(path, (parsed.values,), counts, lines=parsed.lines, problems=parsed.problems)
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Some lines of a file.
+
+    Attributes:
+        values: float32 ``[t, D]``; None where the lines hold no frame.
+        lines: int ``[t]``, their numbers.
+        problems: what was noticed.
+    """
+
+    values: NDArray[np.float32] | None
+    lines: NDArray[np.intp]
+    problems: tuple[Problem, ...] = ()
+
+
+def csv_pieces(path: Path, size: int) -> Iterator[Piece]:
+    """Yield a file as :func:`read_csv` reads it, about ``size`` bytes at a time.
+
+    Raises:
+        InputError: as :func:`read_csv`, once the place is reached.
+    """
+    before, rest, width = _Before(), b"", 0
+    try:
+        with open(path, "rb") as file:
+            while True:
+                data = file.read(size)
+                cut = data.rfind(b"\n") + 1 if data else 0
+                piece, rest = (rest + data[:cut], data[cut:]) if cut or not data else (b"", rest + data)
+                if piece:
+                    parsed = _parse(path, piece, before)
+                    here = width if parsed.values is None else parsed.values.shape[1]
+                    width = width or here
+                    if here != width:
+                        what = f"{_values(here)} where the lines before it have {width}; correct it"
+                        raise InputError.at(path, what, f"line {parsed.lines[0]}")
+                    yield parsed
+                    before = before.behind(piece)
+                if not data:
+                    return
+    except OSError as error:
+        raise InputError.at(path, f"cannot be read ({error.strerror}); check the path and its permissions") from None
+
+
+@dataclass(frozen=True)
+class _Before:
+    """What comes before a piece of a file: so many lines, and the last one."""
+
+    lines: int = 0
+    last: str = ""
+
+    def behind(self, piece: bytes) -> _Before:
+        last = piece.rstrip(b"\r\n").rpartition(b"\n")[2]
+        return _Before(self.lines + piece.count(b"\n"), last.decode("utf-8", "replace"))
+
+
+def _parse(path: Path, data: bytes, before: _Before) -> Piece:
+    written = data.rstrip(b"\0") or data
+    written = written if written.isascii() else data  # then it was no CSV from the start
+    text = decoded(path, written)
+    rows, numbers = numbered_lines(text)
+    problems: tuple[Problem, ...] = ()
+    above = rows[-2] if len(rows) > 1 else before.last
+    if rows and above and not text.endswith("\n") and (len(written) < len(data) or _is_cut(rows[-1], above)):
+        what = "cut off in this line: the lines before it are kept"
+        problems = (Problem("warning", located(path, what, f"line {before.lines + numbers[-1]}")),)
+        rows, numbers = rows[:-1], numbers[:-1]
+    if rows and not before.lines and _is_header(rows[0]):
+        rows, numbers = rows[1:], numbers[1:]
+    lines = np.array(numbers, dtype=np.intp) + before.lines
+    if not rows:
+        return Piece(None, lines, problems)
+    try:
+        values = np.loadtxt(rows, dtype=np.float32, delimiter=",", comments=None, ndmin=2)
+    except ValueError:  # numpy's parser is fast, and does not say what is wrong
+        values = _read_by_cell(path, rows, lines.tolist())
+    return Piece(values, lines, problems)
+
+
+def _is_cut(line: str, before: str) -> bool:
+    """Tell a line that stops short from one that is complete, as the line before it is."""
+    last, last_before = (_bare(row.rpartition(",")[2]) for row in (line, before))
+    stops = line.count(",") < before.count(",") or (last != "" and _number(last) is None)
+    return stops and (last_before == "" or _number(last_before) is not None)
+
+
+def _is_header(line: str) -> bool:
+    """Tell column names from a frame: most of them are no numbers, or they count the columns (0, 1, 2, ...)."""
+    cells = [_bare(cell) for cell in re.split("[,;\t]", line)]
+    if len(cells) == 1:
+        cells = line.split()  # numbers with a wrong separator are a frame too, which the parser refuses
+    first = _number(cells[0])
+    if first not in (None, 0.0, 1.0) and _number(cells[-1]) is not None:
+        return False  # quickly: this is nearly every frame
+    numbers = [_number(cell) for cell in cells if cell]
+    if None in numbers:
+        return 2 * numbers.count(None) > len(numbers)
+    # pandas writes such a header of its own accord; no array reads exactly that
+    return len(numbers) > 3 and any(numbers == list(range(start, start + len(numbers))) for start in (0, 1))
+
+
+def _read_by_cell(path: Path, rows: Sequence[str], numbers: Sequence[int]) -> NDArray[np.float32]:
+    """Parse cell by cell: takes missing readings, and names the line and column of what it cannot take."""
+    for separator, name in ((";", "';'"), ("\t", "tabs")):
+        if separator in rows[0]:
+            raise InputError.at(path, f"separated by {name}? use commas, and a point in decimals", f"line {numbers[0]}")
+    table = [row.split(",") for row in rows]
+    if len(table[0]) == 1 and " " in rows[0].strip():
+        raise InputError.at(path, "separated by spaces? use commas", f"line {numbers[0]}")
+    width = Counter(len(cells) for cells in table).most_common(1)[0][0]
+    for number, cells in zip(numbers, table, strict=True):
+        if len(cells) != width:
+            mend = "leave a missing reading as an empty cell, between its commas"
+            if number == numbers[-1] and len(cells) < width:
+                mend = "the recording was cut off here: remove the line"
+            what = f"{_values(len(cells))} where the other lines have {width}; {mend}"
+            raise InputError.at(path, what, f"line {number}")
+    values = np.empty((len(table), width), dtype=np.float32)
+    for frame, (number, cells) in enumerate(zip(numbers, table, strict=True)):
+        for column, cell in enumerate(cells):
+            reading = _number(_bare(cell)) if cell.strip() else np.nan
+            if reading is None:
+                what = f"{shown(cell)} is not a number; write the reading, or leave the cell empty if it is missing"
+                if column == 0 and len(cells) > 1:
+                    what += " (a column of times does not belong here: remove it)"
+                raise InputError.at(path, what, f"line {number}, column {column + 1}")
+            values[frame, column] = reading
+    return values
+
+
+def _values(count: int) -> str:
+    return "1 value" if count == 1 else f"{count} values"
+
+
+def _bare(cell: str) -> str:
+    return cell.strip().strip('"').strip()
+
+
+def _number(cell: str) -> float | None:
+    """Return the number in a cell, or None; readings that float32 cannot hold become infinite, as in numpy's parser."""
+    try:
+        number = float(cell)
+    except ValueError:
+        return None
+    if "_" in cell:  # Python's float takes 1_000, no CSV means it
+        return None
+    return number if abs(number) <= _LARGEST or number != number else float("inf")

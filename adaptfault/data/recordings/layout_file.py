@@ -1,0 +1,93 @@
+"""Reads the description of an array: from a JSON file, or from its size in words ("2x13x6")."""
+
+from __future__ import annotations
+
+import re
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adaptfault.data.recordings.content import Shape
+from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.text import read_json_object, shown
+from diagnostics import SensorLayout
+
+MOST_CELLS = 1_000_000
+"""More positions than that are a slip of the pen, and would fill the memory."""
+
+_SIZES = re.compile(r"\s*(\d{1,9})\s*[xX×*,]\s*(\d{1,9})\s*[xX×*,]\s*(\d{1,9})\s*", re.ASCII)
+
+
+def looks_like_shape(text: str) -> bool:
+    """Tell whether text is a size such as "2x13x6" (and not the name of a file)."""
+    return _SIZES.fullmatch(text) is not None
+
+
+def parse_shape(text: str) -> Shape:
+    """Return ``(pads, rows, cols)`` from "2x13x6".
+
+    Raises:
+        InputError: the text is none, or a size is 0 or too large.
+    """
+    match = _SIZES.fullmatch(text)
+    if match is None:
+        raise InputError(f"shape {shown(text)}: expected pads x rows x columns, such as 2x13x6")
+    pads, rows, cols = (int(size) for size in match.groups())
+    if min(pads, rows, cols) < 1:
+        raise InputError(f"shape {shown(text)}: every size must be at least 1, such as 2x13x6")
+    if pads * rows * cols > MOST_CELLS:
+        raise InputError(f"shape {shown(text)}: more than {MOST_CELLS} cells; check the sizes")
+    return pads, rows, cols
+
+
+def read_layout(path: str | PathLike[str]) -> SensorLayout:
+    """Read a layout from a JSON file of the schema "adaptfault.layout/1", as ``SensorLayout.to_dict`` gives it.
+
+    Raises:
+        InputError: the file cannot be read, is no JSON, or a field is missing, unknown or of a wrong kind; named.
+    """
+    path = Path(path)
+    document = read_json_object(path)
+    for name, kind in (
+        ("pads", int),
+        ("rows", int),
+        ("cols", int),
+        ("full_scale", float),
+        ("rate", float),
+        ("unit", str),
+    ):
+        if name in document and not _is(document[name], kind):
+            kind_name = {int: "a whole number", float: "a number", str: "text"}[kind]
+            what = f"field {name!r}: expected {kind_name}, got {shown(str(document[name]))}; correct it"
+            raise InputError.at(path, what)
+    sizes = [document.get(name, 1) for name in ("pads", "rows", "cols")]
+    if sizes[0] * sizes[1] * sizes[2] > MOST_CELLS:
+        raise InputError.at(path, f"fields 'pads', 'rows', 'cols': more than {MOST_CELLS} cells; check the sizes")
+    if "present" in document and not (_are_bools(document["present"]) and _is_regular(document["present"])):
+        raise InputError.at(path, "field 'present': expected lists [pads][rows][cols] of true and false; correct it")
+    try:
+        return SensorLayout.from_dict(document)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise InputError.at(path, f"is no layout: {error}; correct the file") from None
+
+
+def _is(value: Any, kind: type) -> bool:
+    if isinstance(value, bool):
+        return False
+    return isinstance(value, int | float) if kind is float else isinstance(value, kind)
+
+
+def _is_regular(lists: Any) -> bool:
+    try:
+        np.array(lists, dtype=bool)
+    except ValueError:
+        return False
+    return True
+
+
+def _are_bools(value: Any, depth: int = 0) -> bool:
+    if isinstance(value, list) and depth < 3:
+        return all(_are_bools(item, depth + 1) for item in value)
+    return isinstance(value, bool) or value in (0, 1)

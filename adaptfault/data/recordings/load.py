@@ -1,0 +1,213 @@
+"""The one way in: files and folders of any known format become :class:`Recordings`, and what was wrong is listed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.data.recordings.bag import STORAGES, read_bag
+from adaptfault.data.recordings.check import check_range, check_readings, check_width, odd_lengths
+from adaptfault.data.recordings.classes import class_indices, label_files
+from adaptfault.data.recordings.content import Content, Shape
+from adaptfault.data.recordings.csv_folder import read_csv
+from adaptfault.data.recordings.dataset import Recordings
+from adaptfault.data.recordings.errors import InputError, Problem
+from adaptfault.data.recordings.files import Found, find
+from adaptfault.data.recordings.npz import read_npy, read_npz
+from adaptfault.data.recordings.settle import check_agreement, given_array, settle_layout
+from diagnostics import SensorLayout
+
+if TYPE_CHECKING:
+    from adaptfault.data.calibration import Calibration
+
+PathName = str | PathLike[str]
+
+READERS: Mapping[str, Callable[[Path], Content]] = {".csv": read_csv, ".npz": read_npz, ".npy": read_npy}
+"""The reader of each format by the end of the file's name; bags, which may be folders, have their own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """What could be read, and what was wrong.
+
+    Attributes:
+        recordings: at least one recording.
+        problems: errors (something was left out) and warnings (something is odd), in the order they were met.
+    """
+
+    recordings: Recordings
+    problems: tuple[Problem, ...] = ()
+
+
+def load(
+    paths: PathName | Iterable[PathName],
+    *,
+    layout: SensorLayout | Shape | PathName | None = None,
+    labels: PathName | None = None,
+    frames: int | None = None,
+    calibration: Calibration | PathName | None = None,
+    full_scale: float | None = None,
+    unit: str | None = None,
+    rate: float | None = None,
+    topic: str | None = None,
+    field: str | None = None,
+) -> Loaded:
+    """Read recordings; one bad file is listed and left out, the others go on.
+
+    Each file's class comes from the file itself (.npz), or else from a table of labels, or else from the folder that
+    holds it (``folder/<class>/<file>``). Files that all lie in one folder have no labels.
+
+    Args:
+        paths: a file, a folder, or several of them. Folders are searched to the bottom, in natural order.
+        layout: the array; a layout file; a shape ``(2, 13, 6)`` or "2x13x6". None: from the files, see Notes.
+        labels: a table with the columns ``file,label``, paths relative to it. None: a folder's ``labels.csv``.
+        frames: the number of frames that each recording must have; None = any.
+        calibration: tables that turn the counts read into newtons (or the file that holds them).
+        full_scale, unit, rate: override what the layout and the files say.
+        topic, field: where the readings are in bags, see :func:`adaptfault.data.recordings.bag.read_bag`.
+
+    Raises:
+        InputError: a path does not exist, no recording survives, or the layout, the table or the calibration is
+            unusable.
+
+    Notes:
+        Without a layout, the shape is the one of ``[n, T, pads, rows, cols]``, or the paper's for frames of 220
+        readings. Counts get the full scale of the smallest converter of 8 to 16 bits that holds them, decimal numbers
+        0..5 N. The rate is the file's, or the paper's 10 Hz.
+    """
+    given = [Path(paths)] if isinstance(paths, str | PathLike) else [Path(path) for path in paths]
+    if not given:
+        raise InputError("no path given; name a recording or a folder of recordings")
+    if frames is not None and frames < 1:
+        raise InputError(f"frames {frames}: expected the number of frames a recording must have, at least 1")
+    array = given_array(layout)
+    tables = _calibration(calibration)
+    aside = {Path(p).resolve() for p in (layout, labels, calibration) if isinstance(p, str | PathLike)}
+    found, problems = find(given, (*READERS, *STORAGES), aside)
+
+    contents: list[tuple[Found, Content]] = []
+    for file in found:
+        try:
+            reader = READERS.get(file.path.suffix.lower()) if file.path.is_file() else None
+            content = reader(file.path) if reader else read_bag(file.path, topic=topic, field=field)
+        except InputError as error:
+            problems.append(Problem("error", str(error)))
+        else:
+            problems += content.problems
+            contents.append((file, content))
+    contents = label_files(contents, None if labels is None else Path(labels), problems)
+    if not contents:
+        raise _nothing_left(problems)
+    settled, doubts = settle_layout([content for _, content in contents], array, full_scale, unit, rate, tables)
+    problems += doubts
+    if tables is not None:
+        try:
+            tables.check(settled)
+        except ValueError as error:
+            raise InputError(f"calibration: {error}") from None
+    return _assemble(contents, settled, frames, tables, problems)
+
+
+def _assemble(
+    contents: Sequence[tuple[Found, Content]],
+    layout: SensorLayout,
+    length: int | None,
+    tables: Calibration | None,
+    problems: list[Problem],
+) -> Loaded:
+    """Check each file against the layout, calibrate it, and put the recordings of all together."""
+    out_of_range: list[Problem] = []
+    clamped = np.zeros((2, layout.n_cells), dtype=np.int64)
+    frames: list[NDArray[np.float32]] = []
+    names: list[str] = []
+    labels: list[str | None] = []
+    usable: list[Content] = []
+    every = [content for _, content in contents]
+    for file, content in contents:
+        try:
+            check_agreement(content, every, tables is not None)
+            check_width(content, layout)
+        except InputError as error:
+            problems.append(Problem("error", str(error)))
+            continue
+        kept, noticed = check_readings(content, layout, length)
+        problems += noticed
+        if not kept:
+            continue
+        usable.append(content)
+        readings = [content.frames[i] for i in kept]
+        if tables is not None:
+            readings = [_calibrated(recording, tables, clamped) for recording in readings]
+        readings = [recording.astype(np.float32, copy=False) for recording in readings]
+        if problem := check_range(content, kept, readings, layout):
+            out_of_range.append(problem)
+        frames += readings
+        names += (_name(file, content, i) for i in kept)
+        labels += (content.labels[i] if content.labels else None for i in kept)
+    if not frames:
+        raise _nothing_left(problems)
+    if length is None:
+        problems += (odd.problem() for odd in odd_lengths(usable))
+    problems += _summary(out_of_range, len(usable), layout)
+    if clamped.any():
+        problems.append(_clamped(clamped))
+    indices, class_names = class_indices(labels, [content.class_names for content in usable], problems)
+    return Loaded(Recordings(tuple(frames), layout, indices, class_names, tuple(names)), tuple(problems))
+
+
+def _calibration(calibration: Calibration | PathName | None) -> Calibration | None:
+    if not isinstance(calibration, str | PathLike):
+        return calibration
+    from adaptfault.data.calibration import Calibration  # here: that module uses this package's errors
+
+    return Calibration.read(calibration)
+
+
+def _calibrated(recording: NDArray[Any], tables: Calibration, clamped: NDArray[np.int64]) -> NDArray[np.float32]:
+    newtons, out = tables.apply(recording)
+    clamped += np.stack([out.below, out.above])
+    return newtons
+
+
+def _clamped(clamped: NDArray[np.int64]) -> Problem:
+    below, above = (int(n) for n in clamped.sum(axis=1))
+    cells = int(clamped.any(axis=0).sum())
+    what = (
+        f"{below} readings below and {above} above the tables of {cells} cells, most on cell"
+        f" {int(clamped.sum(axis=0).argmax())}: clamped to the tables' ends"
+    )
+    return Problem("warning", f"calibration: {what}")
+
+
+def _summary(out_of_range: list[Problem], files: int, layout: SensorLayout) -> list[Problem]:
+    """Return the warnings about the range, as one where most files have it: the scale is wrong, not the readings."""
+    if len(out_of_range) <= max(3, files // 2):
+        return out_of_range
+    what = (
+        f"{len(out_of_range)} of {files} files hold readings outside 0..{layout.full_scale:g} {layout.unit}:"
+        " check the layout's full scale and unit; the first is"
+    )
+    return [Problem("warning", f"{what} {out_of_range[0].message}")]
+
+
+def _name(file: Found, content: Content, i: int) -> str:
+    if content.names is not None:
+        return content.names[i]
+    return file.name if len(content.frames) == 1 else f"{file.name}, recording {i}"
+
+
+def _nothing_left(problems: Sequence[Problem]) -> InputError:
+    """Return the error for a run that has no recording left: the first problem, and how many there are."""
+    errors = [problem for problem in problems if problem.level == "error"] or list(problems)
+    counts = Counter(problem.level for problem in problems)
+    count = (
+        f"{counts['error']} error{'s' * (counts['error'] != 1)}" if counts["error"] else f"{counts['warning']} warnings"
+    )
+    return InputError(f"{errors[0].message} (no recording is left; {count} in all)")

@@ -1,0 +1,176 @@
+"""Recordings cut into windows on the 0..1 scale, and split by recording (Section VI-C)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diagnostics import SensorLayout
+from diagnostics.preprocessing.readings import held
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Windows of T frames, the input of every model.
+
+    Attributes:
+        x: float32 ``[N, T, D]``, readings divided by the layout's full scale: 0..1.
+        y: int64 ``[N]``, class of each window; -1 where there is no label.
+        recording: int64 ``[N]``, which recording a window came from; splits keep these together.
+
+    Raises:
+        ValueError: ``x`` is not three-dimensional, or ``y`` or ``recording`` has another length.
+    """
+
+    x: NDArray[np.float32]
+    y: NDArray[np.int64]
+    recording: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        x = np.asarray(self.x, dtype=np.float32)
+        if x.ndim != 3:
+            raise ValueError(f"windows need x of shape [N, T, D], got {list(x.shape)}")
+        object.__setattr__(self, "x", x)
+        for name in ("y", "recording"):
+            values = np.asarray(getattr(self, name))
+            if values.shape != (len(x),):
+                raise ValueError(f"{len(x)} windows need {name} of shape [{len(x)}], got {list(values.shape)}")
+            object.__setattr__(self, name, values.astype(np.int64, copy=False))
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __str__(self) -> str:
+        n, t, d = self.x.shape
+        classes, recordings = len(np.unique(self.y[self.y >= 0])), len(np.unique(self.recording))
+        return f"{n} windows of {t} frames x {d} cells, {recordings} recordings, {classes} classes"
+
+    def select(self, which: NDArray[Any] | Sequence[int] | slice) -> Windows:
+        """Return the windows of a bool mask ``[N]``, of indices in their order, or of a slice."""
+        if not isinstance(which, slice):
+            which = np.asarray(which)
+            which = which if which.dtype == bool else which.astype(np.intp)
+        return Windows(self.x[which], self.y[which], self.recording[which])
+
+
+def evenly(n: int, most: int) -> NDArray[np.intp]:
+    """Return at most ``most`` of the indices 0 to n - 1, the first and the last among them where there are two."""
+    return np.linspace(0, n - 1, min(n, most)).astype(np.intp)
+
+
+def scale(frames: ArrayLike, layout: SensorLayout) -> NDArray[np.float32]:
+    """Convert readings from the layout's unit to 0..1: the one place that does.
+
+    Divides by the full scale (5 N in Section VI-C). Nothing is clipped, and NaN stays NaN.
+    """
+    return (np.asarray(frames, dtype=np.float64) / layout.full_scale).astype(np.float32)
+
+
+def hold_missing(frames: NDArray[Any]) -> NDArray[Any]:
+    """Return ``frames [T, D]`` with each NaN replaced by the last reading of that cell, 0 before its first.
+
+    A lost frame then looks like a held one instead of turning the network's whole output into NaN.
+    """
+    return held(frames, np.zeros(frames.shape[1], frames.dtype))[1:] if np.isnan(frames).any() else frames
+
+
+def make_windows(
+    recordings: Sequence[ArrayLike],
+    labels: ArrayLike | None,
+    layout: SensorLayout,
+    *,
+    length: int = 10,
+    stride: int | None = None,
+) -> Windows:
+    """Cut recordings into windows on the 0..1 scale.
+
+    Missing readings (NaN) are held from the last frame of their recording (:func:`hold_missing`). What is left after
+    the last whole window is dropped; a recording shorter than one window gives none.
+
+    Args:
+        recordings: arrays ``[T, D]`` or ``[T, pads, rows, cols]`` in the layout's unit; lengths may differ.
+        labels: int ``[n]``, one class a recording; None gives y = -1.
+        layout: the array they come from.
+        length: frames in a window, 10 in Section VI-C.
+        stride: frames between the starts of two windows; None means ``length``, windows that do not overlap.
+
+    Raises:
+        ValueError: a recording that does not fit the layout, another number of labels, no window at all.
+    """
+    stride = length if stride is None else stride
+    if length < 1 or stride < 1:
+        raise ValueError(f"windows need length >= 1 and stride >= 1, got {length} and {stride}")
+    classes = np.full(len(recordings), -1) if labels is None else np.asarray(labels)
+    if classes.shape != (len(recordings),):
+        raise ValueError(f"{len(recordings)} recordings need as many labels, got {list(classes.shape)}")
+    pieces: list[NDArray[np.float32]] = []
+    counts = np.zeros(len(recordings), dtype=np.int64)
+    longest = 0
+    for i, recording in enumerate(recordings):
+        frames = hold_missing(scale(layout.check_recording(recording, f"recording {i}"), layout))
+        longest = max(longest, len(frames))
+        if len(frames) >= length:
+            views = np.lib.stride_tricks.sliding_window_view(frames, length, axis=0)[::stride]  # [n, D, T]
+            pieces.append(views.transpose(0, 2, 1))
+            counts[i] = len(views)
+    if not pieces:
+        raise ValueError(
+            f"no windows: a window needs {length} frames, the longest of {len(recordings)} recordings has {longest}"
+        )
+    x = np.ascontiguousarray(np.concatenate(pieces), dtype=np.float32)
+    return Windows(x, np.repeat(classes, counts), np.repeat(np.arange(len(recordings)), counts))
+
+
+def split(
+    windows: Windows, *, test: float = 0.2, validation: float = 0.2, seed: int = 0
+) -> tuple[Windows, Windows, Windows]:
+    """Return ``(train, validation, test)``, split by recording and stratified by class.
+
+    ``validation`` is a share of what the test leaves, so the defaults give 64 %, 16 % and 20 % (Section VI-C). Every
+    class has a recording on each side, which plain stratification does not promise for small classes; a share of 0
+    leaves that side empty.
+
+    Raises:
+        ValueError: a share outside [0, 1), a class with too few recordings, a recording with two labels.
+    """
+    for name, share in (("test", test), ("validation", validation)):
+        if not 0 <= share < 1:
+            raise ValueError(f"the {name} share must lie in [0, 1), got {share}")
+    recordings, first, inverse = np.unique(windows.recording, return_index=True, return_inverse=True)
+    classes = windows.y[first]  # of each recording
+    if (mixed := classes[inverse] != windows.y).any():
+        raise ValueError(
+            f"recording {windows.recording[mixed][0]} has windows of two classes: give each its own number"
+        )
+    sides = 1 + (test > 0) + (validation > 0)
+    for label, count in zip(*np.unique(classes, return_counts=True), strict=True):
+        if count < sides:
+            raise ValueError(f"class {label} has {count} recordings: a split into {sides} parts needs at least {sides}")
+    rng = np.random.default_rng(seed)
+    rest = np.arange(len(recordings))
+    chosen = _draw(rest, classes, test, 1 + (validation > 0), rng)
+    rest = np.setdiff1d(rest, chosen)
+    held_out = _draw(rest, classes, validation, 1, rng)
+    side = np.zeros(len(recordings), dtype=np.int64)
+    side[held_out], side[chosen] = 1, 2
+    train, val, tested = (windows.select(side[inverse] == i) for i in range(3))
+    return train, val, tested
+
+
+def _draw(
+    candidates: NDArray[np.intp], classes: NDArray[np.int64], share: float, leave: int, rng: np.random.Generator
+) -> NDArray[np.intp]:
+    """Draw ``share`` of the candidates: of each class at least one, and at least ``leave`` left over."""
+    if share == 0:
+        return candidates[:0]
+    _, of, counts = np.unique(classes[candidates], return_inverse=True, return_counts=True)
+    take = np.clip(np.floor(share * counts), 1, counts - leave).astype(int)
+    # Largest remainders first, so that the whole has its share although no class can give a part of a recording.
+    for i in np.argsort(take - share * counts, kind="stable"):
+        if take.sum() < round(share * len(candidates)) and take[i] < counts[i] - leave:
+            take[i] += 1
+    return np.concatenate([rng.permutation(candidates[of == i])[:n] for i, n in enumerate(take)])

@@ -1,0 +1,1 @@
+"""Scores, sensitivity to single faults, the demo and its HTML report."""

@@ -1,0 +1,83 @@
+"""The report of a repair: one HTML file that needs nothing else, for the technician."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from adaptfault.evaluation.html_page import embedded, render, version_of
+from diagnostics import FaultSet
+from diagnostics.decision.plot import draw_forces, pads_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from adaptfault.evaluation.demo import DemoResult
+
+
+@dataclass(frozen=True)
+class _Row:
+    """An injected fault beside what was found of it."""
+
+    injected: str
+    cells: int
+    found: int
+    causes: tuple[str, ...]
+
+
+def write_report(path: str | Path, result: DemoResult) -> Path:
+    """Write the report of a demo run; returns its path.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    return render(
+        path,
+        "report.html",
+        result=result,
+        layout=result.recordings.layout,
+        rows=_rows(result),
+        alarms=_false_alarm_texts(result),
+        forces=embedded(_draw_maps(result)),
+        verdicts=embedded(result.diagnosis.plot()),
+        versions=", ".join(f"{name} {version_of(name)}" for name in ("adaptfault", "torch", "numpy", "scikit-learn")),
+        python=platform.python_version(),
+    )
+
+
+def _rows(result: DemoResult) -> list[_Row]:
+    faulty = result.diagnosis.fault_set
+    rows = []
+    for fault in result.injected:
+        causes = tuple(f.reason for f in result.diagnosis.faults if set(f.cells) & set(fault.cells))
+        found = sum(cell in faulty for cell in fault.cells)
+        rows.append(_Row(fault.describe(result.recordings.layout), len(fault.cells), found, causes))
+    return rows
+
+
+def _false_alarm_texts(result: DemoResult) -> list[str]:
+    layout = result.recordings.layout
+    return ["pad {}, row {}, column {}".format(*layout.position(c)) for c in result.false_alarms]
+
+
+def _draw_maps(result: DemoResult) -> Figure:
+    """Draw mean forces as the paper's Figure 3, with a third row: what the repaired model sees."""
+    layout = result.recordings.layout
+    figure, axes = pads_figure(layout, n_rows=len(result.maps))
+    masked = {name: np.where(layout.present.ravel(), values, np.nan) for name, values in result.maps.items()}
+    # One colour scale for all, from the healthy map: a short then stands out as what it is, off the scale.
+    top = float(np.nanmax(masked["normal"])) or layout.full_scale
+    marks = {"normal": FaultSet((), layout.n_cells), "broken": result.injected_set}
+    for (name, values), row in zip(masked.items(), axes, strict=True):
+        dead = marks.get(name, result.diagnosis.fault_set)
+        for pad, ax in enumerate(row):
+            size = layout.rows * layout.cols
+            on_pad = [c - pad * size for c in dead if c // size == pad]
+            image = draw_forces(ax, layout.grid(values)[pad], layout, on_pad, vmin=0, vmax=top, cmap="viridis")
+            ax.set_title(f"{name}, pad {pad}", fontsize=9)
+        figure.colorbar(image, ax=row.tolist(), label=layout.unit, extend="max")
+    return figure

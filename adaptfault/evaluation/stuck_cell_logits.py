@@ -1,0 +1,257 @@
+"""What a network says with one cell stuck, for every cell in turn, at a fraction of the cost of running it each time.
+
+A window with a stuck cell differs from the window itself by one number a frame. Everything up to the first attention is
+linear (the convolutions have no ReLU), and from there on the residual stream of width d stays a combination of few
+vectors: what the frame itself gives (r), what one unit in the stuck cell gives, straight and through each head (a, five
+vectors), and what all stuck cells of a window have in common (B): what the frames give through each head, and the
+columns of the later linear layers. So the stream is kept as coordinates (sigma, tau, y) of sigma r + tau a + y B. A
+LayerNorm maps the vectors once for all and divides the coordinates; its variance is a quadratic form in them. Frames
+are sums of cells. So no vector of width d is made for a window, and the result is the network's own up to rounding.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from adaptfault.models.network import HEAD_DIM, HEADS, EncoderBlock, TactileTransformer, attend, logits_of
+
+_TIE = 2e-4  # of the largest; closer logits are computed again by the network itself, so that rounding decides nothing
+_BATCH = 512  # stuck cells at once
+_VALUES = HEADS * HEAD_DIM  # what the first attention gives, before it is known to mix few values
+_PARTS = 4  # of a quadratic form
+
+
+class StuckCells:
+    """The network's logits for windows in which one cell is stuck.
+
+    Dropout is left out, whatever mode the model is in. Its weights must stay as they are.
+    """
+
+    def __init__(self, model: TactileTransformer) -> None:
+        self.model = model
+        with torch.no_grad():
+            cells = torch.diag(model.present.to(model.head.weight.dtype))  # absent positions give nothing
+            frames = _convolved(model, torch.cat([cells, torch.zeros_like(cells[:1])]))
+            frames[:-1] -= frames[-1]  # of one unit in each cell; the last is that of no pressure, (D + 1, d)
+            reader = cast(EncoderBlock, model.blocks[0]).qkv
+            first = frames @ reader.weight.T
+            first[-1] += reader.bias
+            self.first = first.view(-1, 3, HEADS, HEAD_DIM).permute(1, 2, 0, 3)  # (3, heads, D + 1, 64)
+            self.layers = _layers(model, frames, _spread(self.first[2, :, :-1].transpose(0, 1)))
+
+    @torch.no_grad()
+    def logits(self, window: Tensor, cells: Tensor, values: Tensor) -> Tensor:
+        """Return logits ``[P, n_classes]`` of ``window [T, D]`` with cell ``cells[p]`` stuck at ``values[p]``."""
+        out = self._by_coordinates(window, cells, values)
+        best = out.topk(min(2, out.shape[1]), dim=1).values
+        near = (best[:, 0] - best[:, -1] < _TIE * out.abs().amax(1)).nonzero().squeeze(1)
+        if len(near) and out.shape[1] > 1:
+            stuck = window.repeat(len(near), 1, 1)
+            stuck[torch.arange(len(near), device=window.device), :, cells[near]] = values[near, None]
+            out[near] = logits_of(self.model, stuck).to(out.device)
+        return out
+
+    def _by_coordinates(self, window: Tensor, cells: Tensor, values: Tensor) -> Tensor:
+        frames = torch.where(self.model.present, window, 0.0)
+        frames = torch.cat([frames, torch.ones_like(frames[:, :1])], dim=1)  # (T, D + 1)
+        own = frames @ self.first  # (3, heads, T, 64)
+        shared = _spread(own[2].transpose(0, 1)).flatten(0, 1)  # (T * heads, 256)
+        seen = [layer.within(frames, shared) for layer in self.layers]
+        delta = values[:, None] - window.T[cells]  # (P, T)
+        batches = zip(torch.split(cells, _BATCH), torch.split(delta, _BATCH), strict=True)
+        return torch.cat([self._answers(own, seen, *batch) for batch in batches])
+
+    def _answers(self, own: Tensor, seen: list[_Seen], cells: Tensor, delta: Tensor) -> Tensor:
+        """Return the logits of P stuck cells whose readings move by ``delta [P, T]``."""
+        shares = self._attention(own, cells, delta)  # (heads, P, T, T)
+        through = (shares @ delta[..., None]).squeeze(3).permute(1, 2, 0)
+        sigma, tau = torch.ones_like(delta), torch.cat([delta[..., None], through], dim=2)
+        # One buffer takes all coordinates as they come; 1 is the coordinate of a bias, of a layer or of a norm.
+        y = delta.new_ones(*delta.shape, len(seen[-1].read))
+        mixed = shares.permute(1, 2, 3, 0).flatten(2)
+        y[..., : mixed.shape[2]] = mixed
+        for layer, at in zip(self.layers, seen, strict=True):
+            known = y[..., : len(at.gram)]
+            inner = _half_product(known, at.gram)
+            inner.addcmul_(sigma[..., None], at.frames_along)
+            inner.baddbmm_(tau, at.cells_along[cells])
+            square = 2 * inner.mul_(known).sum(-1) + sigma**2 * at.frames_square
+            square += (tau @ layer.products[cells] + 2 * sigma[..., None] * at.across[cells]).mul_(tau).sum(-1)
+            scale = torch.rsqrt(square / len(layer.norm.weight) + layer.norm.eps)
+            sigma, tau = sigma * scale, tau * scale[..., None]
+            known *= scale[..., None]
+            if layer is not self.layers[-1]:
+                out = y.new_empty(*delta.shape, at.read.shape[1])
+                _times(y[..., : len(at.read)], at.read, out)
+                out.addcmul_(sigma[..., None], at.frames_read)
+                out.baddbmm_(tau, layer.cells_read[cells])
+                out = attend(out) if layer.attends else out.relu_()
+                y[..., len(at.read) : len(at.read) + out.shape[2]] = out
+        pooled = y.mean(1) @ at.read + sigma @ at.frames_read / sigma.shape[1]  # over the frames
+        pooled += (tau.mean(1, keepdim=True) @ layer.cells_read[cells]).squeeze(1)
+        return cast(Tensor, self.model.head(F.relu(pooled)))
+
+    def _attention(self, own: Tensor, cells: Tensor, delta: Tensor) -> Tensor:
+        """Return the share that each frame takes of each frame in the first attention, ``[heads, P, T, T]``."""
+        query, key = (self.first[i][:, cells] for i in (0, 1))  # of one unit in the stuck cell, (heads, P, 64)
+        key_side = query @ own[1].mT + (query * key).sum(2, keepdim=True) * delta
+        scores = delta[:, :, None] * key_side[:, :, None]
+        scores.addcmul_((key @ own[0].mT)[..., None], delta[:, None])
+        scores += (own[0] @ own[1].mT)[:, None]
+        return torch.softmax(scores / HEAD_DIM**0.5, dim=3)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A layer as one window of T frames has it, in m coordinates: those of :class:`_Layer`, the first 256 replaced.
+
+    Attributes:
+        gram: ``[m, m]``, for :func:`_half_product`.
+        read: ``[m + 1, k]``.
+        frames_along: ``[T, m]``, inner products of the frames with the vectors of the layer.
+        frames_square: ``[T]``, of the frames with themselves.
+        frames_read: ``[T, k]``, what is read of them.
+        cells_along: ``[D, K, m]``.
+        across: ``[D, T, K]``, inner products of frames and cells.
+    """
+
+    gram: Tensor
+    read: Tensor
+    frames_along: Tensor
+    frames_square: Tensor
+    frames_read: Tensor
+    cells_along: Tensor
+    across: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class _Layer:
+    """A LayerNorm, the vectors that it finds in the stream, and what reads the stream next.
+
+    These are m that linear layers have written (the first 256 by the first attention), and K = 1 + heads for each of D
+    cells: what one unit in the cell gives straight, and through each head.
+
+    Attributes:
+        norm: the LayerNorm.
+        gram: ``[m, m]``, inner products of what has been written, each vector without its mean.
+        read: ``[m + 1, k]``, what the next linear layer reads of it after the norm, of the norm's bias, of its own.
+        attends: what it reads are queries, keys and values.
+        straight: ``[D + 1, D + 1]``, inner products of the cells' first vectors, and of what no pressure gives.
+        straight_along: ``[D + 1, m]``, those with what has been written.
+        straight_read: ``[D + 1, k]``, what is read of them.
+        through: ``[D, heads, 256]``, the cells' other vectors as coordinates of the first 256.
+        cells_along: ``[D, K, m]``, inner products with what has been written.
+        products: ``[D, K, K]``, of the vectors of one cell.
+        cells_read: ``[D, K, k]``, what is read of them.
+    """
+
+    norm: nn.LayerNorm
+    gram: Tensor
+    read: Tensor
+    attends: bool
+    straight: Tensor
+    straight_along: Tensor
+    straight_read: Tensor
+    through: Tensor
+    cells_along: Tensor
+    products: Tensor
+    cells_read: Tensor
+
+    @classmethod
+    def of(cls, norm: nn.LayerNorm, reader: nn.Linear, written: Tensor, cells: Tensor, through: Tensor) -> _Layer:
+        """Work out what is needed of centred vectors, ``written [m, d]`` and ``cells [D + 1, d]``."""
+        gram, along = written @ written.T, cells @ written.T
+        read = torch.cat([written * norm.weight, norm.bias[None]]) @ reader.weight.T
+        read[-1] += reader.bias  # the coordinate of the norm's bias is 1
+        straight, straight_read = cells @ cells.T, (cells * norm.weight) @ reader.weight.T
+        cells_along = torch.cat([along[:-1, None], through @ gram[:_VALUES]], dim=1)
+        others = cells_along[:, :, :_VALUES] @ through.mT
+        first = torch.cat([straight.diagonal()[:-1, None, None], others[:, :1].mT], dim=1)
+        cells_read = torch.cat([straight_read[:-1, None], through @ read[:_VALUES]], dim=1)
+        products = torch.cat([first, others], dim=2)
+        attends = reader.out_features == 3 * _VALUES
+        return cls(
+            norm, gram, read, attends, straight, along, straight_read, through, cells_along, products, cells_read
+        )
+
+    def within(self, frames: Tensor, shared: Tensor) -> _Seen:
+        """Return what a window of ``frames [T, D + 1]`` has; ``shared [n, 256]`` replace the first 256 vectors."""
+        along, straight = frames @ self.straight_along, frames @ self.straight
+        return _Seen(
+            gram=_half_gram(_mix(_mix(self.gram, shared).T, shared)),
+            read=torch.cat([shared @ self.read[:_VALUES], self.read[_VALUES:]]),
+            frames_along=_mix(along, shared),
+            frames_square=(straight * frames).sum(1),
+            frames_read=frames @ self.straight_read,
+            cells_along=_mix(self.cells_along, shared),
+            across=torch.cat([straight[:, :-1].T[..., None], along[:, :_VALUES] @ self.through.mT], dim=2),
+        )
+
+
+def _layers(model: TactileTransformer, cells: Tensor, through: Tensor) -> list[_Layer]:
+    """Follow what is written, and what cells ``[D + 1, d]`` give, through the norms."""
+    first, second = (cast(EncoderBlock, block) for block in model.blocks)
+    layers: list[_Layer] = []
+    written = cells.new_zeros(0, cells.shape[1])
+    for writer, norm, reader in (
+        (first.out, first.norm1, first.up),
+        (first.down, first.norm2, second.qkv),
+        (second.out, second.norm1, second.up),
+        (second.down, second.norm2, model.dense),
+    ):
+        written = torch.cat([written, writer.weight.T, writer.bias[None]])
+        written = written - written.mean(1, keepdim=True)
+        cells = cells - cells.mean(1, keepdim=True)
+        layers.append(_Layer.of(norm, reader, written, cells, through))
+        written, cells = torch.cat([written * norm.weight, norm.bias[None]]), cells * norm.weight
+    return layers
+
+
+def _convolved(model: TactileTransformer, frames: Tensor) -> Tensor:
+    """Return what the convolutions make of frames ``[n, D]``, ``[n, d]``."""
+    frames = torch.where(model.present, frames, 0.0)
+    out: Tensor = model.conv2(model.conv1(frames.reshape(-1, *model.layout.shape))).flatten(1)
+    return out
+
+
+def _spread(values: Tensor) -> Tensor:
+    """Put the values ``[n, heads, 64]`` of each head at their place among those of all, ``[n, heads, 256]``."""
+    return torch.diag_embed(values.mT).permute(0, 2, 3, 1).flatten(2)
+
+
+def _mix(products: Tensor, shared: Tensor) -> Tensor:
+    """Turn inner products ``[..., m]`` with the first 256 vectors into those with ``shared [n, 256]`` of them."""
+    return torch.cat([products[..., :_VALUES] @ shared.T, products[..., _VALUES:]], dim=-1)
+
+
+def _edges(m: int) -> list[tuple[int, int]]:
+    """Return where each of the parts of m begins and ends."""
+    at = [m * i // _PARTS for i in range(_PARTS + 1)]
+    return list(itertools.pairwise(at))
+
+
+def _half_gram(gram: Tensor) -> Tensor:
+    """Return ``gram [m, m]`` with the blocks on its diagonal halved, for :func:`_half_product`."""
+    for start, stop in _edges(len(gram)):
+        gram[start:stop, start:stop] /= 2
+    return gram
+
+
+def _half_product(y: Tensor, gram: Tensor) -> Tensor:
+    """Return z of ``y [P, T, m]`` such that z y = y G y / 2, G being symmetric: 5 / 8 of the work of y G."""
+    out = y.new_empty(y.shape)
+    for start, stop in _edges(len(gram)):
+        _times(y[..., :stop], gram[:stop, start:stop], out[..., start:stop])
+    return out
+
+
+def _times(y: Tensor, matrix: Tensor, out: Tensor) -> None:
+    """Write ``y [P, T, m]`` times ``matrix [m, k]`` to ``out [P, T, k]``; both may be parts of a wider buffer."""
+    a, b = (part.as_strided((part.shape[0] * part.shape[1], part.shape[2]), (part.stride(1), 1)) for part in (y, out))
+    torch.mm(a, matrix, out=b)

@@ -1,0 +1,225 @@
+"""The state of a fleet: who needs a technician first, which wires die most, what could not be maintained."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict, dataclass
+from datetime import date, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from adaptfault.fleet.outcome import Outcome
+
+SCHEMA = "adaptfault.fleet/1"
+STATES = ("ok", "degraded", "technician", "unknown")
+
+_SHOWN = 10  # of each list, in the text
+_YEAR = 365.25
+
+
+@dataclass(frozen=True)
+class WireCount:
+    """How often one wire is at fault over the fleet.
+
+    Attributes:
+        wire: the line, as "pad 1, row 2", or "single cells".
+        kind: of the fault.
+        shape: of the skins it is on; lines of different skins are different wires.
+        robots: how many have it.
+        share: of the robots with such a skin.
+        cells: behind it, over all of them.
+    """
+
+    wire: str
+    kind: str
+    shape: str
+    robots: int
+    share: float
+    cells: int
+
+    def __str__(self) -> str:
+        return f"{self.wire} {self.kind}: {self.robots} robots ({100 * self.share:.1f} %), {self.cells} cells"
+
+
+@dataclass(frozen=True)
+class AgeGroup:
+    """Robots whose skin has been in service for the same number of whole years.
+
+    Attributes:
+        years: whole years in service.
+        robots: how many were looked at.
+        degraded: how many of them have a fault.
+        wires: dead lines in each, on average.
+        cells: faulty cells in each, on average.
+        worst: the line that is dead most often, with its number of robots; None if none is.
+    """
+
+    years: int
+    robots: int
+    degraded: int
+    wires: float
+    cells: float
+    worst: str | None
+
+    def __str__(self) -> str:
+        worst = f"; most often {self.worst}" if self.worst else ""
+        return (
+            f"{self.years} to {self.years + 1} years: {self.degraded} of {self.robots} robots have faults,"
+            f" {self.wires:.2f} wires and {self.cells:.1f} cells each{worst}"
+        )
+
+
+@dataclass(frozen=True)
+class FleetReport:
+    """How maintenance of a fleet ended.
+
+    Attributes:
+        outcomes: one a robot, in the order of the list.
+        began, ended: UTC, as ISO 8601.
+        dry_run: nothing was changed.
+        source: the list of the fleet.
+    """
+
+    outcomes: tuple[Outcome, ...]
+    began: str
+    ended: str
+    dry_run: bool = False
+    source: str = ""
+
+    @property
+    def exit_code(self) -> int:
+        """The worst of the robots: 2 if one needs a technician, else 3 if one is unknown, else 1, else 0.
+
+        A robot known to be bad weighs more than one nothing is known of.
+        """
+        return max((o.exit_code for o in self.outcomes), key=(0, 1, 3, 2).index, default=0)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Robots by state: ok (exit code 0), degraded (1), technician (2), unknown (3)."""
+        codes = Counter(o.exit_code for o in self.outcomes)
+        return {state: codes[code] for code, state in enumerate(STATES)}
+
+    @cached_property
+    def technician(self) -> tuple[Outcome, ...]:
+        """Robots that need one, the most urgent first: by the accuracy left, then by the share of dead cells."""
+        needy = [o for o in self.outcomes if o.exit_code == 2]
+        return tuple(sorted(needy, key=lambda o: (o.kept, -(o.faulty or 0) / (o.cells or 1), o.robot.name)))
+
+    @property
+    def errors(self) -> tuple[Outcome, ...]:
+        """Robots nothing is known of: an error, or recordings that are unusable."""
+        return tuple(o for o in self.outcomes if o.exit_code == 3)
+
+    @cached_property
+    def wires(self) -> tuple[WireCount, ...]:
+        """Wires at fault, those of most robots first; cells by themselves are one entry a kind."""
+        skins = Counter(o.shape for o in self.outcomes if o.shape)
+        robots: Counter[tuple[str, str, str]] = Counter()
+        cells: Counter[tuple[str, str, str]] = Counter()
+        for outcome in self.outcomes:
+            behind: Counter[tuple[str, str, str]] = Counter()
+            for cause in outcome.causes:
+                behind[cause.wire or "single cells", cause.kind, outcome.shape or ""] += cause.cells
+            robots.update(behind.keys())
+            cells.update(behind)
+        found = [WireCount(*key, n, n / skins[key[2]], cells[key]) for key, n in robots.items()]
+        return tuple(sorted(found, key=lambda w: (-w.robots, -w.cells, w.wire, w.kind, w.shape)))
+
+    @property
+    def families(self) -> dict[str, int]:
+        """Root causes by what they sit on: row, column, address lines, converter, single cells; most frequent first."""
+        causes = Counter(cause.family or "single cells" for o in self.outcomes for cause in o.causes)
+        return dict(causes.most_common())
+
+    @cached_property
+    def ages(self) -> tuple[AgeGroup, ...]:
+        """Faults by whole years in service, of robots that were looked at and whose first day is known."""
+        today = datetime.fromisoformat(self.ended).date()
+        groups: dict[int, list[Outcome]] = {}
+        for outcome in self.outcomes:
+            if outcome.robot.commissioned is not None and outcome.decision != "error":
+                days = (today - date.fromisoformat(outcome.robot.commissioned)).days
+                groups.setdefault(max(0, int(days / _YEAR)), []).append(outcome)
+        return tuple(_group(years, groups[years]) for years in sorted(groups))
+
+    @property
+    def seconds(self) -> float:
+        """What all robots took on the workers, added up."""
+        return sum(o.seconds for o in self.outcomes)
+
+    def __str__(self) -> str:
+        status = ("OK", "WARNING", "CRITICAL", "UNKNOWN")[self.exit_code]
+        counts = ", ".join(f"{n} {state}" for state, n in self.counts.items() if n) or "none"
+        measured = " ".join(f"{state}={n};;;0;{len(self.outcomes)}" for state, n in self.counts.items())
+        would = " (dry run: nothing was changed)" if self.dry_run else ""
+        lines = [f"ADAPTFAULT FLEET {status} - {len(self.outcomes)} robots: {counts}{would} | {measured}"]
+        lines += _listed("need a technician, the most urgent first", [_needy(o) for o in self.technician])
+        lines += _listed("die most", [str(wire) for wire in self.wires])
+        lines += _listed("by age", [str(group) for group in self.ages])
+        lines += _listed("nothing is known of", [f"{o.robot.name}: {o.reason}" for o in self.errors])
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict."""
+        return {
+            "schema": SCHEMA,
+            "source": self.source,
+            "began": self.began,
+            "ended": self.ended,
+            "dry_run": self.dry_run,
+            "exit_code": self.exit_code,
+            "counts": self.counts,
+            "technician": [o.robot.name for o in self.technician],
+            "errors": {o.robot.name: o.reason for o in self.errors},
+            "wires": [asdict(wire) for wire in self.wires],
+            "families": self.families,
+            "ages": [asdict(group) for group in self.ages],
+            "seconds": self.seconds,
+            "outcomes": [o.to_dict() for o in self.outcomes],
+        }
+
+    def write_page(self, path: str | Path) -> Path:
+        """Write the report as one HTML file that needs nothing else; returns its path.
+
+        Raises:
+            OSError: the folder cannot be written.
+        """
+        import platform
+
+        from adaptfault.evaluation.html_page import render, version_of
+
+        return render(
+            path,
+            "fleet.html",
+            report=self,
+            versions=f"adaptfault {version_of('adaptfault')}",
+            python=platform.python_version(),
+        )
+
+
+def _group(years: int, outcomes: list[Outcome]) -> AgeGroup:
+    robots = Counter(wire for o in outcomes for wire in {c.wire for c in o.causes if c.wire})
+    worst = min(robots, key=lambda wire: (-robots[wire], wire), default=None)
+    return AgeGroup(
+        years=years,
+        robots=len(outcomes),
+        degraded=sum(bool(o.faulty) for o in outcomes),
+        wires=sum(len({c.wire for c in o.causes if c.wire}) for o in outcomes) / len(outcomes),
+        cells=sum(o.faulty or 0 for o in outcomes) / len(outcomes),
+        worst=None if worst is None else f"{worst} ({robots[worst]})",
+    )
+
+
+def _needy(o: Outcome) -> str:
+    tags = f" [{', '.join(o.robot.tags)}]" if o.robot.tags else ""
+    left = f"{100 * o.kept:.0f} % of the accuracy is left" if o.accuracy is not None else o.reason
+    return f"{o.robot.name}{tags}: {left}; {o.faulty} of {o.cells} cells are faulty"
+
+
+def _listed(title: str, entries: list[str]) -> list[str]:
+    if not entries:
+        return []
+    more = [f"  and {len(entries) - _SHOWN} more"] if len(entries) > _SHOWN else []
+    return [f"{title}:", *(f"  {entry}" for entry in entries[:_SHOWN]), *more]

@@ -1,0 +1,1 @@
+"""Expected readings of missing cells, given the healthy cells."""

@@ -1,0 +1,78 @@
+"""A base made to be repaired: while it trains, random cells go missing and are filled in, as a repair will do later."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from adaptfault.data.windows import Windows
+from adaptfault.imputation.linear import AffineFill, CellStatistics
+from diagnostics import FaultSet, SensorLayout
+
+_WHOLE = 0.2  # share of the parts of a batch that keep all cells
+_PARTS = 2  # of a batch, each with a fault set of its own
+_MOST = 0.9  # of scattered cells are missing at most
+_VALIDATED = 16  # fault sets that validation looks at, each on its share of the recordings
+
+
+def random_fault_set(layout: SensorLayout, rng: np.random.Generator) -> FaultSet:
+    """Draw a fault set of any shape and size: scattered cells, lines, a block or a whole pad.
+
+    Lines are rows or columns, up to half of them, at random or side by side, of one pad or the same ones of all pads
+    (as a broken address does). Where there is one pad only, no pad is lost as a whole. One cell at least stays healthy.
+    """
+    pads, rows, cols = layout.shape
+    lost = np.zeros(layout.shape, dtype=bool)
+    which = slice(None) if rng.random() < 0.5 else slice(pad := int(rng.integers(pads)), pad + 1)
+    match rng.choice(["cells", "lines", "band", "block"] + ["pad"] * (pads > 1)):
+        case "cells":
+            lost = rng.random(layout.shape) < rng.uniform(0, _MOST)
+        case "lines" | "band" as shape:
+            axis = int(rng.integers(1, 3))
+            n = layout.shape[axis]
+            many = int(rng.integers(1, max(2, n // 2 + 1)))
+            first = int(rng.integers(n - many + 1))
+            lines = np.arange(first, first + many) if shape == "band" else rng.choice(n, many, replace=False)
+            np.moveaxis(lost[which], axis, 0)[lines] = True
+        case "block":
+            (top, bottom), (left, right) = (np.sort(rng.choice(n + 1, 2, replace=False)) for n in (rows, cols))
+            lost[which, top:bottom, left:right] = True
+        case "pad":
+            lost[rng.integers(pads)] = True
+    cells = np.flatnonzero(lost.ravel() & layout.present.ravel())
+    if len(cells) == layout.present.sum():
+        cells = rng.permutation(cells)[1:]
+    return FaultSet(tuple(cells.tolist()), layout.n_cells)
+
+
+class RandomRepairs:
+    """For the ``augment`` of training: each part of a batch loses a random fault set, and the linear fill repairs it.
+
+    Args:
+        layout: the array.
+        statistics: of its fault-free frames.
+    """
+
+    def __init__(self, layout: SensorLayout, statistics: CellStatistics) -> None:
+        self.layout, self.statistics = layout, statistics
+
+    def __call__(self, x: Tensor, generator: torch.Generator) -> Tensor:
+        """Map windows ``[B, T, D]`` on the 0..1 scale to windows of the same shape."""
+        rng = np.random.default_rng(int(torch.randint(2**62, (1,), generator=generator)))
+        return torch.cat([x if rng.random() < _WHOLE else self._repair(x, rng) for x in torch.chunk(x, _PARTS)])
+
+    def beside(self, windows: Windows, seed: int) -> Windows:
+        """Return windows twice: as they are, and repaired after random losses, the same for each seed."""
+        rng = np.random.default_rng(seed)
+        group = np.unique(windows.recording, return_inverse=True)[1] % _VALIDATED
+        repaired = windows.x.copy()
+        for i in range(min(_VALIDATED, group.max() + 1)):
+            repaired[group == i] = self._repair(torch.from_numpy(repaired[group == i]), rng).numpy()
+        return Windows(np.concatenate([windows.x, repaired]), np.tile(windows.y, 2), np.tile(windows.recording, 2))
+
+    @torch.no_grad()
+    def _repair(self, x: Tensor, rng: np.random.Generator) -> Tensor:
+        faults = random_fault_set(self.layout, rng)
+        filled: Tensor = AffineFill(faults, *self.statistics.conditional_mean(faults))(x[..., faults.healthy])
+        return filled

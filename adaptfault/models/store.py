@@ -1,0 +1,204 @@
+"""Models on disk: a folder with weights (safetensors) and what they mean (JSON), hashed, never pickle."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from adaptfault.data.atomic import atomic_write
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from torch import Tensor
+
+    from adaptfault.models.network import TactileTransformer
+
+SCHEMA = "adaptfault.model/1"
+ADAPTATION = "adaptfault.adaptation/1"  # schema of an adapted model
+MANIFEST = "manifest.json"
+
+
+def save_tensors(folder: str | Path, schema: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    """Write tensors and what they mean into a folder, which is made if need be; what it held before is replaced.
+
+    The tensors go to a file named by their hash and ``manifest.json`` then names that file, so that replacing one small
+    file switches from the old content to the new.
+
+    Raises:
+        ValueError: ``about`` does not fit into JSON.
+    """
+    from safetensors.torch import save
+
+    # Copies: safetensors refuses tensors that share memory or are not contiguous.
+    _save(folder, schema, about, save({k: tensor.detach().cpu().clone().contiguous() for k, tensor in tensors.items()}))
+
+
+def save_arrays(folder: str | Path, schema: str, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays as :func:`save_tensors` writes tensors. Needs no torch.
+
+    Raises:
+        ValueError: ``about`` does not fit into JSON.
+    """
+    from safetensors.numpy import save
+
+    _save(folder, schema, about, save({name: np.ascontiguousarray(array) for name, array in arrays.items()}))
+
+
+def _save(folder: str | Path, schema: str, about: Mapping[str, Any], data: bytes) -> None:
+    digest = hashlib.sha256(data).hexdigest()
+    name = f"weights-{digest[:12]}.safetensors"
+    manifest = {"schema": schema, **about, "weights": {"file": name, "sha256": digest}}
+    try:
+        text = json.dumps(manifest, indent=1, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"what is to be saved does not fit into JSON: {error}") from None
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    atomic_write(folder / name, data)
+    atomic_write(folder / MANIFEST, text.encode())
+    for old in folder.glob("weights-*.safetensors"):
+        if old.name != name:
+            old.unlink(missing_ok=True)
+
+
+def schema_of(folder: str | Path) -> str:
+    """Return the schema of what is in a folder.
+
+    Raises:
+        FileNotFoundError: there is no ``manifest.json``.
+        ValueError: it is not JSON with a schema.
+    """
+    return str(_manifest(Path(folder))["schema"])
+
+
+def read_manifest(folder: str | Path, schema: str) -> dict[str, Any]:
+    """Return what ``manifest.json`` says. Needs no torch.
+
+    Raises:
+        FileNotFoundError: there is none in the folder.
+        ValueError: it is not JSON, or of another schema.
+    """
+    manifest = _manifest(Path(folder))
+    if manifest["schema"] != schema:
+        raise ValueError(f"{Path(folder) / MANIFEST} has schema {manifest['schema']!r}, expected {schema!r}")
+    return manifest
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    path = folder / MANIFEST
+    if not path.is_file():
+        raise FileNotFoundError(f"{folder}: expected a folder with a {MANIFEST}, found none")
+    try:
+        manifest = json.loads(path.read_bytes())
+        manifest["schema"]
+    except (ValueError, TypeError, KeyError):
+        raise ValueError(f"{path} is damaged or of another program: no JSON with a schema") from None
+    return dict(manifest)
+
+
+def load_tensors(folder: str | Path, schema: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Read what :func:`save_tensors` wrote.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is damaged, or of another schema.
+    """
+    from safetensors.torch import load
+
+    manifest, data = _load(Path(folder), schema)
+    return manifest, load(data)
+
+
+def load_arrays(folder: str | Path, schema: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Read what :func:`save_arrays` wrote; raises what :func:`load_tensors` raises. Needs no torch."""
+    from safetensors.numpy import load
+
+    manifest, data = _load(Path(folder), schema)
+    return manifest, load(data)
+
+
+def _load(folder: Path, schema: str) -> tuple[dict[str, Any], bytes]:
+    manifest = read_manifest(folder, schema)
+    return manifest, read_attached(folder, manifest, "weights")
+
+
+def attach(folder: str | Path, key: str, name: str, data: bytes) -> Path:
+    """Write one more file into a folder that has a manifest, which then states its hash as ``key``; return its path.
+
+    Raises:
+        FileNotFoundError: there is no ``manifest.json``.
+        ValueError: it is damaged.
+    """
+    folder = Path(folder)
+    manifest = {**_manifest(folder), key: {"file": name, "sha256": hashlib.sha256(data).hexdigest()}}
+    atomic_write(folder / name, data)
+    atomic_write(folder / MANIFEST, json.dumps(manifest, indent=1, allow_nan=False).encode())
+    return folder / name
+
+
+def read_attached(folder: str | Path, manifest: Mapping[str, Any], key: str) -> bytes:
+    """Return the content of the file that a manifest states as ``key``. Needs no torch.
+
+    Raises:
+        FileNotFoundError: it is missing.
+        ValueError: its hash is not the stated one, or none is stated.
+    """
+    folder = Path(folder)
+    try:
+        name, digest = manifest[key]["file"], manifest[key]["sha256"]
+        path = folder / Path(name).name  # a manifest cannot point outside its folder
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{folder / MANIFEST} is damaged: {error}") from None
+    if not path.is_file():
+        raise FileNotFoundError(f"{folder / MANIFEST} names a file that is missing: {name}")
+    data = path.read_bytes()
+    if hashlib.sha256(data).hexdigest() != digest:
+        raise ValueError(f"{path} is damaged: its hash is not the one in {MANIFEST}")
+    return data
+
+
+def save_model(
+    folder: str | Path,
+    model: TactileTransformer,
+    *,
+    class_names: Sequence[str] = (),
+    extra: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a model into a folder; an earlier model there is replaced in one step.
+
+    Args:
+        folder: where to.
+        model: its weights and :attr:`~adaptfault.models.network.TactileTransformer.config`.
+        class_names: one name a class, or none.
+        extra: anything JSON-safe to keep with it.
+
+    Raises:
+        ValueError: another number of class names than classes, or ``extra`` does not fit into JSON.
+    """
+    if class_names and len(class_names) != model.n_classes:
+        raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
+    about = {"config": model.config, "class_names": list(class_names), "extra": dict(extra or {})}
+    save_tensors(folder, SCHEMA, about, model.state_dict())
+
+
+def load_model(folder: str | Path) -> TactileTransformer:
+    """Read the model that :func:`save_model` wrote; it comes in eval mode.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a file is damaged, or the weights do not fit the network.
+    """
+    from adaptfault.models.network import TactileTransformer
+
+    manifest, tensors = load_tensors(folder, SCHEMA)
+    try:
+        model = TactileTransformer.from_config(manifest["config"])
+        model.load_state_dict(tensors)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"the model in {folder} is damaged: {str(error).splitlines()[0]}") from None
+    return model.eval()

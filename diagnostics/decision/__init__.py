@@ -1,0 +1,1 @@
+"""From log ratios to the diagnosis: calibration, prevalence, root causes, coverage."""

@@ -1,0 +1,96 @@
+"""Writes any dataclass of numbers and arrays as JSON and named arrays, and reads it back bit for bit. No pickle.
+
+The types of the fields say how each value is read: numbers, booleans, arrays, other dataclasses and named tuples,
+tuples of these, and ``| None``. A :class:`~diagnostics.layout.SensorLayout` is written by its own ``to_dict``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from types import NoneType, UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from diagnostics.layout import SensorLayout
+
+Arrays = dict[str, NDArray[Any]]
+T = TypeVar("T")
+
+
+def to_state(value: object, name: str = "") -> tuple[Any, Arrays]:
+    """Return a JSON-safe description of ``value``, and its arrays by dotted name, as :func:`from_state` reads them."""
+    arrays: Arrays = {}
+    return _packed(value, name, arrays), arrays
+
+
+def from_state(cls: type[T], about: Any, arrays: Mapping[str, ArrayLike]) -> T:
+    """Rebuild what :func:`to_state` wrote.
+
+    Raises:
+        KeyError: a field or an array is missing.
+        TypeError, ValueError: one is of a wrong kind, shape or dtype, or no longer finite.
+    """
+    value: T = _read(cls, about, arrays, cls.__name__)
+    return value
+
+
+def _names(cls: Any) -> list[str]:
+    return [field.name for field in fields(cls)] if is_dataclass(cls) else list(cls._fields)
+
+
+def _structured(cls: Any) -> bool:
+    return is_dataclass(cls) or hasattr(cls, "_fields")
+
+
+def _packed(value: Any, name: str, arrays: Arrays) -> Any:
+    if isinstance(value, SensorLayout):
+        return value.to_dict()
+    if isinstance(value, np.ndarray):
+        arrays[name] = np.array(value, order="C")
+        finite = bool(np.isfinite(value).all())
+        return {"array": name, "dtype": str(value.dtype), "shape": list(value.shape), "finite": finite}
+    if _structured(value):
+        prefix = f"{name}." if name else ""
+        return {key: _packed(getattr(value, key), f"{prefix}{key}", arrays) for key in _names(type(value))}
+    if isinstance(value, tuple):
+        return [_packed(item, f"{name}.{i}", arrays) for i, item in enumerate(value)]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return value if not isinstance(value, float) or np.isfinite(value) else str(value)  # JSON has no infinity
+
+
+def _read(kind: Any, about: Any, arrays: Mapping[str, ArrayLike], name: str) -> Any:
+    origin = get_origin(kind)
+    if origin in (Union, UnionType):
+        (some,) = (option for option in get_args(kind) if option is not NoneType)
+        return None if about is None else _read(some, about, arrays, name)
+    if kind is SensorLayout:
+        return SensorLayout.from_dict(about)
+    if origin is np.ndarray:
+        return _array(about, arrays)
+    if origin is tuple:
+        item = get_args(kind)[0]
+        return tuple(_read(item, each, arrays, f"{name}.{i}") for i, each in enumerate(about))
+    if _structured(kind):
+        if not isinstance(about, Mapping):
+            raise TypeError(f"expected the fields of {name}, got {about!r}")
+        hints = get_type_hints(kind)
+        return kind(**{key: _read(hints[key], about[key], arrays, key) for key in _names(kind)})
+    if isinstance(about, bool) != (kind is bool) or not isinstance(about, int | float | str):
+        raise TypeError(f"expected {kind.__name__} for {name}, got {about!r}")
+    return kind(about)
+
+
+def _array(about: Any, arrays: Mapping[str, ArrayLike]) -> NDArray[Any]:
+    """Return a copy of its own, as the fitted arrays are."""
+    name, array = about["array"], np.asarray(arrays[about["array"]])
+    if str(array.dtype) != about["dtype"] or list(array.shape) != about["shape"]:
+        raise ValueError(
+            f"expected {about['dtype']} {about['shape']} for {name}, got {array.dtype} {list(array.shape)}"
+        )
+    if about["finite"] and not np.isfinite(array).all():
+        raise ValueError(f"{name} holds numbers that are not finite")
+    return np.array(array, order="C")

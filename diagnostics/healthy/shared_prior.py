@@ -1,0 +1,95 @@
+"""What the cells of a large array have in common: how a touch loads a cell, given its nearest neighbours.
+
+A patch sees a few dozen touches, too few to learn from them alone how sharp the edge of a contact is. All patches
+together see thousands. So one regression is shared by all cells, on the cells within three rows and columns of each;
+the model of each patch starts from it, and learns in what it differs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+from scipy.special import expit
+
+from diagnostics.events.tiles import Tile
+from diagnostics.layout import SensorLayout
+from diagnostics.preprocessing.scale import Array
+
+REACH = 3  # rows and columns
+_FEATURES = 4  # see Summary.features
+_MOST, _QUIET = 20_000, 0.2  # samples; share of them without any load around
+_RIDGE = 1e-3  # per sample
+_STEPS = 12  # of Newton's method, each by the curvature there is at most
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Neighbourhoods ``[n, 4, 7, 7]``, the cell itself 0, and what the cell did: never, always loaded, ``[n, 2]``."""
+
+    neighbourhoods: Array
+    did: Array
+
+    @classmethod
+    def of(cls, features: Array, tile: Tile, layout: SensorLayout, rng: np.random.Generator, most: int) -> Samples:
+        """Take at most so many from the stretches of a patch, features ``[n, 4, inputs]``."""
+        alone = tile.rectangle(layout)
+        rows, cols = alone.layout.rows, alone.layout.cols
+        grid = np.zeros((len(features), _FEATURES, rows + 2 * REACH, cols + 2 * REACH), np.float32)
+        r, c = alone.cells // cols, alone.cells % cols
+        grid[:, :, r + REACH, c + REACH] = features
+        windows = np.lib.stride_tricks.sliding_window_view(grid, (2 * REACH + 1,) * 2, axis=(2, 3))
+        neighbourhoods = windows[:, :, r[tile.place], c[tile.place]].transpose(0, 2, 1, 3, 4)
+        neighbourhoods = neighbourhoods.reshape(-1, *neighbourhoods.shape[2:]).copy()  # (n * outputs, 4, 7, 7)
+        own = neighbourhoods[:, :, REACH, REACH].copy()
+        neighbourhoods[:, :, REACH, REACH] = 0
+        loaded = neighbourhoods[:, 2].any(axis=(1, 2))
+        some, quiet = np.flatnonzero(loaded), np.flatnonzero(~loaded)
+        some = rng.permutation(some)[:most]
+        chosen = np.concatenate([some, rng.permutation(quiet)[: round(_QUIET * len(some)) + 1]])
+        did = np.stack([own[:, 2] == 0, own[:, 3] == 1], axis=1)[chosen]
+        return cls(neighbourhoods[chosen], did.astype(np.float32))
+
+
+@dataclass(frozen=True)
+class SharedPrior:
+    """The shared regressions.
+
+    Attributes:
+        weight: float64 ``[2, 4, 7, 7]``, never and always loaded; of each feature of the cells around.
+        bias: ``[2]``.
+    """
+
+    weight: NDArray[np.float64]
+    bias: NDArray[np.float64]
+
+    @classmethod
+    def fit(cls, parts: list[Samples]) -> SharedPrior:
+        """Fit on samples of many patches."""
+        x = np.concatenate([part.neighbourhoods.reshape(len(part.neighbourhoods), -1) for part in parts]).astype(
+            np.float64
+        )[:_MOST]
+        y = np.concatenate([part.did for part in parts]).astype(np.float64)[:_MOST]
+        x = np.concatenate([x, np.ones((len(x), 1))], axis=1)
+        w = np.zeros((x.shape[1], 2))
+        for q in range(2):
+            for _ in range(_STEPS):
+                p = expit(x @ w[:, q])
+                bend = np.maximum(p * (1 - p), 1e-3)
+                slope = x.T @ (p - y[:, q]) / len(x) + _RIDGE * w[:, q]
+                curve = (x * bend[:, None]).T @ x / len(x) + _RIDGE * np.eye(len(w))
+                w[:, q] -= linalg.solve(curve, slope, assume_a="pos")
+        side = 2 * REACH + 1
+        return cls(w[:-1].T.reshape(2, _FEATURES, side, side), w[-1])
+
+    def on(self, tile: Tile, layout: SensorLayout) -> NDArray[np.float64]:
+        """Return the weights of a patch, ``[4, inputs, 2, outputs]``."""
+        rows, cols = tile.inputs // layout.cols % layout.rows, tile.inputs % layout.cols
+        down, across = (of[:, None] - of[tile.place] for of in (rows, cols))  # (inputs, outputs)
+        near = (np.abs(down) <= REACH) & (np.abs(across) <= REACH)
+        found = np.zeros((_FEATURES, len(tile.inputs), 2, len(tile.outputs)))
+        i, j = np.nonzero(near)
+        found[:, i, :, j] = self.weight[:, :, down[i, j] + REACH, across[i, j] + REACH].transpose(2, 1, 0)
+        return found

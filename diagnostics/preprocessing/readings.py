@@ -1,0 +1,96 @@
+"""Recordings as they came, turned into float64 only where they are read: large ones are never held twice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+Recording = NDArray[np.float64]
+
+_MOST_VALUES = 1 << 23  # of a block of frames
+_RECORDINGS, _CELLS = 200, 2000  # of a sample, about
+
+
+class RecordingBlocks(Sequence[Recording]):
+    """A sequence of recordings, float64 ``[T, D]`` each when asked for.
+
+    Args:
+        given: arrays ``[T, D]`` of numbers; kept as they are.
+    """
+
+    def __init__(self, given: Sequence[NDArray[Any]]) -> None:
+        self._given = list(given)
+
+    def __len__(self) -> int:
+        return len(self._given)
+
+    @overload
+    def __getitem__(self, which: int) -> Recording: ...
+    @overload
+    def __getitem__(self, which: slice) -> RecordingBlocks: ...
+    def __getitem__(self, which: int | slice) -> Recording | RecordingBlocks:
+        if isinstance(which, slice):
+            return RecordingBlocks(self._given[which])
+        return np.asarray(self._given[which], dtype=np.float64)
+
+    def piece(self, which: int, frames: slice, cells: NDArray[np.intp]) -> Recording:
+        """Return some frames of some cells of one recording."""
+        return np.asarray(self._given[which][frames][:, cells], dtype=np.float64)
+
+    def blocks(self) -> Iterator[Recording]:
+        """Yield all frames in order, so many at once that a block stays small."""
+        for given in self._given:
+            step = max(1, _MOST_VALUES // given.shape[1])
+            for first in range(0, len(given), step):
+                yield np.asarray(given[first : first + step], dtype=np.float64)
+
+    def sample(self, present: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Iterator[Recording]]:
+        """Return some of the cells that are ``present`` (bool ``[D]``), and some recordings of these, spread evenly."""
+        cells = np.flatnonzero(present)
+        cells = cells[:: max(1, len(cells) // _CELLS)]
+        which = range(0, len(self), max(1, len(self) // _RECORDINGS))
+        return cells, (self.piece(i, slice(None), cells) for i in which)
+
+    def whole(self, present: NDArray[np.bool_]) -> RecordingBlocks:
+        """Return the recordings with the last reading of a cell for each that is missing, without lost frames.
+
+        NaN is left where a cell delivered nothing yet. What misses nothing of the cells that are ``present`` (bool
+        ``[D]``) is not copied.
+
+        Raises:
+            ValueError: no frame with a reading.
+        """
+        whole = [recording for recording in (_whole(given, present) for given in self._given) if len(recording)]
+        if not whole:
+            raise ValueError("the recordings hold no frame with a reading: nothing to learn from")
+        return RecordingBlocks(whole)
+
+    @classmethod
+    def of(cls, recordings: Sequence[NDArray[Any]]) -> RecordingBlocks:
+        """Return ``recordings`` if they are that already."""
+        return recordings if isinstance(recordings, RecordingBlocks) else cls(recordings)
+
+
+def held(frames: NDArray[Any], last: NDArray[Any]) -> NDArray[Any]:
+    """Return the last reading of each cell before ``frames`` and by the end of each, ``[1 + t, D]``; NaN: none yet.
+
+    Args:
+        frames: ``[t, D]``; NaN = missing.
+        last: ``[D]``, the last reading before them.
+    """
+    whole = np.concatenate([last[None], frames])
+    missing = np.isnan(whole)
+    if missing.any():
+        at = np.maximum.accumulate(np.where(missing, 0, np.arange(len(whole))[:, None]), axis=0)
+        whole = np.take_along_axis(whole, at, axis=0)
+    return whole
+
+
+def _whole(given: NDArray[Any], present: NDArray[np.bool_]) -> NDArray[Any]:
+    if not np.isnan(given.min(axis=0)[present]).any():
+        return given
+    came = given[~np.isnan(given).all(axis=1, where=present)]
+    return held(came, np.full(given.shape[1], np.nan))[1:]

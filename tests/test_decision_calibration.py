@@ -1,0 +1,183 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.special import expit
+from sklearn.linear_model import LogisticRegression
+
+from adaptfault.data.recordings import Recordings
+from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
+from diagnostics.decision import calibration
+from diagnostics.decision.calibration import Calibrator, _bounded_logistic, _slope_beyond, faulty_at
+
+ASKED = np.ones(100, bool)
+EARLY = np.zeros(100, int)  # of the kind that never moved
+LATE = np.ones(100, int)  # of the kind that came to rest
+NO_JUMP = np.zeros(100)
+
+
+def probability(
+    ratio: np.ndarray, jump: np.ndarray = NO_JUMP, scored: np.ndarray = ASKED, kind: np.ndarray = EARLY
+) -> np.ndarray:
+    weights = Calibrator()
+    return weights.probability(weights.calibrate(ratio, jump, kind), kind, scored)
+
+
+def test_the_stronger_the_evidence_the_likelier_the_fault():
+    p = probability(np.linspace(-5, 15, 100))
+    assert (np.diff(p) >= 0).all()
+    assert p[0] < 0.1
+    assert p[-1] > 0.99
+    assert ((p >= 0) & (p <= 1)).all()
+
+
+def test_a_jump_adds_to_the_evidence():
+    jump = np.where(np.arange(100) == 7, 4.0, 0.0)
+    p = probability(np.full(100, 2.0), jump, kind=LATE)
+    assert p[7] > p[8]
+
+
+def test_cells_that_move_are_as_good_as_alive_whatever_is_said_of_them():
+    scored = np.arange(100) < 50
+    p = probability(np.full(100, 20.0), scored=scored)
+    assert p[:50].min() > 0.99
+    assert p[50:].max() < 0.001
+
+
+def test_the_same_evidence_weighs_more_where_many_cells_are_broken():
+    alone, among = np.full(100, -3.0), np.full(100, -3.0)
+    alone[0] = among[0] = 4.0
+    among[1:40] = 12.0
+    assert probability(among)[0] > probability(alone)[0]
+
+
+def test_broken_cells_that_never_moved_do_not_make_those_that_did_suspect():
+    kind = np.where(np.arange(100) < 50, 0, 1)
+    many, few = np.full(100, 1.0), np.full(100, 1.0)
+    many[:40] = 15.0
+    assert (probability(many, kind=kind)[50:] == probability(few, kind=kind)[50:]).all()
+    assert (probability(many, kind=kind)[40:50] > probability(few, kind=kind)[40:50]).all()
+
+
+def test_no_cells_at_all_are_asked_without_harm():
+    assert probability(NO_JUMP, scored=~ASKED).max() < 0.001
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_expected_share_of_false_alarms_goes_no_farther_beyond_the_rate_than_it_would_fall_short(seed: int):
+    p = np.random.default_rng(seed).beta(0.3, 0.3, 200)
+    for rate in (0.001, 0.01, 0.2):
+        chosen = faulty_at(p, rate)
+        inside, rest = np.sort(p[chosen]), p[~chosen & (p > 0.5)]
+
+        def off(cells: np.ndarray, rate: float = rate) -> float:
+            return float((1 - cells).sum() - rate * len(cells))
+
+        assert off(inside) <= max(rate - off(inside[1:]), 0) + 1e-12
+        if len(rest):  # one more would have been too far
+            assert off(np.append(inside, rest.max())) > rate - off(inside) - 1e-12
+
+
+def test_a_looser_rate_never_takes_a_cell_out_again():
+    p = np.random.default_rng(0).beta(0.3, 0.3, 200)
+    chosen = [faulty_at(p, rate) for rate in (0.001, 0.01, 0.1, 0.5)]
+    assert all((fewer <= more).all() for fewer, more in pairwise(chosen))
+
+
+def test_no_cell_that_is_rather_alive_is_faulty_however_good_the_others_look():
+    p = np.array([1.0] * 99 + [0.4])
+    assert faulty_at(p, 0.1).sum() == 99
+    assert not faulty_at(np.zeros(5), 0.5).any()
+
+
+def test_too_few_recordings_to_split_give_the_defaults():
+    layout = SensorLayout(1, 3, 3)
+    rng = np.random.default_rng(0)
+    assert Calibrator.fit([rng.uniform(0, 3, (50, 9))] * 3, layout) == Calibrator()
+
+
+@pytest.mark.parametrize(("recordings", "frames"), [(40, 1000), (4, 3000)])
+def test_no_log_is_explained_by_what_its_own_recordings_taught(monkeypatch, recordings: int, frames: int):
+    taught: dict[int, set[int]] = {}
+    used: list[tuple[set[int], set[int], int]] = []  # recordings of a log and of its reference, frames of the log
+
+    class Stop(Exception):
+        pass
+
+    def fit(cls: type, given: list[np.ndarray], layout: SensorLayout) -> object:
+        reference = object()
+        taught[id(reference)] = {int(r[0, 8] // 1) for r in given}
+        kept.append(reference)
+        return reference
+
+    def trial(log: np.ndarray, faults: object, layout: object, reference: object, exclusion: object) -> None:
+        used.append((set(np.unique(log[:, 8] // 1).astype(int).tolist()), taught[id(reference)], len(log)))
+        if len(used) == 20:
+            raise Stop
+
+    kept: list[object] = []
+    monkeypatch.setattr(calibration.Reference, "fit", classmethod(fit))
+    monkeypatch.setattr(calibration, "_trial", trial)
+    rng = np.random.default_rng(0)
+    reference = [np.column_stack([rng.uniform(0, 3, (frames, 8)), np.full(frames, i + 0.5)]) for i in range(recordings)]
+    with pytest.raises(Stop):
+        Calibrator.fit(reference, SensorLayout(1, 3, 3))
+    assert max(frames for *_, frames in used) <= 8 * 600
+    # Of few recordings one may be parted, and no more.
+    assert max(len(log & known) for log, known, _ in used) <= (recordings < 32)
+
+
+def test_what_is_called_likely_is_as_often_true(fitted: SelfDiagnosis, grasps: Recordings):
+    rng = np.random.default_rng(0)
+    said, true = [], []
+    for _ in range(25):
+        log = np.concatenate([grasps.frames[i] for i in rng.choice(np.arange(21, 140, 2), 3, replace=False)])
+        cells = rng.choice(220, 22, replace=False)
+        faults = [Fault(kind, (int(c),)) for c, kind in zip(cells, ["open", "short"] * 11, strict=True)]
+        diagnosis = fitted.diagnose(inject(log, faults, grasps.layout))
+        said.append(diagnosis.probability)
+        true.append(np.isin(np.arange(220), cells))
+    p, broken = np.concatenate(said), np.concatenate(true)
+    for low, high in ((0.0, 0.02), (0.02, 0.2), (0.9, 1.01)):
+        of_bin = (p >= low) & (p < high)
+        assert abs(p[of_bin].mean() - broken[of_bin].mean()) < 0.08
+    assert p.sum() == pytest.approx(broken.sum(), rel=0.25)
+
+
+def test_no_evidence_never_speaks_for_a_fault_however_few_healthy_cells_were_seen():
+    rng = np.random.default_rng(0)
+    dead = np.arange(200) >= 6  # healthy cells that hold a load are rare in a small reference
+    evidence = np.column_stack([np.where(dead, 4, -4) + rng.normal(0, 3, 200), rng.normal(0, 1, 200) + 2 * dead])
+    offset, slope, jump = _bounded_logistic(evidence, dead, base=-1.0)  # as if faults were rarer elsewhere
+    assert offset <= 0
+    assert slope > 0
+    assert 0 <= jump <= 1
+    # Without the bounds, the same data would call a cell faulty that nothing speaks against.
+    free = LogisticRegression(C=10.0).fit(evidence, dead)
+    assert free.intercept_[0] + 1.0 > 2
+
+
+def test_within_the_bounds_it_is_a_logistic_regression():
+    rng = np.random.default_rng(1)
+    evidence = rng.normal(0, 2, (5000, 2))
+    dead = rng.random(5000) < expit(-1.5 + 1.2 * evidence[:, 0] + 0.4 * evidence[:, 1] - 0.5)
+    free = LogisticRegression(C=10.0).fit(evidence, dead)
+    expected = (free.intercept_[0] + 0.5, *free.coef_[0])
+    assert _bounded_logistic(evidence, dead, base=-0.5) == pytest.approx(expected, abs=2e-3)
+
+
+def test_more_evidence_than_is_held_for_certain_is_worth_the_less_the_farther_healthy_cells_go():
+    far = np.linspace(0, 18, 40)
+    dead = np.arange(80) < 40
+    odds = np.full(80, 3.0)
+    assert _slope_beyond(6.1 + np.concatenate([far, far]), odds, dead, 1.5) < 0.1  # healthy ones go as far
+    assert _slope_beyond(6.1 + np.concatenate([far, far / 20]), odds, dead, 1.5) == pytest.approx(1.5)
+    few = np.concatenate([6.1 + far, 6.1 + far[:3], np.zeros(1500)])  # of so many a model errs about some
+    assert _slope_beyond(few, np.full(len(few), 3.0), np.arange(len(few)) < 40, 1.5) == 1.5
+
+
+def test_such_evidence_of_a_cell_that_holds_a_load_all_along_is_worth_as_much_as_any():
+    weights = Calibrator(tail_slope=(0.1, 0.1, 0.1))
+    baseline, loaded = (weights.calibrate(np.array([6.0, 16.0]), np.zeros(2), np.full(2, kind)) for kind in (0, 3))
+    assert baseline[0] == loaded[0] == pytest.approx(3.6)
+    assert (baseline[1], loaded[1]) == pytest.approx((4.6, 9.6))

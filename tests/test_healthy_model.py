@@ -1,0 +1,155 @@
+import numpy as np
+import pytest
+
+from diagnostics import SensorLayout
+from diagnostics.evidence.stream_state import run_to_end
+from diagnostics.healthy.model import HealthyModel, Prediction, excerpts, p_floor_of
+from diagnostics.healthy.tiled_model import fit_healthy_model
+from diagnostics.preprocessing.scale import Scale
+
+LAYOUT = SensorLayout(1, 1, 12)
+SCALE = Scale(np.zeros(12), 0.05, 5.0)
+
+
+def blobs(seed: int, recordings: int = 150) -> list[np.ndarray]:
+    """Presses on a line of 12 cells; what they do not reach reads exactly 0; cell 11 is never reached."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(recordings):
+        centre, force = rng.uniform(1, 7.5), rng.uniform(0.8, 2) * np.sin(np.linspace(0, np.pi, 40))[:, None]
+        load = force * (1 - ((np.arange(12) - centre - np.linspace(0, 0.3, 40)[:, None]) / 2.5) ** 2)
+        found.append(np.where(load > 0.1, load, 0))
+    return found
+
+
+@pytest.fixture(scope="module")
+def model() -> HealthyModel:
+    return HealthyModel.fit(blobs(0), LAYOUT, SCALE)
+
+
+@pytest.fixture(scope="module")
+def unseen() -> np.ndarray:
+    """Features of presses that the model was not fitted on."""
+    return excerpts(blobs(1, 100), SCALE, np.random.default_rng(1))[0]
+
+
+ALL = np.ones(12, bool)
+
+
+def all_but(*cells: int) -> np.ndarray:
+    return ~np.isin(np.arange(12), cells)
+
+
+def test_a_cell_between_loaded_ones_is_hardly_ever_unloaded_and_one_far_from_them_nearly_always(model, unseen):
+    never = run_to_end(model.predict(unseen, ALL)).never
+    loaded = unseen[:, 2] > 0
+    assert np.median(never[:, 4][loaded[:, 3] & loaded[:, 5]]) < 0.05
+    assert never[:, 10][~loaded[:, 8:].any(axis=1)].min() > 0.9
+
+
+def test_it_tells_more_about_touches_not_seen_than_each_cells_own_share(model, unseen):
+    cells = np.arange(1, 9)
+    unloaded = unseen[:, 2, cells] == 0
+    seen = excerpts(blobs(0), SCALE, np.random.default_rng(0))[0]
+
+    def log_loss(p: np.ndarray) -> float:
+        return float(-np.log(np.where(unloaded, p, 1 - p)).mean())
+
+    own_share = np.broadcast_to((seen[:, 2, cells] == 0).mean(axis=0), unloaded.shape)
+    assert log_loss(run_to_end(model.predict(unseen, ALL)).never[:, cells]) < 0.5 * log_loss(own_share)
+
+
+@pytest.mark.parametrize("predictors", [ALL, all_but(4)])
+def test_what_a_cell_reads_itself_does_not_matter(model, unseen, predictors):
+    spoiled = unseen.copy()
+    spoiled[:, :, 4] = 1.0
+    for name in ("never", "always", "mean"):
+        said, of_spoiled = (getattr(run_to_end(model.predict(f, predictors)), name)[:, 4] for f in (unseen, spoiled))
+        np.testing.assert_allclose(of_spoiled, said, atol=1e-5, err_msg=name)
+
+
+def test_what_an_untrusted_cell_reads_matters_to_no_cell(model, unseen):
+    predictors = all_but(3, 6)
+    spoiled = unseen.copy()
+    spoiled[:, :, [3, 6]] = 0.7
+    for name in ("never", "always", "mean"):
+        said, of_spoiled = (getattr(run_to_end(model.predict(f, predictors)), name) for f in (unseen, spoiled))
+        np.testing.assert_allclose(of_spoiled, said, atol=1e-5, err_msg=name)
+
+
+def test_the_load_of_a_cell_is_foreseen_from_the_others_even_beside_untrusted_ones(model, unseen):
+    truth = unseen[:, 1, 4]
+    for predictors, share in ((ALL, 0.3), (all_but(4, 5), 0.5)):
+        error = run_to_end(model.predict(unseen, predictors)).mean[:, 4] - truth
+        assert np.sqrt(np.mean(error**2)) < share * truth.std()
+
+
+def test_without_a_trusted_cell_the_usual_is_expected(model, unseen):
+    expected = run_to_end(model.predict(unseen, ~ALL))
+    assert np.ptp(expected.never, axis=0).max() < 1e-5
+    assert expected.mean[0] == pytest.approx(run_to_end(model.predict(unseen, ~ALL)).mean[-1])
+    assert expected.never[0, 10] > expected.never[0, 4]
+
+
+def test_a_cell_that_was_never_loaded_is_expected_to_stay_so(model, unseen):
+    assert run_to_end(model.predict(unseen, ALL)).never[:, 11].min() > 0.99
+
+
+def test_cells_may_rest_at_any_value():
+    offset = np.linspace(0, 2, 12)
+    moved = excerpts([r + offset for r in blobs(0)], Scale(offset, 0.05, 5.0), np.random.default_rng(0))[0]
+    plain = excerpts(blobs(0), SCALE, np.random.default_rng(0))[0]
+    np.testing.assert_allclose(moved, plain, atol=1e-3)
+
+
+def test_a_wider_range_of_loads_is_likelier_and_that_of_an_unknown_cell_is_certain():
+    one = np.ones((1, 2))
+    expected = Prediction(one, one, np.array([[0.5, 0.5]]), np.array([0.1, np.nan]), np.ones(2))
+    cells = np.arange(2)
+    narrow = expected.within(np.array([0.45, 0.45]), np.array([0.55, 0.55]), cells)
+    wide = expected.within(np.array([0.3, 0.3]), np.array([0.7, 0.7]), cells)
+    far = expected.within(np.array([0.0, 0.0]), np.array([0.1, 0.1]), cells)
+    assert 0 < far[0, 0] < narrow[0, 0] < wide[0, 0] < 1
+    assert narrow[0, 1] == far[0, 1] == 1
+
+
+def test_large_arrays_are_modelled_in_tiles_that_know_every_cell():
+    layout = SensorLayout(1, 2, 260)
+    rng = np.random.default_rng(0)
+    column = np.arange(520) % 260
+    recordings = []
+    for _ in range(300):
+        force = 2 * np.sin(np.linspace(0, np.pi, 8))[:, None]
+        recordings.append(np.maximum(0, force * (1 - ((column - rng.uniform(0, 260)) / 12) ** 2)))
+    scale = Scale(np.zeros(520), 0.05, 5.0)
+    model = fit_healthy_model(recordings, layout, scale)
+    assert len(model.local_regressions) > 1
+    assert sorted(np.concatenate([regression.outputs for regression in model.local_regressions])) == list(range(520))
+    features = excerpts(recordings, scale, rng)[0]
+    expected = run_to_end(model.predict(features, np.ones(520, bool)))
+    assert np.isfinite(expected.spread).all()
+    loaded = features[:, 2] > 0
+    assert expected.never[loaded].mean() < 0.3
+    assert expected.never[~loaded].mean() > 0.9
+
+
+def patted(recordings: int, times: int) -> list[np.ndarray]:
+    """Recordings of one press each, that comes again and again."""
+    return [np.tile(np.concatenate([np.zeros((8, 12)), press]), (times, 1))[8:-4] for press in blobs(3, recordings)]
+
+
+def test_a_press_that_comes_again_and_again_teaches_as_much_as_once():
+    rng = np.random.default_rng(0)
+    *_, once = excerpts(patted(20, 1), SCALE, rng)
+    features, source, again = excerpts(patted(20, 6), SCALE, rng)
+    assert once == again == 20
+    assert len(features) == len(source) > 6 * 20
+    model = HealthyModel.fit(patted(20, 6), LAYOUT, SCALE)
+    assert model.p_floor(12).max() == p_floor_of(20)
+
+
+@pytest.mark.parametrize(("recordings", "sources"), [(20, 20), (3, 18)])
+def test_a_recording_is_one_source_unless_there_are_few(recordings: int, sources: int):
+    _, source, number = excerpts(patted(recordings, 6), SCALE, np.random.default_rng(0))
+    assert sorted(set(source.tolist())) == list(range(sources))
+    assert number == sources

@@ -1,0 +1,274 @@
+import numpy as np
+import pytest
+
+from diagnostics import Line, SensorLayout
+from diagnostics.decision.line_cover import Cause, candidate_groups, cheapest_of_few, cheapest_of_many, solve
+
+LAYOUT = SensorLayout(2, 11, 10)
+SURE, DOUBTFUL, NOTHING = 8.0, 5.0, 0.0
+DOUBT = np.ones(220)
+
+
+def mask(*cells: np.ndarray | list[int]) -> np.ndarray:
+    return np.isin(np.arange(220), np.concatenate([np.asarray(c, int) for c in cells] or [np.zeros(0, int)]))
+
+
+def explained(
+    faulty: np.ndarray, contradicting: np.ndarray, matching: np.ndarray | None = None, weight: np.ndarray | None = None
+) -> tuple[Cause, ...]:
+    """Explain ``faulty`` cells (bool); those that could be faulty too are the untested ones."""
+    matching = ~contradicting if matching is None else matching
+    return solve(
+        faulty,
+        matching | faulty,
+        contradicting,
+        np.where(faulty, SURE, NOTHING) if weight is None else weight,
+        DOUBT,
+        LAYOUT,
+    )
+
+
+def test_a_row_whose_cells_are_faulty_is_one_cause():
+    row = LAYOUT.cells_on(Line(1, "row", 4))
+    (cause,) = explained(mask(row), ~mask(row))
+    assert cause.line == Line(1, "row", 4)
+    assert cause.cells == cause.seen == tuple(row)
+    assert cause.probability > 0.99
+    assert cause.whole
+
+
+def test_an_untested_cell_on_a_broken_wire_is_inferred():
+    column = LAYOUT.cells_on(Line(0, "column", 2))
+    (cause,) = explained(mask(column[:8]), ~mask(column))
+    assert cause.line == Line(0, "column", 2)
+    assert cause.seen == tuple(column[:8])
+    assert cause.cells == tuple(column)
+
+
+@pytest.mark.parametrize("live", [0, 5, 10])
+def test_a_live_cell_on_a_broken_wire_is_never_inferred_to_be_faulty(live: int):
+    column = LAYOUT.cells_on(Line(0, "column", 2))
+    faulty = mask(np.delete(column, live))
+    causes = explained(faulty, ~faulty)
+    assert {c for cause in causes for c in cause.cells} == set(np.flatnonzero(faulty).tolist())
+
+
+def test_scattered_cells_have_a_cause_each():
+    cells = np.array([3, 47, 81, 160, 219])
+    causes = explained(mask(cells), ~mask(cells))
+    assert [cause.line for cause in causes] == [None] * 5
+    assert sorted(c for cause in causes for c in cause.cells) == cells.tolist()
+
+
+def test_two_faulty_cells_on_a_line_of_live_ones_are_no_broken_line():
+    assert all(cause.line is None for cause in explained(mask([0, 5]), ~mask([0, 5])))
+
+
+def test_a_row_among_many_live_cells_of_it_is_not_blamed():
+    row = LAYOUT.cells_on(Line(0, "row", 3))
+    faulty = mask(row[[0, 3, 6, 8]])
+    assert all(cause.line is None for cause in explained(faulty, ~faulty))
+
+
+def test_a_whole_pad_is_blamed_on_its_converter():
+    pad = mask(range(110, 220))
+    (cause,) = explained(pad, ~pad)
+    assert cause.line == Line(1, "converter", 0)
+
+
+def test_no_faulty_cell_has_no_cause():
+    assert explained(mask(), ~mask()) == ()
+    assert explained(mask(), mask()) == ()
+
+
+@pytest.mark.parametrize("cut", range(1, 7))
+@pytest.mark.parametrize("from_the_end", [False, True])
+def test_a_wire_cut_at_a_position_is_blamed_for_the_cells_behind_it_only(cut: int, from_the_end: bool):
+    line = Line(1, "row", 7)
+    row = LAYOUT.cells_on(line)
+    dead = row[:-cut] if from_the_end else row[cut:]
+    (cause,) = explained(mask(dead), ~mask(dead))
+    assert cause.line == line
+    assert cause.cells == tuple(dead)
+    assert not cause.whole
+
+
+def test_untested_cells_behind_a_cut_are_inferred_and_those_before_it_are_not():
+    line = Line(0, "column", 6)
+    column = LAYOUT.cells_on(line)
+    faulty, untested = mask(column[[4, 5, 6, 8, 9]]), mask(column[[3, 7, 10]])
+    (cause,) = explained(faulty, ~faulty & ~untested)
+    assert (cause.line, cause.whole) == (line, False)
+    assert cause.cells == tuple(column[4:])
+
+
+def test_doubtful_cells_on_one_wire_convict_it_together():
+    row = LAYOUT.cells_on(Line(0, "row", 3))
+    matching = mask(row)
+    (cause,) = explained(mask(), ~matching, matching, np.where(matching, DOUBTFUL, NOTHING))
+    assert cause.line == Line(0, "row", 3)
+    assert cause.cells == tuple(row)
+    assert 0.5 < cause.probability <= 1
+
+
+def test_as_many_doubtful_cells_here_and_there_convict_nothing():
+    matching = mask(np.random.default_rng(0).choice(220, 10, replace=False))
+    assert explained(mask(), ~matching, matching, np.where(matching, DOUBTFUL, NOTHING)) == ()
+
+
+def test_a_long_line_of_weak_suspects_is_the_edge_of_a_contact_and_no_wire():
+    layout = SensorLayout(1, 64, 32)
+    matching = np.isin(np.arange(2048), layout.cells_on(Line(0, "row", 5)))
+    none = np.zeros(2048, bool)
+    assert solve(none, matching, ~matching, np.where(matching, 2.6, NOTHING), np.ones(2048), layout) == ()
+
+
+@pytest.mark.parametrize(("weight", "blamed"), [(2.65, False), (4.0, True)])
+def test_doubtful_cells_on_one_wire_count_for_less_than_as_many_independent_ones(weight: float, blamed: bool):
+    layout = SensorLayout(1, 4, 10)
+    matching = np.isin(np.arange(40), layout.cells_on(Line(0, "column", 5)))
+    none = np.zeros(40, bool)
+    # 10.6 by one cell alone would convict it.
+    causes = solve(none, matching, ~matching, np.where(matching, weight, NOTHING), np.ones(40), layout)
+    assert bool(causes) == blamed
+
+
+@pytest.mark.parametrize(("doubt", "blamed"), [(1.0, False), (0.8, False), (0.1, True), (0.0, True)])
+def test_a_cell_that_is_likely_to_be_faulty_leads_doubtful_ones_on_its_wire(doubt: float, blamed: bool):
+    row = LAYOUT.cells_on(Line(0, "row", 3))
+    matching = mask(row[:3])
+    leading = np.where(mask(row[:1]), doubt, 1.0)
+    assert bool(solve(mask(), matching, mask(), np.where(matching, 4.6, NOTHING), leading, LAYOUT)) == blamed
+
+
+def test_cells_are_suspected_together_as_wires_would_explain_them():
+    row, column = LAYOUT.cells_on(Line(0, "row", 3)), LAYOUT.cells_on(Line(1, "column", 2))
+    matching = mask(row, column[4:])
+    weight = np.where(mask(row[[0, 5]], column[[6, 9]]), 3.0, NOTHING)
+    groups = candidate_groups(matching, ~matching, weight, LAYOUT)
+    assert [group.tolist() for group in groups] == [row.tolist(), column[4:].tolist()]
+    assert candidate_groups(matching, ~matching, np.where(mask(row[:1], column[-1:]), 3.0, NOTHING), LAYOUT) == []
+
+
+def test_lines_are_suspected_together_that_a_stuck_address_would_move_if_none_lives():
+    moved, _ = LAYOUT.misaddressed(Line(0, "row_address", 3), 0)
+    matching = mask(moved)
+    weight = np.where(mask(moved[[0, 15]]), 3.0, NOTHING)  # one cell each of two rows: no row is suspected
+    (group,) = candidate_groups(matching, ~matching, weight, LAYOUT)
+    assert group.tolist() == moved.tolist()
+    contradicting = ~matching | mask(moved[-1:])
+    assert all(len(g) < len(moved) for g in candidate_groups(matching, contradicting, weight, LAYOUT))
+
+
+def test_cells_of_a_pad_with_a_live_one_are_not_suspected_together():
+    matching = mask(np.arange(110))  # a converter has no middle to be broken in
+    weight = np.where(matching, 3.0, NOTHING)
+    pad = np.arange(110).tolist()
+    assert pad in [group.tolist() for group in candidate_groups(matching, mask(), weight, LAYOUT)]
+    matching[60] = False
+    groups = [group.tolist() for group in candidate_groups(matching, mask([60]), weight, LAYOUT)]
+    assert pad[:60] not in groups
+    assert pad[61:] not in groups
+    addresses = [line for line in LAYOUT.lines if line.kind.endswith("address")]
+    moved = [LAYOUT.misaddressed(line, level)[0].tolist() for line in addresses for level in (0, 1)]
+    assert max(len(group) for group in groups if group not in moved) == 11  # no more than a column
+
+
+def test_a_few_doubtful_cells_do_not_convict_a_wire():
+    row = LAYOUT.cells_on(Line(0, "row", 3))
+    matching = mask(row[:2])
+    assert explained(mask(), ~matching, matching, np.where(matching, DOUBTFUL, NOTHING)) == ()
+
+
+def test_cells_at_rest_that_nothing_was_asked_of_convict_nothing():
+    assert explained(mask(), mask(), np.ones(220, bool), np.full(220, NOTHING)) == ()
+
+
+@pytest.mark.parametrize("weight", [DOUBTFUL, SURE])
+def test_live_cells_on_it_do_not_let_a_wire_be_blamed_whatever_is_said_of_the_others(weight: float):
+    row = LAYOUT.cells_on(Line(0, "row", 3))
+    live = row[[1, 4, 7]]
+    matching = mask(np.setdiff1d(row, live))
+    causes = explained(mask(), ~matching, matching, np.where(matching, weight, NOTHING))
+    assert not {c for cause in causes for c in cause.cells} & set(live.tolist())
+    assert all(cause.line != Line(0, "row", 3) or not cause.whole for cause in causes)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_broken_lines_are_found_exactly_among_single_faults_and_untested_cells(seed: int):
+    rng = np.random.default_rng(seed)
+    lines = [
+        Line(0, "row", int(rng.integers(11))),
+        Line(0, "column", int(rng.integers(10))),
+        Line(1, "row", int(rng.integers(11))),
+    ]
+    broken = np.unique(np.concatenate([LAYOUT.cells_on(line) for line in lines]))
+    single = rng.choice(np.setdiff1d(np.arange(220), broken), 8, replace=False)
+    tested = rng.random(220) > 0.3
+    faulty = mask(broken, single)
+    causes = explained(faulty & tested, ~faulty & tested)
+    assert {cause.line for cause in causes if cause.line and cause.whole} == set(lines)
+    found = {c for cause in causes for c in cause.cells}
+    assert found >= set(broken.tolist()) | set(single[tested[single]].tolist())
+    assert not found & set(np.flatnonzero(~faulty & tested).tolist())
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_every_faulty_cell_has_a_cause_and_no_cell_that_speaks_against_it_is_in_one(seed: int):
+    rng = np.random.default_rng(seed)
+    faulty = rng.random(220) < rng.choice([0.05, 0.3, 0.7])
+    contradicting = ~faulty & (rng.random(220) < 0.5)
+    causes = explained(faulty, contradicting, weight=np.where(faulty, SURE, rng.normal(0, 1, 220)))
+    found = {c for cause in causes for c in cause.cells}
+    assert set(np.flatnonzero(faulty).tolist()) <= found
+    assert not found & set(np.flatnonzero(contradicting).tolist())
+
+
+def test_positions_without_a_cell_are_never_blamed():
+    present = np.ones(LAYOUT.shape, bool)
+    present[0, 3, :4] = False
+    layout = SensorLayout(2, 11, 10, present=present)
+    row = layout.cells_on(Line(0, "row", 3))
+    faulty = mask(row)
+    contradicting = ~faulty & present.ravel()
+    (cause,) = solve(faulty, faulty, contradicting, np.where(faulty, SURE, NOTHING), DOUBT, layout)
+    assert (cause.line, cause.cells) == (Line(0, "row", 3), tuple(row))
+
+
+def test_one_certain_cell_and_a_strong_suspect_behind_the_last_live_one_are_a_cut():
+    row = LAYOUT.cells_on(Line(1, "row", 4))
+    faulty, suspect = mask(row[9:]), mask(row[8:9])
+    for strength, cut in ((6.0, True), (2.6, False)):
+        weight = np.where(faulty, SURE, np.where(suspect, strength, NOTHING))
+        cause = explained(faulty, ~(faulty | suspect), weight=weight)[0]
+        assert cause.cells == (tuple(row[8:]) if cut else tuple(row[9:]))
+        assert (cause.line is not None) == cut
+
+
+def test_where_single_faults_are_common_two_neighbours_at_the_end_of_a_line_are_no_cut():
+    row = LAYOUT.cells_on(Line(1, "row", 4))
+    faulty = mask(row[8:])
+    for common, cut in ((0.0, True), (0.1, False)):
+        causes = solve(faulty, faulty, ~faulty, np.where(faulty, SURE, NOTHING), DOUBT, LAYOUT, common)
+        assert any(cause.line is not None for cause in causes) == cut
+
+
+def test_suspects_alone_need_more_than_a_certain_cell_does():
+    row = LAYOUT.cells_on(Line(1, "row", 4))
+    for certain in (0, 1):
+        faulty = mask(row[9:][:certain])
+        contradicting = ~mask(row[6:])
+        weight = np.where(mask(row[6:]), 3.0, NOTHING)
+        causes = explained(faulty, contradicting, weight=weight)
+        assert any(cause.line is not None for cause in causes) == bool(certain)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_trying_all_sets_of_wires_and_integer_programming_agree(seed: int):
+    rng = np.random.default_rng(seed)
+    wires, cells = int(rng.integers(1, 9)), int(rng.integers(1, 20))
+    covers = rng.random((wires, cells)) < 0.4
+    cost, saves = rng.uniform(1, 9, wires), rng.uniform(-1, 6, cells)
+    few, many = cheapest_of_few(cost, covers, saves), cheapest_of_many(cost, covers, saves)
+    assert few.any() or many.sum() == 0
+    np.testing.assert_array_equal(few, many)

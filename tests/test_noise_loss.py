@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+from test_baseline import events
+
+from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, SensorLayout, inject
+from diagnostics.events.constant_runs import ConstantRuns
+from diagnostics.evidence.noise_loss import NoiseLoss
+
+LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
+CELLS, PRESENT = LAYOUT.n_cells, np.ones(LAYOUT.n_cells, bool)
+STEP = 1 / 1023
+NOISE = 2 * STEP
+
+
+def flickering(seed: int, recordings: int = 24, noise: float = NOISE, rest: float = 0.0) -> list[np.ndarray]:
+    """Presses on a skin with noise, and a converter whose readings end at 0."""
+    rng = np.random.default_rng(seed)
+    rests = rest + np.random.default_rng(99).uniform(0, STEP, CELLS)
+    read = [r + rests + noise * rng.standard_normal(r.shape) for r in events(seed, recordings)]
+    return [np.clip(np.round(r / STEP), 0, 1023) * STEP for r in read]
+
+
+def runs_of(frames: np.ndarray) -> ConstantRuns:
+    return ConstantRuns.begin(CELLS).extend(frames, np.arange(len(frames)), 0.005)
+
+
+def test_the_longest_time_that_a_cell_read_the_same_is_found():
+    recordings = flickering(0)
+    noise_loss = NoiseLoss.fit(recordings, PRESENT)
+    frames, cell = np.concatenate(recordings), 60
+    changed = np.flatnonzero(np.diff(frames[:, cell]))
+    assert noise_loss.longest[cell] == np.diff([-1, *changed, len(frames) - 1]).max()
+    assert noise_loss.recording == 64
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1 * STEP])
+def test_skins_without_noise_or_with_less_than_a_converter_step_tell_nothing(noise):
+    assert np.isinf(NoiseLoss.fit(flickering(0, noise=noise, rest=0.05), PRESENT).longest).all()
+
+
+def test_few_recordings_tell_nothing():
+    assert np.isinf(NoiseLoss.fit(flickering(0, recordings=7), PRESENT).longest).all()
+
+
+def test_a_cell_that_does_not_flicker_any_more_is_broken_unless_half_of_them_do_not():
+    noise_loss = NoiseLoss.fit(flickering(0), PRESENT)
+    idle = np.concatenate(flickering(5, 4))[:200]
+
+    def said(dead: int) -> np.ndarray:
+        frames = idle.copy()
+        frames[:, CELLS - dead :] = 0.0
+        return noise_loss.evidence(runs_of(frames), PRESENT, PRESENT, sunk=False)
+
+    assert np.flatnonzero(said(10) > 0).tolist() == list(range(CELLS - 10, CELLS))
+    assert not (said(40) > 0).any()
+
+
+def test_a_cell_that_is_not_heard_for_long_is_not_said_to_read_the_same():
+    noise_loss = NoiseLoss.fit(flickering(0), PRESENT)
+    frames = np.concatenate(flickering(5, 5))
+    frames[50:, 60] = np.nan
+    assert not (noise_loss.evidence(runs_of(frames), PRESENT, PRESENT, sunk=False) > 0).any()
+
+
+def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_blamed_for_want_of_noise():
+    rng = np.random.default_rng(4)
+    rests = np.linspace(0.004, 0.04, CELLS)
+
+    def read(seed: int, recordings: int, sunk: float = 0.0) -> list[np.ndarray]:
+        idle = [
+            np.maximum(r + rests - sunk + NOISE * rng.standard_normal(r.shape), 0) for r in events(seed, recordings)
+        ]
+        return [np.round(r / STEP) * STEP for r in idle]
+
+    fitted = SelfDiagnosis(LAYOUT).fit(read(0, 24))
+    stream = fitted.stream()
+    for frames in read(1, 6, sunk=0.015):
+        stream.extend(frames)
+    stream = stream.complete()
+    same = fitted.reference_.noise_loss.evidence(stream.runs, stream.rests(), PRESENT, sunk=False)
+    assert (same > 0).any()  # they read 0, and nothing else
+    assert not (stream.temporal() > 10).any()
+
+
+def test_dead_cells_that_nothing_touches_are_found_for_want_of_noise_by_a_monitor_too():
+    fitted = SelfDiagnosis(LAYOUT).fit(flickering(0))
+    log = flickering(1, 4)
+    assert not fitted.diagnose(log).fault_set
+    dead = {LAYOUT.cell(0, 7, 4): None, LAYOUT.cell(0, 7, 7): 0.4}
+    faults = [Fault(FaultKind.STUCK if v else FaultKind.OPEN, (cell,), value=v) for cell, v in dead.items()]
+    broken = [inject(r, faults, LAYOUT) for r in log]
+    diagnosis = fitted.diagnose(broken)
+    assert diagnosis.fault_set == dead.keys()
+    monitor = Monitor(fitted)
+    for frame in np.concatenate(broken):
+        monitor.update(frame)
+    np.testing.assert_array_equal(monitor.diagnosis().probability, diagnosis.probability)

@@ -1,0 +1,116 @@
+import numpy as np
+import pytest
+from test_baseline import events
+
+from adaptfault.data.simulated_grasps import simulate
+from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, SensorLayout, inject
+from diagnostics.preprocessing.offset import OffsetTracker, ReferenceOffset
+from diagnostics.preprocessing.scale import Scale
+
+LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
+CELLS, PRESENT = LAYOUT.n_cells, np.ones(LAYOUT.n_cells, bool)
+USUAL = ReferenceOffset(0.0, 0.005)
+SCALE = Scale(np.zeros(CELLS), 0.01, 1.0)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> SelfDiagnosis:
+    return SelfDiagnosis(LAYOUT).fit(events(0))
+
+
+def test_where_nothing_moved_the_scale_stays_as_it_is():
+    tare = OffsetTracker.begin(CELLS)
+    for frames in events(1):
+        tare = tare.extend(frames, SCALE, PRESENT, USUAL)
+        assert tare.on(SCALE) is SCALE
+        assert tare.off(frames) is frames
+
+
+def test_what_moves_all_cells_is_taken_off_each_frame():
+    frames = events(1)[0]
+    drift = np.linspace(0.01, 0.03, len(frames))[:, None]
+    tare = OffsetTracker.begin(CELLS).extend(frames + drift, SCALE, PRESENT, USUAL)
+    moved = tare.on(SCALE)
+    np.testing.assert_allclose(moved.baseline, 0.03, atol=1e-12)
+    np.testing.assert_allclose(moved.root_load(tare.off(frames + drift)), SCALE.root_load(frames), atol=0.02)
+
+
+def test_an_offset_of_one_cell_is_its_lowest_reading_and_a_large_one_is_a_load():
+    frames = events(1)[0].copy()
+    frames[:, 60], frames[:, 61] = frames[:, 60] + 0.015, 0.3
+    baseline = OffsetTracker.begin(CELLS).extend(frames, SCALE, PRESENT, USUAL).on(SCALE).baseline
+    assert np.flatnonzero(baseline).tolist() == [60]
+    assert baseline[60] == pytest.approx(0.015)
+
+
+def test_an_offset_as_in_the_reference_is_usual():
+    assert ReferenceOffset.fit(events(0), SCALE, PRESENT) == USUAL
+    assert ReferenceOffset.fit([r + 0.02 for r in events(0)], SCALE, PRESENT) == pytest.approx((0, 0.02))
+
+
+def test_where_rests_wander_an_offset_counts_from_where_cells_mostly_rest():
+    rng = np.random.default_rng(0)
+    wander = [r + 0.006 * rng.standard_normal(CELLS) for r in events(0)]
+    highest = Scale(np.full(CELLS, 0.02), 0.01, 1.0)
+    usual = ReferenceOffset.fit(wander, highest, PRESENT)
+    assert usual.mostly == pytest.approx(-0.024, abs=0.005)  # a quarter of the cells rests lower still
+    assert usual.mostly < usual.most < -0.01
+    warmer = OffsetTracker.begin(CELLS).extend(wander[0] + 0.015, highest, PRESENT, usual)
+    assert warmer.common == pytest.approx(0.015, abs=0.003)
+
+
+def test_a_large_offset_of_all_cells_is_not_taken_for_one_of_each():
+    rng = np.random.default_rng(0)
+    frames = events(1)[0] + 0.001 * rng.standard_normal(CELLS)
+    tare = OffsetTracker.begin(CELLS).extend(frames + 0.019, SCALE, PRESENT, USUAL)  # of single cells up to 0.02
+    assert tare.common == pytest.approx(0.019, abs=0.003)
+    assert not tare.own.any()
+
+
+def test_a_small_offset_of_one_cell_is_no_load_where_the_reference_held_light_loads_throughout():
+    recordings = [np.asarray(r, dtype=np.float64) for r in simulate(10, SensorLayout(2, 8, 6), n_frames=60).frames]
+    full_scale, cells = 5.0, 96
+    fitted = SelfDiagnosis(SensorLayout(2, 8, 6)).fit(recordings[::2])
+    offsets = np.linspace(0, 0.018, cells) * full_scale
+    for k in range(1, 13, 2):
+        assert not fitted.diagnose([np.minimum(r + offsets, full_scale) for r in recordings[k::12]]).fault_set
+
+
+@pytest.mark.parametrize("offset", [0.007, 0.015, 0.03])
+def test_a_skin_that_has_warmed_up_has_no_fault_and_its_dead_cells_are_found_all_the_same(fitted, offset):
+    log = events(1, 8)
+    assert not fitted.diagnose([r + offset for r in log]).fault_set
+    dead = LAYOUT.cell(0, 2, 3)
+    broken = [inject(r + offset, [Fault(FaultKind.OPEN, (dead,))], LAYOUT) for r in log]
+    assert fitted.diagnose(broken).fault_set == {dead}
+
+
+def test_offsets_of_single_cells_and_those_that_change_between_recordings_are_no_fault(fitted):
+    log, rng = events(1, 8), np.random.default_rng(0)
+    assert not fitted.diagnose([r + 0.015 * np.linspace(0, 1, CELLS) for r in log]).fault_set
+    assert not fitted.diagnose([r + rng.uniform(0, 0.02) for r in log]).fault_set
+
+
+def test_a_little_noise_that_the_reference_did_not_have_is_no_fault(fitted):
+    rng = np.random.default_rng(0)
+    log = [np.clip(r + 0.002 * rng.standard_normal(r.shape), 0, 1) for r in events(1, 8)]
+    assert not fitted.diagnose(log).fault_set
+
+
+def test_a_monitor_takes_off_the_same(fitted):
+    log = np.concatenate([r + 0.01 * i for i, r in enumerate(events(1, 3))])
+    monitor = Monitor(fitted)
+    for frame in log:
+        monitor.update(frame)
+    np.testing.assert_array_equal(monitor.diagnosis().probability, fitted.diagnose(log).probability)
+
+
+def test_while_nearly_all_cells_are_loaded_the_offset_stays():
+    frames = events(1)[0] + 0.03
+    frames[20:40] += 0.4
+    tare = (
+        OffsetTracker.begin(CELLS).extend(frames[:32], SCALE, PRESENT, USUAL).extend(frames[32:], SCALE, PRESENT, USUAL)
+    )
+    assert tare.common.min() > 0.025
+    held = OffsetTracker.begin(CELLS).extend(np.full((40, CELLS), 0.5), SCALE, PRESENT, USUAL)
+    assert not held.common.any()

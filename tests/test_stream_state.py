@@ -1,0 +1,156 @@
+import numpy as np
+import pytest
+
+from adaptfault.data.recordings import Recordings
+from diagnostics import FaultKind, Line, SensorLayout, bridge, freeze_stream, inject, line_fault, lose_frames
+from diagnostics.evidence.spatial import Exclusion
+from diagnostics.evidence.stream_state import StreamState, run_to_end
+from diagnostics.faults import Fault
+from diagnostics.healthy.reference import Reference
+
+LAYOUT = SensorLayout(2, 6, 5)
+ROW, COLUMN = np.divmod(np.arange(30), 5)
+UNKNOWN = Reference.unknown(LAYOUT)
+
+
+def pressed(presses: int, seed: int = 0) -> np.ndarray:
+    """Round presses here and there, 20 frames each, with pauses."""
+    rng = np.random.default_rng(seed)
+    force, log = np.sin(np.linspace(0, np.pi, 20))[:, None], []
+    for _ in range(presses):
+        at = [(rng.uniform(0, 5), rng.uniform(0, 4)) for _ in range(2)]
+        load = [np.maximum(0, 3 - ((ROW - r) ** 2 + (COLUMN - c) ** 2) / 1.5) for r, c in at]
+        log += [
+            force * np.concatenate(load) * (1 + rng.normal(0, 0.02, (20, 60))),
+            np.zeros((int(rng.integers(3, 9)), 60)),
+        ]
+    return np.concatenate(log)
+
+
+def remembered(log: np.ndarray, size: int | None = None, reference: Reference = UNKNOWN) -> StreamState:
+    stream = StreamState(LAYOUT, reference, Exclusion(2.0))
+    for first in range(0, len(log), size or len(log)):
+        stream.extend(log[first : first + (size or len(log))])
+    return stream.complete()
+
+
+def same(a: StreamState, b: StreamState) -> None:
+    """Assert that two memories hold the same."""
+    for part, names in {
+        "runs": ("start", "length", "low", "high", "jump", "company", "last"),
+        "intermittency": ("blinking", "noisy", "blinks", "high", "blinks_since", "noisy_since"),
+        "transport": ("seen", "lost", "first_lost", "last", "repeats"),
+    }.items():
+        for name in names:
+            of_a, of_b = (getattr(getattr(m, part), name) for m in (a, b))
+            np.testing.assert_array_equal(of_a, of_b, err_msg=f"{part}.{name}")
+    np.testing.assert_array_equal(a.accumulated, b.accumulated)
+    np.testing.assert_array_equal(a.received, b.received)
+    for kind, of_a in a.duplicates.of.items():
+        for name in ("since", "seen_by", "witnesses", "sums"):
+            np.testing.assert_array_equal(getattr(of_a, name), getattr(b.duplicates.of[kind], name), err_msg=name)
+    assert [(r.onset, r.frames) for r in a.transport.repetitions] == [
+        (r.onset, r.frames) for r in b.transport.repetitions
+    ]
+    assert len(a.events.kept) == len(b.events.kept)
+    for t, u in zip(a.events.kept, b.events.kept, strict=True):
+        assert [(p.first, p.n) for p in t.parts] == [(p.first, p.n) for p in u.parts]
+        np.testing.assert_array_equal(t.suffixes()[0].features(), u.suffixes()[0].features())
+
+
+def broken() -> np.ndarray:
+    """Faults of all kinds in one log, lost frames, and a frozen stream."""
+    faults = [
+        line_fault(LAYOUT, Line(0, "row", 2), FaultKind.OPEN, onset=700),
+        Fault("stuck", (45,), value=2.2, onset=300),
+        Fault("intermittent", (12,)),
+        Fault("noisy", (38,), onset=100),
+        bridge(LAYOUT, Line(1, "column", 0), onset=1000),
+    ]
+    log = inject(pressed(90), faults, LAYOUT, seed=0, dither=0.004)
+    return lose_frames(freeze_stream(log, 1500, 1600), 0.06, seed=0)
+
+
+@pytest.mark.parametrize("size", [1, 7, 32, 1000])
+def test_it_is_the_same_however_the_frames_come_in(size: int):
+    log = broken()
+    same(remembered(log, size), remembered(log))
+
+
+def test_looking_at_it_in_between_changes_nothing():
+    log = broken()[:1800]
+    stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
+    for first in range(0, 1800, 13):
+        stream.extend(log[first : first + 13])
+        run_to_end(stream.complete().spatial())
+    same(stream.complete(), remembered(log))
+
+
+def test_a_completed_memory_leaves_the_first_one_as_it_was():
+    log = pressed(3)[:50]
+    stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
+    stream.extend(log)
+    before = stream.runs
+    assert stream.complete().runs.length.max() == 50
+    assert stream.runs is before
+    assert before.length.max() < 50
+
+
+def test_it_stays_of_constant_size_over_a_long_log():
+    log = pressed(40)
+    stream, most = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0)), []
+    for _ in range(20):
+        stream.extend(log)
+        most.append(len(stream.events.kept))
+    assert stream.transport.seen == 20 * len(log)
+    assert max(most) < 100
+    assert max(most[10:]) <= max(most[:10]) + 5
+    assert all(len(event.parts) <= 4 for event in stream.events.kept)
+    assert len(stream.transport.repetitions) < 100
+
+
+def test_evidence_of_touches_that_were_let_go_still_counts():
+    cell = LAYOUT.cell(0, 2, 2)
+    log = inject(pressed(200), [Fault("open", (cell,))], LAYOUT)
+    stream = remembered(log)
+    assert stream.events.kept[0].first > 1000
+    assert stream.accumulated[cell] > 10
+    few = remembered(log[stream.events.kept[0].first :])
+    evidence, without = (run_to_end(m.spatial()).surprisal[cell] for m in (stream, few))
+    assert evidence > without + 5
+
+
+def test_settled_evidence_ends_with_the_stretch_that_it_belongs_to():
+    cell = LAYOUT.cell(0, 2, 2)
+    log = inject(pressed(250), [Fault("open", (cell,))], LAYOUT, until=5500)
+    stream = remembered(log[:5500])
+    assert stream.accumulated[cell] > 10
+    assert remembered(log).accumulated[cell] < 3
+
+
+def test_missed_frames_are_counted_and_say_nothing_of_cells():
+    log = pressed(10)
+    stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
+    stream.extend(log[:100])
+    stream.miss(5)
+    stream.miss(0)
+    stream.miss(-3)
+    stream.extend(log[100:])
+    assert stream.transport.lost == 5
+    np.testing.assert_array_equal(stream.complete().runs.start, remembered(log).runs.start)
+
+
+def test_a_cell_that_delivers_a_reading_now_and_then_was_heard():
+    log = pressed(20)[:320]
+    log[:, 7] = np.nan
+    log[:, 8] = np.where(np.arange(len(log)) % 32 < 30, log[:, 8], np.nan)  # silent at the end of each segment
+    assert remembered(log).received.tolist() == [cell != 7 for cell in range(60)]
+
+
+def test_a_frozen_stream_makes_no_cell_still(grasps: Recordings):
+    layout = grasps.layout
+    log = np.concatenate([grasps.frames[i] for i in (30, 50, 70)]).astype(float)
+    stream = StreamState(layout, Reference.unknown(layout), Exclusion(2.0))
+    frozen = np.concatenate([log, np.repeat(log[-1:], 3000, axis=0)])
+    stream.extend(frozen)
+    assert stream.complete().runs.length[log[-1] > 0.3].max() < 200

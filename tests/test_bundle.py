@@ -73,7 +73,7 @@ def test_opening_and_monitoring_need_no_torch(made_bundle):
         "import sys\n"
         "from adaptfault.robot.bundle import Bundle\n"
         f"bundle = Bundle.open({str(made_bundle)!r})\n"
-        "bundle.active(), bundle.diagnoser(), bundle.knowledge()\n"
+        "bundle.active(), bundle.diagnoser(), bundle.known_faults()\n"
         "sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
@@ -133,10 +133,10 @@ def test_a_flipped_bit_in_any_file_is_noticed_and_a_good_version_runs(bundle, tm
         broken[rng.integers(len(broken))] ^= 1 << int(rng.integers(8))
         path.write_bytes(bytes(broken))
         again = Bundle.open(bundle.path)
-        assert again.problems(mend=False), path
+        assert again.problems(repair=False), path
         assert again.active().number == (1 if path.parent.name == "0002" else 2), path
         path.write_bytes(whole)
-    assert Bundle.open(bundle.path).problems(mend=False) == []
+    assert Bundle.open(bundle.path).problems(repair=False) == []
 
 
 def test_a_missing_or_truncated_file_is_noticed(bundle):

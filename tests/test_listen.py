@@ -271,7 +271,7 @@ def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp
         child.stdin.write("what\nauto\nrecord\n")
         answers = [child.stderr.readline() for _ in range(4)]
         assert answers[0] == "stop: not recording\n"
-        assert "'what' is no command" in answers[1]
+        assert "'what' is not a command" in answers[1]
         assert answers[2] == "auto: recording as the rule says\n"
         send(port, packets(np.full((5, 6), 2.0), start=7))
         wait_for(child, "2,2,2,2,2,2\n", 5)

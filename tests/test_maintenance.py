@@ -39,7 +39,7 @@ def test_the_same_recordings_twice_change_nothing(bundle, later_grasps, broken_r
     before = files(bundle)
     report = maintain(bundle, log)
     assert (report.decision, report.version) == ("unchanged", 2)
-    assert "not seen before" in report.reason
+    assert "used before" in report.reason
     assert files(bundle) == before
 
 
@@ -61,7 +61,7 @@ def test_known_faults_in_new_recordings_deploy_nothing_again(bundle, later_grasp
     maintain(bundle, broken(later_grasps[:12], broken_row))
     report = maintain(bundle, broken(later_grasps[12:], broken_row))
     assert (report.decision, report.version) == ("unchanged", 2)
-    assert "does without these cells already" in report.reason
+    assert "excludes these cells already" in report.reason
 
 
 def test_faults_add_up_over_runs(bundle, later_grasps, broken_row):
@@ -84,7 +84,7 @@ def test_after_a_rollback_the_same_faults_deploy_nothing(bundle, later_grasps, b
     ("poison", "reason", "code"),
     [
         (lambda r, rng: np.full_like(r, 5.0), "no healthy cell", 2),
-        (lambda r, rng: 5 * rng.random(r.shape), "no healthy cell|contradict", 2),
+        (lambda r, rng: 5 * rng.random(r.shape), "no healthy cell|residual variance ratio", 2),
         (lambda r, rng: r * 800, "no recording is usable", 3),
         (lambda r, rng: np.full_like(r, np.nan), "no recording is usable", 3),
         (lambda r, rng: r[:, :59], "no recording is usable", 3),
@@ -139,15 +139,15 @@ def test_what_was_kept_once_is_not_judged_again(bundle, later_grasps, broken_row
     def no_gain(running, candidate, windows):
         return Judgement(running=0.5, candidate=0.5, gain=0.0, low=-0.1, high=0.1, collapsed=())
 
-    monkeypatch.setattr(module, "judge", no_gain)
+    monkeypatch.setattr(module, "compare_candidate", no_gain)
     first = maintain(bundle, broken(later_grasps[:8], broken_row))
     assert (first.decision, first.version) == ("kept", 1)
-    assert "within chance" in first.reason
-    monkeypatch.setattr(module, "judge", None)  # would fail if it were asked
+    assert "interval of the gain includes 0" in first.reason
+    monkeypatch.setattr(module, "compare_candidate", None)  # would fail if it were asked
     for log in (later_grasps[8:16], later_grasps[16:]):
         again = maintain(bundle, broken(log, broken_row))
         assert (again.decision, again.exit_code) == ("kept", first.exit_code)
-        assert again.reason == f"judged before: {first.reason}"
+        assert again.reason == f"compared before: {first.reason}"
 
 
 def test_a_candidate_in_which_a_class_collapses_is_refused(bundle, later_grasps, broken_row, monkeypatch):
@@ -156,7 +156,7 @@ def test_a_candidate_in_which_a_class_collapses_is_refused(bundle, later_grasps,
     def collapse(running, candidate, windows):
         return Judgement(running=0.5, candidate=0.6, gain=0.1, low=0.05, high=0.15, collapsed=(1,))
 
-    monkeypatch.setattr(module, "judge", collapse)
+    monkeypatch.setattr(module, "compare_candidate", collapse)
     report = maintain(bundle, broken(later_grasps, broken_row))
     assert (report.decision, report.version) == ("refused", 1)
     assert bundle.class_names[1] in report.reason

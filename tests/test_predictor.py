@@ -279,7 +279,7 @@ def test_a_start_without_any_whole_version_is_refused(carried):
 
 def test_a_version_for_another_array_is_not_taken(carried):
     carried.layout = type(SMALL)(3, 3, 2)
-    with pytest.raises(ValueError, match="the robot has 3 x 3 x 2 cells"):
+    with pytest.raises(ValueError, match="the bundle for 3 x 3 x 2 cells"):
         running(carried)
 
 

@@ -1,4 +1,4 @@
-"""A lock between processes that a crash releases: the kernel's, on a file."""
+"""A lock between processes (flock), which the kernel releases when its holder dies."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Busy(OSError):
 
 @contextmanager
 def locked(path: Path, *, wait: bool) -> Iterator[None]:
-    """Hold the lock on a file, which is made if need be and stays.
+    """Hold the lock on a file; the file is created where missing and stays.
 
     Raises:
         Busy: another process holds it, and ``wait`` is False.
@@ -26,7 +26,7 @@ def locked(path: Path, *, wait: bool) -> Iterator[None]:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
-            raise Busy(f"{path.parent} is being maintained by another process; let it end") from None
+            raise Busy(f"{path.parent} is being maintained by another process; wait until it ends") from None
         yield
     finally:
         os.close(descriptor)

@@ -1,4 +1,4 @@
-"""The parts of a bundle that never change: what an adaptation, a diagnosis and a judgement start from."""
+"""The constant parts of a bundle: adapter, reference of the diagnosis, held-out windows, calibration."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _SCHEMA = "adaptfault.reference/1"
 
 
 class Parts:
-    """Reads the parts; each is checked against its hash when it is first needed, and Damaged is raised.
+    """Reads the parts. The first use checks all hashes and raises Damaged on a mismatch.
 
     Args:
-        folder: where they lie.
+        folder: of the parts.
         hashes: of their files.
     """
 
@@ -39,7 +39,7 @@ class Parts:
         check: Windows | None,
         calibration: Calibration | None,
     ) -> None:
-        """Write them into a new folder; without windows to ``check`` on, the adapter gives up half of its validation.
+        """Write the parts into a new folder; without ``check``, half of the validation windows become the check.
 
         Raises:
             ValueError: the diagnoser is not fitted, or there are too few windows.
@@ -49,7 +49,7 @@ class Parts:
         if diagnoser.reference_ is None:
             raise ValueError("a bundle needs a diagnoser that is fitted on fault-free recordings: call fit first")
         if check is None:
-            adapter, check = _give_up_half(adapter)
+            adapter, check = _split_validation(adapter)
         folder.mkdir(parents=True)
         save_adapter(folder / _ADAPTER, adapter)
         save_windows(folder / _CHECK, check)
@@ -79,19 +79,19 @@ class Parts:
         return load_adapter(self._checked / _ADAPTER)
 
     def check_windows(self) -> Windows:
-        """Return the windows that no model learns from, which new versions are judged on."""
+        """Return the held-out windows on which a candidate and the running version are compared."""
         from adaptfault.adaptation.adapter_files import load_windows
 
         return load_windows(self._checked / _CHECK)
 
     @property
     def calibration(self) -> Path | None:
-        """The table from raw counts to the layout's unit, if there is one."""
+        """Path of the calibration table from raw counts to the layout's unit; None without one."""
         path = self._checked / _CALIBRATION
         return path if path.is_file() else None
 
 
-def _give_up_half(adapter: Adapter) -> tuple[Adapter, Windows]:
+def _split_validation(adapter: Adapter) -> tuple[Adapter, Windows]:
     """Return an adapter with every second validation recording of each class, and the windows of the others."""
     import numpy as np
 
@@ -100,7 +100,9 @@ def _give_up_half(adapter: Adapter) -> tuple[Adapter, Windows]:
     windows = adapter.validation
     recordings, first = np.unique(windows.recording, return_index=True)
     if len(recordings) < 2:
-        raise ValueError("new versions are judged on windows that no model learns from: give them as check=")
+        raise ValueError(
+            "one validation recording cannot be split into validation and check; give held-out windows as check="
+        )
     by_class = recordings[np.argsort(windows.y[first], kind="stable")]
     given = np.isin(windows.recording, by_class[1::2])
     return Adapter(adapter.model, adapter.train, windows.select(~given)), windows.select(given)

@@ -1,4 +1,4 @@
-"""A version: one model for one fault set, in a folder written once and checked at every load. Needs no torch."""
+"""A version: one model for one fault set, in a folder written once and verified at every load. Needs no torch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from adaptfault.robot.checksummed_json import check_files, hash_files, read_sealed, sync, sync_tree, write_sealed
+from adaptfault.robot.checksummed_json import (
+    check_files,
+    hash_files,
+    read_checksummed,
+    sync,
+    sync_tree,
+    write_checksummed,
+)
 from diagnostics import FaultSet, SensorLayout
 
 SCHEMA = "adaptfault.version/1"
@@ -20,16 +27,16 @@ _UNFINISHED = ".unfinished-"
 
 @dataclass(frozen=True)
 class Version:
-    """One version of what a robot runs.
+    """One model version of a robot.
 
     Attributes:
         number: 1 is the fault-free model.
-        folder: holds the weights, and ``model.onnx`` where it could be exported.
+        folder: with the weights, and ``model.onnx`` where the export worked.
         layout: the array.
-        class_names: one name a class.
+        class_names: one name for each class.
         length: frames in a window.
-        fault_set: F, the cells that it does without.
-        about: how it came about, JSON.
+        fault_set: F, the cells that it does not use.
+        about: origin of the version, JSON.
     """
 
     number: int
@@ -45,13 +52,13 @@ class Version:
 
     @classmethod
     def read(cls, folder: Path) -> Version:
-        """Read a version and check each of its files.
+        """Read a version and verify each of its files.
 
         Raises:
-            FileNotFoundError: there is none.
-            Damaged: a file is not what was written.
+            FileNotFoundError: the folder holds no version.
+            Damaged: a file fails its checksum.
         """
-        document = read_sealed(folder / ABOUT, SCHEMA)
+        document = read_checksummed(folder / ABOUT, SCHEMA)
         check_files(folder, document["files"])
         layout = SensorLayout.from_dict(document["layout"])
         return cls(
@@ -76,12 +83,12 @@ class Versions:
         return Version.read(self.path(number))
 
     def path(self, number: int) -> Path:
-        """Return where a version lies."""
+        """Return the folder of a version."""
         return self.folder / f"{number:04d}"
 
     @property
     def numbers(self) -> list[int]:
-        """All that are there, ascending; they may be damaged."""
+        """Numbers of all versions on disk, ascending; versions may be damaged."""
         return sorted(int(p.name) for p in self.folder.glob("[0-9]*") if p.name.isdecimal())
 
     def write(
@@ -94,7 +101,7 @@ class Versions:
         fault_set: FaultSet,
         about: Mapping[str, Any],
     ) -> Version:
-        """Write a version into a new folder, bring it to the disk, and only then give it its name.
+        """Write a version into a temporary folder, sync it, then rename it.
 
         Args:
             fill: writes the model's files into the folder it is given.
@@ -116,14 +123,14 @@ class Versions:
             "about": dict(about),
             "files": hash_files(new),
         }
-        write_sealed(new / ABOUT, document)
+        write_checksummed(new / ABOUT, document)
         sync_tree(new)
         os.replace(new, self.path(number))
         sync(self.folder)
         return self[number]
 
     def sweep(self, keep: Collection[int] | None = None) -> None:
-        """Remove what crashes left unfinished and, if ``keep`` is given, all versions but these."""
+        """Remove unfinished versions of crashed runs and, if ``keep`` is given, all versions but these."""
         for unfinished in self.folder.glob(f"{_UNFINISHED}*"):
             shutil.rmtree(unfinished)
         if keep is not None:

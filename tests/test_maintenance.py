@@ -107,6 +107,45 @@ def test_cells_in_another_order_never_deploy(bundle, later_grasps, rng):
     assert bundle.versions.numbers == [1]
 
 
+def test_idle_recordings_beside_grasps_hide_no_fault(bundle, later_grasps, rng):
+    row = line_fault(bundle.layout, Line(1, "row", 2), FaultKind.OPEN)
+    idle = [np.abs(rng.normal(0, 0.003, (60, 60))) for _ in range(24)]
+    report = maintain(bundle, broken([*later_grasps, *idle], row), dry_run=True)
+    assert report.decision != "refused"
+    assert report.fault_set == set(row.cells)
+
+
+def test_refused_recordings_are_diagnosed_again(bundle, later_grasps, rng):
+    order = rng.permutation(bundle.layout.n_cells)
+    log = [r[:, order] for r in later_grasps]
+    first, second = maintain(bundle, log), maintain(bundle, log)
+    assert (first.decision, first.exit_code, first.used) == ("refused", 2, ())
+    assert (second.decision, second.exit_code, second.reason) == ("refused", 2, first.reason)
+    assert [run["what"] for run in bundle.journal.runs()] == ["refused", "refused"]
+
+
+def test_single_readings_outside_the_range_are_missing_and_counted(bundle, later_grasps, broken_row):
+    log = broken(later_grasps, broken_row)
+    log[2][5, 3], log[3][7, 0] = np.inf, 1e308
+    report = maintain(bundle, log, dry_run=True)
+    json.dumps(report.to_dict(), allow_nan=False)
+    assert report.fault_set == set(broken_row.cells)
+    assert [text.split(":")[0] for text in report.left_out] == ["recording 2", "recording 3"]
+    assert "1 readings outside 0 to 5 N are missing" in report.left_out[0]
+
+
+def test_recovered_cells_lead_back_to_the_version_that_uses_them(bundle, later_grasps, broken_row):
+    assert maintain(bundle, broken(later_grasps, broken_row)).version == 2
+    bundle.confirm()
+    third = len(later_grasps) // 3
+    reports = [maintain(bundle, later_grasps[i * third : (i + 1) * third]) for i in range(3)]
+    assert [len(r.fault_set) for r in reports] == [5, 5, 0]
+    assert (reports[-1].decision, reports[-1].version, reports[-1].exit_code) == ("deployed", 1, 0)
+    assert "recovered" in reports[-1].reason
+    assert bundle.active().number == 1
+    assert bundle.rollback().number == 2
+
+
 def test_one_bad_recording_does_not_stop_the_others(bundle, later_grasps, broken_row):
     log = [later_grasps[0][:, :7], *broken(later_grasps, broken_row)]
     report = maintain(bundle, log, names=["short.csv"])

@@ -44,7 +44,7 @@ class StreamingPredictor(Protocol):
     @property
     def layout(self) -> SensorLayout: ...  # noqa: D102
     def stream(self, frame: NDArray[np.float64], time: float | None = None) -> StreamResult: ...  # noqa: D102
-    def confirm(self) -> object: ...  # noqa: D102
+    def confirm(self) -> bool | None: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -99,6 +99,7 @@ class Session:
         self.switch = None if rule is None else Switch(rule)
         self.label: Any = None
         self._classified = 0
+        self._confirmed = self._confirm_failed = False
         self._faulty: NDArray[np.bool_] | None = None
         self._time = 0.0
         self._arrived: float | None = None
@@ -150,9 +151,8 @@ class Session:
             return []
         events = []
         self._classified += 1
-        if self._classified == CONFIRMED_AFTER and not isinstance(self.watcher, Monitor):
-            self.watcher.confirm()
-            events.append(self._event("confirmed", f"{CONFIRMED_AFTER} windows classified"))
+        if self._classified % CONFIRMED_AFTER == 0 and not self._confirmed:
+            events += self._confirm()
         if reading.label == self.label:
             return events
         self.label = reading.label
@@ -161,6 +161,19 @@ class Session:
         names = getattr(self.watcher, "class_names", ())
         text = f"{names[label] if names else label} ({share:.0%})"
         return [*events, self._event("class", text, label=label, probability=share, dropped=len(reading.fault_set))]
+
+    def _confirm(self) -> list[Event]:
+        """Confirm the running version; a failure is reported once and repeated after as many windows."""
+        assert not isinstance(self.watcher, Monitor)
+        try:
+            self._confirmed = self.watcher.confirm() is not False
+            problem = "another version is active, or the bundle cannot be written"
+        except OSError as error:
+            problem = str(error)
+        if self._confirmed:
+            return [self._event("confirmed", f"{self._classified} windows classified")]
+        first, self._confirm_failed = not self._confirm_failed, True
+        return [self._event("trouble", f"the version is not confirmed: {problem}")] if first else []
 
     def _record(self, frame: Frame) -> list[Event]:
         recorder = self.recorder

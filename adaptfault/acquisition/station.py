@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Collection
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from adaptfault.acquisition.ordering import Frame
@@ -19,6 +20,7 @@ from adaptfault.acquisition.receiver import Receiver
 from adaptfault.acquisition.recorder import Recorder
 from adaptfault.acquisition.session import Event, Session, StreamingPredictor
 from adaptfault.acquisition.switch import Rule, parse_when
+from adaptfault.robot.converter_range import within_range
 from diagnostics import Monitor, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
@@ -95,6 +97,7 @@ class Station:
         queue = max(64, _WAITING // (8 * layout.n_cells))
         self.receiver = Receiver(layout, port, host=host, devices=devices, ticks=ticks, queue=queue)
         self._sessions: dict[str, Session] = {}
+        self._outside = 0  # readings outside the layout's range
         self._command: bool | None = None  # the last command, also for devices that come later
 
     async def listen(self) -> None:
@@ -144,7 +147,11 @@ class Station:
             session = self._sessions[frame.device] = self._begin(frame.device)
         if self.calibration is not None:
             newtons = self.calibration.apply(frame.values)[0].astype(float)
-            frame = Frame(frame.device, frame.time, newtons, frame.lost, frame.restarted)
+            frame = replace(frame, values=newtons)
+        values, outside = within_range(frame.values, self.layout)
+        if outside:
+            self._outside += outside
+            frame = replace(frame, values=values)
         self._emit(session.take(frame, time.monotonic()))
 
     def _begin(self, device: str) -> Session:
@@ -193,8 +200,14 @@ class Station:
 
     def _end(self) -> None:
         counters = self.receiver.counters
-        result = {"schema": SCHEMA, "layout": self.layout.to_dict(), "counters": counters.to_dict()}
-        print(json.dumps(result, allow_nan=False) if self.as_json else f"end: {counters}", flush=True)
+        result = {
+            "schema": SCHEMA,
+            "layout": self.layout.to_dict(),
+            "counters": counters.to_dict(),
+            "readings_outside_range": self._outside,
+        }
+        outside = f", {self._outside} readings outside the range" if self._outside else ""
+        print(json.dumps(result, allow_nan=False) if self.as_json else f"end: {counters}{outside}", flush=True)
 
 
 def _read_commands(loop: asyncio.AbstractEventLoop, handle: Callable[[str], None]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 import os
 import shutil
@@ -190,13 +189,14 @@ class Bundle:
                     self._fall_back(pointer, f"version {pointer.active} was started {STARTS} times and never confirmed")
                 elif after != pointer:
                     after.write(self.path)
-        except OSError as error:
-            if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
-                raise  # a bundle that cannot be written runs all the same
+        except OSError as error:  # a full or read-only disk must not stop the prediction
+            _log.warning("%s cannot be written, so this start is not counted: %s", self.path, error)
         return self.active()
 
     def confirm(self) -> None:
-        """End the probation of the active version."""
+        """End the probation of the active version; raises OSError where the bundle cannot be written."""
+        if not Pointer.read(self.path).probation:
+            return
         with locked(self.path / _STATE_LOCK, wait=True):
             pointer = Pointer.read(self.path)
             if pointer.probation:
@@ -258,9 +258,9 @@ class Bundle:
             known = self.active().about.get("knowledge")
         return KnownFaults(self.layout.n_cells) if known is None else KnownFaults.from_dict(known)
 
-    def maintenance(self) -> AbstractContextManager[None]:
-        """Hold the maintenance lock, one run at a time; raises Busy."""
-        return locked(self.path / _MAINTENANCE_LOCK, wait=False)
+    def maintenance(self, *, dry_run: bool = False) -> AbstractContextManager[None]:
+        """Hold the maintenance lock, one run at a time; raises Busy. A dry run needs no write access."""
+        return locked(self.path / _MAINTENANCE_LOCK, wait=False, optional=dry_run)
 
     def write_version(self, adaptation: Adaptation, about: dict[str, Any]) -> Version:
         """Write an adaptation as a new version without activating it."""

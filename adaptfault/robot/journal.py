@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -38,7 +39,7 @@ class Journal:
 
         A crash between a transaction and its checksum leaves an intact file with an old checksum, which is rewritten.
         """
-        with locked(self.bundle / _LOCK, wait=True):
+        with locked(self.bundle / _LOCK, wait=True, optional=not repair):
             if not self.path.exists():
                 return (
                     [f"{self.path} is missing: a new journal is started"] if (self.bundle / _CHECKSUM).exists() else []
@@ -47,7 +48,7 @@ class Journal:
             if checksum.exists() and checksum.read_text() == hash_file(self.path):
                 return []
             try:
-                with closing(sqlite3.connect(self.path)) as connection:
+                with closing(self._connect()) as connection:
                     intact = connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
                     for (document,) in connection.execute("SELECT document FROM runs"):
                         json.loads(document)
@@ -102,9 +103,14 @@ class Journal:
 
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
-        # Not read-only: after a crash SQLite has to roll back first.
-        with locked(self.bundle / _LOCK, wait=True), closing(sqlite3.connect(self.path)) as connection:
+        with locked(self.bundle / _LOCK, wait=True, optional=True), closing(self._connect()) as connection:
             yield connection
+
+    def _connect(self) -> sqlite3.Connection:
+        """Connect for reading: with write access where possible, because SQLite rolls back after a crash."""
+        if os.access(self.path, os.W_OK) and os.access(self.bundle, os.W_OK):
+            return sqlite3.connect(self.path)
+        return sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
 
     @contextmanager
     def _connection(self) -> Iterator[sqlite3.Connection]:

@@ -13,15 +13,27 @@ class Busy(OSError):
 
 
 @contextmanager
-def locked(path: Path, *, wait: bool) -> Iterator[None]:
+def locked(path: Path, *, wait: bool, optional: bool = False) -> Iterator[None]:
     """Hold the lock on a file; the file is created where missing and stays.
+
+    Args:
+        path: of the lock file.
+        wait: for another process to release it.
+        optional: continue without the lock where the file cannot be opened for writing (a read-only disk).
 
     Raises:
         Busy: another process holds it, and ``wait`` is False.
+        OSError: the file cannot be opened, and the lock is not ``optional``.
     """
     import fcntl  # POSIX only, as robots are
 
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError:
+        if not optional:
+            raise
+        yield
+        return
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))

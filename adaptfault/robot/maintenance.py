@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,15 +13,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptfault.robot.bundle import Bundle, now
+from adaptfault.robot.checksummed_json import Damaged
+from adaptfault.robot.converter_range import within_range
 from adaptfault.robot.deployment_test import Judgement, compare_candidate, with_faults
 from adaptfault.robot.known_faults import KnownFaults
 from adaptfault.robot.plausibility import contradiction, implausible
 from adaptfault.robot.pointer import Pointer
+from adaptfault.robot.versions import Version
 from diagnostics import Diagnosis, Fault, FaultSet
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.adaptation.result import Adaptation
+    from adaptfault.data.windows import Windows
 
 SCHEMA = "adaptfault.maintenance/1"
 Decision = Literal["unchanged", "deployed", "kept", "refused"]
@@ -48,7 +53,8 @@ class MaintenanceReport:
         accuracy: of the version that runs now, under the known faults, on the held-out windows; None if not measured.
         fault_free_accuracy: of version 1 on the same windows without faults; None if not measured.
         stages: cost and result of each adaptation stage, as text.
-        used, left_out: names of recordings, and why the latter could not be used.
+        used: names of the recordings whose diagnosis entered the known faults; empty where they were refused.
+        left_out: recordings, or readings of them, that were not used, with the reason.
         warnings: damage found in the bundle.
         dry_run: nothing was changed.
         seconds: wall clock.
@@ -143,7 +149,7 @@ def maintain(
         Damaged: a needed part of the bundle fails its checksum.
     """
     began = time.perf_counter()
-    with bundle.maintenance():
+    with bundle.maintenance(dry_run=dry_run):
         report = _Maintenance(bundle, dry_run, budget, say).run(_checked(recordings, names, bundle))
     return replace(report, seconds=time.perf_counter() - began)
 
@@ -156,6 +162,7 @@ class _InputRecording:
     frames: NDArray[np.float64] | None
     digest: str
     problem: str | None
+    outside: int = 0  # readings out of the converter's range, missing in ``frames``
 
 
 def _checked(
@@ -174,7 +181,10 @@ def _checked(
             problem = implausible(frames, bundle.layout) if len(frames) else "it holds no frame"
         except ValueError as error:
             frames, problem = None, str(error)
-        incoming.append(_InputRecording(name, frames, digest, problem))
+        outside = 0
+        if frames is not None and problem is None:
+            frames, outside = within_range(frames, bundle.layout)
+        incoming.append(_InputRecording(name, frames, digest, problem, outside))
     return incoming
 
 
@@ -199,6 +209,11 @@ class _Maintenance:
         fresh = list({r.digest: r for r in incoming if r.digest not in seen}.values())
         usable = [r for r in fresh if r.problem is None]
         self.left_out = tuple(f"{r.name}: {r.problem}" for r in fresh if r.problem is not None)
+        self.left_out += tuple(
+            f"{r.name}: {r.outside} readings outside 0 to {bundle.layout.full_scale:g} {bundle.layout.unit} are missing"
+            for r in usable
+            if r.outside
+        )
         if not fresh:
             code = self._code(self.before.fault_set)
             return self._report("unchanged", code, "all recordings were used before", self.before)
@@ -229,7 +244,7 @@ class _Maintenance:
                 f"residual variance ratio {strange:.2f} of the cells taken as healthy exceeds {_CONTRADICTORY:g}:"
                 " wrong sensor, or changed wiring"
             )
-            return self._report("refused", 2, reason, self.before, **found)
+            return self._report("refused", 2, reason, self.before, **{**found, "used": ()})
         if faulty == self.version.fault_set:
             reason = f"version {self.version.number} excludes these cells already" if faulty else "no faulty cell"
             return self._report("unchanged", self._code(faulty), reason, known, **found)
@@ -247,6 +262,8 @@ class _Maintenance:
 
         faulty = known.fault_set
         windows = self.bundle.parts.check_windows()
+        if (earlier := self._version_for(faulty)) is not None:
+            return self._return_to(earlier, windows, known, found)
         broken = with_faults(windows, known.faults, self.bundle.layout)
         running = Adaptation.load(self.version.folder)
         free = float((adapter.model.predict(windows.x) == windows.y).mean())
@@ -264,7 +281,7 @@ class _Maintenance:
             reason = f"the adapted model loses more than half of the recall of {names}"
             return self._report("refused", max(1, code), reason, known, accuracy=judgement.running, **found)
         if not judgement.better:
-            code = max(1, self._code(faulty, judgement.running, free))
+            code = self._code(faulty, judgement.running, free)
             reason = (
                 f"version {self.version.number} is as good under these faults as the adapted model"
                 " (90 % interval of the gain includes 0)"
@@ -276,6 +293,42 @@ class _Maintenance:
             f" ({free:.3f} without any)"
         )
         number = self.version.number if self.dry_run else self._deploy(adaptation, known, judgement, free)
+        return self._report("deployed", code, reason, known, accuracy=judgement.candidate, number=number, **found)
+
+    def _version_for(self, faulty: FaultSet) -> Version | None:
+        """Return the latest version for exactly this F, where the running one also excludes recovered cells."""
+        if not set(faulty) < set(self.version.fault_set):
+            return None
+        for number in reversed(self.bundle.versions.numbers):
+            with suppress(Damaged, FileNotFoundError):
+                if (version := self.bundle.versions[number]).fault_set == faulty:
+                    return version
+        return None
+
+    def _return_to(
+        self, earlier: Version, windows: Windows, known: KnownFaults, found: dict[str, Any]
+    ) -> MaintenanceReport:
+        """Return to a version that uses the recovered cells, unless it is less accurate than the running one."""
+        from adaptfault.adaptation.result import Adaptation
+
+        broken = with_faults(windows, known.faults, self.bundle.layout)
+        running, candidate = Adaptation.load(self.version.folder), Adaptation.load(earlier.folder)
+        judgement = compare_candidate(running.predict, candidate.predict, broken)
+        free = float((self.bundle.parts.adapter().model.predict(windows.x) == windows.y).mean())
+        found |= {"judgement": judgement, "fault_free_accuracy": free}
+        recovered = len(self.version.fault_set) - len(known.fault_set)
+        accuracies = f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}"
+        if judgement.gain < 0 or judgement.collapsed:
+            code = self._code(known.fault_set, judgement.running, free)
+            reason = (
+                f"{recovered} cells recovered, but version {earlier.number}, which uses them, is worse: {accuracies}"
+            )
+            return self._report("kept", code, reason, known, accuracy=judgement.running, **found)
+        if not self.dry_run:
+            self.bundle.deploy(earlier.number)
+        code = self._code(known.fault_set, judgement.candidate, free)
+        number = self.version.number if self.dry_run else earlier.number
+        reason = f"{recovered} cells recovered; version {earlier.number} uses them again ({accuracies})"
         return self._report("deployed", code, reason, known, accuracy=judgement.candidate, number=number, **found)
 
     def _judged_before(self, faulty: FaultSet) -> dict[str, Any] | None:
@@ -302,7 +355,7 @@ class _Maintenance:
             now(),
             report.decision,
             {**report.to_dict(), "knowledge": self.known.to_dict(), "judged": self._judgement_of(report)},
-            [(r.digest, r.name) for r in usable],
+            [(r.digest, r.name) for r in usable] if report.used else [],  # refused ones are diagnosed again
         )
 
     def _judgement_of(self, report: MaintenanceReport) -> dict[str, Any] | None:

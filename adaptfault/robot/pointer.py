@@ -47,6 +47,7 @@ class Pointer:
     def deployed(self, number: int) -> Pointer:
         """Return the pointer to a new version, on probation. An unconfirmed version does not become a fallback."""
         kept = self.fallbacks if self.probation else (self.active, *self.fallbacks)
+        kept = tuple(fallback for fallback in kept if fallback != number)  # a return to an earlier version
         return replace(self, active=number, fallbacks=kept, probation=True, starts=0, starter="")
 
     def started(self, starter: str) -> Pointer:

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.data.windows import scale
+from adaptfault.data.windows import hold_missing, scale
 from adaptfault.models.inference import Inference
 from adaptfault.robot.bundle import PROCESS
+from adaptfault.robot.converter_range import MARGIN, within_range
 from diagnostics import Fault, FaultSet, Monitor, SensorLayout
 
 if TYPE_CHECKING:
@@ -90,6 +91,7 @@ class Predictor:
         self._monitor = Monitor(bundle.diagnoser())
         self.layout = bundle.layout
         self.class_names = tuple(bundle.class_names)
+        self.outside = 0  # readings outside the range so far
         self._last: NDArray[np.float32]  # last reading of each cell that is not missing
         self._frames: NDArray[np.float32]  # last frames, scaled
         self.reset()
@@ -124,28 +126,32 @@ class Predictor:
     def predict(self, x: NDArray[Any]) -> NDArray[np.int64]:
         """Return the class of each window ``[N, T, D]`` on the 0..1 scale, int64 ``[N]``."""
         self._keep_up()
-        return self._running.model.predict(x)
+        return self._running.model.predict(_finite(x))
 
     def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
         """Return class probabilities ``[N, n_classes]`` of windows ``[N, T, D]``; F's cells may hold anything."""
         self._keep_up()
-        return self._running.model.predict_proba(x)
+        return self._running.model.predict_proba(_finite(x))
 
     def stream(self, frame: ArrayLike, time: float | None = None) -> Reading:
         """Process one frame and classify the window that ends with it.
 
-        A missing reading (NaN or infinite) is replaced by the last reading of its cell, 0 before the first, as in
-        ``make_windows``.
+        A missing reading (NaN, infinite, or outside the range by more than 5 % of the full scale) is replaced by the
+        last reading of its cell, 0 before the first, as in ``make_windows``.
 
         Args:
             frame: ``[D]`` or ``[pads, rows, cols]`` in the layout's unit.
-            time: of the frame, seconds; frames missing between two times are reported as lost.
+            time: of the frame, seconds; None or not finite where unknown. Frames missing between two times are reported
+                as lost.
 
         Raises:
             ValueError: the frame has another shape.
         """
-        reading = np.asarray(frame, dtype=np.float64).reshape(-1)
-        reading = np.where(np.isfinite(reading), reading, np.nan)
+        reading, outside = within_range(np.asarray(frame, dtype=np.float64).reshape(-1), self.layout)
+        if outside and not self.outside:
+            _log.warning("%d readings outside the range of %s count as missing", outside, self.layout)
+        self.outside += outside
+        time = None if time is None or not np.isfinite(time) else time
         events = self._monitor.update(reading, time)
         self._keep_up()
         model = self._running.model
@@ -168,12 +174,17 @@ class Predictor:
         """End the probation of the running version.
 
         Returns:
-            False, without a confirmation, where another version is active that does not run here yet.
+            False, without a confirmation, where another version is active that does not run here yet, or the bundle
+            cannot be written (logged).
         """
         bundle = self._running.bundle
         if bundle.active().number != self.version:
             return False
-        bundle.confirm()
+        try:
+            bundle.confirm()
+        except OSError as error:
+            _log.warning("version %d stays on probation: %s", self.version, error)
+            return False
         return True
 
     def __str__(self) -> str:
@@ -228,6 +239,16 @@ def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
         raise ValueError(f"the version is for {model.layout}, the bundle for {layout}")
     model.predict_proba(np.zeros((1, model.length, layout.n_cells), np.float32))
     return _Running(version, model, bundle)
+
+
+def _finite(x: NDArray[Any]) -> NDArray[np.float32]:
+    """Return windows ``[N, T, D]`` without missing readings: NaN, infinite, or out of range by more than 5 %."""
+    x = np.asarray(x, dtype=np.float32)
+    if x.ndim != 3 or bool(((x >= -MARGIN) & (x <= 1 + MARGIN)).all()):  # NaN compares as False
+        return x
+    missing = ~((x >= -MARGIN) & (x <= 1 + MARGIN))
+    held: NDArray[np.float32] = np.stack([hold_missing(window) for window in np.where(missing, np.float32(np.nan), x)])
+    return held
 
 
 def _start_any(bundle: Bundle) -> _Running:

@@ -125,7 +125,7 @@ def test_a_version_that_cannot_be_confirmed_is_reported_once_and_tried_again():
 
 def test_readings_outside_the_range_are_missing_and_counted(capsys):
     values = np.zeros((12, 6))
-    values[3, 2], values[5, 1] = 1e30, -7.0
+    values[3, 2], values[5, 1] = 1e30, -700.0
     lines = listened(capsys, packets(values), "--shape", "1x2x3", "--frames", "12", "--json")
     end = json.loads(lines[-1])
     assert end["counters"]["kept"] == 12

@@ -1,4 +1,4 @@
-"""Readings outside the range of the converter, which count as missing. Needs no torch."""
+"""Readings that no converter gives count as missing. Needs no torch."""
 
 from __future__ import annotations
 
@@ -8,26 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics import SensorLayout
-
-MARGIN = 0.05
-"""Share of the full scale by which calibrated readings may lie outside the range."""
+from diagnostics.preprocessing.transport import invalid
 
 
-def within_range(frames: NDArray[np.float64], layout: SensorLayout) -> tuple[NDArray[np.float64], int]:
+def within_range(frames: NDArray[Any], layout: SensorLayout) -> tuple[NDArray[Any], int]:
     """Return readings ``[..., D]`` in the layout's unit with NaN where no converter gives such a value.
 
-    That is: infinite, or more than 5 % of the full scale outside 0 to ``layout.full_scale``.
+    That is: infinite, or more than one full scale outside 0 to full scale, as in a diagnosis.
 
     Returns:
         The readings (the same array where all are in range), and the number of readings replaced.
     """
-    outside = outside_range(frames, layout)
-    count = int(np.count_nonzero(outside))
-    return (np.where(outside, np.nan, frames), count) if count else (frames, 0)
-
-
-def outside_range(frames: NDArray[Any], layout: SensorLayout) -> NDArray[np.bool_]:
-    """Return which readings ``[..., D]`` no converter gives, bool; False for missing ones (NaN)."""
-    margin = MARGIN * layout.full_scale
-    outside: NDArray[np.bool_] = (frames < -margin) | (frames > layout.full_scale + margin)
-    return outside
+    wrong = invalid(frames, layout.full_scale)
+    return (frames, 0) if wrong is None else (np.where(wrong, np.nan, frames), int(np.count_nonzero(wrong)))

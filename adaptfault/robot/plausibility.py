@@ -10,9 +10,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from adaptfault.data.windows import hold_missing, scale
 from adaptfault.imputation.linear import CellStatistics
-from adaptfault.robot.converter_range import outside_range
 from diagnostics import FaultSet, SensorLayout
 
+_MARGIN = 0.05  # of full scale: calibrated readings may lie outside the range by so much
 _MOST_OUTSIDE = 0.01  # largest share of readings outside the margin
 _RIDGE = 1e-6  # of the mean variance: covariances are stored in single precision
 
@@ -23,7 +23,9 @@ def implausible(recording: NDArray[Any], layout: SensorLayout) -> str | None:
     present = ~np.isnan(frames)
     if not present.any():
         return "it holds no reading"
-    if (share := outside_range(frames, layout).sum() / present.sum()) > _MOST_OUTSIDE:
+    margin = _MARGIN * layout.full_scale
+    outside = present & ((frames < -margin) | (frames > layout.full_scale + margin))
+    if (share := outside.sum() / present.sum()) > _MOST_OUTSIDE:
         return (
             f"{share:.0%} of its readings lie outside 0 to {layout.full_scale:g} {layout.unit}"
             f" (from {np.nanmin(frames):.4g} to {np.nanmax(frames):.4g}): raw counts, or another sensor"

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from adaptfault.data.windows import hold_missing, scale
 from adaptfault.models.inference import Inference
 from adaptfault.robot.bundle import PROCESS
-from adaptfault.robot.converter_range import MARGIN, within_range
+from adaptfault.robot.converter_range import within_range
 from diagnostics import Fault, FaultSet, Monitor, SensorLayout
 
 if TYPE_CHECKING:
@@ -136,8 +136,8 @@ class Predictor:
     def stream(self, frame: ArrayLike, time: float | None = None) -> Reading:
         """Process one frame and classify the window that ends with it.
 
-        A missing reading (NaN, infinite, or outside the range by more than 5 % of the full scale) is replaced by the
-        last reading of its cell, 0 before the first, as in ``make_windows``.
+        A missing reading (NaN, infinite, or more than one full scale outside the range) is replaced by the last
+        reading of its cell, 0 before the first, as in ``make_windows``.
 
         Args:
             frame: ``[D]`` or ``[pads, rows, cols]`` in the layout's unit.
@@ -147,12 +147,13 @@ class Predictor:
         Raises:
             ValueError: the frame has another shape.
         """
-        reading, outside = within_range(np.asarray(frame, dtype=np.float64).reshape(-1), self.layout)
+        given = np.asarray(frame, dtype=np.float64).reshape(-1)
+        reading, outside = within_range(given, self.layout)
         if outside and not self.outside:
             _log.warning("%d readings outside the range of %s count as missing", outside, self.layout)
         self.outside += outside
         time = None if time is None or not np.isfinite(time) else time
-        events = self._monitor.update(reading, time)
+        events = self._monitor.update(given, time)
         self._keep_up()
         model = self._running.model
         scaled = scale(reading, self.layout)
@@ -242,11 +243,11 @@ def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
 
 
 def _finite(x: NDArray[Any]) -> NDArray[np.float32]:
-    """Return windows ``[N, T, D]`` without missing readings: NaN, infinite, or out of range by more than 5 %."""
+    """Return windows ``[N, T, D]`` on the 0..1 scale without missing or invalid readings."""
     x = np.asarray(x, dtype=np.float32)
-    if x.ndim != 3 or bool(((x >= -MARGIN) & (x <= 1 + MARGIN)).all()):  # NaN compares as False
+    if x.ndim != 3 or not x.size or bool(((x >= -1) & (x <= 2)).all()):  # NaN compares as False
         return x
-    missing = ~((x >= -MARGIN) & (x <= 1 + MARGIN))
+    missing = ~((x >= -1) & (x <= 2))  # as for a layout of full scale 1
     held: NDArray[np.float32] = np.stack([hold_missing(window) for window in np.where(missing, np.float32(np.nan), x)])
     return held
 

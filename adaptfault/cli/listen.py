@@ -84,7 +84,7 @@ def _layout(args: argparse.Namespace, newtons: float | None) -> SensorLayout:
     """Return the array that the options describe: the paper's where they say nothing."""
     from dataclasses import replace
 
-    from adaptfault.data.recordings.settle import given_array
+    from adaptfault.data.recordings.resolve import given_array
     from diagnostics import SensorLayout
 
     if args.layout and args.shape:

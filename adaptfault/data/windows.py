@@ -131,8 +131,8 @@ def split(
     """Return ``(train, validation, test)``, split by recording and stratified by class.
 
     ``validation`` is a share of the recordings outside the test set, so the defaults give 64 %, 16 % and 20 %
-    (Section VI-C). Every class has a recording on each side, which plain stratification does not promise for small classes; a share of 0
-    leaves that side empty.
+    (Section VI-C). Every class has a recording on each side, which plain stratification does not guarantee for small
+    classes; a share of 0 leaves that side empty.
 
     Raises:
         ValueError: a share outside [0, 1), a class with too few recordings, a recording with two labels.

@@ -19,6 +19,7 @@ from adaptfault.data.recordings.csv_folder import csv_pieces
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.files import Found, find
 from adaptfault.data.recordings.infer import SLACK
+from adaptfault.data.recordings.layout_file import layout_beside
 from adaptfault.data.recordings.load import READERS, PathName
 from adaptfault.data.recordings.resolve import check_agreement, given_array, resolve_layout
 from diagnostics import SensorLayout
@@ -88,7 +89,7 @@ class Stream:
         field: str | None = None,
     ) -> None:
         given = [Path(paths)] if isinstance(paths, str | PathLike) else [Path(path) for path in paths]
-        array = given_array(layout)
+        array = given_array(layout) if layout is not None else layout_beside(given)
         shape = array.shape if isinstance(array, SensorLayout) else array
         self._tables = _tables(calibration)
         aside = {Path(p).resolve() for p in (layout, calibration) if isinstance(p, str | PathLike)}

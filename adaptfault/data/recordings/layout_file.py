@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ from adaptfault.data.recordings.content import Shape
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.text import read_json_object, shown
 from diagnostics import SensorLayout
+
+LAYOUT_NAME = "layout.json"
+"""The name of the layout that is read from a folder of recordings without an option."""
 
 MOST_CELLS = 1_000_000
 """A layout with more positions is a typing error, and would fill the memory."""
@@ -40,6 +44,21 @@ def parse_shape(text: str) -> Shape:
     if pads * rows * cols > MOST_CELLS:
         raise InputError(f"shape {shown(text)}: more than {MOST_CELLS} cells; check the sizes")
     return pads, rows, cols
+
+
+def layout_beside(paths: Sequence[Path]) -> SensorLayout | None:
+    """Return the layout in the :data:`LAYOUT_NAME` of the folders given, or of the folders that hold the files given.
+
+    None unless every path has one, and all are the same.
+
+    Raises:
+        InputError: such a file is no layout.
+    """
+    files = [(path if path.is_dir() else path.parent) / LAYOUT_NAME for path in paths]
+    if not files or not all(file.is_file() for file in files):
+        return None
+    layouts = {read_layout(file) for file in dict.fromkeys(files)}
+    return layouts.pop() if len(layouts) == 1 else None
 
 
 def read_layout(path: str | PathLike[str]) -> SensorLayout:

@@ -20,8 +20,9 @@ from adaptfault.data.recordings.csv_folder import read_csv
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.files import Found, find
+from adaptfault.data.recordings.layout_file import layout_beside
 from adaptfault.data.recordings.npz import read_npy, read_npz
-from adaptfault.data.recordings.resolve import Resolved, check_agreement, given_array, resolve_layout
+from adaptfault.data.recordings.resolve import Resolved, check_agreement, check_statements, given_array, resolve_layout
 from diagnostics import SensorLayout
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ def load(
     rate: float | None = None,
     topic: str | None = None,
     field: str | None = None,
+    strict: bool = False,
 ) -> Loaded:
     """Read recordings; a bad file is listed and left out, the others are read.
 
@@ -75,6 +77,7 @@ def load(
         frames: the number of frames that each recording must have; None = any.
         calibration: tables that turn the counts read into newtons (or the file that holds them).
         full_scale, unit, rate: override the layout and the files.
+        strict: refuse files that state another full scale or rate than ``layout``, as a model's layout requires.
         topic, field: where the readings are in bags, see :func:`adaptfault.data.recordings.bag.read_bag`.
 
     Raises:
@@ -82,18 +85,18 @@ def load(
             unusable.
 
     Notes:
-        Without a layout, the shape is the one of ``[n, T, pads, rows, cols]`` or ``[n, T, rows, cols]`` (one pad), or
-        the paper's for frames of 220 readings. Without a full scale, counts get the one of the smallest converter of 8
-        to 16 bits that holds them; decimal numbers get the paper's 0..5 N for the paper's shape, else the range of the
-        converter whose step they show, else 0 to the largest reading. The rate is the file's, or 10 Hz. Whatever is
-        inferred so is listed in ``inferred``.
+        Without a layout, ``layout.json`` in the folders given is used where there is one. Otherwise the shape is the
+        one of ``[n, T, pads, rows, cols]`` or ``[n, T, rows, cols]`` (one pad), or the paper's for frames of 220
+        readings. Without a full scale, counts get the one of the smallest converter of 8 to 16 bits that holds them;
+        decimal numbers get the paper's 0..5 N for the paper's shape, else the range of the converter whose step they
+        show, else 0 to the largest reading. The rate is the file's, or 10 Hz. Every inferred fact is in ``inferred``.
     """
     given = [Path(paths)] if isinstance(paths, str | PathLike) else [Path(path) for path in paths]
     if not given:
         raise InputError("no path given; name a recording or a folder of recordings")
     if frames is not None and frames < 1:
         raise InputError(f"frames {frames}: expected the number of frames a recording must have, at least 1")
-    array = given_array(layout)
+    array = given_array(layout) if layout is not None else layout_beside(given)
     shape = array.shape if isinstance(array, SensorLayout) else array
     tables = _calibration(calibration)
     aside = {Path(p).resolve() for p in (layout, labels, calibration) if isinstance(p, str | PathLike)}
@@ -119,7 +122,7 @@ def load(
             tables.check(resolved.layout)
         except ValueError as error:
             raise InputError(f"calibration: {error}") from None
-    return _assemble(contents, resolved, frames, tables, problems)
+    return _assemble(contents, resolved, frames, tables, problems, strict=strict)
 
 
 def _assemble(
@@ -128,6 +131,8 @@ def _assemble(
     length: int | None,
     tables: Calibration | None,
     problems: list[Problem],
+    *,
+    strict: bool,
 ) -> Loaded:
     """Check each file against the layout, calibrate it, and put the recordings of all together."""
     layout = resolved.layout
@@ -142,6 +147,8 @@ def _assemble(
         try:
             check_agreement(content, every, tables is not None)
             check_width(content, layout)
+            if strict:
+                check_statements(content, layout, tables is not None)
         except InputError as error:
             problems.append(Problem("error", str(error)))
             continue

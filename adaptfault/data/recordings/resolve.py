@@ -151,6 +151,18 @@ def check_agreement(content: Content, contents: Sequence[Content], calibrated: b
         raise InputError.at(content.path, "another mask of present cells than the files before it; load them apart")
 
 
+def check_statements(content: Content, layout: SensorLayout, calibrated: bool) -> None:
+    """Raise InputError if a file states another full scale or rate than the layout."""
+    full_scale = None if calibrated else content.full_scale
+    if full_scale is not None and not math.isclose(full_scale, layout.full_scale, rel_tol=1e-3):
+        came = f"full scale {full_scale:g} {content.unit or ''}".rstrip()
+        what = f"{came} where {layout.full_scale:g} {layout.unit} is expected; use recordings of the same sensor"
+        raise InputError.at(content.path, what)
+    if content.rate is not None and not same_rate(content.rate, layout.rate):
+        what = f"rate {content.rate:g} Hz where {layout.rate:g} Hz is expected; use recordings of the same sensor"
+        raise InputError.at(content.path, what)
+
+
 def same_rate(one: float, other: float) -> bool:
     """Return whether two rates differ by less than the jitter of measured ones."""
     return abs(one - other) < _SAME_RATE * max(one, other)

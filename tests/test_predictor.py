@@ -290,7 +290,7 @@ def test_readings_outside_the_range_never_make_the_probabilities_nan(carried):
     predictor.reset()
     for i, value in enumerate((1e30, np.inf, -np.inf, 1e308, -1e30, np.nan)):
         log[10 + i, i % D] = value
-    found = [predictor.stream(frame, np.nan).probabilities for frame in log]
+    found = [predictor.stream(frame).probabilities for frame in log]
     assert all(p is None or np.isfinite(p).all() for p in found)
     np.testing.assert_array_equal(found[-1], clean[-1])
     assert predictor.outside == 5

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import shutil
+import time
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
@@ -16,6 +18,7 @@ from uuid import uuid4
 from adaptfault.robot.checksummed_json import (
     Damaged,
     damage,
+    decoding,
     hash_files,
     read_with_copy,
     sync,
@@ -46,6 +49,8 @@ _MAINTENANCE_LOCK, _STATE_LOCK = "maintenance.lock", "state.lock"
 
 PROCESS = uuid4().hex  # identifies this process in the count of starts
 _log = logging.getLogger(__name__)
+_TEMPORARY = re.compile(r"\.(bundle|current|journal)\..*\.[a-z0-9_]{8}")  # names that atomic_write makes
+_ABANDONED = 3600  # seconds
 _KEPT = 5  # latest versions that stay on the disk, besides the fault-free one
 
 
@@ -81,9 +86,10 @@ class Bundle:
                 f"{self.path}: expected a bundle, a folder with {_ABOUT}; adaptfault train --out X.bundle makes one"
             )
         self.about: dict[str, Any] = read_with_copy(self.path / _ABOUT, SCHEMA)
-        self.layout = SensorLayout.from_dict(self.about["layout"])
-        self.class_names: tuple[str, ...] = tuple(self.about["class_names"])
-        self.parts = Parts(self.path / _PARTS, self.about["parts"])
+        with decoding(self.path / _ABOUT):
+            self.layout = SensorLayout.from_dict(self.about["layout"])
+            self.class_names: tuple[str, ...] = tuple(map(str, self.about["class_names"]))
+            self.parts = Parts(self.path / _PARTS, dict(self.about["parts"]))
         self.versions = Versions(self.path / "versions")
         self.journal = Journal(self.path)
 
@@ -226,7 +232,7 @@ class Bundle:
         )
         problems += self.journal.damage(repair=repair)
         try:
-            self.parts.check()
+            self.parts.check(repair=repair)
         except Damaged as error:
             problems.append(str(error))
         for number in self.versions.numbers:
@@ -235,6 +241,13 @@ class Bundle:
             except (Damaged, FileNotFoundError) as error:
                 problems.append(str(error))
         return problems
+
+    def sweep(self) -> None:
+        """Remove temporary files that crashes left, once they are older than any write."""
+        for path in self.path.glob(".*"):
+            with suppress(OSError):  # another process may remove it, too
+                if _TEMPORARY.fullmatch(path.name) and time.time() - path.stat().st_mtime > _ABANDONED:
+                    path.unlink()
 
     def _fall_back(self, pointer: Pointer, reason: str) -> None:
         try:
@@ -256,7 +269,10 @@ class Bundle:
         known = self.journal.last("knowledge")
         if known is None:  # new or lost journal: the active version stores the faults it was adapted to
             known = self.active().about.get("knowledge")
-        return KnownFaults(self.layout.n_cells) if known is None else KnownFaults.from_dict(known)
+        if known is None:
+            return KnownFaults(self.layout.n_cells)
+        with decoding(self.journal.path):
+            return KnownFaults.from_dict(known)
 
     def maintenance(self, *, dry_run: bool = False) -> AbstractContextManager[None]:
         """Hold the maintenance lock, one run at a time; raises Busy. A dry run needs no write access."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,10 @@ def read_checksummed(path: Path, schema: str) -> dict[str, Any]:
         FileNotFoundError: the file does not exist.
         Damaged: the checksum does not match, or the schema differs.
     """
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except (IsADirectoryError, NotADirectoryError):
+        raise Damaged(f"{path} is damaged: expected a file") from None
     try:
         document = json.loads(data)
         checksum = document.pop(_CHECKSUM)
@@ -48,6 +51,17 @@ def read_checksummed(path: Path, schema: str) -> dict[str, Any]:
     if found != schema:
         raise Damaged(f"{path} has schema {found!r}, expected {schema!r}")
     return dict(document)
+
+
+@contextmanager
+def decoding(path: Path) -> Iterator[None]:
+    """Raise Damaged for any error in decoding the content of ``path``, whose checksum may be right all the same."""
+    try:
+        yield
+    except (OSError, ImportError, Damaged):
+        raise
+    except Exception as error:  # a malformed document raises any of a dozen kinds, SafetensorError among them
+        raise Damaged(f"{path} is damaged: {type(error).__name__} {error}") from None
 
 
 def write_with_copy(path: Path, document: Mapping[str, Any]) -> None:

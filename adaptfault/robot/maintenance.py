@@ -202,6 +202,8 @@ class _Maintenance:
     def run(self, incoming: Sequence[_InputRecording]) -> MaintenanceReport:
         """Diagnose recordings that no earlier run used, decide, and journal the run unless it is a dry run."""
         bundle = self.bundle
+        if not self.dry_run:
+            bundle.sweep()
         self.warnings = tuple(bundle.problems(repair=not self.dry_run))
         self.version = bundle.active()
         self.before = bundle.known_faults()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
-from pathlib import Path
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
+from adaptfault.data.atomic import atomic_write
 from adaptfault.models.store import load_arrays, save_arrays
-from adaptfault.robot.checksummed_json import check_files
+from adaptfault.robot.checksummed_json import Damaged, check_files, decoding
 from diagnostics import SelfDiagnosis
 
 if TYPE_CHECKING:
@@ -17,11 +18,12 @@ if TYPE_CHECKING:
     from adaptfault.data.windows import Windows
 
 _ADAPTER, _REFERENCE, _CHECK, _CALIBRATION = "adapter", "reference", "check", "calibration.csv"
+_COPY = "reference.copy"
 _SCHEMA = "adaptfault.reference/1"
 
 
 class Parts:
-    """Reads the parts. The first use checks all hashes and raises Damaged on a mismatch.
+    """Reads the parts. The first use of each checks its hashes and raises Damaged on a mismatch.
 
     Args:
         folder: of the parts.
@@ -30,6 +32,7 @@ class Parts:
 
     def __init__(self, folder: Path, hashes: Mapping[str, str]) -> None:
         self.folder, self.hashes = folder, hashes
+        self._whole: set[str] = set()  # parts that were checked
 
     @staticmethod
     def write(
@@ -54,41 +57,73 @@ class Parts:
         save_adapter(folder / _ADAPTER, adapter)
         save_windows(folder / _CHECK, check)
         about, arrays = diagnoser.state()
-        save_arrays(folder / _REFERENCE, _SCHEMA, {"diagnosis": about}, arrays)
+        for name in (_REFERENCE, _COPY):  # prediction needs it, so there are two
+            save_arrays(folder / name, _SCHEMA, {"diagnosis": about}, arrays)
         if calibration is not None:
             calibration.write(folder / _CALIBRATION)
 
-    def check(self) -> None:
-        """Check all of them; raises Damaged."""
-        check_files(self.folder, self.hashes)
+    def check(self, *, repair: bool = False) -> None:
+        """Check all of them; ``repair`` restores the reference or its copy from the other. Raises Damaged."""
+        problems = []
+        for name in sorted({PurePosixPath(file).parts[0] for file in self.hashes}):
+            try:
+                self._verified(name)
+            except Damaged as error:
+                problems.append(str(error))
+                if repair and name in (_REFERENCE, _COPY):
+                    self._restore(name, _COPY if name == _REFERENCE else _REFERENCE)
+        if problems:
+            raise Damaged("; ".join(problems))
 
-    @cached_property
-    def _checked(self) -> Path:
-        self.check()
-        return self.folder
+    def _verified(self, name: str) -> Path:
+        """Return the path of one part after a check of its files only; raises Damaged."""
+        if name not in self._whole:
+            check_files(self.folder, {f: h for f, h in self.hashes.items() if PurePosixPath(f).parts[0] == name})
+            self._whole.add(name)
+        return self.folder / name
+
+    def _restore(self, name: str, source: str) -> None:
+        with suppress(Damaged, OSError):
+            whole = self._verified(source)
+            for path in whole.iterdir():
+                atomic_write(self.folder / name / path.name, path.read_bytes())
 
     def diagnoser(self) -> SelfDiagnosis:
-        """Return the fitted self-diagnosis. Needs no torch."""
-        about, arrays = load_arrays(self._checked / _REFERENCE, _SCHEMA)
-        return SelfDiagnosis.from_state(about["diagnosis"], arrays)
+        """Return the fitted self-diagnosis, from its copy where the part is damaged. Needs no torch."""
+        try:
+            return _diagnoser(self._verified(_REFERENCE))
+        except Damaged:
+            if not any(PurePosixPath(file).parts[0] == _COPY for file in self.hashes):
+                raise
+        return _diagnoser(self._verified(_COPY))
 
     def adapter(self) -> Adapter:
         """Return the adapter, with the fault-free model and windows."""
         from adaptfault.adaptation.adapter_files import load_adapter
 
-        return load_adapter(self._checked / _ADAPTER)
+        path = self._verified(_ADAPTER)
+        with decoding(path):
+            return load_adapter(path)
 
     def check_windows(self) -> Windows:
         """Return the held-out windows on which a candidate and the running version are compared."""
         from adaptfault.adaptation.adapter_files import load_windows
 
-        return load_windows(self._checked / _CHECK)
+        path = self._verified(_CHECK)
+        with decoding(path):
+            return load_windows(path)
 
     @property
     def calibration(self) -> Path | None:
         """Path of the calibration table from raw counts to the layout's unit; None without one."""
-        path = self._checked / _CALIBRATION
+        path = self._verified(_CALIBRATION)
         return path if path.is_file() else None
+
+
+def _diagnoser(path: Path) -> SelfDiagnosis:
+    with decoding(path):
+        about, arrays = load_arrays(path, _SCHEMA)
+        return SelfDiagnosis.from_state(about["diagnosis"], arrays)
 
 
 def _split_validation(adapter: Adapter) -> tuple[Adapter, Windows]:

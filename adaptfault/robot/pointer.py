@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from adaptfault.robot.checksummed_json import read_with_copy, write_with_copy
+from adaptfault.robot.checksummed_json import decoding, read_with_copy, write_with_copy
 
 SCHEMA = "adaptfault.current/1"
 NAME = "current.json"
@@ -37,8 +37,10 @@ class Pointer:
     def read(cls, bundle: Path) -> Pointer:
         """Read the pointer, or its copy where it is damaged; raises Damaged where both are."""
         d = read_with_copy(bundle / NAME, SCHEMA)
-        rejected = tuple(tuple(cells) for cells in d["rejected"])
-        return cls(d["active"], tuple(d["fallbacks"]), d["probation"], d["starts"], d["starter"], rejected)
+        with decoding(bundle / NAME):
+            rejected = tuple(tuple(map(int, cells)) for cells in d["rejected"])
+            fallbacks = tuple(map(int, d["fallbacks"]))
+            return cls(int(d["active"]), fallbacks, bool(d["probation"]), int(d["starts"]), str(d["starter"]), rejected)
 
     def write(self, bundle: Path) -> None:
         """Write the pointer; replacing the file switches the version."""

@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from adaptfault.data.windows import hold_missing, scale
 from adaptfault.models.inference import Inference
 from adaptfault.robot.bundle import PROCESS
+from adaptfault.robot.checksummed_json import Damaged, decoding
 from adaptfault.robot.converter_range import within_range
-from diagnostics import Fault, FaultSet, Monitor, SensorLayout
+from diagnostics import Fault, FaultSet, Monitor, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
     from adaptfault.robot.bundle import Bundle
@@ -88,7 +89,7 @@ class Predictor:
         self._loading: threading.Thread | None = None
         self._ready: _Running | None = None
         self._failed: int | None = None  # number of the version that could not be loaded
-        self._monitor = Monitor(bundle.diagnoser())
+        self._monitor = Monitor(_reference(bundle))
         self.layout = bundle.layout
         self.class_names = tuple(bundle.class_names)
         self.outside = 0  # readings outside the range so far
@@ -141,18 +142,23 @@ class Predictor:
 
         Args:
             frame: ``[D]`` or ``[pads, rows, cols]`` in the layout's unit.
-            time: of the frame, seconds; None or not finite where unknown. Frames missing between two times are reported
-                as lost.
+            time: of the frame, seconds; frames missing between two times are reported as lost. None: unknown.
 
         Raises:
-            ValueError: the frame has another shape.
+            ValueError: the frame has another shape, or the time is not finite.
         """
-        given = np.asarray(frame, dtype=np.float64).reshape(-1)
+        given = np.asarray(frame, dtype=np.float64)
+        if given.shape not in ((self.layout.n_cells,), self.layout.shape):
+            raise ValueError(
+                f"expected a frame [{self.layout.n_cells}] or {list(self.layout.shape)}, got {list(given.shape)}"
+            )
+        if time is not None and not np.isfinite(time):
+            raise ValueError(f"time {time}: expected seconds, or None where it is unknown")
+        given = given.reshape(-1)
         reading, outside = within_range(given, self.layout)
         if outside and not self.outside:
             _log.warning("%d readings outside the range of %s count as missing", outside, self.layout)
         self.outside += outside
-        time = None if time is None or not np.isfinite(time) else time
         events = self._monitor.update(given, time)
         self._keep_up()
         model = self._running.model
@@ -235,7 +241,8 @@ def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
     Raises:
         FileNotFoundError, ImportError, ValueError: the version cannot be loaded.
     """
-    model = Inference.load(version.folder)
+    with decoding(version.folder):
+        model = Inference.load(version.folder)
     if model.layout != layout:
         raise ValueError(f"the version is for {model.layout}, the bundle for {layout}")
     model.predict_proba(np.zeros((1, model.length, layout.n_cells), np.float32))
@@ -263,6 +270,15 @@ def _start_any(bundle: Bundle) -> _Running:
                 raise
             _log.warning("version %d could not be loaded: %s", version.number, error)
     raise AssertionError("unreachable")
+
+
+def _reference(bundle: Bundle) -> SelfDiagnosis:
+    """Return the bundle's diagnoser; where it is damaged, one without a reference, so that prediction goes on."""
+    try:
+        return bundle.diagnoser()
+    except Damaged as error:
+        _log.warning("monitoring without the healthy reference: %s", error)
+        return SelfDiagnosis(bundle.layout)
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:

@@ -11,6 +11,7 @@ from typing import Any
 
 from adaptfault.robot.checksummed_json import (
     check_files,
+    decoding,
     hash_files,
     read_checksummed,
     sync,
@@ -59,16 +60,21 @@ class Version:
             Damaged: a file fails its checksum.
         """
         document = read_checksummed(folder / ABOUT, SCHEMA)
+        with decoding(folder / ABOUT):
+            return cls._decode(folder, document)
+
+    @classmethod
+    def _decode(cls, folder: Path, document: Mapping[str, Any]) -> Version:
         check_files(folder, document["files"])
         layout = SensorLayout.from_dict(document["layout"])
         return cls(
-            number=document["number"],
+            number=int(document["number"]),
             folder=folder,
             layout=layout,
             class_names=tuple(document["class_names"]),
-            length=document["length"],
+            length=int(document["length"]),
             fault_set=FaultSet(tuple(document["fault_set"]), layout.n_cells),
-            about=document["about"],
+            about=dict(document["about"]),
         )
 
 
@@ -89,7 +95,7 @@ class Versions:
     @property
     def numbers(self) -> list[int]:
         """Numbers of all versions on disk, ascending; versions may be damaged."""
-        return sorted(int(p.name) for p in self.folder.glob("[0-9]*") if p.name.isdecimal())
+        return sorted(int(p.name) for p in self.folder.glob("[0-9]*") if p.name.isdecimal() and p.is_dir())
 
     def write(
         self,
@@ -109,7 +115,7 @@ class Versions:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         self.sweep()
-        number = max(self.numbers, default=0) + 1
+        number = max((int(p.name) for p in self.folder.iterdir() if p.name.isdecimal()), default=0) + 1
         new = self.folder / f"{_UNFINISHED}{number:04d}"
         new.mkdir()
         fill(new)
@@ -132,7 +138,7 @@ class Versions:
     def sweep(self, keep: Collection[int] | None = None) -> None:
         """Remove unfinished versions of crashed runs and, if ``keep`` is given, all versions but these."""
         for unfinished in self.folder.glob(f"{_UNFINISHED}*"):
-            shutil.rmtree(unfinished)
+            shutil.rmtree(unfinished) if unfinished.is_dir() else unfinished.unlink()
         if keep is not None:
             for number in set(self.numbers) - set(keep):
                 shutil.rmtree(self.path(number))

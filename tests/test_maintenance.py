@@ -146,6 +146,29 @@ def test_recovered_cells_lead_back_to_the_version_that_uses_them(bundle, later_g
     assert bundle.rollback().number == 2
 
 
+def test_a_log_that_tests_nothing_says_so_in_the_first_line_and_by_its_exit_code(bundle):
+    log = [np.zeros((60, 60)) for _ in range(6)]
+    report = maintain(bundle, log, dry_run=True)
+    assert (report.decision, report.exit_code, report.fault_set) == ("unchanged", 1, set())
+    assert "the recordings test only 0% of the cells" in str(report).splitlines()[0]
+    assert maintain(bundle, log, dry_run=True, untested_code=0).exit_code == 0
+
+
+def test_a_change_of_the_whole_sensor_is_measured_and_needs_a_technician_where_it_costs(bundle, later_grasps):
+    assert maintain(bundle, later_grasps, dry_run=True).change is None
+    weak = maintain(bundle, [0.3 * r for r in later_grasps], dry_run=True)
+    assert weak.change.gain == pytest.approx(0.3, rel=0.3)
+    assert "sensor changed: readings are about 0." in str(weak).splitlines()[0]
+    shifted = maintain(bundle, [r * 0.6 + 1.5 for r in later_grasps], dry_run=True)
+    assert shifted.change.offset == pytest.approx(1.5, rel=0.05)
+    for report in (weak, shifted):
+        cost = [
+            float(part) for part in report.reason.split("accuracy of version 1 ")[1].split(" with")[0].split(" -> ")
+        ]
+        assert report.exit_code >= (2 if cost[1] < 0.9 * cost[0] else 1)
+        json.dumps(report.to_dict(), allow_nan=False)
+
+
 def test_one_bad_recording_does_not_stop_the_others(bundle, later_grasps, broken_row):
     log = [later_grasps[0][:, :7], *broken(later_grasps, broken_row)]
     report = maintain(bundle, log, names=["short.csv"])

@@ -21,6 +21,7 @@ from adaptfault.robot.plausibility import contradiction, implausible
 from adaptfault.robot.pointer import Pointer
 from adaptfault.robot.versions import Version
 from diagnostics import Diagnosis, Fault, FaultSet
+from diagnostics.evidence.sensor_change import SensorChange, sensor_change
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
@@ -33,6 +34,7 @@ Decision = Literal["unchanged", "deployed", "kept", "refused"]
 _TECHNICIAN_BELOW = 0.9  # share of the fault-free accuracy below which the sensor needs a technician
 _CONTRADICTORY = 1.0  # residual variance ratio at which other cells predict no better than the mean
 _UNKNOWN = 3
+_TESTED = 0.05  # test coverage below which recordings test nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +54,7 @@ class MaintenanceReport:
         judgement: comparison of the last candidate with the running version; None without a candidate.
         accuracy: of the version that runs now, under the known faults, on the held-out windows; None if not measured.
         fault_free_accuracy: of version 1 on the same windows without faults; None if not measured.
+        change: of the whole sensor against the reference (gain, offset); None where none was found.
         stages: cost and result of each adaptation stage, as text.
         used: names of the recordings whose diagnosis entered the known faults; empty where they were refused.
         left_out: recordings, or readings of them, that were not used, with the reason.
@@ -70,6 +73,7 @@ class MaintenanceReport:
     judgement: Judgement | None = None
     accuracy: float | None = None
     fault_free_accuracy: float | None = None
+    change: SensorChange | None = None
     stages: tuple[str, ...] = ()
     used: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
@@ -112,6 +116,7 @@ class MaintenanceReport:
             "judgement": None if self.judgement is None else vars(self.judgement),
             "accuracy": self.accuracy,
             "fault_free_accuracy": self.fault_free_accuracy,
+            "change": None if self.change is None else vars(self.change),
             "stages": list(self.stages),
             "used": list(self.used),
             "left_out": list(self.left_out),
@@ -128,6 +133,7 @@ def maintain(
     names: Sequence[str] = (),
     dry_run: bool = False,
     budget: float | None = None,
+    untested_code: int = 1,
     say: Callable[[str], None] = lambda text: None,
 ) -> MaintenanceReport:
     """Diagnose new recordings and update the running version where that is needed.
@@ -142,6 +148,7 @@ def maintain(
         names: of the recordings, for messages.
         dry_run: report only, change nothing.
         budget: seconds that an adaptation may take.
+        untested_code: exit code where no fault is known and the recordings test less than 5 % of the cells.
         say: receives one line of progress before each long step.
 
     Raises:
@@ -150,7 +157,7 @@ def maintain(
     """
     began = time.perf_counter()
     with bundle.maintenance(dry_run=dry_run):
-        report = _Maintenance(bundle, dry_run, budget, say).run(_checked(recordings, names, bundle))
+        report = _Maintenance(bundle, dry_run, budget, untested_code, say).run(_checked(recordings, names, bundle))
     return replace(report, seconds=time.perf_counter() - began)
 
 
@@ -195,6 +202,7 @@ class _Maintenance:
     bundle: Bundle
     dry_run: bool
     budget: float | None
+    untested_code: int
     say: Callable[[str], None]
     warnings: tuple[str, ...] = field(default=(), init=False)
     judged: dict[str, Any] | None = field(default=None, init=False)
@@ -224,9 +232,44 @@ class _Maintenance:
         self.say(f"diagnosing {len(usable)} new recordings")
         frames = [r.frames for r in usable if r.frames is not None]
         report = self._decide(bundle.diagnoser().diagnose(frames), frames, tuple(r.name for r in usable))
+        report = self._with_change(self._with_coverage(report), frames)
         if not self.dry_run:
             self._write(report, usable)
         return report
+
+    def _with_coverage(self, report: MaintenanceReport) -> MaintenanceReport:
+        """Return the report with the exit code of recordings that test nothing."""
+        diagnosis = report.diagnosis
+        if diagnosis is None or report.exit_code != 0 or diagnosis.coverage.test_coverage >= _TESTED:
+            return report
+        share = diagnosis.coverage.test_coverage
+        reason = f"the recordings test only {share:.0%} of the cells, so faults may be hidden; {report.reason}"
+        return replace(report, exit_code=self.untested_code, reason=reason)
+
+    def _with_change(self, report: MaintenanceReport, frames: list[NDArray[np.float64]]) -> MaintenanceReport:
+        """Return the report with a change of the whole sensor, and its effect on the accuracy."""
+        from adaptfault.adaptation.result import Adaptation
+
+        layout = self.bundle.layout
+        healthy = np.flatnonzero(layout.present.ravel() & ~report.fault_set.mask)
+        if not len(healthy):
+            return report
+        train = self.bundle.parts.adapter().train
+        reference = (
+            train.x[train.recording == number].reshape(-1, layout.n_cells) * layout.full_scale
+            for number in np.unique(train.recording)
+        )
+        change = sensor_change(frames, reference, layout, healthy)
+        if change is None:
+            return report
+        windows = with_faults(self.bundle.parts.check_windows(), report.faults, layout)
+        model = Adaptation.load(self.bundle.versions[report.version].folder)
+        before = float((model.predict(windows.x) == windows.y).mean())
+        changed = (windows.x * change.gain + change.offset / layout.full_scale).astype(np.float32)
+        after = float((model.predict(changed) == windows.y).mean())
+        effect = f"{change.reason}; accuracy of version {report.version} {before:.3f} -> {after:.3f} with this change"
+        code = max(report.exit_code, 2 if after < _TECHNICIAN_BELOW * before else 1)
+        return replace(report, change=change, exit_code=code, reason=f"{effect}; {report.reason}")
 
     def _decide(
         self, diagnosis: Diagnosis, frames: list[NDArray[np.float64]], used: tuple[str, ...]

@@ -114,6 +114,21 @@ def test_devices_are_limited_and_those_that_are_not_wanted_refused():
     assert (receiver.counters.refused, len(frames)) == (500, 5)
 
 
+def test_a_device_is_bound_to_its_address_until_it_is_silent():
+    async def run():
+        receiver = Receiver(SensorLayout(1, 2, 3, rate=10.0))
+        for i in range(3):
+            receiver.take(format_packet("a", i / 10, np.ones(6)), i / 10, "10.0.0.1")
+            receiver.take(format_packet("a", 5 + i / 10, np.zeros(6)), i / 10, "10.0.0.66")
+        receiver.take(format_packet("a", 0.3, np.ones(6)), 20.0, "10.0.0.2")  # restarted with another address
+        receiver.close()
+        return receiver.counters, [frame async for frame in receiver]
+
+    counters, frames = asyncio.run(run())
+    assert (counters.kept, counters.refused) == (4, 3)
+    assert all((frame.values == 1).all() for frame in frames)
+
+
 def test_when_nobody_fetches_the_oldest_frames_go_and_are_counted():
     receiver, frames = taken(packets(300), queue=100)
     assert (receiver.counters.dropped, receiver.counters.kept) == (200, 300)

@@ -18,6 +18,7 @@ MOST_DEVICES = 16
 QUEUE = 1024
 _KERNEL_BUFFER = 4 << 20  # bytes requested, for datagrams that arrive while this process does not run
 _TURNS = 8  # of the event loop for each frame fetched; each turn reads one datagram
+_BOUND = 10.0  # seconds of silence after which a device may send from another address
 _TICK = 0.05  # seconds between checks for held packets
 
 
@@ -33,7 +34,7 @@ class Counters:
         kept: frames, in order.
         dropped: kept frames that were not fetched in time.
         malformed, oversized: not packets of this array.
-        refused: from devices that are not listed, or beyond the limit of devices.
+        refused: from devices that are not listed, beyond the limit of devices, or from a second address.
         devices: number of devices.
         duplicates, late, strays, held, lost, restarts: as in :class:`Arrivals`, all devices together.
     """
@@ -96,6 +97,7 @@ class Receiver(asyncio.DatagramProtocol):
         self._queue: deque[Frame] = deque(maxlen=queue)
         self._longest = longest_packet(layout.n_cells)
         self._streams: dict[str, Ordering] = {}
+        self._senders: dict[str, tuple[str, float]] = {}  # address of each device, and when it sent last
         self._received = self._dropped = self._malformed = self._oversized = self._refused = 0
         self._transport: asyncio.BaseTransport | None = None
         self._news = asyncio.Event()
@@ -122,8 +124,12 @@ class Receiver(asyncio.DatagramProtocol):
         """Counts of the packets of each device."""
         return {name: stream.arrivals for name, stream in self._streams.items()}
 
-    def take(self, data: bytes, now: float) -> None:
-        """Process one datagram that arrived at ``now``, seconds of a monotonic clock."""
+    def take(self, data: bytes, now: float, sender: str = "") -> None:
+        """Process one datagram that arrived at ``now``, seconds of a monotonic clock, from the address ``sender``.
+
+        A device is bound to the address that it sends from first: packets with its name from other addresses are
+        refused until it has been silent for 10 s.
+        """
         self._received += 1
         if len(data) > self._longest:
             self._oversized += 1
@@ -140,6 +146,11 @@ class Receiver(asyncio.DatagramProtocol):
                 self._refused += 1
                 return
             stream = self._streams[packet.device] = Ordering(packet.device, self.layout.rate, window=self.window)
+        bound, last = self._senders.get(packet.device, (sender, now))
+        if sender != bound and now - last < _BOUND:
+            self._refused += 1
+            return
+        self._senders[packet.device] = (sender, now)
         self._put(stream.push(packet, now))
 
     def poll(self, now: float) -> None:
@@ -197,7 +208,7 @@ class Receiver(asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, addr: object) -> None:
         """Called by asyncio."""
-        self.take(data, time.monotonic())
+        self.take(data, time.monotonic(), str(addr[0]) if isinstance(addr, tuple) else "")
 
     def error_received(self, exc: Exception) -> None:
         """Called by asyncio for ICMP errors, which do not affect a receiver."""

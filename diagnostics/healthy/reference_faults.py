@@ -33,7 +33,7 @@ def find_reference_faults(
     recordings: RecordingBlocks,
     layout: SensorLayout,
     tolerance: float,
-    diagnose: Callable[[RecordingBlocks, NDArray[np.bool_], NDArray[np.float64]], Diagnosis],
+    diagnose: Callable[[RecordingBlocks, NDArray[np.bool_], NDArray[np.float64], SensorLayout], Diagnosis],
 ) -> NDArray[np.float64]:
     """Return P(dead) of the cells that are dead throughout the reference, ``[D]``; 0 for all others.
 
@@ -53,7 +53,7 @@ def find_reference_faults(
     usual = rest[present & ~never_moved]
     # A cell that holds more than any rests at is loaded, or dead.
     rest = np.where(rest > usual.max(), np.median(usual), rest)
-    found = diagnose(_sample(recordings), suspects, rest)
+    found = diagnose(_sample(recordings), suspects, rest, layout)
     dead = never_moved & found.fault_set.mask & (found.probability >= _SURE)
     return np.where(dead, found.probability, 0.0)
 

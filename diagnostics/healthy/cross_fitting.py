@@ -10,13 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.healthy.stacking import RegressionOutput, Stacking, neighbourhood
-from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.scale import Array
+
+if TYPE_CHECKING:
+    from diagnostics.layout import SensorLayout
 
 FOLDS = 4  # of the sources
 _LEFT_OUT = (0.03, 0.06, 0.12, 0.2, 0.4, 0.7, 0.95)  # shares of the cells that are no predictors, in turn

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,64 +26,21 @@ from diagnostics.events.constant_runs import segments
 from diagnostics.events.contact_events import SEGMENT, ContactEvent, EventLog, Summary, count_repeats
 from diagnostics.healthy.cross_fitting import FOLDS, CrossFitting, RegressionFit
 from diagnostics.healthy.local_regression import LocalRegression, predict_regressions
+from diagnostics.healthy.prediction import Prediction
 from diagnostics.healthy.stacking import RegressionOutput, Stacking, neighbourhood
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.scale import Array, Scale
+
+if TYPE_CHECKING:
+    from diagnostics.preprocessing.scale import Array, Scale
 
 _SAMPLES = 3000  # excerpts of events to fit on, about
 _MOST_DRAWS = 8  # excerpts of one event: more of them are nearly the same
 _SHORTEST = 6  # frames of an excerpt
 _MIN_P_FLOOR = 0.002  # lower limit of the probabilities, however many events there are: models err
 _MIN_RECORDINGS = 12  # with fewer recordings each event is a source of its own
-_OUTLIERS = 0.1  # share of events in which any load is equally likely (contamination)
 _EXPERIENCED, _INEXPERIENCED = 1 / 400, 1 / 100  # p_floor after 400 and after 100 events
 _SHARED = 0.4  # part of the evidence about a cell that also holds for its neighbours, where events are few
 _BATCH = 6144  # cells times excerpts in one batch: bounds memory
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """Predicted loads of healthy cells in each of n excerpts, given the predictors.
-
-    Attributes:
-        never: float ``[n, D]``, P(unloaded throughout).
-        always: float ``[n, D]``, P(loaded throughout).
-        mean: float ``[n, D]``, expected mean root load, 0 to 1.
-        spread: float ``[D]``, scale of the Student t error of ``mean``; NaN: unknown.
-        own: float ``[D]``, 1: the prediction is specific to the cell; 0: to any cell with the same surroundings.
-    """
-
-    never: NDArray[np.float64]
-    always: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    own: NDArray[np.float64]
-
-    def on(self, excerpts: NDArray[np.bool_] | slice, cells: NDArray[np.intp] | slice = slice(None)) -> Prediction:
-        """Return the prediction for some of the excerpts and cells."""
-        never, always, mean = (values[excerpts][:, cells] for values in (self.never, self.always, self.mean))
-        return Prediction(never, always, mean, self.spread[cells], self.own[cells])
-
-    def within(
-        self,
-        low: NDArray[np.float64],
-        high: NDArray[np.float64],
-        cells: NDArray[np.intp],
-        inflation: NDArray[np.float64] | float = 1.0,
-    ) -> NDArray[np.float64]:
-        """Return P(low <= mean root load <= high), ``[n, k]``.
-
-        A contaminated Student t distribution: 0.9 F_4((x - mean) / (inflation * spread)) + 0.1 of a uniform one.
-
-        Args:
-            low, high: root loads ``[k]``.
-            cells: int ``[k]``.
-            inflation: factor on the spread in each excerpt, ``[n]``.
-        """
-        mean, spread = self.mean[:, cells], self.spread[cells] * np.reshape(inflation, (-1, 1))
-        likely = _student_t((high - mean) / spread) - _student_t((low - mean) / spread)
-        p = (1 - _OUTLIERS) * likely + _OUTLIERS * (np.minimum(high, 1.0) - low)
-        return np.where(np.isnan(spread), 1.0, p)
 
 
 @dataclass(frozen=True)
@@ -173,13 +130,6 @@ class HealthyModel:
 def _inexperience(p_floor: NDArray[np.float64]) -> NDArray[np.float64]:
     inexperience: NDArray[np.float64] = np.log(p_floor / _EXPERIENCED) / np.log(_INEXPERIENCED / _EXPERIENCED)
     return np.clip(inexperience, 0.0, 1.0)
-
-
-def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ``scipy.stats.t(4).cdf(x)`` in closed form, ten times as fast. Edges of objects make the tails heavy."""
-    x = np.clip(x, -1e6, 1e6)
-    u = x / np.sqrt(1 + x**2 / 4)
-    return 0.5 + 0.375 * u * (1 - u**2 / 12)
 
 
 class ReferenceEvent(NamedTuple):

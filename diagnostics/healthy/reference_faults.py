@@ -9,16 +9,19 @@ groups at the border without such neighbours, are not detected.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from diagnostics.decision.result import Diagnosis
 from diagnostics.healthy.stacking import enclosed
-from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.baseline import baseline
 from diagnostics.preprocessing.readings import RecordingBlocks
+
+if TYPE_CHECKING:
+    from diagnostics.decision.result import Diagnosis
+    from diagnostics.layout import SensorLayout
 
 _PIECES, _FRAMES = 60, 200  # pieces that are diagnosed, evenly spread, and frames of each: sizes
 _CERTAIN = 0.99  # P(faulty) from which on a cell counts as dead in every later log

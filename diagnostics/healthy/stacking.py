@@ -14,14 +14,15 @@ input odds) and ``MLPClassifier`` as second level. Fitted on events that the reg
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
-from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.scale import Array
+if TYPE_CHECKING:
+    from diagnostics.layout import SensorLayout
+    from diagnostics.preprocessing.scale import Array
 
 _MAX_ODDS = 8.0  # log odds of the regressions are clipped here
 _PRIOR_CELLS = np.float32(0.5)  # pseudo-count of a ring: the mean of the pad; of the pad: the mean of the array

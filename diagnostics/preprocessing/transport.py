@@ -159,7 +159,7 @@ class TransportState:
         """
         found = []
         if self.lost:
-            text = f"{self.lost} frames came without a reading or not at all, the first is number {self.first_lost}"
+            text = f"{_count(self.lost, 'frame')} lost (no reading, or never received), the first is {self.first_lost}"
             found.append(TransportFault("lost", self.first_lost, self.lost, f"{text}: check the link to the sensor"))
         if self.invalid:
             text = f"{_count(self.invalid, 'reading')} outside what a converter gives, the first in frame"
@@ -168,12 +168,15 @@ class TransportState:
         for r in self.repetitions:
             loaded = int((r.frame > loaded_from)[working].sum())
             if loaded >= _LOADED_CELLS:
-                text = (
-                    f"the frame {r.onset}, in which {loaded} working cells are loaded, came {r.frames} times in a row"
-                )
-                text += f" ({r.frames / rate:.1f} s)"
+                text = f"frame {r.onset}, in which {loaded} working cells are loaded, was received {r.frames} times"
+                text += f" in a row ({r.frames / rate:.1f} s)"
                 found.append(
-                    TransportFault("frozen", r.onset, r.frames, f"{text}: the stream was frozen, not the cells")
+                    TransportFault(
+                        "frozen",
+                        r.onset,
+                        r.frames,
+                        f"{text}: the stream was frozen, not the cells; check the link to the sensor",
+                    )
                 )
         return tuple(found)
 

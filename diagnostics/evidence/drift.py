@@ -3,12 +3,12 @@
 The evidence of an offset is the sum of -log P(loaded throughout | other cells) over the last events, as far as the cell
 is loaded throughout each. That of a gain g is the log likelihood ratio
 
-    log sum_{g, s} P(g) P(s) L_s(g) / max_{g0 in 0.75..1.33} L_s(g0),  L_s(g) = prod_{e >= s} t_4(root_e; sqrt(g) mean_e)
+    log sum_{g, s} P(g) P(s) L_s(g) / max_{0.75 <= h <= 1.33} L_s(h),    L_s(g) = prod_{e >= s} t_4(y_e; sqrt(g) m_e)
 
-over gains g and change points s, with a contaminated Student t: Bayesian change point detection (Barry and Hartigan
-1993) for one change of scale.
-Both need several events, because objects have edges and a reading may hold a residue of the last load. Offsets below
-2 % of full scale and gains between 0.75 and 1.33 are not detected.
+over gains g and change points s, for root loads y and predicted means m, with a contaminated Student t: Bayesian change
+point detection (Barry and Hartigan 1993) for one change of scale. Both need several events, because objects have edges
+and a reading may hold a residue of the last load. Offsets below 2 % of full scale and gains
+between 0.75 and 1.33 are not detected.
 """
 
 from __future__ import annotations

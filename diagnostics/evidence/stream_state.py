@@ -249,7 +249,7 @@ class StreamState:
     def _with_held_loads(self, cells: CellState) -> CellState:
         """Return the cells with the evidence of loads that are held where nothing has moved for some events."""
         if self.reference.model is None:
-            return cells  # a log alone does not tell how healthy cells hold loads
+            return cells  # held loads cannot be predicted from one log alone
         loaded = cells.scored & (self.scale.root_load(self.runs.value) > self.scale.root_near)
         begun = np.array([event.first for event in self.events.kept])
         outlasted, accumulated = np.zeros(len(loaded), bool), cells.accumulated.copy()
@@ -286,7 +286,7 @@ class StreamState:
         if self.tiled:
             skin = self._skin.extend(root, numbers, scale.root_near, runs.start, jumped)
             self._skin = skin.split(KEPT_EVENTS)[1].without_loads()
-            # Of a hundred cells on a line one is always dead: cells that never moved do not tell two lines apart.
+            # On long lines some cell is always dead: cells that never moved are no difference between two lines.
             frames = np.where(runs.moved, frames, np.nan)
         self.intermittency = self.intermittency.extend(known, root, numbers, scale, self.reference.usual, still)
         self.duplicates = self.duplicates.extend(frames, numbers, informative(frames, still, scale), scale.near)

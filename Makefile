@@ -46,7 +46,7 @@ test-pythons: .venv/installed
 		version=$$($$python -c 'import ensurepip, sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null) || continue; \
 		test -e .venv-$$version/tested && continue; echo "Python $$version ($$python)"; \
 		$$python -m venv .venv-$$version && \
-		.venv-$$version/bin/python -m pip install --quiet --disable-pip-version-check pytest mcap rosbags \
+		.venv-$$version/bin/python -m pip install --quiet --disable-pip-version-check hypothesis pytest mcap rosbags \
 			$$($(BIN)/python -c 'import tomllib; print(*[d for d in tomllib.load(open("pyproject.toml", "rb"))["project"]["dependencies"] if not d.startswith("torch")], sep="\n")' | tr -d ' ') && \
 		.venv-$$version/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -e . && \
 		.venv-$$version/bin/python -m pytest --ignore tests/test_examples.py && touch .venv-$$version/tested || exit 1; \

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
 
@@ -48,6 +49,12 @@ if importlib.util.find_spec("torch") is None:  # what does without it is tested 
                 pytest.skip("needs torch")
             raise
 
+
+# The same few examples on every machine.
+hypothesis.settings.register_profile(
+    "few", derandomize=True, database=None, deadline=None, max_examples=30, print_blob=False
+)
+hypothesis.settings.load_profile("few")
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "sdh2x13x6_grasps36.npz"
 

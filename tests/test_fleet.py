@@ -95,6 +95,7 @@ def test_a_robot_that_is_being_maintained_is_waited_for(fleet, monkeypatch):
     assert "being maintained by another process" in outcome.reason
 
 
+@pytest.mark.slow
 def test_two_workers_of_a_dask_cluster_report_what_one_process_does(fleet, sequential, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(

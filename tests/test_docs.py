@@ -22,7 +22,10 @@ HOME = Path(__file__).parents[1]
 PAGES = [HOME / "README.md", *sorted((HOME / "docs").glob("*.md"))]
 WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text()]
 NOT_RUN = {"reproduce": "test_paper.py runs it, small"}
-SLOW = {"": ("README.md", "maintenance.md"), "python": ("robot-software.md",)}  # make examples alone runs these
+SLOW = {
+    "": ("README.md", "maintenance.md"),
+    "python": ("robot-software.md",),
+}  # make test-all and make examples run these
 QUICK = {
     "train": ["--epochs", "1"],
     "demo": ["--epochs", "1"],

@@ -25,7 +25,7 @@ NOT_RUN = {"reproduce": "test_paper.py runs it, small"}
 SLOW = {
     "": ("README.md", "maintenance.md"),
     "python": ("robot-software.md",),
-}  # make test-all and make examples run these
+}  # make test-all runs these
 QUICK = {
     "train": ["--epochs", "1"],
     "demo": ["--epochs", "1"],

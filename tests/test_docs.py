@@ -22,7 +22,8 @@ HOME = Path(__file__).parents[1]
 PAGES = [HOME / "README.md", *sorted((HOME / "docs").glob("*.md"))]
 WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text()]
 NOT_RUN = {"reproduce": "test_paper.py runs it, small"}
-SLOW = {"": ("README.md", "maintenance.md"), "python": ("robot-software.md",)}  # make examples alone runs these
+# make test-all runs these, by the language of their blocks.
+SLOW = {"": ("README.md", "maintenance.md"), "python": ("robot-software.md",)}
 QUICK = {
     "train": ["--epochs", "1"],
     "demo": ["--epochs", "1"],

@@ -63,7 +63,7 @@ class _Alone:
 
 
 class TiledStreamState(StreamState):
-    """A :class:`~diagnostics.stream.StreamState` of an array of several patches.
+    """A :class:`~diagnostics.evidence.stream_state.StreamState` of an array of several patches.
 
     Attributes:
         local: the touches of each patch.

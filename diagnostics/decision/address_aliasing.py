@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.evidence.duplicate_lines import DuplicatePair
-from diagnostics.evidence.stream_state import StreamState, run_to_end
+from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.model import Prediction
 from diagnostics.layout import Line, LineKind, address_bits
 
@@ -122,7 +122,7 @@ def _level_ratio(line: Line, onset: int, stream: StreamState) -> float:
         for features, cells, judged, model in stream.views(onset):
             those = judged[np.isin(cells[judged], true)]
             if len(those):
-                ratio += sign * _plausible(features, run_to_end(model.predict(features, predictors[cells])), those)
+                ratio += sign * _plausible(features, model.predict(features, predictors[cells]), those)
             loaded |= bool((features[:, 2, np.isin(cells, empty)] > 0).any())
         # What nothing is connected to never reads a load.
         if loaded:

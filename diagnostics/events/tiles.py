@@ -81,8 +81,7 @@ def tiles(layout: SensorLayout) -> tuple[Tile, ...]:
     """Return the patches of a layout, each cell an output of exactly one; a single one if the cells are few."""
     cells, present = layout.grid(np.arange(layout.n_cells)), layout.present
     if present.sum() <= MOST_CELLS:
-        every = np.flatnonzero(present)
-        return (Tile(every, every),)
+        return (Tile(cells.ravel(), cells.ravel()),)
     found = []
     for pad in range(layout.pads):
         for r in range(0, layout.rows, TILE):
@@ -140,12 +139,20 @@ class TiledEvents:
         jumped: NDArray[np.bool_],
     ) -> TiledEvents:
         """Return the events after more frames, see ``EventLog.extend``; a still tile stays as it is."""
+        if len(self.tiles) == 1:
+            return self.replaced([self.of[0].extend(root, numbers, root_near, start, jumped)])
         of = list(self.of)
         for i in self._inputs.with_any(start > numbers[0]):
             if self._needed[i]:
                 cells = self.tiles[i].inputs
                 of[i] = of[i].extend(root[:, cells], numbers, root_near, start[cells], jumped[cells])
         return self.replaced(of)
+
+    def split(self, most: int, keep: int) -> tuple[TiledEvents, TiledEvents]:
+        """Return (the events to drop, those to keep): in tiles with more than ``most``, the last ``keep`` stay."""
+        none = EventLog()
+        parts = [events.split(keep) if len(events.kept) > most else (none, events) for events in self.of]
+        return self.replaced([old for old, _ in parts]), self.replaced([kept for _, kept in parts])
 
     def replaced(self, of: Sequence[EventLog]) -> TiledEvents:
         """Return the same patches with other touches."""

@@ -6,7 +6,7 @@ that away, and the model is believed the less in that touch.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -35,7 +35,7 @@ Mask = NDArray[np.bool_]
 class Model(Protocol):
     """Knows what healthy cells would do in a touch."""
 
-    def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Generator[None, None, Prediction]:
+    def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
         """See ``HealthyModel.predict``."""
 
 
@@ -141,10 +141,9 @@ class ConditionalTest:
         )
         return cls(cells, model, values, scored, cells.eligible & ~unsure, features, begins, counted, novelty)
 
-    def score(self, predictors: Mask) -> Generator[None, None, tuple[Prediction, Floats]]:
+    def score(self, predictors: Mask) -> tuple[Prediction, Floats]:
         """Return what the ``predictors`` cells (bool ``[D]``) expect, and the surprise of each stretch ``[n, D]``."""
-        expected = yield from self.model.predict(self.features, predictors)
-        yield
+        expected = self.model.predict(self.features, predictors)
         held = np.flatnonzero(self.scored & ~self.values.rests)
         likely = _shrunk_to_even(expected.never, self.features[:, 2] == 0, predictors & self.cells.runs.moved)
         inflation = _inflation(expected, self.features, predictors)

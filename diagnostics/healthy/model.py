@@ -9,7 +9,7 @@ touches.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -116,6 +116,10 @@ class HealthyModel:
         if not all(0 < regression.p_floor < 1 for regression in self.local_regressions):
             raise ValueError("expected p_floor between 0 and 1")
 
+    def of_tile(self, i: int, cells: NDArray[np.intp], layout: SensorLayout) -> HealthyModel:
+        """Return the model of tile i as one of an array ``layout`` of its own, in which its inputs are ``cells``."""
+        return HealthyModel((self.local_regressions[i].at(cells),), layout, self.stacking)
+
     def p_floor(self, n_cells: int) -> NDArray[np.float64]:
         """Return the chance ``[D]`` of D cells that a touch does with one what none did before; 1: nothing is known."""
         p_floor = np.ones(n_cells)
@@ -127,7 +131,7 @@ class HealthyModel:
         """Return how little is known of healthy touches of D cells, ``[D]``: 0 where it holds 400, 1 with up to 100."""
         return _inexperience(self.p_floor(n_cells))
 
-    def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Generator[None, None, Prediction]:
+    def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
         """Say what healthy cells would do. A generator that pauses on its way, for those who cannot wait.
 
         Args:
@@ -144,7 +148,6 @@ class HealthyModel:
             judged = np.flatnonzero(known)
             step = max(1, _AT_ONCE // len(judged))
             for first in range(0, len(features), step):
-                yield
                 some = slice(first, first + step)
                 of_some = RegressionOutput(*(values[some] for values in vars(regressed).values()))
                 known_values = self.stacking.predict(

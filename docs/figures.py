@@ -35,7 +35,6 @@ from diagnostics import (
 )
 from diagnostics.events.constant_runs import segments
 from diagnostics.events.contact_events import SEGMENT, ContactEvent, EventLog
-from diagnostics.evidence.stream_state import run_to_end
 
 Floats = NDArray[np.float64]
 
@@ -172,7 +171,7 @@ def healthy_model() -> Figure:
     frames = healthy(seed=4)[0]
     features = events_of(frames)[0].suffixes()[0].features()[None]
     model = reference().reference_.model
-    expected = run_to_end(model.predict(features, np.ones(LAYOUT.n_cells, bool)))
+    expected = model.predict(features, np.ones(LAYOUT.n_cells, bool))
     figure, axes = panels(1, 1, 1)
     draw_map(axes[0], features[0, 1], "observed mean root load", "", vmin=0, vmax=0.8)
     never = expected.never[0]

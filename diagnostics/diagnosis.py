@@ -72,7 +72,7 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame with a reading.
         """
-        healthy = _recordings(recordings, self.layout).whole(self.layout.present.ravel())
+        healthy = _recordings(recordings, self.layout).valid(self.layout.full_scale).whole(self.layout.present.ravel())
         dead = find_reference_faults(healthy, self.layout, tolerance_of(healthy, self.layout), self._diagnosed_cold)
         self.reference_ = Reference.fit(healthy, self.layout, dead)
         self.calibrator_ = Calibrator.fit(healthy, living(self.layout, dead))

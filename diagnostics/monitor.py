@@ -6,14 +6,17 @@ from collections.abc import Generator
 from contextlib import nullcontext
 from copy import copy
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diagnostics.decision.result import Diagnosis
-from diagnostics.diagnosis import SelfDiagnosis
-from diagnostics.faults import Fault
 from diagnostics.layout import Line
+
+if TYPE_CHECKING:
+    from diagnostics.decision.result import Diagnosis
+    from diagnostics.diagnosis import SelfDiagnosis
+    from diagnostics.faults import Fault
 
 Key = tuple[Line | None, int]
 

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from diagnostics import SensorLayout
-from diagnostics.healthy.model import HealthyModel, Prediction, excerpts, p_floor_of
+from diagnostics.healthy.model import HealthyModel, excerpts, p_floor_of
+from diagnostics.healthy.prediction import Prediction
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.scale import Scale
 

@@ -5,7 +5,7 @@ from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, Summary
 from diagnostics.evidence.conditional_test import CellState, Model
 from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, group_excluded_evidence
-from diagnostics.healthy.model import Prediction
+from diagnostics.healthy.prediction import Prediction
 from diagnostics.preprocessing.scale import Array, Scale
 
 CELLS, FRAMES = 8, 20

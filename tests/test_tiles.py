@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from diagnostics import Fault, FaultKind, Line, Monitor, SelfDiagnosis, SensorLayout, inject, line_fault
-from diagnostics.events.tiles import HALO, TILE, TiledEvents, tiles
+from diagnostics.events.tiled_events import TiledEvents
+from diagnostics.events.tiles import HALO, TILE, tiles
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.preprocessing.scale import Scale

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.evidence.duplicate_lines import DuplicatePair
-from diagnostics.evidence.stream_state import StreamState
-from diagnostics.healthy.model import Prediction
 from diagnostics.layout import Line, LineKind, address_bits
+
+if TYPE_CHECKING:
+    from diagnostics.evidence.duplicate_lines import DuplicatePair
+    from diagnostics.evidence.stream_state import StreamState
+    from diagnostics.healthy.prediction import Prediction
 
 _CLEAR = 3.0  # log ratio: below it the data cannot tell which level a bit is stuck at
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,10 @@ from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.calibration_subset import calibration_subset
 from diagnostics.healthy.reference import Reference
-from diagnostics.layout import SensorLayout
 from diagnostics.simulation.injection import inject
+
+if TYPE_CHECKING:
+    from diagnostics.layout import SensorLayout
 
 _LOGS, _LOGS_OF_LARGE = 192, 32  # drawn to fit the weights; large arrays have more cells in each
 _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.decision.address_aliasing import Aliasing
 from diagnostics.decision.line_cover import Cause, solve
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, LineKind, SensorLayout
+
+if TYPE_CHECKING:
+    from diagnostics.decision.address_aliasing import Aliasing
 
 _SAME_VALUE = 0.02  # of full scale: stuck cells this near to each other may share a cause
 _SAME_KIND = 1 / 3  # of the single faults: open, short or stuck

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,10 @@ from scipy.special import expit, logit, softmax
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, count_repeats
-from diagnostics.healthy.model import Prediction
 from diagnostics.preprocessing.scale import Array, Scale
+
+if TYPE_CHECKING:
+    from diagnostics.healthy.prediction import Prediction
 
 _ANYWHERE = 0.2  # of broken cells stick anywhere, of the rest as many to the low rail as to the high one
 P_MIN = 1e-4  # no touch is less likely than this: models err

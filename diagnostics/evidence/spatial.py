@@ -19,12 +19,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.contact_events import ContactEvent
 from diagnostics.evidence.conditional_test import (
     P_MIN,
     SUDDEN_JUMP,
@@ -35,8 +34,11 @@ from diagnostics.evidence.conditional_test import (
     Model,
 )
 from diagnostics.evidence.drift import drifting, gain_evidence, misleading, offset_evidence
-from diagnostics.healthy.model import Prediction
-from diagnostics.preprocessing.scale import Scale
+
+if TYPE_CHECKING:
+    from diagnostics.events.contact_events import ContactEvent
+    from diagnostics.healthy.prediction import Prediction
+    from diagnostics.preprocessing.scale import Scale
 
 _TELLING = 0.5  # log evidence from which on a touch counts as one that tested the cell
 _ONE_LOAD = 0.5  # correlation of what touches elsewhere say of a load that outlasts them

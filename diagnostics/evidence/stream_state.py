@@ -13,26 +13,29 @@ from __future__ import annotations
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import SEGMENT, EventLog
-from diagnostics.events.tiles import Rectangle, TiledEvents, tiles
+from diagnostics.events.tiled_events import TiledEvents
+from diagnostics.events.tiles import Rectangle, Tile, tiles
 from diagnostics.evidence.conditional_test import SUDDEN_JUMP, CellState, Model
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, group_excluded_evidence, held_load_evidence
-from diagnostics.healthy.model import Prediction
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
-from diagnostics.healthy.reference import Reference
-from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.offset import OffsetTracker
 from diagnostics.preprocessing.readings import held
-from diagnostics.preprocessing.scale import Array, Scale
-from diagnostics.preprocessing.transport import TransportState
+from diagnostics.preprocessing.transport import TransportState, invalid
+
+if TYPE_CHECKING:
+    from diagnostics.healthy.prediction import Prediction
+    from diagnostics.healthy.reference import Reference
+    from diagnostics.layout import SensorLayout
+    from diagnostics.preprocessing.scale import Array, Scale
 
 MAX_EVENTS, KEPT_EVENTS = 40, 32  # with more events in a tile, all but the last are scored and dropped
 _SILENT, _NEVER_RECEIVED = 2 * SEGMENT, SEGMENT // 2  # consecutive frames without a reading: not chance any more
@@ -80,7 +83,7 @@ class StreamState:
         self, layout: SensorLayout, reference: Reference, exclusion: Exclusion, needed: Mask | None = None
     ) -> None:
         model = reference.model
-        every = tiles(layout) if model is None else tuple(r.tile for r in model.local_regressions)
+        every = tiles(layout) if model is None else tuple(Tile(r.inputs, r.outputs) for r in model.local_regressions)
         self.layout, self.reference = layout, reference
         self.tiled = len(every) > 1
         self.exclusion = exclusion._replace(threshold=_EXCLUDED) if self.tiled else exclusion
@@ -108,6 +111,9 @@ class StreamState:
 
     def extend(self, frames: NDArray[np.float64]) -> bool:
         """Take in frames ``[t, D]``; return whether a segment was completed."""
+        wrong = invalid(frames, self.layout.full_scale)
+        if wrong is not None:
+            frames, self.transport = np.where(wrong, np.nan, frames), self.transport.dropped(wrong)
         before = self.transport.seen
         self.transport, new = self.transport.receive(frames, self.present, self.reference.patience)
         completed, taken = False, 0

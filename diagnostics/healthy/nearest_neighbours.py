@@ -10,14 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.contact_events import ContactEvent
-from diagnostics.healthy.model import Prediction
+from diagnostics.healthy.prediction import Prediction
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.scale import Array
+
+if TYPE_CHECKING:
+    from diagnostics.events.contact_events import ContactEvent
 
 _NEIGHBOURS = 20
 _PRIOR_WEIGHT = 1.0  # neighbours that the share over all samples counts for: few neighbours prove little

@@ -104,7 +104,6 @@ def _diagnosed(args: argparse.Namespace, diagnoser: SelfDiagnosis, log: Recordin
     from tqdm import tqdm
 
     from adaptfault.data.recordings import Recordings
-    from diagnostics.evidence.stream_state import run_to_end
 
     stream = diagnoser.stream()
     hide = None if (shown := progress(args)) is None else not shown
@@ -115,4 +114,4 @@ def _diagnosed(args: argparse.Namespace, diagnoser: SelfDiagnosis, log: Recordin
     if not isinstance(log, Recordings):
         for problem in log.problems:
             print(problem, file=sys.stderr)
-    return run_to_end(diagnoser.evaluate(stream, n_recordings=len(log)))
+    return diagnoser.evaluate(stream, n_recordings=len(log))

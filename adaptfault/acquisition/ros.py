@@ -1,6 +1,6 @@
 """A diagnosis as ROS sees it: the content of ``diagnostic_msgs/DiagnosticArray`` as plain dicts, and into a bag.
 
-No ROS is needed. Publish the dicts with rclpy (``examples/ros2_node.py``) once a second: what is not repeated for some
+No ROS is needed. Publish the dicts with rclpy (``examples/ros2``) once a second: what is not repeated for some
 seconds counts as stale.
 """
 

@@ -28,14 +28,14 @@ run() { # WANTED COMMAND...: run a command whose exit code has to be among those
     esac
 }
 
-first_hour() { # NAME RAW FAULT CAUSE: one array, what is broken, and the words of the root cause
-    name=$1 raw=$2 fault=$3 cause=$4
+first_hour() { # NAME RAW LATER FAULT CAUSE: one array, the recordings kept back, the fault, the words of its cause
+    name=$1 raw=$2 later=$3 fault=$4 cause=$5
     home=$out/$name
     mkdir -p "$home"
     run 0 info "$raw" --picture "$home/raw.png"
-    # One recording in six is kept back: the robot records it later.
-    run 0 convert "$raw" --leave ::6 --out "$home/healthy.npz"
-    run 0 convert "$raw" --take ::6 --out "$home/later.npz"
+    # The robot records these later: no model is trained on them.
+    run 0 convert "$raw" --leave "$later" --out "$home/healthy.npz"
+    run 0 convert "$raw" --take "$later" --out "$home/later.npz"
     run "0 1" diagnose "$home/later.npz" --reference "$home/healthy.npz" --html "$home/later.html"
     run 0 train "$home/healthy.npz" --epochs "$epochs" --out "$home/robot.bundle"
     run 0 evaluate "$home/robot.bundle" "$home/later.npz"
@@ -47,7 +47,7 @@ first_hour() { # NAME RAW FAULT CAUSE: one array, what is broken, and the words 
         echo "first_hour: $name: no \"$cause\" in $home/diagnosis.html" >&2
         exit 1
     }
-    run 2 maintain "$home/robot.bundle" "$home/broken.npz" --report "$home/maintenance.html"
+    run "1 2" maintain "$home/robot.bundle" "$home/broken.npz" --report "$home/maintenance.html"
     run 0 evaluate "$home/robot.bundle" "$home/broken.npz"
     run 0 report "$home/robot.bundle" --out "$home/report.html"
     echo "first_hour: $name: verdict right"
@@ -61,11 +61,11 @@ for array in "$@"; do
         # CSV files of one folder a class and a layout.json, as a user's own recordings would lie there.
         [ -d "$out/skin-csv" ] || run 0 simulate --shape 10x10 --full-scale 3.3 --unit V --rate 20 \
             --grasps "${GRASPS:-24}" --frames 60 --classes nothing normal softer harder --out "$out/skin-csv"
-        first_hour skin "$out/skin-csv" row:0:4=short "row 4 is short"
+        first_hour skin "$out/skin-csv" ::6 row:0:4=short "row 4 is short"
         ;;
-    icub) file=icub5x1x12_grasps11 fault=row:1:0=short cause="pad 1" ;;
-    insole) file=insole2x33x15 fault=row:0:12=open cause="row 12 is open" ;;
-    sdh) file=sdh2x13x6_grasps36 fault=row:0:9=short cause="row 9 is short" ;;
+    icub) file=icub5x1x12_grasps11 later=::6 fault=row:1:0=short cause="pad 1" ;;
+    insole) file=insole2x33x15 later=::8 fault=row:0:12=open cause="row 12 is open" ;;
+    sdh) file=sdh2x13x6_grasps36 later=::6 fault=row:0:9=short cause="row 9 is short" ;;
     *)
         echo "first_hour: no array $array: skin, icub, insole, sdh" >&2
         exit 3
@@ -73,7 +73,7 @@ for array in "$@"; do
     esac
     [ "$array" = skin ] && continue
     if [ -f "$data/$file.npz" ]; then
-        first_hour "$array" "$data/$file.npz" "$fault" "$cause"
+        first_hour "$array" "$data/$file.npz" "$later" "$fault" "$cause"
     else
         echo "first_hour: $array: $data/$file.npz is not there; left out"
     fi

@@ -85,3 +85,21 @@ def test_the_example_runs_on_recordings(name: str, small_grasps: Recordings, tmp
 def test_no_example_that_takes_recordings_is_left_out():
     takes = {path.name for path in EXAMPLES if 'argument("recording' in path.read_text() or "[REC" in path.read_text()}
     assert takes == set(ON_RECORDINGS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("array", ["skin", "icub", "insole", "sdh"])
+def test_the_first_hour_ends_with_the_right_verdict_on_every_array(array: str, tmp_path: Path):
+    data = HOME.parents[1] / "shared/data"
+    if array != "skin" and not data.is_dir():
+        pytest.skip("the real recordings are not here")
+    command = f"{sys.executable} -W error -m adaptfault"
+    environment = {**os.environ, "ADAPTFAULT": command, "DATA": str(data), "EPOCHS": "1", "GRASPS": "8"}
+    environment["PYTHONPATH"] = str(HOME.parent)
+    done = subprocess.run(
+        ["sh", HOME / "first_hour.sh", tmp_path, array], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    assert f"first_hour: {array}: verdict right" in done.stdout
+    for page in ("later.html", "diagnosis.html", "maintenance.html", "report.html"):
+        assert (tmp_path / array / page).stat().st_size > 10_000

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from adaptfault.fleet.listing import Fleet
     from adaptfault.fleet.run import maintain_fleet
     from adaptfault.fleet.summary import FleetReport
+    from adaptfault.imputation.restorer import Restorer
     from adaptfault.models.export import add_onnx
     from adaptfault.models.history import History
     from adaptfault.models.inference import Inference
@@ -57,6 +58,7 @@ __all__ = [
     "Recorder",
     "Recordings",
     "ReducedModel",
+    "Restorer",
     "Scores",
     "Sensitivity",
     "Station",
@@ -102,6 +104,7 @@ _HOMES = {
     "Recorder": "acquisition",
     "Recordings": "data.recordings",
     "ReducedModel": "adaptation.reduced_model",
+    "Restorer": "imputation.restorer",
     "Station": "acquisition",
     "Scores": "evaluation.scores",
     "Sensitivity": "evaluation.sensitivity",

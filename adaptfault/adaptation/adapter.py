@@ -17,8 +17,8 @@ from adaptfault.adaptation.result import Adaptation
 from adaptfault.adaptation.stages import Method, Run
 from adaptfault.data.windows import Windows, evenly
 from adaptfault.evaluation.scores import evaluate
-from adaptfault.imputation.linear import CellStatistics
-from adaptfault.imputation.tiled import LARGE, TiledStatistics
+from adaptfault.imputation.statistics import CellStatistics
+from adaptfault.imputation.tiled_statistics import LARGE, TiledStatistics
 from adaptfault.models.compact import CompactNetwork, compacted
 from adaptfault.models.network import TactileTransformer, logits_of
 from diagnostics import FaultSet

@@ -1,4 +1,4 @@
-"""The adapter on disk, small enough for a robot: weights, and fault-free windows in converter steps. No pickle."""
+"""The adapter on disk, small enough for a robot: weights and quantised fault-free windows. No pickle."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from torch import Tensor
 
 from adaptfault.adaptation.adapter import Adapter
 from adaptfault.data.windows import Windows, evenly
-from adaptfault.imputation.linear import CellStatistics
+from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.models.network import TactileTransformer
 from adaptfault.models.store import load_tensors, save_tensors
 
 SCHEMA = "adaptfault.adapter/1"
 WINDOWS_SCHEMA = "adaptfault.windows/1"
-LIMIT = 20_000_000  # bytes: what the paper's layout must fit into
+LIMIT = 20_000_000  # bytes of an adapter
 
-_SHARE = 0.5  # of the limit is the most that windows take if the weights then still fit
-_FINEST = 1 / 4095  # step for readings that show no converter steps: a 12-bit converter's
+_SHARE = 0.5  # of the limit: the most that windows take
+_FINEST = 1 / 4095  # step for readings without visible converter steps: a 12-bit converter
 _MOST_STEPS = 65_535
 _OVERHEAD = 100_000  # bytes for names, labels and JSON
 
 
 def save_adapter(path: str | Path, adapter: Adapter, *, limit: int = LIMIT) -> None:
-    """Write all that an adaptation needs into a folder of at most ``limit`` bytes.
+    """Write everything an adaptation needs into a folder of at most ``limit`` bytes.
 
-    Readings are kept exactly where they are whole converter steps, else to 12 bits. If the windows need more than half
-    of the room, they are thinned evenly. The weights take what is left: 32-bit floats, or 16-bit ones, or 8-bit
-    integers with a scale for each row, the first that fits. What was kept is told in ``manifest.json``.
+    Readings that are whole converter steps are stored exactly, others with 12 bits. Windows that need more than half of
+    the limit are thinned evenly. The weights use the first format that fits the rest: 32-bit floats, 16-bit floats, or
+    8-bit integers with a scale for each row. ``manifest.json`` records the choices.
 
     Raises:
-        ValueError: it does not fit, even so.
+        ValueError: the smallest format does not fit, or the model is no ``TactileTransformer``.
     """
     statistics = adapter.statistics
     upper = np.triu_indices(len(statistics.mean))
@@ -72,7 +72,7 @@ def save_windows(path: str | Path, windows: Windows, *, limit: int = LIMIT // 4)
 
 
 def load_windows(path: str | Path) -> Windows:
-    """Read what :func:`save_windows` wrote; raises what :func:`load_adapter` raises."""
+    """Read windows written by :func:`save_windows`; raises the errors of :func:`load_adapter`."""
     about, tensors = load_tensors(path, WINDOWS_SCHEMA)
     try:
         return _unpack(about["windows"], tensors, "windows")
@@ -81,7 +81,7 @@ def load_windows(path: str | Path) -> Windows:
 
 
 def load_adapter(path: str | Path) -> Adapter:
-    """Read what :func:`save_adapter` wrote.
+    """Read an adapter written by :func:`save_adapter`.
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -111,7 +111,7 @@ def _bytes(tensors: dict[str, Tensor]) -> int:
 
 
 def _pack_thinned(windows: Windows, targets: NDArray[Any], room: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Pack windows, as many as fit, and say how they are packed."""
+    """Pack as many windows as fit; return them and the packing parameters."""
     keep = len(windows)
     while True:
         which = evenly(len(windows), keep)
@@ -139,7 +139,7 @@ def _pack(windows: Windows, targets: NDArray[Any]) -> tuple[dict[str, Tensor], d
 def _unpack(told: dict[str, Any], tensors: dict[str, Tensor], name: str) -> Windows:
     n, t, d = told["shape"]
     size = 2 * n * t * d
-    data = zlib.decompressobj().decompress(tensors[f"{name}.x"].numpy().tobytes(), size)  # never more than it should be
+    data = zlib.decompressobj().decompress(tensors[f"{name}.x"].numpy().tobytes(), size)  # at most the expected size
     counts = np.frombuffer(data, np.uint8).reshape(2, -1).T.copy().view(np.uint16).reshape(n, t, d)
     counts = np.cumsum(counts, axis=1, dtype=np.uint16)
     x = (told["low"] + counts * told["step"]).astype(np.float32)
@@ -147,7 +147,7 @@ def _unpack(told: dict[str, Any], tensors: dict[str, Tensor], name: str) -> Wind
 
 
 def _steps(x: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the lowest reading and the converter's step, or a fine enough one where the readings show none."""
+    """Return the lowest reading and the converter step, or a 12-bit step if the readings show none."""
     values = np.unique(x).astype(np.float64)
     low, width = float(values[0]), float(values[-1] - values[0])
     gaps = np.diff(values)
@@ -189,7 +189,7 @@ _SCALE = ":scale"
 
 
 def _restore(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Undo :func:`_half` or :func:`_eighth`, as far as can be."""
+    """Undo :func:`_half` or :func:`_eighth`, up to rounding."""
     whole = {}
     for name, tensor in state.items():
         if name.endswith(_SCALE):

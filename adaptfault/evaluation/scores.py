@@ -1,4 +1,4 @@
-"""How good a classifier is: accuracy and the macro averages of Section III-B."""
+"""Scores of a model: accuracy and macro averages of classes (Section III-B), R2 and absolute error of values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SCHEMA = "adaptfault.scores/1"
 
 
 class Classifier(Protocol):
-    """Anything that names the class of windows ``[N, T, D]``."""
+    """Anything with ``predict`` for windows ``[N, T, D]``."""
 
     def predict(self, x: NDArray[np.float32], /) -> ArrayLike:
         """Return int ``[N]``."""
@@ -110,12 +110,12 @@ class Scores:
 def accuracy_interval(right: ArrayLike, recording: ArrayLike, *, level: float = 0.95) -> tuple[float, float]:
     """Return the confidence interval of an accuracy, clustered by recording.
 
-    The windows of one recording stand and fall together, so the recordings are what is counted: a cluster-robust
-    t interval, or where no window (or each) is wrong, the exact binomial one over recordings.
+    Windows of one recording are correlated, so the recordings count as samples: a cluster-robust t interval, or the
+    exact binomial interval over recordings where all windows are right or all are wrong.
 
     Args:
-        right: bool ``[N]``, which windows were classified rightly.
-        recording: int ``[N]``, the recording that each window came from.
+        right: bool ``[N]``, whether each window was classified correctly.
+        recording: int ``[N]``, the recording of each window.
         level: of confidence.
     """
     from statsmodels.regression.linear_model import OLS

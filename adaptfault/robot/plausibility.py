@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from adaptfault.data.windows import hold_missing, scale
-from adaptfault.imputation.linear import CellStatistics
+from adaptfault.imputation.statistics import CellStatistics
 from diagnostics import FaultSet, SensorLayout
 
 _BEYOND = 0.05  # of full scale: how far a reading may lie outside, as calibrations do

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from adaptfault.data.recordings import Recordings, load, save_npz
     from adaptfault.data.simulated_grasps import simulate
     from adaptfault.data.windows import Windows, make_windows, split
-    from adaptfault.evaluation.scores import Scores, evaluate
+    from adaptfault.evaluation.scores import Scores, ValueScores, evaluate
     from adaptfault.evaluation.sensitivity import Sensitivity, analyse, sensitivity
     from adaptfault.fleet.listing import Fleet
     from adaptfault.fleet.run import maintain_fleet
@@ -63,6 +63,7 @@ __all__ = [
     "Sensitivity",
     "Station",
     "TactileTransformer",
+    "ValueScores",
     "Windows",
     "add_onnx",
     "analyse",
@@ -109,6 +110,7 @@ _HOMES = {
     "Scores": "evaluation.scores",
     "Sensitivity": "evaluation.sensitivity",
     "TactileTransformer": "models.network",
+    "ValueScores": "evaluation.scores",
     "Windows": "data.windows",
     "add_onnx": "models.export",
     "analyse": "evaluation.sensitivity",

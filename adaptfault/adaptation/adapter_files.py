@@ -37,6 +37,8 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int = LIMIT) -> N
     Raises:
         ValueError: the smallest format does not fit, or the model is no ``TactileTransformer``.
     """
+    if not isinstance(adapter.model, TactileTransformer):
+        raise ValueError(f"only the adapter of a TactileTransformer can be saved, not {adapter.model.config['module']}")
     statistics = adapter.statistics
     upper = np.triu_indices(len(statistics.mean))
     tensors: dict[str, Tensor] = {

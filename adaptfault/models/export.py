@@ -18,6 +18,7 @@ from adaptfault.adaptation.reduced_model import ReducedModel
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.models.compact import CompactNetwork
 from adaptfault.models.inference import ONNX_FILE, open_session, run_session
+from adaptfault.models.network import TactileTransformer
 from adaptfault.models.store import attach
 
 TOLERANCE = 1e-5  # of a probability
@@ -80,7 +81,7 @@ def to_onnx(model: ReducedModel) -> bytes:
 
 def _compacted(model: ReducedModel) -> ReducedModel:
     """Return the model with its network in low-rank form, where the network has one."""
-    if not CompactNetwork.suits(model.network):
+    if not isinstance(model.network, TactileTransformer) or not CompactNetwork.suits(model.network):
         return model
     compact = copy.deepcopy(model)
     compact.add_module("network", CompactNetwork(model.network))

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from adaptfault.data.windows import Windows
+from adaptfault.evaluation.scores import r2
 from adaptfault.imputation.dropout import RandomRepairs
 from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.models.checkpoint import fingerprint_weights, fingerprint_windows, read_checkpoint, write_checkpoint
@@ -27,6 +28,7 @@ from adaptfault.models.time_budget import Clock
 from diagnostics import SensorLayout
 
 Augment = Callable[[Tensor, torch.Generator], Tensor]
+Loss = Callable[[Tensor, Tensor], Tensor]
 
 
 class MoreWindows(Protocol):
@@ -51,6 +53,7 @@ def train(
     seed: int = 0,
     patience: int | None = 10,
     averaging: float = 0.995,
+    loss: Loss | None = None,
     budget: float | None = None,
     evaluate_start: bool = False,
     augment: Augment | None = None,
@@ -69,14 +72,16 @@ def train(
     random state does not change.
 
     Args:
-        model: maps windows float32 ``[B, T, D]`` to logits ``[B, n]``.
-        train, validation: fault-free windows, labels 0 to n - 1.
+        model: maps windows float32 ``[B, T, D]`` to logits or values ``[B, n]``.
+        train, validation: fault-free windows, labels 0 to n - 1 or values float ``[N, n]``.
         epochs, learning_rate, batch_size: of Adam; Section III-B has 50 at most, 1e-4 and 32.
         seed: of the order of the windows, of dropout and of ``augment``.
         patience: epochs without a better validation before stopping; None trains all epochs.
         averaging: the exponential average of the weights over the last 1 / (1 - averaging) steps (fewer at first) is
             validated and kept; it varies less than the weights of a single step. 0 keeps the weights of the last step,
             as Section III-B does.
+        loss: (outputs ``[B, n]``, y ``[B]`` or ``[B, k]``) -> scalar. None: cross entropy, or the mean squared error of
+            values.
         budget: seconds, validation included. The first epoch is cut short to fit, a later one that does not fit is left
             out, so a larger budget never gives a worse result. Time before a resume counts.
         evaluate_start: the starting weights are a candidate too, so that fine-tuning never makes validation worse.
@@ -103,6 +108,7 @@ def train(
             raise ValueError("repairable is an augmentation itself: give augment or repairable, not both")
         augment, validation = _random_repairs(model, train, validation, seed)
     run = _Run(model, learning_rate, averaging, Path(checkpoint) if checkpoint is not None else None)
+    run.loss = _default_loss(train) if loss is None else loss
     if run.path is not None:
         run.settings = {
             "learning_rate": learning_rate,
@@ -110,6 +116,7 @@ def train(
             "seed": seed,
             "averaging": averaging,
             "evaluate_start": evaluate_start,
+            **({} if loss is None else {"loss": getattr(loss, "__qualname__", type(loss).__qualname__)}),
             "augment": None if augment is None else getattr(augment, "__qualname__", type(augment).__qualname__),
             "data": fingerprint_windows(train, validation),
             "more": None if more is None else str(more),
@@ -127,8 +134,8 @@ def train(
                 if history is None:
                     continue
                 bar.update()
-                loss, accuracy = history.train_loss[-1], history.validation_accuracy[-1]
-                bar.set_postfix(loss=f"{loss:.4f}", accuracy=f"{accuracy:.4f}", best=history.best_epoch)
+                last, accuracy = history.train_loss[-1], history.validation_accuracy[-1]
+                bar.set_postfix(loss=f"{last:.4f}", accuracy=f"{accuracy:.4f}", best=history.best_epoch)
                 if on_epoch is not None:
                     on_epoch(history)
     finally:
@@ -141,11 +148,11 @@ def _begin(run: _Run, validation: Windows, clock: Clock, evaluate_start: bool) -
     """Validate the starting weights if they are a candidate; else, with a budget, measure the time of a validation."""
     if evaluate_start and run.history.start is None:
         with clock.closing():
-            run.record(replace(run.history, start=_validate(run.model, validation)))
+            run.record(replace(run.history, start=_validate(run.model, validation, run.loss)))
     elif clock.budget < math.inf:  # the first epoch, too, has to leave time for its validation
         sample = validation.select(slice(0, 32))
         with clock.closing(len(sample) / len(validation)):
-            _validate(run.model, sample)
+            _validate(run.model, sample, run.loss)
 
 
 def _epoch(
@@ -167,7 +174,7 @@ def _epoch(
         return None
     with clock.closing():
         with run.averaged():
-            scores = _validate(run.model, validation)
+            scores = _validate(run.model, validation, run.loss)
         history = run.history.longer(loss, scores, time.perf_counter() - began)
         run.record(history, save=seen == n)  # a run cannot resume within an epoch
     return history
@@ -189,7 +196,7 @@ def _pass(
             break
         x, y = source.take(index), source.y[index]  # copies
         x = x if augment is None else augment(x, generator)
-        loss = F.cross_entropy(run.model(x.to(device)), y.to(device))
+        loss = run.loss(run.model(x.to(device)), y.to(device))
         run.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         run.optimizer.step()
@@ -262,6 +269,7 @@ class _Run(Optimisation):
         self.names = [name for name in model.state_dict() if name not in frozen]  # training changes these
         self.best = self._weights()
         self.settings: dict[str, Any] = {}
+        self.loss: Loss = F.cross_entropy
 
     def _weights(self) -> dict[str, Tensor]:
         state = self.model.state_dict()
@@ -321,6 +329,10 @@ def _check(model: nn.Module, train: Windows, validation: Windows) -> None:
                 f"{bad} of {len(windows)} {name} windows hold NaN or infinite readings: make_windows holds them"
             )
         n = logits_of(model, windows.x[:1]).shape[1]
+        if windows.y.ndim == 2:
+            if windows.y.shape[1] != n or not np.isfinite(windows.y).all():
+                raise ValueError(f"{name} targets need {n} finite values a window, got {list(windows.y.shape)}")
+            continue
         if windows.y.min() < 0 or windows.y.max() >= n:
             raise ValueError(
                 f"{name} labels run from {windows.y.min()} to {windows.y.max()}, the model has {n} classes"
@@ -335,12 +347,18 @@ def _random_repairs(model: nn.Module, train: Windows, validation: Windows, seed:
     return repairs, repairs.beside(validation, seed)
 
 
-def _validate(model: nn.Module, windows: Windows) -> tuple[float, float]:
-    """Return loss and accuracy."""
+def _default_loss(windows: Windows) -> Loss:
+    return F.mse_loss if windows.y.ndim == 2 else F.cross_entropy
+
+
+def _validate(model: nn.Module, windows: Windows, criterion: Loss) -> tuple[float, float]:
+    """Return loss, and accuracy or R2."""
     logits, labels = logits_of(model, windows.x), as_tensor(windows.y)
-    loss = F.cross_entropy(logits, labels).item()
+    loss = criterion(logits, labels).item()
     if not math.isfinite(loss):
         raise ValueError(f"the validation loss became {loss}: lower learning_rate")
+    if windows.y.ndim == 2:
+        return loss, r2(windows.y, logits.numpy())
     return loss, (logits.argmax(1) == labels).double().mean().item()
 
 

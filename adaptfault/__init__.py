@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from adaptfault.fleet.run import maintain_fleet
     from adaptfault.fleet.summary import FleetReport
     from adaptfault.imputation.restorer import Restorer
+    from adaptfault.imputation.scikit_learn import CellImputer, FaultTolerantClassifier, FaultTolerantRegressor
     from adaptfault.models.export import add_onnx
     from adaptfault.models.history import History
     from adaptfault.models.inference import Inference
@@ -46,6 +47,9 @@ __all__ = [
     "Bundle",
     "Calibration",
     "CausalCorrection",
+    "CellImputer",
+    "FaultTolerantClassifier",
+    "FaultTolerantRegressor",
     "Fleet",
     "FleetReport",
     "Forecast",
@@ -93,6 +97,9 @@ _HOMES = {
     "Bundle": "robot.bundle",
     "Calibration": "data.calibration",
     "CausalCorrection": "adaptation.baselines.correction",
+    "CellImputer": "imputation.scikit_learn",
+    "FaultTolerantClassifier": "imputation.scikit_learn",
+    "FaultTolerantRegressor": "imputation.scikit_learn",
     "Fleet": "fleet.listing",
     "FleetReport": "fleet.summary",
     "Forecast": "adaptation.forecast",

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptfault.data.windows import evenly, hold_missing, scale
-from adaptfault.imputation.recalibration import Recalibration, two_folds
-from adaptfault.imputation.statistics import CellStatistics
+from adaptfault.imputation.cross_fitted import CrossFitted
+from adaptfault.imputation.recalibration import two_folds
 from adaptfault.imputation.tiled_statistics import LARGE, TiledStatistics
 from diagnostics import FaultSet, SensorLayout
 
 _MOST_FRAMES = 20_000  # of the fit; more are thinned evenly
-_HELD_OUT = 2_000  # frames of each fold on which the error is measured
 _PLANS = 64  # fault sets whose affine maps are cached
 
 Floats = NDArray[np.float64]
@@ -78,9 +77,7 @@ class Restorer:
             self._tiled: TiledStatistics | None = TiledStatistics(x, fold, self.layout)
         else:
             self._tiled = None
-            self._whole = CellStatistics.of_frames(x)
-            self._halves = [CellStatistics.of_frames(x[fold == side]) for side in (False, True)]
-            self._held_out = [(of := x[fold == side])[evenly(len(of), _HELD_OUT)] for side in (True, False)]
+            self._whole = CrossFitted(x, fold)
         self.mean_ = x.mean(axis=0, dtype=np.float64) * self.layout.full_scale
         self._plans: OrderedDict[bytes, tuple[_Map, ...]] = OrderedDict()
         return self
@@ -163,18 +160,7 @@ class Restorer:
         return plan
 
     def _map(self, fault_set: FaultSet) -> _Map:
-        healthy, missing = fault_set.healthy, np.flatnonzero(fault_set.mask)
-        residuals = []
-        for half, frames in zip(self._halves, self._held_out, strict=True):
-            weight, bias = half.conditional_mean(fault_set)
-            centre = self._whole.mean[missing]
-            residuals.append((frames[:, healthy] @ weight.T + bias - centre, frames[:, missing] - centre))
-        predicted, readings = (np.concatenate(values) for values in zip(*residuals, strict=True))
-        correction = Recalibration.fit(predicted, readings, total=len(readings))
-        weight, bias = self._whole.conditional_mean(fault_set)
-        mean = self._whole.mean[missing]
-        weight, bias = correction.gain[:, None] * weight, mean + correction.gain * (bias - mean) + correction.offset
-        return self._in_unit(healthy, missing, weight, bias, correction.deviation)
+        return self._in_unit(fault_set.healthy, np.flatnonzero(fault_set.mask), *self._whole.affine(fault_set))
 
     def _tile_maps(self, fault_set: FaultSet) -> tuple[_Map, ...]:
         assert self._tiled is not None  # for the type checker

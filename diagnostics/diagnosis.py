@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,8 +17,7 @@ from diagnostics.decision.result import Diagnosis
 from diagnostics.decision.root_causes import CellFindings, root_causes
 from diagnostics.decision.serialization import Arrays, from_state, to_state
 from diagnostics.evidence.spatial import Exclusion, Spatial
-from diagnostics.evidence.stream_state import StreamState, run_to_end
-from diagnostics.evidence.tiled_state import new_stream
+from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference import Reference, living, tolerance_of
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
@@ -73,7 +72,7 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame with a reading.
         """
-        healthy = _recordings(recordings, self.layout).whole(self.layout.present.ravel())
+        healthy = _recordings(recordings, self.layout).valid(self.layout.full_scale).whole(self.layout.present.ravel())
         dead = find_reference_faults(healthy, self.layout, tolerance_of(healthy, self.layout), self._diagnosed_cold)
         self.reference_ = Reference.fit(healthy, self.layout, dead)
         self.calibrator_ = Calibrator.fit(healthy, living(self.layout, dead))
@@ -119,31 +118,49 @@ class SelfDiagnosis:
         return diagnoser
 
     def stream(self, needed: NDArray[np.bool_] | None = None) -> StreamState:
-        """Return an empty memory, to be fed with a log and judged; see ``patched.new_stream``."""
+        """Return the state before any frame. Only tiles with a cell that is ``needed`` (bool ``[D]``) are scored."""
         reference = self.reference_ or Reference.unknown(self.layout)
         exclusion = self.calibrator_.exclusion if reference.model else Exclusion(_SUSPICIOUS_COLD)
-        return new_stream(self.layout, reference, exclusion, needed)
+        return StreamState(self.layout, reference, exclusion, needed)
 
-    def evaluate(self, stream: StreamState, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
-        """Judge every cell from what is remembered of a log.
-
-        A generator that pauses every few milliseconds, for those who cannot wait; it returns the diagnosis.
+    def evaluate(self, stream: StreamState, *, n_recordings: int = 1) -> Diagnosis:
+        """Return the diagnosis of the log behind ``stream``.
 
         Raises:
-            ValueError: no frame with a reading has come yet.
+            ValueError: no frame with a reading was received yet.
         """
+        steps = self.steps(stream, n_recordings=n_recordings)
+        while True:
+            try:
+                next(steps)
+            except StopIteration as end:
+                diagnosis: Diagnosis = end.value
+                return diagnosis
+
+    def steps(self, stream: StreamState, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
+        """Do the same as :meth:`evaluate` in steps of a few milliseconds, for a control loop; return the diagnosis."""
         stream = stream.complete()
         if not stream.received.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
         aliased = find_aliasing(stream)
         yield
-        wrong = np.zeros(self.layout.n_cells, bool)
-        wrong[[cell for aliasing in aliased for cell in (*aliasing.cells, *aliasing.doubtful)]] = True
-        spatial = yield from stream.spatial(wrong)
-        found = self._found(stream, spatial, wrong)
+        explained = np.zeros(self.layout.n_cells, bool)
+        explained[[cell for aliasing in aliased for cell in (*aliasing.cells, *aliasing.doubtful)]] = True
+        test = stream.spatial(explained)
+        while not test.step():
+            yield
+        spatial = test.result
         yield
-        found = yield from self._with_those_apart(found, stream, spatial, wrong)
-        causes = yield from root_causes(found, aliased, self.layout)
+        found = self._found(stream, spatial, explained)
+        weight = found.weight.copy()
+        weight_if = self._weight_of_groups(found, stream)
+        for group in self._groups(found, stream, weight_if(spatial.initial), explained):
+            yield
+            of_group = weight_if(stream.group_excluded(spatial, explained, group))
+            weight[group] = np.maximum(weight[group], of_group[group])
+        found = replace(found, weight=weight)
+        yield
+        causes = root_causes(found, aliased, self.layout)
         probability, inferred = found.probability.copy(), np.zeros(self.layout.n_cells, bool)
         for fault in causes:
             cells = list(fault.cells)
@@ -160,7 +177,7 @@ class SelfDiagnosis:
             evidence={
                 "spatial": spatial.evidence + spatial.offset + spatial.gain,
                 "temporal": np.where(spatial.scored, stream.temporal(), intermittency.blinking + intermittency.noisy),
-                "touches": spatial.events.astype(np.float64),
+                "events": spatial.events.astype(np.float64),
             },
             n_frames=stream.transport.seen,
             n_recordings=n_recordings,
@@ -170,10 +187,10 @@ class SelfDiagnosis:
         stream = self.stream(needed)
         for frames in log.blocks():
             stream.extend(frames)
-        return run_to_end(self.evaluate(stream, n_recordings=len(log)))
+        return self.evaluate(stream, n_recordings=len(log))
 
     def _diagnosed_cold(self, log: RecordingBlocks, needed: NDArray[np.bool_], rest: NDArray[np.float64]) -> Diagnosis:
-        """Judge cells that are ``needed`` by those around them, as far as the log tells; they ``rest`` there."""
+        """Diagnose the ``needed`` cells without a reference, but with known baselines ``rest``."""
         cold = SelfDiagnosis(self.layout)
         cold.reference_ = Reference.unknown(self.layout, rest)
         return cold._diagnosed(log, needed)
@@ -184,8 +201,8 @@ class SelfDiagnosis:
         present, silent = stream.present, stream.silent & ~wrong
         temporal, kind = stream.temporal(), kinds(stream)
         known = spatial.scored & ~runs.moved & (reference.dead > 0)
-        calibrate = self.calibrator_.calibrate(spatial.evidence, temporal, kind)
-        still = self.calibrator_.probability(calibrate, kind, spatial.scored & ~known)
+        log_ratio = self.calibrator_.calibrate(spatial.evidence, temporal, kind)
+        still = self.calibrator_.probability(log_ratio, kind, spatial.scored & ~known)
         still[known] = reference.dead[known]
         delivers = present & ~wrong & ~silent
         intermittent, noisy = intermittency.intermittent & delivers, intermittency.excess & delivers
@@ -224,33 +241,33 @@ class SelfDiagnosis:
             known=known,
         )
 
-    def _with_those_apart(
-        self, found: CellFindings, stream: StreamState, spatial: Spatial, wrong: NDArray[np.bool_]
-    ) -> Generator[None, None, CellFindings]:
-        """Return the same, with what speaks for broken wires if their cells do not vouch for each other.
+    def _weight_of_groups(
+        self, found: CellFindings, stream: StreamState
+    ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+        """Return the function from a summed surprisal with a group excluded to the weights ``[D]`` for the line cover.
 
-        The chain rule of probability would ask, for each of them in turn, those before it: half of them, that is about
-        the mean of asking all and asking none. But what is expected where few are asked has to be learned from many
-        touches.
+        By the chain rule of probability each cell of a group is conditioned on those before it: on half of them, about
+        the mean of conditioning on all and on none. With few reference events the predictions from few predictors
+        are poor, so the share is smaller.
         """
+        temporal, kind = stream.temporal(), kinds(stream)
         share = _APART * (1 - stream.reference.inexperience)
-        if not share.any():
-            return found
-        temporal, kind, matching = stream.temporal(), kinds(stream), found.rests & ~found.known & ~wrong
 
-        def weight_if(group_excluded: NDArray[np.float64]) -> NDArray[np.float64]:
-            more = self.calibrator_.calibrate(group_excluded, temporal, kind) - found.weight
+        def weight_if(surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
+            more = self.calibrator_.calibrate(surprisal, temporal, kind) - found.weight
             return found.weight + share * np.maximum(more, 0.0)
 
+        return weight_if
+
+    def _groups(
+        self, found: CellFindings, stream: StreamState, weight: NDArray[np.float64], explained: NDArray[np.bool_]
+    ) -> list[NDArray[np.intp]]:
+        """Return the groups of cells at rest that one broken line would explain."""
+        if (stream.reference.inexperience == 1).all():
+            return []
+        matching = found.rests & ~found.known & ~explained
         contradicting = found.alive | ~(found.rests | found.silent) & stream.present
-        groups = candidate_groups(matching, contradicting, weight_if(spatial.initial), self.layout)
-        if not groups:
-            return found
-        group_excluded = yield from stream.group_excluded(spatial, wrong, groups)
-        weight = found.weight.copy()
-        for group, of_group in zip(groups, group_excluded, strict=True):
-            weight[group] = np.maximum(weight[group], weight_if(of_group)[group])
-        return replace(found, weight=weight)
+        return candidate_groups(matching, contradicting, weight, self.layout)
 
 
 def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> RecordingBlocks:

@@ -6,15 +6,17 @@ from collections.abc import Generator
 from contextlib import nullcontext
 from copy import copy
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from diagnostics.decision.result import Diagnosis
-from diagnostics.diagnosis import SelfDiagnosis
-from diagnostics.evidence.stream_state import run_to_end
-from diagnostics.faults import Fault
 from diagnostics.layout import Line
+
+if TYPE_CHECKING:
+    from diagnostics.decision.result import Diagnosis
+    from diagnostics.diagnosis import SelfDiagnosis
+    from diagnostics.faults import Fault
 
 Key = tuple[Line | None, int]
 
@@ -67,7 +69,7 @@ class Monitor:
         with self._threads.limit(limits=1) if due else nullcontext():
             completed = self._stream.extend(reading[None])
         if self._work is None and completed:
-            self._work = self._diagnoser.evaluate(copy(self._stream))
+            self._work = self._diagnoser.steps(copy(self._stream))
         elif self._work is not None and not due:
             try:
                 with self._threads.limit(limits=1):
@@ -83,7 +85,7 @@ class Monitor:
         Raises:
             ValueError: no frame with a reading has come yet.
         """
-        return run_to_end(self._diagnoser.evaluate(self._stream))
+        return self._diagnoser.evaluate(self._stream)
 
     def _news(self, diagnosis: Diagnosis) -> tuple[Fault, ...]:
         now = {(fault.line, fault.cells[0] if fault.line is None else -1): fault for fault in diagnosis.faults}

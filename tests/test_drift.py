@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from diagnostics.evidence.drift import drifting, gain_evidence, gains_count, misleading
-from diagnostics.healthy.model import Prediction
+from diagnostics.healthy.prediction import Prediction
 
 CELLS, NEAR = 30, 0.1
 SPREAD = 0.05

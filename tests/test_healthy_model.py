@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from diagnostics import SensorLayout
-from diagnostics.evidence.stream_state import run_to_end
-from diagnostics.healthy.model import HealthyModel, Prediction, excerpts, p_floor_of
+from diagnostics.healthy.model import HealthyModel, excerpts, p_floor_of
+from diagnostics.healthy.prediction import Prediction
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.scale import Scale
 
@@ -41,7 +41,7 @@ def all_but(*cells: int) -> np.ndarray:
 
 
 def test_a_cell_between_loaded_ones_is_hardly_ever_unloaded_and_one_far_from_them_nearly_always(model, unseen):
-    never = run_to_end(model.predict(unseen, ALL)).never
+    never = model.predict(unseen, ALL).never
     loaded = unseen[:, 2] > 0
     assert np.median(never[:, 4][loaded[:, 3] & loaded[:, 5]]) < 0.05
     assert never[:, 10][~loaded[:, 8:].any(axis=1)].min() > 0.9
@@ -56,7 +56,7 @@ def test_it_tells_more_about_touches_not_seen_than_each_cells_own_share(model, u
         return float(-np.log(np.where(unloaded, p, 1 - p)).mean())
 
     own_share = np.broadcast_to((seen[:, 2, cells] == 0).mean(axis=0), unloaded.shape)
-    assert log_loss(run_to_end(model.predict(unseen, ALL)).never[:, cells]) < 0.5 * log_loss(own_share)
+    assert log_loss(model.predict(unseen, ALL).never[:, cells]) < 0.5 * log_loss(own_share)
 
 
 @pytest.mark.parametrize("predictors", [ALL, all_but(4)])
@@ -64,7 +64,7 @@ def test_what_a_cell_reads_itself_does_not_matter(model, unseen, predictors):
     spoiled = unseen.copy()
     spoiled[:, :, 4] = 1.0
     for name in ("never", "always", "mean"):
-        said, of_spoiled = (getattr(run_to_end(model.predict(f, predictors)), name)[:, 4] for f in (unseen, spoiled))
+        said, of_spoiled = (getattr(model.predict(f, predictors), name)[:, 4] for f in (unseen, spoiled))
         np.testing.assert_allclose(of_spoiled, said, atol=1e-5, err_msg=name)
 
 
@@ -73,26 +73,26 @@ def test_what_an_untrusted_cell_reads_matters_to_no_cell(model, unseen):
     spoiled = unseen.copy()
     spoiled[:, :, [3, 6]] = 0.7
     for name in ("never", "always", "mean"):
-        said, of_spoiled = (getattr(run_to_end(model.predict(f, predictors)), name) for f in (unseen, spoiled))
+        said, of_spoiled = (getattr(model.predict(f, predictors), name) for f in (unseen, spoiled))
         np.testing.assert_allclose(of_spoiled, said, atol=1e-5, err_msg=name)
 
 
 def test_the_load_of_a_cell_is_foreseen_from_the_others_even_beside_untrusted_ones(model, unseen):
     truth = unseen[:, 1, 4]
     for predictors, share in ((ALL, 0.3), (all_but(4, 5), 0.5)):
-        error = run_to_end(model.predict(unseen, predictors)).mean[:, 4] - truth
+        error = model.predict(unseen, predictors).mean[:, 4] - truth
         assert np.sqrt(np.mean(error**2)) < share * truth.std()
 
 
 def test_without_a_trusted_cell_the_usual_is_expected(model, unseen):
-    expected = run_to_end(model.predict(unseen, ~ALL))
+    expected = model.predict(unseen, ~ALL)
     assert np.ptp(expected.never, axis=0).max() < 1e-5
-    assert expected.mean[0] == pytest.approx(run_to_end(model.predict(unseen, ~ALL)).mean[-1])
+    assert expected.mean[0] == pytest.approx(model.predict(unseen, ~ALL).mean[-1])
     assert expected.never[0, 10] > expected.never[0, 4]
 
 
 def test_a_cell_that_was_never_loaded_is_expected_to_stay_so(model, unseen):
-    assert run_to_end(model.predict(unseen, ALL)).never[:, 11].min() > 0.99
+    assert model.predict(unseen, ALL).never[:, 11].min() > 0.99
 
 
 def test_cells_may_rest_at_any_value():
@@ -126,7 +126,7 @@ def test_large_arrays_are_modelled_in_tiles_that_know_every_cell():
     assert len(model.local_regressions) > 1
     assert sorted(np.concatenate([regression.outputs for regression in model.local_regressions])) == list(range(520))
     features = excerpts(recordings, scale, rng)[0]
-    expected = run_to_end(model.predict(features, np.ones(520, bool)))
+    expected = model.predict(features, np.ones(520, bool))
     assert np.isfinite(expected.spread).all()
     loaded = features[:, 2] > 0
     assert expected.never[loaded].mean() < 0.3

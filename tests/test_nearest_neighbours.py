@@ -3,7 +3,6 @@ import pytest
 
 from diagnostics import SensorLayout
 from diagnostics.events.contact_events import ContactEvent, Summary
-from diagnostics.evidence.stream_state import run_to_end
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
 from diagnostics.preprocessing.scale import Scale
 
@@ -33,7 +32,7 @@ def features(events) -> np.ndarray:
 
 
 def test_a_cell_enclosed_by_loaded_ones_is_expected_to_be_loaded_and_one_far_from_them_not(events, features):
-    never = run_to_end(NearestNeighbours.of(events, LAYOUT).predict(features, ALL)).never
+    never = NearestNeighbours.of(events, LAYOUT).predict(features, ALL).never
     grid = (features[:, 2] > 0).reshape(-1, 9, 9)
     enclosed = np.zeros_like(grid)
     far = np.zeros_like(grid)
@@ -52,14 +51,12 @@ def test_what_a_cell_reads_itself_does_not_matter_where_it_is_not_trusted(events
     spoiled = features.copy()
     spoiled[:, :, centre] = 1.0
     model = NearestNeighbours.of(events, LAYOUT)
-    np.testing.assert_array_equal(
-        run_to_end(model.predict(spoiled, predictors)).never, run_to_end(model.predict(features, predictors)).never
-    )
+    np.testing.assert_array_equal(model.predict(spoiled, predictors).never, model.predict(features, predictors).never)
 
 
 def test_a_cell_between_no_two_trusted_neighbours_is_not_judged(events, features):
     corner = LAYOUT.cell(0, 0, 0)
-    expected = run_to_end(NearestNeighbours.of(events, LAYOUT).predict(features, ALL))
+    expected = NearestNeighbours.of(events, LAYOUT).predict(features, ALL)
     assert (expected.never[:, corner] == 1).all()
     assert (expected.always[:, corner] == 1).all()
     assert np.isnan(expected.spread[corner])
@@ -67,7 +64,7 @@ def test_a_cell_between_no_two_trusted_neighbours_is_not_judged(events, features
 
 
 def test_without_trusted_cells_everything_is_as_expected(events, features):
-    expected = run_to_end(NearestNeighbours.of(events, LAYOUT).predict(features, ~ALL))
+    expected = NearestNeighbours.of(events, LAYOUT).predict(features, ~ALL)
     assert (expected.never == 1).all()
     assert np.isnan(expected.spread).all()
 
@@ -76,6 +73,6 @@ def test_positions_without_a_cell_are_not_judged(events, features):
     present = np.ones(LAYOUT.shape, bool)
     present[0, 4, 4] = False
     layout = SensorLayout(1, 9, 9, present=present)
-    expected = run_to_end(NearestNeighbours.of(events, layout).predict(features, ALL))
+    expected = NearestNeighbours.of(events, layout).predict(features, ALL)
     assert (expected.never[:, LAYOUT.cell(0, 4, 4)] == 1).all()
     assert (expected.never[:, LAYOUT.cell(0, 4, 6)] < 1).any()

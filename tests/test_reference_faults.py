@@ -5,7 +5,6 @@ import pytest
 
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Diagnosis, Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
-from diagnostics.evidence.stream_state import run_to_end
 from diagnostics.healthy.reference import tolerance_of
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -118,7 +117,7 @@ def test_of_a_large_skin_only_what_lies_around_suspects_is_judged_and_tells_the_
         stream = cold.stream(needed)
         for frames in log:
             stream.extend(frames)
-        return run_to_end(cold.evaluate(stream))
+        return cold.evaluate(stream)
 
     readings = RecordingBlocks(
         [*reference, 0.1 * np.ones((10, 1600)) * (places[:, 0] > 30)]

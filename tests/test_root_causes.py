@@ -6,7 +6,6 @@ import pytest
 from diagnostics import Fault, FaultKind, Line, SensorLayout
 from diagnostics.decision.address_aliasing import Aliasing
 from diagnostics.decision.root_causes import CellFindings, root_causes
-from diagnostics.evidence.stream_state import run_to_end
 
 LAYOUT = SensorLayout(2, 11, 6)
 CELLS = LAYOUT.n_cells
@@ -60,7 +59,7 @@ def untested(found: CellFindings, cells: object) -> CellFindings:
 
 
 def causes(found: CellFindings, *find_aliasing: Aliasing) -> tuple[Fault, ...]:
-    return run_to_end(root_causes(found, find_aliasing, LAYOUT))
+    return root_causes(found, find_aliasing, LAYOUT)
 
 
 def row(pad: int, index: int) -> np.ndarray:

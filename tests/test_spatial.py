@@ -1,14 +1,11 @@
-from collections.abc import Generator
-
 import numpy as np
 import pytest
 
 from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, Summary
 from diagnostics.evidence.conditional_test import CellState, Model
-from diagnostics.evidence.spatial import Exclusion, Spatial, group_excluded_evidence, spatial_evidence
-from diagnostics.evidence.stream_state import run_to_end
-from diagnostics.healthy.model import Prediction
+from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, group_excluded_evidence
+from diagnostics.healthy.prediction import Prediction
 from diagnostics.preprocessing.scale import Array, Scale
 
 CELLS, FRAMES = 8, 20
@@ -19,8 +16,7 @@ NONE = np.zeros(CELLS, bool)
 class Copycat:
     """A skin on which all cells are always loaded alike: each does what the trusted ones do on average."""
 
-    def predict(self, features: Array, predictors: np.ndarray) -> Generator[None, None, Prediction]:
-        yield
+    def predict(self, features: Array, predictors: np.ndarray) -> Prediction:
         shape = features[:, 0].shape
         known = predictors if predictors.any() else np.ones(CELLS, bool)
         of_known = features[:, :, known]
@@ -34,8 +30,7 @@ class Copycat:
 class Presser:
     """Is sure that every touch loads all cells."""
 
-    def predict(self, features: Array, predictors: np.ndarray) -> Generator[None, None, Prediction]:
-        yield
+    def predict(self, features: Array, predictors: np.ndarray) -> Prediction:
         even = np.ones(features[:, 0].shape)
         return Prediction(0.02 * even, 0.02 * even, 0.5 * even, np.full(CELLS, 0.05), np.ones(CELLS))
 
@@ -43,8 +38,8 @@ class Presser:
 class Holder:
     """Is sure that all cells hold a root load of one half throughout."""
 
-    def predict(self, features: Array, predictors: np.ndarray) -> Generator[None, None, Prediction]:
-        expected = yield from Presser().predict(features, predictors)
+    def predict(self, features: Array, predictors: np.ndarray) -> Prediction:
+        expected = Presser().predict(features, predictors)
         expected.always[:] = 0.98
         return expected
 
@@ -52,8 +47,8 @@ class Holder:
 class Row:
     """The last three cells lie in a row: each does what the other two do; without them it is loaded, more likely."""
 
-    def predict(self, features: Array, predictors: np.ndarray) -> Generator[None, None, Prediction]:
-        expected = yield from Copycat().predict(features, predictors)
+    def predict(self, features: Array, predictors: np.ndarray) -> Prediction:
+        expected = Copycat().predict(features, predictors)
         for cell in range(5, 8):
             scored = [other for other in range(5, 8) if other != cell and predictors[other]]
             unloaded = (features[:, 2, scored] == 0).all(axis=1)
@@ -83,12 +78,9 @@ def judged(
     """Judge a log that is made of touches of 20 frames each."""
     runs, events = seen(log)
     accumulated = np.zeros(CELLS) if accumulated is None else accumulated
-    work: Generator[None, None, Spatial] = spatial_evidence(
-        events, CellState(runs, accumulated, np.full(CELLS, jump), np.full(CELLS, jump), ~wrong, NONE),
-        model or Copycat(),
-        SCALE, 0.025, Exclusion(2.0),
-    )  # fmt: skip
-    return run_to_end(work)
+    jumps = np.full(CELLS, jump)
+    cells = CellState(runs, accumulated, jumps, jumps, ~wrong, NONE)
+    return SpatialTest(events, cells, model or Copycat(), SCALE, 0.025, Exclusion(2.0)).finish()
 
 
 def pressed(events: int) -> np.ndarray:
@@ -151,10 +143,7 @@ def test_cells_that_broke_together_do_not_vouch_for_each_other():
     zero, predictors = np.zeros(CELLS), np.ones(CELLS, bool)
     cells = CellState(runs, zero, zero, zero, predictors, NONE)
     groups = [np.array([5, 6, 7]), np.array([6])]
-    work: Generator[None, None, np.ndarray] = group_excluded_evidence(
-        events, cells, Row(), SCALE, 0.025, predictors, groups
-    )
-    joined, alone = run_to_end(work)
+    joined, alone = group_excluded_evidence(events, cells, Row(), SCALE, 0.025, predictors, groups)
     assert (joined[5:] > 1).all()
     assert alone[6] < 0.1  # the others of its row are asked
 

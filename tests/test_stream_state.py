@@ -4,7 +4,7 @@ import pytest
 from adaptfault.data.recordings import Recordings
 from diagnostics import FaultKind, Line, SensorLayout, bridge, freeze_stream, inject, line_fault, lose_frames
 from diagnostics.evidence.spatial import Exclusion
-from diagnostics.evidence.stream_state import StreamState, run_to_end
+from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault
 from diagnostics.healthy.reference import Reference
 
@@ -82,7 +82,7 @@ def test_looking_at_it_in_between_changes_nothing():
     stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
     for first in range(0, 1800, 13):
         stream.extend(log[first : first + 13])
-        run_to_end(stream.complete().spatial())
+        stream.complete().spatial().finish()
     same(stream.complete(), remembered(log))
 
 
@@ -116,7 +116,7 @@ def test_evidence_of_touches_that_were_let_go_still_counts():
     assert stream.events.kept[0].first > 1000
     assert stream.accumulated[cell] > 10
     few = remembered(log[stream.events.kept[0].first :])
-    evidence, without = (run_to_end(m.spatial()).surprisal[cell] for m in (stream, few))
+    evidence, without = (m.spatial().finish().surprisal[cell] for m in (stream, few))
     assert evidence > without + 5
 
 

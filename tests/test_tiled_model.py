@@ -10,7 +10,6 @@ from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Fault, FaultKind, SelfDiagnosis, SensorLayout, inject
 from diagnostics.events.contact_events import EventLog
 from diagnostics.events.tiles import Tile
-from diagnostics.evidence.stream_state import run_to_end
 from diagnostics.healthy.local_regression import LocalRegression
 from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
@@ -59,12 +58,12 @@ def test_a_patch_is_judged_as_a_small_array_of_the_same_cells(fitted: SelfDiagno
     features, predictors = touched(tile)
     padded, scored = np.full((9, 4, small.n_cells), 0.5, np.float32), np.ones(small.n_cells, bool)
     padded[:, :, cells], scored[cells] = features, predictors
-    expected = run_to_end(alone.predict(padded, scored))
-    said = run_to_end(fitted.stream().model_of(i, EventLog()).predict(features, predictors))
+    expected = alone.predict(padded, scored)
+    said = fitted.stream().model_of(i, EventLog()).predict(features, predictors)
     for name in ("never", "always", "mean"):
         wanted = getattr(expected, name)[:, cells[regression.place]]
         np.testing.assert_allclose(getattr(said, name)[:, regression.place], wanted, atol=1e-5, err_msg=name)
-    without = run_to_end(HealthyModel(alone.local_regressions, small).predict(padded, scored))
+    without = HealthyModel(alone.local_regressions, small).predict(padded, scored)
     assert np.abs(without.never - expected.never).max() > 0.05  # the rim has a say
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from diagnostics import Fault, FaultKind, Line, Monitor, SelfDiagnosis, SensorLayout, inject, line_fault
-from diagnostics.events.tiles import HALO, TILE, TiledEvents, tiles
-from diagnostics.evidence.stream_state import run_to_end
+from diagnostics.events.tiled_events import TiledEvents
+from diagnostics.events.tiles import HALO, TILE, tiles
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.preprocessing.scale import Scale
@@ -58,8 +58,8 @@ def test_cells_of_a_row_that_runs_through_several_patches_are_judged_with_none_o
     stream = fitted.stream()
     stream.extend(inject(log(SKIN, 100, 40), [line_fault(SKIN, Line(0, "row", 11), FaultKind.OPEN)], SKIN))
     stream = stream.complete()
-    spatial, none = run_to_end(stream.spatial()), np.zeros(SKIN.n_cells, bool)
-    of_row, of_one = run_to_end(stream.group_excluded(spatial, none, [row, row[:1]]))
+    spatial, none = stream.spatial().finish(), np.zeros(SKIN.n_cells, bool)
+    of_row, of_one = (stream.group_excluded(spatial, none, group) for group in (row, row[:1]))
     assert len({i for i, tile in enumerate(tiles(SKIN)) if np.isin(row, tile.outputs).any()}) > 1
     assert of_row[row].sum() > spatial.surprisal[row].sum() + 3
     assert of_one[row[0]] == pytest.approx(spatial.surprisal[row[0]], abs=0.5)
@@ -129,8 +129,8 @@ def test_the_monitor_says_what_the_diagnosis_says(fitted):
 
 
 def test_touches_that_are_let_go_leave_their_evidence(fitted, monkeypatch):
-    monkeypatch.setattr("diagnostics.evidence.tiled_state.MAX_EVENTS", 3)
-    monkeypatch.setattr("diagnostics.evidence.tiled_state.KEPT_EVENTS", 2)
+    monkeypatch.setattr("diagnostics.evidence.stream_state.MAX_EVENTS", 3)
+    monkeypatch.setattr("diagnostics.evidence.stream_state.KEPT_EVENTS", 2)
     healthy, stream = log(SKIN, 600, 90), fitted.stream()
     dead = np.argsort((healthy > 0.5).sum(axis=0))[[-1, -100, -200]]  # often touched
     frames = inject(healthy, [Fault(FaultKind.OPEN, (int(cell),)) for cell in dead], SKIN)

@@ -60,7 +60,6 @@ def _judged(diagnoser: SelfDiagnosis, log: Recordings | Stream) -> Diagnosis:
     import numpy as np
 
     from adaptfault.data.recordings import Recordings
-    from diagnostics.evidence.stream_state import run_to_end
 
     stream = diagnoser.stream()
     for frames in log:
@@ -68,4 +67,4 @@ def _judged(diagnoser: SelfDiagnosis, log: Recordings | Stream) -> Diagnosis:
     if not isinstance(log, Recordings):
         for problem in log.problems:
             print(problem, file=sys.stderr)
-    return run_to_end(diagnoser.evaluate(stream, n_recordings=len(log)))
+    return diagnoser.evaluate(stream, n_recordings=len(log))

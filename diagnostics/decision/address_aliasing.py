@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.evidence.duplicate_lines import DuplicatePair
-from diagnostics.evidence.stream_state import StreamState, run_to_end
-from diagnostics.healthy.model import Prediction
 from diagnostics.layout import Line, LineKind, address_bits
+
+if TYPE_CHECKING:
+    from diagnostics.evidence.duplicate_lines import DuplicatePair
+    from diagnostics.evidence.stream_state import StreamState
+    from diagnostics.healthy.prediction import Prediction
 
 _CLEAR = 3.0  # log ratio: below it the data cannot tell which level a bit is stuck at
 
@@ -122,7 +125,7 @@ def _level_ratio(line: Line, onset: int, stream: StreamState) -> float:
         for features, cells, judged, model in stream.views(onset):
             those = judged[np.isin(cells[judged], true)]
             if len(those):
-                ratio += sign * _plausible(features, run_to_end(model.predict(features, predictors[cells])), those)
+                ratio += sign * _plausible(features, model.predict(features, predictors[cells]), those)
             loaded |= bool((features[:, 2, np.isin(cells, empty)] > 0).any())
         # What nothing is connected to never reads a load.
         if loaded:

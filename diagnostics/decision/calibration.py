@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +20,14 @@ from scipy.special import expit, logit
 from diagnostics.events.tiles import MOST_CELLS
 from diagnostics.evidence.drift import gains_count
 from diagnostics.evidence.spatial import Exclusion
-from diagnostics.evidence.stream_state import StreamState, run_to_end
-from diagnostics.evidence.tiled_state import new_stream
+from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.calibration_subset import calibration_subset
 from diagnostics.healthy.reference import Reference
-from diagnostics.layout import SensorLayout
 from diagnostics.simulation.injection import inject
+
+if TYPE_CHECKING:
+    from diagnostics.layout import SensorLayout
 
 _LOGS, _LOGS_OF_LARGE = 192, 32  # drawn to fit the weights; large arrays have more cells in each
 _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
@@ -279,10 +280,10 @@ def _trial(
     log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference, exclusion: Exclusion
 ) -> _Trial:
     """Return what is said when ``faults`` are in a log."""
-    stream = new_stream(layout, reference, exclusion)
+    stream = StreamState(layout, reference, exclusion)
     stream.extend(inject(log, faults, layout))
     stream = stream.complete()
-    spatial = run_to_end(stream.spatial())
+    spatial = stream.spatial().finish()
     broken = np.zeros(layout.n_cells, bool)
     broken[[c for fault in faults for c in fault.cells]] = True
     scored, gain = spatial.scored, float(np.where(broken, 0.0, spatial.gain).max())

@@ -2,42 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
-
-from diagnostics.layout import SensorLayout
+from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from diagnostics.decision.result import Diagnosis
+    from diagnostics.layout import SensorLayout
 
 _ALIVE, _FAULTY, _UNTESTED, _ABSENT = "#8fbf8f", "#c0392b", "#d9d9d9", "#ffffff"
 
 
-def draw(diagnosis: Diagnosis) -> Figure:
-    """Draw each pad's verdicts: green alive, red faulty with the letter of its kind, grey untested."""
+def draw(layout: SensorLayout, verdicts: NDArray[np.intp], letters: Mapping[int, str]) -> Figure:
+    """Draw each pad: green alive, red faulty, grey untested.
+
+    Args:
+        layout: the array.
+        verdicts: int ``[D]``, 0 alive, 1 faulty, 2 untested, as :class:`~diagnostics.Verdict` counts.
+        letters: what to print on a cell: the kind of its fault.
+    """
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    from diagnostics.decision.result import LETTERS
-
-    layout = diagnosis.layout
     figure, axes = pads_figure(layout, n_rows=1)
-    colours = np.where(layout.present.ravel(), diagnosis.verdicts.astype(int), 3)
+    colours = np.where(layout.present.ravel(), verdicts, 3)
     palette = ListedColormap([_ALIVE, _FAULTY, _UNTESTED, _ABSENT])
     for pad, ax in enumerate(axes[0]):
         ax.imshow(layout.grid(colours)[pad], cmap=palette, vmin=-0.5, vmax=3.5)
         ax.set_title(f"pad {pad}")
         _ticks(ax, layout)
-    for fault in diagnosis.faults:
-        for cell in fault.cells:
-            pad, row, col = layout.position(cell)
-            axes[0, pad].text(col, row, LETTERS[fault.kind], ha="center", va="center", color="white", fontsize=8)
+    for cell, letter in letters.items():
+        pad, row, col = layout.position(cell)
+        axes[0, pad].text(col, row, letter, ha="center", va="center", color="white", fontsize=8)
     legend = {"alive": _ALIVE, "faulty": _FAULTY, "untested": _UNTESTED}
     figure.legend(
         handles=[Patch(color=c, label=name) for name, c in legend.items()], loc="outside lower center", ncols=3

@@ -130,7 +130,8 @@ class Diagnosis:
         """Draw the verdict map; returns a matplotlib Figure."""
         from diagnostics.decision.plot import draw
 
-        return draw(self)
+        letters = {cell: LETTERS[fault.kind] for fault in self.faults for cell in fault.cells}
+        return draw(self.layout, self.verdicts.astype(np.intp), letters)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict (no NaN) that :meth:`from_dict` reads."""

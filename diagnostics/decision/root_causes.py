@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.decision.address_aliasing import Aliasing
 from diagnostics.decision.line_cover import Cause, solve
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, LineKind, SensorLayout
+
+if TYPE_CHECKING:
+    from diagnostics.decision.address_aliasing import Aliasing
 
 _SAME_VALUE = 0.02  # of full scale: stuck cells this near to each other may share a cause
 _SAME_KIND = 1 / 3  # of the single faults: open, short or stuck
@@ -60,23 +63,18 @@ class CellFindings:
     known: Mask
 
 
-def root_causes(
-    found: CellFindings, find_aliasing: Sequence[Aliasing], layout: SensorLayout
-) -> Generator[None, None, tuple[Fault, ...]]:
-    """Name the root causes of faulty cells, one fault each, the biggest first: that is where a technician starts.
-
-    A generator that pauses between groups of cells, for those who cannot wait (a monitor); it returns the faults.
-    """
+def root_causes(found: CellFindings, find_aliasing: Sequence[Aliasing], layout: SensorLayout) -> tuple[Fault, ...]:
+    """Name the root causes of faulty cells, one fault each, the biggest first: that is where a technician starts."""
     aliased = np.zeros(layout.n_cells, bool)
     for aliasing in find_aliasing:
         aliased[list(aliasing.cells)] = True
     faults = [_aliased(aliasing, layout) for aliasing in find_aliasing]
-    causes = yield from _causes(found, aliased, layout, 0.0)
+    causes = _causes(found, aliased, layout, 0.0)
     singles = sum(cause.line is None for _, _, cause in causes)
     if 0 < singles < len(causes):
         # Where many cells fail one by one, some will be neighbours at the end of a wire: look at the wires once more.
         common = _SAME_KIND * singles / int((found.alive | found.faulty).sum())
-        causes = yield from _causes(found, aliased, layout, common)
+        causes = _causes(found, aliased, layout, common)
     faults += [_fault(kind, value, cause, found, layout) for kind, value, cause in causes]
     faults = _addresses_of_dead_rows(faults, found, layout)
     return tuple(sorted(faults, key=lambda fault: (-len(fault.cells), fault.cells)))
@@ -84,7 +82,7 @@ def root_causes(
 
 def _causes(
     found: CellFindings, aliased: Mask, layout: SensorLayout, common: float
-) -> Generator[None, None, list[tuple[FaultKind, float | None, Cause]]]:
+) -> list[tuple[FaultKind, float | None, Cause]]:
     """Return kind, value and cause of each fault; ``common``: the share of single faults of one kind, at least."""
     causes = []
     for kind, faulty, matching, value in _alike(found, layout.full_scale):
@@ -98,8 +96,6 @@ def _causes(
             contradicting |= ~matching & ~found.silent
         explained = _explained(faulty & ~aliased, matching & ~aliased, contradicting, found, layout, common)
         causes += [(kind, value, cause) for cause in explained]
-        if faulty.sum() > 1:  # a single cell is soon explained
-            yield
     return causes
 
 

@@ -8,22 +8,19 @@ nothing; time and memory grow with the cells, never with their square. A small a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.contact_events import EventLog
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.scale import Array
 
 TILE, HALO = 8, 4  # cells: a patch, and how far what surrounds it reaches
 MOST_CELLS = 400  # that are judged as one; beyond that, patches
 
-CellState = NDArray[np.intp]
+Cells = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +31,11 @@ class Tile:
         inputs, outputs: cell indices, ascending; the inputs hold the outputs.
     """
 
-    inputs: CellState
-    outputs: CellState
+    inputs: Cells
+    outputs: Cells
 
     @cached_property
-    def place(self) -> CellState:
+    def place(self) -> Cells:
         """Where the outputs lie among the inputs."""
         return np.searchsorted(self.inputs, self.outputs)
 
@@ -61,7 +58,7 @@ class Rectangle:
     """
 
     layout: SensorLayout
-    cells: CellState
+    cells: Cells
 
     @property
     def full(self) -> bool:
@@ -81,8 +78,7 @@ def tiles(layout: SensorLayout) -> tuple[Tile, ...]:
     """Return the patches of a layout, each cell an output of exactly one; a single one if the cells are few."""
     cells, present = layout.grid(np.arange(layout.n_cells)), layout.present
     if present.sum() <= MOST_CELLS:
-        every = np.flatnonzero(present)
-        return (Tile(every, every),)
+        return (Tile(cells.ravel(), cells.ravel()),)
     found = []
     for pad in range(layout.pads):
         for r in range(0, layout.rows, TILE):
@@ -92,71 +88,3 @@ def tiles(layout: SensorLayout) -> tuple[Tile, ...]:
                 if present[core].any():
                     found.append(Tile(cells[neighbourhood][present[neighbourhood]], cells[core][present[core]]))
     return tuple(found)
-
-
-@dataclass(frozen=True, eq=False)
-class _Inputs:
-    """The inputs of all patches, one after the other: ``cells[starts[i]:starts[i + 1]]`` are those of patch i."""
-
-    cells: CellState
-    starts: CellState
-
-    @classmethod
-    def of(cls, all_tiles: Sequence[Tile]) -> _Inputs:
-        sizes = [len(tile.inputs) for tile in all_tiles]
-        return cls(np.concatenate([p.inputs for p in all_tiles]), np.concatenate([[0], np.cumsum(sizes)]))
-
-    def with_any(self, mask: NDArray[np.bool_]) -> list[int]:
-        """Return the patches that have an input in ``mask`` (bool ``[D]``)."""
-        found: list[int] = np.flatnonzero(np.logical_or.reduceat(mask[self.cells], self.starts[:-1])).tolist()
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class TiledEvents:
-    """The touches of each patch so far.
-
-    Attributes:
-        patches: of the array; of: the touches of each, over its inputs.
-    """
-
-    tiles: tuple[Tile, ...]
-    of: tuple[EventLog, ...]
-    _inputs: _Inputs
-    _needed: tuple[bool, ...]
-
-    @classmethod
-    def begin(cls, all_tiles: tuple[Tile, ...], needed: NDArray[np.bool_] | None = None) -> TiledEvents:
-        """Nothing seen yet. Patches without an output that is ``needed`` (bool ``[D]``; None: all) stay so."""
-        of_each = tuple(needed is None or bool(needed[tile.outputs].any()) for tile in all_tiles)
-        return cls(all_tiles, (EventLog(),) * len(all_tiles), _Inputs.of(all_tiles), of_each)
-
-    def extend(
-        self,
-        root: Array,
-        numbers: CellState,
-        root_near: float,
-        start: CellState,
-        jumped: NDArray[np.bool_],
-    ) -> TiledEvents:
-        """Return the events after more frames, see ``EventLog.extend``; a still tile stays as it is."""
-        of = list(self.of)
-        for i in self._inputs.with_any(start > numbers[0]):
-            if self._needed[i]:
-                cells = self.tiles[i].inputs
-                of[i] = of[i].extend(root[:, cells], numbers, root_near, start[cells], jumped[cells])
-        return self.replaced(of)
-
-    def replaced(self, of: Sequence[EventLog]) -> TiledEvents:
-        """Return the same patches with other touches."""
-        return replace(self, of=tuple(of))
-
-    def holding(self, cells: NDArray[np.bool_]) -> Iterator[int]:
-        """Yield the patches that are needed and have one of the ``cells`` (bool ``[D]``) among their outputs."""
-        for i in self._inputs.with_any(cells):
-            if self._needed[i] and cells[self.tiles[i].outputs].any():
-                yield i
-
-    def kept(self) -> Iterator[tuple[int, EventLog]]:
-        """Yield the patches that were touched, and their touches."""
-        return ((i, events) for i, events in enumerate(self.of) if events.kept)

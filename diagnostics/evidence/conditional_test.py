@@ -6,9 +6,9 @@ that away, and the model is believed the less in that touch.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,10 @@ from scipy.special import expit, logit, softmax
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, count_repeats
-from diagnostics.healthy.model import Prediction
 from diagnostics.preprocessing.scale import Array, Scale
+
+if TYPE_CHECKING:
+    from diagnostics.healthy.prediction import Prediction
 
 _ANYWHERE = 0.2  # of broken cells stick anywhere, of the rest as many to the low rail as to the high one
 P_MIN = 1e-4  # no touch is less likely than this: models err
@@ -35,7 +37,7 @@ Mask = NDArray[np.bool_]
 class Model(Protocol):
     """Knows what healthy cells would do in a touch."""
 
-    def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Generator[None, None, Prediction]:
+    def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
         """See ``HealthyModel.predict``."""
 
 
@@ -141,10 +143,9 @@ class ConditionalTest:
         )
         return cls(cells, model, values, scored, cells.eligible & ~unsure, features, begins, counted, novelty)
 
-    def score(self, predictors: Mask) -> Generator[None, None, tuple[Prediction, Floats]]:
+    def score(self, predictors: Mask) -> tuple[Prediction, Floats]:
         """Return what the ``predictors`` cells (bool ``[D]``) expect, and the surprise of each stretch ``[n, D]``."""
-        expected = yield from self.model.predict(self.features, predictors)
-        yield
+        expected = self.model.predict(self.features, predictors)
         held = np.flatnonzero(self.scored & ~self.values.rests)
         likely = _shrunk_to_even(expected.never, self.features[:, 2] == 0, predictors & self.cells.runs.moved)
         inflation = _inflation(expected, self.features, predictors)

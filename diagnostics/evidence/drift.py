@@ -6,14 +6,15 @@ of either: objects have edges, and a reading may hold a residue of the last load
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from diagnostics.healthy.model import Prediction
-from diagnostics.preprocessing.scale import Array
+if TYPE_CHECKING:
+    from diagnostics.healthy.prediction import Prediction
+    from diagnostics.preprocessing.scale import Array
 
 _OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is faulty: four touches
 _LEAST_OFFSET = 0.02  # of full scale, at the mean: a smaller one does no harm

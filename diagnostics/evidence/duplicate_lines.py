@@ -14,12 +14,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.layout import LineKind, SensorLayout, address_bits
-from diagnostics.preprocessing.scale import Scale
+
+if TYPE_CHECKING:
+    from diagnostics.preprocessing.scale import Scale
 
 _EVERY = 4  # frames; a lasting fault does not hide between them
 _FEWEST_WITNESSES = 4  # and three more than healthy lines ever had

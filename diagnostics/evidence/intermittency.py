@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 from diagnostics.events.constant_runs import segments
 from diagnostics.events.contact_events import SEGMENT
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.scale import Array, Scale
+
+if TYPE_CHECKING:
+    from diagnostics.preprocessing.scale import Array, Scale
 
 Floats = NDArray[np.float64]
 

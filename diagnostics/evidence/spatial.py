@@ -1,28 +1,29 @@
-"""Spatial evidence: would a healthy cell hold this value while the other cells do what they do?
+"""Spatial evidence: does a healthy cell hold this value in these contact events, given the other cells?
 
-For each cell that ends the log still, at value v from frame s on, two explanations compete. Stuck: it reads v whatever
-happens. Healthy: it reads v throughout a touch as often as healthy cells do when the others are touched like that.
-Every touch after s adds
+Detects cells that hold one value v from frame s to the end of the log: open, short, or stuck anywhere. Every contact
+event e after s adds to the log likelihood ratio of stuck against healthy
 
-    log 1 / P(v throughout the touch | healthy, others)
+    sum_e  w_e * -log P(cell reads v throughout e | healthy, readings of the other cells)  +  log P(v | stuck)
 
-Cells that broke together, as those on one wire, vouch for each other all the same: they are judged once more with none
-of them asked (see :func:`group_excluded_evidence`).
+The prior of v counts once: broken cells mostly stick to a rail, a healthy cell under a constant load reads any value.
+The ratio equals a sequence of conditional tests as in pseudo-likelihood estimation (Besag 1975). It does not detect
+cells that no event loads and that no event leaves unloaded among loaded neighbours: they stay untested.
 
-How likely a stuck cell is to be stuck at just this v is charged once: a cell held still under a constant load also
-reads one value, but an arbitrary one, while the rails are where broken cells go.
+Which cells may serve as predictors depends on which cells are faulty, so the test is iterated: cells that moved are
+the first predictors; then constant cells whose value is plausible join them, and cells that look stuck leave, until
+nothing changes. Cells that failed together corroborate each other as predictors, so groups that one broken line would
+explain are scored once more with the whole group excluded (:func:`group_excluded_evidence`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.contact_events import ContactEvent
 from diagnostics.evidence.conditional_test import (
     P_MIN,
     SUDDEN_JUMP,
@@ -33,8 +34,11 @@ from diagnostics.evidence.conditional_test import (
     Model,
 )
 from diagnostics.evidence.drift import drifting, gain_evidence, misleading, offset_evidence
-from diagnostics.healthy.model import Prediction
-from diagnostics.preprocessing.scale import Scale
+
+if TYPE_CHECKING:
+    from diagnostics.events.contact_events import ContactEvent
+    from diagnostics.healthy.prediction import Prediction
+    from diagnostics.preprocessing.scale import Scale
 
 _TELLING = 0.5  # log evidence from which on a touch counts as one that tested the cell
 _ONE_LOAD = 0.5  # correlation of what touches elsewhere say of a load that outlasts them
@@ -45,11 +49,11 @@ Floats = NDArray[np.float64]
 
 
 class Exclusion(NamedTuple):
-    """What evidence is worth, as far as it matters while it is gathered.
+    """When a cell is excluded from the predictors.
 
     Attributes:
-        suspicious: log evidence from which on a cell is left out when others are judged.
-        gains: share of the evidence of another gain that counts.
+        threshold: log evidence from which on a cell is excluded.
+        gains: factor on the evidence of a changed gain, see :func:`~diagnostics.evidence.drift.gains_count`.
     """
 
     threshold: float
@@ -58,19 +62,18 @@ class Exclusion(NamedTuple):
 
 @dataclass(frozen=True)
 class Spatial:
-    """What the other cells say.
+    """Result of the spatial test.
 
     Attributes:
-        evidence: float ``[D]``, log likelihood ratio stuck : healthy; 0 where there is nothing to ask.
-        surprise: float ``[D]``, the part of it that touches brought.
-        at_first: float ``[D]``, the same while only the cells that moved were asked.
-        asked: bool ``[D]``, the cells that are still now.
-        touches: int ``[D]``, how many touches each was judged by that said more than nothing.
-        offset: float ``[D]``, log likelihood ratio of a cell that moves, but is loaded all through the last touches,
-            however little the others are; 0 for the others.
-        gain: float ``[D]``, log likelihood ratio of a cell that moves, but has another gain; 0: too few touches tell.
-        factor: float ``[D]``, how many times its gain in the reference, where it certainly is another; NaN elsewhere.
-        since: int ``[D]``, from about which frame on; 0: all along, or not known.
+        evidence: float ``[D]``, log likelihood ratio stuck : healthy; 0 for cells that are not constant.
+        surprisal: float ``[D]``, the part of it that the events add.
+        initial: float ``[D]``, the same in the first round, when only cells that moved were predictors.
+        scored: bool ``[D]``, the cells that are constant now.
+        events: int ``[D]``, number of events that carry evidence about each cell.
+        offset: float ``[D]``, log likelihood ratio that a moving cell never returns to its baseline; 0 elsewhere.
+        gain: float ``[D]``, log likelihood ratio that a moving cell has another gain; 0: too few events.
+        factor: float ``[D]``, that gain relative to the reference, where it is certain; NaN elsewhere.
+        since: int ``[D]``, first frame of the changed gain; 0: from the start, or unknown.
     """
 
     evidence: Floats
@@ -85,99 +88,112 @@ class Spatial:
 
     @property
     def drifting(self) -> Mask:
-        """The cells that move, but certainly not as healthy ones do, bool ``[D]``."""
+        """Cells that move but certainly have another offset or gain, bool ``[D]``."""
         return drifting(self.offset, self.gain)
 
     @classmethod
     def before(cls, cells: CellState) -> Spatial:
-        """Return what is known where nothing touched the cells since earlier touches were weighed."""
-        scored = cells.scored
-        accumulated, nothing = np.where(scored, cells.accumulated, 0.0), np.zeros(len(scored))
-        none = np.zeros(len(scored), np.intp)
-        return cls(
-            accumulated, accumulated, accumulated, scored, none, nothing, nothing, np.full(len(scored), np.nan), none
-        )
+        """Return the result without any event since earlier events were accumulated."""
+        scored, d = cells.scored, len(cells.scored)
+        accumulated, nothing, none = np.where(scored, cells.accumulated, 0.0), np.zeros(d), np.zeros(d, np.intp)
+        unknown = np.full(d, np.nan)
+        return cls(accumulated, accumulated, accumulated, scored, none, nothing, nothing, unknown, none)
 
 
-class _Agreed(NamedTuple):
-    """What the cells say that are asked in the end; ``initial``: what was brought while those asked at first were."""
-
-    expected: Prediction
-    surprisal: Floats
-    summed: Floats
-    initial: Floats
-    evidence: Floats
-    predictors: Mask
-
-
-def _agreed(test: ConditionalTest, predictors: Mask, threshold: float) -> Generator[None, None, _Agreed]:
-    """Ask the ``predictors`` cells, leave out those that look stuck, put the others back, until none changes sides."""
-    predictors, summed = predictors & test.eligible, []
-    for _ in range(_MOST_ROUNDS):
-        yield
-        expected, surprisal = yield from test.score(predictors)
-        summed.append(test.summed(surprisal))
-        evidence = np.where(test.scored, test.values.prior + summed[-1], 0.0)
-        asked_now = predictors
-        predictors = test.eligible & (evidence + test.cells.temporal < threshold)
-        if (predictors == asked_now).all():
-            break
-    return _Agreed(expected, surprisal, summed[-1], summed[0], evidence, predictors)
-
-
-def spatial_evidence(
-    events: Sequence[ContactEvent], cells: CellState, model: Model, scale: Scale, tolerance: float, exclusion: Exclusion
-) -> Generator[None, None, Spatial]:
-    """Weigh stuck against healthy for each cell that is still now. A generator that pauses on its way.
-
-    Cells that moved answer first; still cells whose value proved normal are then put back, and those that look
-    stuck are left out, until no cell changes sides: cells that died side by side vouch for each other at first. Cells
-    that move, but not as healthy ones do (see ``drift``), are left out as well.
+class SpatialTest:
+    """The iterated test; each :meth:`step` is one round, so that a control loop can spread it over frames.
 
     Args:
-        touches: what happened.
-        cells: what is known of them.
-        model: what healthy looks like.
-        scale: what a reading means.
-        tolerance: how near to v counts as v.
-        caution: what evidence is worth.
+        events: the contact events, in time order.
+        cells: state of each cell.
+        model: the healthy model.
+        scale: baseline and full scale.
+        tolerance: a reading within 2 tolerances of v counts as v.
+        exclusion: when a cell is excluded from the predictors.
+
+    Attributes:
+        result: of the rounds so far.
     """
-    if not events:
-        known, prior = Spatial.before(cells), HeldValues.now(cells, scale, tolerance).prior
-        return replace(known, evidence=np.where(known.surprisal > 0, prior + known.surprisal, known.evidence))
-    test = ConditionalTest.of(events, cells, model, scale, tolerance)
-    values, runs = test.values, cells.runs
-    # At first those are asked that moved, unless their load has outlived a touch, or jumped alone. Of the cells at rest
-    # few are broken.
-    first = np.array([event.first for event in events])
-    moved = cells.eligible & runs.moved & (first[:, None] <= runs.start)
-    fresh = runs.start >= events[-1].since
-    predictors = test.eligible & runs.moved & (values.rests | (fresh & (cells.temporal < SUDDEN_JUMP)))
-    agreed = yield from _agreed(test, predictors, exclusion.threshold)
-    initial, drifts, whole = agreed.initial, np.zeros(len(predictors), bool), test.features[test.begins]
-    for _ in range(_MOST_DRIFTING):
-        yield
-        expected = agreed.expected.on(test.begins)
-        offset = offset_evidence(whole, expected.always, moved[-1] & np.isfinite(expected.spread))
-        gain = gain_evidence(whole, expected, moved, scale.root_near, exclusion.gains * test.novelty[test.begins])
-        more = misleading(offset, gain.evidence, drifts)
-        if not more.any():
-            break
-        drifts |= more
-        without = replace(test, eligible=test.eligible & ~drifts)
-        agreed = yield from _agreed(without, agreed.predictors, exclusion.threshold)
-    of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
-    return Spatial(
-        agreed.evidence,
-        agreed.summed,
-        initial,
-        test.scored,
-        np.where(of_gain, gain.events, (agreed.surprisal > _TELLING).sum(axis=0)),
-        offset,
-        gain.evidence,
-        factor=np.where(of_gain, gain.factor, np.nan),
-        since=np.where(of_gain & (gain.since > 0), first[gain.since], 0),
-    )
+
+    def __init__(
+        self,
+        events: Sequence[ContactEvent],
+        cells: CellState,
+        model: Model,
+        scale: Scale,
+        tolerance: float,
+        exclusion: Exclusion,
+    ) -> None:
+        self.result = Spatial.before(cells)
+        self._events, self._cells, self._scale, self._exclusion = events, cells, scale, exclusion
+        if not events:
+            prior, known = HeldValues.now(cells, scale, tolerance).prior, self.result
+            evidence = np.where(known.surprisal > 0, prior + known.surprisal, known.evidence)
+            self.result = replace(known, evidence=evidence)
+            return
+        self._test = test = ConditionalTest.of(events, cells, model, scale, tolerance)
+        runs = cells.runs
+        # First predictors: cells that moved, unless their load outlasts an event, or they jumped alone. Few of the
+        # cells at rest are broken.
+        fresh = runs.start >= events[-1].since
+        plausible = test.values.rests | (fresh & (cells.temporal < SUDDEN_JUMP))
+        self._predictors: Mask = test.eligible & runs.moved & plausible
+        self._drifts = np.zeros(len(plausible), bool)
+        self._initial: Floats | None = None
+        self._rounds = self._exclusions = 0
+
+    def step(self) -> bool:
+        """Score all cells once, and update the predictors. Return whether the result is final."""
+        if not self._events:
+            return True
+        test, predictors = self._test, self._predictors & self._test.eligible
+        expected, surprisal = test.score(predictors)
+        summed = test.summed(surprisal)
+        evidence = np.where(test.scored, test.values.prior + summed, 0.0)
+        if self._initial is None:
+            self._initial = summed
+        self._rounds += 1
+        self._predictors = test.eligible & (evidence + self._cells.temporal < self._exclusion.threshold)
+        if self._rounds < _MOST_ROUNDS and (self._predictors != predictors).any():
+            return False
+        return self._drift(expected, surprisal, summed, evidence)
+
+    def finish(self) -> Spatial:
+        """Run all rounds and return the result."""
+        while not self.step():
+            pass
+        return self.result
+
+    def _drift(self, expected: Prediction, surprisal: Floats, summed: Floats, evidence: Floats) -> bool:
+        """Look for cells with another offset or gain; exclude them and start again if there are new ones."""
+        test, cells = self._test, self._cells
+        first = np.array([event.first for event in self._events])
+        moved = cells.eligible & cells.runs.moved & (first[:, None] <= cells.runs.start)
+        whole, on_whole = test.features[test.begins], expected.on(test.begins)
+        offset = offset_evidence(whole, on_whole.always, moved[-1] & np.isfinite(on_whole.spread))
+        counts = self._exclusion.gains * test.novelty[test.begins]
+        gain = gain_evidence(whole, on_whole, moved, self._scale.root_near, counts)
+        of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
+        assert self._initial is not None
+        self.result = Spatial(
+            evidence,
+            summed,
+            self._initial,
+            test.scored,
+            np.where(of_gain, gain.events, (surprisal > _TELLING).sum(axis=0)),
+            offset,
+            gain.evidence,
+            factor=np.where(of_gain, gain.factor, np.nan),
+            since=np.where(of_gain & (gain.since > 0), first[gain.since], 0),
+        )
+        more = misleading(offset, gain.evidence, self._drifts)
+        self._exclusions += 1
+        if not more.any() or self._exclusions >= _MOST_DRIFTING:
+            return True
+        self._drifts = self._drifts | more
+        self._test = replace(test, eligible=test.eligible & ~more)
+        self._rounds = 0
+        return False
 
 
 def group_excluded_evidence(
@@ -188,43 +204,43 @@ def group_excluded_evidence(
     tolerance: float,
     predictors: Mask,
     groups: Sequence[NDArray[np.intp]],
-) -> Generator[None, None, Floats]:
-    """Return what touches brought against cells with nobody asked who may have broken with them, ``[groups, D]``.
+) -> Floats:
+    """Return the summed surprisal with each group of cells excluded from the predictors, ``[groups, D]``.
 
     Args:
-        touches, cells, model, scale, tolerance: as for :func:`spatial_evidence`.
-        trusted: bool ``[D]``, those that were asked in the end.
-        groups: cells each, that may have broken together.
+        events, cells, model, scale, tolerance: as for :class:`SpatialTest`.
+        predictors: bool ``[D]``, the final predictors.
+        groups: cell indices of each group that one fault would explain.
     """
     test = ConditionalTest.of(events, cells, model, scale, tolerance)
     summed = np.zeros((len(groups), len(predictors)))
     for i, group in enumerate(groups):
         others = predictors & test.eligible
         others[group] = False
-        _, surprisal = yield from test.score(others)
+        _, surprisal = test.score(others)
         summed[i] = test.summed(surprisal)
     return summed
 
 
 def held_load_evidence(
     cells: CellState, outlasted: NDArray[np.intp], model: Model, scale: Scale, tolerance: float
-) -> Generator[None, None, Floats]:
-    """Return what it says that a load is held where nothing moves, a log likelihood ratio ``[D]``.
+) -> Floats:
+    """Return the log likelihood ratio ``[D]`` of loads that are held where nothing moves.
 
-    All cells have a say in that, so that a thing that lies there is no fault: its cells have each other.
+    All cells are predictors here, so an object that rests on the skin is no fault: its cells support each other.
 
     Args:
-        cells: what is known of them.
-        outlasted: int ``[D]``, how many touches of other parts of the skin each load has outlasted.
-        model, scale, tolerance: as for :func:`spatial_evidence`.
+        cells: state of each cell.
+        outlasted: int ``[D]``, number of events elsewhere on the skin that each load has outlasted.
+        model, scale, tolerance: as for :class:`SpatialTest`.
     """
     value = np.nan_to_num(cells.runs.value)
     values, root = HeldValues.of(value, scale, tolerance), scale.root_load(value)
     held = np.flatnonzero(outlasted)
     loaded = (root > scale.root_near).astype(np.float32)
-    expected = yield from model.predict(np.stack([root, root, loaded, loaded])[None], cells.eligible)
+    expected = model.predict(np.stack([root, root, loaded, loaded])[None], cells.eligible)
     likely = expected.always[0, held] * expected.within(values.low[held], values.high[held], held)[0]
-    # However often something else was touched, it is one load.
+    # One load is tested, however many events there were elsewhere.
     evidence = np.zeros(len(outlasted))
     evidence[held] = -np.log(np.maximum(likely, P_MIN)) * outlasted[held] / (1 + _ONE_LOAD * (outlasted[held] - 1))
     return evidence

@@ -1,84 +1,130 @@
-"""What is remembered of a log: fed frame by frame, of constant size, and the same however the frames come in.
+"""The state of a log: fed frame by frame, of constant size, and independent of how the frames are split into blocks.
 
-Frames are looked at in segments of 32. Of each cell the still stretch that it is in is kept, of the log its last
-touches. Older touches are weighed, and only their evidence stays.
+Frames are processed in segments of 32. The state keeps the constant run of every cell and the last contact events of
+every tile (see ``events.tiles``; an array of up to 400 cells is one tile). Older events are scored, and only their
+summed evidence is kept.
+
+A tile cannot tell which cells of its halo are faulty, but their own tiles can. So several tiles are scored twice:
+first with the moving cells as predictors, then without the cells that their own tile suspects.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator
 from copy import copy
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import SEGMENT, EventLog
+from diagnostics.events.tiled_events import TiledEvents
+from diagnostics.events.tiles import Rectangle, Tile, tiles
 from diagnostics.evidence.conditional_test import SUDDEN_JUMP, CellState, Model
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
-from diagnostics.evidence.spatial import Exclusion, Spatial, group_excluded_evidence, spatial_evidence
+from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, group_excluded_evidence, held_load_evidence
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
-from diagnostics.healthy.reference import Reference
-from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.offset import OffsetTracker
 from diagnostics.preprocessing.readings import held
-from diagnostics.preprocessing.scale import Array, Scale
-from diagnostics.preprocessing.transport import TransportState
+from diagnostics.preprocessing.transport import TransportState, invalid
 
-Result = TypeVar("Result")
+if TYPE_CHECKING:
+    from diagnostics.healthy.prediction import Prediction
+    from diagnostics.healthy.reference import Reference
+    from diagnostics.layout import SensorLayout
+    from diagnostics.preprocessing.scale import Array, Scale
 
-MAX_EVENTS, KEPT_EVENTS = 40, 32  # when there are more, all but the last so many are weighed and let go
-_SILENT, _NEVER_HEARD = 2 * SEGMENT, SEGMENT // 2  # frames on end without a reading: that is no chance any more
-_PAUSE = SEGMENT // 2  # frames of a segment after which that begins, a little with each frame: it ends with the segment
+MAX_EVENTS, KEPT_EVENTS = 40, 32  # with more events in a tile, all but the last are scored and dropped
+_SILENT, _NEVER_RECEIVED = 2 * SEGMENT, SEGMENT // 2  # consecutive frames without a reading: not chance any more
+_PAUSE = SEGMENT // 2  # frames of a segment after which old events are scored, a part with each frame
+_EXCLUDED = 3.0  # log evidence from which on a cell of a tiled array is no predictor
+_STEPS = 8  # in which one pass over all tiles is split: a monitor does one step a frame
+
+Mask = NDArray[np.bool_]
+Cells = NDArray[np.intp]
+
+
+class Test(Protocol):
+    """A test in steps, so that a control loop can spread it over frames."""
+
+    result: Spatial
+
+    def step(self) -> bool:
+        """Do a part of the work; return whether the result is final."""
+
+    def finish(self) -> Spatial:
+        """Do all that is left, and return the result."""
 
 
 class StreamState:
     """The state of a diagnosis after some frames.
 
+    Args:
+        layout: the array.
+        reference: the healthy reference.
+        exclusion: when a cell is excluded from the predictors.
+        needed: bool ``[D]``, the cells to be scored; None: all. Tiles without such a cell are skipped.
+
     Attributes:
-        layout, reference: as given.
-        caution: what evidence is worth.
-        stream: what is known of the transport.
-        runs: the still stretch of each cell.
-        touches: the last ones.
-        settled: float ``[D]``, evidence from touches that are gone, of the stretches that still go on.
-        unrest: blinks and noise.
-        twins: lines that read alike.
-        touched: bool ``[D]``, cells that read more than untouched ones do.
-        scale: what a reading means, as offsets are now.
+        transport: lost and repeated frames.
+        runs: the constant run of each cell.
+        local: the last contact events of each tile.
+        accumulated: float ``[D]``, evidence from dropped events, for the constant runs that still last.
+        intermittency: blinks and excess noise.
+        duplicates: pairs of lines that read the same.
+        touched: bool ``[D]``, cells that were loaded at least once.
+        scale: baseline with the present offsets, and full scale.
     """
 
-    def __init__(self, layout: SensorLayout, reference: Reference, exclusion: Exclusion) -> None:
-        self.layout, self.reference, self.exclusion = layout, reference, exclusion
+    def __init__(
+        self, layout: SensorLayout, reference: Reference, exclusion: Exclusion, needed: Mask | None = None
+    ) -> None:
+        model = reference.model
+        every = tiles(layout) if model is None else tuple(Tile(r.inputs, r.outputs) for r in model.local_regressions)
+        self.layout, self.reference = layout, reference
+        self.tiled = len(every) > 1
+        self.exclusion = exclusion._replace(threshold=_EXCLUDED) if self.tiled else exclusion
         self.present = layout.present.ravel()
         self.transport = TransportState()
         self.runs = ConstantRuns.begin(layout.n_cells)
-        self.events = EventLog()
+        self.local = TiledEvents.begin(every if self.tiled else tiles(layout), needed)
         self.accumulated = np.zeros(layout.n_cells)
         self.intermittency = Intermittency.begin(layout)
         self.duplicates = DuplicateLines.begin(layout)
         self.touched = np.zeros(layout.n_cells, bool)
         self.scale: Scale = reference.scale
+        self._skin = EventLog()  # events of the whole skin, if there are several tiles
         self._offsets = OffsetTracker.begin(layout.n_cells)
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
         self._filled = 0
-        self._leaving: Iterator[None] = iter(())  # work at the touches that are let go
+        self._dropping: tuple[Test, TiledEvents] | None = None  # the test of old events, and the events to keep
+        self._models: dict[int, Model] = {}
+
+    @property
+    def events(self) -> EventLog:
+        """The last contact events of the skin as a whole."""
+        return self._skin if self.tiled else self.local.of[0]
 
     def extend(self, frames: NDArray[np.float64]) -> bool:
         """Take in frames ``[t, D]``; return whether a segment was completed."""
+        wrong = invalid(frames, self.layout.full_scale)
+        if wrong is not None:
+            frames, self.transport = np.where(wrong, np.nan, frames), self.transport.dropped(wrong)
         before = self.transport.seen
-        self.transport, known_values = self.transport.receive(frames, self.present, self.reference.patience)
-        completed = False
-        taken = 0
-        next(self._leaving, None)
-        while taken < len(known_values):
-            if self._filled == _PAUSE and self._crowded:
-                self._leaving = self._let_go()
-            n = min((_PAUSE if self._filled < _PAUSE else SEGMENT) - self._filled, len(known_values) - taken)
-            chosen = known_values[taken : taken + n]
+        self.transport, new = self.transport.receive(frames, self.present, self.reference.patience)
+        completed, taken = False, 0
+        if self._dropping and self._dropping[0].step():
+            self._drop()
+        while taken < len(new):
+            if self._filled == _PAUSE and self._crowded and self._dropping is None:
+                old, kept = self.local.split(MAX_EVENTS, KEPT_EVENTS)
+                self._dropping = self._test(self.cells(None), old, passes=1), kept
+            n = min((_PAUSE if self._filled < _PAUSE else SEGMENT) - self._filled, len(new) - taken)
+            chosen = new[taken : taken + n]
             self._buffer[self._filled : self._filled + n] = frames[chosen]
             self._numbers[self._filled : self._filled + n] = chosen + before
             self._filled += n
@@ -90,158 +136,249 @@ class StreamState:
 
     @property
     def due(self) -> bool:
-        """Whether the next frame brings more work than being kept."""
+        """Whether the next frame takes more work than storing it."""
         return self._filled == SEGMENT - 1 or (self._filled >= _PAUSE and self._crowded)
 
     def miss(self, frames: int) -> None:
-        """Count frames that never came, as the sender's clock tells."""
+        """Count frames that were never received, according to the sender's clock."""
         if frames > 0:
             self.transport = self.transport.without(frames)
 
     def complete(self) -> StreamState:
-        """Return a memory in which the frames that wait for their segment have been looked at; this one stays."""
+        """Return a state in which the frames of the unfinished segment are processed; this state stays as it is."""
         if not self._filled:
             return self
-        self._gone()
+        self._drop()
         other = copy(self)
-        other._close()  # reads the frames that wait, and changes none of them
+        other._close()  # reads the buffered frames and changes none of them
         return other
 
     @property
-    def received(self) -> NDArray[np.bool_]:
-        """Which cells ever delivered a reading, bool ``[D]``."""
+    def received(self) -> Mask:
+        """Cells that delivered a reading at least once, bool ``[D]``."""
         return np.isfinite(self.runs.last)
 
     @property
-    def silent(self) -> NDArray[np.bool_]:
-        """Which cells deliver no reading, or none any more, bool ``[D]``."""
-        return self.present & (self.runs.missed >= np.where(self.received, _SILENT, _NEVER_HEARD))
+    def silent(self) -> Mask:
+        """Cells that deliver no reading, or no longer do, bool ``[D]``."""
+        return self.present & (self.runs.missed >= np.where(self.received, _SILENT, _NEVER_RECEIVED))
 
-    def rests(self) -> NDArray[np.bool_]:
-        """Where a cell reads now, or held still at, what an untouched one reads, bool ``[D]``."""
+    def rests(self) -> Mask:
+        """Cells whose constant run lies at their baseline, bool ``[D]``."""
         return np.isfinite(self.runs.value) & (self.scale.root_load(self.runs.value) <= self.scale.root_near)
 
     def temporal(self) -> NDArray[np.float64]:
-        """What each cell's still stretch says, and the jump into it, a log likelihood ratio ``[D]``."""
-        reference = self.reference
-        rests = self.rests()
+        """Log likelihood ratio of the constant run, its level and noise, and the jump into it, ``[D]``."""
+        reference, rests = self.reference, self.rests()
         lower = reference.least.lower(self.runs, rests & self.present)
         low = reference.least.evidence(self.runs, rests, reference.tolerance, self.present, lower)
         noise = reference.noise_loss.evidence(self.runs, rests, self.present, lower < -reference.tolerance)
         untouched = np.where(np.abs(noise) > np.abs(low), noise, low)
         return reference.jumps_seen.evidence(self.runs, self.layout.full_scale) + untouched
 
-    def model(self) -> Model:
-        """What healthy cells would do; without a reference, as far as this log tells."""
-        return self.reference.model or NearestNeighbours.of(self.events.kept, self.layout)
+    def model_of(self, i: int, events: EventLog) -> Model:
+        """Return the healthy model of tile i; without a reference, a model of its ``events``."""
+        known = self.reference.model
+        if not self.tiled:
+            return known or NearestNeighbours.of(events.kept, self.layout)
+        if i in self._models:
+            return self._models[i]
+        own = self.local.tiles[i].rectangle(self.layout)
+        if known is None:
+            log = NearestNeighbours.of(events.kept, own.layout).log
+            return _Rectangular(NearestNeighbours(own.on(log), own.layout), own)
+        return self._models.setdefault(i, _Rectangular(known.of_tile(i, own.cells, own.layout), own))
 
-    def views(self, onset: int) -> Iterator[tuple[Array, NDArray[np.intp], NDArray[np.intp], Model]]:
-        """Yield what happened from frame ``onset`` on: features ``[n, 4, k]``, the k cells, those judged, by a model.
+    def views(self, onset: int) -> Iterator[tuple[Array, Cells, Cells, Model]]:
+        """Yield, for each tile, its events since frame ``onset`` as features ``[n, 4, k]``.
 
-        The cells that the model judges are given by their place among the k.
+        With them the k cells, the places among these of the cells that the model predicts, and the model.
         """
-        suffixes = [s.features() for event in self.events.kept for s in event.suffixes() if s.first >= onset]
-        if suffixes:
-            every = np.arange(self.layout.n_cells)
-            yield np.stack(suffixes), every, every, self.model()
+        for i, events in self.local.kept():
+            tile = self.local.tiles[i]
+            suffixes = [s.features() for e in events.kept for s in e.suffixes() if s.first >= onset]
+            if suffixes:
+                yield np.stack(suffixes), tile.inputs, tile.place, self.model_of(i, events)
 
-    def spatial(
-        self, wrong: NDArray[np.bool_] | None = None, events: EventLog | None = None
-    ) -> Generator[None, None, Spatial]:
-        """What the other cells say of each cell that is still, over all touches or those given.
+    def spatial(self, explained: Mask | None = None) -> Test:
+        """Return the spatial test of all constant cells; cells already ``explained`` (bool ``[D]``) are left out."""
+        cells = self.cells(explained)
+        return self._test(self._with_held_loads(cells) if self.tiled else cells, self.local, passes=2)
 
-        Cells that are known to be ``wrong`` (bool ``[D]``) are not asked.
-        """
-        events = self.events if events is None else events
-        return spatial_evidence(
-            events.kept, self.cells(wrong), self.model(), self.scale, self.reference.tolerance,
-            self.exclusion,
-        )  # fmt: skip
-
-    def group_excluded(
-        self, spatial: Spatial, wrong: NDArray[np.bool_], groups: Sequence[NDArray[np.intp]]
-    ) -> Generator[None, None, NDArray[np.float64]]:
-        """What touches say of cells if nobody is asked who may have broken with them, ``[groups, D]``.
+    def group_excluded(self, spatial: Spatial, explained: Mask, group: Cells) -> NDArray[np.float64]:
+        """Return the summed surprisal ``[D]`` with a group of cells excluded from the predictors.
 
         Args:
-            spatial: what was found with all asked that are not suspected.
-            wrong: bool ``[D]``, known to be wrong.
-            groups: cells each, that may have broken together.
+            spatial: the result of the test with all cells that are not suspected as predictors.
+            explained: bool ``[D]``, cells already explained.
+            group: cells that one fault would explain.
         """
-        if not self.events.kept:
-            return np.tile(self.accumulated, (len(groups), 1))
-        return (
-            yield from group_excluded_evidence(
-                self.events.kept, self.cells(wrong), self.model(), self.scale, self.reference.tolerance,
-                ~self._suspected(spatial), groups,
-            )
-        )  # fmt: skip
+        every, predictors = self.cells(explained), ~self.suspected(spatial)
+        total, among = self.accumulated.copy(), np.zeros(len(predictors), bool)
+        among[group] = True
+        for i, events in self.local.kept():
+            tile = self.local.tiles[i]
+            if among[tile.outputs].any():
+                cells = tile.inputs
+                (summed,) = group_excluded_evidence(
+                    events.kept, every.of(cells), self.model_of(i, events), self.scale.of(cells),
+                    self.reference.tolerance, predictors[cells], [np.flatnonzero(among[cells])],
+                )  # fmt: skip
+                total[tile.outputs] = summed[tile.place]
+        return total
 
-    def _suspected(self, spatial: Spatial) -> NDArray[np.bool_]:
+    def suspected(self, spatial: Spatial) -> Mask:
+        """Return the cells that are no predictors after a test, bool ``[D]``."""
         return (spatial.scored & (spatial.evidence + self.temporal() >= self.exclusion.threshold)) | spatial.drifting
 
-    def cells(self, wrong: NDArray[np.bool_] | None) -> CellState:
-        """What is known of the cells before the others are asked, but those that are known to be ``wrong``."""
-        wrong = self.intermittency.intermittent | self.intermittency.excess | (False if wrong is None else wrong)
-        eligible = self.present & self.received & ~self.silent & ~wrong
-        return CellState(self.runs, self.accumulated, self.temporal(), self._sudden(), eligible, np.zeros_like(wrong))
+    def cells(self, explained: Mask | None) -> CellState:
+        """Return the state of the cells before the spatial test; ``explained`` cells (bool ``[D]``) are left out."""
+        explained = self.intermittency.intermittent | self.intermittency.excess | (explained is not None and explained)
+        eligible = self.present & self.received & ~self.silent & ~explained
+        nothing = np.zeros_like(eligible)
+        return CellState(self.runs, self.accumulated, self.temporal(), self._jumps(), eligible, nothing)
 
-    def _sudden(self) -> NDArray[np.float64]:
+    def _test(self, cells: CellState, events: TiledEvents, passes: int) -> Test:
+        if self.tiled:
+            return _TiledTest(self, cells, events, passes)
+        (only,) = events.of
+        return SpatialTest(
+            only.kept, cells, self.model_of(0, only), self.scale, self.reference.tolerance, self.exclusion
+        )
+
+    def _with_held_loads(self, cells: CellState) -> CellState:
+        """Return the cells with the evidence of loads that are held where nothing has moved for some events."""
+        if self.reference.model is None:
+            return cells  # a log alone does not tell how healthy cells hold loads
+        loaded = cells.scored & (self.scale.root_load(self.runs.value) > self.scale.root_near)
+        begun = np.array([event.first for event in self.events.kept])
+        outlasted, accumulated = np.zeros(len(loaded), bool), cells.accumulated.copy()
+        for i in self.local.holding(loaded):
+            tile, own = self.local.tiles[i], self.local.of[i].kept
+            since = np.maximum(self.runs.start[tile.inputs], own[-1].end if own else 0)
+            many = np.where(loaded[tile.inputs], len(begun) - np.searchsorted(begun, since), 0)
+            outlasted[tile.outputs] = many[tile.place] > 0
+            if outlasted[tile.outputs].any():
+                state, scale = cells.of(tile.inputs), self.scale.of(tile.inputs)
+                model = self.model_of(i, self.local.of[i])
+                evidence = held_load_evidence(state, many, model, scale, self.reference.tolerance)
+                accumulated[tile.outputs] += evidence[tile.place]
+        return replace(cells, accumulated=accumulated, outlasted=outlasted)
+
+    def _jumps(self) -> NDArray[np.float64]:
         return self.reference.jumps_seen.size(self.runs, self.layout.full_scale)
 
     def _close(self) -> None:
-        self._gone()
+        """Process a segment."""
+        self._drop()
         frames, numbers = self._buffer[: self._filled], self._numbers[: self._filled]
         self._filled = 0
         self._offsets = self._offsets.extend(frames, self.reference.scale, self.present, self.reference.offset)
         self.scale = scale = self._offsets.on(self.reference.scale)
         start, known = self.runs.start, _known(frames, self.runs.last)
-        self.runs = self.runs.extend(frames, numbers, self.reference.tolerance, scale.baseline)
-        # Evidence belongs to a stretch, and ends with it.
-        self.accumulated = np.where(self.runs.start == start, self.accumulated, 0.0)
-        root, still = scale.root_load(self._offsets.off(known)), self.runs.start <= numbers[0]
+        self.runs = runs = self.runs.extend(frames, numbers, self.reference.tolerance, scale.baseline)
+        # Evidence belongs to a constant run, and ends with it.
+        self.accumulated = np.where(runs.start == start, self.accumulated, 0.0)
+        root, still = scale.root_load(self._offsets.off(known)), runs.start <= numbers[0]
         self.touched = self.touched | root.any(axis=0)
-        self._remember(root, numbers, (self._sudden() >= SUDDEN_JUMP) & (self.runs.alone | still))
+        jumped = (self._jumps() >= SUDDEN_JUMP) & (runs.alone | still)
+        self.local = self.local.extend(root, numbers, scale.root_near, runs.start, jumped)
+        if self.tiled:
+            skin = self._skin.extend(root, numbers, scale.root_near, runs.start, jumped)
+            self._skin = skin.split(KEPT_EVENTS)[1].without_loads()
+            # Of a hundred cells on a line one is always dead: cells that never moved do not tell two lines apart.
+            frames = np.where(runs.moved, frames, np.nan)
         self.intermittency = self.intermittency.extend(known, root, numbers, scale, self.reference.usual, still)
-        self.duplicates = self.duplicates.extend(
-            self._comparable(frames), numbers, informative(frames, still, scale), scale.near
-        )
+        self.duplicates = self.duplicates.extend(frames, numbers, informative(frames, still, scale), scale.near)
 
     @property
     def _crowded(self) -> bool:
-        return len(self.events.kept) > MAX_EVENTS
+        return any(len(events.kept) > MAX_EVENTS for events in self.local.of)
 
-    def _remember(self, root: Array, numbers: NDArray[np.intp], jumped: NDArray[np.bool_]) -> None:
-        self.events = self.events.extend(root, numbers, self.scale.root_near, self.runs.start, jumped)
+    def _drop(self) -> None:
+        """Finish the test of old events, and drop them."""
+        if self._dropping is not None:
+            test, kept = self._dropping
+            self.accumulated, self.local, self._dropping = test.finish().surprisal, kept, None
 
-    def _comparable(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
-        return frames
 
-    def _gone(self) -> None:
-        """Weigh the touches that are let go to the end."""
-        for _ in self._leaving:
+@dataclass(frozen=True)
+class _Rectangular:
+    """The model of a tile's bounding rectangle, applied to the inputs of the tile."""
+
+    model: Model
+    own: Rectangle
+
+    def predict(self, features: Array, predictors: Mask) -> Prediction:
+        """See ``HealthyModel.predict``."""
+        e = self.model.predict(self.own.on(features), self.own.on(predictors))
+        return e if self.own.full else e.on(slice(None), self.own.cells)
+
+
+@dataclass(frozen=True)
+class _Restricted:
+    """A model whose predictors are restricted to some of the inputs, bool ``[inputs]``."""
+
+    model: Model
+    allowed: Mask
+
+    def predict(self, features: Array, predictors: Mask) -> Prediction:
+        """See ``HealthyModel.predict``."""
+        return self.model.predict(features, predictors & self.allowed)
+
+
+class _TiledTest:
+    """The spatial test of several tiles, in one or two passes, see the module."""
+
+    def __init__(self, stream: StreamState, cells: CellState, events: TiledEvents, passes: int) -> None:
+        self._stream, self._cells, self._events, self._passes = stream, cells, events, passes
+        self._outside = stream.runs.moved  # predictors of each tile outside its outputs
+        self._begin()
+
+    def _begin(self) -> None:
+        self.result = Spatial(*(np.array(values) for values in vars(Spatial.before(self._cells)).values()))
+        self._queue = [
+            (i, events)
+            for i, events in enumerate(self._events.of)
+            if events.kept or self._cells.outlasted[self._events.tiles[i].outputs].any()
+        ]
+        self._each = max(1, -(-len(self._queue) // _STEPS))
+
+    def step(self) -> bool:
+        """Score some tiles."""
+        now, self._queue = self._queue[: self._each], self._queue[self._each :]
+        for i, events in now:
+            self._score(i, events)
+        if self._queue:
+            return False
+        self._passes -= 1
+        if self._passes == 0:
+            return True
+        self._outside = ~self._stream.suspected(self.result)
+        self._begin()
+        return False
+
+    def finish(self) -> Spatial:
+        """Score all tiles that are left."""
+        while not self.step():
             pass
+        return self.result
 
-    def _let_go(self) -> Generator[None, None, None]:
-        old, kept = self.events.split(KEPT_EVENTS)
-        accumulated = (yield from self.spatial(events=old)).surprisal
-        self.events, self.accumulated = kept, accumulated
+    def _score(self, i: int, events: EventLog) -> None:
+        stream, tile = self._stream, self._events.tiles[i]
+        allowed = self._outside[tile.inputs]
+        allowed[tile.place] = True
+        model = _Restricted(stream.model_of(i, events), allowed)
+        cells, scale = self._cells.of(tile.inputs), stream.scale.of(tile.inputs)
+        test = SpatialTest(events.kept, cells, model, scale, stream.reference.tolerance, stream.exclusion)
+        for name, values in vars(test.finish()).items():
+            getattr(self.result, name)[tile.outputs] = values[tile.place]
 
 
 def _known(frames: NDArray[np.float64], last: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ``frames`` with the last reading of a cell, before them ``last``, for each that is missing.
+    """Return ``frames`` with each missing reading replaced by the one before it; ``last`` holds those before all.
 
-    Not of a cell that delivers none in all of them: what was long ago is no load now.
+    A cell without any reading in these frames stays missing: an old reading is no load now.
     """
     missing = np.isnan(frames)
     return np.where(missing.all(axis=0), np.nan, held(frames, last)[1:]) if missing.any() else frames
-
-
-def run_to_end(work: Generator[None, None, Result]) -> Result:
-    """Run work that pauses to its end, and return what it returns."""
-    while True:
-        try:
-            next(work)
-        except StopIteration as end:
-            result: Result = end.value
-            return result

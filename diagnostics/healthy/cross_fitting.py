@@ -7,13 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.healthy.stacking import RegressionOutput, Stacking, neighbourhood
-from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.scale import Array
+
+if TYPE_CHECKING:
+    from diagnostics.layout import SensorLayout
 
 FOLDS = 4  # of what there is to learn from: each teaches how far to believe what the others taught
 _LEFT_OUT = (0.03, 0.06, 0.12, 0.2, 0.4, 0.7, 0.95)  # of the cells, in turn: so many may be dead, or not moved yet

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.special import expit, logit
 
-from diagnostics.events.tiles import Tile
 from diagnostics.healthy.dual_ridge import covariance_and_precision
 from diagnostics.healthy.dual_ridge import logistic as dual_logistic
 from diagnostics.healthy.stacking import RegressionOutput
@@ -75,11 +74,6 @@ class LocalRegression:
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
                 object.__setattr__(self, name, np.ascontiguousarray(value))
-
-    @property
-    def tile(self) -> Tile:
-        """The cells that it is about."""
-        return Tile(self.inputs, self.outputs)
 
     def at(self, cells: NDArray[np.intp]) -> LocalRegression:
         """Return the same model of another array, whose ``cells`` are the inputs here."""

@@ -9,10 +9,10 @@ touches.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,60 +22,21 @@ from diagnostics.events.constant_runs import segments
 from diagnostics.events.contact_events import SEGMENT, ContactEvent, EventLog, Summary, count_repeats
 from diagnostics.healthy.cross_fitting import FOLDS, CrossFitting, RegressionFit
 from diagnostics.healthy.local_regression import LocalRegression, predict_regressions
+from diagnostics.healthy.prediction import Prediction
 from diagnostics.healthy.stacking import RegressionOutput, Stacking, neighbourhood
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.scale import Array, Scale
+
+if TYPE_CHECKING:
+    from diagnostics.preprocessing.scale import Array, Scale
 
 _SAMPLES = 3000  # stretches of touches that the model is fitted on, about
 _MOST_DRAWS = 8  # stretches of one touch: more of them say the same
 _SHORTEST = 6  # frames of a stretch
 _SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
 _SOURCES = 12  # recordings: of fewer each touch is a source of its own, and counts
-_NOVEL = 0.1  # share of touches that resemble nothing known
 _FAMILIAR, _STRANGE = 1 / 400, 1 / 100  # chance that a touch does with a cell what none did before
 _SHARED = 0.4  # of what is said of a cell where few touches teach: that is true of the cells around it as well
 _AT_ONCE = 6144  # cells of stretches looked at between two pauses
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """What healthy cells would do in each of n stretches, given the trusted cells.
-
-    Attributes:
-        never: float ``[n, D]``, P(unloaded throughout).
-        always: float ``[n, D]``, P(loaded throughout).
-        mean: float ``[n, D]``, expected mean root load.
-        spread: float ``[D]``, scale of the error of ``mean``; NaN: cells of which nothing is known.
-        own: float ``[D]``, how far all that is of the very cell, and not of any that is surrounded alike, 0 to 1.
-    """
-
-    never: NDArray[np.float64]
-    always: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    own: NDArray[np.float64]
-
-    def on(self, excerpts: NDArray[np.bool_] | slice, cells: NDArray[np.intp] | slice = slice(None)) -> Prediction:
-        """Return the same of some stretches and cells."""
-        never, always, mean = (values[excerpts][:, cells] for values in (self.never, self.always, self.mean))
-        return Prediction(never, always, mean, self.spread[cells], self.own[cells])
-
-    def within(
-        self,
-        low: NDArray[np.float64],
-        high: NDArray[np.float64],
-        cells: NDArray[np.intp],
-        inflation: NDArray[np.float64] | float = 1.0,
-    ) -> NDArray[np.float64]:
-        """Return P(mean root load from ``low`` to ``high``), ``[n, k]``, of k ``cells``; the bounds are ``[k]``.
-
-        ``inflation``: how many times as far as usual loads are off in each stretch, ``[n]``.
-        """
-        mean, spread = self.mean[:, cells], self.spread[cells] * np.reshape(inflation, (-1, 1))
-        likely = _student_t((high - mean) / spread) - _student_t((low - mean) / spread)
-        # Now and then a touch is like none before: then any load is as likely as any other.
-        p = (1 - _NOVEL) * likely + _NOVEL * (np.minimum(high, 1.0) - low)
-        return np.where(np.isnan(spread), 1.0, p)
 
 
 @dataclass(frozen=True)
@@ -116,6 +77,10 @@ class HealthyModel:
         if not all(0 < regression.p_floor < 1 for regression in self.local_regressions):
             raise ValueError("expected p_floor between 0 and 1")
 
+    def of_tile(self, i: int, cells: NDArray[np.intp], layout: SensorLayout) -> HealthyModel:
+        """Return the model of tile i as one of an array ``layout`` of its own, in which its inputs are ``cells``."""
+        return HealthyModel((self.local_regressions[i].at(cells),), layout, self.stacking)
+
     def p_floor(self, n_cells: int) -> NDArray[np.float64]:
         """Return the chance ``[D]`` of D cells that a touch does with one what none did before; 1: nothing is known."""
         p_floor = np.ones(n_cells)
@@ -127,7 +92,7 @@ class HealthyModel:
         """Return how little is known of healthy touches of D cells, ``[D]``: 0 where it holds 400, 1 with up to 100."""
         return _inexperience(self.p_floor(n_cells))
 
-    def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Generator[None, None, Prediction]:
+    def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
         """Say what healthy cells would do. A generator that pauses on its way, for those who cannot wait.
 
         Args:
@@ -144,7 +109,6 @@ class HealthyModel:
             judged = np.flatnonzero(known)
             step = max(1, _AT_ONCE // len(judged))
             for first in range(0, len(features), step):
-                yield
                 some = slice(first, first + step)
                 of_some = RegressionOutput(*(values[some] for values in vars(regressed).values()))
                 known_values = self.stacking.predict(
@@ -163,16 +127,6 @@ class HealthyModel:
 def _inexperience(p_floor: NDArray[np.float64]) -> NDArray[np.float64]:
     inexperience: NDArray[np.float64] = np.log(p_floor / _FAMILIAR) / np.log(_STRANGE / _FAMILIAR)
     return np.clip(inexperience, 0.0, 1.0)
-
-
-def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distribution function of Student's t with 4 degrees of freedom: objects have edges, edges surprise.
-
-    In closed form, ten times as fast as the general one.
-    """
-    x = np.clip(x, -1e6, 1e6)
-    u = x / np.sqrt(1 + x**2 / 4)
-    return 0.5 + 0.375 * u * (1 - u**2 / 12)
 
 
 class ReferenceEvent(NamedTuple):

@@ -8,16 +8,19 @@ of the contact is rightly unloaded, however loaded its neighbours on one side ar
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.contact_events import ContactEvent
-from diagnostics.healthy.model import Prediction
+from diagnostics.healthy.prediction import Prediction
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.scale import Array
+
+if TYPE_CHECKING:
+    from diagnostics.events.contact_events import ContactEvent
 
 _NEIGHBOURS = 20
 _PRIOR_WEIGHT = 1.0  # neighbours that the share over all samples counts for: few neighbours prove little
@@ -39,7 +42,7 @@ class NearestNeighbours:
             np.stack([part.features() for event in events for part in (*event.parts, event.suffixes()[0])]), layout
         )
 
-    def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Generator[None, None, Prediction]:
+    def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
         """See ``HealthyModel.predict``. A cell between no two trusted neighbours is not judged: all is as expected."""
         from scipy.spatial import cKDTree
 
@@ -48,7 +51,6 @@ class NearestNeighbours:
         spread = np.full(shape[1], np.nan)
         present = self.layout.present.ravel()
         known = _describe(self.log, predictors, self.layout)
-        yield
         usable = np.flatnonzero(predictors & present & np.isfinite(known).all(axis=(0, 2)))
         if not len(usable):
             return Prediction(never, always, mean, spread, own=np.zeros(shape[1]))
@@ -56,7 +58,6 @@ class NearestNeighbours:
         answers = np.moveaxis(self.log[:, :, usable], 1, -1).reshape(-1, self.log.shape[1])
         kept = np.linspace(0, len(samples) - 1, min(len(samples), _MOST_SAMPLES)).astype(int)
         tree, answers = cKDTree(samples[kept]), answers[kept]
-        yield
         scored = _describe(features, predictors, self.layout)
         judged = np.flatnonzero(np.isfinite(scored).all(axis=(0, 2)) & present)
         neighbours = min(_NEIGHBOURS, len(answers))

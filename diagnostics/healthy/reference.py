@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +16,13 @@ from diagnostics.evidence.intermittency import HealthyRates
 from diagnostics.evidence.noise_loss import NoiseLoss
 from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
-from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.baseline import LowerLimit, baseline
 from diagnostics.preprocessing.offset import ReferenceOffset
 from diagnostics.preprocessing.scale import Scale
 from diagnostics.preprocessing.transport import longest_repetition
+
+if TYPE_CHECKING:
+    from diagnostics.layout import SensorLayout
 
 _TOLERANCE = 0.005  # of full scale: how far a stuck cell's reading may wander, a converter's dither
 _STEPS = 1.5  # and at least so many converter steps

@@ -9,16 +9,19 @@ is done.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from diagnostics.decision.result import Diagnosis
 from diagnostics.healthy.stacking import enclosed
-from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.baseline import baseline
 from diagnostics.preprocessing.readings import RecordingBlocks
+
+if TYPE_CHECKING:
+    from diagnostics.decision.result import Diagnosis
+    from diagnostics.layout import SensorLayout
 
 _PIECES, _FRAMES = 60, 200  # of the reference that are diagnosed, at most, spread evenly; frames of each
 _SURE = 0.99  # P(faulty) from which on a cell counts as dead: it will be called so in every log

@@ -8,15 +8,18 @@ the model of each patch starts from it, and learns in what it differs.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 from scipy.special import expit
 
-from diagnostics.events.tiles import Tile
-from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.scale import Array
+
+if TYPE_CHECKING:
+    from diagnostics.events.tiles import Tile
+    from diagnostics.layout import SensorLayout
 
 REACH = 3  # rows and columns
 _FEATURES = 4  # see Summary.features

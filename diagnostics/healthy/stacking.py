@@ -10,14 +10,15 @@ it, which stay near to what the cell's own foresee.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
-from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.scale import Array
+if TYPE_CHECKING:
+    from diagnostics.layout import SensorLayout
+    from diagnostics.preprocessing.scale import Array
 
 _SURE = 8.0  # log odds that a cell's own regressions are taken for at most
 # Of a ring's cells: so much the mean of the whole array counts, all there is where none is trusted.

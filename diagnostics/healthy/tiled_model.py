@@ -9,21 +9,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import segments
 from diagnostics.events.contact_events import SEGMENT
-from diagnostics.events.tiles import MOST_CELLS, Tile, TiledEvents, tiles
+from diagnostics.events.tiled_events import TiledEvents
+from diagnostics.events.tiles import MOST_CELLS, Tile, tiles
 from diagnostics.healthy.cross_fitting import FOLDS, CrossFitting, RegressionFit
 from diagnostics.healthy.local_regression import FEATURES, RIDGE, LocalRegression, Start, predict_regressions
 from diagnostics.healthy.model import HealthyModel, ReferenceEvent, count_events, drawn, p_floor_of
 from diagnostics.healthy.shared_prior import Samples, SharedPrior
-from diagnostics.healthy.stacking import Stacking
-from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.preprocessing.scale import Array, Scale
+
+if TYPE_CHECKING:
+    from diagnostics.healthy.stacking import Stacking
+    from diagnostics.layout import SensorLayout
 
 _SAMPLES = 256  # stretches for the model of one patch out of many
 _RIDGE = 30.0  # of a patch, per touch: it sees far fewer of them than a whole array

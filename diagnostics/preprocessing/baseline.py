@@ -10,13 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import SEGMENT
 from diagnostics.preprocessing.readings import RecordingBlocks
+
+if TYPE_CHECKING:
+    from diagnostics.events.constant_runs import ConstantRuns
 
 _LOW = 0.05  # quantile of all readings of a cell
 _LEAST = 0.03  # quantile of its readings in one recording: where it rested in that, if it was let go at all

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.preprocessing.readings import RecordingBlocks
-from diagnostics.preprocessing.scale import Scale
+
+if TYPE_CHECKING:
+    from diagnostics.preprocessing.scale import Scale
 
 _LEAST_LOADED = 0.25  # share of the cells that is hardly ever loaded all at once, and more than are open
 _COMMON, _OWN = 0.05, 0.02  # of full scale: the largest offset of all cells together, and of one beside that

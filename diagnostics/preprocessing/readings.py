@@ -8,6 +8,8 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.preprocessing.transport import invalid
+
 Recording = NDArray[np.float64]
 
 _MOST_VALUES = 1 << 23  # of a block of frames
@@ -53,6 +55,14 @@ class RecordingBlocks(Sequence[Recording]):
         cells = cells[:: max(1, len(cells) // _CELLS)]
         which = range(0, len(self), max(1, len(self) // _RECORDINGS))
         return cells, (self.piece(i, slice(None), cells) for i in which)
+
+    def valid(self, full_scale: float) -> RecordingBlocks:
+        """Return the recordings with readings that no converter gives as missing, see ``transport.invalid``."""
+        checked = []
+        for given in self._given:
+            wrong = invalid(given, full_scale) if len(given) else None
+            checked.append(given if wrong is None else np.where(wrong, np.nan, given))
+        return RecordingBlocks(checked)
 
     def whole(self, present: NDArray[np.bool_]) -> RecordingBlocks:
         """Return the recordings with the last reading of a cell for each that is missing, without lost frames.

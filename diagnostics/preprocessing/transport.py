@@ -23,9 +23,10 @@ class TransportFault:
     """Frames that did not arrive as they were taken.
 
     Attributes:
-        kind: ``"lost"`` (frames without any reading) or ``"frozen"`` (one frame again and again).
+        kind: ``"lost"`` (frames without any reading), ``"frozen"`` (one frame repeated) or ``"invalid"`` (readings that
+            no converter gives).
         onset: number of the first such frame.
-        frames: how many.
+        frames: how many frames; of ``"invalid"``: how many readings.
         reason: one plain sentence.
     """
 
@@ -63,6 +64,7 @@ class TransportState:
         last: the last frame that arrived, ``[D]``.
         repeats: how often in a row it has come again; ``since``: number of its first coming.
         repetitions: those beyond patience, the last one perhaps still going on.
+        invalid: readings that no converter gives; ``first_invalid``: number of the frame of the first, -1: none.
     """
 
     seen: int = 0
@@ -72,6 +74,8 @@ class TransportState:
     repeats: int = 0
     since: int = 0
     repetitions: tuple[Repetition, ...] = ()
+    invalid: int = 0
+    first_invalid: int = -1
 
     def receive(
         self, frames: NDArray[np.float64], present: NDArray[np.bool_], patience: int
@@ -119,8 +123,15 @@ class TransportState:
             repeats=int(repeats[-1]),
             since=int(since[-1]),
             repetitions=tuple(repetitions[-_KEPT:]),
+            invalid=self.invalid,
+            first_invalid=self.first_invalid,
         )
         return state, there[repeats <= patience]
+
+    def dropped(self, invalid: NDArray[np.bool_]) -> TransportState:
+        """Return the state with the ``invalid`` readings of the next frames, bool ``[t, D]``, counted."""
+        first = self.seen + int(invalid.any(axis=1).argmax()) if self.first_invalid < 0 else self.first_invalid
+        return replace(self, invalid=self.invalid + int(invalid.sum()), first_invalid=first)
 
     def without(self, frames: int) -> TransportState:
         """Return the stream after frames that never came."""
@@ -141,6 +152,10 @@ class TransportState:
         if self.lost:
             text = f"{self.lost} frames came without a reading or not at all, the first is number {self.first_lost}"
             found.append(TransportFault("lost", self.first_lost, self.lost, f"{text}: check the link to the sensor"))
+        if self.invalid:
+            text = f"{_count(self.invalid, 'reading')} outside what a converter gives, the first in frame"
+            text += f" {self.first_invalid}: counted as missing; check the converter and the link to the sensor"
+            found.append(TransportFault("invalid", self.first_invalid, self.invalid, text))
         for r in self.repetitions:
             loaded = int((r.frame > loaded_from)[working].sum())
             if loaded >= _LOADED_CELLS:
@@ -152,6 +167,21 @@ class TransportState:
                     TransportFault("frozen", r.onset, r.frames, f"{text}: the stream was frozen, not the cells")
                 )
         return tuple(found)
+
+
+def _count(number: int, name: str) -> str:
+    return f"{number} {name}" if number == 1 else f"{number} {name}s"
+
+
+def invalid(frames: NDArray[Any], full_scale: float) -> NDArray[np.bool_] | None:
+    """Return which readings ``[T, D]`` are infinite or over one full scale outside of 0 to full scale; None: none is.
+
+    Missing readings (NaN) are not.
+    """
+    low, high = np.fmin.reduce(frames, axis=None), np.fmax.reduce(frames, axis=None)
+    if np.isnan(low) or (low >= -full_scale and high <= 2 * full_scale):
+        return None
+    return np.asarray((frames < -full_scale) | (frames > 2 * full_scale))
 
 
 def longest_repetition(frames: NDArray[np.float64]) -> int:

@@ -1,0 +1,94 @@
+"""The contact events of each tile of an array."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.events.contact_events import EventLog
+from diagnostics.events.tiles import Tile
+
+if TYPE_CHECKING:
+    from diagnostics.preprocessing.scale import Array
+
+Cells = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class _Inputs:
+    """The inputs of all patches, one after the other: ``cells[starts[i]:starts[i + 1]]`` are those of patch i."""
+
+    cells: Cells
+    starts: Cells
+
+    @classmethod
+    def of(cls, all_tiles: Sequence[Tile]) -> _Inputs:
+        sizes = [len(tile.inputs) for tile in all_tiles]
+        return cls(np.concatenate([p.inputs for p in all_tiles]), np.concatenate([[0], np.cumsum(sizes)]))
+
+    def with_any(self, mask: NDArray[np.bool_]) -> list[int]:
+        """Return the patches that have an input in ``mask`` (bool ``[D]``)."""
+        found: list[int] = np.flatnonzero(np.logical_or.reduceat(mask[self.cells], self.starts[:-1])).tolist()
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class TiledEvents:
+    """The touches of each patch so far.
+
+    Attributes:
+        patches: of the array; of: the touches of each, over its inputs.
+    """
+
+    tiles: tuple[Tile, ...]
+    of: tuple[EventLog, ...]
+    _inputs: _Inputs
+    _needed: tuple[bool, ...]
+
+    @classmethod
+    def begin(cls, all_tiles: tuple[Tile, ...], needed: NDArray[np.bool_] | None = None) -> TiledEvents:
+        """Nothing seen yet. Patches without an output that is ``needed`` (bool ``[D]``; None: all) stay so."""
+        of_each = tuple(needed is None or bool(needed[tile.outputs].any()) for tile in all_tiles)
+        return cls(all_tiles, (EventLog(),) * len(all_tiles), _Inputs.of(all_tiles), of_each)
+
+    def extend(
+        self,
+        root: Array,
+        numbers: Cells,
+        root_near: float,
+        start: Cells,
+        jumped: NDArray[np.bool_],
+    ) -> TiledEvents:
+        """Return the events after more frames, see ``EventLog.extend``; a still tile stays as it is."""
+        if len(self.tiles) == 1:
+            return self.replaced([self.of[0].extend(root, numbers, root_near, start, jumped)])
+        of = list(self.of)
+        for i in self._inputs.with_any(start > numbers[0]):
+            if self._needed[i]:
+                cells = self.tiles[i].inputs
+                of[i] = of[i].extend(root[:, cells], numbers, root_near, start[cells], jumped[cells])
+        return self.replaced(of)
+
+    def split(self, most: int, keep: int) -> tuple[TiledEvents, TiledEvents]:
+        """Return (the events to drop, those to keep): in tiles with more than ``most``, the last ``keep`` stay."""
+        none = EventLog()
+        parts = [events.split(keep) if len(events.kept) > most else (none, events) for events in self.of]
+        return self.replaced([old for old, _ in parts]), self.replaced([kept for _, kept in parts])
+
+    def replaced(self, of: Sequence[EventLog]) -> TiledEvents:
+        """Return the same patches with other touches."""
+        return replace(self, of=tuple(of))
+
+    def holding(self, cells: NDArray[np.bool_]) -> Iterator[int]:
+        """Yield the patches that are needed and have one of the ``cells`` (bool ``[D]``) among their outputs."""
+        for i in self._inputs.with_any(cells):
+            if self._needed[i] and cells[self.tiles[i].outputs].any():
+                yield i
+
+    def kept(self) -> Iterator[tuple[int, EventLog]]:
+        """Yield the patches that were touched, and their touches."""
+        return ((i, events) for i, events in enumerate(self.of) if events.kept)

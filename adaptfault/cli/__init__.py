@@ -18,11 +18,26 @@ from adaptfault.cli import (
     maintain,
     report,
     reproduce,
+    restore,
     rollback,
     train,
 )
 
-COMMANDS = (train, diagnose, adapt, evaluate, demo, reproduce, maintain, rollback, history, report, listen, fleet)
+COMMANDS = (
+    train,
+    diagnose,
+    adapt,
+    restore,
+    evaluate,
+    demo,
+    reproduce,
+    maintain,
+    rollback,
+    history,
+    report,
+    listen,
+    fleet,
+)
 
 BAD_INPUT = 3  # exit code for unusable input or usage, as monitoring tools understand it ("unknown")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -82,6 +82,14 @@ class Restorer:
         self._plans: OrderedDict[bytes, tuple[_Map, ...]] = OrderedDict()
         return self
 
+    @overload
+    def transform(
+        self, recording: ArrayLike, fault_set: FaultSet | None = ..., *, return_std: Literal[False] = ...
+    ) -> Floats: ...
+    @overload
+    def transform(
+        self, recording: ArrayLike, fault_set: FaultSet | None = ..., *, return_std: Literal[True]
+    ) -> tuple[Floats, Floats]: ...
     def transform(
         self, recording: ArrayLike, fault_set: FaultSet | None = None, *, return_std: bool = False
     ) -> Floats | tuple[Floats, Floats]:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from adaptfault.fleet.summary import FleetReport
     from adaptfault.imputation.restorer import Restorer
     from adaptfault.imputation.scikit_learn import CellImputer, FaultTolerantClassifier, FaultTolerantRegressor
+    from adaptfault.models.builders import allow_model, build_model
     from adaptfault.models.export import add_onnx
     from adaptfault.models.history import History
     from adaptfault.models.inference import Inference
@@ -70,7 +71,9 @@ __all__ = [
     "ValueScores",
     "Windows",
     "add_onnx",
+    "allow_model",
     "analyse",
+    "build_model",
     "correct",
     "diagnostic_array",
     "evaluate",
@@ -120,7 +123,9 @@ _HOMES = {
     "ValueScores": "evaluation.scores",
     "Windows": "data.windows",
     "add_onnx": "models.export",
+    "allow_model": "models.builders",
     "analyse": "evaluation.sensitivity",
+    "build_model": "models.builders",
     "correct": "adaptation.baselines.correction",
     "diagnostic_array": "acquisition.ros",
     "evaluate": "evaluation.scores",

@@ -177,7 +177,7 @@ def test_an_adaptation_of_any_model_comes_back_into_an_instance_of_it(training, 
     adapted.save(tmp_path)
     again = Adaptation.load(tmp_path, network=Recurrent(3))
     np.testing.assert_array_equal(again.predict_proba(validation.x), adapted.predict_proba(validation.x))
-    with pytest.raises(ValueError, match=r"is an adaptation of .*Recurrent: give an instance of it as network="):
+    with pytest.raises(ValueError, match=r"the model is a .*Recurrent: give an instance of it as network="):
         Adaptation.load(tmp_path)
 
 
@@ -247,3 +247,53 @@ def test_what_cannot_be_adapted_is_said_before_any_work(model, options, message,
 def test_outputs_that_do_not_fit_the_values_are_refused():
     with pytest.raises(ValueError, match="Recurrent has 3 outputs, the targets have 2 values"):
         Adapter(Recurrent(3), values(10, 0), values(10, 1), layout=LAYOUT)
+
+
+def build(layout: SensorLayout, n_classes: int, length: int) -> nn.Module:
+    torch.manual_seed(0)
+    return Recurrent(n_classes)
+
+
+def test_a_bundle_of_a_built_model_is_maintained_and_opens_only_where_its_builder_is_allowed(
+    training, validation, tmp_path, monkeypatch
+):
+    from adaptfault.models import builders
+    from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.maintenance import maintain
+    from diagnostics import Fault, FaultKind, SelfDiagnosis, inject
+
+    name = f"{__name__}:build"
+    monkeypatch.setattr(builders, "_allowed", set())
+    monkeypatch.delenv(builders.VARIABLE, raising=False)
+    with pytest.raises(ValueError, match="which is not allowed: call allow_model"):
+        builders.build_model(name, LAYOUT, 3, length=T)
+    builders.allow_model(name)
+    model = builders.build_model(name, LAYOUT, 3, length=T)
+    train(model, training, validation, epochs=15, learning_rate=1e-2, patience=None, progress=False)
+    adapter = Adapter(model, training, validation, layout=LAYOUT)
+    recordings = [5 * x.astype(float) for x in training.x]
+    diagnoser = SelfDiagnosis(LAYOUT).fit(recordings)
+    bundle = Bundle.create(tmp_path / "b", adapter.model, adapter, diagnoser, check=classes(60, 5))
+    dead = [Fault(FaultKind.SHORT, (cell,)) for cell in (5, 21)]
+    report = maintain(bundle, [inject(5 * x.astype(float), dead, LAYOUT) for x in classes(150, 6).x])
+    assert report.decision in ("deployed", "kept")
+    assert set(report.diagnosis.fault_set) >= {5, 21}
+    monkeypatch.setattr(builders, "_allowed", set())
+    with pytest.raises(ValueError, match="which is not allowed") as error:
+        Bundle.open(tmp_path / "b").parts.adapter()
+    assert "\n" not in str(error.value)
+    monkeypatch.setenv(builders.VARIABLE, f"other:build, {name}")
+    assert Bundle.open(tmp_path / "b").parts.adapter().model.length == T
+
+
+def test_what_cannot_be_built_or_stored_is_said(training, validation, tmp_path, monkeypatch):
+    from adaptfault.adaptation.adapter_files import save_adapter
+    from adaptfault.models import builders
+
+    monkeypatch.setattr(builders, "_allowed", {"json:dumps", "json:no", f"{__name__}:classes"})
+    with pytest.raises(ValueError, match="expected an import path"):
+        builders.allow_model("rm -rf")
+    with pytest.raises(ValueError, match="cannot be imported"):
+        builders.build_model("json:no", LAYOUT, 3)
+    with pytest.raises(ValueError, match="cannot be rebuilt from a file: make it with build_model"):
+        save_adapter(tmp_path, Adapter(Recurrent(3), training, validation, layout=LAYOUT))

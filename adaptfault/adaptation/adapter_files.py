@@ -14,7 +14,8 @@ from torch import Tensor
 from adaptfault.adaptation.adapter import Adapter
 from adaptfault.data.windows import Windows, evenly
 from adaptfault.imputation.statistics import CellStatistics
-from adaptfault.models.network import TactileTransformer
+from adaptfault.models.any_model import network_from_config
+from adaptfault.models.builders import ModelNotAllowed
 from adaptfault.models.store import load_tensors, save_tensors
 
 SCHEMA = "adaptfault.adapter/1"
@@ -35,10 +36,15 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int = LIMIT) -> N
     8-bit integers with a scale for each row. ``manifest.json`` records the choices.
 
     Raises:
-        ValueError: the smallest format does not fit, or the model is no ``TactileTransformer``.
+        ValueError: the smallest format does not fit, or the model can not be rebuilt (a module without builder).
     """
-    if not isinstance(adapter.model, TactileTransformer):
-        raise ValueError(f"only the adapter of a TactileTransformer can be saved, not {adapter.model.config['module']}")
+    if "module" in adapter.model.config and adapter.model.config["builder"] is None:
+        raise ValueError(
+            f"{adapter.model.config['module']} cannot be rebuilt from a file: make it with"
+            " build_model('package.module:function', layout, n_classes)"
+        )
+    if adapter.task == "regression":
+        raise ValueError("the adapter of a regression cannot be saved: its targets are no classes")
     statistics = adapter.statistics
     upper = np.triu_indices(len(statistics.mean))
     tensors: dict[str, Tensor] = {
@@ -50,9 +56,9 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int = LIMIT) -> N
     parts = {"train": (adapter.train, adapter.targets), "validation": (adapter.validation, adapter.validation_targets)}
     n = sum(len(windows) for windows, _ in parts.values())
     for name, (windows, targets) in parts.items():
-        packed, told = _pack_thinned(windows, targets, int(_SHARE * room * len(windows) / n))
+        packed, packing = _pack_thinned(windows, targets, int(_SHARE * room * len(windows) / n))
         tensors |= {f"{name}.{key}": value for key, value in packed.items()}
-        about[name] = told
+        about[name] = packing
     room = limit - _OVERHEAD - _bytes(tensors)
     choices = {"float32": _whole, "float16": _half, "int8": _eighth}
     for about["weights_as"], shrink in choices.items():
@@ -69,8 +75,8 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int = LIMIT) -> N
 
 def save_windows(path: str | Path, windows: Windows, *, limit: int = LIMIT // 4) -> None:
     """Write windows into a folder as :func:`save_adapter` does, thinned evenly to ``limit`` bytes."""
-    packed, told = _pack_thinned(windows, np.zeros((len(windows), 0), np.float32), limit)
-    save_tensors(path, WINDOWS_SCHEMA, {"windows": told}, {f"windows.{key}": value for key, value in packed.items()})
+    packed, packing = _pack_thinned(windows, np.zeros((len(windows), 0), np.float32), limit)
+    save_tensors(path, WINDOWS_SCHEMA, {"windows": packing}, {f"windows.{key}": value for key, value in packed.items()})
 
 
 def load_windows(path: str | Path) -> Windows:
@@ -91,7 +97,7 @@ def load_adapter(path: str | Path) -> Adapter:
     """
     about, tensors = load_tensors(path, SCHEMA)
     try:
-        model = TactileTransformer.from_config(about["network"])
+        model = network_from_config(about["network"])
         model.load_state_dict(_restore({k.removeprefix("model."): v for k, v in tensors.items() if k[:6] == "model."}))
         adapter = Adapter(model.eval(), *(_unpack(about[name], tensors, name) for name in ("train", "validation")))
         adapter.targets, adapter.validation_targets = (
@@ -103,6 +109,8 @@ def load_adapter(path: str | Path) -> Adapter:
         covariance = np.triu(covariance) + np.triu(covariance, 1).T
         frames = CellStatistics.reference(adapter.train)
         adapter.statistics = CellStatistics(tensors["statistics.mean"].numpy(), covariance, frames)
+    except ModelNotAllowed:
+        raise
     except (KeyError, TypeError, ValueError, RuntimeError, zlib.error) as error:
         raise ValueError(f"the adapter in {path} is damaged: {str(error).splitlines()[0]}") from None
     return adapter
@@ -117,9 +125,9 @@ def _pack_thinned(windows: Windows, targets: NDArray[Any], room: int) -> tuple[d
     keep = len(windows)
     while True:
         which = evenly(len(windows), keep)
-        packed, told = _pack(windows.select(which), targets[which])
+        packed, packing = _pack(windows.select(which), targets[which])
         if (size := _bytes(packed)) <= room or keep == 1:
-            return packed, {**told, "of": len(windows)}
+            return packed, {**packing, "of": len(windows)}
         keep = max(1, min(keep - 1, int(keep * room / size)))
 
 
@@ -138,13 +146,13 @@ def _pack(windows: Windows, targets: NDArray[Any]) -> tuple[dict[str, Tensor], d
     return packed, {"shape": list(windows.x.shape), "low": low, "step": step}
 
 
-def _unpack(told: dict[str, Any], tensors: dict[str, Tensor], name: str) -> Windows:
-    n, t, d = told["shape"]
+def _unpack(packing: dict[str, Any], tensors: dict[str, Tensor], name: str) -> Windows:
+    n, t, d = packing["shape"]
     size = 2 * n * t * d
     data = zlib.decompressobj().decompress(tensors[f"{name}.x"].numpy().tobytes(), size)  # at most the expected size
     counts = np.frombuffer(data, np.uint8).reshape(2, -1).T.copy().view(np.uint16).reshape(n, t, d)
     counts = np.cumsum(counts, axis=1, dtype=np.uint16)
-    x = (told["low"] + counts * told["step"]).astype(np.float32)
+    x = (packing["low"] + counts * packing["step"]).astype(np.float32)
     return Windows(x, tensors[f"{name}.y"].numpy(), tensors[f"{name}.recording"].numpy())
 
 

@@ -69,13 +69,13 @@ class Forest(nn.Module):
         trees, nodes = self.thresholds.shape
         first = nodes * torch.arange(trees, device=x.device)  # of each tree's nodes, all being in one row
         feature, below, above = self.nodes.long().unbind(-1)
-        asked = feature.masked_fill(torch.isinf(self.thresholds), 0).flatten()
+        tested = feature.masked_fill(torch.isinf(self.thresholds), 0).flatten()
         thresholds, below, above = (
             of.flatten() for of in (self.thresholds, below + first[:, None], above + first[:, None])
         )
         at = first.expand(x.shape[0], trees)
         for _ in range(self.depth):
-            at = torch.where(torch.gather(x, 1, asked[at]) <= thresholds[at], below[at], above[at])
+            at = torch.where(torch.gather(x, 1, tested[at]) <= thresholds[at], below[at], above[at])
         votes = nn.functional.one_hot(feature.flatten()[at], self.n_classes).sum(1)
         return ((votes + 1 / self.n_classes) / (trees + 1)).log()
 

@@ -17,8 +17,9 @@ from adaptfault.data.windows import Windows
 from adaptfault.evaluation.scores import Scores, ValueScores, evaluate
 from adaptfault.imputation.linear import AffineFill, NearestFill
 from adaptfault.imputation.tiled import TiledFill
-from adaptfault.models.any_model import AnyModel
-from adaptfault.models.network import TactileTransformer, logits_of
+from adaptfault.models.any_model import network_from_config
+from adaptfault.models.builders import ModelNotAllowed
+from adaptfault.models.network import logits_of
 from adaptfault.models.store import ADAPTATION, load_tensors, save_tensors
 from diagnostics import FaultSet
 
@@ -124,8 +125,8 @@ class Adaptation:
 
         Args:
             path: the folder.
-            network: an instance of the adapted model, for models other than ``TactileTransformer``; its weights are
-                replaced.
+            network: an instance of the adapted model; its weights are replaced. None: a ``TactileTransformer``, or a
+                model with an allowed builder (:func:`~adaptfault.models.builders.allow_model`).
             features: the function that computed its features, if a function was given.
 
         Raises:
@@ -134,7 +135,7 @@ class Adaptation:
         """
         about, tensors = load_tensors(path, ADAPTATION)
         try:
-            inner = _empty_network(path, about["network"], network, features)
+            inner = network_from_config(about["network"], network, features)
             fault_set = FaultSet(tuple(about["fault_set"]), inner.layout.n_cells)
             front = _empty_front(about, fault_set)
             head = None if about["head"] is None else Blend.empty(about["head"], inner.n_classes)
@@ -143,26 +144,11 @@ class Adaptation:
             stages = tuple(Stage(**stage) for stage in about["stages"])
             task = about.get("task", "classification")
             scores = (ValueScores if task == "regression" else Scores).from_dict(about["scores"])
-        except NeedsNetwork:
+        except ModelNotAllowed:
             raise
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise ValueError(f"the adaptation in {path} is damaged: {str(error).splitlines()[0]}") from None
         return cls(model.eval(), fault_set, stages, task, _scores=scores)
-
-
-class NeedsNetwork(ValueError):
-    """An adaptation of a model that the caller has to build."""
-
-
-def _empty_network(
-    path: str | Path, config: dict[str, Any], module: nn.Module | None, features: Any
-) -> TactileTransformer | AnyModel:
-    """Build the network to load a state into."""
-    if "module" not in config:
-        return TactileTransformer.from_config(config)
-    if module is None:
-        raise NeedsNetwork(f"{path} is an adaptation of {config['module']}: give an instance of it as network=")
-    return AnyModel.from_config(config, module, features)
 
 
 def _empty_front(about: dict[str, Any], fault_set: FaultSet) -> nn.Module:

@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.models.network import logits_of
+from adaptfault.models.builders import ModelNotAllowed, build_model, builder_of
+from adaptfault.models.network import TactileTransformer, logits_of
 from diagnostics import SensorLayout
 
 Features = str | Callable[[nn.Module, Tensor], Tensor]
@@ -166,6 +167,7 @@ class AnyModel(nn.Module):
         kind = type(self.module)
         return {
             "module": f"{kind.__module__}.{kind.__qualname__}",
+            "builder": builder_of(self.module),
             "layout": self.layout.to_dict(),
             "length": self.length,
             "n_classes": self.n_classes,
@@ -174,9 +176,17 @@ class AnyModel(nn.Module):
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any], module: nn.Module, function: Any = None) -> AnyModel:
-        """Wrap ``module``, an instance of the class that ``config["module"]`` names."""
+    def from_config(cls, config: Mapping[str, Any], module: nn.Module | None = None, function: Any = None) -> AnyModel:
+        """Wrap ``module``, an instance of the class that ``config["module"]`` names; None: from its builder.
+
+        Raises:
+            ValueError: there is neither a module nor an allowed builder.
+        """
         layout = SensorLayout.from_dict(config["layout"])
+        if module is None and config.get("builder") is None:
+            raise ModelNotAllowed(f"the model is a {config['module']}: give an instance of it as network=")
+        if module is None:
+            module = build_model(config["builder"], layout, config["n_classes"], length=config["length"])
         return cls(
             module,
             layout,
@@ -206,6 +216,15 @@ class AnyModel(nn.Module):
                     reset: Any = getattr(layer, "reset_parameters", None) or layer._reset_parameters
                     reset()
         return copied
+
+
+def network_from_config(
+    config: Mapping[str, Any], module: nn.Module | None = None, function: Any = None
+) -> TactileTransformer | AnyModel:
+    """Build a network, without its weights, from the ``config`` of either class; see :meth:`AnyModel.from_config`."""
+    if "module" not in config:
+        return TactileTransformer.from_config(config)
+    return AnyModel.from_config(config, module, function)
 
 
 def not_resettable(module: nn.Module) -> list[str]:

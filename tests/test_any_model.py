@@ -297,3 +297,32 @@ def test_what_cannot_be_built_or_stored_is_said(training, validation, tmp_path, 
         builders.build_model("json:no", LAYOUT, 3)
     with pytest.raises(ValueError, match="cannot be rebuilt from a file: make it with build_model"):
         save_adapter(tmp_path, Adapter(Recurrent(3), training, validation, layout=LAYOUT))
+
+
+def test_the_command_line_trains_a_model_of_the_user_and_adapts_it(small_grasps, tmp_path, monkeypatch, capsys):
+    from adaptfault.cli import main
+    from adaptfault.data.recordings import save_npz
+    from adaptfault.models import builders
+
+    source = (
+        "from torch import nn\n"
+        "def build(layout, n_classes, length):\n"
+        "    return nn.Sequential(nn.Flatten(), nn.Linear(length * layout.n_cells, 16), nn.ReLU(),"
+        " nn.Linear(16, n_classes))\n"
+    )
+    (tmp_path / "own_network.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(builders, "_allowed", set())
+    data, model = str(tmp_path / "grasps.npz"), str(tmp_path / "model")
+    save_npz(data, small_grasps)
+    command = ["train", data, "--out", model, "--epochs", "3", "--quiet", "--model", "own_network:build"]
+    assert main(command) == 0
+    adapt = ["adapt", model, data, "--faults", "3,8", "--out", str(tmp_path / "adapted"), "--quiet"]
+    assert main(adapt) == 0
+    assert Adaptation.load(tmp_path / "adapted").model.network.config["builder"] == "own_network:build"
+    monkeypatch.setattr(builders, "_allowed", set())
+    capsys.readouterr()
+    assert main(adapt) == 3
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main([*command[:-1], "own_network:lost"]) == 3
+    assert "install its package or set PYTHONPATH" in capsys.readouterr().err

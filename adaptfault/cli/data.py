@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+from adaptfault.adaptation.fault_free import Network
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, make_windows, split
-from adaptfault.models.network import TactileTransformer
 from adaptfault.models.store import SCHEMA, load_model, read_manifest
 
 
-def open_model(folder: str) -> tuple[TactileTransformer, dict[str, Any]]:
+def open_model(folder: str) -> tuple[Network, dict[str, Any]]:
     """Return a model written by ``adaptfault train`` and its manifest."""
     return load_model(folder), read_manifest(folder, SCHEMA)
 
 
-def windows_of(recordings: Recordings, model: TactileTransformer, manifest: dict[str, Any]) -> Windows:
+def windows_of(recordings: Recordings, model: Network, manifest: dict[str, Any]) -> Windows:
     """Cut recordings into the windows that the model takes.
 
     Raises:
@@ -30,8 +30,6 @@ def windows_of(recordings: Recordings, model: TactileTransformer, manifest: dict
     return make_windows(recordings.frames, recordings.labels, recordings.layout, length=model.length)
 
 
-def parts_of(
-    recordings: Recordings, model: TactileTransformer, manifest: dict[str, Any]
-) -> tuple[Windows, Windows, Windows]:
+def parts_of(recordings: Recordings, model: Network, manifest: dict[str, Any]) -> tuple[Windows, Windows, Windows]:
     """Return training, validation and test windows, the same as in training."""
     return split(windows_of(recordings, model, manifest), seed=int(manifest["extra"].get("split_seed", 0)))

@@ -57,7 +57,9 @@ def build_model(builder: str, layout: SensorLayout, n_classes: int, *, length: i
     try:
         model = getattr(import_module(module), function)(layout, n_classes, length)
     except (ImportError, AttributeError) as error:
-        raise ModelNotAllowed(f"the builder {builder!r} cannot be imported: {error}") from None
+        raise ModelNotAllowed(
+            f"the builder {builder!r} cannot be imported ({error}): install its package or set PYTHONPATH"
+        ) from None
     if not isinstance(model, nn.Module):
         raise ModelNotAllowed(f"the builder {builder!r} returned {type(model).__name__}, expected a torch.nn.Module")
     model.__dict__["adaptfault_builder"] = builder

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
+    from adaptfault.models.any_model import AnyModel
     from adaptfault.models.network import TactileTransformer
 
 SCHEMA = "adaptfault.model/1"
@@ -164,7 +165,7 @@ def read_attached(folder: str | Path, manifest: Mapping[str, Any], key: str) -> 
 
 def save_model(
     folder: str | Path,
-    model: TactileTransformer,
+    model: TactileTransformer | AnyModel,
     *,
     class_names: Sequence[str] = (),
     extra: Mapping[str, Any] | None = None,
@@ -178,27 +179,36 @@ def save_model(
         extra: JSON-safe values to store beside the model.
 
     Raises:
-        ValueError: another number of class names than classes, or ``extra`` does not fit into JSON.
+        ValueError: another number of class names than classes, a module without builder, or ``extra`` does not fit into
+            JSON.
     """
     if class_names and len(class_names) != model.n_classes:
         raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
+    if "module" in model.config and model.config["builder"] is None:
+        raise ValueError(
+            f"{model.config['module']} cannot be rebuilt from a file: make it with"
+            " build_model('package.module:function', layout, n_classes)"
+        )
     about = {"config": model.config, "class_names": list(class_names), "extra": dict(extra or {})}
     save_tensors(folder, SCHEMA, about, model.state_dict())
 
 
-def load_model(folder: str | Path) -> TactileTransformer:
+def load_model(folder: str | Path) -> TactileTransformer | AnyModel:
     """Read the model that :func:`save_model` wrote, in eval mode.
 
     Raises:
         FileNotFoundError: a file is missing.
-        ValueError: a file is damaged, or the weights do not fit the network.
+        ValueError: a file is damaged, the weights do not fit the network, or its builder is not allowed.
     """
-    from adaptfault.models.network import TactileTransformer
+    from adaptfault.models.any_model import network_from_config
+    from adaptfault.models.builders import ModelNotAllowed
 
     manifest, tensors = load_tensors(folder, SCHEMA)
     try:
-        model = TactileTransformer.from_config(manifest["config"])
+        model = network_from_config(manifest["config"])
         model.load_state_dict(tensors)
+    except ModelNotAllowed:
+        raise
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"the model in {folder} is damaged: {str(error).splitlines()[0]}") from None
     return model.eval()

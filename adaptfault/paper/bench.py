@@ -195,7 +195,7 @@ class Bench:
         """Return the network of this name from the folder of the run, or train and store it."""
         folder = self.setup.folder / "models" / name
         if (folder / MANIFEST).exists():
-            return load_model(folder)
+            return cast(TactileTransformer, load_model(folder))
         folder.parent.mkdir(parents=True, exist_ok=True)
         self.setup.say(f"seed {self.seed}: training {name}")
         fit(model.to(self.setup.device))

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.data.calibration import Calibration
     from adaptfault.data.windows import Windows
+    from adaptfault.models.any_model import AnyModel
     from adaptfault.models.network import TactileTransformer
 
 SCHEMA = "adaptfault.bundle/1"
@@ -97,7 +98,7 @@ class Bundle:
     def create(
         cls,
         path: str | Path,
-        model: TactileTransformer,
+        model: TactileTransformer | AnyModel,
         adapter: Adapter,
         diagnoser: SelfDiagnosis,
         *,
@@ -291,7 +292,7 @@ def _save(adaptation: Adaptation, folder: Path) -> None:
         _log.warning("without ONNX, this version runs on torch: %s", error)
 
 
-def _fault_free(model: TactileTransformer, validation: Windows) -> Adaptation:
+def _fault_free(model: TactileTransformer | AnyModel, validation: Windows) -> Adaptation:
     """Return the model as an adaptation to no fault: the same logits, bit for bit."""
     from adaptfault.adaptation.reduced_model import ReducedModel
     from adaptfault.adaptation.result import Adaptation

@@ -18,7 +18,7 @@ from diagnostics.decision.root_causes import CellFindings, root_causes
 from diagnostics.decision.serialization import Arrays, from_state, to_state
 from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stream_state import StreamState
-from diagnostics.healthy.reference import Reference, living, tolerance_of
+from diagnostics.healthy.reference import Reference, highest_reading, living, tolerance_of
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.readings import RecordingBlocks
@@ -73,9 +73,11 @@ class SelfDiagnosis:
             ValueError: recordings that do not fit the layout, or hold no frame with a reading.
         """
         healthy = _recordings(recordings, self.layout).valid(self.layout.full_scale).whole(self.layout.present.ravel())
-        dead = find_reference_faults(healthy, self.layout, tolerance_of(healthy, self.layout), self._diagnosed_cold)
-        self.reference_ = Reference.fit(healthy, self.layout, dead)
-        self.calibrator_ = Calibrator.fit(healthy, living(self.layout, dead))
+        # Fractions of full scale refer to the range that was seen: a stated one may be too high.
+        layout = replace(self.layout, full_scale=min(self.layout.full_scale, highest_reading(healthy, self.layout)))
+        dead = find_reference_faults(healthy, layout, tolerance_of(healthy, layout), self._diagnosed_cold)
+        self.reference_ = Reference.fit(healthy, layout, dead)
+        self.calibrator_ = Calibrator.fit(healthy, living(layout, dead))
         return self
 
     def diagnose(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Diagnosis:
@@ -189,10 +191,13 @@ class SelfDiagnosis:
             stream.extend(frames)
         return self.evaluate(stream, n_recordings=len(log))
 
-    def _diagnosed_cold(self, log: RecordingBlocks, needed: NDArray[np.bool_], rest: NDArray[np.float64]) -> Diagnosis:
+    @staticmethod
+    def _diagnosed_cold(
+        log: RecordingBlocks, needed: NDArray[np.bool_], rest: NDArray[np.float64], layout: SensorLayout
+    ) -> Diagnosis:
         """Diagnose the ``needed`` cells without a reference, but with known baselines ``rest``."""
-        cold = SelfDiagnosis(self.layout)
-        cold.reference_ = Reference.unknown(self.layout, rest)
+        cold = SelfDiagnosis(layout)
+        cold.reference_ = Reference.unknown(layout, rest)
         return cold._diagnosed(log, needed)
 
     def _found(self, stream: StreamState, spatial: Spatial, explained: NDArray[np.bool_]) -> CellFindings:

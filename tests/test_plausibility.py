@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from adaptfault.data.windows import make_windows
-from adaptfault.imputation.linear import CellStatistics
+from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.robot.plausibility import contradiction, implausible
 from diagnostics import FaultSet
 
@@ -43,6 +43,16 @@ def test_cells_in_another_order_and_noise_contradict_each_other(later_grasps, st
     assert contradiction(shuffled, NONE, statistics, small_grasps.layout) > 1
     noise = [rng.random(r.shape) * 5 for r in later_grasps]
     assert contradiction(noise, NONE, statistics, small_grasps.layout) > 1
+
+
+def test_idle_and_static_recordings_contradict_nothing(later_grasps, statistics, small_grasps, rng):
+    idle = [np.abs(rng.normal(0, 0.003, r.shape)) for r in later_grasps]
+    static = [r[30] + rng.normal(0, 0.003, r.shape) for r in later_grasps]
+    for log in (idle, static):
+        assert contradiction(log, NONE, statistics, small_grasps.layout) == 0
+    order = rng.permutation(60)
+    mixed = [r[:, order] for r in later_grasps] + 10 * idle
+    assert contradiction(mixed, NONE, statistics, small_grasps.layout) > 1
 
 
 def test_faulty_cells_do_not_count(later_grasps, statistics, small_grasps, rng):

@@ -108,11 +108,11 @@ def test_on_a_large_array_only_tiles_of_candidates_are_scored_with_the_same_resu
         recording[:, dead] = 0
     requested: list[np.ndarray] = []
 
-    def all_of(log: RecordingBlocks, needed: np.ndarray, _: np.ndarray) -> Diagnosis:
+    def all_of(log: RecordingBlocks, needed: np.ndarray, *_: object) -> Diagnosis:
         requested.append(needed)
         return SelfDiagnosis(skin).diagnose(list(log))
 
-    def some_of(log: RecordingBlocks, needed: np.ndarray, _: np.ndarray) -> Diagnosis:
+    def some_of(log: RecordingBlocks, needed: np.ndarray, *_: object) -> Diagnosis:
         cold = SelfDiagnosis(skin)
         stream = cold.stream(needed)
         for frames in log:

@@ -174,7 +174,7 @@ class StreamState:
         low = reference.least.evidence(self.runs, rests, reference.tolerance, self.present, lower)
         noise = reference.noise_loss.evidence(self.runs, rests, self.present, lower < -reference.tolerance)
         untouched = np.where(np.abs(noise) > np.abs(low), noise, low)
-        return reference.jumps_seen.evidence(self.runs, self.layout.full_scale) + untouched
+        return reference.jumps_seen.evidence(self.runs, reference.scale.full_scale) + untouched
 
     def model_of(self, i: int, events: EventLog) -> Model:
         """Return the healthy model of tile i; without a reference, a model of its ``events``."""
@@ -266,7 +266,7 @@ class StreamState:
         return replace(cells, accumulated=accumulated, outlasted=outlasted)
 
     def _jumps(self) -> NDArray[np.float64]:
-        return self.reference.jumps_seen.size(self.runs, self.layout.full_scale)
+        return self.reference.jumps_seen.size(self.runs, self.reference.scale.full_scale)
 
     def _close(self) -> None:
         """Process a segment."""

@@ -18,6 +18,7 @@ from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.baseline import LowerLimit, baseline
 from diagnostics.preprocessing.offset import ReferenceOffset
+from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.preprocessing.scale import Scale
 from diagnostics.preprocessing.transport import longest_repetition
 
@@ -133,6 +134,16 @@ class Reference:
 def living(layout: SensorLayout, dead: NDArray[np.float64]) -> SensorLayout:
     """Return a layout without the cells that are ``dead`` (P(dead) ``[D]``)."""
     return replace(layout, present=layout.present & ~layout.grid(dead > 0)) if dead.any() else layout
+
+
+def highest_reading(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
+    """Return the highest reading of a present cell that moves; full scale, if none moves."""
+    present = layout.present.ravel()
+    low, high = np.full(layout.n_cells, np.inf), np.full(layout.n_cells, -np.inf)
+    for frames in RecordingBlocks.of(recordings).blocks():
+        low, high = np.fmin(low, np.fmin.reduce(frames)), np.fmax(high, np.fmax.reduce(frames))
+    moved = present & (high > low)
+    return float(high[moved].max()) if moved.any() else layout.full_scale
 
 
 def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:

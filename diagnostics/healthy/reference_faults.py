@@ -33,7 +33,7 @@ def find_reference_faults(
     recordings: RecordingBlocks,
     layout: SensorLayout,
     tolerance: float,
-    diagnose: Callable[[RecordingBlocks, NDArray[np.bool_], NDArray[np.float64]], Diagnosis],
+    diagnose: Callable[[RecordingBlocks, NDArray[np.bool_], NDArray[np.float64], SensorLayout], Diagnosis],
 ) -> NDArray[np.float64]:
     """Return P(dead) of the cells that are dead throughout the reference, ``[D]``; 0 for all others.
 
@@ -52,7 +52,7 @@ def find_reference_faults(
     typical = rest[present & ~never_moved]
     # A cell that holds more than any baseline is loaded, or dead.
     rest = np.where(rest > typical.max(), np.median(typical), rest)
-    found = diagnose(_sample(recordings), candidates, rest)
+    found = diagnose(_sample(recordings), candidates, rest, layout)
     dead = never_moved & found.fault_set.mask & (found.probability >= _CERTAIN)
     return np.where(dead, found.probability, 0.0)
 

@@ -14,6 +14,8 @@ LineKind = Literal["row", "column", "row_address", "column_address", "converter"
 
 SCHEMA = "adaptfault.layout/1"
 
+_MOST_CELLS = 10_000_000  # larger sizes are errors of a file
+
 
 @dataclass(frozen=True, order=True)
 class Line:
@@ -30,6 +32,8 @@ class Line:
     def __post_init__(self) -> None:
         if self.kind not in get_args(LineKind):
             raise ValueError(f"unknown kind of line {self.kind!r}: use one of {', '.join(get_args(LineKind))}")
+        if not all(isinstance(n, int | np.integer) and n >= 0 for n in (self.pad, self.index)):
+            raise ValueError(f"a line needs a pad and an index, whole and >= 0; got {self.pad!r} and {self.index!r}")
 
     def __str__(self) -> str:
         match self.kind:
@@ -45,11 +49,11 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class SensorLayout:
-    """A tactile skin: ``pads`` arrays of ``rows`` x ``cols`` cells behind row and column multiplexers.
+    """A tactile array: ``pads`` arrays of ``rows`` x ``cols`` cells behind row and column multiplexers.
 
     A cell's index runs pad, then row, then column (C order of ``[pads, rows, cols]``). Positions where ``present``
     is False hold no sensing element (a masked corner); they keep their index, so that D is always
-    ``pads * rows * cols``, but nothing is ever said or learned about them.
+    ``pads * rows * cols``, and take no part in fitting or diagnosis.
 
     Args:
         pads, rows, cols: size, each at least 1. The paper's 11 x 10 pad has 11 rows here (Section III-A, H = 11).
@@ -81,6 +85,10 @@ class SensorLayout:
             if not (np.isfinite(number) and number > 0):
                 raise ValueError(f"a layout needs {name} > 0; got {getattr(self, name)!r}")
             object.__setattr__(self, name, number)
+        if self.n_cells > _MOST_CELLS:
+            raise ValueError(f"a layout has at most {_MOST_CELLS:,} cells; got {self.n_cells:,}")
+        if not isinstance(self.unit, str):
+            raise ValueError(f"a layout needs the name of a unit; got {self.unit!r}")
         present = np.ones(self.shape, bool) if self.present is None else np.array(self.present, bool)
         if present.size != self.n_cells:
             raise ValueError(
@@ -141,7 +149,7 @@ class SensorLayout:
         """Return the present cells that ``line`` serves, ascending.
 
         An address bit and a converter channel serve their whole pad: every cell is selected and read through them.
-        Which cells a *stuck* bit misreads is told by :meth:`misaddressed`.
+        The cells that a *stuck* bit misreads are those of :meth:`misaddressed`.
 
         Raises:
             IndexError: the layout has no such line.
@@ -153,7 +161,7 @@ class SensorLayout:
 
     @cached_property
     def beside(self) -> NDArray[np.intp]:
-        """The eight cells around each on its pad, row by row, int ``[D, 8]``; -1: there is none."""
+        """The eight neighbours of each cell on its pad, row by row, int ``[D, 8]``; -1: none."""
         index = np.full((self.pads, self.rows + 2, self.cols + 2), -1, dtype=np.intp)
         index[:, 1:-1, 1:-1] = np.where(self.present, self._grid, -1)
         steps = [(down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1)]
@@ -230,16 +238,18 @@ class SensorLayout:
         Raises:
             ValueError: a field is missing, unknown, or of a wrong kind; another schema.
         """
+        if not isinstance(d, Mapping):
+            raise ValueError(f"expected a layout, a dict with pads, rows and cols; got {str(d)[:60]}")
         if d.get("schema", SCHEMA) != SCHEMA:
             raise ValueError(f"expected schema {SCHEMA!r}, got {d['schema']!r}")
         known = ("pads", "rows", "cols", "full_scale", "unit", "rate", "present")
         if unknown := set(d) - set(known) - {"schema"}:
-            raise ValueError(f"a layout has no field {sorted(unknown)[0]!r}: it knows {', '.join(known)}")
+            raise ValueError(f"a layout has no field {sorted(unknown, key=str)[0]!r}: use {', '.join(known)}")
         if missing := [name for name in known[:3] if name not in d]:
             raise ValueError(f"a layout needs the field {missing[0]!r}")
         try:
             return cls(**{name: d[name] for name in known if name in d})
-        except TypeError as error:
+        except (TypeError, OverflowError) as error:
             raise ValueError(f"a field of the layout is of a wrong kind: {error}") from None
 
     def __eq__(self, other: object) -> bool:
@@ -253,12 +263,12 @@ class SensorLayout:
     def __str__(self) -> str:
         masked = self.n_cells - int(self.present.sum())
         text = f"{self.pads} x {self.rows} x {self.cols} cells, 0..{self.full_scale:g} {self.unit}, {self.rate:g} Hz"
-        return f"{text}, {masked} positions masked" if masked else text
+        return f"{text}, {masked} position{'s' if masked > 1 else ''} masked" if masked else text
 
     def _key(self) -> tuple[Any, ...]:
         return (*self.shape, self.full_scale, self.unit, self.rate, self.present.tobytes())
 
 
 def address_bits(wires: int) -> int:
-    """Return how many bits select one of ``wires``: 4 for the paper's 11 rows and 10 columns (Section II)."""
+    """Return the number of address bits for ``wires`` lines: 4 for the paper's 11 rows and 10 columns (Section II)."""
     return (wires - 1).bit_length()

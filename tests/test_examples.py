@@ -1,6 +1,6 @@
 """Every example runs as its first line says, and on recordings where it takes some. ``make examples`` shows them.
 
-Those that are marked slow run there only, not in ``make test``.
+Those that are marked slow run there and in ``make test-all``, not in ``make test``.
 """
 
 import importlib.util
@@ -46,6 +46,7 @@ SLOW_ON_RECORDINGS = {
     "adaptation_figures.py",
     "compare_classification.py",
     "compare_keras.py",
+    "wrong_fault_set.py",
 }
 NEEDS = {"deploy_speed.py": "onnxruntime"}  # others do without, and say so
 
@@ -64,6 +65,7 @@ def marked(names: Iterable[str], slow: set[str]) -> list[ParameterSet]:
     return [pytest.param(name, marks=pytest.mark.slow if name in slow else (), id=name) for name in names]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [path.name for path in EXAMPLES if '"--only"' in path.read_text()])
 def test_an_example_says_what_it_can_be_told_to_pick(name: str, tmp_path: Path):
     run(HOME / name, tmp_path, "--help")

@@ -22,6 +22,9 @@ _BLOCK = 4096
 """Frames converted at a time: a block that fits the cache is transposed faster."""
 
 
+_MOST_POINTS = 50_000_000  # of a padded table [D, P], which takes 16 bytes a point
+
+
 @dataclass(frozen=True, eq=False)
 class OutOfRange:
     """The number of readings outside each cell's table, which were clamped to its ends.
@@ -146,7 +149,13 @@ class Calibration:
         if highest >= width:
             line = points[highest][0][2]
             raise InputError.at(path, f"cell {highest}, but the layout has {width} cells, from 0", f"line {line}")
-        raw = np.full((width, max(map(len, points.values()))), np.nan)
+        most = max(map(len, points.values()))
+        if width * most > _MOST_POINTS:
+            what = (
+                f"{most} points of one cell and {width} cells need a table of over {_MOST_POINTS:,} points; thin them"
+            )
+            raise InputError.at(path, what)
+        raw = np.full((width, most), np.nan)
         force = raw.copy()
         for cell, rows in points.items():
             _check_rows(path, cell, rows)

@@ -20,7 +20,7 @@ from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.files import Found, find
 from adaptfault.data.recordings.infer import SLACK
 from adaptfault.data.recordings.layout_file import layout_beside
-from adaptfault.data.recordings.load import READERS, PathName
+from adaptfault.data.recordings.load import READERS, PathName, nothing_left
 from adaptfault.data.recordings.resolve import check_agreement, given_array, resolve_layout
 from diagnostics import SensorLayout
 
@@ -73,7 +73,7 @@ class Stream:
         problems: errors and warnings; complete after an iteration.
 
     Raises:
-        InputError: as :func:`adaptfault.load`; a file that does not fit is an error too.
+        InputError: as :func:`adaptfault.load`.
     """
 
     def __init__(
@@ -98,14 +98,29 @@ class Stream:
             raise InputError(problems[0].message if problems else "no path given; name a recording")
         self.problems: list[Problem] = problems
         known = full_scale is not None or isinstance(array, SensorLayout) or self._tables is not None
-        self._sources = [_open(file, shape, topic, field, problems, largest=not known) for file in found]
-        heads = [source.about for source in self._sources]
+        sources = []
+        for file in found:
+            try:
+                sources.append(_open(file, shape, topic, field, problems, largest=not known))
+            except InputError as error:
+                problems.append(Problem("error", str(error)))
+        if not sources:
+            raise nothing_left(problems)
+        heads = [source.about for source in sources]
         resolved = resolve_layout(heads, array, full_scale, unit, rate, self._tables)
         self.layout, self.inferred = resolved.layout, resolved.inferred
         problems += resolved.problems
-        for head in heads:
-            check_agreement(head, heads, self._tables is not None)
-            check_width(head, self.layout)
+        self._sources = []
+        for source in sources:
+            try:
+                check_agreement(source.about, heads, self._tables is not None)
+                check_width(source.about, self.layout)
+            except InputError as error:
+                problems.append(Problem("error", str(error)))
+            else:
+                self._sources.append(source)
+        if not self._sources:
+            raise nothing_left(problems)
         if self._tables is not None:
             self._tables.check(self.layout)
 
@@ -114,8 +129,16 @@ class Stream:
         return sum(source.recordings for source in self._sources)
 
     def __iter__(self) -> Iterator[NDArray[np.float64]]:
+        frames = 0
         for source in self._sources:
-            yield from self._checked(source)
+            try:
+                for block in self._checked(source):
+                    frames += len(block)
+                    yield block
+            except InputError as error:  # the blocks before it count
+                self.problems.append(Problem("error", str(error)))
+        if not frames:
+            raise nothing_left(self.problems)
 
     def _checked(self, source: Source) -> Iterator[NDArray[np.float64]]:
         present, full = self.layout.present.ravel(), self.layout.full_scale

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.content import Content
 from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.sizes import LONGEST_LINE
 from adaptfault.data.recordings.text import decoded, numbered_lines, read_bytes, shown
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -64,6 +65,10 @@ def csv_pieces(path: Path, size: int) -> Iterator[Piece]:
                 data = file.read(size)
                 cut = data.rfind(b"\n") + 1 if data else 0
                 piece, rest = (rest + data[:cut], data[cut:]) if cut or not data else (b"", rest + data)
+                if len(rest) > LONGEST_LINE:
+                    raise InputError.at(
+                        path, f"has a line of over {LONGEST_LINE:,} bytes, so it is no CSV file; remove it"
+                    )
                 if piece:
                     parsed = _parse(path, piece, before)
                     here = width if parsed.values is None else parsed.values.shape[1]

@@ -114,7 +114,7 @@ def load(
             contents.append((file, content.read_as(shape) if shape else content))
     contents = label_files(contents, None if labels is None else Path(labels), problems)
     if not contents:
-        raise _nothing_left(problems)
+        raise nothing_left(problems)
     resolved = resolve_layout([content for _, content in contents], array, full_scale, unit, rate, tables)
     problems += resolved.problems
     if tables is not None:
@@ -167,7 +167,7 @@ def _assemble(
         names += (_name(file, content, i) for i in kept)
         labels += (content.labels[i] if content.labels else None for i in kept)
     if not frames:
-        raise _nothing_left(problems)
+        raise nothing_left(problems)
     if length is None:
         problems += other_lengths(usable)
     problems += _summary(out_of_range, len(usable), layout)
@@ -219,7 +219,7 @@ def _name(file: Found, content: Content, i: int) -> str:
     return file.name if len(content.frames) == 1 else f"{file.name}, recording {i}"
 
 
-def _nothing_left(problems: Sequence[Problem]) -> InputError:
+def nothing_left(problems: Sequence[Problem]) -> InputError:
     """Return the error for a run that has no recording left: the first problem, and how many there are."""
     errors = [problem for problem in problems if problem.level == "error"] or list(problems)
     counts = Counter(problem.level for problem in problems)

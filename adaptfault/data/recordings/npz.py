@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import zipfile
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -17,6 +18,7 @@ from adaptfault.data.atomic import atomic_write
 from adaptfault.data.recordings.content import Content, Shape, grid_shape
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError, Problem
+from adaptfault.data.recordings.sizes import check_archive, check_array
 from adaptfault.data.recordings.text import read_bytes, read_json_object
 
 _KEYS = (
@@ -138,7 +140,14 @@ def _open(path: Path) -> Any:
     if not data.startswith((b"PK\x03\x04", b"PK\x05\x06", b"\x93NUMPY")):
         raise InputError.at(path, "is no NumPy file; write it again with numpy.savez or numpy.save")
     try:
+        if data.startswith(b"PK"):
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                check_archive(path, archive, _KEYS)
+        else:
+            check_array(path, data)
         return np.load(io.BytesIO(data), allow_pickle=False)
+    except InputError:
+        raise
     except Exception as error:  # a damaged file raises any of a dozen kinds: zipfile's, zlib's, struct's, numpy's
         raise _damaged(path, error) from None
 

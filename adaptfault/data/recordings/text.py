@@ -7,15 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.sizes import check_file
 
 
 def read_bytes(path: Path) -> bytes:
     """Return the content of a file; InputError where it cannot be read or is empty."""
     try:
+        check_file(path)
         data = path.read_bytes()
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError.at(path, f"cannot be read ({reason}); check the path and its permissions") from None
+    except InputError:
+        raise
     except ValueError:  # a null character in the path
         raise InputError.at(repr(str(path)), "is not a path; check its name") from None
     if not data:

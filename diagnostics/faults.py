@@ -90,18 +90,52 @@ class Fault:
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Fault:
-        """Rebuild a fault from :meth:`to_dict`."""
+        """Rebuild a fault from :meth:`to_dict`.
+
+        Raises:
+            ValueError: a field is missing, unknown or of a wrong kind.
+        """
+        try:
+            return cls._from_dict(d)
+        except (TypeError, KeyError, AttributeError, OverflowError) as error:
+            raise ValueError(f"expected a fault with kind and cells, got {str(d)[:60]} ({error})") from None
+
+    @classmethod
+    def _from_dict(cls, d: Mapping[str, Any]) -> Fault:
+        for name, kinds in _KINDS.items():
+            if not isinstance(d.get(name), kinds) or isinstance(d.get(name), bool):
+                raise TypeError(f"field {name!r} is {str(d.get(name))[:30]!r}")
+        numbers = [d[name] for name in ("value", "probability") if d.get(name) is not None]
+        if not all(np.isfinite(float(number)) for number in numbers):
+            raise TypeError("value and probability must be finite")
+        if not all(isinstance(text, str) for text in d.get("alternatives") or ()):
+            raise TypeError("alternatives must be text")
         line = Line(**d["line"]) if d.get("line") else None
-        alternatives = tuple(d.get("alternatives", ()))
+        alternatives = tuple(d.get("alternatives") or ())
         return cls(
             **{
                 **d,
                 "kind": FaultKind(d["kind"]),
                 "cells": tuple(d["cells"]),
                 "line": line,
+                "reason": d.get("reason") or "",
                 "alternatives": alternatives,
             }
         )
+
+
+_NONE = type(None)
+_KINDS: Mapping[str, tuple[type, ...]] = {
+    "kind": (str,),
+    "cells": (list, tuple),
+    "line": (dict, _NONE),
+    "value": (int, float, _NONE),
+    "onset": (int, _NONE),
+    "probability": (int, float, _NONE),
+    "reason": (str, _NONE),
+    "evidence": (int, _NONE),
+    "alternatives": (list, tuple, _NONE),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +152,8 @@ class FaultSet(Set[int]):
     n_cells: int
 
     def __post_init__(self) -> None:
+        if isinstance(self.n_cells, bool) or not isinstance(self.n_cells, int | np.integer) or self.n_cells < 0:
+            raise ValueError(f"F needs the number of cells, a whole number >= 0; got {self.n_cells!r}")
         cells = np.unique(np.asarray(list(self.cells)))
         if cells.size and not np.issubdtype(cells.dtype, np.integer):
             raise ValueError(f"F holds cell indices, whole numbers; got {self.cells!r}")

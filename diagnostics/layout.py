@@ -14,6 +14,8 @@ LineKind = Literal["row", "column", "row_address", "column_address", "converter"
 
 SCHEMA = "adaptfault.layout/1"
 
+_MOST_CELLS = 10_000_000  # larger sizes are errors of a file
+
 
 @dataclass(frozen=True, order=True)
 class Line:
@@ -30,6 +32,8 @@ class Line:
     def __post_init__(self) -> None:
         if self.kind not in get_args(LineKind):
             raise ValueError(f"unknown kind of line {self.kind!r}: use one of {', '.join(get_args(LineKind))}")
+        if not all(isinstance(n, int | np.integer) and n >= 0 for n in (self.pad, self.index)):
+            raise ValueError(f"a line needs a pad and an index, whole and >= 0; got {self.pad!r} and {self.index!r}")
 
     def __str__(self) -> str:
         match self.kind:
@@ -81,6 +85,10 @@ class SensorLayout:
             if not (np.isfinite(number) and number > 0):
                 raise ValueError(f"a layout needs {name} > 0; got {getattr(self, name)!r}")
             object.__setattr__(self, name, number)
+        if self.n_cells > _MOST_CELLS:
+            raise ValueError(f"a layout has at most {_MOST_CELLS:,} cells; got {self.n_cells:,}")
+        if not isinstance(self.unit, str):
+            raise ValueError(f"a layout needs the name of a unit; got {self.unit!r}")
         present = np.ones(self.shape, bool) if self.present is None else np.array(self.present, bool)
         if present.size != self.n_cells:
             raise ValueError(
@@ -230,16 +238,18 @@ class SensorLayout:
         Raises:
             ValueError: a field is missing, unknown, or of a wrong kind; another schema.
         """
+        if not isinstance(d, Mapping):
+            raise ValueError(f"expected a layout, a dict with pads, rows and cols; got {str(d)[:60]}")
         if d.get("schema", SCHEMA) != SCHEMA:
             raise ValueError(f"expected schema {SCHEMA!r}, got {d['schema']!r}")
         known = ("pads", "rows", "cols", "full_scale", "unit", "rate", "present")
         if unknown := set(d) - set(known) - {"schema"}:
-            raise ValueError(f"a layout has no field {sorted(unknown)[0]!r}: it knows {', '.join(known)}")
+            raise ValueError(f"a layout has no field {sorted(unknown, key=str)[0]!r}: it knows {', '.join(known)}")
         if missing := [name for name in known[:3] if name not in d]:
             raise ValueError(f"a layout needs the field {missing[0]!r}")
         try:
             return cls(**{name: d[name] for name in known if name in d})
-        except TypeError as error:
+        except (TypeError, OverflowError) as error:
             raise ValueError(f"a field of the layout is of a wrong kind: {error}") from None
 
     def __eq__(self, other: object) -> bool:

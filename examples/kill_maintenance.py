@@ -60,7 +60,7 @@ def check(bundle: af.Bundle, confirmed: int) -> str:
     assert np.isfinite(af.Adaptation.load(version.folder).predict_proba(x)).all()
     assert version.number >= confirmed, f"version {confirmed} was confirmed, {version.number} runs"
     again.versions[confirmed]
-    problems = [p for p in again.problems() if "reads well" not in p]
+    problems = [p for p in again.problems() if "is readable" not in p]
     assert not problems, problems
     return f"version {version.number - confirmed:+d}, {len(again.journal.runs())} runs"
 

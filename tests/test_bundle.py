@@ -1,17 +1,21 @@
 import shutil
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from adaptfault.adaptation.adapter import Adapter
 from adaptfault.adaptation.result import Adaptation
+from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.data.windows import make_windows
 from adaptfault.models.network import TactileTransformer
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.checksummed_json import Damaged
 from adaptfault.robot.lock import Busy
+from adaptfault.robot.maintenance import maintain
 from diagnostics import FaultSet, SelfDiagnosis
 
 
@@ -73,7 +77,7 @@ def test_opening_and_monitoring_need_no_torch(made_bundle):
         "import sys\n"
         "from adaptfault.robot.bundle import Bundle\n"
         f"bundle = Bundle.open({str(made_bundle)!r})\n"
-        "bundle.active(), bundle.diagnoser(), bundle.knowledge()\n"
+        "bundle.active(), bundle.diagnoser(), bundle.known_faults()\n"
         "sys.exit('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
@@ -133,10 +137,10 @@ def test_a_flipped_bit_in_any_file_is_noticed_and_a_good_version_runs(bundle, tm
         broken[rng.integers(len(broken))] ^= 1 << int(rng.integers(8))
         path.write_bytes(bytes(broken))
         again = Bundle.open(bundle.path)
-        assert again.problems(mend=False), path
+        assert again.problems(repair=False), path
         assert again.active().number == (1 if path.parent.name == "0002" else 2), path
         path.write_bytes(whole)
-    assert Bundle.open(bundle.path).problems(mend=False) == []
+    assert Bundle.open(bundle.path).problems(repair=False) == []
 
 
 def test_a_missing_or_truncated_file_is_noticed(bundle):
@@ -180,3 +184,67 @@ def test_a_bundle_that_cannot_be_written_runs_all_the_same(bundle, monkeypatch):
 
     monkeypatch.setattr("adaptfault.robot.bundle.locked", refuse)
     assert bundle.begin().number == 2
+
+
+READ_ONLY = """
+import os, sys
+import numpy as np
+from adaptfault.cli import main
+from adaptfault.robot.predictor import Predictor
+path, log, page = sys.argv[1:]
+def use():
+    assert main(["history", path]) == 0
+    assert main(["report", path, "--out", page]) == 0
+    assert main(["maintain", path, log, "--dry-run", "--quiet"]) == 0
+    predictor = Predictor.load(path)
+    for _ in range(20):
+        reading = predictor.stream(np.zeros(predictor.layout.n_cells))
+    assert reading.label is not None
+    return predictor
+use()  # imports all that is needed
+os.remove(page)
+if os.geteuid() == 0:  # root may write everything
+    os.setuid(65534)
+try:
+    open(os.path.join(path, "x"), "w")
+except OSError:
+    pass
+else:
+    sys.exit("the bundle can be written, so this test would prove nothing")
+assert not use().confirm()
+"""
+
+
+def test_history_report_dry_run_and_prediction_need_no_write_access(bundle, later_grasps):
+    maintain(bundle, later_grasps[:4])
+    bundle.deploy(1)
+    with tempfile.TemporaryDirectory() as place:
+        path, log, page = Path(place, "robot.bundle"), Path(place, "log.npz"), Path(place, "out", "report.html")
+        shutil.copytree(bundle.path, path)
+        frames = tuple(r.astype(np.float32) for r in later_grasps[4:8])
+        save_npz(log, Recordings(frames, bundle.layout))
+        page.parent.mkdir()
+        page.parent.chmod(0o777)
+        for one in [*path.rglob("*"), path, Path(place)]:
+            one.chmod(0o555 if one.is_dir() else 0o444)
+        try:
+            subprocess.run([sys.executable, "-c", READ_ONLY, str(path), str(log), str(page)], check=True)
+        finally:
+            for one in [Path(place), path, *path.rglob("*")]:
+                one.chmod(0o755)
+
+
+FULL_DISK = """
+import resource, sys
+from adaptfault.robot.bundle import Bundle
+from adaptfault.robot.predictor import Predictor
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))  # every write to a file fails, as on a full disk
+bundle = Bundle.open(sys.argv[1])
+assert Predictor.load(sys.argv[1]).version == 1
+assert not Predictor.load(sys.argv[1]).confirm()
+"""
+
+
+def test_a_version_on_probation_starts_on_a_full_disk(bundle):
+    bundle.deploy(1)
+    subprocess.run([sys.executable, "-c", FULL_DISK, str(bundle.path)], check=True)

@@ -7,10 +7,10 @@ from adaptfault.robot.checksummed_json import (
     check_files,
     damage,
     hash_files,
-    read_either,
-    read_sealed,
-    write_sealed,
-    write_twice,
+    read_checksummed,
+    read_with_copy,
+    write_checksummed,
+    write_with_copy,
 )
 
 SCHEMA = "adaptfault.test/1"
@@ -24,62 +24,62 @@ def flip(path, bit: int) -> None:
 
 
 def test_a_document_comes_back(tmp_path):
-    write_sealed(tmp_path / "a.json", DOCUMENT)
-    assert read_sealed(tmp_path / "a.json", SCHEMA) == DOCUMENT
+    write_checksummed(tmp_path / "a.json", DOCUMENT)
+    assert read_checksummed(tmp_path / "a.json", SCHEMA) == DOCUMENT
 
 
 def test_every_flipped_bit_is_noticed(tmp_path):
     path = tmp_path / "a.json"
-    write_sealed(path, DOCUMENT)
+    write_checksummed(path, DOCUMENT)
     whole = path.read_bytes()
     for bit in range(8 * len(whole)):
         flip(path, bit)
         with pytest.raises(Damaged):
-            read_sealed(path, SCHEMA)
+            read_checksummed(path, SCHEMA)
         path.write_bytes(whole)
-    assert read_sealed(path, SCHEMA) == DOCUMENT
+    assert read_checksummed(path, SCHEMA) == DOCUMENT
 
 
 @pytest.mark.parametrize("data", [b"", b"{}", b"[1]", b"null", b'{"sha256": "x"}', b"\xff\xfe"])
 def test_what_is_no_sealed_document_is_damaged(tmp_path, data):
     (tmp_path / "a.json").write_bytes(data)
     with pytest.raises(Damaged):
-        read_sealed(tmp_path / "a.json", SCHEMA)
+        read_checksummed(tmp_path / "a.json", SCHEMA)
 
 
 def test_a_document_of_another_schema_is_refused(tmp_path):
-    write_sealed(tmp_path / "a.json", DOCUMENT)
+    write_checksummed(tmp_path / "a.json", DOCUMENT)
     with pytest.raises(Damaged, match="expected 'adaptfault"):
-        read_sealed(tmp_path / "a.json", "adaptfault.other/1")
+        read_checksummed(tmp_path / "a.json", "adaptfault.other/1")
 
 
 def test_what_json_lacks_is_not_written(tmp_path):
     with pytest.raises(ValueError, match="JSON"):
-        write_sealed(tmp_path / "a.json", {**DOCUMENT, "x": float("nan")})
+        write_checksummed(tmp_path / "a.json", {**DOCUMENT, "x": float("nan")})
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("broken", ["a.json", "a.copy.json"])
 def test_a_damaged_document_is_read_from_its_copy_and_mended(tmp_path, broken):
     path = tmp_path / "a.json"
-    write_twice(path, DOCUMENT)
+    write_with_copy(path, DOCUMENT)
     flip(tmp_path / broken, 100)
-    assert read_either(path, SCHEMA) == DOCUMENT
-    assert any(broken in problem for problem in damage(path, SCHEMA, mend=False))
-    assert damage(path, SCHEMA, mend=True)
-    assert damage(path, SCHEMA, mend=True) == []
+    assert read_with_copy(path, SCHEMA) == DOCUMENT
+    assert any(broken in problem for problem in damage(path, SCHEMA, repair=False))
+    assert damage(path, SCHEMA, repair=True)
+    assert damage(path, SCHEMA, repair=True) == []
     assert json.loads((tmp_path / broken).read_bytes())["text"] == "pad 0"
 
 
 def test_a_missing_document_and_two_damaged_ones_are_told_apart(tmp_path):
     path = tmp_path / "a.json"
     with pytest.raises(FileNotFoundError):
-        read_either(path, SCHEMA)
-    write_twice(path, DOCUMENT)
+        read_with_copy(path, SCHEMA)
+    write_with_copy(path, DOCUMENT)
     flip(path, 100)
     flip(tmp_path / "a.copy.json", 100)
     with pytest.raises(Damaged, match="both"):
-        read_either(path, SCHEMA)
+        read_with_copy(path, SCHEMA)
 
 
 def test_a_changed_or_missing_file_is_noticed(tmp_path):

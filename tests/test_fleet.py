@@ -116,13 +116,13 @@ def test_a_fleet_is_maintained_through_the_command_line(made_bundle, later_grasp
     assert main([*arguments, "--json"]) == 0  # the run ended: this is a new one, with nothing new to see
     document = json.loads(capsys.readouterr().out)
     assert document["schema"] == "adaptfault.fleet/1"
-    assert "not seen before" in document["outcomes"][0]["reason"]
+    assert "used before" in document["outcomes"][0]["reason"]
     assert document["ages"][0]["robots"] == 1
     assert json.loads((tmp_path / "f.fleet" / "report.json").read_text()) == document
     assert "The fleet's skins" in (tmp_path / "f.fleet" / "report.html").read_text()
     (tmp_path / "f.toml").write_text("")
     assert main(arguments) == 3
-    assert "no robot in it" in capsys.readouterr().err
+    assert "it lists no robot" in capsys.readouterr().err
 
 
 # A killed run. These fake the workers: what is asked is who is worked on.
@@ -332,7 +332,7 @@ def test_a_pattern_names_robots_after_its_stars(tmp_path, pattern, names):
 
 def test_a_pattern_of_recordings_is_looked_up_when_it_is_needed(tmp_path):
     robot = Robot("a", "a", (f"{tmp_path}/*.npz",))
-    with pytest.raises(FileNotFoundError, match="no recording fits"):
+    with pytest.raises(FileNotFoundError, match="no recording matches"):
         robot.paths()
     (tmp_path / "2.npz").touch()
     (tmp_path / "1.npz").touch()
@@ -346,8 +346,8 @@ A = '[[robots]]\nname = "a"\nbundle = "a"\nrecordings = "a"\n'
     ("text", "reason"),
     [
         ("robots = [", "not a TOML file"),
-        ("", "no robot in it"),
-        ("robots = 3", "`robots` is no array of tables"),
+        ("", "it lists no robot"),
+        ("robots = 3", "`robots` is not an array of tables"),
         ('[[robots]]\nbundle = "a"', "robot 1: `name` is missing"),
         ('[[robots]]\nname = "a"\nrecordings = "a"', r"robot 1 \('a'\): `bundle` is missing"),
         ('[[robots]]\nname = "a"\nbundle = "a"', r"robot 1 \('a'\): `recordings` is missing"),
@@ -357,7 +357,7 @@ A = '[[robots]]\nname = "a"\nbundle = "a"\nrecordings = "a"\n'
         (A + A, "2 robots have the name 'a'"),
         (A + A.replace('name = "a"', 'name = "b"'), "2 robots have the bundle"),
         ('bundles = "x/*.bundle"', "`bundles` needs `recordings`"),
-        ('bundles = "x/*.bundle"\nrecordings = "r"', "no bundle fits"),
+        ('bundles = "x/*.bundle"\nrecordings = "r"', "no bundle matches"),
         ('bundles = "*.toml"\nrecordings = "{folder}"', "expected only {bundle_dir} and {name}"),
         ('recordings = "r"\n' + A, "need `bundles`"),
     ],

@@ -83,7 +83,7 @@ def test_a_robot_that_crashes_hangs_or_exits_is_an_error_and_the_others_go_on(wh
     found = errors(done("a crash b hang c exit d", limit=1.5, **where))
     assert set(found) == {"crash", "hang", "exit"}
     assert "the process that maintained it died" in found["crash"]
-    assert "not done after 1.5 s" in found["hang"]
+    assert "not finished after 1.5 s" in found["hang"]
     assert found["exit"] == "SystemExit: 3"
 
 

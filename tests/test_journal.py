@@ -21,7 +21,7 @@ def test_runs_and_the_recordings_they_saw_come_back(journal):
 
 def test_an_empty_journal_is_no_damage(tmp_path):
     journal = Journal(tmp_path)
-    assert (journal.runs(), journal.seen(["aa"]), journal.damage(mend=True)) == ([], set(), [])
+    assert (journal.runs(), journal.seen(["aa"]), journal.damage(repair=True)) == ([], set(), [])
 
 
 def test_a_run_is_written_with_all_its_recordings_or_not_at_all(journal):
@@ -37,27 +37,27 @@ def test_every_damaged_byte_is_noticed_and_what_still_reads_is_kept(journal):
         broken = bytearray(whole)
         broken[place] ^= 4
         journal.path.write_bytes(bytes(broken))
-        assert journal.damage(mend=False)
+        assert journal.damage(repair=False)
     journal.path.write_bytes(whole)
-    assert journal.damage(mend=False) == []
+    assert journal.damage(repair=False) == []
     assert len(journal.runs()) == 2
 
 
 def test_a_broken_journal_is_set_aside_and_a_new_one_begun(journal, tmp_path):
     journal.path.write_bytes(b"x" * 5000)
-    assert "set aside" in journal.damage(mend=True)[0]
+    assert "renamed" in journal.damage(repair=True)[0]
     assert (tmp_path / "journal.damaged.sqlite").exists()
     assert journal.runs() == []
     journal.add("2026-01-03T00:00:00+00:00", "kept", {"version": 1})
-    assert journal.damage(mend=True) == []
+    assert journal.damage(repair=True) == []
 
 
 def test_a_crash_before_the_seal_loses_nothing(journal, tmp_path):
     seal = (tmp_path / "journal.sha256").read_bytes()
     journal.add("2026-01-03T00:00:00+00:00", "kept", {"version": 2})
     (tmp_path / "journal.sha256").write_bytes(seal)
-    assert "reads well" in journal.damage(mend=True)[0]
-    assert journal.damage(mend=True) == []
+    assert "is readable" in journal.damage(repair=True)[0]
+    assert journal.damage(repair=True) == []
     assert len(journal.runs()) == 3
 
 
@@ -74,6 +74,6 @@ def test_a_crash_within_a_transaction_leaves_the_state_before(journal, tmp_path)
         shutil.copy(path, other)
     connection.close()
     crashed = Journal(other)
-    crashed.damage(mend=True)
+    crashed.damage(repair=True)
     assert len(crashed.runs()) == 2
     assert crashed.seen(["aa", "17"]) == {"aa"}

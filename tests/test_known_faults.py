@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 
-from adaptfault.robot.known_faults import Knowledge
+from adaptfault.robot.known_faults import KnownFaults
 from diagnostics import Diagnosis, Fault, FaultKind, Line, SensorLayout
 
 LAYOUT = SensorLayout(1, 3, 4)
@@ -19,13 +19,13 @@ def log(*faults: Fault, untested: tuple[int, ...] = ()) -> Diagnosis:
 
 
 def test_new_faults_count_at_once_and_add_to_the_old():
-    known = Knowledge(D).merged(log(ROW)).merged(log(BLINKING, untested=(0, 1, 2, 3)))
+    known = KnownFaults(D).merged(log(ROW)).merged(log(BLINKING, untested=(0, 1, 2, 3)))
     assert known.fault_set == {0, 1, 2, 3, 7}
     assert known.faults == (BLINKING, ROW)
 
 
 def test_a_dead_cell_stays_dead_until_three_logs_show_it_alive():
-    known = Knowledge(D).merged(log(ROW))
+    known = KnownFaults(D).merged(log(ROW))
     for _ in range(2):
         known = known.merged(log())
         assert known.fault_set == {0, 1, 2, 3}
@@ -33,7 +33,7 @@ def test_a_dead_cell_stays_dead_until_three_logs_show_it_alive():
 
 
 def test_an_intermittent_cell_needs_twice_the_proof():
-    known = Knowledge(D).merged(log(BLINKING))
+    known = KnownFaults(D).merged(log(BLINKING))
     for _ in range(5):
         known = known.merged(log())
         assert known.fault_set == {7}
@@ -41,19 +41,19 @@ def test_an_intermittent_cell_needs_twice_the_proof():
 
 
 def test_logs_that_do_not_test_a_cell_prove_nothing():
-    known = Knowledge(D).merged(log(ROW))
+    known = KnownFaults(D).merged(log(ROW))
     for _ in range(10):
         known = known.merged(log(untested=(0, 1, 2, 3)))
     assert known.fault_set == {0, 1, 2, 3}
 
 
 def test_being_found_faulty_again_takes_all_proofs_away():
-    known = Knowledge(D).merged(log(ROW)).merged(log()).merged(log()).merged(log(ROW)).merged(log()).merged(log())
+    known = KnownFaults(D).merged(log(ROW)).merged(log()).merged(log()).merged(log(ROW)).merged(log()).merged(log())
     assert known.fault_set == {0, 1, 2, 3}
 
 
 def test_cells_of_one_wire_recover_one_by_one():
-    known = Knowledge(D).merged(log(ROW))
+    known = KnownFaults(D).merged(log(ROW))
     for _ in range(3):
         known = known.merged(log(untested=(2, 3)))
     assert known.fault_set == {2, 3}
@@ -61,11 +61,11 @@ def test_cells_of_one_wire_recover_one_by_one():
 
 
 def test_a_cell_whose_wire_is_found_to_be_the_cause_is_named_once():
-    known = Knowledge(D).merged(log(Fault(FaultKind.OPEN, (1,)))).merged(log(ROW))
+    known = KnownFaults(D).merged(log(Fault(FaultKind.OPEN, (1,)))).merged(log(ROW))
     assert known.faults == (ROW,)
 
 
 def test_knowledge_survives_json():
-    known = Knowledge(D).merged(log(ROW, BLINKING)).merged(log(untested=(0,)))
-    again = Knowledge.from_dict(json.loads(json.dumps(known.to_dict(), allow_nan=False)))
+    known = KnownFaults(D).merged(log(ROW, BLINKING)).merged(log(untested=(0,)))
+    again = KnownFaults.from_dict(json.loads(json.dumps(known.to_dict(), allow_nan=False)))
     assert (again.faults, dict(again.proofs), again.fault_set) == (known.faults, dict(known.proofs), known.fault_set)

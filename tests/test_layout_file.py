@@ -23,7 +23,7 @@ def test_a_layout_file_is_read_and_its_scale_goes_before_the_archives(tmp_path):
     file = archive(tmp_path / "a.npz", frames=counts(highest=450), full_scale=1023, unit="count")
     loaded = load(file, layout=path)
     assert loaded.recordings.layout == layout
-    assert "the file says 0..1023 count, but 0..500 count was asked for" in messages(loaded, "warning")[0]
+    assert "the file states 0..1023 count, but 0..500 count is used" in messages(loaded, "warning")[0]
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_a_shape_is_read_from_words(words):
 
 
 @pytest.mark.parametrize(
-    "words", ["", "2x13", "2x13x6x1", "2x-3x6", "0x3x6", "axbxc", "2x1.5x6", "999999999x9x9", "٢x٣x٤"]
+    "words", ["", "2", "2x13x6x1", "2x-3x6", "0x3x6", "axbxc", "2x1.5x6", "999999999x9x9", "٢x٣x٤"]
 )
 def test_a_shape_that_is_none_is_refused(words):
     with pytest.raises(InputError, match=r"^shape .*2x13x6|cells"):

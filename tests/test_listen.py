@@ -107,6 +107,31 @@ def test_a_predictor_is_confirmed_once_after_it_has_worked_for_a_while():
     assert [kind for kind, _ in events].count("confirmed") == 1
 
 
+def test_a_version_that_cannot_be_confirmed_is_reported_once_and_tried_again():
+    predictor = Scripted()
+    answers = [OSError("no space left"), False, True]
+
+    def confirm():
+        answer = answers.pop(0)
+        if isinstance(answer, OSError):
+            raise answer
+        return answer
+
+    predictor.confirm = confirm
+    events = told(Session("a", predictor), frames(5 * CONFIRMED_AFTER))
+    assert [kind for kind, _ in events] == ["class", "trouble", "confirmed"]
+    assert not answers
+
+
+def test_readings_outside_the_range_are_missing_and_counted(capsys):
+    values = np.zeros((12, 6))
+    values[3, 2], values[5, 1] = 1e30, -700.0
+    lines = listened(capsys, packets(values), "--shape", "1x2x3", "--frames", "12", "--json")
+    end = json.loads(lines[-1])
+    assert end["counters"]["kept"] == 12
+    assert end["readings_outside_range"] == 2
+
+
 def test_a_touch_is_recorded_with_what_came_before_and_after_it(tmp_path):
     session = Session("a", Scripted(), recorder=Recorder(tmp_path, SMALL, "a"), rule=parse_when("contact", SMALL))
     given = [*frames(20), *frames(10, 2.0, 20), *frames(30, 0.0, 30)]
@@ -271,7 +296,7 @@ def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp
         child.stdin.write("what\nauto\nrecord\n")
         answers = [child.stderr.readline() for _ in range(4)]
         assert answers[0] == "stop: not recording\n"
-        assert "'what' is no command" in answers[1]
+        assert "'what' is not a command" in answers[1]
         assert answers[2] == "auto: recording as the rule says\n"
         send(port, packets(np.full((5, 6), 2.0), start=7))
         wait_for(child, "2,2,2,2,2,2\n", 5)

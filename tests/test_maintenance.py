@@ -39,7 +39,7 @@ def test_the_same_recordings_twice_change_nothing(bundle, later_grasps, broken_r
     before = files(bundle)
     report = maintain(bundle, log)
     assert (report.decision, report.version) == ("unchanged", 2)
-    assert "not seen before" in report.reason
+    assert "used before" in report.reason
     assert files(bundle) == before
 
 
@@ -61,7 +61,7 @@ def test_known_faults_in_new_recordings_deploy_nothing_again(bundle, later_grasp
     maintain(bundle, broken(later_grasps[:12], broken_row))
     report = maintain(bundle, broken(later_grasps[12:], broken_row))
     assert (report.decision, report.version) == ("unchanged", 2)
-    assert "does without these cells already" in report.reason
+    assert "excludes these cells already" in report.reason
 
 
 def test_faults_add_up_over_runs(bundle, later_grasps, broken_row):
@@ -84,7 +84,7 @@ def test_after_a_rollback_the_same_faults_deploy_nothing(bundle, later_grasps, b
     ("poison", "reason", "code"),
     [
         (lambda r, rng: np.full_like(r, 5.0), "no healthy cell", 2),
-        (lambda r, rng: 5 * rng.random(r.shape), "no healthy cell|contradict", 2),
+        (lambda r, rng: 5 * rng.random(r.shape), "no healthy cell|residual variance ratio", 2),
         (lambda r, rng: r * 800, "no recording is usable", 3),
         (lambda r, rng: np.full_like(r, np.nan), "no recording is usable", 3),
         (lambda r, rng: r[:, :59], "no recording is usable", 3),
@@ -105,6 +105,45 @@ def test_cells_in_another_order_never_deploy(bundle, later_grasps, rng):
     report = maintain(bundle, [r[:, order] for r in later_grasps])
     assert report.decision == "refused"
     assert bundle.versions.numbers == [1]
+
+
+def test_idle_recordings_beside_grasps_hide_no_fault(bundle, later_grasps, rng):
+    row = line_fault(bundle.layout, Line(1, "row", 2), FaultKind.OPEN)
+    idle = [np.abs(rng.normal(0, 0.003, (60, 60))) for _ in range(24)]
+    report = maintain(bundle, broken([*later_grasps, *idle], row), dry_run=True)
+    assert report.decision != "refused"
+    assert report.fault_set == set(row.cells)
+
+
+def test_refused_recordings_are_diagnosed_again(bundle, later_grasps, rng):
+    order = rng.permutation(bundle.layout.n_cells)
+    log = [r[:, order] for r in later_grasps]
+    first, second = maintain(bundle, log), maintain(bundle, log)
+    assert (first.decision, first.exit_code, first.used) == ("refused", 2, ())
+    assert (second.decision, second.exit_code, second.reason) == ("refused", 2, first.reason)
+    assert [run["what"] for run in bundle.journal.runs()] == ["refused", "refused"]
+
+
+def test_single_readings_outside_the_range_are_missing_and_counted(bundle, later_grasps, broken_row):
+    log = broken(later_grasps, broken_row)
+    log[2][5, 3], log[3][7, 0] = np.inf, 1e308
+    report = maintain(bundle, log, dry_run=True)
+    json.dumps(report.to_dict(), allow_nan=False)
+    assert report.fault_set == set(broken_row.cells)
+    assert [text.split(":")[0] for text in report.left_out] == ["recording 2", "recording 3"]
+    assert "1 readings outside 0 to 5 N are missing" in report.left_out[0]
+
+
+def test_recovered_cells_lead_back_to_the_version_that_uses_them(bundle, later_grasps, broken_row):
+    assert maintain(bundle, broken(later_grasps, broken_row)).version == 2
+    bundle.confirm()
+    third = len(later_grasps) // 3
+    reports = [maintain(bundle, later_grasps[i * third : (i + 1) * third]) for i in range(3)]
+    assert [len(r.fault_set) for r in reports] == [5, 5, 0]
+    assert (reports[-1].decision, reports[-1].version, reports[-1].exit_code) == ("deployed", 1, 0)
+    assert "recovered" in reports[-1].reason
+    assert bundle.active().number == 1
+    assert bundle.rollback().number == 2
 
 
 def test_one_bad_recording_does_not_stop_the_others(bundle, later_grasps, broken_row):
@@ -139,15 +178,15 @@ def test_what_was_kept_once_is_not_judged_again(bundle, later_grasps, broken_row
     def no_gain(running, candidate, windows):
         return Judgement(running=0.5, candidate=0.5, gain=0.0, low=-0.1, high=0.1, collapsed=())
 
-    monkeypatch.setattr(module, "judge", no_gain)
+    monkeypatch.setattr(module, "compare_candidate", no_gain)
     first = maintain(bundle, broken(later_grasps[:8], broken_row))
     assert (first.decision, first.version) == ("kept", 1)
-    assert "within chance" in first.reason
-    monkeypatch.setattr(module, "judge", None)  # would fail if it were asked
+    assert "interval of the gain includes 0" in first.reason
+    monkeypatch.setattr(module, "compare_candidate", None)  # would fail if it were asked
     for log in (later_grasps[8:16], later_grasps[16:]):
         again = maintain(bundle, broken(log, broken_row))
         assert (again.decision, again.exit_code) == ("kept", first.exit_code)
-        assert again.reason == f"judged before: {first.reason}"
+        assert again.reason == f"compared before: {first.reason}"
 
 
 def test_a_candidate_in_which_a_class_collapses_is_refused(bundle, later_grasps, broken_row, monkeypatch):
@@ -156,7 +195,7 @@ def test_a_candidate_in_which_a_class_collapses_is_refused(bundle, later_grasps,
     def collapse(running, candidate, windows):
         return Judgement(running=0.5, candidate=0.6, gain=0.1, low=0.05, high=0.15, collapsed=(1,))
 
-    monkeypatch.setattr(module, "judge", collapse)
+    monkeypatch.setattr(module, "compare_candidate", collapse)
     report = maintain(bundle, broken(later_grasps, broken_row))
     assert (report.decision, report.version) == ("refused", 1)
     assert bundle.class_names[1] in report.reason

@@ -91,11 +91,59 @@ def test_counts_that_never_rise_leave_a_doubt_about_the_full_scale(tmp_path):
     assert "no count exceeds 0: taken as 0..255" in warning
 
 
-def test_decimal_readings_beyond_5_need_a_full_scale(tmp_path):
-    file = archive(tmp_path / "a.npz", frames=rng.uniform(0, 90, (2, 5, 1, 2, 3)))
-    assert "more than the paper's 5 N; give the full scale" in refusal(file)
+def test_decimal_readings_of_another_array_get_a_scale_that_is_reported(tmp_path):
+    values = rng.uniform(0, 80, (2, 5, 1, 2, 3))
+    values[0, 0, 0, 0, 0] = 88.2
+    file = archive(tmp_path / "a.npz", frames=values)
+    loaded = load(file)
+    assert (loaded.recordings.layout.full_scale, loaded.recordings.layout.unit) == (89, "a.u.")
+    assert any("full scale 89 a.u. (largest reading 88.2, no converter step" in text for text in loaded.inferred)
     assert load(file, full_scale=100, unit="kPa").recordings.layout == SensorLayout(1, 2, 3, full_scale=100, unit="kPa")
     assert load(file, layout=SensorLayout(1, 2, 3, full_scale=100)).problems == ()
+
+
+def test_the_full_scale_of_decimal_readings_is_that_of_the_converter_whose_step_they_show(tmp_path):
+    volts = rng.integers(0, 2500, (3, 50, 1, 10, 10)) * (3.3 / 4095)
+    for file in (archive(tmp_path / "a.npz", frames=volts), write(tmp_path / "b.csv", volts[0].reshape(50, -1))):
+        loaded = load(file, layout="10x10")
+        assert loaded.recordings.layout.shape == (1, 10, 10)
+        assert loaded.recordings.layout.full_scale == pytest.approx(3.3, rel=0.002)
+        assert any("converter step 0.000806, 12 bits, largest reading 2.01" in text for text in loaded.inferred)
+    rounded = load(archive(tmp_path / "c.npz", frames=np.round(rng.uniform(0, 2.04, (3, 50, 10, 10)), 3)))
+    assert rounded.recordings.layout.full_scale == 2.1  # thousandths are how the numbers were written
+
+
+def test_what_is_stated_is_not_inferred(tmp_path):
+    file = archive(tmp_path / "a.npz", frames=rng.uniform(0, 2, (2, 5, 10, 10)))
+    assert [text.split()[0] for text in load(file).inferred] == ["shape", str(file) + ":", "full", "rate"]
+    stated = load(file, layout="1x10x10", full_scale=3.3, unit="V", rate=50)
+    assert stated.inferred == ()
+    assert stated.recordings.layout == SensorLayout(1, 10, 10, full_scale=3.3, unit="V", rate=50)
+    with pytest.raises(InputError, match="no reading is above 0, so nothing shows the range; give the full scale"):
+        load(archive(tmp_path / "b.npz", frames=np.zeros((2, 5, 10, 10))))
+
+
+def test_four_axes_are_recordings_of_one_pad_unless_the_shape_has_several(tmp_path):
+    values = counts(4, 6, (2, 3))
+    for file in (archive(tmp_path / "a.npz", frames=values), tmp_path / "a.npy"):
+        np.save(tmp_path / "a.npy", values)
+        for layout in (None, "2x3", "1x2x3", (1, 2, 3)):
+            recordings = load(file, layout=layout).recordings
+            assert (recordings.layout.shape, len(recordings)) == ((1, 2, 3), 4)
+            np.testing.assert_array_equal(recordings.frames[1], values[1].reshape(6, 6))
+        (one,) = load(file, layout="6x2x3").recordings
+        np.testing.assert_array_equal(one, values.reshape(4, 36))
+    masked = archive(tmp_path / "b.npz", frames=values, present=np.ones((6, 2, 3), bool))
+    assert load(masked).recordings.layout.shape == (6, 2, 3)
+
+
+def test_an_archive_without_its_json_names_what_it_lost(tmp_path):
+    file = archive(tmp_path / "renamed.npz", frames=counts(), labels=[0, 1, 1])
+    (lost,) = [text for text in load(file).inferred if "renamed.json" in text]
+    assert "no renamed.json beside it" in lost
+    assert "class names (the numbers of the labels are used), full scale, rate" in lost
+    write(tmp_path / "renamed.json", json.dumps({"class_names": ["x", "y"], "rate": 20, "full_scale": 1023}))
+    assert load(file).inferred == ()
 
 
 def test_readings_that_look_scaled_already_are_questioned(tmp_path):

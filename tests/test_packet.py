@@ -38,7 +38,7 @@ def test_line_ends_and_a_last_comma_do_no_harm(end: bytes):
     [
         (b"", "0 values"),
         (b"esp32", "0 values"),
-        (b"esp32,1", "0 values behind device and time stamp, expected 3"),
+        (b"esp32,1", "0 values after device and time stamp, expected 3"),
         (b"esp32,1,2,3", "2 values"),
         (b"esp32,1,2,3,4,5", "4 values"),
         (b"esp32,1,2,3,4,,", "5 values"),

@@ -45,6 +45,16 @@ def test_cells_in_another_order_and_noise_contradict_each_other(later_grasps, st
     assert contradiction(noise, NONE, statistics, small_grasps.layout) > 1
 
 
+def test_idle_and_static_recordings_contradict_nothing(later_grasps, statistics, small_grasps, rng):
+    idle = [np.abs(rng.normal(0, 0.003, r.shape)) for r in later_grasps]
+    static = [r[30] + rng.normal(0, 0.003, r.shape) for r in later_grasps]
+    for log in (idle, static):
+        assert contradiction(log, NONE, statistics, small_grasps.layout) == 0
+    order = rng.permutation(60)
+    mixed = [r[:, order] for r in later_grasps] + 10 * idle
+    assert contradiction(mixed, NONE, statistics, small_grasps.layout) > 1
+
+
 def test_faulty_cells_do_not_count(later_grasps, statistics, small_grasps, rng):
     broken = [r.copy() for r in later_grasps]
     for r in broken:

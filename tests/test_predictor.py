@@ -279,8 +279,35 @@ def test_a_start_without_any_whole_version_is_refused(carried):
 
 def test_a_version_for_another_array_is_not_taken(carried):
     carried.layout = type(SMALL)(3, 3, 2)
-    with pytest.raises(ValueError, match="the robot has 3 x 3 x 2 cells"):
+    with pytest.raises(ValueError, match="the bundle for 3 x 3 x 2 cells"):
         running(carried)
+
+
+def test_readings_outside_the_range_never_make_the_probabilities_nan(carried):
+    predictor = running(carried)
+    log = presses(60, 30)
+    clean = [predictor.stream(frame).probabilities for frame in log]
+    predictor.reset()
+    for i, value in enumerate((1e30, np.inf, -np.inf, 1e308, -1e30, np.nan)):
+        log[10 + i, i % D] = value
+    found = [predictor.stream(frame).probabilities for frame in log]
+    assert all(p is None or np.isfinite(p).all() for p in found)
+    np.testing.assert_array_equal(found[-1], clean[-1])
+    assert predictor.outside == 5
+    x = small_windows(3)
+    x[0, 2, 1] = x[1, 0, 0] = np.float32(np.inf)
+    x[2, 1, 3] = 1e30
+    assert np.isfinite(predictor.predict_proba(x)).all()
+
+
+def test_a_version_on_probation_runs_on_a_disk_that_cannot_be_written(carried, caplog):
+    def full():
+        raise OSError(28, "No space left on device")
+
+    carried.confirm = full
+    predictor = running(carried, 2)
+    assert not predictor.confirm()
+    assert "stays on probation" in caplog.text
 
 
 def test_only_the_running_version_is_confirmed(carried):

@@ -71,7 +71,7 @@ def test_a_day_of_a_robots_life(bundle, later_grasps, broken_row, tmp_path, caps
     assert " deployed: " in out.splitlines()[0], out
     assert "pad 1, row 2 is short" in (tmp_path / "skin.html").read_text()
     assert bundle.active().fault_set == set(broken_row.cells)
-    assert here("maintain", path, tmp_path / "morning", "--quiet")[1].count("not seen before") == 1
+    assert here("maintain", path, tmp_path / "morning", "--quiet")[1].count("used before") == 1
 
     # The new version runs, without torch, and once it has proved to work its probation is over.
     noon = broken(later_grasps[14:], broken_row)

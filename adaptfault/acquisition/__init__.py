@@ -1,4 +1,4 @@
-"""Acquisition: frames as they come from the sensor, put in order and recorded."""
+"""Acquisition: receives frames from sensors, orders and records them."""
 
 from adaptfault.acquisition.ordering import Arrivals, Frame, Ordering
 from adaptfault.acquisition.packet import Packet, PacketError, format_packet, parse_packet

@@ -1,4 +1,4 @@
-"""Puts the packets of one device in order: late, doubled, lost and stray ones, and a device that started anew."""
+"""Ordering of one device's packets: late, duplicate, lost and stray packets, and restarts of the device."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from numpy.typing import NDArray
 from adaptfault.acquisition.packet import Packet
 
 WINDOW = 3
-"""So many packets are held back at most while one before them is missing."""
+"""Most packets that are held back while an earlier one is missing."""
 
-_LATE = 1.0  # seconds by which a packet may come behind its successors; one that is older began a new count
-_FAR = 10.0  # seconds; a time stamp that leaps further has to be confirmed by the next one
-_PATIENCE = 0.25  # seconds; a packet is held so long at least: the network has its own hiccups
-_REMEMBERED = 64  # time stamps that are known again as doubles
+_LATE = 1.0  # seconds by which a packet may be older than the last frame; an older time stamp is a restart
+_FAR = 10.0  # seconds; a larger jump of the time stamp needs a second packet that agrees
+_PATIENCE = 0.25  # seconds for which a packet is held at least, because networks delay packets
+_REMEMBERED = 64  # time stamps in which duplicates are recognised
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame in its place.
+    """A frame in the order of time stamps.
 
     Attributes:
-        device: who sent it.
-        time: seconds; rises from frame to frame, also where the device started anew.
+        device: name of the sender.
+        time: seconds; increases from frame to frame, also across a restart of the device.
         values: float64 ``[D]``, NaN = missing reading.
-        lost: how many frames before it never came.
-        restarted: the device's clock started anew with it.
+        lost: number of frames missing before this one.
+        restarted: the device's clock restarted with this frame.
     """
 
     device: str
@@ -41,17 +41,19 @@ class Frame:
 
 @dataclass(frozen=True)
 class Arrivals:
-    """What became of one device's packets: ``received`` = all the others but ``lost``, ``restarts``, + ``held``.
+    """Counts of one device's packets.
+
+    ``received`` = ``kept`` + ``duplicates`` + ``late`` + ``strays`` + ``held``.
 
     Attributes:
-        received: packets that could be read.
-        kept: given on as frames.
-        duplicates: came twice.
-        late: came when later ones had been given on already.
+        received: valid packets.
+        kept: passed on as frames.
+        duplicates: repeated time stamps.
+        late: older than a frame that was passed on.
         strays: time stamps far from all others.
-        held: wait for one before them.
-        lost: frames that never came, as the time stamps tell.
-        restarts: the device's clock began anew.
+        held: waiting for an earlier packet.
+        lost: frames missing according to the time stamps.
+        restarts: restarts of the device's clock.
     """
 
     received: int = 0
@@ -72,23 +74,23 @@ class _Waiting:
 
 
 class Ordering:
-    """The packets of one device in the order of their time stamps, in constant memory.
+    """Orders the packets of one device by time stamp, in constant memory.
 
-    A packet that follows the last one is given on at once. One that leaves a gap is held back until the gap is filled,
-    or ``window`` packets are held, or as long as they take. A time stamp that leaps is taken seriously once a second
-    one agrees with it: back, the device has started anew; forth, it was silent.
+    A packet that follows the last frame is passed on at once. A packet after a gap is held back until the gap is
+    filled, ``window`` packets are held, or the time of so many packets has passed. A jump of the time stamp needs a
+    second packet that agrees: backwards the device restarted, forwards it was silent.
 
     Args:
-        device: its name.
+        device: name of the device.
         rate: packets per second.
         window: most packets held back.
     """
 
     def __init__(self, device: str, rate: float, *, window: int = WINDOW) -> None:
         self.device, self.rate, self.window = device, rate, window
-        self._last: float | None = None  # time stamp of the last frame given on
-        self._arrived = 0.0  # when that one came, by the receiver's clock
-        self._offset = 0.0  # from the device's clock to one that never jumps back
+        self._last: float | None = None  # time stamp of the last frame passed on
+        self._arrived = 0.0  # its arrival by the receiver's clock
+        self._offset = 0.0  # from the device's clock to a clock that never goes back
         self._held: list[_Waiting] = []
         self._stray: _Waiting | None = None
         self._seen: deque[float] = deque(maxlen=_REMEMBERED)
@@ -96,25 +98,25 @@ class Ordering:
 
     @property
     def arrivals(self) -> Arrivals:
-        """What became of the packets so far."""
+        """Counts so far."""
         held = len(self._held) + (self._stray is not None)
         return Arrivals(
             self._received, self._kept, self._duplicates, self._late, self._strays, held, self._lost, self._restarts
         )
 
     def push(self, packet: Packet, now: float) -> list[Frame]:
-        """Take in a packet that arrived at ``now`` (seconds); return the frames that are next."""
+        """Add a packet that arrived at ``now`` (seconds); return the frames that are ready."""
         self._received += 1
         return self._place(_Waiting(packet.time, packet, now))
 
     def overdue(self, now: float) -> list[Frame]:
-        """Return the frames that have waited long enough at ``now``, seconds of the receiver's clock."""
+        """Return the frames whose waiting time is over at ``now``, seconds of the receiver's clock."""
         if self._held and now - min(one.arrived for one in self._held) > max(_PATIENCE, (self.window + 1) / self.rate):
             return self._release_held()
         return []
 
     def flush(self) -> list[Frame]:
-        """Return the frames that still wait: no more will come."""
+        """Return all held frames; call at the end."""
         if self._stray is not None:
             self._stray = None
             self._strays += 1
@@ -129,7 +131,7 @@ class Ordering:
             return []
         step = one.time - self._last
         if not -_LATE <= step <= _FAR:
-            return self._leap(one)
+            return self._handle_jump(one)
         if step <= 0:
             self._late += 1
             return []
@@ -140,8 +142,8 @@ class Ordering:
             frames += self._release_following()
         return frames
 
-    def _leap(self, one: _Waiting) -> list[Frame]:
-        """Deal with a time stamp far from the last: wait for a second one that agrees."""
+    def _handle_jump(self, one: _Waiting) -> list[Frame]:
+        """Handle a time stamp far from the last: wait for a second packet that agrees."""
         other, self._stray = self._stray, one
         if other is None:
             return []
@@ -151,7 +153,7 @@ class Ordering:
         self._stray = None
         frames = self._release_held()
         first, second = sorted((other, one))
-        frames.append(self._release(first, anew=first.time < (self._last or 0.0)))
+        frames.append(self._release(first, restarted=first.time < (self._last or 0.0)))
         return frames + self._place(second)
 
     def _release_following(self) -> list[Frame]:
@@ -165,15 +167,15 @@ class Ordering:
         return [self._release(one) for one in held]
 
     def _missing(self, time: float) -> int:
-        """Return how many frames there should be between the last one and this time."""
+        """Return the number of frames missing between the last one and this time."""
         return 0 if self._last is None else max(0, round((time - self._last) * self.rate) - 1)
 
-    def _release(self, one: _Waiting, *, anew: bool = False) -> Frame:
+    def _release(self, one: _Waiting, *, restarted: bool = False) -> Frame:
         lost = 0
-        if anew and self._last is not None:
+        if restarted and self._last is not None:
             self._restarts += 1
             self._seen.clear()
-            # How long it was away only the receiver's clock can tell.
+            # Only the receiver's clock measures the duration of the restart.
             away = max(one.arrived - self._arrived, 1 / self.rate)
             self._offset += self._last + away - one.time
         else:
@@ -182,4 +184,4 @@ class Ordering:
         self._seen.append(one.time)
         self._lost += lost
         self._kept += 1
-        return Frame(self.device, one.time + self._offset, one.packet.values, lost, anew)
+        return Frame(self.device, one.time + self._offset, one.packet.values, lost, restarted)

@@ -1,4 +1,4 @@
-"""The paper's UDP packets, ``device_id,timestamp,220 values`` as CSV text (Section II): read and written."""
+"""The paper's UDP packets, ``device_id,timestamp,220 values`` as CSV text (Section II): parsing and formatting."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TICKS = 1000.0
 """Time stamps count milliseconds, as the ESP32's ``millis()`` does."""
 
 DEVICE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:-]{0,63}")
-"""What a device may be called: the name becomes part of file names, so nothing that leads out of a folder."""
+"""Valid device names; a name becomes part of file names, so path separators are excluded."""
 
 _LARGEST = float(np.finfo(np.float32).max)
 _LATEST = 1e19  # ticks; nanoseconds since 1970 fit
@@ -21,7 +21,7 @@ _VALUE_BYTES = 32  # a double written in full, and its comma
 
 
 class PacketError(ValueError):
-    """A datagram that is no packet of this array. One line: what came, what was expected."""
+    """A datagram that is not a packet of this array. One line: what came, what was expected."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +29,9 @@ class Packet:
     """One scan of the array.
 
     Attributes:
-        device: the sender's name.
-        time: when it was taken, in seconds of the sender's clock.
-        values: float64 ``[D]``, in the unit that the sender uses; NaN = missing reading.
+        device: name of the sender.
+        time: seconds of the sender's clock.
+        values: float64 ``[D]`` in the sender's unit; NaN = missing reading.
     """
 
     device: str
@@ -40,20 +40,20 @@ class Packet:
 
 
 def longest_packet(n_cells: int) -> int:
-    """Return how many bytes a packet of so many cells can have."""
+    """Return the largest size of a packet of ``n_cells`` values, in bytes."""
     return 128 + _VALUE_BYTES * n_cells
 
 
 def parse_packet(data: bytes, n_cells: int, *, ticks: float = TICKS) -> Packet:
-    """Read a packet. An empty value and ``nan`` are missing readings; a line end or a last comma does no harm.
+    """Parse a packet. An empty value and ``nan`` are missing readings; a line end or a trailing comma is ignored.
 
     Args:
         data: the datagram.
-        n_cells: D, how many values there must be.
-        ticks: time stamps count so many in a second.
+        n_cells: D, number of values.
+        ticks: ticks of the time stamp in a second.
 
     Raises:
-        PacketError: anything else.
+        PacketError: the datagram is not such a packet.
     """
     if len(data) > longest_packet(n_cells):
         raise PacketError(f"{len(data)} bytes; {n_cells} values take {longest_packet(n_cells)} at most")
@@ -65,7 +65,7 @@ def parse_packet(data: bytes, n_cells: int, *, ticks: float = TICKS) -> Packet:
     if len(values) == n_cells + 1 and not values[-1]:
         values.pop()
     if len(values) != n_cells:
-        raise PacketError(f"{len(values)} values behind device and time stamp, expected {n_cells}")
+        raise PacketError(f"{len(values)} values after device and time stamp, expected {n_cells}")
     if DEVICE.fullmatch(device) is None:
         raise PacketError(f"device {device[:20]!r}; expected letters, digits and . _ : - (64 at most)")
     time = _number(stamp)
@@ -81,7 +81,7 @@ def format_packet(device: str, time: float, values: ArrayLike, *, ticks: float =
     """Write the packet that :func:`parse_packet` reads; values keep 6 digits, the time stamp is a whole number.
 
     Raises:
-        ValueError: the device's name could not be read back.
+        ValueError: :func:`parse_packet` would reject the device name.
     """
     if DEVICE.fullmatch(device) is None:
         raise ValueError(f"device {device!r}; expected letters, digits and . _ : - (64 at most)")
@@ -91,7 +91,7 @@ def format_packet(device: str, time: float, values: ArrayLike, *, ticks: float =
 
 
 def _number(text: str) -> float:
-    """Return the number; PacketError where Python's float is more generous than a sender can mean ("1_000")."""
+    """Return the number; raise PacketError also for forms that only Python's float accepts ("1_000")."""
     try:
         number = float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Receives the packets of several devices over UDP, whatever else comes with them, in bounded memory."""
+"""Receives the packets of several devices over UDP in bounded memory."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from diagnostics import SensorLayout
 
 MOST_DEVICES = 16
 QUEUE = 1024
-_KERNEL_BUFFER = 4 << 20  # bytes asked for: what arrives while this process has no turn; the system may give less
-_TURNS = 8  # of the event loop for each frame fetched; each reads one datagram: the queue counts what it drops
-_TICK = 0.05  # seconds between looks at packets that wait
+_KERNEL_BUFFER = 4 << 20  # bytes requested, for datagrams that arrive while this process does not run
+_TURNS = 8  # of the event loop for each frame fetched; each turn reads one datagram
+_TICK = 0.05  # seconds between checks for held packets
 
 
 @dataclass(frozen=True)
 class Counters:
-    """What became of every datagram.
+    """Counts of all datagrams.
 
     ``received`` is the sum of ``kept``, ``malformed``, ``oversized``, ``refused``, ``duplicates``, ``late``, ``strays``
     and ``held``.
@@ -31,10 +31,10 @@ class Counters:
     Attributes:
         received: datagrams.
         kept: frames, in order.
-        dropped: frames of these that nobody fetched in time.
-        malformed, oversized: no packets of this array.
-        refused: of devices that are not wanted or too many.
-        devices: how many sent packets.
+        dropped: kept frames that were not fetched in time.
+        malformed, oversized: not packets of this array.
+        refused: from devices that are not listed, or beyond the limit of devices.
+        devices: number of devices.
         duplicates, late, strays, held, lost, restarts: as in :class:`Arrivals`, all devices together.
     """
 
@@ -65,18 +65,18 @@ class Counters:
 class Receiver(asyncio.DatagramProtocol):
     """Frames of one kind of array from the network: ``async with Receiver(layout, port) as r: async for frame in r:``.
 
-    Nothing a datagram holds can stop it or make it grow: datagrams that are no packets are counted and forgotten,
-    devices and frames that wait are limited. When the queue is full, the oldest frame goes: a loop wants the newest.
+    No content of a datagram stops the receiver or grows its memory: invalid datagrams are counted and discarded; the
+    numbers of devices and of waiting frames are limited. A full queue discards its oldest frame.
 
     Args:
-        layout: the array; its rate tells which packets are missing.
-        port: where to listen, 0 for any that is free.
-        host: address to listen on; the default hears this machine only, "0.0.0.0" all of the network.
-        ticks: time stamps count so many in a second.
-        devices: names of those to listen to; None: any.
-        most_devices: so many at most; packets of others are refused.
+        layout: the array; its rate determines which packets are missing.
+        port: to listen on; 0 chooses a free one.
+        host: address to listen on; the default receives from this machine only, "0.0.0.0" from the whole network.
+        ticks: ticks of the time stamps in a second.
+        devices: names of the accepted devices; None: any.
+        most_devices: limit of devices; packets of further ones are refused.
         queue: frames that may wait to be fetched.
-        window: packets of a device held back for one that is late.
+        window: packets of a device held back for a late one.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Receiver(asyncio.DatagramProtocol):
 
     @property
     def counters(self) -> Counters:
-        """What became of every datagram so far."""
+        """Counts of all datagrams so far."""
         each = [stream.arrivals for stream in self._streams.values()]
         total = {f.name: sum(getattr(one, f.name) for one in each) for f in fields(Arrivals) if f.name != "received"}
         return Counters(
@@ -119,11 +119,11 @@ class Receiver(asyncio.DatagramProtocol):
 
     @property
     def arrivals(self) -> dict[str, Arrivals]:
-        """What became of the packets of each device."""
+        """Counts of the packets of each device."""
         return {name: stream.arrivals for name, stream in self._streams.items()}
 
     def take(self, data: bytes, now: float) -> None:
-        """Deal with one datagram that came at ``now``, in seconds of a clock that never jumps."""
+        """Process one datagram that arrived at ``now``, seconds of a monotonic clock."""
         self._received += 1
         if len(data) > self._longest:
             self._oversized += 1
@@ -143,12 +143,12 @@ class Receiver(asyncio.DatagramProtocol):
         self._put(stream.push(packet, now))
 
     def poll(self, now: float) -> None:
-        """Let go of packets that have waited long enough for one before them."""
+        """Release packets whose waiting time for an earlier one is over."""
         for stream in self._streams.values():
             self._put(stream.overdue(now))
 
     def close(self) -> None:
-        """Stop listening. Frames that are here already can still be fetched; then the iteration ends."""
+        """Stop listening. Received frames can still be fetched; then the iteration ends."""
         if self._closed:
             return
         self._closed = True
@@ -186,7 +186,7 @@ class Receiver(asyncio.DatagramProtocol):
         return self
 
     async def __anext__(self) -> Frame:
-        for _ in range(_TURNS):  # for the socket, however many frames wait here
+        for _ in range(_TURNS):  # lets the loop read the socket, however many frames wait
             await asyncio.sleep(0)
         while not self._queue:
             if self._closed:
@@ -200,7 +200,7 @@ class Receiver(asyncio.DatagramProtocol):
         self.take(data, time.monotonic())
 
     def error_received(self, exc: Exception) -> None:
-        """Called by asyncio: some host could not be reached, which is no concern of a listener."""
+        """Called by asyncio for ICMP errors, which do not affect a receiver."""
 
     async def _tick(self) -> None:
         while True:

@@ -1,4 +1,4 @@
-"""Records frames so that a power cut costs the last moment at most."""
+"""Records frames as CSV files; a power cut loses at most the last second."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from adaptfault.data.recordings.layout_file import read_layout
 from diagnostics import SensorLayout
 
 INTERVAL = 1.0
-"""Seconds after which what was recorded is on the disk: the most that a power cut can cost."""
+"""Seconds between two syncs to the disk: the most that a power cut loses."""
 
 LONGEST = 3600.0
-"""Seconds after which a recording goes on in a new file."""
+"""Seconds after which a recording continues in a new file."""
 
 _GAP = 1.0  # seconds; lost frames up to that are written as missing readings, a longer pause begins a new recording
 
@@ -44,20 +44,20 @@ class Recorded:
 class Recorder:
     """Writes the frames of one device as CSV recordings into a folder, which :func:`adaptfault.load` reads.
 
-    One frame a line, one cell a column, no header; lost frames become lines of missing readings. Each line is handed to
-    the system at once, and to the disk every ``interval`` seconds, by a thread: the caller never waits for a disk.
-    A file that was cut off in its last line is read up to there. The folder also gets the layout, as ``layout.json``.
+    One frame per line, one cell per column, no header; lost frames become lines of missing readings. Each line is
+    written at once and synced every ``interval`` seconds by a thread, so the caller does not wait for the disk.
+    :func:`adaptfault.load` reads a truncated file up to its last complete line. ``layout.json`` holds the layout.
 
     Args:
-        folder: made if it is not there.
+        folder: created where missing.
         layout: the array.
-        device: begins the files' names.
+        device: prefix of the file names.
         longest: seconds after which a new file begins.
-        interval: seconds between two writes to the disk.
+        interval: seconds between two syncs.
 
     Raises:
         ValueError: the folder holds recordings of another layout.
-        OSError: the folder cannot be made or written to.
+        OSError: the folder cannot be created or written.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Recorder:
         self.folder, self.layout, self.device = Path(folder), layout, device
         self.longest, self.interval = longest, interval
         self.folder.mkdir(parents=True, exist_ok=True)
-        _keep_layout(self.folder / "layout.json", layout)
+        _write_layout(self.folder / "layout.json", layout)
         self._file: TextIO | None = None
         self._path = self.folder
         self._first = self._last = 0.0
@@ -87,14 +87,14 @@ class Recorder:
         return None if self._file is None else self._path
 
     def write(self, values: ArrayLike, at: float) -> Recorded | None:
-        """Append a frame ``[D]`` taken at ``at`` (seconds, rising); begins a file where none is open.
+        """Append a frame ``[D]`` taken at ``at`` (seconds, increasing); open a file where none is open.
 
         Returns:
-            The recording that ended before it: there was a pause, or the file was long enough.
+            The recording that ended before this frame, because of a pause or its length; None otherwise.
 
         Raises:
-            ValueError: a frame of another size.
-            OSError: the disk is full or gone; what was written is closed.
+            ValueError: the frame has another size.
+            OSError: the disk is full or missing; the file is closed.
         """
         frame = np.asarray(values, dtype=np.float64).ravel()
         if frame.size != self.layout.n_cells:
@@ -118,7 +118,7 @@ class Recorder:
         return ended
 
     def close(self) -> Recorded | None:
-        """End the recording: it is on the disk when this returns. None where nothing is being recorded."""
+        """End the recording and sync it to the disk. None where nothing is being recorded."""
         file, self._file = self._file, None
         if file is None:
             return None
@@ -141,7 +141,7 @@ class Recorder:
     def _open(self, at: float) -> TextIO:
         began = datetime.now(timezone.utc)
         number = 0
-        while True:  # a clock that was set back must not lead to a file that is there
+        while True:  # after the clock is set back a name may exist already
             number += 1
             name = f"{self.device.replace(':', '-')}_{began:%Y%m%dT%H%M%S}_{number}.csv"
             try:
@@ -163,7 +163,7 @@ class Recorder:
             self._syncing = self._disk.submit(os.fsync, file.fileno())
 
     def _settle(self) -> None:
-        """Wait for the disk, whose errors are raised here."""
+        """Wait for the running sync and raise its error."""
         waiting, self._syncing = self._syncing, None
         if waiting is not None:
             waiting.result()
@@ -171,7 +171,7 @@ class Recorder:
     def _abandon(self) -> None:
         file, self._file = self._file, None
         if file is not None:
-            with contextlib.suppress(OSError):  # it tries to write the rest once more
+            with contextlib.suppress(OSError):  # close repeats the failed write
                 file.close()
 
 
@@ -179,7 +179,7 @@ def _line(frame: NDArray[np.float64]) -> str:
     return ",".join([f"{value:.9g}" for value in frame.tolist()]) + "\n"
 
 
-def _keep_layout(path: Path, layout: SensorLayout) -> None:
+def _write_layout(path: Path, layout: SensorLayout) -> None:
     if path.exists():
         if (there := read_layout(path)) != layout:
             raise ValueError(f"{path.parent} holds recordings of {there}, not of {layout}; record into another folder")
@@ -188,7 +188,7 @@ def _keep_layout(path: Path, layout: SensorLayout) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Put the name of a new file on the disk."""
+    """Sync the directory entry of a new file."""
     if os.name != "posix":
         return
     descriptor = os.open(folder, os.O_RDONLY)

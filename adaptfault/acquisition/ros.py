@@ -1,7 +1,7 @@
-"""A diagnosis as ROS sees it: the content of ``diagnostic_msgs/DiagnosticArray`` as plain dicts, and into a bag.
+"""Converts a diagnosis into ``diagnostic_msgs/DiagnosticArray``, as plain dicts, and writes it into a bag.
 
-No ROS is needed. Publish the dicts with rclpy (``examples/ros2_node.py``) once a second: what is not repeated for some
-seconds counts as stale.
+Needs no ROS. Publish the dicts with rclpy (``examples/ros2_node.py``) once a second; ROS marks a status as stale when
+it is not repeated for some seconds.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from diagnostics import Diagnosis, Fault, Line, SensorLayout
 
 TOPIC = "/diagnostics"
 
-_SHARE = 0.1  # of a pad's cells; when so many are faulty, it is an error even if no wire was found, as for exit codes
-_LISTED = 20  # cells named in one value; the rest is counted
+_SHARE = 0.1  # share of faulty cells of a pad that is an ERROR even without a faulty wire, as for exit codes
+_LISTED = 20  # most cells named in one value
 _GROUPS = {
     "rows": ("row",),
     "columns": ("column",),
@@ -42,15 +42,15 @@ def diagnostic_array(
 ) -> dict[str, Any]:
     """Return a DiagnosticArray: one status for each pad, each group of its wires, and the stream of frames.
 
-    The names are those of the layout, whatever the diagnosis: "tactile: pad 0", "tactile: pad 0 rows" (``columns``,
-    ``addresses``, ``converter``), ..., "tactile: stream". A pad with single faulty cells is a WARN; with a tenth of its
-    cells or a wire an ERROR, as is the wire's group. Lost or frozen frames are a WARN of the stream. Cells that nothing
-    tested are counted in the values, and no reason for alarm.
+    The names depend on the layout only: "tactile: pad 0", "tactile: pad 0 rows" (``columns``, ``addresses``,
+    ``converter``), ..., "tactile: stream". Single faulty cells of a pad are a WARN; a tenth of its cells, or a wire, is
+    an ERROR, also of the wire's group. Lost or frozen frames are a WARN of the stream. Untested cells are counted in
+    the values and do not change the level.
 
     Args:
-        diagnosis: what to tell.
+        diagnosis: to convert.
         stamp: seconds since 1970.
-        name: begins all names.
+        name: prefix of all names.
         hardware_id: of the sensor.
     """
     layout = diagnosis.layout
@@ -73,7 +73,7 @@ def stale_array(
     name: str = "tactile",
     hardware_id: str = "tactile",
 ) -> dict[str, Any]:
-    """Return the same statuses, all STALE with this message: for a sensor that no frame comes from."""
+    """Return the same statuses, all STALE with this message, for a sensor that sends no frames."""
     names = [one for pad in range(layout.pads) for one in (f"pad {pad}", *(f"pad {pad} {group}" for group in _GROUPS))]
     statuses = [_status(one, Level.STALE, message, {}) for one in (*names, "stream")]
     return _array(statuses, stamp, name, hardware_id)
@@ -83,7 +83,7 @@ def write_diagnostics(path: str | os.PathLike[str], arrays: Iterable[Mapping[str
     """Write DiagnosticArrays into a new bag (MCAP, metadata version 8, which ROS 2 Humble reads), at their stamps.
 
     Raises:
-        ValueError: rosbags is not installed, or something is there already.
+        ValueError: rosbags is not installed, or the path exists.
         OSError: the bag cannot be written.
     """
     try:
@@ -139,7 +139,7 @@ def _stream(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _places(layout: SensorLayout, cells: list[int]) -> str:
-    """Return the cells as "row.column", so many that a line can hold them."""
+    """Return at most 20 cells as "row.column", and the number of the others."""
     places = ["{1}.{2}".format(*layout.position(cell)) for cell in cells[:_LISTED]]
     more = [f"and {len(cells) - _LISTED} more"] if len(cells) > _LISTED else []
     return " ".join([*places, *more])

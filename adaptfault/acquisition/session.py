@@ -1,4 +1,4 @@
-"""What is done with the frames of one device: watched, classified, recorded, and told as events."""
+"""Processes the frames of one device: monitoring, classification, recording, events."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from adaptfault.acquisition.switch import Contact, Rule, Switch
 from diagnostics import Fault, FaultSet, Monitor, SensorLayout
 
 CONFIRMED_AFTER = 100
-"""Windows classified, after which a predictor that is on probation is confirmed."""
+"""Number of classified windows after which a version on probation is confirmed."""
 
 SILENCE = 2.0
-"""Seconds without a frame, after which a device is told to be silent and its recording is closed."""
+"""Seconds without a frame after which a device is reported silent and its recording is closed."""
 
-_BEFORE = 0.5  # seconds before a touch that are recorded with it
+_BEFORE = 0.5  # seconds recorded before a contact
 
 
-class Reading(Protocol):
-    """What a predictor says of a frame; ``label`` is None until a window is full."""
+class StreamResult(Protocol):
+    """Result of one frame, as :class:`adaptfault.Reading`; ``label`` is None until a window is full."""
 
     @property
     def label(self) -> Any: ...  # noqa: D102
@@ -38,26 +38,26 @@ class Reading(Protocol):
     def events(self) -> tuple[Fault, ...]: ...  # noqa: D102
 
 
-class Streaming(Protocol):
-    """A predictor, as far as it is used here: it also watches the cells."""
+class StreamingPredictor(Protocol):
+    """The methods of :class:`adaptfault.Predictor` that a session uses."""
 
     @property
     def layout(self) -> SensorLayout: ...  # noqa: D102
-    def stream(self, frame: NDArray[np.float64], time: float | None = None) -> Reading: ...  # noqa: D102
-    def confirm(self) -> object: ...  # noqa: D102
+    def stream(self, frame: NDArray[np.float64], time: float | None = None) -> StreamResult: ...  # noqa: D102
+    def confirm(self) -> bool | None: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something worth a line.
+    """An event of one device.
 
     Attributes:
         kind: "fault" (new or changed), "gone", "class", "recording", "recorded", "restart", "silent", "confirmed" or
             "trouble".
-        device: whose.
+        device: name of the device.
         time: seconds, as in :class:`Frame`.
-        text: one plain sentence.
-        data: the same for programs, JSON-safe.
+        text: one sentence.
+        data: the content as JSON-safe values.
     """
 
     kind: str
@@ -76,20 +76,20 @@ class Event:
 
 
 class Session:
-    """One device.
+    """Monitors, classifies and records one device.
 
     Args:
-        device: its name.
-        watcher: a predictor, or a monitor where there is none.
-        recorder: where its frames are recorded; None: nowhere.
-        rule: when, see :func:`parse_when`.
-        clock: gives the local time.
+        device: name of the device.
+        watcher: a predictor, or a monitor.
+        recorder: writes its frames; None: no recording.
+        rule: when to record, see :func:`parse_when`.
+        clock: returns the local time.
     """
 
     def __init__(
         self,
         device: str,
-        watcher: Streaming | Monitor,
+        watcher: StreamingPredictor | Monitor,
         *,
         recorder: Recorder | None = None,
         rule: Rule | None = None,
@@ -99,6 +99,7 @@ class Session:
         self.switch = None if rule is None else Switch(rule)
         self.label: Any = None
         self._classified = 0
+        self._confirmed = self._confirm_failed = False
         self._faulty: NDArray[np.bool_] | None = None
         self._time = 0.0
         self._arrived: float | None = None
@@ -106,16 +107,16 @@ class Session:
         self._before: deque[Frame] = deque(maxlen=before)
 
     def take(self, frame: Frame, now: float) -> list[Event]:
-        """Deal with a frame that arrived at ``now`` (seconds of the receiver's clock); return what there is to tell."""
+        """Process a frame that arrived at ``now`` (seconds of the receiver's clock); return its events."""
         self._time, self._arrived = frame.time, now
-        events = [self._event("restart", "the device started anew")] if frame.restarted else []
+        events = [self._event("restart", "the device restarted")] if frame.restarted else []
         if isinstance(self.watcher, Monitor):
             news = self.watcher.update(frame.values, frame.time)
         else:
             reading = self.watcher.stream(frame.values, frame.time)
             news = tuple(reading.events)
             events += self._classify(reading)
-        events += [self._told(fault) for fault in news]
+        events += [self._fault_event(fault) for fault in news]
         faulty = np.zeros(frame.values.size, bool) if self._faulty is None else self._faulty
         for fault in news:
             faulty[list(fault.cells)] = fault.probability != 0
@@ -123,20 +124,20 @@ class Session:
         return events + self._record(frame)
 
     def idle(self, now: float) -> list[Event]:
-        """Say that no frame has come until ``now``: a recording that waits in vain is closed."""
+        """Check for silence at ``now``; a silent device's recording is closed."""
         if self._arrived is None or now - self._arrived < SILENCE:
             return []
         self._arrived = None
         return [self._event("silent", f"no frame for {SILENCE:g} s"), *self.close()]
 
     def command(self, record: bool | None) -> list[Event]:
-        """Record from now on (True), do not (False), or go by the rule (None)."""
+        """Record from now on (True), do not record (False), or follow the rule (None)."""
         if self.switch is not None:
             self.switch.command = record
         return [] if record else self.close()
 
     def close(self) -> list[Event]:
-        """End the recording, if there is one."""
+        """End the recording, if one is open."""
         if self.recorder is None:
             return []
         try:
@@ -145,14 +146,13 @@ class Session:
             return [self._trouble(error)]
         return [] if recorded is None else [self._recorded(recorded)]
 
-    def _classify(self, reading: Reading) -> list[Event]:
+    def _classify(self, reading: StreamResult) -> list[Event]:
         if reading.label is None:
             return []
         events = []
         self._classified += 1
-        if self._classified == CONFIRMED_AFTER and not isinstance(self.watcher, Monitor):
-            self.watcher.confirm()
-            events.append(self._event("confirmed", f"{CONFIRMED_AFTER} windows classified"))
+        if self._classified % CONFIRMED_AFTER == 0 and not self._confirmed:
+            events += self._confirm()
         if reading.label == self.label:
             return events
         self.label = reading.label
@@ -161,6 +161,19 @@ class Session:
         names = getattr(self.watcher, "class_names", ())
         text = f"{names[label] if names else label} ({share:.0%})"
         return [*events, self._event("class", text, label=label, probability=share, dropped=len(reading.fault_set))]
+
+    def _confirm(self) -> list[Event]:
+        """Confirm the running version; a failure is reported once and repeated after as many windows."""
+        assert not isinstance(self.watcher, Monitor)
+        try:
+            self._confirmed = self.watcher.confirm() is not False
+            problem = "another version is active, or the bundle cannot be written"
+        except OSError as error:
+            problem = str(error)
+        if self._confirmed:
+            return [self._event("confirmed", f"{self._classified} windows classified")]
+        first, self._confirm_failed = not self._confirm_failed, True
+        return [self._event("trouble", f"the version is not confirmed: {problem}")] if first else []
 
     def _record(self, frame: Frame) -> list[Event]:
         recorder = self.recorder
@@ -175,7 +188,7 @@ class Session:
             try:
                 ended = recorder.write(one.values, one.time)
             except OSError as error:
-                self.switch.command = False  # until told otherwise: a full disk does not get emptier by trying
+                self.switch.command = False  # until the next command: retrying on a full disk is pointless
                 return [*events, self._trouble(error)]
             events += [] if ended is None else [self._recorded(ended)]
             if recorder.path != before:
@@ -183,7 +196,7 @@ class Session:
         self._before.clear()
         return events
 
-    def _told(self, fault: Fault) -> Event:
+    def _fault_event(self, fault: Fault) -> Event:
         return self._event("gone" if fault.probability == 0 else "fault", fault.reason, fault=fault.to_dict())
 
     def _recorded(self, recorded: Recorded) -> Event:

@@ -1,4 +1,4 @@
-"""A station: receives, and deals with every device's frames until it is told to end."""
+"""A station: receives and processes the frames of all devices until it is stopped."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ import threading
 import time
 from collections.abc import Callable, Collection
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.packet import TICKS
 from adaptfault.acquisition.receiver import Receiver
 from adaptfault.acquisition.recorder import Recorder
-from adaptfault.acquisition.session import Event, Session, Streaming
+from adaptfault.acquisition.session import Event, Session, StreamingPredictor
 from adaptfault.acquisition.switch import Rule, parse_when
+from adaptfault.robot.converter_range import within_range
 from diagnostics import Monitor, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
@@ -28,31 +30,31 @@ SCHEMA = "adaptfault.listen/1"
 
 _COMMANDS = {"record": True, "stop": False, "auto": None}
 _ANSWERS = {True: "recording from now on", False: "not recording", None: "recording as the rule says"}
-_LOOK = 0.5  # seconds between looks at devices that are silent
-_WAITING = 16_000_000  # bytes of frames that may wait: what comes in a burst is dealt with later
-_LINE = 1000  # bytes; a longer command is none
+_CHECK = 0.5  # seconds between checks for silent devices
+_WAITING = 16_000_000  # bytes of frames that may wait, for bursts
+_LINE = 1000  # bytes; longest command
 
 
 class Station:
-    """Listens to sensors: each device is watched, classified where there is a bundle, and recorded.
+    """Monitors, classifies (with a bundle) and records every device that sends.
 
-    Events go to stdout, a line each; the counters of all datagrams are the last line. It ends after ``seconds`` or
+    Events go to stdout, one line each; the counters of all datagrams are the last line. It ends after ``seconds`` or
     ``frames``, on SIGINT or SIGTERM, and on "quit" from stdin ("record", "stop" and "auto" switch the recording).
 
     Args:
         layout: the array; None: the bundle's.
         port, host, devices, ticks: as for :class:`Receiver`.
-        bundle: folder of a predictor; None: only watch.
-        record: folder for recordings; None: none.
+        bundle: folder of a bundle; None: monitor only.
+        record: folder for recordings; None: no recording.
         when: when to record, see :func:`parse_when`.
         seconds, frames: when to end; None: never.
-        calibration: turns the values that come into the layout's unit.
-        on_event: called with each event, from the loop, instead of a line on stdout.
-        as_json: one JSON object a line.
-        quiet: nothing on stderr.
+        calibration: converts received values into the layout's unit.
+        on_event: called with each event in the event loop, instead of printing it.
+        as_json: one JSON object per line.
+        quiet: no output on stderr.
 
     Raises:
-        ValueError: neither layout nor bundle, a rule that is none, tables that do not fit the layout.
+        ValueError: neither layout nor bundle, an unknown rule, or a calibration of another layout.
     """
 
     def __init__(
@@ -76,32 +78,33 @@ class Station:
         self.bundle, self.record, self.calibration = bundle, record, calibration
         self.seconds, self.frames, self.as_json, self.quiet = seconds, frames, as_json, quiet
         self.on_event = self._print if on_event is None else on_event
-        self._ready: list[Streaming | Monitor] = []
+        self._ready: list[StreamingPredictor | Monitor] = []
         if bundle is not None:
             predictor = self._predictor()
             layout = predictor.layout
             self._ready.append(predictor)
         if layout is None:
-            raise ValueError("which array? give a layout or a bundle")
+            raise ValueError("the array is unknown: give a layout or a bundle")
         if calibration is not None:
             calibration.check(layout)
         self.layout = layout
         self._rule: Rule | None = None if record is None else parse_when(when, layout)
         if record is not None:
-            with Recorder(record, layout):  # a folder that cannot be used is told now
+            with Recorder(record, layout):  # a folder that cannot be used raises now
                 pass
         if not self._ready:
-            self._ready.append(self._monitor())  # now, not when the first frame comes: it takes a second
+            self._ready.append(self._monitor())  # takes a second, so before the first frame
         queue = max(64, _WAITING // (8 * layout.n_cells))
         self.receiver = Receiver(layout, port, host=host, devices=devices, ticks=ticks, queue=queue)
         self._sessions: dict[str, Session] = {}
-        self._command: bool | None = None  # the last that came; holds for devices that come later
+        self._outside = 0  # readings outside the layout's range
+        self._command: bool | None = None  # the last command, also for devices that come later
 
     async def listen(self) -> None:
-        """Listen until told to end.
+        """Listen until stopped.
 
         Raises:
-            OSError: the port is taken, or the address not this machine's.
+            OSError: the port is taken, or the address does not belong to this machine.
         """
         loop = asyncio.get_running_loop()
         try:
@@ -112,15 +115,15 @@ class Station:
                         loop.add_signal_handler(number, receiver.close)
                 if self.seconds is not None:
                     loop.call_later(self.seconds, receiver.close)
-                _read_commands(loop, self._obey)
-                looking = asyncio.create_task(self._look())
+                _read_commands(loop, self._handle_command)
+                looking = asyncio.create_task(self._check_silence())
                 try:
                     await self._take_all()
                 finally:
                     looking.cancel()
         finally:
             for session in self._sessions.values():
-                self._tell(session.close())
+                self._emit(session.close())
         self._end()
 
     async def _take_all(self) -> None:
@@ -131,12 +134,12 @@ class Station:
             if self.frames is not None and taken >= self.frames:
                 return
 
-    async def _look(self) -> None:
+    async def _check_silence(self) -> None:
         while True:
-            await asyncio.sleep(_LOOK)
+            await asyncio.sleep(_CHECK)
             now = time.monotonic()
             for session in self._sessions.values():
-                self._tell(session.idle(now))
+                self._emit(session.idle(now))
 
     def _take(self, frame: Frame) -> None:
         session = self._sessions.get(frame.device)
@@ -144,8 +147,12 @@ class Station:
             session = self._sessions[frame.device] = self._begin(frame.device)
         if self.calibration is not None:
             newtons = self.calibration.apply(frame.values)[0].astype(float)
-            frame = Frame(frame.device, frame.time, newtons, frame.lost, frame.restarted)
-        self._tell(session.take(frame, time.monotonic()))
+            frame = replace(frame, values=newtons)
+        values, outside = within_range(frame.values, self.layout)
+        if outside:
+            self._outside += outside
+            frame = replace(frame, values=values)
+        self._emit(session.take(frame, time.monotonic()))
 
     def _begin(self, device: str) -> Session:
         watcher = self._ready.pop() if self._ready else self._monitor() if self.bundle is None else self._predictor()
@@ -157,8 +164,8 @@ class Station:
     def _monitor(self) -> Monitor:
         return Monitor(SelfDiagnosis(self.layout))
 
-    def _predictor(self) -> Streaming:
-        from adaptfault.robot.predictor import Predictor  # here: watching needs no model
+    def _predictor(self) -> StreamingPredictor:
+        from adaptfault.robot.predictor import Predictor  # imported here, because monitoring alone needs no model
 
         assert self.bundle is not None
         try:
@@ -166,21 +173,21 @@ class Station:
         except ImportError as error:
             raise ValueError(f"{self.bundle}: classifying needs {error.name}; install it, or give no bundle") from None
 
-    def _obey(self, line: str) -> None:
+    def _handle_command(self, line: str) -> None:
         word = line.strip().lower()
         if word == "quit":
             self.receiver.close()
         elif word in _COMMANDS and self.record is not None:
             self._command = _COMMANDS[word]
             for session in self._sessions.values():
-                self._tell(session.command(self._command))
+                self._emit(session.command(self._command))
             self._say(f"{word}: {_ANSWERS[self._command]}")
         elif word in _COMMANDS:
-            self._say(f"{word}: there is no folder to record into; start with --record FOLDER")
+            self._say(f"{word}: no folder to record into; start with --record FOLDER")
         elif word:
-            self._say(f"{word[:20]!r} is no command; expected {', '.join(_COMMANDS)} or quit")
+            self._say(f"{word[:20]!r} is not a command; expected {', '.join(_COMMANDS)} or quit")
 
-    def _tell(self, events: list[Event]) -> None:
+    def _emit(self, events: list[Event]) -> None:
         for event in events:
             self.on_event(event)
 
@@ -193,17 +200,23 @@ class Station:
 
     def _end(self) -> None:
         counters = self.receiver.counters
-        result = {"schema": SCHEMA, "layout": self.layout.to_dict(), "counters": counters.to_dict()}
-        print(json.dumps(result, allow_nan=False) if self.as_json else f"end: {counters}", flush=True)
+        result = {
+            "schema": SCHEMA,
+            "layout": self.layout.to_dict(),
+            "counters": counters.to_dict(),
+            "readings_outside_range": self._outside,
+        }
+        outside = f", {self._outside} readings outside the range" if self._outside else ""
+        print(json.dumps(result, allow_nan=False) if self.as_json else f"end: {counters}{outside}", flush=True)
 
 
-def _read_commands(loop: asyncio.AbstractEventLoop, obey: Callable[[str], None]) -> None:
-    """Hand each line of stdin to ``obey``, from a thread that may wait forever."""
+def _read_commands(loop: asyncio.AbstractEventLoop, handle: Callable[[str], None]) -> None:
+    """Pass each line of stdin to ``handle`` from a thread that may block forever."""
     try:
         descriptor = sys.stdin.fileno()
         if os.isatty(descriptor) and os.tcgetpgrp(descriptor) != os.getpgrp():
             return  # in the background, reading from the terminal would stop the process
-    except (AttributeError, OSError, ValueError):  # there is no stdin
+    except (AttributeError, OSError, ValueError):  # no stdin
         return
 
     def read() -> None:
@@ -214,6 +227,6 @@ def _read_commands(loop: asyncio.AbstractEventLoop, obey: Callable[[str], None])
                 *lines, rest = (rest + data).split(b"\n")
                 rest = rest[-_LINE:]
                 for line in lines:
-                    loop.call_soon_threadsafe(obey, line.decode("utf-8", "replace"))
+                    loop.call_soon_threadsafe(handle, line.decode("utf-8", "replace"))
 
     threading.Thread(target=read, name="commands", daemon=True).start()

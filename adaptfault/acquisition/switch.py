@@ -1,4 +1,4 @@
-"""When to record: always, on command, at certain hours, or while something is touched."""
+"""Recording rules: always, on command, at certain hours, or during contact."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from numpy.typing import NDArray
 from diagnostics import SensorLayout
 
 Rule = Callable[[NDArray[np.float64], NDArray[np.bool_], datetime], bool]
-"""Says of a frame ``[D]``, the cells not to be trusted (bool ``[D]``) and the local time whether to record it."""
+"""Returns whether to record a frame ``[D]``, given the faulty cells (bool ``[D]``) and the local time."""
 
-_SHARE = 0.05  # of full scale, from which on a cell counts as touched
-_CELLS = 3  # so many at once: a single one may be noise, or broken
-_AFTER = 1.0  # seconds for which a recording goes on after the last touch
+_SHARE = 0.05  # of full scale: threshold above which a cell is loaded
+_CELLS = 3  # loaded cells that make a contact; a single one may be noise or a fault
+_AFTER = 1.0  # seconds for which a recording continues after the last contact
 _HOURS = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)-([01]?\d|2[0-3]):([0-5]\d)", re.ASCII)
 
 
 @dataclass(frozen=True)
 class Contact:
-    """While at least ``cells`` cells that are not known to be faulty read more than ``threshold``."""
+    """Record while at least ``cells`` cells without a known fault read more than ``threshold``."""
 
     threshold: float
     cells: int = _CELLS
 
     def __call__(self, values: NDArray[np.float64], faulty: NDArray[np.bool_], clock: datetime) -> bool:
-        """Judge one frame."""
+        """Return whether to record this frame."""
         return int(np.count_nonzero((values > self.threshold) & ~faulty)) >= self.cells
 
 
 @dataclass(frozen=True)
 class Daily:
-    """From ``start`` to ``end`` every day, over midnight too."""
+    """Record from ``start`` to ``end`` every day, also across midnight."""
 
     start: time
     end: time
 
     def __call__(self, values: NDArray[np.float64], faulty: NDArray[np.bool_], clock: datetime) -> bool:
-        """Judge one frame."""
+        """Return whether to record this frame."""
         now = clock.time()
         if self.start <= self.end:
             return self.start <= now < self.end
@@ -50,20 +50,20 @@ class Daily:
 
 @dataclass(frozen=True)
 class Constant:
-    """Always, or only when told."""
+    """Record always, or only on command."""
 
     on: bool
 
     def __call__(self, values: NDArray[np.float64], faulty: NDArray[np.bool_], clock: datetime) -> bool:
-        """Judge one frame."""
+        """Return whether to record this frame."""
         return self.on
 
 
 def parse_when(text: str, layout: SensorLayout) -> Rule:
-    """Read a rule: "always", "command", "contact", "contact:0.5" or "08:00-17:30".
+    """Parse a rule: "always", "command", "contact", "contact:0.5" or "08:00-17:30".
 
     Raises:
-        ValueError: none of these.
+        ValueError: an unknown rule.
     """
     name, _, number = text.partition(":")
     if text in ("always", "command"):
@@ -84,10 +84,10 @@ def parse_when(text: str, layout: SensorLayout) -> Rule:
 
 
 class Switch:
-    """Follows a rule, until a command says otherwise.
+    """Applies a rule unless a command overrides it.
 
     Attributes:
-        command: True: record; False: do not; None: as the rule says.
+        command: True: record; False: do not; None: follow the rule.
     """
 
     def __init__(self, rule: Rule) -> None:
@@ -96,7 +96,7 @@ class Switch:
         self._until = -np.inf
 
     def __call__(self, values: NDArray[np.float64], faulty: NDArray[np.bool_], at: float, clock: datetime) -> bool:
-        """Say whether to record the frame ``values`` ``[D]``, taken at ``at`` (seconds), by local time ``clock``."""
+        """Return whether to record the frame ``values`` ``[D]``, taken at ``at`` (seconds), at local time ``clock``."""
         if self.command is not None:
             self._until = -np.inf
             return self.command

@@ -1,4 +1,4 @@
-"""The command line: one module a command, results on stdout, everything else on stderr, never a traceback."""
+"""The command line: one module a command; results go to stdout, messages to stderr; errors are one line."""
 
 from __future__ import annotations
 
@@ -7,36 +7,44 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+from adaptfault import __version__
 from adaptfault.cli import (
     adapt,
+    convert,
     demo,
     diagnose,
     evaluate,
     fleet,
     history,
+    info,
     listen,
     maintain,
     report,
     reproduce,
     restore,
     rollback,
+    simulate,
     train,
 )
+from adaptfault.cli.options import refuse_missing
 
 COMMANDS = (
-    train,
+    info,
+    convert,
+    simulate,
     diagnose,
-    adapt,
     restore,
+    train,
     evaluate,
+    adapt,
     demo,
-    reproduce,
     maintain,
     rollback,
     history,
     report,
     listen,
     fleet,
+    reproduce,
 )
 
 BAD_INPUT = 3  # exit code for unusable input or usage, as monitoring tools understand it ("unknown")
@@ -55,16 +63,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = _Parser(
         prog="adaptfault",
         description="Finds the dead cells of a tactile array and repairs the classifier that reads it.",
-        epilog="Try: adaptfault demo",
+        epilog="Try: adaptfault info RECORDINGS on your own files, or adaptfault demo on simulated ones.",
     )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    parser.add_argument("--version", action="version", version=f"adaptfault {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for module in COMMANDS:
         module.add(commands)
     args = parser.parse_args(argv)
+    if args.command is None:
+        parser.print_help()
+        return 0
     try:
+        refuse_missing(args)
         return int(args.run(args))
     except (ValueError, OSError) as error:
-        # One line, whatever happened: what came, what was expected, how to mend it.
         print(f"adaptfault {args.command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:

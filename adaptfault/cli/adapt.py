@@ -1,4 +1,4 @@
-"""adaptfault adapt: a model and F in; a forecast or a repaired model out."""
+"""adaptfault adapt: adapts a model to a fault set F, or forecasts its accuracy under F."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from adaptfault.cli.options import (
     device,
     emit,
     fault_set,
-    load_recordings,
     progress,
     say,
 )
@@ -25,37 +24,37 @@ if TYPE_CHECKING:
 _EXAMPLE = """  adaptfault adapt model grasps/ --faults diagnosis.json --out adapted
       grasps/: the fault-free recordings that the model was trained on
   adaptfault adapt model grasps/ --keep adapter
-      what a robot needs to adapt without the recordings, in 20 MB; then, on the robot:
+      stores what a robot needs to adapt without the recordings, at most 20 MB; then, on the robot:
   adaptfault adapt adapter --faults 3,17 --forecast"""
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "adapt", "repair a model for a set of faulty cells", _EXAMPLE)
-    parser.add_argument("model", metavar="MODEL", help="folder written by adaptfault train, or by --keep")
+    parser.add_argument("model", metavar="MODEL", help="folder written by adaptfault train or --keep, or a bundle")
     add_recordings(parser, least=0)
     parser.add_argument("--faults", metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200")
     parser.add_argument("--out", metavar="FOLDER", help="where the adapted model goes")
     parser.add_argument(
-        "--forecast", action="store_true", help="say what accuracy to expect, and adapt only with --out"
+        "--forecast", action="store_true", help="print the accuracy to expect, and adapt only with --out"
     )
     parser.add_argument(
-        "--keep", metavar="FOLDER", help="where to keep all that later adaptations need, without recordings"
+        "--keep", metavar="FOLDER", help="store everything that later adaptations need, without recordings"
     )
     parser.add_argument(
         "--method",
         default="auto",
         choices=("auto", "fill", "head", "finetune", "scratch"),
-        help="how far to go (default auto: the first that is good enough)",
+        help="method of adaptation (default auto: the first that is accurate enough)",
     )
     parser.add_argument("--budget", type=float, metavar="S", help="seconds of training allowed")
-    parser.add_argument("--seed", type=int, default=0, help="of training (default 0)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of training (default 0)")
     add_device(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Keep the adapter, forecast, adapt and save: what was asked for."""
+    """Keep the adapter, forecast, adapt and save, as the options state."""
     if args.faults is None and args.keep is None:
         raise ValueError("nothing to do: give --faults F with --out or --forecast, or --keep FOLDER")
     if (args.faults is None) != (args.out is None and not args.forecast):
@@ -84,22 +83,27 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _adapter(args: argparse.Namespace) -> Adapter:
-    """Return the adapter that was kept, or one for the model and its recordings."""
+    """Return a kept adapter, a bundle's, or a new one for the model and its recordings."""
     from adaptfault.adaptation.adapter_files import SCHEMA, load_adapter
+    from adaptfault.cli.trained_model import TrainedModel, open_bundle
     from adaptfault.models.store import schema_of
 
+    bundle = open_bundle(args.model)
+    if bundle is not None:
+        if args.recordings:
+            raise ValueError(f"{args.model} holds its own windows: leave the recordings out")
+        return bundle.parts.adapter()
     if schema_of(args.model) == SCHEMA:
         if args.recordings:
             raise ValueError(f"{args.model} holds its own windows: leave the recordings out")
         return load_adapter(args.model)
     from adaptfault.adaptation.adapter import Adapter
-    from adaptfault.cli.data import open_model, parts_of
 
-    model, manifest = open_model(args.model)
     if not args.recordings:
         raise ValueError(f"{args.model} is a model: give the fault-free recordings that it was trained on, too")
-    train, validation, _ = parts_of(load_recordings(args, args.recordings, labelled=True), model, manifest)
-    return Adapter(model, train, validation)
+    trained = TrainedModel.open(args.model)
+    train, validation, _ = trained.parts(trained.recordings(args, args.recordings))
+    return Adapter(trained.network, train, validation)
 
 
 def _adapt(

@@ -1,4 +1,4 @@
-"""adaptfault diagnose: recordings in, verdicts, root causes and what was not tested out."""
+"""adaptfault diagnose: recordings in; verdicts, root causes and untested cells out."""
 
 from __future__ import annotations
 
@@ -8,61 +8,108 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from adaptfault.cli.options import Commands, add_recordings, command, emit, load_recordings, say, stream_recordings
+from adaptfault.cli.options import (
+    Commands,
+    add_recordings,
+    command,
+    emit,
+    load_recordings,
+    progress,
+    report_inferred,
+    say,
+    stream_recordings,
+)
 
 if TYPE_CHECKING:
     from adaptfault.data.recordings import Recordings
     from adaptfault.data.recordings.blocks import Stream
     from diagnostics import Diagnosis, SelfDiagnosis
 
-_EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.json --picture diagnosis.png
-      without --reference the cells are judged by the cells around them"""
+_EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.json --html diagnosis.html
+      without --reference each cell is compared with the cells around it
+  adaptfault diagnose today/ --reference robot.bundle
+      the healthy model of the bundle"""
+
+_ROWS = 24  # of a map, which is followed by the summary if it has more: the first line has left the screen
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "diagnose", "find the faulty cells and wires in a log of recordings", _EXAMPLE)
     add_recordings(parser, labels=False)
-    parser.add_argument("--reference", nargs="+", metavar="FILE", help="fault-free recordings of the same array")
+    parser.add_argument(
+        "--reference", nargs="+", metavar="FILE", help="fault-free recordings of the same array, or a bundle"
+    )
     parser.add_argument("--out", metavar="FILE", help="write the diagnosis as JSON")
     parser.add_argument("--picture", metavar="FILE", help="write the verdict map as PNG")
-    parser.set_defaults(run=run)
+    parser.add_argument("--html", metavar="FILE", help="write the technician's page")
+    parser.set_defaults(run=run, writes=("out", "picture", "html"))
 
 
 def run(args: argparse.Namespace) -> int:
-    """Diagnose; the exit code says how bad it is."""
+    """Diagnose; the exit code gives the severity."""
     from adaptfault.data.recordings.blocks import is_large
-
-    large = args.frames is None and is_large(args.recordings)
-    log = stream_recordings(args, args.recordings) if large else load_recordings(args, args.recordings)
-
     from diagnostics import SelfDiagnosis
 
-    diagnoser = SelfDiagnosis(log.layout)
-    if args.reference:
-        reference = load_recordings(args, args.reference)
-        if reference.layout.shape != log.layout.shape:
-            raise ValueError(f"the reference is of {reference.layout}, the log of {log.layout}")
-        say(args, f"learning what healthy looks like from {len(reference)} recordings")
-        diagnoser.fit(reference.frames)
-    diagnosis = _judged(diagnoser, log)
+    diagnoser = _fitted(args) if args.reference else None
+    layout = None if diagnoser is None else diagnoser.layout
+    log: Recordings | Stream
+    if args.frames is None and is_large(args.recordings):
+        log = stream_recordings(args, args.recordings, layout)
+        report_inferred(args, log.inferred)
+    else:
+        log = load_recordings(args, args.recordings, layout=layout)
+    diagnosis = _diagnosed(args, diagnoser or SelfDiagnosis(log.layout), log)
     if args.out:
         Path(args.out).write_text(json.dumps(diagnosis.to_dict(), allow_nan=False))
     if args.picture:
         diagnosis.plot().savefig(args.picture, dpi=150)
-    advice = [f"to test more: {touch}" for touch in diagnosis.coverage.advice[:5]]
-    emit(args, diagnosis.to_dict(), "\n".join([str(diagnosis), *advice]))
+    if args.html:
+        from adaptfault.evaluation.html_diagnosis import write_diagnosis
+
+        write_diagnosis(args.html, diagnosis, name=", ".join(args.recordings), reference=bool(args.reference))
+    emit(args, diagnosis.to_dict(), text_of(diagnosis))
     return diagnosis.exit_code
 
 
-def _judged(diagnoser: SelfDiagnosis, log: Recordings | Stream) -> Diagnosis:
-    """Look at one piece of the log after another: what is remembered of them does not grow."""
+def _fitted(args: argparse.Namespace) -> SelfDiagnosis:
+    """Return the healthy model of a bundle, or one that is fitted on the reference recordings."""
+    from diagnostics import SelfDiagnosis
+
+    if len(args.reference) == 1 and (Path(args.reference[0]) / "bundle.json").is_file():
+        from adaptfault.robot.bundle import Bundle
+
+        return Bundle.open(args.reference[0]).diagnoser()
+    reference = load_recordings(args, args.reference)
+    say(args, f"fitting the healthy model on {len(reference)} recordings")
+    return SelfDiagnosis(reference.layout).fit(reference.frames)
+
+
+def text_of(diagnosis: Diagnosis) -> str:
+    """Return the diagnosis as text, with what was not tested and what would test it."""
+    lines = str(diagnosis).splitlines()
+    untested = len(diagnosis.coverage.untested)
+    if untested:
+        cells = "1 cell was" if untested == 1 else f"{untested} cells were"
+        lines.append(f"{cells} not tested: a fault there would not be found")
+    lines += [f"to test more: {touch}" for touch in diagnosis.coverage.advice[:5]]
+    if diagnosis.layout.rows > _ROWS:
+        lines.append(lines[0])
+    return "\n".join(lines)
+
+
+def _diagnosed(args: argparse.Namespace, diagnoser: SelfDiagnosis, log: Recordings | Stream) -> Diagnosis:
+    """Pass the log through the diagnosis recording by recording, or block by block, in constant memory."""
     import numpy as np
+    from tqdm import tqdm
 
     from adaptfault.data.recordings import Recordings
 
     stream = diagnoser.stream()
-    for frames in log:
+    hide = None if (shown := progress(args)) is None else not shown
+    total = len(log) if isinstance(log, Recordings) else None
+    unit = "recording" if isinstance(log, Recordings) else "block"
+    for frames in tqdm(log, total=total, unit=unit, desc="diagnosing", disable=hide, leave=False):
         stream.extend(np.asarray(frames, dtype=np.float64))
     if not isinstance(log, Recordings):
         for problem in log.problems:

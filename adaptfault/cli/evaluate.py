@@ -1,11 +1,11 @@
-"""adaptfault evaluate: how good a model is, fault-free or with injected faults, adapted or not."""
+"""adaptfault evaluate: scores of a model or an adaptation, on healthy recordings or with injected faults."""
 
 from __future__ import annotations
 
 import argparse
 
 from adaptfault.cli.inject_option import INJECT_HELP, parse_faults
-from adaptfault.cli.options import Commands, add_device, add_recordings, command, device, emit, load_recordings
+from adaptfault.cli.options import Commands, add_device, add_recordings, command, device, emit, say
 
 _EXAMPLE = """  adaptfault evaluate model grasps/ --inject random:5=short
   adaptfault evaluate model grasps/ --inject row:0:3=open --adapted adapted"""
@@ -14,11 +14,11 @@ _EXAMPLE = """  adaptfault evaluate model grasps/ --inject random:5=short
 def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "evaluate", "score a model on the test recordings", _EXAMPLE)
-    parser.add_argument("model", metavar="MODEL", help="folder written by adaptfault train")
+    parser.add_argument("model", metavar="MODEL", help="folder written by adaptfault train, or a bundle")
     add_recordings(parser)
     parser.add_argument("--adapted", metavar="FOLDER", help="score this adaptation of the model instead")
     parser.add_argument("--inject", action="append", default=[], metavar="FAULT", help=INJECT_HELP)
-    parser.add_argument("--seed", type=int, default=0, help="of random faults (default 0)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of random faults (default 0)")
     parser.add_argument("--all", action="store_true", help="score on all recordings, not only on the test share")
     add_device(parser)
     parser.set_defaults(run=run)
@@ -29,17 +29,20 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from adaptfault.adaptation.result import Adaptation
-    from adaptfault.cli.data import open_model, parts_of, windows_of
+    from adaptfault.cli.trained_model import TrainedModel
     from adaptfault.evaluation.scores import Scores, accuracy_interval
     from diagnostics import inject
 
-    model, manifest = open_model(args.model)
-    recordings = load_recordings(args, args.recordings, labelled=True)
-    classifier = Adaptation.load(args.adapted) if args.adapted else model
+    trained = TrainedModel.open(args.model)
+    model, recordings = trained.network, trained.recordings(args, args.recordings)
+    classifier = Adaptation.load(args.adapted) if args.adapted else trained.adaptation or model
     (classifier.model if isinstance(classifier, Adaptation) else model).to(device(args))
     if isinstance(classifier, Adaptation) and classifier.fault_set.n_cells != model.layout.n_cells:
         raise ValueError(f"{args.adapted}: an adaptation over {classifier.fault_set.n_cells} cells, not of this model")
-    windows = windows_of(recordings, model, manifest) if args.all else parts_of(recordings, model, manifest)[2]
+    whole = args.all or trained.split_seed is None
+    if whole and not args.all:
+        say(args, f"{args.model} does not store the split of its training: scored on all recordings given")
+    windows = trained.windows(recordings) if whole else trained.parts(recordings)[2]
     rng = np.random.default_rng(args.seed)
     faults = parse_faults(args.inject, recordings.layout, rng)
     if faults:

@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
         bundle.confirm()
     pointer = Pointer.read(bundle.path)
     runs = bundle.journal.runs(args.last)
-    problems = bundle.problems(mend=False)
+    problems = bundle.problems(repair=False)
     result = {
         "schema": "adaptfault.history/1",
         "version": bundle.active().number,

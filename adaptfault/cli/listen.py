@@ -1,19 +1,18 @@
-"""adaptfault listen: watches, classifies and records what sensors send over UDP."""
+"""adaptfault listen: monitors, classifies and records frames that sensors send over UDP."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
 
-from adaptfault.cli.options import Commands, add_array, command
+from adaptfault.cli.options import Commands, add_array, command, layout_of
 
 if TYPE_CHECKING:
     from adaptfault.acquisition import Station
-    from diagnostics import SensorLayout
 
 _EXAMPLE = """  adaptfault listen robot.bundle --port 5005 --record today/ --when contact
-      packets: device_id,timestamp,one value a cell; without a bundle cells are watched, nothing is classified
-      on stdin: record, stop, auto (as --when says), quit"""
+      packets: device_id,timestamp,one value a cell; without a bundle cells are monitored, nothing is classified
+      on stdin: record, stop, auto (as --when states), quit"""
 
 _WHEN = (
     "always | command (on stdin) | contact or contact:X (cells above X in the array's unit, default 5 %% of full scale)"
@@ -23,9 +22,9 @@ _WHEN = (
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "listen", "watch, classify and record what sensors send over UDP", _EXAMPLE)
-    parser.add_argument("bundle", nargs="?", metavar="BUNDLE", help="what the robot carries, to classify as well")
-    parser.add_argument("--port", type=int, required=True, help="UDP port; 0 takes a free one and says which")
+    parser = command(commands, "listen", "monitor, classify and record frames that sensors send over UDP", _EXAMPLE)
+    parser.add_argument("bundle", nargs="?", metavar="BUNDLE", help="the robot's bundle, to classify as well")
+    parser.add_argument("--port", type=int, required=True, help="UDP port; 0 takes a free one and prints it")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this machine only)")
     parser.add_argument("--device", action="append", metavar="ID", help="listen to this one only; may be repeated")
     parser.add_argument(
@@ -40,7 +39,7 @@ def add(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Listen until told to end; files are closed whatever happens."""
+    """Listen until the end that the options or stdin give; files are closed in any case."""
     import asyncio
 
     asyncio.run(_station(args).listen())
@@ -52,7 +51,7 @@ def _station(args: argparse.Namespace) -> Station:
     from adaptfault.data.calibration import Calibration
 
     if args.when and not args.record:
-        raise ValueError("--when says when to record: give --record FOLDER, too")
+        raise ValueError("--when needs --record FOLDER: it chooses when to record")
     if not 0 <= args.port < 65536:
         raise ValueError(f"--port {args.port}: expected 0 to 65535")
     if not args.ticks > 0:
@@ -63,8 +62,9 @@ def _station(args: argparse.Namespace) -> Station:
 
         table = Bundle.open(args.bundle).parts.calibration
     tables = Calibration.read(table) if table else None
+    layout = layout_of(args) if tables is None else layout_of(args, full_scale=tables.full_scale, unit="N")
     return Station(
-        None if args.bundle else _layout(args, None if tables is None else tables.full_scale),
+        None if args.bundle else layout,
         args.port,
         bundle=args.bundle,
         host=args.host,
@@ -78,20 +78,3 @@ def _station(args: argparse.Namespace) -> Station:
         as_json=args.json,
         quiet=args.quiet,
     )
-
-
-def _layout(args: argparse.Namespace, newtons: float | None) -> SensorLayout:
-    """Return the array that the options describe: the paper's where they say nothing."""
-    from dataclasses import replace
-
-    from adaptfault.data.recordings.settle import given_array
-    from diagnostics import SensorLayout
-
-    if args.layout and args.shape:
-        raise ValueError("--layout and --shape both given: one of them is enough")
-    array = given_array(args.layout or args.shape) or SensorLayout.paper()
-    layout = array if isinstance(array, SensorLayout) else SensorLayout(*array)
-    full_scale = newtons if args.full_scale is None else args.full_scale
-    unit = "N" if args.unit is None and newtons is not None else args.unit
-    said = {"full_scale": full_scale, "unit": unit, "rate": args.rate}
-    return replace(layout, **{name: value for name, value in said.items() if value is not None})

@@ -28,10 +28,10 @@ def run(args: argparse.Namespace) -> int:
 
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.maintenance import maintain
-    from adaptfault.robot.new_recordings import load_incoming
+    from adaptfault.robot.new_recordings import load_new_recordings
 
     bundle = Bundle.open(args.bundle)
-    incoming = load_incoming(bundle, args.recordings)
+    incoming = load_new_recordings(bundle, args.recordings)
     for problem in incoming.problems:
         print(problem, file=sys.stderr)
     report = maintain(

@@ -1,16 +1,17 @@
-"""Options that several commands share, and how they are read."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from adaptfault.data.recordings import Recordings
+    from adaptfault.data.recordings import Loaded, Recordings
     from adaptfault.data.recordings.blocks import Stream
     from diagnostics import FaultSet, SensorLayout
 
@@ -34,7 +35,7 @@ def command(commands: Commands, name: str, summary: str, example: str) -> argpar
 def add_recordings(
     parser: argparse.ArgumentParser, *, option: bool = False, labels: bool = True, least: int = 1
 ) -> None:
-    """Add where recordings come from: ``least`` arguments, or an ``option`` for a command that can do without."""
+    """Add the paths of recordings, as ``least`` arguments or as an ``option``, and how they are read."""
     help_ = "file or folder of recordings (.csv, .npz, .npy; ROS 2 bags: folder, .mcap, .db3)"
     if option:
         parser.add_argument("--recordings", nargs="+", metavar="FILE", help=help_)
@@ -51,7 +52,7 @@ def add_recordings(
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
-    """Add where networks are trained."""
+    """Add the option of the device that trains networks."""
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default auto: cuda where there is one)")
 
 
@@ -73,41 +74,62 @@ def device(args: argparse.Namespace) -> str:
     return name
 
 
-def add_array(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
-    """Add what describes the array; returns the group of options."""
-    group = parser.add_argument_group("how recordings are read")
+def add_array(parser: argparse.ArgumentParser, *, calibration: bool = True) -> argparse._ArgumentGroup:
+    """Add the options that describe the array; returns their group."""
+    group = parser.add_argument_group("how recordings are read" if calibration else "the array")
     group.add_argument("--layout", metavar="FILE", help="layout of the array, a JSON file")
-    group.add_argument("--shape", metavar="PxRxC", help="layout from a shape: pads x rows x columns, as 2x13x6")
+    group.add_argument("--shape", metavar="PxRxC", help="shape: pads x rows x columns, as 2x13x6; 10x10 is one pad")
     group.add_argument("--full-scale", type=float, metavar="X", help="largest value a cell can report")
     group.add_argument("--unit", metavar="U", help="unit of the recordings, as N or count")
     group.add_argument("--rate", type=float, metavar="HZ", help="frames per second")
-    group.add_argument("--calibration", metavar="TABLE", help="CSV table cell,raw,force: raw counts to newtons")
+    if calibration:
+        group.add_argument("--calibration", metavar="TABLE", help="CSV table cell,raw,force: raw counts to newtons")
     return group
 
 
-def load_recordings(args: argparse.Namespace, paths: Sequence[str], *, labelled: bool = False) -> Recordings:
-    """Read recordings as the options say; problems go to stderr.
+def layout_of(args: argparse.Namespace, *, full_scale: float | None = None, unit: str | None = None) -> SensorLayout:
+    """Return the array that the options describe, the paper's where they state nothing.
+
+    Args:
+        args: the options of :func:`add_array`.
+        full_scale, unit: used where the options state none.
 
     Raises:
-        ValueError: nothing could be read, or labels are needed and missing.
+        ValueError: the options make no layout, or state it twice.
     """
-    from adaptfault.data.recordings import load
+    from dataclasses import replace
 
-    _one_layout(args)
-    loaded = load(
-        paths,
-        layout=args.layout or args.shape,
-        labels=getattr(args, "labels", None),
-        frames=args.frames,
-        calibration=args.calibration,
-        full_scale=args.full_scale,
-        unit=args.unit,
-        rate=args.rate,
-        topic=args.topic,
-        field=args.field,
-    )
-    for problem in loaded.problems:
-        print(problem, file=sys.stderr)
+    from adaptfault.data.recordings.resolve import given_array
+    from diagnostics import SensorLayout
+
+    if args.layout and args.shape:
+        raise ValueError("--layout and --shape both given: one of them is enough")
+    array = given_array(args.layout or args.shape) or SensorLayout.paper()
+    layout = array if isinstance(array, SensorLayout) else SensorLayout(*array)
+    stated = {
+        "full_scale": full_scale if args.full_scale is None else args.full_scale,
+        "unit": unit if args.unit is None else args.unit,
+        "rate": args.rate,
+    }
+    return replace(layout, **{name: value for name, value in stated.items() if value is not None})
+
+
+def load_recordings(
+    args: argparse.Namespace, paths: Sequence[str], *, labelled: bool = False, layout: SensorLayout | None = None
+) -> Recordings:
+    """Read recordings as the options state; problems and inferred facts go to stderr.
+
+    Args:
+        args: the options of :func:`add_recordings`.
+        paths: files and folders.
+        labelled: whether labels are required.
+        layout: the layout that the recordings must have, as a model's; options and files may not contradict it.
+
+    Raises:
+        ValueError: nothing could be read, labels are required and missing, or an option contradicts ``layout``.
+    """
+    loaded = load_reported(args, paths, layout)
+    report_inferred(args, loaded.inferred)
     if labelled and loaded.recordings.labels is None:
         raise ValueError(
             f"{paths[0]}: the recordings have no labels; give --labels TABLE, one folder for each class,"
@@ -116,30 +138,104 @@ def load_recordings(args: argparse.Namespace, paths: Sequence[str], *, labelled:
     return loaded.recordings
 
 
-def stream_recordings(args: argparse.Namespace, paths: Sequence[str]) -> Stream:
-    """Open recordings that are too large to be loaded, as the options say; problems are known after an iteration.
+def load_reported(args: argparse.Namespace, paths: Sequence[str], layout: SensorLayout | None = None) -> Loaded:
+    """Read recordings as :func:`load_recordings`; only the problems are printed."""
+    from adaptfault.data.recordings import load
+
+    options = _array_options(args) if layout is None else {**_agreeing(args, layout), "layout": layout, "strict": True}
+    loaded = load(paths, labels=getattr(args, "labels", None), frames=args.frames, **options)
+    for problem in loaded.problems:
+        print(problem, file=sys.stderr)
+    if layout is not None:
+        _check_scale(paths[0], loaded.recordings)
+    return loaded
+
+
+def stream_recordings(args: argparse.Namespace, paths: Sequence[str], layout: SensorLayout | None = None) -> Stream:
+    """Open recordings that are too large to be loaded, as the options state.
 
     Raises:
-        ValueError: nothing could be read.
+        ValueError: nothing could be read, or an option contradicts ``layout``.
     """
     from adaptfault.data.recordings.blocks import Stream
 
-    _one_layout(args)
-    return Stream(
-        paths,
-        layout=args.layout or args.shape,
-        calibration=args.calibration,
-        full_scale=args.full_scale,
-        unit=args.unit,
-        rate=args.rate,
-        topic=args.topic,
-        field=args.field,
-    )
+    options = _array_options(args) if layout is None else {**_agreeing(args, layout), "layout": layout}
+    return Stream(paths, **options)
 
 
-def _one_layout(args: argparse.Namespace) -> None:
+def report_inferred(args: argparse.Namespace, inferred: Sequence[str]) -> None:
+    """Print on stderr what was inferred about the array."""
+    for text in inferred:
+        say(args, f"inferred: {text}")
+
+
+def _array_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the options that describe the array, as :func:`adaptfault.load` takes them."""
     if args.layout and args.shape:
         raise ValueError("--layout and --shape both given: one of them is enough")
+    names = ("calibration", "full_scale", "unit", "rate", "topic", "field")
+    return {"layout": args.layout or args.shape, **{name: getattr(args, name) for name in names}}
+
+
+def _agreeing(args: argparse.Namespace, layout: SensorLayout) -> dict[str, Any]:
+    """Return the options that remain where the layout is known, after a check that none contradicts it."""
+    from adaptfault.data.recordings.resolve import given_array, same_rate
+    from diagnostics import SensorLayout
+
+    options = _array_options(args)
+    array = given_array(options["layout"])
+    shape = array.shape if isinstance(array, SensorLayout) else array
+    if shape is not None and shape != layout.shape:
+        raise ValueError(f"--shape or --layout gives {' x '.join(map(str, shape))} cells, expected {layout}")
+    if args.full_scale is not None and args.full_scale != layout.full_scale:
+        raise ValueError(f"--full-scale {args.full_scale:g} given, expected {layout.full_scale:g} {layout.unit}")
+    if args.rate is not None and not same_rate(args.rate, layout.rate):
+        raise ValueError(f"--rate {args.rate:g} given, expected {layout.rate:g} Hz")
+    return {name: options[name] for name in ("calibration", "topic", "field")}
+
+
+def _check_scale(path: str, recordings: Recordings) -> None:
+    """Refuse readings most of which exceed the full scale; warn if none comes near it.
+
+    Raises:
+        ValueError: more than half of the readings above 0 exceed the full scale.
+    """
+    import numpy as np
+
+    layout = recordings.layout
+    readings = np.concatenate([frames[frames > 0] for frames in recordings])
+    if not readings.size:
+        return
+    full, largest = layout.full_scale, float(readings.max())
+    if np.median(readings) > 1.02 * full:
+        raise ValueError(
+            f"{path}: readings reach {largest:.4g} where the full scale is {full:g} {layout.unit};"
+            " use recordings in the same unit"
+        )
+    if largest < 0.1 * full:
+        what = f"the largest reading is {largest:.4g} where the full scale is {full:g} {layout.unit}"
+        print(f"warning: {path}: {what}; is it the same unit?", file=sys.stderr)
+
+
+def refuse_missing(args: argparse.Namespace) -> None:
+    """Raise ValueError for a path that does not exist, before anything heavy is imported.
+
+    Checked are the inputs of every command, and the folders of the files that it writes.
+    """
+    many = [*(getattr(args, "recordings", None) or []), *(getattr(args, "reference", None) or [])]
+    one = [getattr(args, name, None) for name in ("labels", "layout", "calibration", "adapted", "model", "fleet")]
+    for path in filter(None, [*many, *one]):
+        if not os.path.lexists(path):
+            raise ValueError(f"{path}: is not there; check the path")
+    bundle = getattr(args, "bundle", None)
+    if bundle and not os.path.isfile(os.path.join(bundle, "bundle.json")):
+        what = "expected a bundle, a folder with bundle.json; adaptfault train --out X.bundle makes one"
+        raise ValueError(f"{bundle}: {what}")
+    for name in getattr(args, "writes", ()):
+        path = getattr(args, name)
+        folder = os.path.dirname(path) if path else ""
+        if folder and not os.path.isdir(folder):
+            raise ValueError(f"--{name} {path}: the folder {folder} is not there; create it first")
 
 
 def fault_set(text: str, layout: SensorLayout) -> FaultSet:
@@ -172,14 +268,19 @@ def _diagnosed(path: Path, layout: SensorLayout) -> FaultSet:
 
 
 def progress(args: argparse.Namespace) -> bool | None:
-    """Return what tqdm should do: None shows progress on a terminal."""
+    """Return whether progress is shown; None shows it on a terminal."""
     return False if args.quiet else None
 
 
 def say(args: argparse.Namespace, text: str) -> None:
-    """Tell what is being done, on stderr."""
+    """Print a step on stderr, above a progress bar if one is shown."""
     if not args.quiet:
-        print(text, file=sys.stderr, flush=True)
+        if "tqdm" in sys.modules:
+            from tqdm import tqdm
+
+            tqdm.write(text, file=sys.stderr)
+        else:
+            print(text, file=sys.stderr, flush=True)
 
 
 def emit(args: argparse.Namespace, result: dict[str, Any], text: str) -> None:

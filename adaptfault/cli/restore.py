@@ -38,12 +38,12 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.data.recordings import Recordings, save_npz
     from adaptfault.imputation.restorer import Restorer
     from adaptfault.robot.bundle import Bundle
-    from adaptfault.robot.new_recordings import load_incoming
+    from adaptfault.robot.new_recordings import load_new_recordings
 
     bundle = Bundle.open(args.bundle)
     layout = bundle.layout
-    faults = bundle.knowledge().fault_set if args.faults is None else fault_set(args.faults, layout)
-    incoming = load_incoming(bundle, args.recordings)
+    faults = bundle.known_faults().fault_set if args.faults is None else fault_set(args.faults, layout)
+    incoming = load_new_recordings(bundle, args.recordings)
     for problem in incoming.problems:
         print(problem, file=sys.stderr)
     say(args, f"{len(faults)} of {faults.n_cells} cells are faulty; restoring {len(incoming.frames)} recordings")

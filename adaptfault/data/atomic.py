@@ -1,4 +1,4 @@
-"""Writes a file whole or not at all, so that a power cut never leaves half of one."""
+"""Writes a file atomically: after a power failure it holds the old content or the new."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
         with contextlib.suppress(OSError):
             os.unlink(name)
         raise
-    if os.name == "posix":  # the new name lasts only once its folder is on disk
+    if os.name == "posix":  # the rename is durable once the folder is synchronised
         folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)

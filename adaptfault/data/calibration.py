@@ -1,4 +1,4 @@
-"""Turns raw converter counts into newtons by one table a cell, interpolated linearly (Section VI-C)."""
+"""Converts raw counts to newtons with one table a cell and linear interpolation (Section VI-C)."""
 
 from __future__ import annotations
 
@@ -19,12 +19,15 @@ from adaptfault.data.recordings.text import numbered_lines, read_text
 from diagnostics import SensorLayout
 
 _BLOCK = 4096
-"""Frames at a time: a block lies in the cache while it is turned from frames to cells and back."""
+"""Frames converted at a time: a block that fits the cache is transposed faster."""
+
+
+_MOST_POINTS = 50_000_000  # of a padded table [D, P], which takes 16 bytes a point
 
 
 @dataclass(frozen=True, eq=False)
 class OutOfRange:
-    """How many readings lay outside a cell's table and were clamped to its ends.
+    """The number of readings outside each cell's table, which were clamped to its ends.
 
     Attributes:
         below, above: int ``[D]``.
@@ -99,7 +102,7 @@ class Calibration:
             raise ValueError(f"cell {lacking[0]} has no table ({lacking.size} cells have none); calibrate it")
 
     def apply(self, counts: ArrayLike) -> tuple[NDArray[np.float32], OutOfRange]:
-        """Return newtons, float32 of the shape of ``counts`` (``[T, D]``, or one frame ``[D]``), and what was clamped.
+        """Return newtons, float32 of the shape of ``counts`` (``[T, D]`` or ``[D]``), and the clamped readings.
 
         Readings outside a cell's table get the force at its end. NaN stays NaN.
 
@@ -146,7 +149,13 @@ class Calibration:
         if highest >= width:
             line = points[highest][0][2]
             raise InputError.at(path, f"cell {highest}, but the layout has {width} cells, from 0", f"line {line}")
-        raw = np.full((width, max(map(len, points.values()))), np.nan)
+        most = max(map(len, points.values()))
+        if width * most > _MOST_POINTS:
+            what = (
+                f"{most} points of one cell and {width} cells need a table of over {_MOST_POINTS:,} points; thin them"
+            )
+            raise InputError.at(path, what)
+        raw = np.full((width, most), np.nan)
         force = raw.copy()
         for cell, rows in points.items():
             _check_rows(path, cell, rows)
@@ -159,7 +168,7 @@ class Calibration:
         return cls(raw, force)
 
     def write(self, path: str | PathLike[str]) -> None:
-        """Write the table that :meth:`read` gives back exactly. OSError if the file cannot be written."""
+        """Write the table so that :meth:`read` returns the same values. OSError if the file cannot be written."""
         lines = ["cell,raw,force"]
         for cell, raw, force in self._tables:
             lines += (f"{cell},{r!r},{f!r}" for r, f in zip(raw.tolist(), force.tolist(), strict=True))
@@ -172,7 +181,7 @@ _Point = tuple[float, float, int]
 
 
 def _disorder(raw: NDArray[np.float64], force: NDArray[np.float64]) -> str:
-    """Say what is wrong with the points of one cell; empty if nothing is."""
+    """Return what is wrong with the points of one cell; empty if nothing is."""
     if not (np.isfinite(raw).all() and np.isfinite(force).all()):
         return "a point is infinite"
     if (steps := np.flatnonzero(np.diff(raw) <= 0)).size:

@@ -1,4 +1,4 @@
-"""A file of JSON lines that only grows: what a run has done so far, so that a killed one goes on where it was."""
+"""An append-only file of JSON lines: the log of a run, from which a killed run continues."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Lines:
     """One JSON document a line.
 
     Args:
-        path: the file; it need not exist. What a kill left of a last line is dropped.
+        path: the file; it need not exist. An incomplete last line, which a kill leaves, is dropped.
     """
 
     def __init__(self, path: Path) -> None:
@@ -39,10 +39,10 @@ class Lines:
         return documents
 
     def add(self, document: Any) -> None:
-        """Add one."""
+        """Append a document."""
         with self.path.open("a") as file:
             file.write(json.dumps(document, allow_nan=False) + "\n")
 
     def begin(self, document: Any) -> None:
-        """Drop what is there and begin with this one."""
+        """Replace the content with this document."""
         atomic_write(self.path, (json.dumps(document, allow_nan=False) + "\n").encode())

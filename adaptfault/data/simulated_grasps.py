@@ -1,7 +1,7 @@
 """Simulated grasps of the paper's task: a soft block squeezed between opposing tactile pads (Section VI-B).
 
-Smooth blobs make every repair of dead cells look perfect. So contact is thresholded here, objects have edges, and every
-surface is rough, until the statistics are those of real arrays (``examples/simulated_vs_real.py``).
+Smooth contact makes every imputation of dead cells look perfect. Contact is therefore thresholded here, objects have
+edges, and surfaces are rough, so that the statistics match those of real arrays (``examples/simulated_vs_real.py``).
 
 Lengths are in cell pitches; closing and heights in units of the nominal closing; loads in newtons, 5 of which are the
 full scale. A cell sits at s = (row, column) from the centre of its pad; odd pads face even ones, so their columns are
@@ -12,7 +12,7 @@ the signed distance to the outline of the block, negative inside.
    3.2 to 7 pitches long, drawn for each face of each block. Edges are rounded: contact spreads as the pads close.
 2. Elastic foundation (Winkler): e(s, t) = max(0, closing(t) + tilt(t) . s + h). The block shifts between the pads until
    both sides carry the same force. Stiffness k(b) = that of the object * the concentration of stress along the edge *
-   (1 + A exp(-|b - c|**2 / 2 r**2)); A > 0 is a stiff inclusion, -1 < A < 0 a void. The nearer face feels it more.
+   (1 + A exp(-|b - c|**2 / 2 r**2)); A > 0 is a stiff inclusion, -1 < A < 0 a void. The nearer face is affected more.
 3. Relaxation, the standard linear solid: p = k ((1 - g) e + g z), dz/dt = de/dt - z / tau, p >= 0.
 4. Cover: the elastic skin of the pad blurs p over neighbouring cells (Gaussian).
 5. Hysteresis of the resistive layer, the play operator in relative load:
@@ -20,7 +20,7 @@ the signed distance to the outline of the block, negative inside.
 6. Readout: gain y + offset + noise of standard deviation sqrt(floor**2 + (c gain y)**2). Under the threshold a cell
    reads exactly 0, the rest is rounded to converter steps. Gain and offset belong to the sensor, not to the recording.
 
-Nominal motion: the robot saves what it feels while it grasps, so a recording starts at contact, at half the closing.
+Nominal motion: the robot records while it grasps, so a recording starts at contact, at half the closing.
 It closes within a tenth of the recording and holds, with tremor and at most one small slip; a third of the grasps end
 in a partial release. Motion is stretched over the recording, whatever its length; relaxation and tremor run in seconds.
 
@@ -79,13 +79,13 @@ class Readout:
 
     @classmethod
     def draw(cls, layout: SensorLayout, seed: int = 0) -> Readout:
-        """Return the sensor that ``seed`` stands for."""
-        rng = np.random.default_rng([seed, len(CLASS_NAMES)])  # no class has this number: a stream of its own
+        """Return the sensor of a ``seed``."""
+        rng = np.random.default_rng([seed, len(CLASS_NAMES)])  # no class has this number: an independent random stream
         gain = np.exp(rng.normal(0, 0.15, layout.shape)).clip(0.65, 1.5)
         return cls(layout, gain.astype(np.float32), rng.uniform(-0.015, 0.015, layout.shape).astype(np.float32))
 
     def read(self, load: Array, rng: np.random.Generator) -> Array:
-        """Return what the converter reports for loads ``[..., pads, rows, cols]`` in newtons, in the layout's unit.
+        """Return the converter's readings for loads ``[..., pads, rows, cols]`` in newtons, in the layout's unit.
 
         Newtons stand for fifths of the full scale. Absent positions read 0.
         """
@@ -125,7 +125,7 @@ def relaxing_pressure(compression: Array, stiffness: Array, tau: Array, rate: fl
 
 
 def hysteresis(load: Array, width: float = PLAY) -> Array:
-    """Return what a resistive layer shows of ``load`` ``[T, ...]``: it lags by the share ``width`` either way."""
+    """Return the output of a resistive layer under ``load`` ``[T, ...]``: it lags by the share ``width``."""
     shown = np.empty_like(load)
     last = np.zeros_like(load[0])
     for t, now in enumerate(load):
@@ -241,7 +241,7 @@ def _facing(pads: int) -> Array:
 def _faces(rng: np.random.Generator, name: str, n: int, layout: SensorLayout) -> tuple[Array, Array, Array]:
     """Return relative stiffness and the heights before and after the slip, ``[n, pads, rows, cols]``, of new blocks."""
     one, face = (n, 1, 1, 1), (n, layout.pads, 1, 1)  # drawn once for a block, and for each face
-    unit = np.sqrt(layout.rows * layout.cols / 110)  # what is one pitch on the paper's pad
+    unit = np.sqrt(layout.rows * layout.cols / 110)  # one pitch on the paper's pad
     row, col = _positions(layout)
     # the softer it is, the further it bulges between the pads
     a, b = (0.34 * m * rng.normal(1, 0.03, one) * STIFFNESS.get(name, 1.0) ** -0.08 for m in (layout.rows, layout.cols))
@@ -297,7 +297,7 @@ def _balance(height: Array, stiffness: Array) -> Array:
 
 
 def _cover(size: int) -> Array:
-    """Return the blur of the cover along one axis, ``[size, size]`` and symmetric; what leaves the pad is lost."""
+    """Return the blur of the cover along one axis, ``[size, size]`` and symmetric; beyond the pad load is lost."""
     apart = np.subtract.outer(np.arange(size), np.arange(size))
     whole = np.exp(-(np.arange(-5, 6) ** 2) / (2 * COVER**2)).sum()
     return np.asarray(np.exp(-(apart**2) / (2 * COVER**2)) / whole, np.float32)

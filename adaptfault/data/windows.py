@@ -1,4 +1,4 @@
-"""Recordings cut into windows on the 0..1 scale, and split by recording (Section VI-C)."""
+"""Cuts recordings into windows on the 0..1 scale, and splits them by recording (Section VI-C)."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def evenly(n: int, most: int) -> NDArray[np.intp]:
 
 
 def scale(frames: ArrayLike, layout: SensorLayout) -> NDArray[np.float32]:
-    """Convert readings from the layout's unit to 0..1: the one place that does.
+    """Convert readings from the layout's unit to 0..1. No other function does.
 
     Divides by the full scale (5 N in Section VI-C). Nothing is clipped, and NaN stays NaN.
     """
@@ -77,7 +77,7 @@ def scale(frames: ArrayLike, layout: SensorLayout) -> NDArray[np.float32]:
 def hold_missing(frames: NDArray[Any]) -> NDArray[Any]:
     """Return ``frames [T, D]`` with each NaN replaced by the last reading of that cell, 0 before its first.
 
-    A lost frame then looks like a held one instead of turning the network's whole output into NaN.
+    A single NaN would turn the whole output of the network into NaN.
     """
     return held(frames, np.zeros(frames.shape[1], frames.dtype))[1:] if np.isnan(frames).any() else frames
 
@@ -92,8 +92,8 @@ def make_windows(
 ) -> Windows:
     """Cut recordings into windows on the 0..1 scale.
 
-    Missing readings (NaN) are held from the last frame of their recording (:func:`hold_missing`). What is left after
-    the last whole window is dropped; a recording shorter than one window gives none.
+    Missing readings (NaN) are held from the last frame of their recording (:func:`hold_missing`). Frames after
+    the last whole window are dropped; a recording shorter than one window gives none.
 
     Args:
         recordings: arrays ``[T, D]`` or ``[T, pads, rows, cols]`` in the layout's unit; lengths may differ.
@@ -134,9 +134,9 @@ def split(
 ) -> tuple[Windows, Windows, Windows]:
     """Return ``(train, validation, test)``, split by recording and stratified by class.
 
-    ``validation`` is a share of what the test leaves, so the defaults give 64 %, 16 % and 20 % (Section VI-C). Every
-    class has a recording on each side, which plain stratification does not promise for small classes; a share of 0
-    leaves that side empty.
+    ``validation`` is a share of the recordings outside the test set, so the defaults give 64 %, 16 % and 20 %
+    (Section VI-C). Every class has a recording on each side, which plain stratification does not guarantee for small
+    classes; a share of 0 leaves that side empty.
 
     Raises:
         ValueError: a share outside [0, 1), a class with too few recordings, a recording with two labels.
@@ -173,7 +173,7 @@ def _draw(
         return candidates[:0]
     _, of, counts = np.unique(classes[candidates], return_inverse=True, return_counts=True)
     take = np.clip(np.floor(share * counts), 1, counts - leave).astype(int)
-    # Largest remainders first, so that the whole has its share although no class can give a part of a recording.
+    # Largest remainders first: the total then matches the share although recordings are indivisible.
     for i in np.argsort(take - share * counts, kind="stable"):
         if take.sum() < round(share * len(candidates)) and take[i] < counts[i] - leave:
             take[i] += 1

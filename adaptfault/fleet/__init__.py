@@ -1,1 +1,1 @@
-"""Many robots: the list of them, maintenance of all on workers, and what the fleet needs."""
+"""Fleets: the list of robots, their maintenance on worker processes, and the summary."""

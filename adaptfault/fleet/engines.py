@@ -1,4 +1,4 @@
-"""Who goes through the robots: joblib's threads on this machine, or a Dask cluster; each robot in a guarded process."""
+"""Parallel execution over robots: joblib threads on this machine, or a Dask cluster; one process per robot."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 Engine = Callable[[Sequence[Robot]], Iterator[Outcome]]
-"""Works on robots and yields their outcomes as they come."""
+"""Maintains robots and yields their outcomes in order of completion."""
 
-_WAIT = 60  # s for a cluster's first worker, and that it may be without any later on
-_LOOK = 0.1  # s between two looks for finished robots
-_DIED = "every Dask worker that had it died; one may be short of memory"
+_WAIT = 60  # s to wait for a cluster's first worker, and without any worker later
+_LOOK = 0.1  # s between two checks for finished robots
+_DIED = "every Dask worker that processed it died; memory may be short"
 
 
 @contextmanager
 def engine(task: Task, *, jobs: int | None, dask: str | None) -> Iterator[Engine]:
-    """Give what works on robots; see :func:`adaptfault.maintain_fleet` for the arguments.
+    """Return the engine for these options; see :func:`adaptfault.maintain_fleet` for the arguments.
 
     Raises:
         ValueError: Dask is not installed.
-        OSError: there is no scheduler at the address, or it has no worker.
+        OSError: no scheduler answers at the address, or it has no worker.
     """
     if dask is None:
         from joblib import cpu_count
@@ -71,29 +71,29 @@ def _on_joblib(task: Task, guards: Sequence[Guard], robots: Sequence[Robot]) -> 
         finally:
             free.put(guard)
 
-    # Threads, which only wait: joblib's own processes are one pool, which a single crash brings down.
+    # Threads that wait for the guards' processes: a crash in joblib's own process pool would end the whole pool.
     parallel = Parallel(len(guards), backend="threading", return_as="generator_unordered", batch_size=1)
     yield from parallel(delayed(done)(robot) for robot in robots)
 
 
 def _on_dask(client: Client, task: Task, robots: Sequence[Robot]) -> Iterator[Outcome]:
-    # Not through joblib: its Dask backend (1.6) waits for ever for a task whose worker died.
+    # Not through joblib: its Dask backend (1.6) never returns a task whose worker died.
     suspects = []
     for robot, outcome in _finished(client, task, robots):
         if outcome is None:
             suspects.append(robot)
         else:
             yield outcome
-    for suspect in suspects:  # alone: some only waited beside one that takes workers down
+    for suspect in suspects:  # one at a time: some only shared a worker with the robot that crashes it
         for robot, outcome in _finished(client, task, [suspect]):
             yield outcome or Outcome.error(robot, _DIED)
 
 
 def _finished(client: Client, task: Task, robots: Sequence[Robot]) -> Iterator[tuple[Robot, Outcome | None]]:
-    """Yield robots as they are done, with None where their workers died.
+    """Yield robots in order of completion, with None where their workers died.
 
     Raises:
-        OSError: the scheduler or the last worker is gone.
+        OSError: the scheduler or the last worker disappeared.
     """
     from distributed import as_completed
 
@@ -102,9 +102,7 @@ def _finished(client: Client, task: Task, robots: Sequence[Robot]) -> Iterator[t
     while robot_of:
         for future in coming.next_batch(block=False):
             if future.cancelled():
-                raise OSError(
-                    "the Dask scheduler went away or was restarted; start the run again to go on where it was"
-                )
+                raise OSError("the Dask scheduler went away or was restarted; start the run again to resume it")
             yield (robot := robot_of.pop(future)), _outcome(future, robot)
         if not coming.has_ready():
             time.sleep(_LOOK)
@@ -112,7 +110,7 @@ def _finished(client: Client, task: Task, robots: Sequence[Robot]) -> Iterator[t
             if client.nthreads():
                 seen = time.monotonic()
             elif idle > _WAIT:
-                raise OSError(f"no Dask worker for {_WAIT} s; start workers and the run again to go on where it was")
+                raise OSError(f"no Dask worker for {_WAIT} s; start workers, then the run again to resume it")
 
 
 def _outcome(future: Future, robot: Robot) -> Outcome | None:

@@ -1,4 +1,4 @@
-"""A process for one robot at a time: where it crashes or goes on past the limit, that robot alone is lost."""
+"""A worker process for one robot at a time: a crash or a timeout affects that robot only."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
     from loky import ProcessPoolExecutor
 
 _DIED = "the process that maintained it died; memory may be short, or a native library crashed"
-_START = 600  # s for a process to start and load what maintenance needs, from a cold disk
-_IDLE = 300  # s after which a process without work ends by itself
-_LOOK = 0.2  # s between two looks whether who started the process still lives
+_START = 600  # s for a process to start and import from a cold disk
+_IDLE = 300  # s after which an idle process ends
+_LOOK = 0.2  # s between two checks that the parent process lives
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is done with each robot.
+    """The work on one robot.
 
     Attributes:
-        work: gives its outcome.
-        ready: loads what ``work`` needs; not counted towards the limit.
+        work: returns the outcome of a robot.
+        ready: imports what ``work`` needs; not counted towards the limit.
         limit: seconds for one robot; None: no limit.
     """
 
@@ -42,7 +42,7 @@ class Task:
 
 
 class Guard:
-    """Keeps one process, loky's; after a death or a robot past its limit the next robot gets a new one."""
+    """Owns one loky process and replaces it after a crash or a timeout."""
 
     def __init__(self) -> None:
         self._executor: ProcessPoolExecutor | None = None
@@ -51,19 +51,19 @@ class Guard:
         """Return the robot's outcome; an error if its process died, raised, or had to be killed at the limit."""
         began = time.perf_counter()
         try:
-            self._ask(_START, task.ready)
-            outcome: Outcome = self._ask(task.limit, task.work, robot)
+            self._call(_START, task.ready)
+            outcome: Outcome = self._call(task.limit, task.work, robot)
         except _Lost as lost:
             return Outcome.error(robot, str(lost), time.perf_counter() - began)
         return outcome
 
     def close(self) -> None:
-        """Kill the process, whatever it does; whoever waits for it gets an error."""
+        """Kill the process; a waiting caller gets an error."""
         executor, self._executor = self._executor, None
         if executor is not None:
             executor.shutdown(kill_workers=True)
 
-    def _ask(self, seconds: float | None, call: Callable[..., Any], *args: object) -> Any:
+    def _call(self, seconds: float | None, call: Callable[..., Any], *args: object) -> Any:
         if self._executor is None:
             self._executor = _process()
         try:
@@ -71,7 +71,7 @@ class Guard:
             error = future.exception(seconds)
         except TimeoutError:
             self.close()
-            raise _Lost(f"not done after {seconds:g} s, so its process was killed; look at its recordings") from None
+            raise _Lost(f"not finished after {seconds:g} s, so its process was killed; check its recordings") from None
         except BrokenExecutor as broken:  # it died between two robots
             error = broken
         if isinstance(error, BrokenExecutor):
@@ -83,12 +83,12 @@ class Guard:
 
 
 class _Lost(Exception):
-    """No outcome, and why."""
+    """The reason why there is no outcome."""
 
 
 def quiet() -> None:
-    """Ignore loky's warning that a process ended: it is replaced, and as an error it would stop loky's thread."""
-    # A process that grew by 300 MB ends between two robots (loky's guard against leaks), and so does an idle one.
+    """Ignore loky's warning that a process ended; raised as an error it would stop loky's thread."""
+    # loky ends a process that grew by 300 MB, and an idle one, between two robots.
     warnings.filterwarnings("ignore", message="A worker (stopped|was restarted) while some jobs were given")
 
 
@@ -96,10 +96,10 @@ _here = threading.local()
 
 
 def do_on_worker(task: Task, robot: Robot) -> Outcome:
-    """Do it on a Dask worker: each of its threads keeps a process from robot to robot."""
+    """Process a robot on a Dask worker; each of its threads keeps one process."""
     if not hasattr(_here, "guard"):
         quiet()
-        # Under a nanny the worker may have no children, lest they outlive it; ours end when it does.
+        # Daemon processes may have no children; this one's end with it, see _end_with.
         multiprocessing.current_process().daemon = False
         _here.guard = Guard()
     guard: Guard = _here.guard
@@ -113,12 +113,12 @@ def _process() -> ProcessPoolExecutor:
 
 
 def _begin(parent: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who started the run, and no robot's error
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C stops the parent, not the robot's maintenance
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 
 def _end_with(parent: int) -> None:
-    """End when who started this was killed: the robot's lock has to be free when the run goes on."""
+    """End when the parent was killed, so that the robot's lock is free when the run resumes."""
     while os.getppid() == parent:
         time.sleep(_LOOK)
     os._exit(1)

@@ -1,4 +1,4 @@
-"""The list of a fleet, a TOML file: each robot's bundle and recordings, one by one or by a pattern."""
+"""The list of a fleet, a TOML file: bundle and recordings of each robot, as entries or by a pattern."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ else:
 
 _ENTRY = {"name", "bundle", "recordings", "tags", "commissioned"}
 _LISTING = {"bundles", "recordings", "tags", "robots"}
-_MEND = 'expected [[robots]] with name, bundle, recordings, or bundles = "robots/*/robot.bundle" and recordings'
+_EXPECTED = 'expected [[robots]] with name, bundle, recordings, or bundles = "robots/*/robot.bundle" and recordings'
 
 
 @dataclass(frozen=True)
 class Robot:
-    """One robot: where its bundle and its recordings are.
+    """One robot: paths of its bundle and its recordings.
 
     Attributes:
         name: unique in the fleet.
         bundle: path of its bundle.
-        recordings: files, folders or glob patterns; looked up when the robot's turn comes.
-        tags: any words, as where it works.
-        commissioned: the day its skin came into service, as ISO 8601; None if unknown.
+        recordings: files, folders or glob patterns, expanded when the robot is processed.
+        tags: free text, as its site.
+        commissioned: first day of its sensor in service, ISO 8601; None if unknown.
     """
 
     name: str
@@ -41,16 +41,16 @@ class Robot:
     commissioned: str | None = None
 
     def paths(self) -> list[str]:
-        """Return files and folders, with the patterns looked up.
+        """Return files and folders, with patterns expanded.
 
         Raises:
-            FileNotFoundError: nothing fits a pattern.
+            FileNotFoundError: a pattern matches nothing.
         """
         found: list[str] = []
         for pattern in self.recordings:
             fitting = sorted(glob.glob(pattern, recursive=True)) if glob.has_magic(pattern) else [pattern]
             if not fitting:
-                raise FileNotFoundError(f"{pattern}: no recording fits this pattern")
+                raise FileNotFoundError(f"{pattern}: no recording matches this pattern")
             found += fitting
         return found
 
@@ -65,7 +65,7 @@ class Fleet:
 
     Args:
         robots: at least one.
-        source: the file they are from, if any.
+        source: the file that lists them, if any.
 
     Raises:
         ValueError: no robot, or two of the same name or bundle.
@@ -77,7 +77,7 @@ class Fleet:
     def __post_init__(self) -> None:
         where = f"{self.source}: " if self.source else ""
         if not self.robots:
-            raise ValueError(f"{where}no robot in it; {_MEND}")
+            raise ValueError(f"{where}it lists no robot; {_EXPECTED}")
         for what, values in (("name", [r.name for r in self.robots]), ("bundle", [r.bundle for r in self.robots])):
             value, times = Counter(values).most_common(1)[0]
             if times > 1:
@@ -93,7 +93,7 @@ class Fleet:
     def read(cls, path: str | Path) -> Fleet:
         """Read a list of robots; paths in it are relative to the file.
 
-        One by one::
+        As entries::
 
             [[robots]]
             name = "r001"
@@ -102,8 +102,8 @@ class Fleet:
             tags = ["hall 3"]                   # optional
             commissioned = 2025-03-01           # optional: faults by age
 
-        or by a pattern, where a robot is called what the stars stand for; ``{bundle_dir}`` is the folder that holds
-        the bundle, ``{name}`` the robot's name::
+        or by a pattern, where the text matched by the stars is the robot's name; ``{bundle_dir}`` is the folder that
+        holds the bundle, ``{name}`` the robot's name::
 
             bundles = "robots/*/robot.bundle"
             recordings = "{bundle_dir}/recordings"
@@ -120,13 +120,13 @@ class Fleet:
         _known(listed, _LISTING, str(path))
         entries = listed.get("robots", [])
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise ValueError(f"{path}: `robots` is no array of tables; {_MEND}")
+            raise ValueError(f"{path}: `robots` is not an array of tables; {_EXPECTED}")
         home = path.resolve().parent
         robots = [_robot(entry, home, f"{path}, robot {i}") for i, entry in enumerate(entries, 1)]
         if "bundles" in listed:
-            robots += _fitting(listed, home, path)
+            robots += _matching(listed, home, path)
         elif "recordings" in listed or "tags" in listed:
-            raise ValueError(f"{path}: `recordings` and `tags` outside [[robots]] need `bundles`; {_MEND}")
+            raise ValueError(f"{path}: `recordings` and `tags` outside [[robots]] need `bundles`; {_EXPECTED}")
         return cls(tuple(robots), str(path))
 
 
@@ -150,14 +150,14 @@ def _robot(entry: Mapping[str, Any], home: Path, where: str) -> Robot:
     )
 
 
-def _fitting(listed: Mapping[str, Any], home: Path, path: Path) -> Iterator[Robot]:
-    """Yield the robots whose bundles fit the pattern, in order."""
+def _matching(listed: Mapping[str, Any], home: Path, path: Path) -> Iterator[Robot]:
+    """Yield the robots whose bundles match the pattern, sorted."""
     pattern, recordings = _text(listed, "bundles", str(path)), _texts(listed, "recordings", str(path))
     if not recordings:
         raise ValueError(f'{path}: `bundles` needs `recordings`, as recordings = "{{bundle_dir}}/recordings"')
     found = sorted(glob.glob(pattern, root_dir=home, recursive=True))
     if not found:
-        raise ValueError(f"{path}: no bundle fits {pattern}")
+        raise ValueError(f"{path}: no bundle matches {pattern}")
     for fitting in found:
         bundle, name = os.path.normpath(home / fitting), _name(fitting, pattern)
         values = {"bundle_dir": glob.escape(os.path.dirname(bundle)), "name": glob.escape(name)}
@@ -170,7 +170,7 @@ def _fitting(listed: Mapping[str, Any], home: Path, path: Path) -> Iterator[Robo
 
 
 def _name(bundle: str, pattern: str) -> str:
-    """Return what the stars stand for; with a ``**``, all from the first star on."""
+    """Return the text matched by the stars; with a ``**``, everything from the first star on."""
     parts, stars = Path(bundle).parts, Path(pattern).parts
     if "**" in stars:
         kept = parts[next(i for i, part in enumerate(stars) if glob.has_magic(part)) :]
@@ -180,7 +180,7 @@ def _name(bundle: str, pattern: str) -> str:
 
 
 def _pattern(home: Path, pattern: str) -> str:
-    # A star in the name of the folder that all is in stands for itself.
+    # A star in the name of the list's own folder is literal.
     return os.path.normpath(pattern if os.path.isabs(pattern) else os.path.join(glob.escape(str(home)), pattern))
 
 

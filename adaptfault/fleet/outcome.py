@@ -1,4 +1,4 @@
-"""What comes back from one robot: a few hundred bytes, not its diagnosis."""
+"""The outcome of one robot: a few hundred bytes, without the diagnosis."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from adaptfault.fleet.listing import Robot
 
-if TYPE_CHECKING:  # who only passes outcomes on does without torch
+if TYPE_CHECKING:  # passing outcomes on needs no torch
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.maintenance import Decision, MaintenanceReport
     from diagnostics import Fault
@@ -22,9 +22,9 @@ class Cause:
 
     Attributes:
         kind: of the fault, as "short".
-        wire: the line, as "pad 1, row 2"; None for cells by themselves.
-        family: what kind of line, as "row"; None likewise.
-        cells: how many are behind it.
+        wire: the line, as "pad 1, row 2"; None for single cells.
+        family: kind of line, as "row"; None for single cells.
+        cells: number of faulty cells that it explains.
     """
 
     kind: str
@@ -34,7 +34,7 @@ class Cause:
 
     @classmethod
     def of(cls, fault: Fault) -> Cause:
-        """Sum a fault up."""
+        """Return the cause of a fault."""
         line = fault.line
         wire, family = (None, None) if line is None else (str(line), line.kind)
         return cls(str(fault.kind), wire, family, len(fault.cells))
@@ -42,20 +42,20 @@ class Cause:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How maintenance of one robot ended.
+    """Result of maintenance of one robot.
 
     Attributes:
-        robot: which.
-        decision: of the maintenance; "error" if there was none.
+        robot: the robot.
+        decision: of the maintenance; "error" if it failed.
         exit_code: of the maintenance; 3 for an error.
-        reason: why, in one line.
-        version: that runs now; None for an error, as what follows.
-        cells, faulty: how many cells the skin has, and how many of them are known to be faulty.
-        shape: of the skin, as "2 x 11 x 10".
-        accuracy, fault_free_accuracy: of what runs now, under the faults and without; None if never judged.
+        reason: of the decision, one line.
+        version: that runs now; None for an error, as the following.
+        cells, faulty: number of cells, and of known faulty ones.
+        shape: of the array, as "2 x 11 x 10".
+        accuracy, fault_free_accuracy: of the running version, with and without the faults; None if never measured.
         causes: known root causes.
-        notes: recordings left out and damage, the first few.
-        recordings: how many new ones were used.
+        notes: first recordings left out, and damage.
+        recordings: number of new recordings used.
         seconds: wall clock on the worker.
     """
 
@@ -78,7 +78,7 @@ class Outcome:
     def of(
         cls, robot: Robot, bundle: Bundle, report: MaintenanceReport, *, notes: tuple[str, ...], seconds: float
     ) -> Outcome:
-        """Sum a report up; where nothing was judged in this run, the accuracy is the one last judged."""
+        """Summarise a report; without a measurement in this run, the accuracy is the last one measured."""
         accuracy, free = report.accuracy, report.fault_free_accuracy
         if accuracy is None and report.decision != "refused":
             runs = [run for run in bundle.journal.runs() if run.get("accuracy") is not None]
@@ -105,12 +105,12 @@ class Outcome:
 
     @classmethod
     def error(cls, robot: Robot, reason: str, seconds: float = 0.0) -> Outcome:
-        """Return the outcome of a robot that could not be maintained."""
+        """Return the outcome of a robot whose maintenance failed."""
         return cls(robot, "error", 3, " ".join(reason.split()), seconds=seconds)
 
     @property
     def kept(self) -> float:
-        """The share of the fault-free accuracy that is left; 0 where nothing that works is known."""
+        """Share of the fault-free accuracy that is left; 0 if unknown."""
         if self.accuracy is None or not self.fault_free_accuracy:
             return 0.0
         return self.accuracy / self.fault_free_accuracy
@@ -121,7 +121,7 @@ class Outcome:
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Outcome:
-        """Rebuild it from :meth:`to_dict`'s dict, also after a way through JSON."""
+        """Rebuild from :meth:`to_dict`, also after JSON."""
         robot = {**d["robot"], "recordings": tuple(d["robot"]["recordings"]), "tags": tuple(d["robot"]["tags"])}
         causes = tuple(Cause(**cause) for cause in d["causes"])
         return cls(**{**d, "robot": Robot(**robot), "causes": causes, "notes": tuple(d["notes"])})

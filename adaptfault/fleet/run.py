@@ -1,4 +1,4 @@
-"""Maintains a whole fleet on workers; what is done is on disk at once, so a killed run goes on."""
+"""Maintains a fleet on worker processes; each outcome is stored at once, so that a killed run resumes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 SCHEMA = "adaptfault.fleet-ledger/1"
 LEDGER = "ledger.jsonl"
 
-_OVER = timedelta(hours=12)  # a run that stood still for so long is not gone on with: robots have recorded since
+_OVER = timedelta(hours=12)  # a run without progress for longer is not resumed, because the robots have recorded since
 
 
 def maintain_fleet(
@@ -42,22 +42,22 @@ def maintain_fleet(
 ) -> FleetReport:
     """Run ``maintain`` over all robots; one that fails is an error in the report, and the others go on.
 
-    Each outcome is written to ``folder/ledger.jsonl`` as it comes. Called again after a kill, with the same options, it
-    does the robots that are not there yet; after a run that ended, or that stood still for 12 hours, it starts anew.
+    Each outcome is appended to ``folder/ledger.jsonl``. Called again after a kill with the same options, it processes
+    the remaining robots; after a run that ended, or without progress for 12 hours, it starts a new run.
 
     Args:
-        fleet: the robots. Their paths must mean the same on every worker (a shared folder, with Dask).
-        folder: of the run; made if need be.
+        fleet: the robots. Their paths must be valid on every worker (a shared folder, with Dask).
+        folder: of the run; created where missing.
         jobs: worker processes on this machine, one thread each; None: as many as cores.
-        dask: address of a Dask scheduler whose workers do it instead, as "tcp://host:8786".
+        dask: address of a Dask scheduler whose workers are used instead, as "tcp://host:8786".
         dry_run: report only, change nothing.
         budget: seconds that one adaptation may take.
-        limit: seconds that one robot may take; its process is killed then, and the robot is an error. None: no limit.
+        limit: seconds per robot, after which its process is killed and the robot is an error. None: no limit.
         progress: show or hide it on stderr; None shows it on a terminal.
 
     Raises:
         ValueError: ``jobs`` is below 1 or given with ``dask``, ``limit`` is not above 0, Dask is not installed, or the
-            ledger is not one.
+            ledger has another schema.
         Busy: another process maintains the fleet in this folder.
         OSError: the scheduler does not answer.
     """
@@ -91,7 +91,7 @@ def maintain_fleet(
 
 
 def _resumed(documents: list[Any], fleet: Fleet, options: dict[str, Any]) -> tuple[str, dict[str, Outcome]]:
-    """Return when the run in the ledger began and what it did; nothing if a new one is due."""
+    """Return the start and the outcomes of the run in the ledger; empty if a new run is due."""
     if not documents:
         return "", {}
     head, *entries = documents
@@ -102,11 +102,11 @@ def _resumed(documents: list[Any], fleet: Fleet, options: dict[str, Any]) -> tup
     if over or head["options"] != options or datetime.now(timezone.utc) - last > _OVER:
         return "", {}
     earlier = [Outcome.from_dict(entry["outcome"]) for entry in entries]
-    # A robot whose bundle or recordings are elsewhere now is done again.
-    listed = {_where(robot): robot for robot in fleet.robots}
-    done = {robot.name: replace(o, robot=robot) for o in earlier if (robot := listed.get(_where(o.robot)))}
+    # A robot whose paths changed is processed again.
+    listed = {_identity(robot): robot for robot in fleet.robots}
+    done = {robot.name: replace(o, robot=robot) for o in earlier if (robot := listed.get(_identity(o.robot)))}
     return head["began"], done
 
 
-def _where(robot: Robot) -> str:
+def _identity(robot: Robot) -> str:
     return json.dumps([robot.name, robot.bundle, robot.recordings])

@@ -1,4 +1,4 @@
-"""The state of a fleet: who needs a technician first, which wires die most, what could not be maintained."""
+"""The state of a fleet: robots that need a technician, wires that fail most often, failed robots."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _YEAR = 365.25
 
 @dataclass(frozen=True)
 class WireCount:
-    """How often one wire is at fault over the fleet.
+    """Number of faults of one wire over the fleet.
 
     Attributes:
         wire: the line, as "pad 1, row 2", or "single cells".
         kind: of the fault.
-        shape: of the skins it is on; lines of different skins are different wires.
-        robots: how many have it.
-        share: of the robots with such a skin.
-        cells: behind it, over all of them.
+        shape: of the array; wires of different arrays are counted apart.
+        robots: number of robots with this fault.
+        share: of the robots with such an array.
+        cells: faulty cells that it explains, over all robots.
     """
 
     wire: str
@@ -44,15 +44,15 @@ class WireCount:
 
 @dataclass(frozen=True)
 class AgeGroup:
-    """Robots whose skin has been in service for the same number of whole years.
+    """Robots whose sensor has been in service for the same number of whole years.
 
     Attributes:
         years: whole years in service.
-        robots: how many were looked at.
-        degraded: how many of them have a fault.
-        wires: dead lines in each, on average.
-        cells: faulty cells in each, on average.
-        worst: the line that is dead most often, with its number of robots; None if none is.
+        robots: number of robots.
+        degraded: number of them with a fault.
+        wires: mean number of faulty wires.
+        cells: mean number of faulty cells.
+        worst: the wire that fails most often, with its number of robots; None without faulty wires.
     """
 
     years: int
@@ -72,10 +72,10 @@ class AgeGroup:
 
 @dataclass(frozen=True)
 class FleetReport:
-    """How maintenance of a fleet ended.
+    """Result of maintenance of a fleet.
 
     Attributes:
-        outcomes: one a robot, in the order of the list.
+        outcomes: one per robot, in the order of the list.
         began, ended: UTC, as ISO 8601.
         dry_run: nothing was changed.
         source: the list of the fleet.
@@ -91,7 +91,7 @@ class FleetReport:
     def exit_code(self) -> int:
         """The worst of the robots: 2 if one needs a technician, else 3 if one is unknown, else 1, else 0.
 
-        A robot known to be bad weighs more than one nothing is known of.
+        A robot known to be degraded outranks one in an unknown state.
         """
         return max((o.exit_code for o in self.outcomes), key=(0, 1, 3, 2).index, default=0)
 
@@ -103,18 +103,18 @@ class FleetReport:
 
     @cached_property
     def technician(self) -> tuple[Outcome, ...]:
-        """Robots that need one, the most urgent first: by the accuracy left, then by the share of dead cells."""
+        """Robots that need a technician, most urgent first: by remaining accuracy, then by share of faulty cells."""
         needy = [o for o in self.outcomes if o.exit_code == 2]
         return tuple(sorted(needy, key=lambda o: (o.kept, -(o.faulty or 0) / (o.cells or 1), o.robot.name)))
 
     @property
     def errors(self) -> tuple[Outcome, ...]:
-        """Robots nothing is known of: an error, or recordings that are unusable."""
+        """Robots in an unknown state: an error, or unusable recordings."""
         return tuple(o for o in self.outcomes if o.exit_code == 3)
 
     @cached_property
     def wires(self) -> tuple[WireCount, ...]:
-        """Wires at fault, those of most robots first; cells by themselves are one entry a kind."""
+        """Faulty wires, the most frequent first; single cells are one entry per kind."""
         skins = Counter(o.shape for o in self.outcomes if o.shape)
         robots: Counter[tuple[str, str, str]] = Counter()
         cells: Counter[tuple[str, str, str]] = Counter()
@@ -129,13 +129,13 @@ class FleetReport:
 
     @property
     def families(self) -> dict[str, int]:
-        """Root causes by what they sit on: row, column, address lines, converter, single cells; most frequent first."""
+        """Root causes by kind of wire (row, column, address lines, converter) or single cells, most frequent first."""
         causes = Counter(cause.family or "single cells" for o in self.outcomes for cause in o.causes)
         return dict(causes.most_common())
 
     @cached_property
     def ages(self) -> tuple[AgeGroup, ...]:
-        """Faults by whole years in service, of robots that were looked at and whose first day is known."""
+        """Faults by whole years in service, of maintained robots with a known first day."""
         today = datetime.fromisoformat(self.ended).date()
         groups: dict[int, list[Outcome]] = {}
         for outcome in self.outcomes:
@@ -146,7 +146,7 @@ class FleetReport:
 
     @property
     def seconds(self) -> float:
-        """What all robots took on the workers, added up."""
+        """Total time of all robots on the workers."""
         return sum(o.seconds for o in self.outcomes)
 
     def __str__(self) -> str:
@@ -156,9 +156,9 @@ class FleetReport:
         would = " (dry run: nothing was changed)" if self.dry_run else ""
         lines = [f"ADAPTFAULT FLEET {status} - {len(self.outcomes)} robots: {counts}{would} | {measured}"]
         lines += _listed("need a technician, the most urgent first", [_needy(o) for o in self.technician])
-        lines += _listed("die most", [str(wire) for wire in self.wires])
+        lines += _listed("most frequent faults", [str(wire) for wire in self.wires])
         lines += _listed("by age", [str(group) for group in self.ages])
-        lines += _listed("nothing is known of", [f"{o.robot.name}: {o.reason}" for o in self.errors])
+        lines += _listed("unknown state", [f"{o.robot.name}: {o.reason}" for o in self.errors])
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
@@ -181,10 +181,10 @@ class FleetReport:
         }
 
     def write_page(self, path: str | Path) -> Path:
-        """Write the report as one HTML file that needs nothing else; returns its path.
+        """Write the report as one self-contained HTML file and return its path.
 
         Raises:
-            OSError: the folder cannot be written.
+            OSError: the file cannot be written.
         """
         import platform
 

@@ -1,4 +1,4 @@
-"""What a worker does: maintain one robot on one thread, whatever is wrong with it, and say in short how it went."""
+"""Maintenance of one robot on one thread; every error becomes an outcome."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from adaptfault.fleet.listing import Robot
 from adaptfault.fleet.outcome import Outcome
 from adaptfault.robot.lock import Busy
 
-_PATIENCE, _PAUSE = 120, 0.5  # s to wait for a robot that another process maintains, and between two tries
+_PATIENCE, _PAUSE = 120, 0.5  # s to wait for a robot that another process maintains, and between two attempts
 
 
 def ready() -> None:
-    """Load what maintenance needs."""
+    """Import what maintenance needs (the import of this module does it)."""
 
 
 def maintain_robot(robot: Robot, *, dry_run: bool = False, budget: float | None = None) -> Outcome:
-    """Maintain one robot; the outcome of one that cannot be is an error with its reason.
+    """Maintain one robot; a failure becomes an outcome "error" with its reason.
 
     Args:
-        robot: paths, which must mean the same on every worker.
+        robot: with paths that are valid on every worker.
         dry_run: report only.
         budget: seconds that an adaptation may take.
     """
@@ -31,12 +31,12 @@ def maintain_robot(robot: Robot, *, dry_run: bool = False, budget: float | None 
             return _patiently(robot, dry_run, budget, began)
     except (ValueError, OSError) as error:
         return Outcome.error(robot, str(error), time.perf_counter() - began)
-    except Exception as error:  # one robot never ends the night of all the others
+    except Exception as error:  # one robot must not stop the others
         return Outcome.error(robot, f"{type(error).__name__}: {error}", time.perf_counter() - began)
 
 
 def _patiently(robot: Robot, dry_run: bool, budget: float | None, began: float) -> Outcome:
-    """Wait for a robot that is being maintained: a Dask worker goes on with it for a while after its run was killed."""
+    """Wait for a locked robot: a Dask worker may still process it after its run was killed."""
     while True:
         try:
             return _maintained(robot, dry_run, budget, began)
@@ -49,10 +49,10 @@ def _patiently(robot: Robot, dry_run: bool, budget: float | None, began: float) 
 def _maintained(robot: Robot, dry_run: bool, budget: float | None, began: float) -> Outcome:
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.maintenance import maintain
-    from adaptfault.robot.new_recordings import load_incoming
+    from adaptfault.robot.new_recordings import load_new_recordings
 
     bundle = Bundle.open(robot.bundle)
-    incoming = load_incoming(bundle, robot.paths())
+    incoming = load_new_recordings(bundle, robot.paths())
     report = maintain(bundle, incoming.frames, names=incoming.names, dry_run=dry_run, budget=budget)
     notes = tuple(problem.message for problem in incoming.problems if problem.level == "error")
     return Outcome.of(robot, bundle, report, notes=notes, seconds=time.perf_counter() - began)
@@ -60,7 +60,7 @@ def _maintained(robot: Robot, dry_run: bool, budget: float | None, began: float)
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Workers are as many as cores: threads within each would only wait for each other."""
+    """Limit numeric libraries to one thread, because there are as many workers as cores."""
     import torch
     from threadpoolctl import threadpool_limits
 

@@ -1,1 +1,1 @@
-"""What a deployed robot carries and does: the bundle, its versions, and the maintenance that replaces them."""
+"""Deployment on a robot: the bundle, its model versions, maintenance, and prediction."""

@@ -1,13 +1,14 @@
-"""The bundle: the one folder that a robot carries. Opening it, and running what it holds, needs no torch."""
+"""The bundle: the folder with everything that one robot needs. Opening it and predicting need no torch."""
 
 from __future__ import annotations
 
-import errno
 import logging
 import os
+import re
 import shutil
+import time
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
@@ -17,14 +18,15 @@ from uuid import uuid4
 from adaptfault.robot.checksummed_json import (
     Damaged,
     damage,
+    decoding,
     hash_files,
-    read_either,
+    read_with_copy,
     sync,
     sync_tree,
-    write_twice,
+    write_with_copy,
 )
 from adaptfault.robot.journal import Journal
-from adaptfault.robot.known_faults import Knowledge
+from adaptfault.robot.known_faults import KnownFaults
 from adaptfault.robot.lock import locked
 from adaptfault.robot.parts import Parts
 from adaptfault.robot.pointer import NAME as POINTER
@@ -46,34 +48,36 @@ SCHEMA = "adaptfault.bundle/1"
 _ABOUT, _PARTS = "bundle.json", "parts"
 _MAINTENANCE_LOCK, _STATE_LOCK = "maintenance.lock", "state.lock"
 
-PROCESS = uuid4().hex  # this one, among those that start versions
+PROCESS = uuid4().hex  # identifies this process in the count of starts
 _log = logging.getLogger(__name__)
-_KEPT = 5  # versions, besides the fault-free one
+_TEMPORARY = re.compile(r"\.(bundle|current|journal)\..*\.[a-z0-9_]{8}")  # names that atomic_write makes
+_ABANDONED = 3600  # seconds
+_KEPT = 5  # latest versions that stay on the disk, besides the fault-free one
 
 
 class Bundle:
-    """Network, layout, calibration, healthy reference, replay set, versions and history of one robot's skin.
+    """Network, layout, calibration, healthy reference, stored windows, versions and history of one robot's sensor.
 
     The folder::
 
         bundle.json           the layout, the classes, and the hash of each part (and a copy)
-        parts/adapter         fault-free model and windows: what an adaptation starts from
-        parts/reference       what healthy looks like: what a diagnosis compares with
-        parts/check           windows that no model learns from: what a new version is judged on
+        parts/adapter         fault-free model and windows, from which every adaptation starts
+        parts/reference       fitted healthy model of the self-diagnosis
+        parts/check           held-out windows on which a new version is compared with the running one
         parts/calibration.csv
         versions/0001, ...    one model for one fault set each; 0001 is the fault-free one
         current.json          which version runs (and a copy)
-        journal.sqlite        recordings seen, runs, what is known of the cells
+        journal.sqlite        recordings used, maintenance runs, known faults
 
-    Parts and versions are written once, in a new folder that gets its name when all is on the disk. Every load checks
-    the hashes. A version that is damaged makes the one before run.
+    Parts and versions are written once, into a temporary folder that is renamed after all data is synced. Every load
+    checks the hashes. Where the active version is damaged, the last valid one before it runs.
 
     Args:
         path: an existing bundle.
 
     Raises:
-        FileNotFoundError: there is none.
-        Damaged: neither ``bundle.json`` nor its copy is what was written.
+        FileNotFoundError: the folder holds no bundle.
+        Damaged: both ``bundle.json`` and its copy fail their checksum.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -82,10 +86,11 @@ class Bundle:
             raise FileNotFoundError(
                 f"{self.path}: expected a bundle, a folder with {_ABOUT}; adaptfault train --out X.bundle makes one"
             )
-        self.about: dict[str, Any] = read_either(self.path / _ABOUT, SCHEMA)
-        self.layout = SensorLayout.from_dict(self.about["layout"])
-        self.class_names: tuple[str, ...] = tuple(self.about["class_names"])
-        self.parts = Parts(self.path / _PARTS, self.about["parts"])
+        self.about: dict[str, Any] = read_with_copy(self.path / _ABOUT, SCHEMA)
+        with decoding(self.path / _ABOUT):
+            self.layout = SensorLayout.from_dict(self.about["layout"])
+            self.class_names: tuple[str, ...] = tuple(map(str, self.about["class_names"]))
+            self.parts = Parts(self.path / _PARTS, dict(self.about["parts"]))
         self.versions = Versions(self.path / "versions")
         self.journal = Journal(self.path)
 
@@ -106,34 +111,34 @@ class Bundle:
         class_names: Sequence[str] = (),
         calibration: Calibration | None = None,
     ) -> Bundle:
-        """Make a bundle from a fault-free model and what belongs to it.
+        """Write a new bundle from a fault-free model, its adapter and a fitted diagnoser.
 
         Args:
-            path: where to; must not exist.
+            path: folder to create; must not exist.
             model: the fault-free model, which becomes version 1.
-            adapter: adapts it; its windows are kept, within 20 MB.
+            adapter: of the same model; its windows are stored, at most 20 MB of them.
             diagnoser: fitted on fault-free recordings.
-            check: fault-free, labelled windows that neither model nor adapter learns from, as the test windows of
-                ``split``; new versions are judged on them. None: the adapter gives up half of its validation windows.
+            check: held-out fault-free labelled windows, as the test windows of ``split``, on which new versions are
+                compared with the running one. None takes half of the adapter's validation windows.
             class_names: one name a class, or none.
-            calibration: from raw counts to the layout's unit, if recordings come raw.
+            calibration: from raw counts to the layout's unit, if recordings are raw counts.
 
         Raises:
-            FileExistsError: there is something at ``path``.
-            ValueError: the parts are of different arrays, or the diagnoser is not fitted.
+            FileExistsError: ``path`` exists.
+            ValueError: the parts have different array shapes, or the diagnoser is not fitted.
         """
         path = Path(path)
         if path.exists():
             raise FileExistsError(f"{path} exists: choose another name, or remove it")
         if not diagnoser.layout.shape == adapter.model.layout.shape == model.layout.shape:
             raise ValueError(
-                f"model, adapter and diagnoser are of different arrays: {model.layout}, {diagnoser.layout}"
+                f"model, adapter and diagnoser need one array shape; got {model.layout} and {diagnoser.layout}"
             )
         if class_names and len(class_names) != model.n_classes:
             raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
         path.parent.mkdir(parents=True, exist_ok=True)
         new = path.with_name(f".{path.name}.unfinished")
-        shutil.rmtree(new, ignore_errors=True)  # of a crash, if it is there
+        shutil.rmtree(new, ignore_errors=True)  # left by a crash
         Parts.write(new / _PARTS, adapter, diagnoser, check, calibration)
         about: dict[str, Any] = {
             "schema": SCHEMA,
@@ -142,7 +147,7 @@ class Bundle:
             "created": now(),
             "parts": hash_files(new / _PARTS),
         }
-        write_twice(new / _ABOUT, about)
+        write_with_copy(new / _ABOUT, about)
         bundle = cls(new)
         Pointer(active=1).write(new)
         bundle.write_version(_fault_free(model, adapter.validation), {"reason": "the fault-free model"})
@@ -151,18 +156,18 @@ class Bundle:
         sync(path.parent)
         return cls(path)
 
-    # What runs.
+    # The active version.
 
     @property
     def pointer(self) -> Path:
-        """The file that is replaced when another version is to run."""
+        """The file that names the active version; replaced at every switch."""
         return self.path / POINTER
 
     def active(self) -> Version:
-        """Return the version that runs, or where that is damaged, the last good one before it.
+        """Return the active version; where it is damaged, the last valid one before it.
 
         Raises:
-            Damaged: no version is left that can be read.
+            Damaged: no version can be read.
         """
         pointer = Pointer.read(self.path)
         before = [n for n in reversed(self.versions.numbers) if n < pointer.active]
@@ -175,12 +180,13 @@ class Bundle:
         raise Damaged(f"{self.path} holds no version that can be read: {problems[0]}")
 
     def begin(self, starter: str = PROCESS) -> Version:
-        """Return the version to run, from the one that starts to run it: counts starts while it is on probation.
+        """Return the version to run and count the start while that version is on probation.
 
-        One that was started twice without :meth:`confirm` gives way to the one before.
+        A version that was started twice without :meth:`confirm` is replaced by the one before it.
 
         Args:
-            starter: who starts it. The same one in a row counts once: a process may serve several devices.
+            starter: identifies the caller. Consecutive starts by the same starter count once, because one process may
+                serve several devices.
         """
         try:
             with locked(self.path / _STATE_LOCK, wait=True):
@@ -190,13 +196,14 @@ class Bundle:
                     self._fall_back(pointer, f"version {pointer.active} was started {STARTS} times and never confirmed")
                 elif after != pointer:
                     after.write(self.path)
-        except OSError as error:
-            if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
-                raise  # a bundle that cannot be written runs all the same
+        except OSError as error:  # a full or read-only disk must not stop the prediction
+            _log.warning("%s cannot be written, so this start is not counted: %s", self.path, error)
         return self.active()
 
     def confirm(self) -> None:
-        """Say that the version which runs is healthy: its probation is over."""
+        """End the probation of the active version; raises OSError where the bundle cannot be written."""
+        if not Pointer.read(self.path).probation:
+            return
         with locked(self.path / _STATE_LOCK, wait=True):
             pointer = Pointer.read(self.path)
             if pointer.probation:
@@ -204,27 +211,29 @@ class Bundle:
                 self.journal.add(now(), "confirmed", {"version": pointer.active})
 
     def deploy(self, number: int) -> None:
-        """Switch to a version, on probation."""
+        """Make a version the active one, on probation."""
         with locked(self.path / _STATE_LOCK, wait=True):
             Pointer.read(self.path).deployed(number).write(self.path)
 
     def rollback(self) -> Version:
-        """Return to the version before; what is left is not deployed for the same faults again.
+        """Return to the previous version. The fault set of the rejected one is not deployed again.
 
         Raises:
-            ValueError: there is none before.
+            ValueError: there is no previous version.
         """
         with locked(self.path / _STATE_LOCK, wait=True):
             pointer = Pointer.read(self.path)
             self._fall_back(pointer, f"version {pointer.active} was rolled back")
         return self.active()
 
-    def problems(self, *, mend: bool = True) -> list[str]:
-        """Check every file and return what is damaged; what can be mended is, unless ``mend`` is False."""
-        problems = damage(self.pointer, POINTER_SCHEMA, mend=mend) + damage(self.path / _ABOUT, SCHEMA, mend=mend)
-        problems += self.journal.damage(mend=mend)
+    def problems(self, *, repair: bool = True) -> list[str]:
+        """Check every file and return the damage; ``repair`` restores what has a copy."""
+        problems = damage(self.pointer, POINTER_SCHEMA, repair=repair) + damage(
+            self.path / _ABOUT, SCHEMA, repair=repair
+        )
+        problems += self.journal.damage(repair=repair)
         try:
-            self.parts.check()
+            self.parts.check(repair=repair)
         except Damaged as error:
             problems.append(str(error))
         for number in self.versions.numbers:
@@ -233,6 +242,13 @@ class Bundle:
             except (Damaged, FileNotFoundError) as error:
                 problems.append(str(error))
         return problems
+
+    def sweep(self) -> None:
+        """Remove temporary files that crashes left, once they are older than any write."""
+        for path in self.path.glob(".*"):
+            with suppress(OSError):  # another process may remove it, too
+                if _TEMPORARY.fullmatch(path.name) and time.time() - path.stat().st_mtime > _ABANDONED:
+                    path.unlink()
 
     def _fall_back(self, pointer: Pointer, reason: str) -> None:
         try:
@@ -247,21 +263,24 @@ class Bundle:
         """Return the fitted self-diagnosis; raises Damaged. Needs no torch."""
         return self.parts.diagnoser()
 
-    # Its history.
+    # History.
 
-    def knowledge(self) -> Knowledge:
-        """Return what is known of the cells after the last run."""
+    def known_faults(self) -> KnownFaults:
+        """Return the known faults after the last maintenance run."""
         known = self.journal.last("knowledge")
-        if known is None:  # the journal is new or was lost: the version that runs knows what it was made for
+        if known is None:  # new or lost journal: the active version stores the faults it was adapted to
             known = self.active().about.get("knowledge")
-        return Knowledge(self.layout.n_cells) if known is None else Knowledge.from_dict(known)
+        if known is None:
+            return KnownFaults(self.layout.n_cells)
+        with decoding(self.journal.path):
+            return KnownFaults.from_dict(known)
 
-    def maintenance(self) -> AbstractContextManager[None]:
-        """Hold the lock of maintenance: one run at a time; raises Busy."""
-        return locked(self.path / _MAINTENANCE_LOCK, wait=False)
+    def maintenance(self, *, dry_run: bool = False) -> AbstractContextManager[None]:
+        """Hold the maintenance lock, one run at a time; raises Busy. A dry run needs no write access."""
+        return locked(self.path / _MAINTENANCE_LOCK, wait=False, optional=dry_run)
 
     def write_version(self, adaptation: Adaptation, about: dict[str, Any]) -> Version:
-        """Write an adaptation as a new version. Nothing is switched."""
+        """Write an adaptation as a new version without activating it."""
         version = self.versions.write(
             partial(_save, adaptation),
             layout=self.layout,
@@ -277,23 +296,23 @@ class Bundle:
 
 
 def now() -> str:
-    """Return the time, UTC, as ISO 8601."""
+    """Return the current UTC time as ISO 8601."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
 def _save(adaptation: Adaptation, folder: Path) -> None:
-    """Write an adaptation, and beside it the ONNX file: where that cannot be made, it runs on torch."""
+    """Write an adaptation and its ONNX file; without the ONNX file the version runs on torch."""
     from adaptfault.models.export import ExportError, add_onnx
 
     adaptation.save(folder)
     try:
         add_onnx(folder)
     except (ImportError, ExportError) as error:
-        _log.warning("without ONNX, this version runs on torch: %s", error)
+        _log.warning("no ONNX export, this version runs on torch: %s", error)
 
 
 def _fault_free(model: TactileTransformer | AnyModel, validation: Windows) -> Adaptation:
-    """Return the model as an adaptation to no fault: the same logits, bit for bit."""
+    """Return the model as an adaptation to the empty fault set, with identical logits."""
     from adaptfault.adaptation.reduced_model import ReducedModel
     from adaptfault.adaptation.result import Adaptation
     from diagnostics import FaultSet

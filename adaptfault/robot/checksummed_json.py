@@ -1,92 +1,109 @@
-"""JSON documents that know when they were damaged, and the hashes of the files beside them."""
+"""JSON documents with a checksum and a copy, and SHA-256 hashes of other files."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from adaptfault.data.atomic import atomic_write
 
-_SEAL = "sha256"
+_CHECKSUM = "sha256"
 _CHUNK = 1 << 20
 
 
 class Damaged(ValueError):
-    """A file is not what was written: a flipped bit, a truncation, another program."""
+    """The content of a file differs from what was written: flipped bit, truncation, or a write by another program."""
 
 
-def write_sealed(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a JSON document with the hash of its content; what was there is replaced whole or not at all."""
-    sealed = {**document, _SEAL: _hash(document)}
-    atomic_write(path, json.dumps(sealed, indent=1, allow_nan=False).encode())
+def write_checksummed(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON document with the SHA-256 of its content, atomically."""
+    checksummed = {**document, _CHECKSUM: _hash(document)}
+    atomic_write(path, json.dumps(checksummed, indent=1, allow_nan=False).encode())
 
 
-def read_sealed(path: Path, schema: str) -> dict[str, Any]:
-    """Read what :func:`write_sealed` wrote.
+def read_checksummed(path: Path, schema: str) -> dict[str, Any]:
+    """Read what :func:`write_checksummed` wrote.
 
     Raises:
-        FileNotFoundError: there is none.
-        Damaged: its content is not the one that was sealed, or it has another schema.
+        FileNotFoundError: the file does not exist.
+        Damaged: the checksum does not match, or the schema differs.
     """
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except (IsADirectoryError, NotADirectoryError):
+        raise Damaged(f"{path} is damaged: expected a file") from None
     try:
         document = json.loads(data)
-        seal = document.pop(_SEAL)
+        checksum = document.pop(_CHECKSUM)
         found = document["schema"]
     except (ValueError, TypeError, KeyError, AttributeError):
-        raise Damaged(f"{path} is damaged: no sealed JSON") from None
-    if seal != _hash(document) or data != json.dumps({**document, _SEAL: seal}, indent=1, allow_nan=False).encode():
-        raise Damaged(f"{path} is damaged: its content is not the one that was sealed")
+        raise Damaged(f"{path} is damaged: not JSON with a checksum") from None
+    if (
+        checksum != _hash(document)
+        or data != json.dumps({**document, _CHECKSUM: checksum}, indent=1, allow_nan=False).encode()
+    ):
+        raise Damaged(f"{path} is damaged: its content does not match its checksum")
     if found != schema:
         raise Damaged(f"{path} has schema {found!r}, expected {schema!r}")
     return dict(document)
 
 
-def write_twice(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a sealed document, then a copy beside it: the document itself is what counts, the copy is a spare."""
-    write_sealed(path, document)
-    atomic_write(_spare(path), path.read_bytes())
+@contextmanager
+def decoding(path: Path) -> Iterator[None]:
+    """Raise Damaged for any error in decoding the content of ``path``, whose checksum may be right all the same."""
+    try:
+        yield
+    except (OSError, ImportError, Damaged):
+        raise
+    except Exception as error:  # a malformed document raises any of a dozen kinds, SafetensorError among them
+        raise Damaged(f"{path} is damaged: {type(error).__name__} {error}") from None
 
 
-def read_either(path: Path, schema: str) -> dict[str, Any]:
-    """Read what :func:`write_twice` wrote, from the copy where the document itself is damaged or missing.
+def write_with_copy(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a checksummed document, then a copy beside it that is read where the document is damaged."""
+    write_checksummed(path, document)
+    atomic_write(_copy(path), path.read_bytes())
+
+
+def read_with_copy(path: Path, schema: str) -> dict[str, Any]:
+    """Read what :func:`write_with_copy` wrote; read the copy where the document is damaged or missing.
 
     Raises:
-        FileNotFoundError: neither is there.
+        FileNotFoundError: neither exists.
         Damaged: neither can be read.
     """
     try:
-        return read_sealed(path, schema)
+        return read_checksummed(path, schema)
     except (FileNotFoundError, Damaged):
-        if not _spare(path).exists():
+        if not _copy(path).exists():
             raise
     try:
-        return read_sealed(_spare(path), schema)
+        return read_checksummed(_copy(path), schema)
     except Damaged:
         raise Damaged(f"{path} and its copy are both damaged") from None
 
 
-def damage(path: Path, schema: str, *, mend: bool) -> list[str]:
-    """Return what is wrong with a document or its copy; mend the one by the other."""
+def damage(path: Path, schema: str, *, repair: bool) -> list[str]:
+    """Return the damage of a document and its copy; repair one from the other."""
     problems = []
-    for one, other in ((path, _spare(path)), (_spare(path), path)):
+    for one, other in ((path, _copy(path)), (_copy(path), path)):
         try:
-            read_sealed(one, schema)
+            read_checksummed(one, schema)
         except (FileNotFoundError, Damaged) as error:
             problems.append(f"{one} is missing" if isinstance(error, FileNotFoundError) else str(error))
             with suppress(FileNotFoundError, Damaged):
-                read_sealed(other, schema)
-                if mend:
+                read_checksummed(other, schema)
+                if repair:
                     atomic_write(one, other.read_bytes())
     return problems
 
 
-def _spare(path: Path) -> Path:
+def _copy(path: Path) -> Path:
     return path.with_suffix(".copy" + path.suffix)
 
 
@@ -97,7 +114,7 @@ def hash_files(folder: Path, *, without: str = "") -> dict[str, str]:
 
 
 def check_files(folder: Path, hashes: Mapping[str, str]) -> None:
-    """Compare the files of a folder with the hashes that were noted.
+    """Compare the files of a folder with recorded hashes.
 
     Raises:
         Damaged: one is missing or differs.
@@ -107,7 +124,7 @@ def check_files(folder: Path, hashes: Mapping[str, str]) -> None:
         if not path.is_file():
             raise Damaged(f"{path} is missing")
         if hash_file(path) != expected:
-            raise Damaged(f"{path} is damaged: its hash is not the one that was noted")
+            raise Damaged(f"{path} is damaged: its SHA-256 differs from the recorded one")
 
 
 def hash_file(path: Path) -> str:
@@ -120,13 +137,13 @@ def hash_file(path: Path) -> str:
 
 
 def sync_tree(folder: Path) -> None:
-    """Bring every file and folder below ``folder``, and itself, to the disk."""
+    """Flush ``folder`` and everything below it to the disk (fsync)."""
     for path in [*folder.rglob("*"), folder]:
         sync(path)
 
 
 def sync(path: Path) -> None:
-    """Bring a file, or the names in a folder, to the disk."""
+    """Flush a file, or the entries of a folder, to the disk (fsync)."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""Whether a candidate may replace what runs: both are judged on fault-free windows that the new faults are put into."""
+"""Comparison of a candidate with the running model on held-out windows with the known faults injected."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from diagnostics import Fault, SensorLayout, inject
 Predict = Callable[[NDArray[np.float32]], NDArray[np.int64]]
 
 _DRAWS = 2000
-_SURE = 0.95  # share of the draws that must agree
-_COLLAPSE = 0.5  # a class that keeps less than this share of its recall has collapsed
+_CONFIDENCE = 0.95  # share of the bootstrap draws that must agree
+_COLLAPSE = 0.5  # a class collapses when it keeps less than this share of its recall
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A candidate beside what runs, both under the new faults.
+    """Accuracy of a candidate and of the running model under the same faults.
 
     Attributes:
         running, candidate: accuracies.
-        gain: their difference, and its interval (5 % to 95 %), bootstrapped by recording.
-        collapsed: classes whose recall the candidate more than halves.
+        gain: candidate - running.
+        low, high: 5 % and 95 % quantiles of the gain, paired bootstrap over recordings.
+        collapsed: classes of which the candidate keeps less than half of the running model's recall.
     """
 
     running: float
@@ -38,18 +39,18 @@ class Judgement:
 
     @property
     def better(self) -> bool:
-        """The candidate is better beyond chance."""
+        """Whether the lower limit of the gain is positive."""
         return self.low > 0
 
     def __str__(self) -> str:
         return (
-            f"under these faults what runs has accuracy {self.running:.3f}, the candidate {self.candidate:.3f}"
+            f"accuracy under these faults: running {self.running:.3f}, candidate {self.candidate:.3f}"
             f" (gain {self.gain:+.3f}, 90 % interval {self.low:+.3f} to {self.high:+.3f})"
         )
 
 
 def with_faults(windows: Windows, faults: Sequence[Fault], layout: SensorLayout, *, seed: int = 0) -> Windows:
-    """Return fault-free windows as the sensor would report them with these faults, from the first frame on."""
+    """Return fault-free windows with these faults injected from the first frame on."""
     x = np.empty_like(windows.x)
     always = [Fault(f.kind, f.cells, line=f.line, value=f.value) for f in faults]  # no onset
     for number in np.unique(windows.recording):
@@ -60,8 +61,10 @@ def with_faults(windows: Windows, faults: Sequence[Fault], layout: SensorLayout,
     return Windows(x, windows.y, windows.recording)
 
 
-def judge(running: Predict, candidate: Predict, windows: Windows, *, seed: int = 0) -> Judgement:
-    """Compare two classifiers on labelled windows that hold the new faults; recordings are what is counted."""
+def compare_candidate(running: Predict, candidate: Predict, windows: Windows, *, seed: int = 0) -> Judgement:
+    """Compare two classifiers on labelled windows with injected faults.
+
+    Paired bootstrap over recordings, because windows of one recording are dependent (Efron and Tibshirani 1993)."""
     right = np.stack([running(windows.x) == windows.y, candidate(windows.x) == windows.y]).astype(float)  # [2, N]
     recordings, inverse = np.unique(windows.recording, return_inverse=True)
     size = np.bincount(inverse).astype(float)
@@ -69,7 +72,7 @@ def judge(running: Predict, candidate: Predict, windows: Windows, *, seed: int =
     rng = np.random.default_rng(seed)
     drawn = rng.integers(len(recordings), size=(_DRAWS, len(recordings)))
     gains = won[drawn].sum(axis=1) / size[drawn].sum(axis=1)
-    low, high = np.quantile(gains, [1 - _SURE, _SURE])
+    low, high = np.quantile(gains, [1 - _CONFIDENCE, _CONFIDENCE])
     return Judgement(
         running=float(right[0].mean()),
         candidate=float(right[1].mean()),
@@ -83,13 +86,13 @@ def judge(running: Predict, candidate: Predict, windows: Windows, *, seed: int =
 def _collapsed(
     right: NDArray[np.float64], y: NDArray[Any], inverse: NDArray[np.intp], drawn: NDArray[np.intp]
 ) -> tuple[int, ...]:
-    """Return the classes whose recall is more than halved, in nearly all draws of their recordings."""
+    """Return the classes whose recall is more than halved in at least 95 % of the bootstrap draws."""
     collapsed = []
     for label in np.unique(y):
         of_it = y == label
         kept = np.bincount(
             inverse[of_it], weights=right[1, of_it] - _COLLAPSE * right[0, of_it], minlength=drawn.shape[1]
         )
-        if (kept[drawn].sum(axis=1) < 0).mean() >= _SURE:
+        if (kept[drawn].sum(axis=1) < 0).mean() >= _CONFIDENCE:
             collapsed.append(int(label))
     return tuple(collapsed)

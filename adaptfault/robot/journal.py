@@ -1,8 +1,9 @@
-"""The journal of a bundle: which recordings were seen, and what each maintenance run found and did. Needs no torch."""
+"""The journal of a bundle: recordings used and results of each maintenance run. Needs no torch."""
 
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -13,7 +14,7 @@ from adaptfault.data.atomic import atomic_write
 from adaptfault.robot.checksummed_json import hash_file
 from adaptfault.robot.lock import locked
 
-NAME, _SEAL, _LOCK = "journal.sqlite", "journal.sha256", "journal.lock"
+NAME, _CHECKSUM, _LOCK = "journal.sqlite", "journal.sha256", "journal.lock"
 _ASIDE = "journal.damaged.sqlite"
 
 _TABLES = """
@@ -24,44 +25,46 @@ _TABLES = """
 
 
 class Journal:
-    """What happened to a robot's skin and its classifier, in order.
+    """Maintenance runs, confirmations and rollbacks in order, in an SQLite file.
 
-    SQLite keeps a transaction whole through a crash. A file beside it holds the hash of the whole, so that a bit that
-    flips later is noticed too.
+    SQLite makes each transaction atomic. A file beside it holds the SHA-256 of the database, which detects later bit
+    flips.
     """
 
     def __init__(self, bundle: Path) -> None:
         self.bundle, self.path = bundle, bundle / NAME
 
-    def damage(self, *, mend: bool) -> list[str]:
-        """Return what is wrong with the file; to mend is to set a broken one aside and begin a new one.
+    def damage(self, *, repair: bool) -> list[str]:
+        """Return the damage of the file; ``repair`` renames a broken file and starts a new one.
 
-        A crash between a transaction and its seal leaves an intact file under an old seal: it is sealed again.
+        A crash between a transaction and its checksum leaves an intact file with an old checksum, which is rewritten.
         """
-        with locked(self.bundle / _LOCK, wait=True):
+        with locked(self.bundle / _LOCK, wait=True, optional=not repair):
             if not self.path.exists():
-                return [f"{self.path} is missing: begun anew"] if (self.bundle / _SEAL).exists() else []
-            seal = self.bundle / _SEAL
-            if seal.exists() and seal.read_text() == hash_file(self.path):
+                return (
+                    [f"{self.path} is missing: a new journal is started"] if (self.bundle / _CHECKSUM).exists() else []
+                )
+            checksum = self.bundle / _CHECKSUM
+            if checksum.exists() and checksum.read_text() == hash_file(self.path):
                 return []
             try:
-                with closing(sqlite3.connect(self.path)) as connection:
+                with closing(self._connect()) as connection:
                     intact = connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
                     for (document,) in connection.execute("SELECT document FROM runs"):
                         json.loads(document)
             except (sqlite3.DatabaseError, ValueError):
                 intact = False
             if intact:
-                if mend:
-                    self._seal()
-                return [f"{self.path} was changed outside, or a crash came before its seal; it reads well"]
-            if mend:
+                if repair:
+                    self._write_checksum()
+                return [f"{self.path} differs from its checksum (other program, or a crash); it is readable"]
+            if repair:
                 self.path.replace(self.path.with_name(_ASIDE))
-                seal.unlink(missing_ok=True)
-            return [f"{self.path} is damaged: to be set aside as {_ASIDE}, and begun anew"]
+                checksum.unlink(missing_ok=True)
+            return [f"{self.path} is damaged: it is renamed to {_ASIDE} and a new journal is started"]
 
     def add(self, time: str, what: str, document: Mapping[str, Any], recordings: Sequence[tuple[str, str]] = ()) -> int:
-        """Add a run and the recordings ``(digest, name)`` that it saw, all or nothing; return its number."""
+        """Add a run and the recordings ``(digest, name)`` that it used, in one transaction; return its number."""
         with self._connection() as connection, connection:
             cursor = connection.execute(
                 "INSERT INTO runs (time, what, document) VALUES (?, ?, ?)",
@@ -72,7 +75,7 @@ class Journal:
             return int(cursor.lastrowid or 0)
 
     def seen(self, digests: Sequence[str]) -> set[str]:
-        """Return those of the recordings that an earlier run saw."""
+        """Return those of the recordings that an earlier run used."""
         if not self.path.exists():
             return set()
         with self._reading() as connection:
@@ -80,7 +83,7 @@ class Journal:
         return known & set(digests)
 
     def runs(self, last: int | None = None) -> list[dict[str, Any]]:
-        """Return the runs, the oldest first: each its document with ``id``, ``time`` and ``what``."""
+        """Return the runs, oldest first: each document with ``id``, ``time`` and ``what``."""
         if not self.path.exists():
             return []
         with self._reading() as connection:
@@ -89,7 +92,7 @@ class Journal:
         return [{**json.loads(text), "id": i, "time": time, "what": what} for i, time, what, text in reversed(rows)]
 
     def last(self, key: str) -> Any:
-        """Return what the last run whose document has this key says there; None if none has it."""
+        """Return the value of ``key`` in the last run that has it; None if no run has it."""
         if not self.path.exists():
             return None
         with self._reading() as connection:
@@ -100,9 +103,14 @@ class Journal:
 
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
-        # Not read-only: after a crash SQLite has to roll back first.
-        with locked(self.bundle / _LOCK, wait=True), closing(sqlite3.connect(self.path)) as connection:
+        with locked(self.bundle / _LOCK, wait=True, optional=True), closing(self._connect()) as connection:
             yield connection
+
+    def _connect(self) -> sqlite3.Connection:
+        """Connect for reading: with write access where possible, because SQLite rolls back after a crash."""
+        if os.access(self.path, os.W_OK) and os.access(self.bundle, os.W_OK):
+            return sqlite3.connect(self.path)
+        return sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
 
     @contextmanager
     def _connection(self) -> Iterator[sqlite3.Connection]:
@@ -111,7 +119,7 @@ class Journal:
                 connection.executescript(_TABLES)
                 connection.execute("PRAGMA synchronous=FULL")
                 yield connection
-            self._seal()
+            self._write_checksum()
 
-    def _seal(self) -> None:
-        atomic_write(self.bundle / _SEAL, hash_file(self.path).encode())
+    def _write_checksum(self) -> None:
+        atomic_write(self.bundle / _CHECKSUM, hash_file(self.path).encode())

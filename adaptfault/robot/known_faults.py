@@ -1,4 +1,4 @@
-"""What is known of a robot's cells over all logs so far: a dead cell stays dead until it has proven life again."""
+"""Known faults over all logs: a faulty cell stays faulty until several logs in a row show it alive."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from diagnostics import Diagnosis, Fault, FaultKind, FaultSet, Verdict
 
 SCHEMA = "adaptfault.knowledge/1"
 
-# In how many logs a faulty cell has to be ALIVE, with none in between that calls it faulty, until it is believed.
-_PROOFS = 3
-_PROOFS_BLINKING = 6  # a loose contact is fine most of the time
+# A faulty cell recovers after it is ALIVE in so many logs with none in between that finds it FAULTY.
+_ALIVE_LOGS = 3
+_ALIVE_LOGS_INTERMITTENT = 6  # a loose contact works most of the time
 
 
 @dataclass(frozen=True)
-class Knowledge:
-    """What is known of the cells.
+class KnownFaults:
+    """The faults of one sensor, as known from all logs so far.
 
     Attributes:
         n_cells: D.
-        faults: one for each root cause that still has cells.
-        proofs: for a faulty cell, in how many logs since it was alive.
+        faults: one for each root cause that still has faulty cells.
+        proofs: number of logs that show a faulty cell alive since the last log that found it faulty.
     """
 
     n_cells: int
@@ -33,25 +33,25 @@ class Knowledge:
 
     @property
     def fault_set(self) -> FaultSet:
-        """F, the cells not to be used."""
+        """F, the cells that a classifier must not use."""
         return FaultSet(tuple({cell for fault in self.faults for cell in fault.cells}), self.n_cells)
 
-    def merged(self, diagnosis: Diagnosis) -> Knowledge:
-        """Return what is known after one more log.
+    def merged(self, diagnosis: Diagnosis) -> KnownFaults:
+        """Return the known faults after one more log.
 
-        New faults count at once. A faulty cell that the log shows alive has one proof more; with three of them (six if
-        it blinked) it has recovered. One that the log did not test stays as it is.
+        New faults are added at once. A known faulty cell recovers after three logs that show it alive (six for an
+        intermittent fault). A log that does not test the cell changes nothing.
         """
         now = diagnosis.fault_set
         alive = FaultSet(tuple(np.flatnonzero(diagnosis.verdicts == Verdict.ALIVE).tolist()), self.n_cells)
         proofs = {cell: self.proofs.get(cell, 0) + (cell in alive) for cell in self.fault_set - now}
         kept = []
         for fault in self.faults:
-            needed = _PROOFS_BLINKING if fault.kind is FaultKind.INTERMITTENT else _PROOFS
+            needed = _ALIVE_LOGS_INTERMITTENT if fault.kind is FaultKind.INTERMITTENT else _ALIVE_LOGS
             cells = tuple(cell for cell in fault.cells if cell not in now and proofs[cell] < needed)
             if cells:
                 kept.append(fault if cells == fault.cells else replace(fault, cells=cells))
-        merged = Knowledge(self.n_cells, (*diagnosis.faults, *kept))
+        merged = KnownFaults(self.n_cells, (*diagnosis.faults, *kept))
         return replace(merged, proofs={cell: n for cell, n in proofs.items() if n and cell in merged.fault_set})
 
     def to_dict(self) -> dict[str, Any]:
@@ -64,8 +64,8 @@ class Knowledge:
         }
 
     @classmethod
-    def from_dict(cls, d: Mapping[str, Any]) -> Knowledge:
-        """Rebuild it.
+    def from_dict(cls, d: Mapping[str, Any]) -> KnownFaults:
+        """Rebuild from :meth:`to_dict`.
 
         Raises:
             ValueError: another schema.

@@ -1,10 +1,11 @@
-"""The maintenance routine: diagnose what came in, merge it with what was known, adapt, judge, deploy or keep."""
+"""Maintenance: diagnose new recordings, merge with the known faults, adapt, compare, deploy or keep."""
 
 from __future__ import annotations
 
 import hashlib
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,44 +13,49 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptfault.robot.bundle import Bundle, now
-from adaptfault.robot.deployment_test import Judgement, judge, with_faults
-from adaptfault.robot.known_faults import Knowledge
+from adaptfault.robot.checksummed_json import Damaged
+from adaptfault.robot.converter_range import within_range
+from adaptfault.robot.deployment_test import Judgement, compare_candidate, with_faults
+from adaptfault.robot.known_faults import KnownFaults
 from adaptfault.robot.plausibility import contradiction, implausible
 from adaptfault.robot.pointer import Pointer
+from adaptfault.robot.versions import Version
 from diagnostics import Diagnosis, Fault, FaultSet
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.adaptation.result import Adaptation
+    from adaptfault.data.windows import Windows
 
 SCHEMA = "adaptfault.maintenance/1"
 Decision = Literal["unchanged", "deployed", "kept", "refused"]
 
-_TECHNICIAN_BELOW = 0.9  # of the fault-free accuracy: what is left then is no repair
-_CONTRADICTORY = 1.0  # the healthy cells explain each other worse than their means do
+_TECHNICIAN_BELOW = 0.9  # share of the fault-free accuracy below which the sensor needs a technician
+_CONTRADICTORY = 1.0  # residual variance ratio at which other cells predict no better than the mean
 _UNKNOWN = 3
 
 
 @dataclass(frozen=True, eq=False)
 class MaintenanceReport:
-    """What a maintenance run found and did.
+    """Result of a maintenance run.
 
     Attributes:
-        decision: "unchanged": nothing new, or nothing that what runs does not do without already. "deployed": a new
-            version runs, on probation. "kept": the faults are known, what runs is as good as what could. "refused": the
-            recordings cannot be from this sensor, or there is nothing that works.
+        decision: "unchanged": no new fault, or the running version already excludes all faulty cells. "deployed": a new
+            version runs, on probation. "kept": no candidate is better than the running version. "refused": the
+            recordings do not fit this sensor, or no working model is left.
         exit_code: 0 no fault known; 1 degraded but handled; 2 needs a technician; 3 unusable recordings.
         reason: why, in one sentence.
         fault_set: F, as known now.
-        version: that runs now.
-        faults: that are known now, one for each root cause.
-        diagnosis: of the new recordings; None where there were none.
-        judgement: of the last candidate beside what ran; None where there was none.
-        accuracy: of what runs now, under the faults known now, on the windows kept for that; None if not judged.
-        fault_free_accuracy: of version 1 on the same windows without faults; None if not judged.
-        stages: what each stage of the adaptation cost and reached, as text.
-        used, left_out: names of recordings, and why the latter could not be used.
-        warnings: damage that was found in the bundle.
+        version: number of the version that runs after this run.
+        faults: known faults after this run, one for each root cause.
+        diagnosis: of the new recordings; None without new recordings.
+        judgement: comparison of the last candidate with the running version; None without a candidate.
+        accuracy: of the version that runs now, under the known faults, on the held-out windows; None if not measured.
+        fault_free_accuracy: of version 1 on the same windows without faults; None if not measured.
+        stages: cost and result of each adaptation stage, as text.
+        used: names of the recordings whose diagnosis entered the known faults; empty where they were refused.
+        left_out: recordings, or readings of them, that were not used, with the reason.
+        warnings: damage found in the bundle.
         dry_run: nothing was changed.
         seconds: wall clock.
     """
@@ -124,41 +130,44 @@ def maintain(
     budget: float | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> MaintenanceReport:
-    """Diagnose what was recorded since the last run and bring what runs up to date.
+    """Diagnose new recordings and update the running version where that is needed.
 
-    The same recordings twice change nothing: the journal knows them by their content. A new version is deployed only
-    if, with the new faults put into windows that no model learned from, it is better than what runs beyond chance
-    (bootstrap over recordings), and no class collapses.
+    Recordings that an earlier run used are skipped; the journal identifies them by the SHA-256 of their content. A new
+    version is deployed only if it is significantly better than the running one on held-out windows with the known
+    faults injected (paired bootstrap over recordings), and no class collapses.
 
     Args:
-        bundle: the robot's.
+        bundle: of the robot.
         recordings: ``[T, D]`` or a list of them, in the layout's unit, in time order.
         names: of the recordings, for messages.
-        dry_run: find out and report, change nothing.
+        dry_run: report only, change nothing.
         budget: seconds that an adaptation may take.
-        say: told what is being done.
+        say: receives one line of progress before each long step.
 
     Raises:
-        Busy: another run is under way.
-        Damaged: a part of the bundle that is needed is not what was written.
+        Busy: another maintenance run holds the lock.
+        Damaged: a needed part of the bundle fails its checksum.
     """
     began = time.perf_counter()
-    with bundle.maintenance():
+    with bundle.maintenance(dry_run=dry_run):
         report = _Maintenance(bundle, dry_run, budget, say).run(_checked(recordings, names, bundle))
     return replace(report, seconds=time.perf_counter() - began)
 
 
 @dataclass
-class _Incoming:
-    """A recording that came in: its content, and whether it can be used."""
+class _InputRecording:
+    """A recording given to maintenance, and the reason why it cannot be used, if any."""
 
     name: str
     frames: NDArray[np.float64] | None
     digest: str
     problem: str | None
+    outside: int = 0  # readings out of the converter's range, missing in ``frames``
 
 
-def _checked(recordings: ArrayLike | Sequence[ArrayLike], names: Sequence[str], bundle: Bundle) -> list[_Incoming]:
+def _checked(
+    recordings: ArrayLike | Sequence[ArrayLike], names: Sequence[str], bundle: Bundle
+) -> list[_InputRecording]:
     given: Any = recordings
     if isinstance(given, np.ndarray) and (given.ndim <= 2 or given.shape[1:] == bundle.layout.shape):
         given = [given]
@@ -172,13 +181,16 @@ def _checked(recordings: ArrayLike | Sequence[ArrayLike], names: Sequence[str], 
             problem = implausible(frames, bundle.layout) if len(frames) else "it holds no frame"
         except ValueError as error:
             frames, problem = None, str(error)
-        incoming.append(_Incoming(name, frames, digest, problem))
+        outside = 0
+        if frames is not None and problem is None:
+            frames, outside = within_range(frames, bundle.layout)
+        incoming.append(_InputRecording(name, frames, digest, problem, outside))
     return incoming
 
 
 @dataclass
 class _Maintenance:
-    """One run under way."""
+    """State of one maintenance run."""
 
     bundle: Bundle
     dry_run: bool
@@ -187,19 +199,26 @@ class _Maintenance:
     warnings: tuple[str, ...] = field(default=(), init=False)
     judged: dict[str, Any] | None = field(default=None, init=False)
 
-    def run(self, incoming: Sequence[_Incoming]) -> MaintenanceReport:
-        """Diagnose what was not seen before, decide, and write down what was done, unless this is a dry run."""
+    def run(self, incoming: Sequence[_InputRecording]) -> MaintenanceReport:
+        """Diagnose recordings that no earlier run used, decide, and journal the run unless it is a dry run."""
         bundle = self.bundle
-        self.warnings = tuple(bundle.problems(mend=not self.dry_run))
+        if not self.dry_run:
+            bundle.sweep()
+        self.warnings = tuple(bundle.problems(repair=not self.dry_run))
         self.version = bundle.active()
-        self.before = bundle.knowledge()
+        self.before = bundle.known_faults()
         seen = bundle.journal.seen([r.digest for r in incoming])
         fresh = list({r.digest: r for r in incoming if r.digest not in seen}.values())
         usable = [r for r in fresh if r.problem is None]
         self.left_out = tuple(f"{r.name}: {r.problem}" for r in fresh if r.problem is not None)
+        self.left_out += tuple(
+            f"{r.name}: {r.outside} readings outside 0 to {bundle.layout.full_scale:g} {bundle.layout.unit} are missing"
+            for r in usable
+            if r.outside
+        )
         if not fresh:
             code = self._code(self.before.fault_set)
-            return self._report("unchanged", code, "no recording that was not seen before", self.before)
+            return self._report("unchanged", code, "all recordings were used before", self.before)
         if not usable:
             return self._report("refused", _UNKNOWN, "no recording is usable", self.before)
         self.say(f"diagnosing {len(usable)} new recordings")
@@ -212,7 +231,7 @@ class _Maintenance:
     def _decide(
         self, diagnosis: Diagnosis, frames: list[NDArray[np.float64]], used: tuple[str, ...]
     ) -> MaintenanceReport:
-        """Say what is to be done about a diagnosis, and deploy if that is it."""
+        """Decide about a diagnosis; deploy where the decision is to."""
         known = self.before.merged(diagnosis)
         faulty = known.fault_set
         found: dict[str, Any] = {"diagnosis": diagnosis, "used": used}
@@ -224,34 +243,36 @@ class _Maintenance:
         strange = contradiction(frames, faulty, adapter.statistics, self.bundle.layout)
         if strange > _CONTRADICTORY:
             reason = (
-                f"the cells that seem healthy contradict each other ({strange:.1f} of what moves in them is not"
-                " explained by the others; 1 is as if they had nothing in common): not this sensor, or wired otherwise"
+                f"residual variance ratio {strange:.2f} of the cells taken as healthy exceeds {_CONTRADICTORY:g}:"
+                " wrong sensor, or changed wiring"
             )
-            return self._report("refused", 2, reason, self.before, **found)
+            return self._report("refused", 2, reason, self.before, **{**found, "used": ()})
         if faulty == self.version.fault_set:
-            reason = f"version {self.version.number} does without these cells already" if faulty else "no faulty cell"
+            reason = f"version {self.version.number} excludes these cells already" if faulty else "no faulty cell"
             return self._report("unchanged", self._code(faulty), reason, known, **found)
         if (judged := self._judged_before(faulty)) is not None:
             self.judged = judged
-            return self._report("kept", judged["exit_code"], f"judged before: {judged['reason']}", known, **found)
+            return self._report("kept", judged["exit_code"], f"compared before: {judged['reason']}", known, **found)
         if faulty.cells in Pointer.read(self.bundle.path).rejected:
             reason = "a version for these faults was rolled back before"
             return self._report("kept", max(1, self._code(faulty)), reason, known, **found)
         return self._adapt(adapter, known, found)
 
-    def _adapt(self, adapter: Adapter, known: Knowledge, found: dict[str, Any]) -> MaintenanceReport:
-        """Adapt and judge: the cheapest stage that is enough, and if a class collapses in it, the fill alone."""
+    def _adapt(self, adapter: Adapter, known: KnownFaults, found: dict[str, Any]) -> MaintenanceReport:
+        """Adapt and compare: method "auto" first; where a class collapses, imputation alone."""
         from adaptfault.adaptation.result import Adaptation
 
         faulty = known.fault_set
         windows = self.bundle.parts.check_windows()
+        if (earlier := self._version_for(faulty)) is not None:
+            return self._return_to(earlier, windows, known, found)
         broken = with_faults(windows, known.faults, self.bundle.layout)
         running = Adaptation.load(self.version.folder)
         free = float((adapter.model.predict(windows.x) == windows.y).mean())
         self.say(f"{len(faulty)} of {faulty.n_cells} cells are faulty; adapting")
         for method in ("auto", "fill"):
             adaptation = adapter.adapt(faulty, method=method, budget=self.budget, progress=False)
-            judgement = judge(running.predict, adaptation.predict, broken)
+            judgement = compare_candidate(running.predict, adaptation.predict, broken)
             found["stages"] = tuple(str(stage) for stage in adaptation.stages)
             if not judgement.collapsed:
                 break
@@ -259,11 +280,14 @@ class _Maintenance:
         if judgement.collapsed:
             names = ", ".join(self._class_name(c) for c in judgement.collapsed)
             code = self._code(faulty, judgement.running, free)
-            reason = f"the adapted model loses more than half of what is recognised of {names}"
+            reason = f"the adapted model loses more than half of the recall of {names}"
             return self._report("refused", max(1, code), reason, known, accuracy=judgement.running, **found)
         if not judgement.better:
-            code = max(1, self._code(faulty, judgement.running, free))
-            reason = f"version {self.version.number} is as good under these faults as the adapted model, within chance"
+            code = self._code(faulty, judgement.running, free)
+            reason = (
+                f"version {self.version.number} is as good under these faults as the adapted model"
+                " (90 % interval of the gain includes 0)"
+            )
             return self._report("kept", code, reason, known, accuracy=judgement.running, **found)
         code = self._code(faulty, judgement.candidate, free)
         reason = (
@@ -273,14 +297,50 @@ class _Maintenance:
         number = self.version.number if self.dry_run else self._deploy(adaptation, known, judgement, free)
         return self._report("deployed", code, reason, known, accuracy=judgement.candidate, number=number, **found)
 
+    def _version_for(self, faulty: FaultSet) -> Version | None:
+        """Return the latest version for exactly this F, where the running one also excludes recovered cells."""
+        if not set(faulty) < set(self.version.fault_set):
+            return None
+        for number in reversed(self.bundle.versions.numbers):
+            with suppress(Damaged, FileNotFoundError):
+                if (version := self.bundle.versions[number]).fault_set == faulty:
+                    return version
+        return None
+
+    def _return_to(
+        self, earlier: Version, windows: Windows, known: KnownFaults, found: dict[str, Any]
+    ) -> MaintenanceReport:
+        """Return to a version that uses the recovered cells, unless it is less accurate than the running one."""
+        from adaptfault.adaptation.result import Adaptation
+
+        broken = with_faults(windows, known.faults, self.bundle.layout)
+        running, candidate = Adaptation.load(self.version.folder), Adaptation.load(earlier.folder)
+        judgement = compare_candidate(running.predict, candidate.predict, broken)
+        free = float((self.bundle.parts.adapter().model.predict(windows.x) == windows.y).mean())
+        found |= {"judgement": judgement, "fault_free_accuracy": free}
+        recovered = len(self.version.fault_set) - len(known.fault_set)
+        accuracies = f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}"
+        if judgement.gain < 0 or judgement.collapsed:
+            code = self._code(known.fault_set, judgement.running, free)
+            reason = (
+                f"{recovered} cells recovered, but version {earlier.number}, which uses them, is worse: {accuracies}"
+            )
+            return self._report("kept", code, reason, known, accuracy=judgement.running, **found)
+        if not self.dry_run:
+            self.bundle.deploy(earlier.number)
+        code = self._code(known.fault_set, judgement.candidate, free)
+        number = self.version.number if self.dry_run else earlier.number
+        reason = f"{recovered} cells recovered; version {earlier.number} uses them again ({accuracies})"
+        return self._report("deployed", code, reason, known, accuracy=judgement.candidate, number=number, **found)
+
     def _judged_before(self, faulty: FaultSet) -> dict[str, Any] | None:
-        """Return how an adaptation to these faults was judged beside what runs, if it was in the last run."""
+        """Return the last comparison if it was for these faults and this version; None otherwise."""
         judged = self.bundle.journal.last("judged")
         if judged is None or (tuple(judged["fault_set"]), judged["version"]) != (faulty.cells, self.version.number):
             return None
         return dict(judged)
 
-    def _deploy(self, adaptation: Adaptation, known: Knowledge, judgement: Judgement, free: float) -> int:
+    def _deploy(self, adaptation: Adaptation, known: KnownFaults, judgement: Judgement, free: float) -> int:
         about = {
             "reason": f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}",
             "knowledge": known.to_dict(),
@@ -291,17 +351,17 @@ class _Maintenance:
         self.bundle.deploy(version.number)
         return version.number
 
-    def _write(self, report: MaintenanceReport, usable: Sequence[_Incoming]) -> None:
-        """Note the run. A crash before this leaves recordings to be seen again: they find nothing new."""
+    def _write(self, report: MaintenanceReport, usable: Sequence[_InputRecording]) -> None:
+        """Journal the run. After a crash before this the recordings are diagnosed again, with the same result."""
         self.bundle.journal.add(
             now(),
             report.decision,
             {**report.to_dict(), "knowledge": self.known.to_dict(), "judged": self._judgement_of(report)},
-            [(r.digest, r.name) for r in usable],
+            [(r.digest, r.name) for r in usable] if report.used else [],  # refused ones are diagnosed again
         )
 
     def _judgement_of(self, report: MaintenanceReport) -> dict[str, Any] | None:
-        """Return what the next run has to know so as not to judge the same again."""
+        """Return what the next run needs so that it does not repeat the same comparison."""
         if report.judgement is None or report.decision == "deployed":
             return self.judged
         about = {"version": report.version, "exit_code": report.exit_code, "reason": report.reason}
@@ -312,7 +372,7 @@ class _Maintenance:
         decision: Decision,
         code: int,
         reason: str,
-        known: Knowledge,
+        known: KnownFaults,
         *,
         number: int | None = None,
         **found: Any,
@@ -332,7 +392,7 @@ class _Maintenance:
         )
 
     def _code(self, faulty: FaultSet, accuracy: float | None = None, free: float | None = None) -> int:
-        """0 no fault known, 1 handled, 2 too little accuracy is left."""
+        """Return 0: no known fault; 1: handled; 2: accuracy below 90 % of the fault-free one."""
         if accuracy is None or free is None:
             about = self.version.about
             accuracy, free = about.get("accuracy"), about.get("fault_free_accuracy")

@@ -1,4 +1,4 @@
-"""What a robot recorded, read as its bundle says: in the layout's unit, or raw through the bundle's calibration."""
+"""Reads new recordings for a bundle: in the layout's unit, or raw counts through the bundle's calibration."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from adaptfault.robot.bundle import Bundle
 
 
 @dataclass(frozen=True, eq=False)
-class Incoming:
+class NewRecordings:
     """Recordings for :func:`adaptfault.maintain`.
 
     Attributes:
         frames: ``[T, D]`` each, in the layout's unit.
         names: one a recording.
-        problems: what was left out or is odd.
+        problems: recordings that were left out, and warnings.
     """
 
     frames: tuple[NDArray[np.float32], ...]
@@ -30,15 +30,15 @@ class Incoming:
     problems: tuple[Problem, ...]
 
 
-def load_incoming(bundle: Bundle, paths: Sequence[str | PathLike[str]]) -> Incoming:
+def load_new_recordings(bundle: Bundle, paths: Sequence[str | PathLike[str]]) -> NewRecordings:
     """Read files and folders of recordings for a bundle.
 
-    What ``adaptfault listen`` recorded lies beside a ``layout.json`` and is in its unit already; all else is raw, and
-    goes through the bundle's calibration where it has one.
+    Recordings of ``adaptfault listen`` lie beside a ``layout.json`` and are in its unit. All others are raw and are
+    converted with the bundle's calibration where it has one.
 
     Raises:
         InputError: a path does not exist, or nothing could be read.
-        Damaged: the calibration is not what was written.
+        Damaged: the calibration fails its checksum.
     """
     given = [Path(path) for path in paths]
     ready = [p for p in given if ((p if p.is_dir() else p.parent) / "layout.json").exists()]
@@ -46,7 +46,7 @@ def load_incoming(bundle: Bundle, paths: Sequence[str | PathLike[str]]) -> Incom
     parts = [
         load(p, layout=bundle.layout, calibration=t) for p, t in ((ready, None), (raw, bundle.parts.calibration)) if p
     ]
-    return Incoming(
+    return NewRecordings(
         tuple(frames for part in parts for frames in part.recordings.frames),
         tuple(name for part in parts for name in part.recordings.names),
         tuple(problem for part in parts for problem in part.problems),

@@ -1,14 +1,15 @@
-"""The parts of a bundle that never change: what an adaptation, a diagnosis and a judgement start from."""
+"""The constant parts of a bundle: adapter, reference of the diagnosis, held-out windows, calibration."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
-from pathlib import Path
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
+from adaptfault.data.atomic import atomic_write
 from adaptfault.models.store import load_arrays, save_arrays
-from adaptfault.robot.checksummed_json import check_files
+from adaptfault.robot.checksummed_json import Damaged, check_files, decoding
 from diagnostics import SelfDiagnosis
 
 if TYPE_CHECKING:
@@ -17,19 +18,21 @@ if TYPE_CHECKING:
     from adaptfault.data.windows import Windows
 
 _ADAPTER, _REFERENCE, _CHECK, _CALIBRATION = "adapter", "reference", "check", "calibration.csv"
+_COPY = "reference.copy"
 _SCHEMA = "adaptfault.reference/1"
 
 
 class Parts:
-    """Reads the parts; each is checked against its hash when it is first needed, and Damaged is raised.
+    """Reads the parts. The first use of each checks its hashes and raises Damaged on a mismatch.
 
     Args:
-        folder: where they lie.
+        folder: of the parts.
         hashes: of their files.
     """
 
     def __init__(self, folder: Path, hashes: Mapping[str, str]) -> None:
         self.folder, self.hashes = folder, hashes
+        self._whole: set[str] = set()  # parts that were checked
 
     @staticmethod
     def write(
@@ -39,7 +42,7 @@ class Parts:
         check: Windows | None,
         calibration: Calibration | None,
     ) -> None:
-        """Write them into a new folder; without windows to ``check`` on, the adapter gives up half of its validation.
+        """Write the parts into a new folder; without ``check``, half of the validation windows become the check.
 
         Raises:
             ValueError: the diagnoser is not fitted, or there are too few windows.
@@ -49,49 +52,81 @@ class Parts:
         if diagnoser.reference_ is None:
             raise ValueError("a bundle needs a diagnoser that is fitted on fault-free recordings: call fit first")
         if check is None:
-            adapter, check = _give_up_half(adapter)
+            adapter, check = _split_validation(adapter)
         folder.mkdir(parents=True)
         save_adapter(folder / _ADAPTER, adapter)
         save_windows(folder / _CHECK, check)
         about, arrays = diagnoser.state()
-        save_arrays(folder / _REFERENCE, _SCHEMA, {"diagnosis": about}, arrays)
+        for name in (_REFERENCE, _COPY):  # prediction needs it, so there are two
+            save_arrays(folder / name, _SCHEMA, {"diagnosis": about}, arrays)
         if calibration is not None:
             calibration.write(folder / _CALIBRATION)
 
-    def check(self) -> None:
-        """Check all of them; raises Damaged."""
-        check_files(self.folder, self.hashes)
+    def check(self, *, repair: bool = False) -> None:
+        """Check all of them; ``repair`` restores the reference or its copy from the other. Raises Damaged."""
+        problems = []
+        for name in sorted({PurePosixPath(file).parts[0] for file in self.hashes}):
+            try:
+                self._verified(name)
+            except Damaged as error:
+                problems.append(str(error))
+                if repair and name in (_REFERENCE, _COPY):
+                    self._restore(name, _COPY if name == _REFERENCE else _REFERENCE)
+        if problems:
+            raise Damaged("; ".join(problems))
 
-    @cached_property
-    def _checked(self) -> Path:
-        self.check()
-        return self.folder
+    def _verified(self, name: str) -> Path:
+        """Return the path of one part after a check of its files only; raises Damaged."""
+        if name not in self._whole:
+            check_files(self.folder, {f: h for f, h in self.hashes.items() if PurePosixPath(f).parts[0] == name})
+            self._whole.add(name)
+        return self.folder / name
+
+    def _restore(self, name: str, source: str) -> None:
+        with suppress(Damaged, OSError):
+            whole = self._verified(source)
+            for path in whole.iterdir():
+                atomic_write(self.folder / name / path.name, path.read_bytes())
 
     def diagnoser(self) -> SelfDiagnosis:
-        """Return the fitted self-diagnosis. Needs no torch."""
-        about, arrays = load_arrays(self._checked / _REFERENCE, _SCHEMA)
-        return SelfDiagnosis.from_state(about["diagnosis"], arrays)
+        """Return the fitted self-diagnosis, from its copy where the part is damaged. Needs no torch."""
+        try:
+            return _diagnoser(self._verified(_REFERENCE))
+        except Damaged:
+            if not any(PurePosixPath(file).parts[0] == _COPY for file in self.hashes):
+                raise
+        return _diagnoser(self._verified(_COPY))
 
     def adapter(self) -> Adapter:
         """Return the adapter, with the fault-free model and windows."""
         from adaptfault.adaptation.adapter_files import load_adapter
 
-        return load_adapter(self._checked / _ADAPTER)
+        path = self._verified(_ADAPTER)
+        with decoding(path):
+            return load_adapter(path)
 
     def check_windows(self) -> Windows:
-        """Return the windows that no model learns from, which new versions are judged on."""
+        """Return the held-out windows on which a candidate and the running version are compared."""
         from adaptfault.adaptation.adapter_files import load_windows
 
-        return load_windows(self._checked / _CHECK)
+        path = self._verified(_CHECK)
+        with decoding(path):
+            return load_windows(path)
 
     @property
     def calibration(self) -> Path | None:
-        """The table from raw counts to the layout's unit, if there is one."""
-        path = self._checked / _CALIBRATION
+        """Path of the calibration table from raw counts to the layout's unit; None without one."""
+        path = self._verified(_CALIBRATION)
         return path if path.is_file() else None
 
 
-def _give_up_half(adapter: Adapter) -> tuple[Adapter, Windows]:
+def _diagnoser(path: Path) -> SelfDiagnosis:
+    with decoding(path):
+        about, arrays = load_arrays(path, _SCHEMA)
+        return SelfDiagnosis.from_state(about["diagnosis"], arrays)
+
+
+def _split_validation(adapter: Adapter) -> tuple[Adapter, Windows]:
     """Return an adapter with every second validation recording of each class, and the windows of the others."""
     import numpy as np
 
@@ -100,7 +135,9 @@ def _give_up_half(adapter: Adapter) -> tuple[Adapter, Windows]:
     windows = adapter.validation
     recordings, first = np.unique(windows.recording, return_index=True)
     if len(recordings) < 2:
-        raise ValueError("new versions are judged on windows that no model learns from: give them as check=")
+        raise ValueError(
+            "one validation recording cannot be split into validation and check; give held-out windows as check="
+        )
     by_class = recordings[np.argsort(windows.y[first], kind="stable")]
     given = np.isin(windows.recording, by_class[1::2])
     return Adapter(adapter.model, adapter.train, windows.select(~given)), windows.select(given)

@@ -1,4 +1,4 @@
-"""Whether recordings look like this robot's sensor at all: what does not must not change what the robot runs."""
+"""Plausibility of recordings: recordings of another sensor must not change the running version."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from adaptfault.data.windows import hold_missing, scale
 from adaptfault.imputation.statistics import CellStatistics
 from diagnostics import FaultSet, SensorLayout
 
-_BEYOND = 0.05  # of full scale: how far a reading may lie outside, as calibrations do
-_MOST_BEYOND = 0.01  # share of readings that may lie further out
+_MARGIN = 0.05  # of full scale: calibrated readings may lie outside the range by so much
+_MOST_OUTSIDE = 0.01  # largest share of readings outside the margin
 _RIDGE = 1e-6  # of the mean variance: covariances are stored in single precision
 
 
 def implausible(recording: NDArray[Any], layout: SensorLayout) -> str | None:
-    """Say what is wrong with a recording ``[T, D]`` by itself; None if nothing is."""
+    """Return why a recording ``[T, D]`` cannot be from this sensor; None if it can."""
     frames = recording[:, layout.present.ravel()]
-    heard = ~np.isnan(frames)
-    if not heard.any():
+    present = ~np.isnan(frames)
+    if not present.any():
         return "it holds no reading"
-    margin = _BEYOND * layout.full_scale
-    beyond = heard & ((frames < -margin) | (frames > layout.full_scale + margin))
-    if (share := beyond.sum() / heard.sum()) > _MOST_BEYOND:
+    margin = _MARGIN * layout.full_scale
+    outside = present & ((frames < -margin) | (frames > layout.full_scale + margin))
+    if (share := outside.sum() / present.sum()) > _MOST_OUTSIDE:
         return (
             f"{share:.0%} of its readings lie outside 0 to {layout.full_scale:g} {layout.unit}"
             f" (from {np.nanmin(frames):.4g} to {np.nanmax(frames):.4g}): raw counts, or another sensor"
@@ -36,12 +36,13 @@ def implausible(recording: NDArray[Any], layout: SensorLayout) -> str | None:
 def contradiction(
     recordings: list[NDArray[Any]], fault_set: FaultSet, statistics: CellStatistics, layout: SensorLayout
 ) -> float:
-    """Return how much of what the healthy cells read the other healthy cells do not explain.
+    """Return the residual variance ratio of the healthy cells.
 
-    Of each recording that has movement, the variance of the error when each healthy cell is predicted from the others
-    (linear conditional mean), divided by the variance of the cells; then the median over recordings. On a sensor like
-    the one that the statistics are of it is far below 1. Above 1 the others predict a cell worse than its own mean
-    does: cells in another order, another sensor, noise, or faults that were not found. 0 if nothing moved.
+    Per recording: variance of the error of the linear conditional mean of each healthy cell given the others, divided
+    by the variance of the cells; then the median over recordings. Far below 1 on the sensor of the statistics. Above 1
+    the others predict a cell worse than its mean: cells in another order, another sensor, noise, or undetected faults.
+    Recordings whose total variance is below the residual variance of the statistics are excluded, because the
+    residuals of noise alone exceed its variance by construction. 0 where that excludes all of them (idle or static).
     """
     healthy = np.array(sorted(set(fault_set.healthy.tolist()) & set(np.flatnonzero(layout.present.ravel()).tolist())))
     covariance = statistics.covariance[np.ix_(healthy, healthy)]
@@ -49,10 +50,11 @@ def contradiction(
         len(healthy)
     )
     precision = cho_solve(cho_factor(covariance, lower=True), np.eye(len(healthy)))
+    expected = float((1 / np.diag(precision)).sum())  # residual variance of recordings like those of the statistics
     ratios = []
     for recording in recordings:
         off = hold_missing(scale(recording, layout))[:, healthy].astype(np.float64) - statistics.mean[healthy]
         error = off @ precision / np.diag(precision)  # of each cell, predicted from all others
-        if moved := float(off.var(axis=0).sum()):
+        if (moved := float(off.var(axis=0).sum())) > expected:
             ratios.append(float(error.var(axis=0).sum()) / moved)
     return float(np.median(ratios)) if ratios else 0.0

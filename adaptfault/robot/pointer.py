@@ -1,29 +1,29 @@
-"""Which version runs: a small file that is replaced in one step, with a copy in case it is damaged. Needs no torch."""
+"""The active version: a small file that is replaced atomically, with a copy. Needs no torch."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from adaptfault.robot.checksummed_json import read_either, write_twice
+from adaptfault.robot.checksummed_json import decoding, read_with_copy, write_with_copy
 
 SCHEMA = "adaptfault.current/1"
 NAME = "current.json"
 
-STARTS = 2  # of a version on probation; at the next one, if nothing confirmed its health, the old one is back
+STARTS = 2  # of a version on probation; the next start without a confirmation returns to the version before
 
 
 @dataclass(frozen=True)
 class Pointer:
-    """Which version runs, and which ones to fall back to.
+    """The active version and its fallbacks.
 
     Attributes:
-        active: the version's number.
-        fallbacks: confirmed versions before it, the latest first.
-        probation: its health was not yet confirmed.
-        starts: how often it was started while on probation.
-        starter: who started it last.
-        rejected: the fault sets of versions that failed or were rolled back: not to be deployed for again.
+        active: number of the active version.
+        fallbacks: confirmed earlier versions, latest first.
+        probation: the active version is not confirmed yet.
+        starts: number of starts on probation.
+        starter: identifies the last starter.
+        rejected: fault sets of versions that failed or were rolled back; they are not deployed again.
     """
 
     active: int
@@ -35,22 +35,25 @@ class Pointer:
 
     @classmethod
     def read(cls, bundle: Path) -> Pointer:
-        """Read it, or its copy where it is damaged; raises Damaged where both are."""
-        d = read_either(bundle / NAME, SCHEMA)
-        rejected = tuple(tuple(cells) for cells in d["rejected"])
-        return cls(d["active"], tuple(d["fallbacks"]), d["probation"], d["starts"], d["starter"], rejected)
+        """Read the pointer, or its copy where it is damaged; raises Damaged where both are."""
+        d = read_with_copy(bundle / NAME, SCHEMA)
+        with decoding(bundle / NAME):
+            rejected = tuple(tuple(map(int, cells)) for cells in d["rejected"])
+            fallbacks = tuple(map(int, d["fallbacks"]))
+            return cls(int(d["active"]), fallbacks, bool(d["probation"]), int(d["starts"]), str(d["starter"]), rejected)
 
     def write(self, bundle: Path) -> None:
-        """Write it: the moment the file is replaced is the moment the version is switched."""
-        write_twice(bundle / NAME, {"schema": SCHEMA, **asdict(self)})
+        """Write the pointer; replacing the file switches the version."""
+        write_with_copy(bundle / NAME, {"schema": SCHEMA, **asdict(self)})
 
     def deployed(self, number: int) -> Pointer:
-        """Return the pointer to a new version, on probation. One that was never confirmed is no fallback."""
+        """Return the pointer to a new version, on probation. An unconfirmed version does not become a fallback."""
         kept = self.fallbacks if self.probation else (self.active, *self.fallbacks)
+        kept = tuple(fallback for fallback in kept if fallback != number)  # a return to an earlier version
         return replace(self, active=number, fallbacks=kept, probation=True, starts=0, starter="")
 
     def started(self, starter: str) -> Pointer:
-        """Return the pointer after one more start, by somebody who was not the last to start it."""
+        """Return the pointer after a start; consecutive starts by one starter count once."""
         new = self.probation and starter != self.starter
         return replace(self, starts=self.starts + 1, starter=starter) if new else self
 
@@ -59,12 +62,12 @@ class Pointer:
         return replace(self, probation=False, starts=0, starter="")
 
     def fallen_back(self, rejected: tuple[int, ...]) -> Pointer:
-        """Return the pointer to the version before; the fault set of the one that is left is not tried again.
+        """Return the pointer to the previous version; the fault set of the one that is left is rejected.
 
         Raises:
-            ValueError: there is none before.
+            ValueError: there is no previous version.
         """
         if not self.fallbacks:
-            raise ValueError(f"version {self.active} is the first: there is none to fall back to")
+            raise ValueError(f"version {self.active} is the first: there is no version to fall back to")
         first, *rest = self.fallbacks
         return Pointer(first, tuple(rest), rejected=(*self.rejected, rejected))

@@ -1,4 +1,4 @@
-"""What robot software calls in its loop: a class, the faults, and each newly deployed version between two frames."""
+"""Prediction and monitoring in the robot's loop; newly deployed versions take over between two frames."""
 
 from __future__ import annotations
 
@@ -14,32 +14,34 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.data.windows import scale
+from adaptfault.data.windows import hold_missing, scale
 from adaptfault.models.inference import Inference
 from adaptfault.robot.bundle import PROCESS
-from diagnostics import Fault, FaultSet, Monitor, SensorLayout
+from adaptfault.robot.checksummed_json import Damaged, decoding
+from adaptfault.robot.converter_range import within_range
+from diagnostics import Fault, FaultSet, Monitor, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.versions import Version
 
-_POLL = 1.0  # seconds between two looks at the bundle's pointer
-_RETRY = 60.0  # after one at which the bundle could not be read
-_STARTS = 3  # of versions that fail to load, before giving up: the bundle goes back to an earlier one after two
+_POLL = 1.0  # seconds between two checks of the bundle's pointer
+_RETRY = 60.0  # seconds until the next check after the bundle could not be read
+_STARTS = 3  # attempts to load a version; the bundle falls back to an earlier one after two
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What one frame brought.
+    """Result of one frame.
 
     Attributes:
         label: the class of the window that ends with this frame; None until a window is full.
         probabilities: float32 ``[n_classes]``; None until a window is full.
         fault_set: F, the cells that were not used.
-        events: faults that the monitor newly found, that changed, or that are gone (probability 0).
-        version: number of the deployed version that answered.
+        events: faults that are new, changed, or gone (probability 0).
+        version: number of the version that computed the label.
     """
 
     label: int | None
@@ -49,15 +51,15 @@ class Reading:
     version: int
 
     def __str__(self) -> str:
-        sure = "" if self.probabilities is None else f" ({self.probabilities.max():.2f})"
-        said = "window not full yet" if self.label is None else f"class {self.label}{sure}"
+        confidence = "" if self.probabilities is None else f" ({self.probabilities.max():.2f})"
+        result = "window not full yet" if self.label is None else f"class {self.label}{confidence}"
         news = "".join(f"; {event.reason}" for event in self.events)
-        return f"{said}, {len(self.fault_set)} cells dropped, version {self.version}{news}"
+        return f"{result}, {len(self.fault_set)} cells dropped, version {self.version}{news}"
 
 
 @dataclass(frozen=True, eq=False)
 class _Running:
-    """A version that is loaded, and the bundle as it was opened for it."""
+    """A loaded version, and the bundle that was opened for it."""
 
     version: Version
     model: Inference
@@ -65,13 +67,13 @@ class _Running:
 
 
 class Predictor:
-    """Predicts, monitors, and keeps up with what maintenance deploys, without torch where ONNX Runtime is installed.
+    """Predicts, monitors, and switches to newly deployed versions; needs no torch where ONNX Runtime is installed.
 
-    A new version is loaded in the background and takes over between two frames. One that cannot be loaded is reported
-    in the log, and the old one goes on. One thread may use a predictor at a time.
+    A new version is loaded in a thread and takes over between two frames. A version that cannot be loaded is logged,
+    and the running one continues. Not thread-safe: one thread may use a predictor at a time.
 
     Args:
-        open_bundle: opens the bundle anew, as it is now on disk; see :meth:`load`.
+        open_bundle: opens the bundle as it is now on disk; see :meth:`load`.
 
     Raises:
         FileNotFoundError, ValueError: no version of the bundle can be loaded.
@@ -87,11 +89,12 @@ class Predictor:
         self._loading: threading.Thread | None = None
         self._ready: _Running | None = None
         self._failed: int | None = None  # number of the version that could not be loaded
-        self._monitor = Monitor(bundle.diagnoser())
+        self._monitor = Monitor(_reference(bundle))
         self.layout = bundle.layout
         self.class_names = tuple(bundle.class_names)
-        self._last: NDArray[np.float32]  # of each cell, the last reading that was none of the missing ones
-        self._frames: NDArray[np.float32]  # the last ones, scaled
+        self.outside = 0  # readings outside the range so far
+        self._last: NDArray[np.float32]  # last reading of each cell that is not missing
+        self._frames: NDArray[np.float32]  # last frames, scaled
         self.reset()
 
     @classmethod
@@ -99,8 +102,8 @@ class Predictor:
         """Open the bundle in a folder and start its active version.
 
         Raises:
-            FileNotFoundError: there is none, or a file is missing.
-            ValueError: it is damaged, and no earlier version is whole.
+            FileNotFoundError: the folder holds no bundle, or a file is missing.
+            ValueError: the active version and all earlier ones are damaged.
         """
         from adaptfault.robot.bundle import Bundle
 
@@ -108,45 +111,55 @@ class Predictor:
 
     @property
     def fault_set(self) -> FaultSet:
-        """F, the cells that are not used."""
+        """F, the cells that the running version does not use."""
         return self._running.model.fault_set
 
     @property
     def version(self) -> int:
-        """Number of the version that answers."""
+        """Number of the running version."""
         return self._running.version.number
 
     @property
     def runtime(self) -> str:
-        """What it runs on, "onnx" or "torch"."""
+        """The runtime, "onnx" or "torch"."""
         return self._running.model.runtime
 
     def predict(self, x: NDArray[Any]) -> NDArray[np.int64]:
         """Return the class of each window ``[N, T, D]`` on the 0..1 scale, int64 ``[N]``."""
         self._keep_up()
-        return self._running.model.predict(x)
+        return self._running.model.predict(_finite(x))
 
     def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
         """Return class probabilities ``[N, n_classes]`` of windows ``[N, T, D]``; F's cells may hold anything."""
         self._keep_up()
-        return self._running.model.predict_proba(x)
+        return self._running.model.predict_proba(_finite(x))
 
     def stream(self, frame: ArrayLike, time: float | None = None) -> Reading:
-        """Take in one frame, and say what the last ones show.
+        """Process one frame and classify the window that ends with it.
 
-        A missing reading (NaN, or infinite) is held from the frame before, 0 before a cell's first, as ``make_windows``
-        does.
+        A missing reading (NaN, infinite, or more than one full scale outside the range) is replaced by the last
+        reading of its cell, 0 before the first, as in ``make_windows``.
 
         Args:
             frame: ``[D]`` or ``[pads, rows, cols]`` in the layout's unit.
-            time: when it was taken, in seconds; frames that the clock says are missing are reported as lost.
+            time: of the frame, seconds; frames missing between two times are reported as lost. None: unknown.
 
         Raises:
-            ValueError: a frame of another shape.
+            ValueError: the frame has another shape, or the time is not finite.
         """
-        reading = np.asarray(frame, dtype=np.float64).reshape(-1)
-        reading = np.where(np.isfinite(reading), reading, np.nan)
-        events = self._monitor.update(reading, time)
+        given = np.asarray(frame, dtype=np.float64)
+        if given.shape not in ((self.layout.n_cells,), self.layout.shape):
+            raise ValueError(
+                f"expected a frame [{self.layout.n_cells}] or {list(self.layout.shape)}, got {list(given.shape)}"
+            )
+        if time is not None and not np.isfinite(time):
+            raise ValueError(f"time {time}: expected seconds, or None where it is unknown")
+        given = given.reshape(-1)
+        reading, outside = within_range(given, self.layout)
+        if outside and not self.outside:
+            _log.warning("%d readings outside the range of %s count as missing", outside, self.layout)
+        self.outside += outside
+        events = self._monitor.update(given, time)
         self._keep_up()
         model = self._running.model
         scaled = scale(reading, self.layout)
@@ -160,27 +173,32 @@ class Predictor:
         return Reading(label, probabilities, model.fault_set, events, self.version)
 
     def reset(self) -> None:
-        """Begin a new recording: no window reaches back over it. The monitor goes on."""
+        """Begin a new recording: no window spans it. The monitor keeps its state."""
         self._frames = np.zeros((0, self.layout.n_cells), np.float32)
         self._last = np.zeros(self.layout.n_cells, np.float32)
 
     def confirm(self) -> bool:
-        """Confirm the running version's health, which ends its probation; the robot decides when it has seen enough.
+        """End the probation of the running version.
 
         Returns:
-            False, and nothing is confirmed, where another version has been deployed that does not run here yet.
+            False, without a confirmation, where another version is active that does not run here yet, or the bundle
+            cannot be written (logged).
         """
         bundle = self._running.bundle
         if bundle.active().number != self.version:
             return False
-        bundle.confirm()
+        try:
+            bundle.confirm()
+        except OSError as error:
+            _log.warning("version %d stays on probation: %s", self.version, error)
+            return False
         return True
 
     def __str__(self) -> str:
         return f"version {self.version}: {self._running.model}"
 
     def _keep_up(self) -> None:
-        """Switch to a new version once it is loaded; now and then look whether there is one."""
+        """Switch to a new version once it is loaded; check for one every second."""
         if self._loading is not None:
             if self._loading.is_alive():
                 return
@@ -199,7 +217,7 @@ class Predictor:
             self._loading.start()
 
     def _load_new(self) -> None:
-        """Load the version that is active now, if it is another; runs in the background, and never raises."""
+        """Load the active version if it differs from the running one; runs in a thread and never raises."""
         number = None
         try:
             bundle = self._open()
@@ -209,8 +227,8 @@ class Predictor:
             number = version.number
             if number != self.version:
                 self._ready = _start(bundle, version, self.layout)
-        except Exception as error:  # whatever it is, the robot's loop must go on with what it has
-            if number is None:  # perhaps it is only busy
+        except Exception as error:  # a failed load must not stop the robot's loop
+            if number is None:  # may be temporary
                 self._stamp, self._next_look = None, monotonic() + _RETRY
             self._failed = number
             what = "the bundle could not be read" if number is None else f"version {number} could not be loaded"
@@ -218,20 +236,31 @@ class Predictor:
 
 
 def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
-    """Load a version and run it once: what cannot run shows now, and no frame waits for the first run's preparations.
+    """Load a version and run it once, so that errors and the first run's set-up time come before the first frame.
 
     Raises:
-        FileNotFoundError, ImportError, ValueError: it cannot be loaded.
+        FileNotFoundError, ImportError, ValueError: the version cannot be loaded.
     """
-    model = Inference.load(version.folder)
+    with decoding(version.folder):
+        model = Inference.load(version.folder)
     if model.layout != layout:
-        raise ValueError(f"it is for {model.layout}, the robot has {layout}")
+        raise ValueError(f"the version is for {model.layout}, the bundle for {layout}")
     model.predict_proba(np.zeros((1, model.length, layout.n_cells), np.float32))
     return _Running(version, model, bundle)
 
 
+def _finite(x: NDArray[Any]) -> NDArray[np.float32]:
+    """Return windows ``[N, T, D]`` on the 0..1 scale without missing or invalid readings."""
+    x = np.asarray(x, dtype=np.float32)
+    if x.ndim != 3 or not x.size or bool(((x >= -1) & (x <= 2)).all()):  # NaN compares as False
+        return x
+    missing = ~((x >= -1) & (x <= 2))  # as for a layout of full scale 1
+    held: NDArray[np.float32] = np.stack([hold_missing(window) for window in np.where(missing, np.float32(np.nan), x)])
+    return held
+
+
 def _start_any(bundle: Bundle) -> _Running:
-    """Start the active version; if it cannot be loaded, start again: after failed starts an earlier one comes back."""
+    """Start the active version; repeat on failure, until the bundle falls back to an earlier version."""
     for left in reversed(range(_STARTS)):
         version = bundle.begin(f"{PROCESS}, {left} tries left")
         try:
@@ -243,8 +272,17 @@ def _start_any(bundle: Bundle) -> _Running:
     raise AssertionError("unreachable")
 
 
+def _reference(bundle: Bundle) -> SelfDiagnosis:
+    """Return the bundle's diagnoser; where it is damaged, one without a reference, so that prediction goes on."""
+    try:
+        return bundle.diagnoser()
+    except Damaged as error:
+        _log.warning("monitoring without the healthy reference: %s", error)
+        return SelfDiagnosis(bundle.layout)
+
+
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return what changes when a file is replaced; None while there is none."""
+    """Return values that change when a file is replaced; None while it does not exist."""
     try:
         stat = os.stat(path)
     except OSError:

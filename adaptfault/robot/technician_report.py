@@ -1,4 +1,4 @@
-"""The technician's page: one HTML file that needs nothing else, about a robot's skin and what runs on it."""
+"""The technician's report: one self-contained HTML file about a robot's sensor and its running version."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from diagnostics import Diagnosis
 
 
 def write_report(path: str | Path, bundle: Bundle, diagnosis: Diagnosis | None = None) -> Path:
-    """Write the page; returns its path.
+    """Write the page and return its path.
 
     Args:
-        path: where to.
-        bundle: the robot's.
+        path: of the HTML file.
+        bundle: of the robot.
         diagnosis: to show; None: the last one in the journal.
 
     Raises:
-        OSError: the folder cannot be written.
+        OSError: the file cannot be written.
     """
     runs = bundle.journal.runs()
     if diagnosis is None:
-        told = [run["diagnosis"] for run in runs if run.get("diagnosis")]
-        diagnosis = Diagnosis.from_dict(told[-1]) if told else None
+        diagnosed = [run["diagnosis"] for run in runs if run.get("diagnosis")]
+        diagnosis = Diagnosis.from_dict(diagnosed[-1]) if diagnosed else None
     active = bundle.active()
-    judged = [run for run in runs if run.get("accuracy") is not None and run["version"] == active.number]
+    compared = [run for run in runs if run.get("accuracy") is not None and run["version"] == active.number]
     return render(
         path,
         "technician.html",
@@ -37,12 +37,12 @@ def write_report(path: str | Path, bundle: Bundle, diagnosis: Diagnosis | None =
         layout=bundle.layout,
         active=active,
         pointer=Pointer.read(bundle.path),
-        knowledge=bundle.knowledge(),
+        knowledge=bundle.known_faults(),
         diagnosis=diagnosis,
         verdicts=None if diagnosis is None else embedded(diagnosis.plot()),
-        last=judged[-1] if judged else None,
+        last=compared[-1] if compared else None,
         runs=[_shown(run) for run in reversed(runs)],
-        problems=bundle.problems(mend=False),
+        problems=bundle.problems(repair=False),
         versions=f"adaptfault {version_of('adaptfault')}",
         python=platform.python_version(),
     )

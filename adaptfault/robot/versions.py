@@ -1,4 +1,4 @@
-"""A version: one model for one fault set, in a folder written once and checked at every load. Needs no torch."""
+"""A version: one model for one fault set, in a folder written once and verified at every load. Needs no torch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from adaptfault.robot.checksummed_json import check_files, hash_files, read_sealed, sync, sync_tree, write_sealed
+from adaptfault.robot.checksummed_json import (
+    check_files,
+    decoding,
+    hash_files,
+    read_checksummed,
+    sync,
+    sync_tree,
+    write_checksummed,
+)
 from diagnostics import FaultSet, SensorLayout
 
 SCHEMA = "adaptfault.version/1"
@@ -20,16 +28,16 @@ _UNFINISHED = ".unfinished-"
 
 @dataclass(frozen=True)
 class Version:
-    """One version of what a robot runs.
+    """One model version of a robot.
 
     Attributes:
         number: 1 is the fault-free model.
-        folder: holds the weights, and ``model.onnx`` where it could be exported.
+        folder: with the weights, and ``model.onnx`` where the export worked.
         layout: the array.
-        class_names: one name a class.
+        class_names: one name for each class.
         length: frames in a window.
-        fault_set: F, the cells that it does without.
-        about: how it came about, JSON.
+        fault_set: F, the cells that it does not use.
+        about: origin of the version, JSON.
     """
 
     number: int
@@ -45,23 +53,28 @@ class Version:
 
     @classmethod
     def read(cls, folder: Path) -> Version:
-        """Read a version and check each of its files.
+        """Read a version and verify each of its files.
 
         Raises:
-            FileNotFoundError: there is none.
-            Damaged: a file is not what was written.
+            FileNotFoundError: the folder holds no version.
+            Damaged: a file fails its checksum.
         """
-        document = read_sealed(folder / ABOUT, SCHEMA)
+        document = read_checksummed(folder / ABOUT, SCHEMA)
+        with decoding(folder / ABOUT):
+            return cls._decode(folder, document)
+
+    @classmethod
+    def _decode(cls, folder: Path, document: Mapping[str, Any]) -> Version:
         check_files(folder, document["files"])
         layout = SensorLayout.from_dict(document["layout"])
         return cls(
-            number=document["number"],
+            number=int(document["number"]),
             folder=folder,
             layout=layout,
             class_names=tuple(document["class_names"]),
-            length=document["length"],
+            length=int(document["length"]),
             fault_set=FaultSet(tuple(document["fault_set"]), layout.n_cells),
-            about=document["about"],
+            about=dict(document["about"]),
         )
 
 
@@ -76,13 +89,13 @@ class Versions:
         return Version.read(self.path(number))
 
     def path(self, number: int) -> Path:
-        """Return where a version lies."""
+        """Return the folder of a version."""
         return self.folder / f"{number:04d}"
 
     @property
     def numbers(self) -> list[int]:
-        """All that are there, ascending; they may be damaged."""
-        return sorted(int(p.name) for p in self.folder.glob("[0-9]*") if p.name.isdecimal())
+        """Numbers of all versions on disk, ascending; versions may be damaged."""
+        return sorted(int(p.name) for p in self.folder.glob("[0-9]*") if p.name.isdecimal() and p.is_dir())
 
     def write(
         self,
@@ -94,7 +107,7 @@ class Versions:
         fault_set: FaultSet,
         about: Mapping[str, Any],
     ) -> Version:
-        """Write a version into a new folder, bring it to the disk, and only then give it its name.
+        """Write a version into a temporary folder, sync it, then rename it.
 
         Args:
             fill: writes the model's files into the folder it is given.
@@ -102,7 +115,7 @@ class Versions:
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         self.sweep()
-        number = max(self.numbers, default=0) + 1
+        number = max((int(p.name) for p in self.folder.iterdir() if p.name.isdecimal()), default=0) + 1
         new = self.folder / f"{_UNFINISHED}{number:04d}"
         new.mkdir()
         fill(new)
@@ -116,16 +129,16 @@ class Versions:
             "about": dict(about),
             "files": hash_files(new),
         }
-        write_sealed(new / ABOUT, document)
+        write_checksummed(new / ABOUT, document)
         sync_tree(new)
         os.replace(new, self.path(number))
         sync(self.folder)
         return self[number]
 
     def sweep(self, keep: Collection[int] | None = None) -> None:
-        """Remove what crashes left unfinished and, if ``keep`` is given, all versions but these."""
+        """Remove unfinished versions of crashed runs and, if ``keep`` is given, all versions but these."""
         for unfinished in self.folder.glob(f"{_UNFINISHED}*"):
-            shutil.rmtree(unfinished)
+            shutil.rmtree(unfinished) if unfinished.is_dir() else unfinished.unlink()
         if keep is not None:
             for number in set(self.numbers) - set(keep):
                 shutil.rmtree(self.path(number))

@@ -159,10 +159,35 @@ class Diagnosis:
         """Rebuild a diagnosis from :meth:`to_dict`.
 
         Raises:
-            ValueError: not a diagnosis, or one of another version.
+            ValueError: not a diagnosis, one of another version, or one with fields of a wrong kind or size.
         """
-        if d.get("schema") != SCHEMA:
-            raise ValueError(f"expected a diagnosis with schema {SCHEMA!r}, got {d.get('schema')!r}")
+        if not isinstance(d, Mapping) or d.get("schema") != SCHEMA:
+            found = repr(d.get("schema")) if isinstance(d, Mapping) else str(d)[:60]
+            raise ValueError(f"expected a diagnosis with schema {SCHEMA!r}, got {found}")
+        try:
+            diagnosis = cls._from_dict(d)
+        except (KeyError, TypeError, AttributeError, OverflowError) as error:
+            raise ValueError(f"the diagnosis is damaged: {type(error).__name__} {error}") from None
+        size = (diagnosis.layout.n_cells,)
+        vectors = {"probability": diagnosis.probability, "verdicts": diagnosis.tested, **diagnosis.evidence}
+        for name, vector in vectors.items():
+            if vector.shape != size:
+                raise ValueError(
+                    f"the diagnosis is damaged: {name} has shape {list(vector.shape)}, expected {list(size)}"
+                )
+        if not ((diagnosis.probability >= 0) & (diagnosis.probability <= 1)).all():
+            raise ValueError("the diagnosis is damaged: a probability is not between 0 and 1")
+        if not all(isinstance(n, int) and n >= 0 for n in (diagnosis.n_frames, diagnosis.n_recordings)):
+            raise ValueError("the diagnosis is damaged: n_frames and n_recordings must be whole numbers >= 0")
+        if not all(isinstance(t.reason, str) and isinstance(t.kind, str) for t in diagnosis.transport):
+            raise ValueError("the diagnosis is damaged: a transport fault needs a kind and a reason")
+        if not all(np.isfinite(values).all() for values in diagnosis.evidence.values()):
+            raise ValueError("the diagnosis is damaged: evidence must be finite")
+        _ = diagnosis.fault_set  # raises ValueError for cells of another layout
+        return diagnosis
+
+    @classmethod
+    def _from_dict(cls, d: Mapping[str, Any]) -> Diagnosis:
         return cls(
             layout=SensorLayout.from_dict(d["layout"]),
             faults=tuple(Fault.from_dict(f) for f in d["faults"]),

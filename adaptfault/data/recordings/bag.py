@@ -30,7 +30,7 @@ class Message:
         time: when it was recorded, nanoseconds.
         values: float32 ``[D]``.
         counts: whole numbers by their type.
-        shape: ``(pads, rows, cols)`` where the message tells.
+        shape: ``(pads, rows, cols)`` where the message states it.
     """
 
     time: int
@@ -40,7 +40,7 @@ class Message:
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether a folder is a bag, as rosbag2 writes it."""
+    """Return whether a folder is a bag as rosbag2 writes it."""
     return (path / "metadata.yaml").is_file() and any(any(path.glob(f"*{storage}*")) for storage in STORAGES)
 
 
@@ -48,8 +48,8 @@ def read_bag(path: Path, *, topic: str | None = None, field: str | None = None) 
     """Read a bag: one recording, or several where there are pauses of a second or more.
 
     The readings are an array of numbers in each message: a ``std_msgs`` MultiArray, a type named after touch
-    (TactileState, ...), or ``field`` of ``topic``. The rate is what the messages' times of recording say. Of a bag
-    that was cut off, what can be read is given, and said how much.
+    (TactileState, ...), or ``field`` of ``topic``. The rate comes from the times at which the messages
+    were recorded. Of a bag that was cut off, the readable messages are returned, with a warning that counts them.
 
     Raises:
         InputError: rosbags is not installed, no message can be read, or topic or field are not clear.
@@ -81,7 +81,7 @@ def read_bag(path: Path, *, topic: str | None = None, field: str | None = None) 
 def bag_messages(
     path: Path, problems: list[Problem], *, topic: str | None = None, field: str | None = None
 ) -> Iterator[Message]:
-    """Yield the readings of a bag message by message, in constant memory; what is missing is added to ``problems``.
+    """Yield the readings of a bag message by message, in constant memory; missing parts are added to ``problems``.
 
     Raises:
         InputError: as :func:`read_bag`.

@@ -1,4 +1,4 @@
-"""Which topic of a bag holds the readings, and which field of its messages."""
+"""Chooses the topic of a bag that holds the readings, and the field of its messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _TACTILE = re.compile(r"std_msgs/.*MultiArray|.*tactile.*", re.IGNORECASE)
 _FLOATS = ("float32", "float64")
 _NUMBERS = (*_FLOATS, *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 
-# What bags of ROS 2 before Iron do not describe themselves, and no distribution brings along.
+# Types that bags before ROS 2 Iron do not describe, and that no distribution ships.
 _KNOWN = {"tactile_msgs/msg/TactileState": "std_msgs/Header header\nsensor_msgs/ChannelFloat32[] sensors\n"}
 
 
@@ -36,7 +36,7 @@ class Topic:
 
     @cached_property
     def store(self) -> Any:
-        """The types that its messages are made of, as rosbags knows them."""
+        """The type store of rosbags with the types of its messages."""
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
         definition = self.definition or _KNOWN.get(self.msgtype, "")
@@ -99,7 +99,7 @@ class Extractor:
         return np.concatenate(parts) if parts else np.empty(0, np.float32)
 
     def shape(self, message: Any) -> Shape | None:
-        """Return ``(pads, rows, cols)`` where a MultiArray tells three dimensions."""
+        """Return ``(pads, rows, cols)`` where a MultiArray states three dimensions."""
         dims = getattr(getattr(message, "layout", None), "dim", [])
         if self.field != "data" or len(dims) != 3:
             return None
@@ -124,7 +124,7 @@ def choose(path: Path, topics: Sequence[Topic], topic: str | None, field: str | 
     else:
         found = [one for one in topics if _TACTILE.fullmatch(one.msgtype)]
         if len(found) != 1:
-            which = "several topics that may hold readings" if found else "no topic that looks like a tactile array"
+            which = "several topics that may hold readings" if found else "no topic of a tactile type"
             raise InputError.at(path, f"has {which}: {', '.join(map(str, found)) or listed}; give --topic (topic=)")
     chosen = found[0]
     try:

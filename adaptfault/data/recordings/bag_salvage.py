@@ -1,4 +1,4 @@
-"""Reads what is left of a bag's file that was cut off or damaged: every message up to there, and some beyond."""
+"""Reads a bag file that was cut off or damaged: every message before the damage, and some after it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Salvage:
     """The messages that can still be read, in the order they were written; may be iterated more than once.
 
     Attributes:
-        reason: after an iteration: where reading ended, in words; empty if nothing was missing.
+        reason: after an iteration: where reading ended and why; empty if nothing was missing.
         skipped: chunks that were damaged and left out.
     """
 

@@ -1,4 +1,4 @@
-"""Recordings larger than memory: read block by block, for those who look at each frame once."""
+"""Reads recordings larger than memory block by block, for code that needs each frame once."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.bag import STORAGES, bag_messages
 from adaptfault.data.recordings.check import check_width
-from adaptfault.data.recordings.content import Content, Shape
+from adaptfault.data.recordings.content import Content, Shape, grid_shape
 from adaptfault.data.recordings.csv_folder import csv_pieces
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.files import Found, find
-from adaptfault.data.recordings.guess import SLACK
-from adaptfault.data.recordings.load import READERS, PathName
-from adaptfault.data.recordings.settle import check_agreement, given_array, settle_layout
+from adaptfault.data.recordings.infer import SLACK
+from adaptfault.data.recordings.layout_file import layout_beside
+from adaptfault.data.recordings.load import READERS, PathName, nothing_left
+from adaptfault.data.recordings.resolve import check_agreement, given_array, resolve_layout
 from diagnostics import SensorLayout
 
 if TYPE_CHECKING:
     from adaptfault.data.calibration import Calibration
 
 LARGE = 200_000_000
-"""Bytes of files, from which on they are better read in blocks: loaded, they take up to ten times that."""
+"""Bytes of files above which they are read in blocks: loaded, they take up to ten times as much memory."""
 
 _BLOCK = 4096  # frames
 _CSV = 2_000_000  # bytes of text
@@ -38,7 +39,13 @@ Blocks = Callable[[], Iterator[NDArray[Any]]]
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """One file: what it says of its array, with some frames in place of all, and how to read its blocks ``[t, D]``."""
+    """One file.
+
+    Attributes:
+        about: its statements about the array, with a sample of the frames.
+        blocks: reads its frames, ``[t, D]`` at a time.
+        recordings: how many it holds.
+    """
 
     about: Content
     blocks: Blocks
@@ -46,7 +53,7 @@ class Source:
 
 
 def is_large(paths: Sequence[PathName]) -> bool:
-    """Tell whether these files and folders hold more than should be loaded at once."""
+    """Return whether these files and folders hold too much to be loaded at once."""
     found, _ = find([Path(path) for path in paths], (*READERS, *STORAGES), set())
     return sum(_size(file.path) for file in found) > LARGE
 
@@ -62,10 +69,11 @@ class Stream:
 
     Attributes:
         layout: the array.
-        problems: what was noticed; complete after an iteration.
+        inferred: as in :class:`adaptfault.data.recordings.Loaded`.
+        problems: errors and warnings; complete after an iteration.
 
     Raises:
-        InputError: as :func:`adaptfault.load`; a file that does not fit is an error too, for there is no way back.
+        InputError: as :func:`adaptfault.load`.
     """
 
     def __init__(
@@ -81,7 +89,8 @@ class Stream:
         field: str | None = None,
     ) -> None:
         given = [Path(paths)] if isinstance(paths, str | PathLike) else [Path(path) for path in paths]
-        array = given_array(layout)
+        array = given_array(layout) if layout is not None else layout_beside(given)
+        shape = array.shape if isinstance(array, SensorLayout) else array
         self._tables = _tables(calibration)
         aside = {Path(p).resolve() for p in (layout, calibration) if isinstance(p, str | PathLike)}
         found, problems = find(given, (*READERS, *STORAGES), aside)
@@ -89,13 +98,29 @@ class Stream:
             raise InputError(problems[0].message if problems else "no path given; name a recording")
         self.problems: list[Problem] = problems
         known = full_scale is not None or isinstance(array, SensorLayout) or self._tables is not None
-        self._sources = [_open(file, topic, field, problems, largest=not known) for file in found]
-        heads = [source.about for source in self._sources]
-        self.layout, doubts = settle_layout(heads, array, full_scale, unit, rate, self._tables)
-        problems += doubts
-        for head in heads:
-            check_agreement(head, heads, self._tables is not None)
-            check_width(head, self.layout)
+        sources = []
+        for file in found:
+            try:
+                sources.append(_open(file, shape, topic, field, problems, largest=not known))
+            except InputError as error:
+                problems.append(Problem("error", str(error)))
+        if not sources:
+            raise nothing_left(problems)
+        heads = [source.about for source in sources]
+        resolved = resolve_layout(heads, array, full_scale, unit, rate, self._tables)
+        self.layout, self.inferred = resolved.layout, resolved.inferred
+        problems += resolved.problems
+        self._sources = []
+        for source in sources:
+            try:
+                check_agreement(source.about, heads, self._tables is not None)
+                check_width(source.about, self.layout)
+            except InputError as error:
+                problems.append(Problem("error", str(error)))
+            else:
+                self._sources.append(source)
+        if not self._sources:
+            raise nothing_left(problems)
         if self._tables is not None:
             self._tables.check(self.layout)
 
@@ -104,8 +129,16 @@ class Stream:
         return sum(source.recordings for source in self._sources)
 
     def __iter__(self) -> Iterator[NDArray[np.float64]]:
+        frames = 0
         for source in self._sources:
-            yield from self._checked(source)
+            try:
+                for block in self._checked(source):
+                    frames += len(block)
+                    yield block
+            except InputError as error:  # the blocks before it count
+                self.problems.append(Problem("error", str(error)))
+        if not frames:
+            raise nothing_left(self.problems)
 
     def _checked(self, source: Source) -> Iterator[NDArray[np.float64]]:
         present, full = self.layout.present.ravel(), self.layout.full_scale
@@ -121,36 +154,43 @@ class Stream:
                 beyond = (frames < -(SLACK - 1) * full) | (frames > SLACK * full)
             outside += int(beyond[:, present].sum())
             yield frames
-        told = {
+        counted = {
             f"{infinite} infinite readings: taken as missing": infinite,
             f"{missing - infinite} missing readings: kept as missing": missing - infinite,
             f"{outside} readings outside 0..{full:g} {self.layout.unit}: kept; if they are real, the full scale is"
             " wrong": outside,
         }
         path = source.about.path
-        self.problems += (Problem("warning", located(path, text)) for text, count in told.items() if count)
+        self.problems += (Problem("warning", located(path, text)) for text, count in counted.items() if count)
 
 
-def _open(file: Found, topic: str | None, field: str | None, problems: list[Problem], *, largest: bool) -> Source:
-    """Return a file; ``largest``: what it says of its array must show the largest reading of each cell."""
+def _open(
+    file: Found, shape: Shape | None, topic: str | None, field: str | None, problems: list[Problem], *, largest: bool
+) -> Source:
+    """Return a file; with ``largest``, the sample of its frames holds the largest reading of each cell."""
     suffix = file.path.suffix.lower()
     if file.path.is_dir() or suffix in STORAGES:
         return _bag(file.path, topic, field, problems, largest)
     if suffix == ".csv":
         return _csv(file.path, problems, largest)
-    if suffix == ".npy" and (pieces := _npy(file.path, largest)) is not None:
+    if suffix == ".npy" and (pieces := _npy(file.path, shape, largest)) is not None:
         return pieces
-    content = READERS[suffix](file.path)
+
+    def read() -> Content:
+        content = READERS[suffix](file.path)
+        return content if shape is None else content.read_as(shape)
+
+    content = read()
     problems += content.problems
     lengths, sample = len(content.frames), _sample(_cut(content.frames))
     lines = None if content.lines is None else content.lines[: len(sample)]
     head = replace(content, frames=(sample,), lines=lines, names=None, labels=None, problems=())
-    return Source(head, lambda: _cut(READERS[suffix](file.path).frames), lengths)
+    return Source(head, lambda: _cut(read().frames), lengths)
 
 
 def _bag(path: Path, topic: str | None, field: str | None, problems: list[Problem], largest: bool) -> Source:
-    def blocks(noticed: list[Problem]) -> Iterator[NDArray[Any]]:
-        messages = bag_messages(path, noticed, topic=topic, field=field)
+    def blocks(problems_found: list[Problem]) -> Iterator[NDArray[Any]]:
+        messages = bag_messages(path, problems_found, topic=topic, field=field)
         width, left_out = 0, 0
         while some := list(islice(messages, _BLOCK)):
             width = width or len(some[0].values)
@@ -160,7 +200,7 @@ def _bag(path: Path, topic: str | None, field: str | None, problems: list[Proble
                 yield np.stack(whole)
         if left_out:
             what = f"{left_out} messages hold another number of readings than the first, {width}: left out"
-            noticed.append(Problem("warning", located(path, what)))
+            problems_found.append(Problem("warning", located(path, what)))
 
     first = list(islice(bag_messages(path, [], topic=topic, field=field), _RATED))
     if not first:
@@ -173,9 +213,9 @@ def _bag(path: Path, topic: str | None, field: str | None, problems: list[Proble
 
 
 def _csv(path: Path, problems: list[Problem], largest: bool) -> Source:
-    def blocks(noticed: list[Problem]) -> Iterator[NDArray[Any]]:
+    def blocks(problems_found: list[Problem]) -> Iterator[NDArray[Any]]:
         for piece in csv_pieces(path, _CSV):
-            noticed += piece.problems
+            problems_found += piece.problems
             if piece.values is not None:
                 yield piece.values
 
@@ -190,8 +230,8 @@ def _csv(path: Path, problems: list[Problem], largest: bool) -> Source:
     return Source(Content(path, (sample,), counts, lines=lines), lambda: blocks(problems), 1)
 
 
-def _npy(path: Path, largest: bool) -> Source | None:
-    """Return an array that can be read in pieces; None where it cannot, and the reader for whole files has its say."""
+def _npy(path: Path, given: Shape | None, largest: bool) -> Source | None:
+    """Return an array that can be read in pieces; None where only the reader of whole files can read it."""
     try:
         with open(path, "rb") as file:
             version = np.lib.format.read_magic(file)
@@ -204,8 +244,8 @@ def _npy(path: Path, largest: bool) -> Source | None:
         return None
     if path.stat().st_size < start + int(np.prod(sizes, dtype=object)) * kind.itemsize:
         return None
-    shape = (sizes[-3], sizes[-2], sizes[-1]) if len(sizes) > 3 else None
-    width = int(np.prod(sizes[-3:])) if shape else sizes[-1]
+    shape = grid_shape(sizes, given)
+    width = int(np.prod(shape)) if shape else sizes[-1]
     frames = int(np.prod(sizes)) // width
 
     def blocks() -> Iterator[NDArray[Any]]:
@@ -215,8 +255,8 @@ def _npy(path: Path, largest: bool) -> Source | None:
                 yield np.fromfile(file, kind, min(_BLOCK, frames - first) * width).reshape(-1, width)
 
     sample = _sample(blocks()) if largest else next(blocks())[:1]
-    head = Content(path, (sample,), counts=kind.kind in "iu", shape=shape)
-    return Source(head, blocks, sizes[0] if len(sizes) in (3, 5) else 1)
+    head = Content(path, (sample,), counts=kind.kind in "iu", shape=shape, stored=sizes)
+    return Source(head, blocks, 1 if frames == sizes[0] else sizes[0])
 
 
 def _sample(blocks: Iterable[NDArray[Any]]) -> NDArray[Any]:

@@ -1,17 +1,16 @@
-"""Judges the readings of one file against the array: what cannot be used is left out, what is odd is told."""
+"""Checks the readings of one file against the array: unusable recordings are left out, doubtful ones get a warning."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.content import Content
 from adaptfault.data.recordings.errors import InputError, Problem, located
-from adaptfault.data.recordings.guess import GIVE_LAYOUT, SLACK, describe_width
+from adaptfault.data.recordings.infer import GIVE_LAYOUT, SLACK, describe_width
 from diagnostics import SensorLayout
 
 
@@ -28,10 +27,10 @@ def check_width(content: Content, layout: SensorLayout) -> None:
 
 
 def check_readings(content: Content, layout: SensorLayout, length: int | None) -> tuple[list[int], list[Problem]]:
-    """Return the recordings of a file that can be used, and what was noticed.
+    """Return the recordings of a file that can be used, and the problems.
 
-    Left out with an error: recordings without frames, of another length than ``length``, or with infinite readings.
-    Kept with a warning: missing readings, counted over the cells that the layout has.
+    Recordings without frames, of another length than ``length``, or with infinite readings are left out with an error.
+    Missing readings are kept with a warning, which counts them over the cells that the layout has.
     """
     kept: list[int] = []
     problems: list[Problem] = []
@@ -87,24 +86,8 @@ def check_range(
     return Problem("warning", located(content.path, what))
 
 
-@dataclass(frozen=True)
-class Odd:
-    """A file whose length departs from what nearly all others share."""
-
-    content: Content
-    common: int
-
-    def problem(self) -> Problem:
-        """Say so."""
-        length = len(self.content.frames[0])
-        what = (
-            f"{length} {_rows(self.content)} where the others have {self.common}: kept; windows use whole windows only"
-        )
-        return Problem("warning", located(self.content.path, what))
-
-
-def odd_lengths(contents: Sequence[Content]) -> list[Odd]:
-    """Return the files of another length, if there are at least 3 and at least 9 in 10 share one.
+def other_lengths(contents: Sequence[Content]) -> list[Problem]:
+    """Warn of each file of another length, if there are at least 3 files and at least 9 in 10 share one length.
 
     Only files of one recording count: archives hold recordings of different lengths by design.
     """
@@ -114,7 +97,12 @@ def odd_lengths(contents: Sequence[Content]) -> list[Odd]:
     common, shared = Counter(len(content.frames[0]) for content in single).most_common(1)[0]
     if shared < 0.9 * len(single):
         return []
-    return [Odd(content, common) for content in single if len(content.frames[0]) != common]
+    problems = []
+    for content in single:
+        if (length := len(content.frames[0])) != common:
+            what = f"{length} {_rows(content)} where the others have {common}: kept; windows use whole windows only"
+            problems.append(Problem("warning", located(content.path, what)))
+    return problems
 
 
 def _rows(content: Content) -> str:

@@ -1,4 +1,4 @@
-"""Gives each recording its class: the file's own, or by a table of labels, or by the folder that holds it."""
+"""Gives each recording its class: from the file, from a table of labels, or from the folder that holds the file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from adaptfault.data.recordings.labels import natural_order, read_label_table
 def label_files(
     contents: Sequence[tuple[Found, Content]], table: Path | None, problems: list[Problem]
 ) -> list[tuple[Found, Content]]:
-    """Give the files that carry no labels one by table or folder; those that have none beside others are left out."""
+    """Label the files that carry no labels, by table or folder; a file without one among others is left out."""
     known: dict[Path, dict[Path, str]] = {}
     tables = {table} if table is not None else {file.table for file, _ in contents if file.table is not None}
     for path in sorted(tables):
@@ -29,22 +29,22 @@ def label_files(
     many = bool(nested) or len({file.path.parent.resolve() for file in bare}) > 1
     labelled = []
     for file, content in contents:
-        asked, label, mend = table or file.table, None, ""
+        listing, label, remedy = table or file.table, None, ""
         if content.labels is not None:
             labelled.append((file, content))
             continue
-        if asked is not None:
-            label = known[asked].get(file.path.resolve())
-            mend = f"is not in the table {asked}: left out; add a line for it"
+        if listing is not None:
+            label = known[listing].get(file.path.resolve())
+            remedy = f"is not in the table {listing}: left out; add a line for it"
         elif file.root in nested and file.is_direct:
-            mend = "lies beside the folders of the classes: left out; move it into one"
+            remedy = "lies beside the folders of the classes: left out; move it into one"
         elif many:
             label = file.path.resolve().parent.name
         else:
             labelled.append((file, content))
             continue
         if label is None:
-            problems.append(Problem("warning", located(file.path, mend)))
+            problems.append(Problem("warning", located(file.path, remedy)))
         else:
             labelled.append((file, replace(content, labels=(label,) * len(content.frames))))
     return labelled

@@ -1,4 +1,4 @@
-"""Reads the paper's CSV files: one recording a file, one frame a line, one cell a column."""
+"""Reads CSV files: one recording a file, one frame a line, one cell a column."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.content import Content
 from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.sizes import LONGEST_LINE
 from adaptfault.data.recordings.text import decoded, numbered_lines, read_bytes, shown
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -21,9 +22,9 @@ _LARGEST = float(np.finfo(np.float32).max)
 def read_csv(path: Path) -> Content:
     """Read a CSV file of T lines x D readings, comma separated, with or without a header line.
 
-    An empty cell and ``nan`` are missing readings and become NaN. Blank lines are passed over. A last line without an
-    end, cut off when the power went, is left out with a warning, and so are the zero bytes that may follow it; if the
-    cut went through its last number, nobody can tell.
+    An empty cell and ``nan`` are missing readings and become NaN. Blank lines are skipped. A last line that a
+    power failure cut off is left out with a warning, and so are the zero bytes that may follow it. A cut inside the
+    last number of a full line cannot be detected.
 
     Raises:
         InputError: not text, no readings, lines of different lengths, a cell that is no number.
@@ -43,7 +44,7 @@ class Piece:
     Attributes:
         values: float32 ``[t, D]``; None where the lines hold no frame.
         lines: int ``[t]``, their numbers.
-        problems: what was noticed.
+        problems: errors and warnings.
     """
 
     values: NDArray[np.float32] | None
@@ -64,6 +65,10 @@ def csv_pieces(path: Path, size: int) -> Iterator[Piece]:
                 data = file.read(size)
                 cut = data.rfind(b"\n") + 1 if data else 0
                 piece, rest = (rest + data[:cut], data[cut:]) if cut or not data else (b"", rest + data)
+                if len(rest) > LONGEST_LINE:
+                    raise InputError.at(
+                        path, f"has a line of over {LONGEST_LINE:,} bytes, so it is no CSV file; remove it"
+                    )
                 if piece:
                     parsed = _parse(path, piece, before)
                     here = width if parsed.values is None else parsed.values.shape[1]
@@ -81,7 +86,7 @@ def csv_pieces(path: Path, size: int) -> Iterator[Piece]:
 
 @dataclass(frozen=True)
 class _Before:
-    """What comes before a piece of a file: so many lines, and the last one."""
+    """The lines before a piece of a file: how many, and the last one."""
 
     lines: int = 0
     last: str = ""
@@ -93,7 +98,7 @@ class _Before:
 
 def _parse(path: Path, data: bytes, before: _Before) -> Piece:
     written = data.rstrip(b"\0") or data
-    written = written if written.isascii() else data  # then it was no CSV from the start
+    written = written if written.isascii() else data  # then the file is binary
     text = decoded(path, written)
     rows, numbers = numbered_lines(text)
     problems: tuple[Problem, ...] = ()
@@ -109,35 +114,35 @@ def _parse(path: Path, data: bytes, before: _Before) -> Piece:
         return Piece(None, lines, problems)
     try:
         values = np.loadtxt(rows, dtype=np.float32, delimiter=",", comments=None, ndmin=2)
-    except ValueError:  # numpy's parser is fast, and does not say what is wrong
+    except ValueError:  # numpy's parser is fast, but does not name the cell
         values = _read_by_cell(path, rows, lines.tolist())
     return Piece(values, lines, problems)
 
 
 def _is_cut(line: str, before: str) -> bool:
-    """Tell a line that stops short from one that is complete, as the line before it is."""
+    """Return whether a line stops short, compared with the line before it."""
     last, last_before = (_bare(row.rpartition(",")[2]) for row in (line, before))
     stops = line.count(",") < before.count(",") or (last != "" and _number(last) is None)
     return stops and (last_before == "" or _number(last_before) is not None)
 
 
 def _is_header(line: str) -> bool:
-    """Tell column names from a frame: most of them are no numbers, or they count the columns (0, 1, 2, ...)."""
+    """Return whether a line is a header: most cells are no numbers, or they count the columns (0, 1, 2, ...)."""
     cells = [_bare(cell) for cell in re.split("[,;\t]", line)]
     if len(cells) == 1:
         cells = line.split()  # numbers with a wrong separator are a frame too, which the parser refuses
     first = _number(cells[0])
     if first not in (None, 0.0, 1.0) and _number(cells[-1]) is not None:
-        return False  # quickly: this is nearly every frame
+        return False  # a shortcut for nearly every frame
     numbers = [_number(cell) for cell in cells if cell]
     if None in numbers:
         return 2 * numbers.count(None) > len(numbers)
-    # pandas writes such a header of its own accord; no array reads exactly that
+    # pandas writes such a header by default; no array reads exactly that
     return len(numbers) > 3 and any(numbers == list(range(start, start + len(numbers))) for start in (0, 1))
 
 
 def _read_by_cell(path: Path, rows: Sequence[str], numbers: Sequence[int]) -> NDArray[np.float32]:
-    """Parse cell by cell: takes missing readings, and names the line and column of what it cannot take."""
+    """Parse cell by cell: accepts missing readings, and names the line and column of a cell that is no number."""
     for separator, name in ((";", "';'"), ("\t", "tabs")):
         if separator in rows[0]:
             raise InputError.at(path, f"separated by {name}? use commas, and a point in decimals", f"line {numbers[0]}")
@@ -147,10 +152,10 @@ def _read_by_cell(path: Path, rows: Sequence[str], numbers: Sequence[int]) -> ND
     width = Counter(len(cells) for cells in table).most_common(1)[0][0]
     for number, cells in zip(numbers, table, strict=True):
         if len(cells) != width:
-            mend = "leave a missing reading as an empty cell, between its commas"
+            remedy = "leave a missing reading as an empty cell, between its commas"
             if number == numbers[-1] and len(cells) < width:
-                mend = "the recording was cut off here: remove the line"
-            what = f"{_values(len(cells))} where the other lines have {width}; {mend}"
+                remedy = "the recording was cut off here: remove the line"
+            what = f"{_values(len(cells))} where the other lines have {width}; {remedy}"
             raise InputError.at(path, what, f"line {number}")
     values = np.empty((len(table), width), dtype=np.float32)
     for frame, (number, cells) in enumerate(zip(numbers, table, strict=True)):
@@ -179,6 +184,6 @@ def _number(cell: str) -> float | None:
         number = float(cell)
     except ValueError:
         return None
-    if "_" in cell:  # Python's float takes 1_000, no CSV means it
+    if "_" in cell:  # Python's float accepts 1_000, which no CSV file means
         return None
     return number if abs(number) <= _LARGEST or number != number else float("inf")

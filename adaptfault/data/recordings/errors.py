@@ -1,4 +1,4 @@
-"""What can be wrong with a user's file, said in one line: which file, where, what came, what was expected, the mend."""
+"""Errors and warnings about a user's file, one line each: file, place, what came, what was expected, the remedy."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Literal
 
 
 class InputError(ValueError):
-    """A file or an option of the user is unusable. One line: ``<file>[, where]: what came; the mend``."""
+    """A file or an option of the user is unusable. One line: ``<file>[, where]: what came; the remedy``."""
 
     @classmethod
     def at(cls, path: str | PathLike[str], what: str, where: str = "") -> InputError:
-        """Return the error for ``what`` is wrong in a file, ``where`` being "line 7" or "recording 3, frame 12"."""
+        """Return the error ``what`` in a file, at the place ``where`` ("line 7", "recording 3, frame 12")."""
         return cls(located(path, what, where))
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Something a reader noticed. What an ``"error"`` names was left out; a ``"warning"`` tells what is odd."""
+    """A problem that a reader found: an ``"error"`` left data out, a ``"warning"`` kept them."""
 
     level: Literal["error", "warning"]
     message: str

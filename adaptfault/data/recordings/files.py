@@ -37,7 +37,7 @@ class Found:
 def find(
     paths: Sequence[Path], suffixes: Collection[str], aside: Collection[Path]
 ) -> tuple[list[Found], list[Problem]]:
-    """Return the files with one of the suffixes and the bags, each once; folders in natural order, to the bottom.
+    """Return the files with one of the suffixes and the bags, each once; folders in natural order, with subfolders.
 
     Args:
         paths: files and folders, in the order wanted.

@@ -1,4 +1,4 @@
-"""Which class a file belongs to: by a table of labels, or by the folder that holds it."""
+"""Reads tables of labels, and orders class names."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.text import read_text
 
 TABLE = "labels.csv"
-"""The name under which a folder's table of labels is found without being asked for."""
+"""The name of the table of labels that is read from a folder without an option."""
 
 
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
-    """Return the key that sorts text as people do: numbers by value ("9" before "10"), before letters."""
+    """Return the key of natural order: numbers by value ("9" before "10"), before letters."""
     parts = re.findall(r"[0-9]{1,18}|[^0-9]+|[0-9]", text)
     return (*((0, int(p), "") if p.isascii() and p.isdigit() else (1, 0, p.casefold()) for p in parts), (1, 0, text))
 

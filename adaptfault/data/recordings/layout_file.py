@@ -1,8 +1,9 @@
-"""Reads the description of an array: from a JSON file, or from its size in words ("2x13x6")."""
+"""Reads the description of an array from a JSON file, or from its shape as text ("2x13x6")."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -14,32 +15,50 @@ from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.text import read_json_object, shown
 from diagnostics import SensorLayout
 
-MOST_CELLS = 1_000_000
-"""More positions than that are a slip of the pen, and would fill the memory."""
+LAYOUT_NAME = "layout.json"
+"""The name of the layout that is read from a folder of recordings without an option."""
 
-_SIZES = re.compile(r"\s*(\d{1,9})\s*[xX×*,]\s*(\d{1,9})\s*[xX×*,]\s*(\d{1,9})\s*", re.ASCII)
+MOST_CELLS = 1_000_000
+"""A layout with more positions is a typing error, and would fill the memory."""
+
+_SIZES = re.compile(r"\s*(?:(\d{1,9})\s*[xX×*,]\s*)?(\d{1,9})\s*[xX×*,]\s*(\d{1,9})\s*", re.ASCII)
 
 
 def looks_like_shape(text: str) -> bool:
-    """Tell whether text is a size such as "2x13x6" (and not the name of a file)."""
+    """Return whether text is a shape such as "2x13x6" or "10x10" (and not the name of a file)."""
     return _SIZES.fullmatch(text) is not None
 
 
 def parse_shape(text: str) -> Shape:
-    """Return ``(pads, rows, cols)`` from "2x13x6".
+    """Return ``(pads, rows, cols)`` from "2x13x6"; "10x10" is one pad, ``(1, 10, 10)``.
 
     Raises:
-        InputError: the text is none, or a size is 0 or too large.
+        InputError: the text is no shape, or a size is 0 or too large.
     """
     match = _SIZES.fullmatch(text)
     if match is None:
-        raise InputError(f"shape {shown(text)}: expected pads x rows x columns, such as 2x13x6")
-    pads, rows, cols = (int(size) for size in match.groups())
+        raise InputError(f"shape {shown(text)}: expected pads x rows x columns, such as 2x13x6, or 10x10 for one pad")
+    pads, rows, cols = (int(size or 1) for size in match.groups())
     if min(pads, rows, cols) < 1:
         raise InputError(f"shape {shown(text)}: every size must be at least 1, such as 2x13x6")
     if pads * rows * cols > MOST_CELLS:
         raise InputError(f"shape {shown(text)}: more than {MOST_CELLS} cells; check the sizes")
     return pads, rows, cols
+
+
+def layout_beside(paths: Sequence[Path]) -> SensorLayout | None:
+    """Return the layout in the :data:`LAYOUT_NAME` of the folders given, or of the folders that hold the files given.
+
+    None unless every path has one, and all are the same.
+
+    Raises:
+        InputError: such a file is no layout.
+    """
+    files = [(path if path.is_dir() else path.parent) / LAYOUT_NAME for path in paths]
+    if not files or not all(file.is_file() for file in files):
+        return None
+    layouts = {read_layout(file) for file in dict.fromkeys(files)}
+    return layouts.pop() if len(layouts) == 1 else None
 
 
 def read_layout(path: str | PathLike[str]) -> SensorLayout:

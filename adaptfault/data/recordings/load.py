@@ -1,4 +1,4 @@
-"""The one way in: files and folders of any known format become :class:`Recordings`, and what was wrong is listed."""
+"""Reads files and folders of any known format into :class:`Recordings`, and lists every problem."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.bag import STORAGES, read_bag
-from adaptfault.data.recordings.check import check_range, check_readings, check_width, odd_lengths
+from adaptfault.data.recordings.check import check_range, check_readings, check_width, other_lengths
 from adaptfault.data.recordings.classes import class_indices, label_files
 from adaptfault.data.recordings.content import Content, Shape
 from adaptfault.data.recordings.csv_folder import read_csv
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.files import Found, find
+from adaptfault.data.recordings.layout_file import layout_beside
 from adaptfault.data.recordings.npz import read_npy, read_npz
-from adaptfault.data.recordings.settle import check_agreement, given_array, settle_layout
+from adaptfault.data.recordings.resolve import Resolved, check_agreement, check_statements, given_array, resolve_layout
 from diagnostics import SensorLayout
 
 if TYPE_CHECKING:
@@ -35,15 +36,18 @@ READERS: Mapping[str, Callable[[Path], Content]] = {".csv": read_csv, ".npz": re
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
-    """What could be read, and what was wrong.
+    """The recordings that could be read, and the problems.
 
     Attributes:
         recordings: at least one recording.
-        problems: errors (something was left out) and warnings (something is odd), in the order they were met.
+        problems: errors (a recording was left out) and warnings (a recording was kept), in the order of the files.
+        inferred: one sentence for each fact of the array that no file, layout or option states, with the reason and
+            the option that states it.
     """
 
     recordings: Recordings
     problems: tuple[Problem, ...] = ()
+    inferred: tuple[str, ...] = ()
 
 
 def load(
@@ -58,19 +62,22 @@ def load(
     rate: float | None = None,
     topic: str | None = None,
     field: str | None = None,
+    strict: bool = False,
 ) -> Loaded:
-    """Read recordings; one bad file is listed and left out, the others go on.
+    """Read recordings; a bad file is listed and left out, the others are read.
 
     Each file's class comes from the file itself (.npz), or else from a table of labels, or else from the folder that
     holds it (``folder/<class>/<file>``). Files that all lie in one folder have no labels.
 
     Args:
         paths: a file, a folder, or several of them. Folders are searched to the bottom, in natural order.
-        layout: the array; a layout file; a shape ``(2, 13, 6)`` or "2x13x6". None: from the files, see Notes.
+        layout: the array; a layout file; a shape ``(2, 13, 6)``, "2x13x6" or, for one pad, "13x6". None: from the
+            files, see Notes.
         labels: a table with the columns ``file,label``, paths relative to it. None: a folder's ``labels.csv``.
         frames: the number of frames that each recording must have; None = any.
         calibration: tables that turn the counts read into newtons (or the file that holds them).
-        full_scale, unit, rate: override what the layout and the files say.
+        full_scale, unit, rate: override the layout and the files.
+        strict: refuse files that state another full scale or rate than ``layout``, as a model's layout requires.
         topic, field: where the readings are in bags, see :func:`adaptfault.data.recordings.bag.read_bag`.
 
     Raises:
@@ -78,16 +85,19 @@ def load(
             unusable.
 
     Notes:
-        Without a layout, the shape is the one of ``[n, T, pads, rows, cols]``, or the paper's for frames of 220
-        readings. Counts get the full scale of the smallest converter of 8 to 16 bits that holds them, decimal numbers
-        0..5 N. The rate is the file's, or the paper's 10 Hz.
+        Without a layout, ``layout.json`` in the folders given is used where there is one. Otherwise the shape is the
+        one of ``[n, T, pads, rows, cols]`` or ``[n, T, rows, cols]`` (one pad), or the paper's for frames of 220
+        readings. Without a full scale, counts get the one of the smallest converter of 8 to 16 bits that holds them;
+        decimal numbers get the paper's 0..5 N for the paper's shape, else the range of the converter whose step they
+        show, else 0 to the largest reading. The rate is the file's, or 10 Hz. Every inferred fact is in ``inferred``.
     """
     given = [Path(paths)] if isinstance(paths, str | PathLike) else [Path(path) for path in paths]
     if not given:
         raise InputError("no path given; name a recording or a folder of recordings")
     if frames is not None and frames < 1:
         raise InputError(f"frames {frames}: expected the number of frames a recording must have, at least 1")
-    array = given_array(layout)
+    array = given_array(layout) if layout is not None else layout_beside(given)
+    shape = array.shape if isinstance(array, SensorLayout) else array
     tables = _calibration(calibration)
     aside = {Path(p).resolve() for p in (layout, labels, calibration) if isinstance(p, str | PathLike)}
     found, problems = find(given, (*READERS, *STORAGES), aside)
@@ -101,28 +111,31 @@ def load(
             problems.append(Problem("error", str(error)))
         else:
             problems += content.problems
-            contents.append((file, content))
+            contents.append((file, content.read_as(shape) if shape else content))
     contents = label_files(contents, None if labels is None else Path(labels), problems)
     if not contents:
-        raise _nothing_left(problems)
-    settled, doubts = settle_layout([content for _, content in contents], array, full_scale, unit, rate, tables)
-    problems += doubts
+        raise nothing_left(problems)
+    resolved = resolve_layout([content for _, content in contents], array, full_scale, unit, rate, tables)
+    problems += resolved.problems
     if tables is not None:
         try:
-            tables.check(settled)
+            tables.check(resolved.layout)
         except ValueError as error:
             raise InputError(f"calibration: {error}") from None
-    return _assemble(contents, settled, frames, tables, problems)
+    return _assemble(contents, resolved, frames, tables, problems, strict=strict)
 
 
 def _assemble(
     contents: Sequence[tuple[Found, Content]],
-    layout: SensorLayout,
+    resolved: Resolved,
     length: int | None,
     tables: Calibration | None,
     problems: list[Problem],
+    *,
+    strict: bool,
 ) -> Loaded:
     """Check each file against the layout, calibrate it, and put the recordings of all together."""
+    layout = resolved.layout
     out_of_range: list[Problem] = []
     clamped = np.zeros((2, layout.n_cells), dtype=np.int64)
     frames: list[NDArray[np.float32]] = []
@@ -134,11 +147,13 @@ def _assemble(
         try:
             check_agreement(content, every, tables is not None)
             check_width(content, layout)
+            if strict:
+                check_statements(content, layout, tables is not None)
         except InputError as error:
             problems.append(Problem("error", str(error)))
             continue
-        kept, noticed = check_readings(content, layout, length)
-        problems += noticed
+        kept, found = check_readings(content, layout, length)
+        problems += found
         if not kept:
             continue
         usable.append(content)
@@ -152,14 +167,15 @@ def _assemble(
         names += (_name(file, content, i) for i in kept)
         labels += (content.labels[i] if content.labels else None for i in kept)
     if not frames:
-        raise _nothing_left(problems)
+        raise nothing_left(problems)
     if length is None:
-        problems += (odd.problem() for odd in odd_lengths(usable))
+        problems += other_lengths(usable)
     problems += _summary(out_of_range, len(usable), layout)
     if clamped.any():
         problems.append(_clamped(clamped))
     indices, class_names = class_indices(labels, [content.class_names for content in usable], problems)
-    return Loaded(Recordings(tuple(frames), layout, indices, class_names, tuple(names)), tuple(problems))
+    recordings = Recordings(tuple(frames), layout, indices, class_names, tuple(names))
+    return Loaded(recordings, tuple(problems), resolved.inferred)
 
 
 def _calibration(calibration: Calibration | PathName | None) -> Calibration | None:
@@ -187,7 +203,7 @@ def _clamped(clamped: NDArray[np.int64]) -> Problem:
 
 
 def _summary(out_of_range: list[Problem], files: int, layout: SensorLayout) -> list[Problem]:
-    """Return the warnings about the range, as one where most files have it: the scale is wrong, not the readings."""
+    """Return the warnings about the range; one for all where most files have it, because then the scale is wrong."""
     if len(out_of_range) <= max(3, files // 2):
         return out_of_range
     what = (
@@ -203,7 +219,7 @@ def _name(file: Found, content: Content, i: int) -> str:
     return file.name if len(content.frames) == 1 else f"{file.name}, recording {i}"
 
 
-def _nothing_left(problems: Sequence[Problem]) -> InputError:
+def nothing_left(problems: Sequence[Problem]) -> InputError:
     """Return the error for a run that has no recording left: the first problem, and how many there are."""
     errors = [problem for problem in problems if problem.level == "error"] or list(problems)
     counts = Counter(problem.level for problem in problems)

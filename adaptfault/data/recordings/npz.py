@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import zipfile
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -14,9 +15,10 @@ from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from adaptfault.data.atomic import atomic_write
-from adaptfault.data.recordings.content import Content, Shape
+from adaptfault.data.recordings.content import Content, Shape, grid_shape
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError, Problem
+from adaptfault.data.recordings.sizes import check_archive, check_array
 from adaptfault.data.recordings.text import read_bytes, read_json_object
 
 _KEYS = (
@@ -31,17 +33,17 @@ _KEYS = (
     "rate",
     "unit",
 )
-_EXPECTED = "expected [n, T, pads, rows, cols] or [n, T, D], or one recording [T, D] or [T, pads, rows, cols]"
+_EXPECTED = "expected [n, T, pads, rows, cols], [n, T, rows, cols] (one pad) or [n, T, D], or one recording [T, D]"
 
 
 def read_npz(path: Path) -> Content:
     """Read an archive of recordings.
 
-    Its arrays: ``frames`` ``[n, T, pads, rows, cols]`` or ``[n, T, D]``; optional ``lengths`` ``[n]`` (what is behind
-    them is padding), ``labels`` ``[n]`` (numbers or text), ``class_names``, ``names`` ``[n]``, ``present`` or
-    ``factory_mask`` (bool ``[pads, rows, cols]``, True = a real cell), and the scalars ``full_scale``, ``rate``,
-    ``unit``. A JSON file of the same stem may give ``class_names``, ``sampling_hz`` (or ``rate``), ``full_scale`` and
-    ``unit``; what the archive says comes first.
+    Its arrays: ``frames`` ``[n, T, pads, rows, cols]``, ``[n, T, rows, cols]`` (one pad) or ``[n, T, D]``; optional
+    ``lengths`` ``[n]`` (frames after them are padding), ``labels`` ``[n]`` (numbers or text), ``class_names``,
+    ``names`` ``[n]``, ``present`` or ``factory_mask`` (bool ``[pads, rows, cols]``, True = a real cell), and the
+    scalars ``full_scale``, ``rate``, ``unit``. A JSON file of the same stem may give ``class_names``, ``sampling_hz``
+    (or ``rate``), ``full_scale`` and ``unit``; the archive itself takes precedence.
 
     Raises:
         InputError: the file is damaged, or an array is missing, of a wrong kind or a wrong size.
@@ -50,6 +52,9 @@ def read_npz(path: Path) -> Content:
     if "frames" not in arrays:
         raise InputError.at(path, "holds no array 'frames'; save the recordings as frames=[n, T, pads, rows, cols]")
     beside, problems = _read_sibling(path)
+    mask = arrays.get("present", arrays.get("factory_mask"))
+    if mask is not None and mask.ndim == 3 and mask.shape[0] > 1 and arrays["frames"].shape[1:] == mask.shape:
+        arrays["frames"] = arrays["frames"][None]  # one recording [T, pads, rows, cols]: the mask shows the pads
     frames, shape = _recordings(path, arrays["frames"], arrays.get("lengths"))
     present = _present(path, arrays, shape, int(frames[0].shape[1]) if frames else 0)
     shape = shape or (None if present is None else (present.shape[0], present.shape[1], present.shape[2]))
@@ -75,12 +80,13 @@ def read_npz(path: Path) -> Content:
         full_scale=_scalar(path, arrays, "full_scale", beside.get("full_scale")),
         rate=_scalar(path, arrays, "rate", beside.get("sampling_hz", beside.get("rate"))),
         unit=unit or None,
+        stored=arrays["frames"].shape,
         problems=problems,
     )
 
 
 def read_npy(path: Path) -> Content:
-    """Read one array, ``[n, T, D]``, ``[T, D]``, ``[n, T, pads, rows, cols]`` or ``[T, pads, rows, cols]``.
+    """Read one array with the axes of ``frames`` in :func:`read_npz`, or one recording ``[T, D]``.
 
     Raises:
         InputError: the file is damaged, or the array is of another kind or shape.
@@ -90,7 +96,7 @@ def read_npy(path: Path) -> Content:
         array.close()
         raise InputError.at(path, "is an archive; name it .npz")
     frames, shape = _recordings(path, array, None)
-    return Content(path, frames, counts=array.dtype.kind in "iu", shape=shape)
+    return Content(path, frames, counts=array.dtype.kind in "iu", shape=shape, stored=array.shape)
 
 
 def save_npz(path: str | PathLike[str], recordings: Recordings) -> None:
@@ -129,12 +135,19 @@ def save_npz(path: str | PathLike[str], recordings: Recordings) -> None:
 
 
 def _open(path: Path) -> Any:
-    """Return what np.load makes of a file that is there and holds something."""
+    """Return the result of np.load for a file that exists and is not empty."""
     data = read_bytes(path)
     if not data.startswith((b"PK\x03\x04", b"PK\x05\x06", b"\x93NUMPY")):
         raise InputError.at(path, "is no NumPy file; write it again with numpy.savez or numpy.save")
     try:
+        if data.startswith(b"PK"):
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                check_archive(path, archive, _KEYS)
+        else:
+            check_array(path, data)
         return np.load(io.BytesIO(data), allow_pickle=False)
+    except InputError:
+        raise
     except Exception as error:  # a damaged file raises any of a dozen kinds: zipfile's, zlib's, struct's, numpy's
         raise _damaged(path, error) from None
 
@@ -167,18 +180,18 @@ def _damaged(path: Path, error: Exception, key: str = "") -> InputError:
 def _recordings(
     path: Path, frames: NDArray[Any], lengths: NDArray[Any] | None
 ) -> tuple[tuple[NDArray[Any], ...], Shape | None]:
-    """Return one array ``[T, D]`` a recording, and ``(pads, rows, cols)`` where the frames show it."""
+    """Return one array ``[T, D]`` a recording, and ``(pads, rows, cols)`` where the frames have these axes."""
     if frames.dtype.kind not in "iuf":
         raise InputError.at(path, f"frames are of type {frames.dtype}; save whole or decimal numbers")
     if not 2 <= frames.ndim <= 5:
         raise InputError.at(path, f"frames have shape {list(frames.shape)}; {_EXPECTED}")
     if frames.size == 0:
         raise InputError.at(path, f"frames have shape {list(frames.shape)} and hold no reading; record again")
-    shape = (frames.shape[-3], frames.shape[-2], frames.shape[-1]) if frames.ndim > 3 else None
+    shape = grid_shape(frames.shape)
     if frames.dtype.kind == "f":
         with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
             frames = frames.astype(np.float32)
-    if frames.ndim in (2, 4):
+    if frames.ndim == 2 or (frames.ndim == 4 and frames.shape[1] == 1):
         frames = frames[None]
     frames = frames.reshape(*frames.shape[:2], -1)  # [n, T, D]
     if lengths is None:
@@ -266,14 +279,14 @@ def _scalar(path: Path, arrays: Mapping[str, NDArray[Any]], key: str, beside: ob
 
 
 def _read_sibling(path: Path) -> tuple[dict[str, Any], tuple[Problem, ...]]:
-    """Return the JSON object beside an archive; one that cannot be read is a warning, it is only an addition."""
+    """Return the JSON object beside an archive; a file that cannot be read is a warning, because it is optional."""
     beside = path.with_suffix(".json")
     if not beside.is_file():
         return {}, ()
     try:
         return read_json_object(beside), ()
     except InputError as error:
-        return {}, (Problem("warning", f"{error}; passed over, class names and sampling rate may be missing"),)
+        return {}, (Problem("warning", f"{error}; ignored, class names and sampling rate may be missing"),)
 
 
 def _class_names_beside(path: Path, beside: Mapping[str, Any]) -> tuple[str, ...]:

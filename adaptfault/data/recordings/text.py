@@ -1,4 +1,4 @@
-"""Opens a text file whole, or says in one line why it is none."""
+"""Reads text and JSON files; the error names in one line what is wrong with a file."""
 
 from __future__ import annotations
 
@@ -7,15 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.sizes import check_file
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the content of a file; InputError where it cannot be read or holds nothing."""
+    """Return the content of a file; InputError where it cannot be read or is empty."""
     try:
+        check_file(path)
         data = path.read_bytes()
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError.at(path, f"cannot be read ({reason}); check the path and its permissions") from None
+    except InputError:
+        raise
     except ValueError:  # a null character in the path
         raise InputError.at(repr(str(path)), "is not a path; check its name") from None
     if not data:
@@ -24,7 +28,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """Return a UTF-8 file (with or without byte order mark) with lines that end in a newline, however they ended.
+    """Return a UTF-8 file (with or without byte order mark) with every line end replaced by a newline.
 
     Raises:
         InputError: the file cannot be read, is empty, binary, or encoded in another way.
@@ -48,13 +52,13 @@ def decoded(path: Path, data: bytes) -> str:
 
 
 def numbered_lines(text: str) -> tuple[list[str], list[int]]:
-    """Return the lines that hold anything and their numbers in the file, counted from 1."""
+    """Return the lines that are not blank and their numbers in the file, counted from 1."""
     held = [(line, number) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
     return [line for line, _ in held], [number for _, number in held]
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file; InputError names the line where the file is no JSON."""
+    """Return the object in a JSON file; InputError names the line where the file is not JSON."""
     text = read_text(path)
     try:
         document = json.loads(text)
@@ -71,5 +75,5 @@ def read_json_object(path: Path) -> dict[str, Any]:
 
 
 def shown(text: str) -> str:
-    """Return text of the user's, quoted and cut to a length that fits a message."""
+    """Return the user's text, quoted and shortened to fit a message."""
     return repr(text if len(text) <= 30 else text[:27] + "...")

@@ -1,0 +1,96 @@
+"""A trained model, from a folder of ``adaptfault train`` or from a bundle, and the recordings that belong to it."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from adaptfault.adaptation.fault_free import Network
+from adaptfault.adaptation.result import Adaptation
+from adaptfault.cli.options import load_recordings
+from adaptfault.data.recordings import Recordings
+from adaptfault.data.windows import Windows, make_windows, split
+from adaptfault.models.store import SCHEMA, load_model, read_manifest
+
+if TYPE_CHECKING:
+    from adaptfault.robot.bundle import Bundle
+
+
+@dataclass(frozen=True)
+class TrainedModel:
+    """A model and the facts that it was stored with.
+
+    Attributes:
+        network: the fault-free model, with its layout and window length.
+        class_names: one name a class, or none.
+        split_seed: of the split into training, validation and test recordings; None where it is not stored.
+        adaptation: the version that a bundle runs; None for a model.
+        calibration: the bundle's table from raw counts to the layout's unit.
+    """
+
+    network: Network
+    class_names: tuple[str, ...]
+    split_seed: int | None
+    adaptation: Adaptation | None = None
+    calibration: Path | None = None
+
+    @classmethod
+    def open(cls, folder: str) -> TrainedModel:
+        """Read a model or a bundle.
+
+        Raises:
+            FileNotFoundError, ValueError: neither, or damaged.
+        """
+        bundle = open_bundle(folder)
+        if bundle is None:
+            manifest = read_manifest(folder, SCHEMA)
+            seed = int(manifest["extra"].get("split_seed", 0))
+            return cls(load_model(folder), tuple(manifest["class_names"]), seed)
+        active = Adaptation.load(bundle.active().folder)
+        return cls(active.model.network, bundle.class_names, None, active, bundle.parts.calibration)
+
+    def recordings(self, args: argparse.Namespace, paths: Sequence[str]) -> Recordings:
+        """Read labelled recordings in the layout of the model.
+
+        Raises:
+            ValueError: they contradict the layout or the classes of the model; both values are named.
+        """
+        if args.calibration is None and self.calibration is not None:
+            args.calibration = str(self.calibration)
+        recordings = load_recordings(args, paths, labelled=True, layout=self.network.layout)
+        if self.class_names and recordings.class_names != self.class_names:
+            recordings = self._in_order(recordings)
+        return recordings
+
+    def _in_order(self, recordings: Recordings) -> Recordings:
+        """Return the recordings with the classes of the model, in the order of the model."""
+        unknown = sorted(set(recordings.class_names) - set(self.class_names))
+        if unknown:
+            classes = ", ".join(self.class_names)
+            raise ValueError(f"the recordings have the class {unknown[0]!r}, the model has {classes}")
+        assert recordings.labels is not None
+        index = np.array([self.class_names.index(name) for name in recordings.class_names], dtype=np.int64)
+        labels = index[recordings.labels]
+        return Recordings(recordings.frames, recordings.layout, labels, self.class_names, recordings.names)
+
+    def windows(self, recordings: Recordings) -> Windows:
+        """Cut recordings into the windows that the model takes."""
+        return make_windows(recordings.frames, recordings.labels, recordings.layout, length=self.network.length)
+
+    def parts(self, recordings: Recordings) -> tuple[Windows, Windows, Windows]:
+        """Return training, validation and test windows, the same as in training."""
+        return split(self.windows(recordings), seed=self.split_seed or 0)
+
+
+def open_bundle(folder: str) -> Bundle | None:
+    """Return the bundle in a folder; None if it holds something else."""
+    if not (Path(folder) / "bundle.json").is_file():
+        return None
+    from adaptfault.robot.bundle import Bundle
+
+    return Bundle.open(folder)

@@ -1,0 +1,118 @@
+"""Writes recordings in every format that :func:`adaptfault.load` reads."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from adaptfault.data.atomic import atomic_write
+from adaptfault.data.recordings.dataset import Recordings
+from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.layout_file import LAYOUT_NAME
+from adaptfault.data.recordings.npz import save_npz
+
+FORMATS = ".npz, .npy, .bag (a ROS 2 bag) or a folder of CSV files"
+
+_TOPIC, _KIND = "/tactile", "std_msgs/msg/Float32MultiArray"
+_PAUSE = 5.0  # seconds between two recordings in a bag, which separate them
+_BEGIN = 1_700_000_000  # unix time of the first message: a bag needs one, recordings have none
+
+
+def save(path: str | PathLike[str], recordings: Recordings) -> tuple[str, ...]:
+    """Write recordings in the format that the name ends in: ``.npz``, ``.npy``, ``.bag``; without an ending, CSV files.
+
+    An archive (``.npz``) holds everything. An array (``.npy``) holds the frames alone, ``[n, T, pads, rows, cols]``,
+    and needs recordings of one length. CSV files lie in one folder a class, with ``layout.json`` beside them. A bag
+    holds one ``Float32MultiArray`` a frame on ``/tactile``, recordings separated by pauses.
+
+    Returns:
+        What the format cannot hold, one item each: empty for an archive.
+
+    Raises:
+        InputError: another ending, no recordings, lengths that differ (``.npy``), or rosbags is missing (``.bag``).
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    if not len(recordings):
+        raise InputError.at(path, "there are no recordings to save; give at least one")
+    match path.suffix.lower():
+        case ".npz":
+            save_npz(path, recordings)
+            return ()
+        case ".npy":
+            return _save_npy(path, recordings)
+        case ".bag":
+            return _save_bag(path, recordings)
+        case "":
+            return _save_csv(path, recordings)
+        case _:
+            raise InputError.at(path, f"recordings are saved as {FORMATS}; choose another name")
+
+
+def _save_npy(path: Path, recordings: Recordings) -> tuple[str, ...]:
+    lengths = {len(frames) for frames in recordings}
+    if len(lengths) > 1:
+        what = f"recordings of {min(lengths)} to {max(lengths)} frames do not fit one array; save them as .npz"
+        raise InputError.at(path, what)
+    buffer = io.BytesIO()
+    np.save(buffer, recordings.layout.grid(np.stack(recordings.frames)), allow_pickle=False)
+    atomic_write(path, buffer.getvalue())
+    return ("full scale, unit and rate", "masked positions", "labels", "names")
+
+
+def _save_csv(path: Path, recordings: Recordings) -> tuple[str, ...]:
+    path.mkdir(parents=True, exist_ok=True)
+    if any(path.iterdir()):
+        raise InputError.at(path, "the folder is not empty; choose another name")
+    atomic_write(path / LAYOUT_NAME, json.dumps(recordings.layout.to_dict(), indent=1).encode())
+    digits = len(str(len(recordings) - 1))
+    for i, frames in enumerate(recordings):
+        folder = path
+        if recordings.labels is not None:
+            folder = path / _safe(recordings.class_names[int(recordings.labels[i])])
+            folder.mkdir(exist_ok=True)
+        text = "".join(",".join(_written(value) for value in row) + "\n" for row in frames.tolist())
+        atomic_write(folder / f"{i:0{digits}d}.csv", text.encode())
+    return ("names",)
+
+
+def _written(value: float) -> str:
+    """Return a float32 as the shortest text that is read back as the same number; a missing reading is empty."""
+    return "" if value != value else f"{value:.9g}"
+
+
+def _safe(name: str) -> str:
+    """Return a class name as the name of a folder."""
+    return re.sub(r"[^\w. +-]", "_", name).strip(". ") or "_"
+
+
+def _save_bag(path: Path, recordings: Recordings) -> tuple[str, ...]:
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise InputError.at(path, "bags are written with rosbags; install it: pip install 'adaptfault[ros]'") from None
+    if path.exists():
+        raise InputError.at(path, "exists; choose another name")
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kinds = store.types
+    sizes = recordings.layout.shape
+    dim = kinds["std_msgs/msg/MultiArrayDimension"]
+    strides = [int(np.prod(sizes[i:])) for i in range(3)]
+    dims = [dim(label=n, size=s, stride=t) for n, s, t in zip(("pad", "row", "column"), sizes, strides, strict=True)]
+    about = kinds["std_msgs/msg/MultiArrayLayout"](dim=dims, data_offset=0)
+    period, at = round(1e9 / recordings.layout.rate), _BEGIN * 10**9
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:  # ROS 2 Humble rejects version 9
+        connection = writer.add_connection(_TOPIC, _KIND, typestore=store)
+        for frames in recordings:
+            for frame in frames:
+                message = kinds[_KIND](layout=about, data=np.asarray(frame, np.float32))
+                writer.write(connection, at, store.serialize_cdr(message, _KIND))
+                at += period
+            at += max(round(_PAUSE * 1e9), 10 * period)
+    return ("full scale and unit", "masked positions", "labels", "names")

@@ -1,0 +1,214 @@
+"""Summarises recordings before anything is fitted: shape, range, step, rest level, classes, silent cells."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics import SensorLayout
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCHEMA = "adaptfault.info/1"
+
+_SAMPLE = 4000  # frames that the rest level and the step are taken from
+_LISTED = 8  # cells or classes that the text lists
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """The content of recordings.
+
+    Attributes:
+        layout: the array.
+        lengths: int ``[n]``, frames of each recording.
+        mean, lowest, highest: float ``[D]``, of the finite readings of each cell; NaN where it has none.
+        rest: float ``[D]``, the reading that a cell has in the 10 % of frames in which it is least loaded (their
+            median).
+        step: the least difference between two readings that are not equal; None where no cell changes.
+        missing: int ``[D]``, missing readings.
+        classes: recordings of each class; empty without labels.
+        inferred: see :class:`adaptfault.data.recordings.Loaded`.
+    """
+
+    layout: SensorLayout
+    lengths: NDArray[np.int64]
+    mean: NDArray[np.float64]
+    lowest: NDArray[np.float64]
+    highest: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    step: float | None
+    missing: NDArray[np.int64]
+    classes: dict[str, int] = field(default_factory=dict)
+    inferred: tuple[str, ...] = ()
+
+    @property
+    def silent(self) -> NDArray[np.intp]:
+        """Present cells whose reading never changes: not loaded, or faulty."""
+        with np.errstate(invalid="ignore"):
+            constant = ~(self.highest > self.lowest)
+        return np.flatnonzero(constant & self.layout.present.ravel())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict of the schema "adaptfault.info/1"."""
+        present = self.layout.present.ravel()
+        return {
+            "schema": SCHEMA,
+            "layout": self.layout.to_dict(),
+            "recordings": len(self.lengths),
+            "frames": int(self.lengths.sum()),
+            "lengths": {"least": int(self.lengths.min()), "most": int(self.lengths.max())},
+            "lowest": _least(self.lowest[present]),
+            "highest": _most(self.highest[present]),
+            "step": self.step,
+            "rest": _median(self.rest[present]),
+            "missing": int(self.missing[present].sum()),
+            "silent": self.silent.tolist(),
+            "classes": self.classes,
+            "inferred": list(self.inferred),
+        }
+
+    def __str__(self) -> str:
+        layout, present = self.layout, self.layout.present.ravel()
+        least, most = int(self.lengths.min()), int(self.lengths.max())
+        frames = f"{least} frames" if least == most else f"{least} to {most} frames"
+        rows = {
+            "recordings": f"{len(self.lengths)} of {frames} each, {self.lengths.sum() / layout.rate:.0f} s in all",
+            "array": str(layout),
+            "readings": self._readings(),
+            "rest level": f"{_number(_median(self.rest[present]))} (median over the cells)",
+            "missing": f"{int(self.missing[present].sum())} readings",
+            "silent": self._silent(),
+            "classes": self._classes(),
+        }
+        lines = [f"{name:12s} {text}" for name, text in rows.items()]
+        return "\n".join([*lines, *(f"{'inferred':12s} {text}" for text in self.inferred)])
+
+    def _readings(self) -> str:
+        present = self.layout.present.ravel()
+        low, high = _least(self.lowest[present]), _most(self.highest[present])
+        if low is None or high is None:
+            return "none"
+        step = "" if self.step is None else f", least step {self.step:.3g}"
+        share = high / self.layout.full_scale
+        return f"{low:.4g} to {high:.4g} {self.layout.unit} ({share:.0%} of the full scale){step}"
+
+    def _silent(self) -> str:
+        silent = self.silent
+        if not silent.size:
+            return "no cell: every cell changes"
+        places = ["pad {}, row {}, column {}".format(*self.layout.position(int(c))) for c in silent[:_LISTED]]
+        more = [f"and {silent.size - _LISTED} more"] if silent.size > _LISTED else []
+        text = f"{silent.size} of {int(self.layout.present.sum())} cells never change (not loaded, or faulty)"
+        return f"{text}: {'; '.join([*places, *more])}"
+
+    def _classes(self) -> str:
+        if not self.classes:
+            return "no labels"
+        listed = [f"{name} {count}" for name, count in list(self.classes.items())[:_LISTED]]
+        more = [f"and {len(self.classes) - _LISTED} more"] if len(self.classes) > _LISTED else []
+        return f"{len(self.classes)}: {', '.join([*listed, *more])}"
+
+    def plot(self) -> Figure:
+        """Draw the mean and the peak of each cell, one map a pad; a cross marks a silent cell."""
+        from diagnostics.decision.plot import draw_forces, pads_figure
+
+        layout = self.layout
+        figure, axes = pads_figure(layout, n_rows=2)
+        size = layout.rows * layout.cols
+        for (name, values), row in zip({"mean": self.mean, "peak": self.highest}.items(), axes, strict=True):
+            shown = np.where(layout.present.ravel(), values, np.nan)
+            top = _most(shown) or layout.full_scale
+            for pad, ax in enumerate(row):
+                silent = [int(c) - pad * size for c in self.silent if c // size == pad]
+                image = draw_forces(ax, layout.grid(shown)[pad], layout, silent, vmin=0, vmax=top, cmap="viridis")
+                ax.set_title(f"{name}, pad {pad}", fontsize=9)
+            figure.colorbar(image, ax=row.tolist(), label=layout.unit)
+        figure.supxlabel("x: the reading of the cell never changes", fontsize=8)
+        return figure
+
+
+def summarise(
+    recordings: Iterable[NDArray[Any]],
+    layout: SensorLayout,
+    *,
+    classes: dict[str, int] | None = None,
+    inferred: tuple[str, ...] = (),
+) -> Summary:
+    """Summarise recordings, or blocks of them, in one pass and constant memory.
+
+    Args:
+        recordings: arrays ``[T, D]`` in the layout's unit; NaN = missing.
+        layout: the array.
+        classes, inferred: stored in the summary.
+
+    Raises:
+        ValueError: no recording, or one that does not fit the layout.
+    """
+    width = layout.n_cells
+    total, finite, lengths = np.zeros(width), np.zeros(width, np.int64), []
+    lowest, highest = np.full(width, np.inf), np.full(width, -np.inf)
+    sample: list[NDArray[np.float64]] = []
+    for i, recording in enumerate(recordings):
+        frames = layout.check_recording(recording, f"recording {i}")
+        known = np.isfinite(frames)
+        lengths.append(len(frames))
+        total += np.sum(frames, axis=0, where=known)
+        finite += known.sum(axis=0)
+        lowest = np.minimum(lowest, np.min(frames, axis=0, initial=np.inf, where=known))
+        highest = np.maximum(highest, np.max(frames, axis=0, initial=-np.inf, where=known))
+        if sum(map(len, sample)) < _SAMPLE:
+            sample.append(frames[: _SAMPLE // 10])
+    if not lengths:
+        raise ValueError("no recording to summarise")
+    seen = finite > 0
+    return Summary(
+        layout=layout,
+        lengths=np.array(lengths, dtype=np.int64),
+        mean=np.where(seen, total / np.maximum(finite, 1), np.nan),
+        lowest=np.where(seen, lowest, np.nan),
+        highest=np.where(seen, highest, np.nan),
+        rest=_rest(np.concatenate(sample)),
+        step=_step(np.concatenate(sample)[:, layout.present.ravel()]),
+        missing=np.int64(sum(lengths)) - finite,
+        classes=dict(classes or {}),
+        inferred=inferred,
+    )
+
+
+def _rest(frames: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the 5 % quantile of each cell, which is the median of its lowest 10 %."""
+    kept = np.where(np.isfinite(frames), frames, np.inf)
+    ordered = np.sort(kept, axis=0)
+    rank = (0.05 * np.maximum(np.isfinite(frames).sum(axis=0) - 1, 0)).astype(int)
+    rest = np.take_along_axis(ordered, rank[None], axis=0)[0]
+    return np.where(np.isfinite(rest), rest, np.nan)
+
+
+def _step(frames: NDArray[np.float64]) -> float | None:
+    """Return the least difference between two distinct readings, above the rounding of float32."""
+    values = np.unique(frames[np.isfinite(frames)].astype(np.float32)).astype(np.float64)
+    gaps = np.diff(values)
+    gaps = gaps[gaps > 1e-6 * max(abs(values[0]), abs(values[-1]))] if gaps.size else gaps
+    return float(gaps.min()) if gaps.size else None
+
+
+def _least(values: NDArray[np.float64]) -> float | None:
+    return float(np.nanmin(values)) if np.isfinite(values).any() else None
+
+
+def _most(values: NDArray[np.float64]) -> float | None:
+    return float(np.nanmax(values)) if np.isfinite(values).any() else None
+
+
+def _median(values: NDArray[np.float64]) -> float | None:
+    return float(np.nanmedian(values)) if np.isfinite(values).any() else None
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.4g}"

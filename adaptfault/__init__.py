@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from adaptfault.adaptation.reduced_model import ReducedModel
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.data.calibration import Calibration
-    from adaptfault.data.recordings import Recordings, load, save_npz
+    from adaptfault.data.recordings import Recordings, load, save, save_npz
     from adaptfault.data.simulated_grasps import simulate
+    from adaptfault.data.summary import Summary, summarise
     from adaptfault.data.windows import Windows, make_windows, split
     from adaptfault.evaluation.scores import Scores, ValueScores, evaluate
     from adaptfault.evaluation.sensitivity import Sensitivity, analyse, sensitivity
@@ -67,6 +68,7 @@ __all__ = [
     "Scores",
     "Sensitivity",
     "Station",
+    "Summary",
     "TactileTransformer",
     "ValueScores",
     "Windows",
@@ -83,12 +85,14 @@ __all__ = [
     "maintain",
     "maintain_fleet",
     "make_windows",
+    "save",
     "save_adapter",
     "save_model",
     "save_npz",
     "sensitivity",
     "simulate",
     "split",
+    "summarise",
     "train",
     "train_fault_aware",
     "write_diagnostics",
@@ -118,6 +122,7 @@ _HOMES = {
     "Restorer": "imputation.restorer",
     "Station": "acquisition",
     "Scores": "evaluation.scores",
+    "Summary": "data.summary",
     "Sensitivity": "evaluation.sensitivity",
     "TactileTransformer": "models.network",
     "ValueScores": "evaluation.scores",
@@ -135,12 +140,14 @@ _HOMES = {
     "maintain": "robot.maintenance",
     "maintain_fleet": "fleet.run",
     "make_windows": "data.windows",
+    "save": "data.recordings",
     "save_adapter": "adaptation.adapter_files",
     "save_model": "models.store",
     "save_npz": "data.recordings",
     "sensitivity": "evaluation.sensitivity",
     "simulate": "data.simulated_grasps",
     "split": "data.windows",
+    "summarise": "data.summary",
     "train": "models.training",
     "train_fault_aware": "adaptation.baselines.fault_aware",
     "write_diagnostics": "acquisition.ros",

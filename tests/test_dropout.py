@@ -68,6 +68,7 @@ def test_validation_looks_at_whole_and_at_repaired_windows():
     np.testing.assert_array_equal(both.y[len(data) :], data.y)
 
 
+@pytest.mark.slow
 def test_a_repairable_base_loses_less_under_the_fill():
     from adaptfault.adaptation.adapter import Adapter
     from diagnostics import FaultSet

@@ -108,11 +108,11 @@ def test_of_a_large_skin_only_what_lies_around_suspects_is_judged_and_tells_the_
         recording[:, dead] = 0
     asked_about: list[np.ndarray] = []
 
-    def all_of(log: RecordingBlocks, needed: np.ndarray, _: np.ndarray) -> Diagnosis:
+    def all_of(log: RecordingBlocks, needed: np.ndarray, *_: object) -> Diagnosis:
         asked_about.append(needed)
         return SelfDiagnosis(skin).diagnose(list(log))
 
-    def some_of(log: RecordingBlocks, needed: np.ndarray, _: np.ndarray) -> Diagnosis:
+    def some_of(log: RecordingBlocks, needed: np.ndarray, *_: object) -> Diagnosis:
         cold = SelfDiagnosis(skin)
         stream = cold.stream(needed)
         for frames in log:

@@ -37,6 +37,7 @@ COMMANDS = (
     train,
     evaluate,
     adapt,
+    restore,
     demo,
     maintain,
     rollback,

@@ -33,7 +33,6 @@ COMMANDS = (
     convert,
     simulate,
     diagnose,
-    restore,
     train,
     evaluate,
     adapt,

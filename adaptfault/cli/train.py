@@ -49,6 +49,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--strict", action="store_true", help="exit code 1 if the training shows a sign of failure")
     parser.add_argument(
         "--model",
+        dest="builder",
         metavar="PACKAGE:FUNCTION",
         help="train the torch module that this function returns for (layout, n_classes, length)"
         " (default: the paper's network)",
@@ -77,8 +78,8 @@ def run(args: argparse.Namespace) -> int:
     say(args, f"{recordings.layout}; {windows}")
     n_classes = len(recordings.class_names)
     model: TactileTransformer | AnyModel
-    if args.model:
-        model = _built(args.model, windows, recordings.layout, n_classes)
+    if args.builder:
+        model = _built(args.builder, windows, recordings.layout, n_classes)
     else:
         model = TactileTransformer(recordings.layout, n_classes, length=args.length, seed=args.seed)
     folder = out.with_name(f".{out.name}.training") if bundled else out

@@ -1,4 +1,5 @@
 # make demo       the main job on simulated grasps, with a report     make test         lint, formatting, types and tests
+# make test-all   the same with the tests that take long              make test-cpus    the tests as on other CPUs
 # make examples   every script of examples/, and every block of code in the docs, small; the quick ones are in make test
 # make benchmark  the diagnosis on every array, against the committed table (BENCHMARK=--quick: minutes)
 # make docs       the site, in build/site: pages and API reference    make wheel-check  the wheel, installed somewhere else
@@ -10,19 +11,39 @@ PYTHON ?= $(shell for p in python3.11 /usr/bin/python3.11 python3.12 python3.13 
 	$$p -c 'import ensurepip, venv, sys; sys.exit(sys.version_info < (3, 10))' >/dev/null 2>&1 && echo $$p && break; done)
 BIN := .venv/bin
 
-.PHONY: demo test examples benchmark docs wheel-check test-pythons format clean
+.PHONY: demo test test-all test-cpus check quick-tests all-tests examples benchmark docs wheel-check test-pythons format clean
 
 demo: .venv/installed
 	$(BIN)/adaptfault demo
 
+PYTEST := $(BIN)/pytest -n auto --dist worksteal
+
+# Side by side: mypy takes one core, and the tests wait for each other now and then.
 test: .venv/installed-dev
+	@$(MAKE) --no-print-directory -j 2 check quick-tests
+
+test-all: .venv/installed-dev
+	@$(MAKE) --no-print-directory -j 2 check all-tests
+
+check:
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal -m 'not slow'
+
+quick-tests:
+	OMP_NUM_THREADS=1 $(PYTEST) -m 'not slow'
+
+all-tests:
+	OMP_NUM_THREADS=1 $(PYTEST)
+
+# Sums come out otherwise with other instructions, and with more threads. A CPU without AVX-512 takes what it has.
+test-cpus: .venv/installed-dev
+	for how in 'default SSE4_2 Prescott 1' 'avx2 AVX2 Haswell 2' 'avx512 AVX512 SkylakeX 1' 'avx512 AVX512 SkylakeX 2'; do \
+		set -- $$how; echo "$$how threads" && ATEN_CPU_CAPABILITY=$$1 MKL_ENABLE_INSTRUCTIONS=$$2 OPENBLAS_CORETYPE=$$3 \
+		OMP_NUM_THREADS=$$4 $(PYTEST) -m 'not slow' || exit 1; done
 
 examples: .venv/installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal -vv -rs tests/test_examples.py tests/test_docs.py
+	OMP_NUM_THREADS=1 $(PYTEST) -vv -rs tests/test_examples.py tests/test_docs.py
 
 # Real arrays are read from ../shared/data where it exists.
 benchmark: .venv/installed-dev
@@ -46,7 +67,7 @@ test-pythons: .venv/installed
 		version=$$($$python -c 'import ensurepip, sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null) || continue; \
 		test -e .venv-$$version/tested && continue; echo "Python $$version ($$python)"; \
 		$$python -m venv .venv-$$version && \
-		.venv-$$version/bin/python -m pip install --quiet --disable-pip-version-check pytest mcap rosbags \
+		.venv-$$version/bin/python -m pip install --quiet --disable-pip-version-check hypothesis pytest mcap rosbags \
 			$$($(BIN)/python -c 'import tomllib; print(*[d for d in tomllib.load(open("pyproject.toml", "rb"))["project"]["dependencies"] if not d.startswith("torch")], sep="\n")' | tr -d ' ') && \
 		.venv-$$version/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -e . && \
 		.venv-$$version/bin/python -m pytest --ignore tests/test_examples.py && touch .venv-$$version/tested || exit 1; \

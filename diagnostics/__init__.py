@@ -1,6 +1,6 @@
-"""Self-diagnosis of tactile arrays: which cells are faulty, why, and what could not be tested.
+"""Self-diagnosis of tactile arrays: which cells are faulty, why, and which could not be tested.
 
-Needs numpy, scipy, statsmodels and scikit-learn; never torch, so that a robot can monitor its skin without it.
+Needs numpy, scipy, statsmodels and scikit-learn; never torch, so that a robot can run the monitor without it.
 """
 
 from diagnostics.decision.coverage import Coverage

@@ -1,4 +1,4 @@
-"""Self-diagnosis: gathers the evidence, weighs it, finds the root causes, and says what was not tested."""
+"""Self-diagnosis: evidence, calibration, faulty set, root causes and coverage of a log."""
 
 from __future__ import annotations
 
@@ -18,26 +18,25 @@ from diagnostics.decision.root_causes import CellFindings, root_causes
 from diagnostics.decision.serialization import Arrays, from_state, to_state
 from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stream_state import StreamState
-from diagnostics.healthy.reference import Reference, living, tolerance_of
+from diagnostics.healthy.reference import Reference, highest_reading, living, tolerance_of
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.readings import RecordingBlocks
 
 SCHEMA = "adaptfault.diagnoser/9"
 
-_SURE = 0.999  # P(faulty) of a cell that was counted out over many frames
-_SUSPICIOUS_COLD = 3.0  # log evidence from which on a cell is not asked about the others, in a cold start
+_CERTAIN = 0.999  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
+_SUSPICIOUS_COLD = 3.0  # raw log ratio from which on a cell is no predictor, in a cold start
 _KNOWN = 9.0  # log likelihood ratio of a cell that was dead in the reference already
-_APART = 0.5  # of what speaks against cells of one wire, where none of them is asked about the others
-# P(faulty) from which on a cell is likely to be faulty. So far such a cell leads the others on its wire, and any other
-# cell, where many touches are known; where few are, strange ones make cells likely too.
+_GROUP_SHARE = 0.5  # share of the evidence added with a group excluded, see _weight_of_groups
+# Certainty that a cell lends its wire, where it is likely to be faulty and where not; less with few reference events.
 _LIKELY, _LEADING = 0.8, (0.75, 0.4)
-_DOUBTED = 0.1  # P(faulty) from which on a cell that moved before is no longer called alive
+_DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """What is stored of a fitted diagnosis."""
+    """The state of a fitted diagnosis that is stored."""
 
     layout: SensorLayout
     false_discovery_rate: float
@@ -46,15 +45,15 @@ class Fitted:
 
 
 class SelfDiagnosis:
-    """Finds faulty cells and the wires behind them, from what a robot recorded in passing.
+    """Finds faulty cells and wires of a tactile array from recordings of normal operation.
 
     Args:
         layout: the array.
-        false_discovery_rate: expected share of healthy cells in F: it is cut where it comes near to this.
+        false_discovery_rate: expected share of healthy cells in F.
 
     Attributes:
-        reference_: what healthy looks like, after :meth:`fit`.
-        weights_: what evidence is worth, after :meth:`fit`.
+        reference_: the healthy reference, after :meth:`fit`; None: cold start.
+        calibrator_: calibration of the log likelihood ratios; defaults before :meth:`fit`.
     """
 
     reference_: Reference | None = None
@@ -65,23 +64,26 @@ class SelfDiagnosis:
         self.false_discovery_rate = false_discovery_rate
 
     def fit(self, recordings: ArrayLike | Sequence[ArrayLike]) -> SelfDiagnosis:
-        """Learn from fault-free recordings, ``[T, D]`` or a list of them, what healthy looks like.
+        """Fit to fault-free recordings, ``[T, D]`` or a list of them.
 
-        Cells that are dead in them all the same are found first, and called so in every log in which they do not move.
+        Cells that are dead in them are found first and excluded; they are reported in every log in which they do not
+        move.
 
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame with a reading.
         """
         healthy = _recordings(recordings, self.layout).valid(self.layout.full_scale).whole(self.layout.present.ravel())
-        dead = find_reference_faults(healthy, self.layout, tolerance_of(healthy, self.layout), self._diagnosed_cold)
-        self.reference_ = Reference.fit(healthy, self.layout, dead)
-        self.calibrator_ = Calibrator.fit(healthy, living(self.layout, dead))
+        # Fractions of full scale refer to the range that was seen: a stated one may be too high.
+        layout = replace(self.layout, full_scale=min(self.layout.full_scale, highest_reading(healthy, self.layout)))
+        dead = find_reference_faults(healthy, layout, tolerance_of(healthy, layout), self._diagnosed_cold)
+        self.reference_ = Reference.fit(healthy, layout, dead)
+        self.calibrator_ = Calibrator.fit(healthy, living(layout, dead))
         return self
 
     def diagnose(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Diagnosis:
-        """Judge every cell from a log: recordings ``[T, D]`` or a list of them, in time order.
+        """Diagnose a log: recordings ``[T, D]`` or a list of them, in time order.
 
-        Without :meth:`fit`, cells are judged by the cells around them in the same log.
+        Without :meth:`fit` (cold start), cells are compared with cells that have similar surroundings in the same log.
 
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame.
@@ -89,13 +91,13 @@ class SelfDiagnosis:
         return self._diagnosed(_recordings(recordings, self.layout))
 
     def state(self) -> tuple[dict[str, Any], Arrays]:
-        """Return everything that was fitted: a JSON-safe dict and arrays by name, as :meth:`from_state` reads them."""
+        """Return the fitted state: a JSON-safe dict and arrays by name, as :meth:`from_state` reads them."""
         fitted, arrays = to_state(Fitted(self.layout, self.false_discovery_rate, self.calibrator_, self.reference_))
         return {"schema": SCHEMA, **fitted}, arrays
 
     @classmethod
     def from_state(cls, about: Mapping[str, Any], arrays: Mapping[str, ArrayLike]) -> SelfDiagnosis:
-        """Rebuild a diagnosis from :meth:`state`; its answers are the same to the last bit.
+        """Rebuild a diagnosis from :meth:`state`; its results are bit-identical.
 
         Raises:
             ValueError: another schema; a field or an array is missing, or of a wrong kind or shape.
@@ -118,7 +120,7 @@ class SelfDiagnosis:
         return diagnoser
 
     def stream(self, needed: NDArray[np.bool_] | None = None) -> StreamState:
-        """Return the state before any frame. Only tiles with a cell that is ``needed`` (bool ``[D]``) are scored."""
+        """Return the state before any frame. Only tiles with a ``needed`` cell (bool ``[D]``; None: all) are scored."""
         reference = self.reference_ or Reference.unknown(self.layout)
         exclusion = self.calibrator_.exclusion if reference.model else Exclusion(_SUSPICIOUS_COLD)
         return StreamState(self.layout, reference, exclusion, needed)
@@ -138,7 +140,7 @@ class SelfDiagnosis:
                 return diagnosis
 
     def steps(self, stream: StreamState, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
-        """Do the same as :meth:`evaluate` in steps of a few milliseconds, for a control loop; return the diagnosis."""
+        """Yield between steps of a few milliseconds of :meth:`evaluate`, for a control loop; return the diagnosis."""
         stream = stream.complete()
         if not stream.received.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
@@ -153,10 +155,10 @@ class SelfDiagnosis:
         yield
         found = self._found(stream, spatial, explained)
         weight = found.weight.copy()
-        weight_if = self._weight_of_groups(found, stream)
-        for group in self._groups(found, stream, weight_if(spatial.initial), explained):
+        weight_of = self._weight_of_groups(found, stream)
+        for group in self._groups(found, stream, weight_of(spatial.initial), explained):
             yield
-            of_group = weight_if(stream.group_excluded(spatial, explained, group))
+            of_group = weight_of(stream.group_excluded(spatial, explained, group))
             weight[group] = np.maximum(weight[group], of_group[group])
         found = replace(found, weight=weight)
         yield
@@ -172,7 +174,7 @@ class SelfDiagnosis:
             layout=self.layout,
             faults=causes,
             probability=probability,
-            tested=(found.alive & stream.touched) | inferred,  # noise alone proves nothing
+            tested=(found.alive & stream.touched) | inferred,  # noise alone is no test
             transport=stream.transport.faults(scale.baseline + scale.near, working, self.layout.rate),
             evidence={
                 "spatial": spatial.evidence + spatial.offset + spatial.gain,
@@ -189,33 +191,36 @@ class SelfDiagnosis:
             stream.extend(frames)
         return self.evaluate(stream, n_recordings=len(log))
 
-    def _diagnosed_cold(self, log: RecordingBlocks, needed: NDArray[np.bool_], rest: NDArray[np.float64]) -> Diagnosis:
+    @staticmethod
+    def _diagnosed_cold(
+        log: RecordingBlocks, needed: NDArray[np.bool_], rest: NDArray[np.float64], layout: SensorLayout
+    ) -> Diagnosis:
         """Diagnose the ``needed`` cells without a reference, but with known baselines ``rest``."""
-        cold = SelfDiagnosis(self.layout)
-        cold.reference_ = Reference.unknown(self.layout, rest)
+        cold = SelfDiagnosis(layout)
+        cold.reference_ = Reference.unknown(layout, rest)
         return cold._diagnosed(log, needed)
 
-    def _found(self, stream: StreamState, spatial: Spatial, wrong: NDArray[np.bool_]) -> CellFindings:
-        """Weigh the evidence, and cut F; cells that are ``wrong`` (bool ``[D]``) have been explained already."""
+    def _found(self, stream: StreamState, spatial: Spatial, explained: NDArray[np.bool_]) -> CellFindings:
+        """Return the findings about each cell; ``explained`` cells (bool ``[D]``) are left out."""
         reference, runs, intermittency = stream.reference, stream.runs, stream.intermittency
-        present, silent = stream.present, stream.silent & ~wrong
+        present, silent = stream.present, stream.silent & ~explained
         temporal, kind = stream.temporal(), kinds(stream)
         known = spatial.scored & ~runs.moved & (reference.dead > 0)
         log_ratio = self.calibrator_.calibrate(spatial.evidence, temporal, kind)
-        still = self.calibrator_.probability(log_ratio, kind, spatial.scored & ~known)
-        still[known] = reference.dead[known]
-        delivers = present & ~wrong & ~silent
+        stuck = self.calibrator_.probability(log_ratio, kind, spatial.scored & ~known)
+        stuck[known] = reference.dead[known]
+        delivers = present & ~explained & ~silent
         intermittent, noisy = intermittency.intermittent & delivers, intermittency.excess & delivers
         drifting = delivers & ~intermittent & ~noisy & spatial.drifting
-        counted_out = silent | intermittent | noisy | drifting
-        probability = np.where(present, np.where(counted_out, _SURE, still), 0.0)
-        faulty = faulty_at(np.where(counted_out, 0.0, probability), self.false_discovery_rate)
-        faulty = (faulty | counted_out) & present & ~wrong
+        certain = silent | intermittent | noisy | drifting
+        probability = np.where(present, np.where(certain, _CERTAIN, stuck), 0.0)
+        faulty = faulty_at(np.where(certain, 0.0, probability), self.false_discovery_rate)
+        faulty = (faulty | certain) & present & ~explained
         value, rests = runs.value, spatial.scored & stream.rests()
         return CellFindings(
             faulty=faulty,
-            # A cell that moved is not dead, unless something speaks against what it does since.
-            alive=present & ~wrong & ~faulty & runs.moved & (probability < _DOUBTED),
+            # A cell that moved is alive, unless it is suspected since.
+            alive=present & ~explained & ~faulty & runs.moved & (probability < _DOUBTED),
             silent=silent,
             rests=rests,
             full=spatial.scored & ~rests & (value >= self.layout.full_scale - 2 * reference.tolerance),
@@ -234,7 +239,7 @@ class SelfDiagnosis:
                 runs.start,
             ),
             probability=probability,
-            # What the line hypothesis asks of a cell at rest is only whether touches speak against it.
+            # A cell at rest supports a broken line by the events alone, without the prior of its value.
             weight=np.where(known, _KNOWN, self.calibrator_.calibrate(spatial.surprisal, temporal, kind)),
             doubt=1 - (1 - reference.inexperience) * np.where(probability > _LIKELY, *_LEADING),
             events=np.where(intermittent, intermittency.blinks, spatial.events),
@@ -251,13 +256,13 @@ class SelfDiagnosis:
         are poor, so the share is smaller.
         """
         temporal, kind = stream.temporal(), kinds(stream)
-        share = _APART * (1 - stream.reference.inexperience)
+        share = _GROUP_SHARE * (1 - stream.reference.inexperience)
 
-        def weight_if(surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
+        def weight_of(surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
             more = self.calibrator_.calibrate(surprisal, temporal, kind) - found.weight
             return found.weight + share * np.maximum(more, 0.0)
 
-        return weight_if
+        return weight_of
 
     def _groups(
         self, found: CellFindings, stream: StreamState, weight: NDArray[np.float64], explained: NDArray[np.bool_]
@@ -265,13 +270,13 @@ class SelfDiagnosis:
         """Return the groups of cells at rest that one broken line would explain."""
         if (stream.reference.inexperience == 1).all():
             return []
-        matching = found.rests & ~found.known & ~explained
+        consistent = found.rests & ~found.known & ~explained
         contradicting = found.alive | ~(found.rests | found.silent) & stream.present
-        return candidate_groups(matching, contradicting, weight, self.layout)
+        return candidate_groups(consistent, contradicting, weight, self.layout)
 
 
 def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> RecordingBlocks:
-    """Return recordings, each ``[T, D]``, T >= 1."""
+    """Return the recordings as blocks, each ``[T, D]`` with T >= 1."""
     given: Any = recordings
     single = isinstance(given, np.ndarray) and (given.shape[1:] == layout.shape or given.ndim <= 2)
     checked = [_checked(r, f"recording {i}", layout) for i, r in enumerate([given] if single else given)]
@@ -282,7 +287,7 @@ def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayou
 
 
 def _checked(recording: ArrayLike, name: str, layout: SensorLayout) -> NDArray[Any]:
-    """Return a recording as ``[T, D]``; numbers stay as they are, and are converted where they are read."""
+    """Return a recording as ``[T, D]``, in its own dtype."""
     given = np.asarray(recording)
     if given.dtype.kind in "fiu" and given.shape[1:] in (layout.shape, (layout.n_cells,)):
         return given.reshape(len(given), layout.n_cells)

@@ -1,4 +1,4 @@
-"""What can be wrong with a tactile array: kinds of fault, one root cause (Fault), and the paper's F (FaultSet)."""
+"""Faults of a tactile array: fault kinds, one root cause (Fault), and the fault set F of the paper (FaultSet)."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from diagnostics.layout import Line, SensorLayout
 
 
 class FaultKind(str, Enum):
-    """How a cell misbehaves. Members are strings (a StrEnum also on Python 3.10)."""
+    """Kind of a fault. Members are strings (a StrEnum also on Python 3.10)."""
 
     OPEN = "open"
     """Reads 0: no current flows (a broken wire)."""
     SHORT = "short"
     """Reads full scale (Section I of the paper: 5 N)."""
     STUCK = "stuck"
-    """Reads one value in between, whatever touches it."""
+    """Reads one constant value in between, whatever touches it."""
     ALIAS = "alias"
     """Reads another cell: a stuck address bit."""
     INTERMITTENT = "intermittent"
-    """Blinks between its value and a rail: a loose crimp."""
+    """Blinks between its load and a rail: a loose contact."""
     NOISY = "noisy"
-    """Reads its value plus excess noise."""
+    """Reads its load plus excess noise."""
     DRIFT = "drift"
-    """Its offset wanders away."""
+    """Its offset or its gain drifts."""
 
     __str__ = str.__str__
 
@@ -40,8 +40,8 @@ class Fault:
     """One root cause: a cell, or every cell behind one broken wire.
 
     Attributes:
-        kind: how the cells misbehave.
-        cells: their indices, ascending and unique.
+        kind: kind of the fault.
+        cells: indices of the faulty cells, ascending and unique.
         line: the wire at fault; None for single cells.
         value: in the layout's unit. OPEN, SHORT, STUCK: what the cells read (None: 0 for OPEN, full scale for SHORT).
             INTERMITTENT: the value they blink to (None: 0). NOISY: standard deviation of the added noise. DRIFT: how
@@ -50,11 +50,11 @@ class Fault:
             row or column read instead, or, where ``cells`` holds the cells of both lines, of the one that ``line``
             touches (a bridge: both read the sum); without a line, the cell read instead.
         onset: first faulty frame; None: from the first frame on.
-        probability: P(this fault is there), 0..1; None: known, not inferred.
-        reason: one plain sentence.
-        evidence: how many independent observations speak for it (touches that tested its cells, blinks, agreements of
-            two lines); None: known, not inferred.
-        alternatives: what else the data allow, one plain sentence each.
+        probability: P(the fault exists), 0..1; None: known, not inferred.
+        reason: one sentence: what was observed, and what to check.
+        evidence: number of independent observations of it (events that tested its cells, blinks, coincidences of two
+            lines); None: known, not inferred.
+        alternatives: other causes that the data permit, one sentence each.
     """
 
     kind: FaultKind
@@ -75,7 +75,7 @@ class Fault:
         object.__setattr__(self, "cells", tuple(cells.tolist()))
 
     def describe(self, layout: SensorLayout) -> str:
-        """Return kind and place in a few words: "pad 0, row 4, column 5: stuck at 2.5 N"."""
+        """Return place and kind in a few words: "pad 0, row 4, column 5: stuck at 2.5 N"."""
         if self.line is not None:
             where = str(self.line)
         else:

@@ -49,11 +49,11 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class SensorLayout:
-    """A tactile skin: ``pads`` arrays of ``rows`` x ``cols`` cells behind row and column multiplexers.
+    """A tactile array: ``pads`` arrays of ``rows`` x ``cols`` cells behind row and column multiplexers.
 
     A cell's index runs pad, then row, then column (C order of ``[pads, rows, cols]``). Positions where ``present``
     is False hold no sensing element (a masked corner); they keep their index, so that D is always
-    ``pads * rows * cols``, but nothing is ever said or learned about them.
+    ``pads * rows * cols``, and take no part in fitting or diagnosis.
 
     Args:
         pads, rows, cols: size, each at least 1. The paper's 11 x 10 pad has 11 rows here (Section III-A, H = 11).
@@ -149,7 +149,7 @@ class SensorLayout:
         """Return the present cells that ``line`` serves, ascending.
 
         An address bit and a converter channel serve their whole pad: every cell is selected and read through them.
-        Which cells a *stuck* bit misreads is told by :meth:`misaddressed`.
+        The cells that a *stuck* bit misreads are those of :meth:`misaddressed`.
 
         Raises:
             IndexError: the layout has no such line.
@@ -161,7 +161,7 @@ class SensorLayout:
 
     @cached_property
     def beside(self) -> NDArray[np.intp]:
-        """The eight cells around each on its pad, row by row, int ``[D, 8]``; -1: there is none."""
+        """The eight neighbours of each cell on its pad, row by row, int ``[D, 8]``; -1: none."""
         index = np.full((self.pads, self.rows + 2, self.cols + 2), -1, dtype=np.intp)
         index[:, 1:-1, 1:-1] = np.where(self.present, self._grid, -1)
         steps = [(down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1)]
@@ -244,7 +244,7 @@ class SensorLayout:
             raise ValueError(f"expected schema {SCHEMA!r}, got {d['schema']!r}")
         known = ("pads", "rows", "cols", "full_scale", "unit", "rate", "present")
         if unknown := set(d) - set(known) - {"schema"}:
-            raise ValueError(f"a layout has no field {sorted(unknown, key=str)[0]!r}: it knows {', '.join(known)}")
+            raise ValueError(f"a layout has no field {sorted(unknown, key=str)[0]!r}: use {', '.join(known)}")
         if missing := [name for name in known[:3] if name not in d]:
             raise ValueError(f"a layout needs the field {missing[0]!r}")
         try:
@@ -263,12 +263,12 @@ class SensorLayout:
     def __str__(self) -> str:
         masked = self.n_cells - int(self.present.sum())
         text = f"{self.pads} x {self.rows} x {self.cols} cells, 0..{self.full_scale:g} {self.unit}, {self.rate:g} Hz"
-        return f"{text}, {masked} positions masked" if masked else text
+        return f"{text}, {masked} position{'s' if masked > 1 else ''} masked" if masked else text
 
     def _key(self) -> tuple[Any, ...]:
         return (*self.shape, self.full_scale, self.unit, self.rate, self.present.tobytes())
 
 
 def address_bits(wires: int) -> int:
-    """Return how many bits select one of ``wires``: 4 for the paper's 11 rows and 10 columns (Section II)."""
+    """Return the number of address bits for ``wires`` lines: 4 for the paper's 11 rows and 10 columns (Section II)."""
     return (wires - 1).bit_length()

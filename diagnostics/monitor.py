@@ -1,4 +1,4 @@
-"""Diagnosis frame by frame, in a control loop: constant memory, no long pauses, and the same answers as in one go."""
+"""Monitor: diagnosis frame by frame in a control loop, with constant memory and the results of the batch diagnosis."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ Key = tuple[Line | None, int]
 
 
 class Monitor:
-    """Watches a running sensor and reports faults that are new, have changed, or are gone.
+    """Monitors a running sensor and reports faults that are new, have changed, or are gone.
 
-    Whenever a segment of 32 frames is complete, all is judged anew, a little of the work with each frame that follows:
-    a fault is reported some 50 frames after it shows, at the latest. :meth:`diagnosis` judges at once.
+    After each segment of 32 frames the diagnosis is updated, in small steps over the frames that follow: a fault is
+    reported at most about 50 frames after it becomes detectable. :meth:`diagnosis` evaluates at once.
 
     Args:
-        fitted: a fitted :class:`SelfDiagnosis`; one that is not fitted judges each cell by those around it.
+        fitted: a fitted :class:`SelfDiagnosis`; an unfitted one is a cold start.
     """
 
     def __init__(self, fitted: SelfDiagnosis) -> None:
-        import scipy.ndimage  # now, not in the loop
+        import scipy.ndimage  # imported here, not in the control loop
         import scipy.optimize  # noqa: F401
         from threadpoolctl import ThreadpoolController
 
-        # Threads that wait for each other on a busy robot cost far more than they save on such small matrices.
+        # On small matrices the synchronisation of threads costs more than it saves.
         self._threads = ThreadpoolController()
         self._diagnoser = fitted
         self._stream = fitted.stream()
@@ -45,14 +45,14 @@ class Monitor:
         self._time: float | None = None
 
     def update(self, frame: ArrayLike, time: float | None = None) -> tuple[Fault, ...]:
-        """Take in one frame; return the faults that are newly found, changed, or gone.
+        """Process one frame; return the faults that are new, changed, or gone.
 
         Args:
             frame: ``[D]`` or ``[pads, rows, cols]``, in the layout's unit; NaN = missing.
-            time: when it was taken, in seconds; frames that the clock says are missing are counted as lost.
+            time: time of the frame in seconds; frames missing from the sequence of times are counted as lost.
 
         Returns:
-            A fault that is gone has probability 0, and its reason says so.
+            The faults; one that is gone has probability 0.
 
         Raises:
             ValueError: a frame of another shape.
@@ -76,28 +76,28 @@ class Monitor:
                     next(self._work)
             except StopIteration as end:
                 self._work = None
-                return self._news(end.value)
+                return self._changes(end.value)
         return ()
 
     def diagnosis(self) -> Diagnosis:
-        """Judge all frames so far, as :meth:`SelfDiagnosis.diagnose` does.
+        """Return the diagnosis of all frames so far, as :meth:`SelfDiagnosis.diagnose` does.
 
         Raises:
-            ValueError: no frame with a reading has come yet.
+            ValueError: no frame with a reading was received yet.
         """
         return self._diagnoser.evaluate(self._stream)
 
-    def _news(self, diagnosis: Diagnosis) -> tuple[Fault, ...]:
+    def _changes(self, diagnosis: Diagnosis) -> tuple[Fault, ...]:
         now = {(fault.line, fault.cells[0] if fault.line is None else -1): fault for fault in diagnosis.faults}
-        news = [fault for key, fault in now.items() if self._differs(self._known.get(key), fault)]
+        changes = [fault for key, fault in now.items() if self._differs(self._known.get(key), fault)]
         faulty = diagnosis.fault_set
         for key, fault in self._known.items():
-            # A cell whose wire was found to be the cause has not recovered.
+            # A cell that is now part of the fault of a wire has not recovered.
             if key not in now and not set(fault.cells) & faulty:
                 text = f"gone since about frame {diagnosis.n_frames}: {fault.reason}"
-                news.append(replace(fault, probability=0.0, reason=text))
+                changes.append(replace(fault, probability=0.0, reason=text))
         self._known = now
-        return tuple(news)
+        return tuple(changes)
 
     @staticmethod
     def _differs(before: Fault | None, now: Fault) -> bool:

@@ -1,6 +1,6 @@
-"""Checks the links between the pages of a built site, places within pages too: python docs/check_links.py build/site
+"""Checks the links between the pages of a built site, anchors included: python docs/check_links.py build/site
 
-Sphinx sees only the links that it makes itself. Links to other sites are not followed.
+Sphinx checks only the links that it makes itself. Links to other sites are not followed.
 """
 
 import sys
@@ -10,34 +10,34 @@ from urllib.parse import unquote, urlsplit
 
 
 class Page(HTMLParser):
-    """The places of a page that can be linked to, and the links on it."""
+    """The anchors of a page and the links on it."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        self.places: set[str] = set()
+        self.anchors: set[str] = set()
         self.links: set[str] = set()
         self.feed(path.read_text())
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Keep what matters of a tag."""
+        """Keep anchors and links of a tag."""
         for name, value in attrs:
             if value and name == "id":
-                self.places.add(value)
+                self.anchors.add(value)
             elif value and name in ("href", "src"):
                 self.links.add(value)
 
 
 def broken(site: Path) -> list[str]:
-    """Return each link that leads nowhere, with its page."""
+    """Return each broken link with its page."""
     pages = {path.resolve(): Page(path) for path in site.rglob("*.html")}
     found = []
     for path, page in pages.items():
         for link in page.links:
             parts = urlsplit(link)
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
-            lost = parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].places
-            if not parts.scheme and (lost or not target.exists()):
-                found.append(f"{path.relative_to(site.resolve())}: {link} leads nowhere")
+            missing = parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].anchors
+            if not parts.scheme and (missing or not target.exists()):
+                found.append(f"{path.relative_to(site.resolve())}: broken link {link}")
     return sorted(found)
 
 

@@ -30,7 +30,7 @@ extensions = [
 ]
 templates_path = ["templates"]
 highlight_language = "text"  # of blocks that do not say
-exclude_patterns = ["templates"]
+exclude_patterns = ["templates", "figures"]
 html_theme = "furo"
 html_title = f"adaptfault {version}"
 html_show_sourcelink = False
@@ -39,7 +39,7 @@ html_show_copyright = False
 myst_heading_anchors = 3
 
 autodoc_default_options = {"members": True, "member-order": "bysource"}
-# Not what these stand for, which fills half a page; functions with NDArray[...] then show what their source says.
+# Show the names of these aliases, not the types behind them, which fill half a page.
 autodoc_type_aliases = {"NDArray": "NDArray", "ArrayLike": "ArrayLike", "StateArrays": "StateArrays"}
 autodoc_preserve_defaults = True
 python_use_unqualified_type_names = True
@@ -49,12 +49,12 @@ napoleon_use_rtype = False
 napoleon_use_ivar = True
 napoleon_attr_annotations = False  # the signature above has the types
 
-# A name of these packages that leads nowhere is an error; other projects' pages are not at hand when the site is built.
+# An unknown name of these packages is an error; other projects' pages are not available when the site is built.
 nitpicky = True
 nitpick_ignore_regex = [
     (r"py:.*", r"(?!adaptfault\.|diagnostics\.).*"),
     (r"py:.*", r".*\._\w+"),
-    (r"py:.*", r".*\.Result"),  # a type variable
+    (r"py:.*", r".*\.(Result|T)"),  # type variables
 ]
 suppress_warnings = ["ref.python"]  # two modules may have a class of one name
 
@@ -79,7 +79,7 @@ def missing_names(app: Sphinx, env: BuildEnvironment) -> None:
 
 
 def public_name(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: TextElement) -> Element | None:
-    """Lead a name of a module, ``FaultSet`` or ``adaptfault.models.store.save_model``, to the public one."""
+    """Resolve a name of a module, ``FaultSet`` or ``adaptfault.models.store.save_model``, to the public one."""
     domain, parts = env.get_domain("py"), node.get("reftarget", "").split(".")
     for package in PUBLIC if node.get("refdomain") == "py" else ():
         for full in (f"{package}.{parts[-1]}", ".".join([package, *parts[-2:]])):
@@ -89,7 +89,7 @@ def public_name(app: Sphinx, env: BuildEnvironment, node: pending_xref, content:
 
 
 def described_elsewhere(app: Sphinx, what: str, name: str, thing: Any, skip: bool, options: Any) -> bool | None:
-    """Leave public names out of the pages of modules: they have pages of their own."""
+    """Skip public names on the pages of modules: they have pages of their own."""
     if what == "module" and any(thing is public for public in public_things()):
         return True
     return None
@@ -97,13 +97,13 @@ def described_elsewhere(app: Sphinx, what: str, name: str, thing: Any, skip: boo
 
 @cache
 def public_things() -> tuple[Any, ...]:
-    """Return what the public names stand for."""
+    """Return the objects behind the public names."""
     packages = [importlib.import_module(name) for name in PUBLIC]
     return tuple(getattr(package, name) for package in packages for name in package.__all__)
 
 
 def public_names(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Lead from a module's page to its public names, which are described elsewhere."""
+    """Link a module's page to its public names, which are described elsewhere."""
     for package in PUBLIC if what == "module" and name not in PUBLIC else ():
         there = importlib.import_module(package)
         names = [n for n in there.__all__ if getattr(getattr(there, n), "__module__", None) == name]
@@ -112,7 +112,7 @@ def public_names(app: Sphinx, what: str, name: str, thing: Any, options: Any, li
 
 
 def plain_words(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Keep from being read as markup what is none: bars, and what stands before a colon in a property."""
+    """Escape text that reStructuredText would read as markup: bars, and text before a colon in a property."""
     for i, line in enumerate(lines):
         parts = re.split(r"(``.*?``)", line)  # every other one is a literal
         parts[::2] = [part.replace("|", "\\|") for part in parts[::2]]
@@ -122,7 +122,7 @@ def plain_words(app: Sphinx, what: str, name: str, thing: Any, options: Any, lin
 
 
 def several_names(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Keep attributes that are described together, "low, high", from being read as a type and a name."""
+    """Join attributes that are described together, "low, high", which are else read as a type and a name."""
     for i, line in enumerate(lines):
         if names := re.match(r":ivar (\w+(?:, \w+)+):", line):
             lines[i] = f":ivar {names[1].replace(', ', ',')}:{line[names.end() :]}"

@@ -1,4 +1,4 @@
-"""Recordings that several test modules use: simulated grasps, and real ones where they are at hand."""
+"""What several test modules use: simulated grasps, what is trained or fitted once, a clock."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
 
 from adaptfault.cli import main
-from adaptfault.data.recordings import Recordings, load, save_npz
+from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.data.simulated_grasps import simulate
 from adaptfault.robot.bundle import Bundle
 from diagnostics import Fault, FaultSet, Line, SelfDiagnosis, SensorLayout, line_fault
@@ -49,7 +50,24 @@ if importlib.util.find_spec("torch") is None:  # what does without it is tested 
             raise
 
 
-REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "sdh2x13x6_grasps36.npz"
+# The same few examples on every machine.
+hypothesis.settings.register_profile(
+    "few", derandomize=True, database=None, deadline=None, max_examples=30, print_blob=False
+)
+hypothesis.settings.load_profile("few")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put what needs a costly fixture together, so that the processes of ``pytest -n 2`` do not wait for each other.
+
+    The first process begins with the fitted diagnosis; the bundle comes last, and is made while the other one is busy.
+    """
+
+    def costly(item: pytest.Item) -> int:
+        names = getattr(item, "fixturenames", ())
+        return 0 if "fitted" in names else 3 if "made_bundle" in names else 2 if "versions" in names else 1
+
+    items.sort(key=costly)
 
 
 @pytest.fixture(scope="session")
@@ -96,14 +114,6 @@ def fitted(grasps: Recordings, made_once) -> SelfDiagnosis:
         return SelfDiagnosis.from_state(json.loads((folder / "about.json").read_text()), dict(arrays))
 
 
-@pytest.fixture(scope="session")
-def real_grasps() -> Recordings:
-    """856 grasps of a real hand; a test that needs them is skipped where they are absent."""
-    if not REAL.exists():
-        pytest.skip("the real recordings are not here")
-    return load(REAL).recordings
-
-
 @pytest.fixture
 def one_thread() -> Iterator[None]:
     """Threads cost more than they bring on small models."""
@@ -141,7 +151,7 @@ def export_versions(home: Path) -> None:
     from adaptfault.adaptation.reduced_model import ReducedModel, phi
     from adaptfault.adaptation.result import Adaptation, Stage
     from adaptfault.data.windows import Windows
-    from adaptfault.imputation.linear import CellStatistics
+    from adaptfault.imputation.statistics import CellStatistics
     from adaptfault.models.export import add_onnx
     from adaptfault.models.network import TactileTransformer
 

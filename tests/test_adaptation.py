@@ -6,7 +6,7 @@ import pytest
 import torch
 from conftest import Clock
 
-from adaptfault.adaptation import forest, stages
+from adaptfault.adaptation import stages
 from adaptfault.adaptation.adapter import Adapter
 from adaptfault.adaptation.forecast import Forecast
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
@@ -14,7 +14,7 @@ from adaptfault.adaptation.result import Adaptation
 from adaptfault.data.windows import Windows
 from adaptfault.evaluation.scores import evaluate
 from adaptfault.imputation.linear import AffineFill
-from adaptfault.models import compact
+from adaptfault.models.compact import CompactNetwork
 from adaptfault.models.network import TactileTransformer
 from diagnostics import FaultSet, SensorLayout
 
@@ -122,16 +122,17 @@ def test_each_stage_repairs_and_none_is_worse_than_the_one_before(adapter):
     assert reached == sorted(reached)
 
 
-def test_the_network_on_fewer_numbers_gives_the_same_head_and_forecast(adapter, monkeypatch):
-    assert adapter.compact is None
-    monkeypatch.setattr(compact, "_WORTH", 1)
-    quick = Adapter(adapter.model, adapter.train, adapter.validation)
-    assert quick.compact is not None
-    usual, same = (a.adapt(F, method="head").predict_proba(adapter.validation.x) for a in (adapter, quick))
-    np.testing.assert_allclose(same, usual, atol=1e-4)
-    assert {n: s.accuracy for n, s in quick.forecast(F).stages.items()} == pytest.approx(
-        {n: s.accuracy for n, s in adapter.forecast(F).stages.items()}, abs=1 / 120
-    )
+def test_on_fewer_numbers_the_network_gives_the_same_features_and_as_good_a_head(adapter):
+    assert adapter.compact is None  # so few windows are not worth it
+    folded = Adapter(adapter.model, adapter.train, adapter.validation)
+    folded.compact = CompactNetwork(adapter.model)
+    one_window = 1.5 / len(adapter.validation)
+    assert folded.fault_free_accuracy == pytest.approx(adapter.fault_free_accuracy, abs=one_window)
+    usual, other = (a.adapt(F, method="head").predict(adapter.validation.x) for a in (adapter, folded))
+    # A forest grown on features that differ in their last bits may split some windows otherwise.
+    assert (usual == other).mean() > 0.95
+    fill = (a.forecast(F).stages["fill"].accuracy for a in (adapter, folded))
+    assert next(fill) == pytest.approx(next(fill), abs=one_window)
 
 
 def test_auto_stops_at_the_first_stage_that_is_enough(adapter, working_clock):
@@ -145,7 +146,7 @@ def test_auto_stops_at_the_first_stage_that_is_enough(adapter, working_clock):
 
 def test_a_larger_budget_never_ends_worse_and_none_is_overdrawn(adapter, working_clock):
     hard, reached = FaultSet(range(30), D), []
-    for budget in (0.0, 2.0, 4.0, 8.0):
+    for budget in (0.0, 2.0, 8.0):
         began = working_clock.now
         adapted = adapter.adapt(hard, method="finetune", budget=budget, progress=False)
         assert working_clock.now - began <= max(budget, 1.6)  # that goes for seeing what a head would take
@@ -162,11 +163,13 @@ def test_scratch_learns_a_new_network_on_the_healthy_cells(adapter, working_cloc
     assert not torch.equal(scratch.model.network.head.weight, adapter.model.head.weight)
 
 
-def test_adapting_never_changes_the_fault_free_model_so_order_does_not_matter(quick):
+def test_adapting_never_changes_the_fault_free_model_so_order_does_not_matter(quick, working_clock):
     before = {name: tensor.clone() for name, tensor in quick.model.state_dict().items()}
-    first = quick.adapt(F, method="finetune", progress=False)
-    quick.adapt(FaultSet(range(10), D), method="finetune", progress=False)
-    again = quick.adapt(F, method="finetune", progress=False)
+    options = {"method": "finetune", "budget": 3.0, "progress": False}
+    first = quick.adapt(F, **options)
+    assert first.stages[-1].name == "finetune"
+    quick.adapt(FaultSet(range(10), D), **options)
+    again = quick.adapt(F, **options)
     assert all(torch.equal(tensor, before[name]) for name, tensor in quick.model.state_dict().items())
     np.testing.assert_array_equal(first.predict_proba(quick.validation.x), again.predict_proba(quick.validation.x))
 
@@ -202,7 +205,7 @@ def test_without_labels_the_fault_free_model_teaches_the_head(adapter):
     lost = FaultSet(range(30), D)
     taught = Adapter(adapter.model, unlabelled, adapter.validation)
     assert taught.adapt(lost, method="head").scores.accuracy > adapter.adapt(lost, method="fill").scores.accuracy
-    np.testing.assert_allclose(taught.targets, adapter.model.predict_proba(adapter.train.x))
+    np.testing.assert_allclose(taught.targets, adapter.model.predict_proba(adapter.train.x), atol=1e-5)
 
 
 # Forecast
@@ -221,8 +224,8 @@ def test_the_forecast_is_what_the_stages_then_reach(adapter):
     assert "without 5 cells, from 120 recordings" in str(forecast)
 
 
-def test_the_interval_covers_new_recordings(adapter, quick, monkeypatch):
-    monkeypatch.setattr(forest, "_TREES", 20)  # quicker grown; the interval is of whatever head there is
+@pytest.mark.slow
+def test_the_interval_covers_new_recordings(adapter, quick):
     covered, rng = 0, np.random.default_rng(0)
     for i in range(20):
         one = Adapter(adapter.model, quick.train, blobs(60, 100 + i))
@@ -296,5 +299,5 @@ def test_what_cannot_be_adapted_is_said(adapter):
         adapter.adapt(F, method="magic")
     with pytest.raises(ValueError, match="one set is empty"):
         Adapter(adapter.model, adapter.train.select([]), adapter.validation)
-    with pytest.raises(TypeError, match="repairs a TactileTransformer, got Flatten"):
-        Adapter(torch.nn.Flatten(), adapter.train, adapter.validation)
+    with pytest.raises(TypeError, match=r"repairs a torch\.nn\.Module, got dict"):
+        Adapter({}, adapter.train, adapter.validation)

@@ -36,7 +36,7 @@ def test_advice_names_each_region_of_untested_cells_the_largest_first():
     )
 
 
-def test_masked_positions_count_nowhere():
+def test_positions_without_a_cell_do_not_count():
     present = np.ones((2, 4, 5), bool)
     present[0] = False
     layout = SensorLayout(2, 4, 5, present=present)

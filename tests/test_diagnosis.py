@@ -43,10 +43,11 @@ def gappy(log: Sequence[np.ndarray], share: float) -> list[np.ndarray]:
     return [np.where(rng.random(r.shape) < share, np.nan, r) for r in log]
 
 
-def loaded(log: Sequence[np.ndarray]) -> np.ndarray:
-    """The 40 cells that carry the most load, 20 of each pad."""
-    most = np.mean([np.minimum(r.max(axis=0), 1) for r in log], axis=0).reshape(2, 110)
-    return np.sort(np.argsort(-most, axis=1, kind="stable")[:, :20] + [[0], [110]], axis=1).ravel()
+def loaded(log: Sequence[np.ndarray], layout: SensorLayout = LAYOUT, n: int = 20) -> np.ndarray:
+    """The ``n`` cells of each pad that carry the most load."""
+    most = np.mean([np.minimum(r.max(axis=0), 1) for r in log], axis=0).reshape(layout.pads, -1)
+    order = np.argsort(-most, axis=1, kind="stable")[:, :n]
+    return np.sort(order + most.shape[1] * np.arange(layout.pads)[:, None], axis=1).ravel()
 
 
 def touched(log: Sequence[np.ndarray]) -> np.ndarray:
@@ -105,7 +106,7 @@ def test_a_static_hold_is_no_fault(fitted, log):
         assert not diagnoser.diagnose([hold, *log, hold]).faults
 
 
-def test_cells_that_nothing_touched_are_untested_neither_faulty_nor_alive(fitted):
+def test_cells_without_any_contact_are_untested_neither_faulty_nor_alive(fitted):
     diagnosis = fitted.diagnose(np.zeros((300, 220)))
     assert (diagnosis.verdicts == Verdict.UNTESTED).all()
     assert diagnosis.coverage.test_coverage == 0
@@ -201,7 +202,7 @@ def test_a_cell_whose_offset_drifts_away_is_found(fitted, log):
 
 
 @pytest.mark.parametrize("onset", [None, 2000])
-def test_a_cell_that_has_lost_most_of_its_gain_is_found_and_says_so(fitted, grasps: Recordings, onset):
+def test_a_cell_that_has_lost_most_of_its_gain_is_found_with_that_reason(fitted, grasps: Recordings, onset):
     log = [grasps.frames[i] for i in range(1, 140, 3)]
     assert not fitted.diagnose(log).faults
     frames = np.concatenate(log)
@@ -278,7 +279,7 @@ def test_a_cell_that_delivers_nothing_is_open(fitted, log):
 
 
 @pytest.mark.parametrize("values", [(0.4, 4.1), (1.2, 2.9), (3.3, 4.6)])
-def test_the_value_a_cell_is_stuck_at_never_changes_what_is_said_of_the_others(fitted, log, values):
+def test_the_value_of_a_stuck_cell_never_changes_the_verdict_on_the_others(fitted, log, values):
     cells = loaded(log)[[2, 9]].tolist()
     dead = [Fault("open", (int(loaded(log)[15]),)), Fault("short", (int(loaded(log)[-5]),))]
     others = ~np.isin(np.arange(220), cells)
@@ -291,7 +292,7 @@ def test_the_value_a_cell_is_stuck_at_never_changes_what_is_said_of_the_others(f
     np.testing.assert_array_equal(*said)
 
 
-def test_an_untouched_cell_on_a_wire_proven_open_is_inferred_faulty_and_its_fault_says_so(fitted, log):
+def test_an_unloaded_cell_on_a_wire_proven_open_is_inferred_faulty_and_named_as_such(fitted, log):
     column = Line(0, "column", 6)
     cells = LAYOUT.cells_on(column)
     untouched = cells[np.max([r[:, cells].max(axis=0) for r in log], axis=0) == 0]
@@ -302,20 +303,29 @@ def test_an_untouched_cell_on_a_wire_proven_open_is_inferred_faulty_and_its_faul
     assert "not tested, are inferred from the wire" in fault.reason
 
 
-@pytest.mark.parametrize("share", [0.4, 0.8, 1.0])
-def test_many_dead_cells_do_not_crash_it_and_hardly_mislead_it(fitted, log, share: float):
+def open_and_short(cells: np.ndarray, rng: np.random.Generator) -> dict[int, Fault]:
+    return {c: Fault(k, (c,)) for c, k in zip(cells.tolist(), rng.choice(["open", "short"], len(cells)), strict=True)}
+
+
+@pytest.mark.parametrize("share", [0.4, 0.8])
+def test_many_dead_cells_are_found_with_hardly_a_false_one(fitted, log, share: float):
     rng = np.random.default_rng(1)
-    cells = rng.choice(220, round(share * 220), replace=False)
-    faults = [Fault(k, (int(c),)) for c, k in zip(cells, rng.choice(["open", "short"], len(cells)), strict=True)]
-    diagnosis = fitted.diagnose(broken(log, faults))
-    found = diagnosis.fault_set
-    if share == 1.0:  # where nothing moves no touch ends, and one is not enough to be sure
-        found = set(np.flatnonzero(diagnosis.probability > 0.95).tolist())
-    assert len(found & set(cells.tolist())) > 0.4 * share * 220
-    assert len(found - set(cells.tolist())) <= 0.04 * max(1, len(found))
+    faults = open_and_short(rng.choice(220, round(share * 220), replace=False), rng)
+    found = fitted.diagnose(broken(log, list(faults.values()))).fault_set
+    assert len(found & faults.keys()) > 0.7 * len(faults)
+    assert len(found - faults.keys()) <= 2
 
 
-def test_a_cell_beside_dead_ones_is_not_dragged_along(fitted, log):
+def test_where_every_cell_is_dead_none_is_alive_shorts_are_found_and_no_kind_is_wrong(fitted, log):
+    faults = open_and_short(np.arange(220), np.random.default_rng(1))
+    diagnosis = fitted.diagnose(broken(log, list(faults.values())))
+    assert (diagnosis.verdicts != Verdict.ALIVE).all()
+    shorts = {cell for cell, fault in faults.items() if fault.kind is FaultKind.SHORT}
+    assert len(diagnosis.fault_set & shorts) > 0.9 * len(shorts)
+    assert all(faults[cell].kind is fault.kind for fault in diagnosis.faults for cell in fault.cells)
+
+
+def test_a_healthy_cell_beside_dead_ones_is_not_reported(fitted, log):
     cells = loaded(log)
     dead = cells[::3].tolist()
     found = fitted.diagnose(broken(log, [Fault("short", (c,)) for c in dead])).fault_set
@@ -332,16 +342,18 @@ def test_without_a_reference_shorts_and_opens_in_the_contact_are_still_found(log
     assert len(SelfDiagnosis(LAYOUT).diagnose(log).faults) == 0
 
 
-def test_a_reference_that_touched_nothing_or_one_corner_only_is_no_evidence_of_faults(log):
-    for reference in ([np.zeros((50, 220))] * 3, [np.where(np.arange(220) < 6, r, 0.0) for r in log]):
-        fitted = SelfDiagnosis(LAYOUT).fit(reference)
+def test_a_reference_with_contact_nowhere_or_in_one_corner_only_is_no_evidence_of_faults(small_grasps: Recordings):
+    layout, log = small_grasps.layout, small_grasps.frames[31::6]
+    n = layout.n_cells
+    for reference in ([np.zeros((50, n))] * 3, [np.where(np.arange(n) < 6, r, 0.0) for r in log]):
+        fitted = SelfDiagnosis(layout).fit(reference)
         assert fitted.diagnose(reference).fault_set == set()
-        diagnosis = fitted.diagnose(log)
-        assert len(diagnosis.fault_set) <= 0.05 * 220
+        diagnosis = fitted.diagnose(small_grasps.frames[30::3])
+        assert len(diagnosis.fault_set) <= 0.05 * n
         assert np.isfinite(diagnosis.probability).all()
 
 
-def test_masked_positions_are_never_judged():
+def test_positions_without_a_cell_have_no_verdict():
     present = np.ones((2, 6, 5), bool)
     present[:, 0] = False
     layout = SensorLayout(2, 6, 5, present=present)
@@ -387,11 +399,14 @@ def test_readings_that_are_missing_here_and_there_are_no_fault(fitted, log, cold
     assert not (COLD if cold else fitted).diagnose(gappy(log, share)).faults
 
 
-def test_what_is_missing_from_the_reference_teaches_no_rest(grasps, log):
-    fit_stacking = SelfDiagnosis(LAYOUT).fit(gappy(grasps.frames[::4], 0.4))
-    cells = loaded(log)[::8].tolist()
+def test_faults_are_found_with_a_reference_that_misses_many_readings(small_grasps: Recordings):
+    layout, log = small_grasps.layout, small_grasps.frames[31::3]
+    fitted = SelfDiagnosis(layout).fit(gappy(small_grasps.frames[::7], 0.4))
+    cells = loaded(log, layout, 8)[::3].tolist()
     faults = [Fault("short" if i % 2 else "open", (cell,)) for i, cell in enumerate(cells)]
-    assert fit_stacking.diagnose(broken(log, faults)).fault_set == set(cells)
+    found = fitted.diagnose([inject(r, faults, layout, seed=i) for i, r in enumerate(log)]).fault_set
+    assert set(cells) <= set(found)
+    assert len(found) <= len(cells) + 1
 
 
 def test_a_cell_that_falls_silent_under_load_is_open_from_then_on(fitted, log):
@@ -479,40 +494,16 @@ def test_a_log_that_cannot_be_diagnosed_is_refused_in_one_line(recordings, messa
     assert "\n" not in str(error.value)
 
 
-def test_recordings_without_a_reading_teach_nothing(log):
-    lost = np.full((5, 220), np.nan)
+def test_recordings_without_a_reading_do_not_change_the_fit(small_grasps: Recordings):
+    diagnoser = SelfDiagnosis(small_grasps.layout)
+    lost = np.full((5, small_grasps.layout.n_cells), np.nan)
     with pytest.raises(ValueError, match="no frame with a reading: nothing to learn"):
-        SelfDiagnosis(LAYOUT).fit([lost])
-    few = [r[::4] for r in log]
-    ours, theirs = (SelfDiagnosis(LAYOUT).fit(reference).state()[1] for reference in ([lost, *few], few))
+        diagnoser.fit([lost])
+    few = small_grasps.frames[30:36]
+    ours, theirs = (SelfDiagnosis(small_grasps.layout).fit(reference).state()[1] for reference in ([lost, *few], few))
     assert all(np.array_equal(ours[name], theirs[name], equal_nan=True) for name in theirs)
 
 
 def test_importing_diagnostics_loads_neither_torch_nor_adaptfault():
     code = "import sys, diagnostics; sys.exit(any(m in sys.modules for m in ('torch', 'adaptfault', 'sklearn')))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-# Real grasps
-
-
-def test_on_real_grasps_dead_cells_are_found_and_healthy_logs_are_clean(real_grasps: Recordings):
-    layout, rng = real_grasps.layout, np.random.default_rng(0)
-    order = rng.permutation(len(real_grasps))
-    fitted = SelfDiagnosis(layout).fit([real_grasps.frames[i] for i in order[:200]])
-    found = false = testable = hit = alarms = 0
-    for _ in range(5):
-        log = [real_grasps.frames[i] for i in rng.choice(order[428:], 6, replace=False)]
-        alarms += len(fitted.diagnose(log).fault_set)
-        cells = rng.choice(np.flatnonzero(layout.present), 22, replace=False)
-        values = rng.choice([0, layout.full_scale, rng.uniform(0.1, 0.9) * layout.full_scale], 22)
-        faults = [Fault("stuck", (int(c),), value=float(v)) for c, v in zip(cells, values, strict=True)]
-        fault_set = fitted.diagnose([inject(r, faults, layout) for r in log]).fault_set
-        hidden = np.concatenate(log)[:, cells]
-        can = set(cells[(np.abs(hidden - values) > 0.05 * layout.full_scale).sum(axis=0) >= 10].tolist())
-        found += len(fault_set & set(cells.tolist()))
-        false += len(fault_set - set(cells.tolist()))
-        testable, hit = testable + len(can), hit + len(fault_set & can)
-    assert alarms <= 1
-    assert found / (found + false) >= 0.97
-    assert hit / testable >= 0.85

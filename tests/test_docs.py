@@ -1,8 +1,11 @@
-"""What the README and the pages of docs/ show is run: blocks of Python, and commands."""
+"""Blocks of Python and commands in the README and on the pages of docs/ run, and what the pages name exists."""
 
+import os
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -19,10 +22,12 @@ from adaptfault.robot.bundle import Bundle
 from diagnostics import FaultSet, inject
 
 HOME = Path(__file__).parents[1]
-PAGES = [HOME / "README.md", *sorted((HOME / "docs").glob("*.md"))]
+GUIDES = [HOME / "README.md", *sorted((HOME / "docs").glob("*.md")), *sorted((HOME / "docs" / "methods").glob("*.md"))]
+PAGES = [*GUIDES, *sorted((HOME / "examples" / "compare").glob("*.md"))]
 WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text()]
 NOT_RUN = {"reproduce": "test_paper.py runs it, small"}
-SLOW = {"": ("README.md", "maintenance.md"), "python": ("robot-software.md",)}  # make examples alone runs these
+# make test-all runs these, by the language of their blocks.
+SLOW = {"": ("README.md", "maintenance.md"), "python": ("robot-software.md",)}
 QUICK = {
     "train": ["--epochs", "1"],
     "demo": ["--epochs", "1"],
@@ -109,13 +114,76 @@ def test_options_that_the_pages_name_exist(capsys):
                     assert option in options, f"{page.name}: {code}: no option {option}"
 
 
-def test_examples_and_targets_that_the_pages_name_exist():
+def test_scripts_and_targets_that_the_pages_name_exist():
     makefile = (HOME / "Makefile").read_text()
     for page in [*PAGES, HOME / "CONTRIBUTING.md"]:
         text = page.read_text()
-        for path, rest in re.findall(r"(examples/\w+\.py)([^`\n]*)", text):
+        for path, rest in re.findall(r"((?:examples|benchmarks|docs)/\w+\.py)([^`\n]*)", text):
             source = (HOME / path).read_text()
             for option in re.findall(r"--[a-z-]+", rest):
                 assert f'"{option}"' in source, f"{page.name}: {path} has no option {option}"
         for target in re.findall(r"`make ([a-z-]+)`|^make ([a-z-]+)", text, re.MULTILINE):
             assert f"\n{''.join(target)}:" in makefile, f"{page.name}: make {''.join(target)}"
+
+
+def test_benchmark_rows_and_arrays_that_the_results_name_exist():
+    rows = re.findall(r"^def (\w+)\(bench: Bench\)", (HOME / "benchmarks" / "rows.py").read_text(), re.MULTILINE)
+    sources = "".join(
+        (HOME / "benchmarks" / f"{name}.py").read_text() for name in ("gestures", "static_holds", "other_sensors")
+    )
+    results = (HOME / "docs" / "results.md").read_text()
+    named = [row for cell in re.findall(r"`([a-z_ ]+)` \|$", results, re.MULTILINE) for row in cell.split()]
+    assert named
+    assert set(named) <= set(rows)
+    skins = re.findall(
+        r"^\| (?:drift: |fabric, |posture, )?([^|]+?) \| \d",
+        (HOME / "docs" / "results-arrays.md").read_text(),
+        re.MULTILINE,
+    )
+    assert skins
+    assert [skin for skin in skins if f'"{skin}"' not in sources] == []
+
+
+@pytest.mark.parametrize("page", [*PAGES, HOME / "CONTRIBUTING.md", HOME / "CHANGELOG.md"], ids=lambda page: page.name)
+def test_files_that_a_page_names_exist(page):
+    places = [page.parent, HOME, HOME / "diagnostics", HOME / "diagnostics" / "decision"]
+    text = page.read_text()
+    named = re.findall(r"`((?:\w+/)*\w+\.py)`", text) if page.name != "CHANGELOG.md" else []
+    linked = [link.partition("#")[0] for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link]
+    missing = [name for name in [*named, *filter(None, linked)] if not any((place / name).exists() for place in places)]
+    assert missing == []
+
+
+@pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.name)
+def test_a_guide_has_at_most_900_words(page):
+    assert len(page.read_text().split()) <= 900
+
+
+@pytest.mark.parametrize("page", sorted((HOME / "docs" / "methods").glob("*.md")), ids=lambda page: page.stem)
+def test_a_method_page_has_formula_figure_cost_and_limits(page):
+    text = page.read_text()
+    assert blocks(page, "text")
+    assert "\n## When to use it\n" in text or page.stem == "evidence"
+    assert "\n## What it costs\n" in text
+    assert re.search(r"\n## What it does not (detect|do)\n", text)
+    for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text):
+        assert (page.parent / picture).stat().st_size < 100_000
+
+
+OWN_WORDS = r"vouch|convict|witness|boil|tare\b|twin|\brim\b|\btouch(?:es)?\b|unrest|told from|takes? its word|knows"
+
+
+@pytest.mark.parametrize("page", [*GUIDES, HOME / "CONTRIBUTING.md", HOME / "CHANGELOG.md"], ids=lambda page: page.name)
+def test_a_page_uses_the_terms_of_the_glossary(page):
+    text = re.sub(r"```.*?```|`[^`]*`", "", page.read_text(), flags=re.DOTALL)
+    assert re.findall(OWN_WORDS, text, re.IGNORECASE) == []
+
+
+@pytest.mark.slow
+def test_the_script_draws_the_figures_of_the_method_pages(tmp_path):
+    script = HOME / "docs" / "figures.py"
+    subprocess.run(
+        [sys.executable, script, "--out", tmp_path], check=True, env={**os.environ, "PYTHONWARNINGS": "error"}
+    )
+    committed = {path.name for path in (HOME / "docs" / "figures").glob("*.png")}
+    assert {path.name for path in tmp_path.glob("*.png")} == committed

@@ -4,7 +4,7 @@ import torch
 
 from adaptfault.data.windows import Windows
 from adaptfault.imputation.dropout import RandomRepairs, random_fault_set
-from adaptfault.imputation.linear import CellStatistics
+from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.models.network import TactileTransformer
 from adaptfault.models.training import train
 from diagnostics import SensorLayout
@@ -68,6 +68,7 @@ def test_validation_looks_at_whole_and_at_repaired_windows():
     np.testing.assert_array_equal(both.y[len(data) :], data.y)
 
 
+@pytest.mark.slow
 def test_a_repairable_base_loses_less_under_the_fill():
     from adaptfault.adaptation.adapter import Adapter
     from diagnostics import FaultSet

@@ -1,6 +1,6 @@
 """Every example runs as its first line says, and on recordings where it takes some. ``make examples`` shows them.
 
-Those that are marked slow run there only, not in ``make test``.
+Those that are marked slow run there and in ``make test-all``, not in ``make test``.
 """
 
 import importlib.util
@@ -20,6 +20,7 @@ EXAMPLES = sorted(HOME.glob("*.py"))
 # What an example takes on recordings, as small as it goes.
 ON_RECORDINGS = {
     "adaptation_figures.py": ["--epochs", "1", "--cases", "1", "--only", "fill"],
+    "any_model.py": ["--small", "--only", "MLP"],
     "compare_classification.py": ["--small", "--only", "adaptfault"],
     "compare_keras.py": ["--epochs", "1", "--windows", "32"],
     "esp32_sender.py": ["--frames", "20"],
@@ -27,9 +28,11 @@ ON_RECORDINGS = {
     "wrong_fault_set.py": ["--draws", "1"],
 }
 LESS = {  # they take minutes
+    "any_model.py": ["--small"],
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
 }
 SLOW = {  # more than 7 s of CPU time
+    "any_model.py",
     "adaptation_figures.py",
     "compare_classification.py",
     "compare_keras.py",
@@ -46,6 +49,7 @@ SLOW_ON_RECORDINGS = {
     "adaptation_figures.py",
     "compare_classification.py",
     "compare_keras.py",
+    "wrong_fault_set.py",
 }
 NEEDS = {"deploy_speed.py": "onnxruntime"}  # others do without, and say so
 
@@ -64,6 +68,7 @@ def marked(names: Iterable[str], slow: set[str]) -> list[ParameterSet]:
     return [pytest.param(name, marks=pytest.mark.slow if name in slow else (), id=name) for name in names]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [path.name for path in EXAMPLES if '"--only"' in path.read_text()])
 def test_an_example_says_what_it_can_be_told_to_pick(name: str, tmp_path: Path):
     run(HOME / name, tmp_path, "--help")
@@ -83,3 +88,21 @@ def test_the_example_runs_on_recordings(name: str, small_grasps: Recordings, tmp
 def test_no_example_that_takes_recordings_is_left_out():
     takes = {path.name for path in EXAMPLES if 'argument("recording' in path.read_text() or "[REC" in path.read_text()}
     assert takes == set(ON_RECORDINGS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("array", ["skin", "icub", "insole", "sdh"])
+def test_the_first_hour_ends_with_the_right_verdict_on_every_array(array: str, tmp_path: Path):
+    data = HOME.parents[1] / "shared/data"
+    if array != "skin" and not data.is_dir():
+        pytest.skip("the real recordings are not here")
+    command = f"{sys.executable} -W error -m adaptfault"
+    environment = {**os.environ, "ADAPTFAULT": command, "DATA": str(data), "EPOCHS": "1", "GRASPS": "8"}
+    environment["PYTHONPATH"] = str(HOME.parent)
+    done = subprocess.run(
+        ["sh", HOME / "first_hour.sh", tmp_path, array], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    assert f"first_hour: {array}: verdict right" in done.stdout
+    for page in ("later.html", "diagnosis.html", "maintenance.html", "report.html"):
+        assert (tmp_path / array / page).stat().st_size > 10_000

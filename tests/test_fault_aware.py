@@ -77,6 +77,7 @@ def test_lines_break_as_a_whole_and_blocks_are_patches():
     assert len(sizes) > 4
 
 
+@pytest.mark.slow
 def test_training_with_faults_bears_them_better():
     data, held_out = windows(256), windows(64, seed=1)
     broken = FaultySamples(windows(200, seed=2), LAYOUT, n=200, n_faults=(10,), seed=9)

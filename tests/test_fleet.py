@@ -78,6 +78,7 @@ def test_each_robot_ends_as_it_should_and_one_bad_robot_stops_no_other(sequentia
     assert sequential.errors == (c, d)
 
 
+@pytest.mark.slow
 def test_two_workers_report_what_one_does(fleet, sequential, tmp_path):
     parallel = maintain_fleet(fleet, tmp_path, jobs=2, dry_run=True, progress=False)
     assert told(parallel) == told(sequential)
@@ -95,6 +96,7 @@ def test_a_robot_that_is_being_maintained_is_waited_for(fleet, monkeypatch):
     assert "being maintained by another process" in outcome.reason
 
 
+@pytest.mark.slow
 def test_two_workers_of_a_dask_cluster_report_what_one_process_does(fleet, sequential, tmp_path):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(

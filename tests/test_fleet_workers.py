@@ -123,6 +123,7 @@ def test_a_process_that_grew_is_replaced_and_its_warning_is_no_error():
     assert found["a"].reason == found["greedy"].reason != found["c"].reason
 
 
+@pytest.mark.slow
 def test_a_cluster_that_is_restarted_ends_the_run_without_an_outcome(cluster):
     import distributed
 

@@ -5,7 +5,7 @@ from diagnostics import Line, SensorLayout
 from diagnostics.decision.line_cover import Cause, candidate_groups, cheapest_of_few, cheapest_of_many, solve
 
 LAYOUT = SensorLayout(2, 11, 10)
-SURE, DOUBTFUL, NOTHING = 8.0, 5.0, 0.0
+SURE, WEAK, NOTHING = 8.0, 5.0, 0.0
 DOUBT = np.ones(220)
 
 
@@ -14,13 +14,16 @@ def mask(*cells: np.ndarray | list[int]) -> np.ndarray:
 
 
 def explained(
-    faulty: np.ndarray, contradicting: np.ndarray, matching: np.ndarray | None = None, weight: np.ndarray | None = None
+    faulty: np.ndarray,
+    contradicting: np.ndarray,
+    consistent: np.ndarray | None = None,
+    weight: np.ndarray | None = None,
 ) -> tuple[Cause, ...]:
     """Explain ``faulty`` cells (bool); those that could be faulty too are the untested ones."""
-    matching = ~contradicting if matching is None else matching
+    consistent = ~contradicting if consistent is None else consistent
     return solve(
         faulty,
-        matching | faulty,
+        consistent | faulty,
         contradicting,
         np.where(faulty, SURE, NOTHING) if weight is None else weight,
         DOUBT,
@@ -45,10 +48,10 @@ def test_an_untested_cell_on_a_broken_wire_is_inferred():
     assert cause.cells == tuple(column)
 
 
-@pytest.mark.parametrize("live", [0, 5, 10])
-def test_a_live_cell_on_a_broken_wire_is_never_inferred_to_be_faulty(live: int):
+@pytest.mark.parametrize("alive", [0, 5, 10])
+def test_a_working_cell_on_a_broken_wire_is_never_inferred_to_be_faulty(alive: int):
     column = LAYOUT.cells_on(Line(0, "column", 2))
-    faulty = mask(np.delete(column, live))
+    faulty = mask(np.delete(column, alive))
     causes = explained(faulty, ~faulty)
     assert {c for cause in causes for c in cause.cells} == set(np.flatnonzero(faulty).tolist())
 
@@ -60,17 +63,17 @@ def test_scattered_cells_have_a_cause_each():
     assert sorted(c for cause in causes for c in cause.cells) == cells.tolist()
 
 
-def test_two_faulty_cells_on_a_line_of_live_ones_are_no_broken_line():
+def test_two_faulty_cells_on_a_line_of_working_ones_are_no_broken_line():
     assert all(cause.line is None for cause in explained(mask([0, 5]), ~mask([0, 5])))
 
 
-def test_a_row_among_many_live_cells_of_it_is_not_blamed():
+def test_a_row_among_many_working_cells_is_not_reported():
     row = LAYOUT.cells_on(Line(0, "row", 3))
     faulty = mask(row[[0, 3, 6, 8]])
     assert all(cause.line is None for cause in explained(faulty, ~faulty))
 
 
-def test_a_whole_pad_is_blamed_on_its_converter():
+def test_a_whole_pad_is_attributed_to_its_converter():
     pad = mask(range(110, 220))
     (cause,) = explained(pad, ~pad)
     assert cause.line == Line(1, "converter", 0)
@@ -83,7 +86,7 @@ def test_no_faulty_cell_has_no_cause():
 
 @pytest.mark.parametrize("cut", range(1, 7))
 @pytest.mark.parametrize("from_the_end", [False, True])
-def test_a_wire_cut_at_a_position_is_blamed_for_the_cells_behind_it_only(cut: int, from_the_end: bool):
+def test_a_wire_cut_at_a_position_explains_only_the_cells_behind_the_cut(cut: int, from_the_end: bool):
     line = Line(1, "row", 7)
     row = LAYOUT.cells_on(line)
     dead = row[:-cut] if from_the_end else row[cut:]
@@ -102,71 +105,71 @@ def test_untested_cells_behind_a_cut_are_inferred_and_those_before_it_are_not():
     assert cause.cells == tuple(column[4:])
 
 
-def test_doubtful_cells_on_one_wire_convict_it_together():
+def test_weak_evidence_along_one_wire_adds_up():
     row = LAYOUT.cells_on(Line(0, "row", 3))
-    matching = mask(row)
-    (cause,) = explained(mask(), ~matching, matching, np.where(matching, DOUBTFUL, NOTHING))
+    consistent = mask(row)
+    (cause,) = explained(mask(), ~consistent, consistent, np.where(consistent, WEAK, NOTHING))
     assert cause.line == Line(0, "row", 3)
     assert cause.cells == tuple(row)
     assert 0.5 < cause.probability <= 1
 
 
-def test_as_many_doubtful_cells_here_and_there_convict_nothing():
-    matching = mask(np.random.default_rng(0).choice(220, 10, replace=False))
-    assert explained(mask(), ~matching, matching, np.where(matching, DOUBTFUL, NOTHING)) == ()
+def test_as_much_weak_evidence_at_scattered_cells_explains_no_wire():
+    consistent = mask(np.random.default_rng(0).choice(220, 10, replace=False))
+    assert explained(mask(), ~consistent, consistent, np.where(consistent, WEAK, NOTHING)) == ()
 
 
 def test_a_long_line_of_weak_suspects_is_the_edge_of_a_contact_and_no_wire():
     layout = SensorLayout(1, 64, 32)
-    matching = np.isin(np.arange(2048), layout.cells_on(Line(0, "row", 5)))
+    consistent = np.isin(np.arange(2048), layout.cells_on(Line(0, "row", 5)))
     none = np.zeros(2048, bool)
-    assert solve(none, matching, ~matching, np.where(matching, 2.6, NOTHING), np.ones(2048), layout) == ()
+    assert solve(none, consistent, ~consistent, np.where(consistent, 2.6, NOTHING), np.ones(2048), layout) == ()
 
 
-@pytest.mark.parametrize(("weight", "blamed"), [(2.65, False), (4.0, True)])
-def test_doubtful_cells_on_one_wire_count_for_less_than_as_many_independent_ones(weight: float, blamed: bool):
+@pytest.mark.parametrize(("weight", "reported"), [(2.65, False), (4.0, True)])
+def test_correlated_evidence_along_one_wire_is_discounted(weight: float, reported: bool):
     layout = SensorLayout(1, 4, 10)
-    matching = np.isin(np.arange(40), layout.cells_on(Line(0, "column", 5)))
+    consistent = np.isin(np.arange(40), layout.cells_on(Line(0, "column", 5)))
     none = np.zeros(40, bool)
-    # 10.6 by one cell alone would convict it.
-    causes = solve(none, matching, ~matching, np.where(matching, weight, NOTHING), np.ones(40), layout)
-    assert bool(causes) == blamed
+    # 10.6 from one cell alone would suffice.
+    causes = solve(none, consistent, ~consistent, np.where(consistent, weight, NOTHING), np.ones(40), layout)
+    assert bool(causes) == reported
 
 
-@pytest.mark.parametrize(("doubt", "blamed"), [(1.0, False), (0.8, False), (0.1, True), (0.0, True)])
-def test_a_cell_that_is_likely_to_be_faulty_leads_doubtful_ones_on_its_wire(doubt: float, blamed: bool):
+@pytest.mark.parametrize(("doubt", "reported"), [(1.0, False), (0.8, False), (0.1, True), (0.0, True)])
+def test_one_almost_certain_cell_lowers_the_cost_of_its_wire(doubt: float, reported: bool):
     row = LAYOUT.cells_on(Line(0, "row", 3))
-    matching = mask(row[:3])
+    consistent = mask(row[:3])
     leading = np.where(mask(row[:1]), doubt, 1.0)
-    assert bool(solve(mask(), matching, mask(), np.where(matching, 4.6, NOTHING), leading, LAYOUT)) == blamed
+    assert bool(solve(mask(), consistent, mask(), np.where(consistent, 4.6, NOTHING), leading, LAYOUT)) == reported
 
 
-def test_cells_are_suspected_together_as_wires_would_explain_them():
+def test_candidate_groups_are_the_cells_that_one_wire_would_explain():
     row, column = LAYOUT.cells_on(Line(0, "row", 3)), LAYOUT.cells_on(Line(1, "column", 2))
-    matching = mask(row, column[4:])
+    consistent = mask(row, column[4:])
     weight = np.where(mask(row[[0, 5]], column[[6, 9]]), 3.0, NOTHING)
-    groups = candidate_groups(matching, ~matching, weight, LAYOUT)
+    groups = candidate_groups(consistent, ~consistent, weight, LAYOUT)
     assert [group.tolist() for group in groups] == [row.tolist(), column[4:].tolist()]
-    assert candidate_groups(matching, ~matching, np.where(mask(row[:1], column[-1:]), 3.0, NOTHING), LAYOUT) == []
+    assert candidate_groups(consistent, ~consistent, np.where(mask(row[:1], column[-1:]), 3.0, NOTHING), LAYOUT) == []
 
 
-def test_lines_are_suspected_together_that_a_stuck_address_would_move_if_none_lives():
+def test_lines_that_a_stuck_address_would_move_are_one_group_if_none_works():
     moved, _ = LAYOUT.misaddressed(Line(0, "row_address", 3), 0)
-    matching = mask(moved)
-    weight = np.where(mask(moved[[0, 15]]), 3.0, NOTHING)  # one cell each of two rows: no row is suspected
-    (group,) = candidate_groups(matching, ~matching, weight, LAYOUT)
+    consistent = mask(moved)
+    weight = np.where(mask(moved[[0, 15]]), 3.0, NOTHING)  # one cell each of two rows: no row is a group
+    (group,) = candidate_groups(consistent, ~consistent, weight, LAYOUT)
     assert group.tolist() == moved.tolist()
-    contradicting = ~matching | mask(moved[-1:])
-    assert all(len(g) < len(moved) for g in candidate_groups(matching, contradicting, weight, LAYOUT))
+    contradicting = ~consistent | mask(moved[-1:])
+    assert all(len(g) < len(moved) for g in candidate_groups(consistent, contradicting, weight, LAYOUT))
 
 
-def test_cells_of_a_pad_with_a_live_one_are_not_suspected_together():
-    matching = mask(np.arange(110))  # a converter has no middle to be broken in
-    weight = np.where(matching, 3.0, NOTHING)
+def test_cells_of_a_pad_with_a_working_one_are_no_group():
+    consistent = mask(np.arange(110))  # a converter has no middle to be broken in
+    weight = np.where(consistent, 3.0, NOTHING)
     pad = np.arange(110).tolist()
-    assert pad in [group.tolist() for group in candidate_groups(matching, mask(), weight, LAYOUT)]
-    matching[60] = False
-    groups = [group.tolist() for group in candidate_groups(matching, mask([60]), weight, LAYOUT)]
+    assert pad in [group.tolist() for group in candidate_groups(consistent, mask(), weight, LAYOUT)]
+    consistent[60] = False
+    groups = [group.tolist() for group in candidate_groups(consistent, mask([60]), weight, LAYOUT)]
     assert pad[:60] not in groups
     assert pad[61:] not in groups
     addresses = [line for line in LAYOUT.lines if line.kind.endswith("address")]
@@ -174,23 +177,23 @@ def test_cells_of_a_pad_with_a_live_one_are_not_suspected_together():
     assert max(len(group) for group in groups if group not in moved) == 11  # no more than a column
 
 
-def test_a_few_doubtful_cells_do_not_convict_a_wire():
+def test_a_few_uncertain_cells_do_not_prove_a_broken_wire():
     row = LAYOUT.cells_on(Line(0, "row", 3))
-    matching = mask(row[:2])
-    assert explained(mask(), ~matching, matching, np.where(matching, DOUBTFUL, NOTHING)) == ()
+    consistent = mask(row[:2])
+    assert explained(mask(), ~consistent, consistent, np.where(consistent, WEAK, NOTHING)) == ()
 
 
-def test_cells_at_rest_that_nothing_was_asked_of_convict_nothing():
+def test_untested_cells_at_rest_are_no_evidence():
     assert explained(mask(), mask(), np.ones(220, bool), np.full(220, NOTHING)) == ()
 
 
-@pytest.mark.parametrize("weight", [DOUBTFUL, SURE])
-def test_live_cells_on_it_do_not_let_a_wire_be_blamed_whatever_is_said_of_the_others(weight: float):
+@pytest.mark.parametrize("weight", [WEAK, SURE])
+def test_a_wire_with_several_working_cells_is_not_reported_whatever_the_others_read(weight: float):
     row = LAYOUT.cells_on(Line(0, "row", 3))
-    live = row[[1, 4, 7]]
-    matching = mask(np.setdiff1d(row, live))
-    causes = explained(mask(), ~matching, matching, np.where(matching, weight, NOTHING))
-    assert not {c for cause in causes for c in cause.cells} & set(live.tolist())
+    alive = row[[1, 4, 7]]
+    consistent = mask(np.setdiff1d(row, alive))
+    causes = explained(mask(), ~consistent, consistent, np.where(consistent, weight, NOTHING))
+    assert not {c for cause in causes for c in cause.cells} & set(alive.tolist())
     assert all(cause.line != Line(0, "row", 3) or not cause.whole for cause in causes)
 
 
@@ -214,7 +217,7 @@ def test_broken_lines_are_found_exactly_among_single_faults_and_untested_cells(s
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_every_faulty_cell_has_a_cause_and_no_cell_that_speaks_against_it_is_in_one(seed: int):
+def test_every_faulty_cell_has_a_cause_and_no_contradicting_cell_is_in_one(seed: int):
     rng = np.random.default_rng(seed)
     faulty = rng.random(220) < rng.choice([0.05, 0.3, 0.7])
     contradicting = ~faulty & (rng.random(220) < 0.5)
@@ -224,7 +227,7 @@ def test_every_faulty_cell_has_a_cause_and_no_cell_that_speaks_against_it_is_in_
     assert not found & set(np.flatnonzero(contradicting).tolist())
 
 
-def test_positions_without_a_cell_are_never_blamed():
+def test_positions_without_a_cell_have_no_cause():
     present = np.ones(LAYOUT.shape, bool)
     present[0, 3, :4] = False
     layout = SensorLayout(2, 11, 10, present=present)
@@ -235,7 +238,7 @@ def test_positions_without_a_cell_are_never_blamed():
     assert (cause.line, cause.cells) == (Line(0, "row", 3), tuple(row))
 
 
-def test_one_certain_cell_and_a_strong_suspect_behind_the_last_live_one_are_a_cut():
+def test_one_certain_cell_and_a_strong_suspect_behind_the_last_working_one_are_a_cut():
     row = LAYOUT.cells_on(Line(1, "row", 4))
     faulty, suspect = mask(row[9:]), mask(row[8:9])
     for strength, cut in ((6.0, True), (2.6, False)):

@@ -218,6 +218,9 @@ def test_with_a_bundle_classes_are_told(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("adaptfault.robot.predictor.Predictor", Predictor)
     bare = types.SimpleNamespace(parts=types.SimpleNamespace(calibration=None))
     monkeypatch.setattr("adaptfault.robot.bundle.Bundle.open", lambda path: bare)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robot.bundle").mkdir()
+    (tmp_path / "robot.bundle/bundle.json").touch()
     lines = listened(capsys, packets(np.zeros((3, 6))), "robot.bundle", "--frames", 3, "--seconds", 20)
     assert lines[0] == "0.1 a class: cup (90%)"
     assert lines[1] == "0.2 a class: ball (90%)"

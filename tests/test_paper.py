@@ -68,6 +68,7 @@ def command(home: Path, *more: str) -> list[str]:
     return ["reproduce", "--recordings", str(home / "grasps.npz"), "--epochs", "1", "--seeds", "0", "1", *more]
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_goes_on_where_it_was_and_measures_nothing_twice(home, capsys):
     out = home / "killed"
     run = command(home, "--figure", "2", "--figure", "3", "--out", str(out), "--quiet")

@@ -45,7 +45,7 @@ def test_a_position_without_a_cell_is_untested():
     assert 1 not in diagnosis.coverage.untested
 
 
-def test_the_exit_code_tells_nothing_single_cells_and_what_needs_a_technician_apart():
+def test_the_exit_code_distinguishes_no_fault_single_cells_and_faults_of_wires():
     assert diagnosed().exit_code == 0
     assert diagnosed(transport=(LOST,)).exit_code == 0
     assert diagnosed(CELL).exit_code == 1

@@ -24,7 +24,7 @@ def at(cells: object) -> np.ndarray:
 
 
 def dead(found: CellFindings, cells: object, value: float = 0.0, onset: int = 0) -> CellFindings:
-    """Return the findings with cells that hold ``value`` beyond doubt, as three touches tell."""
+    """Return the findings with cells that hold ``value`` beyond doubt, as three events show."""
     which = at(cells)
     return replace(
         found,
@@ -51,15 +51,15 @@ def moving(found: CellFindings, kind: str, cells: object) -> CellFindings:
 
 
 def untested(found: CellFindings, cells: object) -> CellFindings:
-    """Return the findings with cells at rest that nothing touched."""
+    """Return the findings with unloaded cells that no event tested."""
     which = at(cells)
     return replace(
         found, alive=found.alive & ~which, rests=found.rests | which, value=np.where(which, 0.0, found.value)
     )
 
 
-def causes(found: CellFindings, *find_aliasing: Aliasing) -> tuple[Fault, ...]:
-    return root_causes(found, find_aliasing, LAYOUT)
+def causes(found: CellFindings, *aliasings: Aliasing) -> tuple[Fault, ...]:
+    return root_causes(found, aliasings, LAYOUT)
 
 
 def row(pad: int, index: int) -> np.ndarray:
@@ -97,17 +97,17 @@ def test_untested_cells_on_a_wire_proven_open_are_inferred_and_the_fault_says_so
     assert any("leaves the untested cells on it alive" in text for text in fault.alternatives)
 
 
-def test_a_cut_wire_says_from_where_on():
-    tail_slope, before = causes(dead(HEALTHY, row(0, 2)[2:])), causes(dead(HEALTHY, row(0, 2)[:4]))
-    assert "from column 2 on" in tail_slope[0].reason
+def test_the_fault_of_a_cut_wire_names_the_cut():
+    after, before = causes(dead(HEALTHY, row(0, 2)[2:])), causes(dead(HEALTHY, row(0, 2)[:4]))
+    assert "from column 2 on" in after[0].reason
     assert "up to column 3" in before[0].reason
-    assert tail_slope[0].line == before[0].line == Line(0, "row", 2)
+    assert after[0].line == before[0].line == Line(0, "row", 2)
 
 
-def test_where_the_cell_beside_the_break_is_untested_the_break_may_be_nearer():
+def test_where_the_cell_beside_the_break_is_untested_the_break_may_be_closer():
     found = dead(untested(HEALTHY, [row(0, 2)[2]]), row(0, 2)[3:])
     (fault,) = causes(found)
-    assert any("nearer to the live end" in text for text in fault.alternatives)
+    assert any("closer to the working end" in text for text in fault.alternatives)
     (sure,) = causes(dead(HEALTHY, row(0, 2)[3:]))
     assert sure.alternatives == ()
 
@@ -119,7 +119,7 @@ def test_cells_stuck_at_different_values_share_no_cause():
     assert [fault.line for fault in causes(found)] == [None] * 6
 
 
-def test_a_cell_that_is_faulty_in_another_way_is_not_put_down_to_the_wire():
+def test_a_cell_with_another_fault_is_not_attributed_to_the_wire():
     found = dead(dead(HEALTHY, row(0, 2)), [row(0, 2)[5]], 5.0)
     found = replace(found, rests=found.rests & ~at([row(0, 2)[5]]))
     by_kind = {fault.kind: fault for fault in causes(found)}
@@ -128,26 +128,26 @@ def test_a_cell_that_is_faulty_in_another_way_is_not_put_down_to_the_wire():
 
 
 @pytest.mark.parametrize(
-    ("name", "kind", "says"),
+    ("name", "kind", "reason"),
     [
         ("intermittent", FaultKind.INTERMITTENT, "blinks"),
         ("noisy", FaultKind.NOISY, "noisier"),
-        ("drifting", FaultKind.DRIFT, "never comes back to rest"),
+        ("drifting", FaultKind.DRIFT, "never returns to its baseline"),
     ],
 )
-def test_cells_that_move_wrongly_are_named_by_how(name: str, kind: FaultKind, says: str):
+def test_cells_that_move_wrongly_are_named_by_how(name: str, kind: FaultKind, reason: str):
     (fault,) = causes(moving(HEALTHY, name, [7]))
     assert (fault.kind, fault.cells) == (kind, (7,))
-    assert says in fault.reason
+    assert reason in fault.reason
 
 
-def test_cells_that_read_too_little_are_told_from_those_that_do_not_come_to_rest():
+def test_a_changed_gain_and_an_offset_are_different_drifts():
     found = moving(HEALTHY, "drifting", [*row(1, 5), 7])
     of_row, single = causes(replace(found, gain=np.where(at(row(1, 5)), 0.35, np.nan)))
     assert (of_row.kind, of_row.line) == (FaultKind.DRIFT, Line(1, "row", 5))
     assert "reads about 0.35 times what it should" in of_row.reason
     assert (single.kind, single.cells) == (FaultKind.DRIFT, (7,))
-    assert "never comes back to rest" in single.reason
+    assert "never returns to its baseline" in single.reason
 
 
 def test_a_loose_wire_makes_its_whole_row_blink():
@@ -172,15 +172,15 @@ def column(index: int) -> np.ndarray:
 
 
 def test_lines_that_one_dead_address_bit_explains_are_one_fault():
-    # Bit 2 stuck at 0: columns 4 and 5 read columns 0 and 1, which nothing touched.
+    # Bit 2 stuck at 0: columns 4 and 5 read columns 0 and 1, which nothing loads.
     dead_ones, sources = np.r_[column(4), column(5)], np.r_[column(0), column(1)]
     (fault,) = causes(dead(untested(HEALTHY, sources), dead_ones))
     assert (fault.kind, fault.line, fault.value) == (FaultKind.ALIAS, Line(0, "column_address", 2), 0)
     assert fault.cells == tuple(np.sort(dead_ones))
-    assert any("each for itself" in text for text in fault.alternatives)
+    assert any("independently of each other" in text for text in fault.alternatives)
 
 
-def test_an_address_bit_is_named_though_one_of_its_lines_was_never_touched():
+def test_an_address_bit_is_named_though_one_of_its_lines_was_never_loaded():
     # Bit 3 stuck at 0: rows 8, 9 and 10 read rows 0, 1 and 2.
     idle = untested(HEALTHY, np.concatenate([row(0, i) for i in (0, 1, 2, 10)]))
     (fault,) = causes(dead(idle, np.r_[row(0, 8), row(0, 9)]))
@@ -189,18 +189,18 @@ def test_an_address_bit_is_named_though_one_of_its_lines_was_never_touched():
     assert "rows 8, 9 are open" in fault.alternatives[0]
 
 
-def test_lines_are_not_put_down_to_an_address_bit_if_another_of_its_lines_works():
+def test_lines_are_not_attributed_to_an_address_bit_if_another_of_its_lines_works():
     idle = untested(HEALTHY, np.concatenate([row(0, i) for i in (0, 1, 2)]))
     faults = causes(dead(idle, np.r_[row(0, 8), row(0, 9)]))
     assert {fault.line for fault in faults} == {Line(0, "row", 8), Line(0, "row", 9)}
 
 
-def test_lines_are_not_put_down_to_an_address_bit_if_what_they_would_read_is_loaded():
+def test_lines_are_not_attributed_to_an_address_bit_if_what_they_would_read_is_loaded():
     faults = causes(dead(HEALTHY, np.r_[column(4), column(5)]))
     assert {fault.line for fault in faults} == {Line(0, "column", 4), Line(0, "column", 5)}
 
 
-def test_an_aliasing_is_told_with_its_copies_and_its_cells_count_for_nothing_else():
+def test_an_aliasing_lists_its_copies_and_its_cells_have_no_other_cause():
     cells = tuple(int(c) for c in row(0, 1))
     aliasing = Aliasing(Line(0, "row_address", 0), 0, cells, 20, 9, ((1, 0), (3, -1)), ("or else",))
     faults = causes(dead(HEALTHY, [cells[0], cells[1]]), aliasing)
@@ -212,7 +212,7 @@ def test_an_aliasing_is_told_with_its_copies_and_its_cells_count_for_nothing_els
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_each_faulty_cell_is_in_a_cause_and_no_live_one(seed: int):
+def test_each_faulty_cell_is_in_a_cause_and_no_working_one(seed: int):
     rng = np.random.default_rng(seed)
     order = rng.permutation(CELLS)
     found = untested(HEALTHY, order[60:])
@@ -224,7 +224,7 @@ def test_each_faulty_cell_is_in_a_cause_and_no_live_one(seed: int):
     assert not named & set(np.flatnonzero(found.alive).tolist())
 
 
-def test_cells_that_were_dead_before_convict_no_wire_of_cells_that_lived_then():
+def test_cells_dead_in_the_reference_are_no_evidence_for_a_wire_that_broke_later():
     on = row(0, 3)
     found = untested(HEALTHY, on)
     found = replace(dead(found, on[-3:-1]), known=at(on[-3:-1]))
@@ -233,7 +233,7 @@ def test_cells_that_were_dead_before_convict_no_wire_of_cells_that_lived_then():
     assert all(fault.line is None for fault in causes(found))
 
 
-def test_a_wire_that_was_broken_before_is_named_and_one_that_breaks_now_serves_a_cell_that_was_dead():
+def test_a_wire_broken_in_the_reference_is_named_and_one_that_breaks_later_includes_cells_dead_before():
     on = row(0, 3)
     (fault,) = causes(replace(dead(HEALTHY, on), known=at(on)))
     assert (fault.line, fault.cells) == (Line(0, "row", 3), tuple(on.tolist()))
@@ -241,4 +241,4 @@ def test_a_wire_that_was_broken_before_is_named_and_one_that_breaks_now_serves_a
     (fault,) = causes(replace(dead(HEALTHY, on), known=at(on[2])))
     assert (fault.line, fault.cells) == (Line(0, "row", 3), tuple(on.tolist()))
     assert "already" not in fault.reason
-    assert "; 1 more, not tested, are inferred" in fault.reason
+    assert "; 1 more, not tested, is inferred" in fault.reason

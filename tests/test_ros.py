@@ -2,9 +2,11 @@
 
 import importlib.util
 import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -130,13 +132,62 @@ def test_writing_without_rosbags_says_what_to_install(tmp_path, monkeypatch):
         write_diagnostics(tmp_path / "bag", [stale_array(LAYOUT)])
 
 
-def test_the_node_goes_stale_without_frames_and_comes_back(log):
-    path = Path(__file__).parents[1] / "examples" / "ros2_node.py"
-    spec = importlib.util.spec_from_file_location("ros2_node", path)
-    node = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(node)
+PACKAGE = Path(__file__).parents[1] / "examples" / "ros2"
+
+
+@pytest.fixture(scope="module")
+def node():
+    """The module of the ROS 2 node."""
+    spec = importlib.util.spec_from_file_location("ros2_node", PACKAGE / "adaptfault_ros" / "node.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_message_of_the_node_fits_the_definitions_of_ros(node, log):
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    names = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    names += tuple(f"diagnostic_msgs/msg/{name}" for name in ("KeyValue", "DiagnosticStatus", "DiagnosticArray"))
+    types = {name.rpartition("/")[2]: store.types[name] for name in names}
+    watch = node.Watch(SelfDiagnosis(LAYOUT), clock=lambda: 1000.5)
+    for frame in log[:40]:
+        watch.take(frame)
+    content = watch.diagnostics()
+    kind = "diagnostic_msgs/msg/DiagnosticArray"
+    read = store.deserialize_cdr(store.serialize_cdr(node.message_of(content, types, int), kind), kind)
+    assert (read.header.stamp.sec, read.header.stamp.nanosec) == (1000, 500_000_000)
+    assert [(s.level, s.name, s.message) for s in read.status] == [
+        (s["level"], s["name"], s["message"]) for s in content["status"]
+    ]
+    assert [{v.key: v.value for v in s.values} for s in read.status] == [
+        {v["key"]: v["value"] for v in s["values"]} for s in content["status"]
+    ]
+
+
+def test_the_node_takes_its_array_from_its_parameters(node, tmp_path):
+    given = {**node.DEFAULTS, "layout": "2x6x5", "full_scale": 3.3, "unit": "V", "rate": 50.0}
+    assert node.diagnoser_of(given).layout == SensorLayout(2, 6, 5, full_scale=3.3, unit="V", rate=50)
+    (tmp_path / "layout.json").write_text(json.dumps(LAYOUT.to_dict()))
+    assert node.diagnoser_of({**node.DEFAULTS, "layout": str(tmp_path / "layout.json")}).layout == LAYOUT
+    with pytest.raises(ValueError, match="give the parameter bundle, or the parameter layout"):
+        node.diagnoser_of(node.DEFAULTS)
+    with pytest.raises(ValueError, match=f"7 values, expected {LAYOUT.n_cells}"):
+        node.Watch(SelfDiagnosis(LAYOUT)).take(np.zeros(7))
+
+
+def test_the_launch_file_and_the_package_name_the_parameters_and_files_of_the_node(node):
+    launch = (PACKAGE / "launch" / "tactile.launch.py").read_text()
+    assert set(re.findall(r'^    "(\w+)": \(', launch, re.MULTILINE)) == set(node.DEFAULTS)
+    package = ElementTree.parse(PACKAGE / "package.xml").getroot()
+    assert (PACKAGE / "resource" / package.findtext("name")).is_file()
+    imported = set(re.findall(r"^    from (\w+)\.msg import", (PACKAGE / "adaptfault_ros/node.py").read_text(), re.M))
+    assert imported <= {one.text for one in package.findall("exec_depend")}
+
+
+def test_the_node_goes_stale_without_frames_and_comes_back(node, log):
     now = [1000.0]
-    watch = node.Watch(LAYOUT, clock=lambda: now[0])
+    watch = node.Watch(SelfDiagnosis(LAYOUT), clock=lambda: now[0])
     assert set(levels(watch.diagnostics()).values()) == {Level.STALE}
     for frame in log[:40]:
         watch.take(frame)

@@ -16,31 +16,31 @@ def log() -> np.ndarray:
 
 
 def received(frames: np.ndarray, size: int = 1000, present: np.ndarray = PRESENT) -> tuple[TransportState, list[int]]:
-    """Feed the frames in chunks; return the stream and the numbers of the frames that say something."""
-    transport, known_values = TransportState(), []
+    """Feed the frames in chunks; return the stream and the numbers of the frames that carry information."""
+    transport, informative = TransportState(), []
     for first in range(0, len(frames), size):
         transport, some = transport.receive(frames[first : first + size], present, PATIENCE)
-        known_values += (some + first).tolist()
-    return transport, known_values
+        informative += (some + first).tolist()
+    return transport, informative
 
 
 def faults(transport: TransportState, working: np.ndarray = PRESENT) -> tuple[TransportFault, ...]:
     return transport.faults(LOADED_FROM, working, rate=10)
 
 
-def test_frames_that_all_arrive_all_say_something_and_there_is_no_fault(log):
-    transport, known_values = received(log)
-    assert known_values == list(range(200))
+def test_frames_that_all_arrive_are_all_informative_and_there_is_no_fault(log):
+    transport, informative = received(log)
+    assert informative == list(range(200))
     assert transport.seen == 200
     assert faults(transport) == ()
 
 
-def test_a_frozen_stream_is_dated_and_counted_and_its_frames_say_nothing_new(log):
-    transport, known_values = received(freeze_stream(log, 60, 160))
+def test_a_frozen_stream_is_dated_and_counted_and_its_frames_are_not_informative(log):
+    transport, informative = received(freeze_stream(log, 60, 160))
     (fault,) = faults(transport)
     assert (fault.kind, fault.onset, fault.frames) == ("frozen", 60, 100)
     assert "frozen" in fault.reason
-    assert known_values == [*range(60 + PATIENCE + 1), *range(160, 200)]
+    assert informative == [*range(60 + PATIENCE + 1), *range(160, 200)]
 
 
 def test_an_idle_pad_that_repeats_zeros_is_no_fault(log):
@@ -57,18 +57,18 @@ def test_full_scale_cells_that_are_themselves_broken_do_not_make_an_idle_pad_fro
 
 
 def test_a_frame_that_comes_again_a_few_times_is_no_fault(log):
-    transport, known_values = received(freeze_stream(log, 60, 60 + PATIENCE))
+    transport, informative = received(freeze_stream(log, 60, 60 + PATIENCE))
     assert faults(transport) == ()
-    assert len(known_values) == 200
+    assert len(informative) == 200
 
 
 def test_lost_frames_are_counted_and_the_first_is_named(log):
     lossy = lose_frames(log, 0.1, seed=0)
-    transport, known_values = received(lossy)
+    transport, informative = received(lossy)
     lost = np.flatnonzero(np.isnan(lossy).all(axis=1))
     (fault,) = faults(transport)
     assert (fault.kind, fault.onset, fault.frames) == ("lost", lost[0], 20)
-    assert known_values == sorted(set(range(200)) - set(lost.tolist()))
+    assert informative == sorted(set(range(200)) - set(lost.tolist()))
 
 
 def test_a_position_without_a_cell_does_not_make_a_lost_frame_arrive(log):
@@ -78,7 +78,7 @@ def test_a_position_without_a_cell_does_not_make_a_lost_frame_arrive(log):
     assert faults(received(log)[0]) == ()
 
 
-def test_frames_that_never_came_count_as_lost(log):
+def test_frames_that_were_never_received_count_as_lost(log):
     transport, _ = received(log[:50])
     transport, _ = transport.without(3).receive(log[50:], PRESENT, PATIENCE)
     (fault,) = faults(transport.without(2))

@@ -1,7 +1,7 @@
 """Converts a diagnosis into ``diagnostic_msgs/DiagnosticArray``, as plain dicts, and writes it into a bag.
 
-Needs no ROS. Publish the dicts with rclpy (``examples/ros2_node.py``) once a second; ROS marks a status as stale when
-it is not repeated for some seconds.
+No ROS is needed. Publish the dicts with rclpy (``examples/ros2``) once a second; ROS marks a status as stale when it is
+not repeated for some seconds.
 """
 
 from __future__ import annotations

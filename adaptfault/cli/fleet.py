@@ -1,4 +1,4 @@
-"""adaptfault fleet maintain: maintenance of many robots on workers, and what the fleet needs."""
+"""adaptfault fleet maintain: maintains many robots in parallel and reports what the fleet needs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from adaptfault.cli.options import Commands, command, emit, progress, say
 _EXAMPLE = """  adaptfault fleet maintain FLEET.toml --jobs 8
       FLEET.toml lists robots as [[robots]] with name, bundle, recordings (and tags, commissioned = 2025-03-01),
       or as bundles = "robots/*/robot.bundle" and recordings = "{bundle_dir}/recordings";
-      killed and started again it goes on where it was"""
+      after a crash the same command continues"""
 
 
 def add(commands: Commands) -> None:
@@ -41,7 +41,7 @@ def add(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Maintain; the exit code says how the worst robot is."""
+    """Maintain; the exit code is that of the worst robot."""
     import json
     from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""adaptfault history: what happened to a robot's skin and to what it runs."""
+"""adaptfault history: lists the maintenance runs and versions of a robot."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from adaptfault.cli.options import Commands, command, emit
 
 _EXAMPLE = """  adaptfault history robot.bundle --last 10
   adaptfault history robot.bundle --confirm
-      the version that runs is healthy: its probation is over"""
+      ends the probation of the version that runs"""
 
 
 def add(commands: Commands) -> None:
@@ -17,12 +17,12 @@ def add(commands: Commands) -> None:
     parser = command(commands, "history", "list maintenance runs and versions", _EXAMPLE)
     parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
     parser.add_argument("--last", type=int, metavar="N", help="only the last N entries")
-    parser.add_argument("--confirm", action="store_true", help="say that the version which runs is healthy")
+    parser.add_argument("--confirm", action="store_true", help="end the probation of the version that runs")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """List."""
+    """List runs and versions."""
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.pointer import Pointer
 
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def line(run: dict[str, Any]) -> str:
-    """Return a run in one line."""
+    """Return one line of text for a run."""
     about = {
         "confirmed": lambda: f"version {run['version']}",
         "rollback": lambda: f"version {run['from']} -> {run['to']}: {run['reason']}",

@@ -1,4 +1,4 @@
-"""adaptfault maintain: a bundle and what the robot recorded in; diagnosed, adapted, deployed or kept."""
+"""adaptfault maintain: diagnoses new recordings of a robot, adapts its model, deploys or keeps it."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ _EXAMPLE = """  adaptfault maintain robot.bundle today/
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "maintain", "diagnose new recordings and bring what the robot runs up to date", _EXAMPLE)
+    parser = command(commands, "maintain", "diagnose new recordings and update the model that the robot runs", _EXAMPLE)
     parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
     parser.add_argument("recordings", nargs="+", metavar="RECORDINGS", help="file or folder of recordings")
     parser.add_argument("--dry-run", action="store_true", help="report only, change nothing")
     parser.add_argument("--budget", type=float, metavar="S", help="seconds that an adaptation may take")
     parser.add_argument("--report", metavar="FILE", help="write the technician's report (HTML)")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, writes=("report",))
 
 
 def run(args: argparse.Namespace) -> int:
-    """Maintain; the exit code says how the sensor is."""
+    """Maintain; the exit code gives the state of the sensor."""
     import sys
 
     from adaptfault.robot.bundle import Bundle

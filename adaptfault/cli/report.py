@@ -13,11 +13,11 @@ def add(commands: Commands) -> None:
     parser = command(commands, "report", "write the technician's report: what is broken, what to check", example)
     parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
     parser.add_argument("--out", default="report.html", metavar="FILE", help="default report.html")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, writes=("out",))
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write it."""
+    """Write the page."""
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.technician_report import write_report
 

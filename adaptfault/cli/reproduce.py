@@ -19,7 +19,7 @@ from adaptfault.cli.options import (
 
 _EXAMPLE = """  adaptfault reproduce --quick
   adaptfault reproduce --figure 6 --recordings grasps.npz --out real
-      killed and started again it goes on where it was"""
+      after a crash the same command continues"""
 
 
 def add(commands: Commands) -> None:

@@ -1,4 +1,4 @@
-"""adaptfault rollback: back to the version before."""
+"""adaptfault rollback: returns to the previous version."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from adaptfault.cli.options import Commands, command, emit
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "rollback", "return to the version before", "  adaptfault rollback robot.bundle")
+    parser = command(commands, "rollback", "return to the previous version", "  adaptfault rollback robot.bundle")
     parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
     parser.set_defaults(run=run)
 

@@ -1,9 +1,10 @@
-"""adaptfault train: recordings in; a model folder, or the bundle that a robot carries, out."""
+"""adaptfault train: trains a model on fault-free recordings; writes a model folder or a bundle."""
 
 from __future__ import annotations
 
 import argparse
 import shutil
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,10 +23,12 @@ from adaptfault.cli.options import (
 if TYPE_CHECKING:
     from adaptfault.data.recordings import Recordings
     from adaptfault.data.windows import Windows
+    from adaptfault.models.any_model import AnyModel
     from adaptfault.models.network import TactileTransformer
+    from diagnostics import SensorLayout
 
 _EXAMPLE = """  adaptfault train grasps/ --out model --epochs 20
-      grasps/<class>/<recording>.csv; run it again after a crash and it goes on where it was
+      grasps/<class>/<recording>.csv; after a crash the same command continues the training
   adaptfault train grasps/ --out robot.bundle
       the folder that a robot carries: for adaptfault maintain and listen"""
 
@@ -35,13 +38,21 @@ def add(commands: Commands) -> None:
     parser = command(commands, "train", "train the paper's network on fault-free recordings", _EXAMPLE)
     add_recordings(parser)
     parser.add_argument("--out", required=True, metavar="FOLDER", help="where the model goes; X.bundle: a bundle")
-    parser.add_argument("--epochs", type=int, default=50, help="at most so many (default 50)")
-    parser.add_argument("--seed", type=int, default=0, help="of split, weights and training (default 0)")
+    parser.add_argument("--epochs", type=int, default=50, help="at most so many epochs (default 50)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of split, weights and training (default 0)")
     parser.add_argument("--length", type=int, default=10, help="frames in a window (default 10)")
     parser.add_argument(
         "--repairable",
         action="store_true",
-        help="let random cells go missing while training: a fill alone then repairs more; needs about twice the epochs",
+        help="remove random cells while training: imputation alone then repairs more; needs about twice the epochs",
+    )
+    parser.add_argument("--strict", action="store_true", help="exit code 1 if the training shows a sign of failure")
+    parser.add_argument(
+        "--model",
+        dest="builder",
+        metavar="PACKAGE:FUNCTION",
+        help="train the torch module that this function returns for (layout, n_classes, length)"
+        " (default: the paper's network)",
     )
     add_device(parser)
     parser.set_defaults(run=run)
@@ -49,10 +60,15 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train, evaluate on the test recordings, save."""
+    out = Path(args.out)
+    bundled = out.suffix == ".bundle"
+    if bundled and out.exists():
+        raise ValueError(f"{out} exists: choose another name, or remove it")
     recordings, where = load_recordings(args, args.recordings, labelled=True), device(args)
 
     from adaptfault.data.windows import make_windows, split
     from adaptfault.evaluation.scores import evaluate
+    from adaptfault.evaluation.training_check import plot_training, training_problems
     from adaptfault.models.network import TactileTransformer
     from adaptfault.models.store import save_model
     from adaptfault.models.training import train
@@ -60,11 +76,12 @@ def run(args: argparse.Namespace) -> int:
     windows = make_windows(recordings.frames, recordings.labels, recordings.layout, length=args.length)
     parts = split(windows, seed=args.seed)
     say(args, f"{recordings.layout}; {windows}")
-    model = TactileTransformer(recordings.layout, len(recordings.class_names), length=args.length, seed=args.seed)
-    out = Path(args.out)
-    bundled = out.suffix == ".bundle"
-    if bundled and out.exists():
-        raise ValueError(f"{out} exists: choose another name, or remove it")
+    n_classes = len(recordings.class_names)
+    model: TactileTransformer | AnyModel
+    if args.builder:
+        model = _built(args.builder, windows, recordings.layout, n_classes)
+    else:
+        model = TactileTransformer(recordings.layout, n_classes, length=args.length, seed=args.seed)
     folder = out.with_name(f".{out.name}.training") if bundled else out
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / "training.safetensors"
@@ -83,29 +100,48 @@ def run(args: argparse.Namespace) -> int:
     scores = evaluate(model.cpu(), parts[2])
     extra = {"split_seed": args.seed, "test_scores": scores.to_dict(), "history": history.to_dict()}
     if bundled:
-        say(args, "learning what healthy looks like")
+        say(args, "fitting the healthy model of the diagnosis")
         _bundle(args, out, recordings, model, parts)
         shutil.rmtree(folder)
     else:
         save_model(out, model, class_names=recordings.class_names, extra=extra)
-        checkpoint.unlink()  # the run is complete: what it left to resume from is the model itself
+        checkpoint.unlink()  # the run is complete: nothing is left to resume
     kind = "bundle" if bundled else "model"
+    picture = out.with_name(f"{out.stem}.training.png") if bundled else out / "training.png"
+    plot_training(scores, history, recordings.class_names).savefig(picture, dpi=120)
+    problems = training_problems(scores, history, recordings.class_names)
+    for problem in problems:
+        print(f"warning: {problem}", file=sys.stderr)
     emit(
         args,
-        {"schema": "adaptfault.train/1", kind: str(out), **extra},
-        f"test: {scores}\ntraining: {history}\n{kind}: {out}",
+        {"schema": "adaptfault.train/1", kind: str(out), **extra, "picture": str(picture), "problems": list(problems)},
+        f"test: {scores}\ntraining: {history}\n{kind}: {out}\npicture: {picture}",
     )
-    return 0
+    return int(args.strict and bool(problems))
+
+
+def _built(builder: str, windows: Windows, layout: SensorLayout, n_classes: int) -> TactileTransformer | AnyModel:
+    """Build the user's model; naming the builder on the command line allows it."""
+    from adaptfault.models.any_model import AnyModel
+    from adaptfault.models.builders import allow_model, build_model
+    from adaptfault.models.network import as_tensor
+
+    allow_model(builder)
+    model = build_model(builder, layout, n_classes, length=windows.x.shape[1])
+    wrapped = AnyModel.probe(model, layout, as_tensor(windows.x[:8]))
+    if wrapped.n_classes != n_classes:
+        raise ValueError(f"--model {builder} has {wrapped.n_classes} outputs, the recordings have {n_classes} classes")
+    return wrapped
 
 
 def _bundle(
     args: argparse.Namespace,
     out: Path,
     recordings: Recordings,
-    model: TactileTransformer,
+    model: TactileTransformer | AnyModel,
     parts: tuple[Windows, Windows, Windows],
 ) -> None:
-    """Make the bundle: the test recordings become the windows that new versions are judged on."""
+    """Make the bundle; new versions are tested on the windows of the test recordings."""
     import numpy as np
 
     from adaptfault.adaptation.adapter import Adapter

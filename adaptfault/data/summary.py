@@ -76,13 +76,14 @@ class Summary:
     def __str__(self) -> str:
         layout, present = self.layout, self.layout.present.ravel()
         least, most = int(self.lengths.min()), int(self.lengths.max())
+        missing = int(self.missing[present].sum())
         frames = f"{least} frames" if least == most else f"{least} to {most} frames"
         rows = {
             "recordings": f"{len(self.lengths)} of {frames} each, {self.lengths.sum() / layout.rate:.0f} s in all",
             "array": str(layout),
             "readings": self._readings(),
             "rest level": f"{_number(_median(self.rest[present]))} (median over the cells)",
-            "missing": f"{int(self.missing[present].sum())} readings",
+            "missing": "1 reading" if missing == 1 else f"{missing} readings",
             "silent": self._silent(),
             "classes": self._classes(),
         }
@@ -104,7 +105,8 @@ class Summary:
             return "no cell: every cell changes"
         places = ["pad {}, row {}, column {}".format(*self.layout.position(int(c))) for c in silent[:_LISTED]]
         more = [f"and {silent.size - _LISTED} more"] if silent.size > _LISTED else []
-        text = f"{silent.size} of {int(self.layout.present.sum())} cells never change (not loaded, or faulty)"
+        change = "changes" if silent.size == 1 else "change"
+        text = f"{silent.size} of {int(self.layout.present.sum())} cells never {change} (not loaded, or faulty)"
         return f"{text}: {'; '.join([*places, *more])}"
 
     def _classes(self) -> str:

@@ -1,4 +1,4 @@
-"""The main job in one run: grasps in, sensor broken, faults found, classifier repaired, a report written."""
+"""The demonstration in one run: train, break the sensor, diagnose, adapt, write a report."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from adaptfault.models.network import TactileTransformer
 from adaptfault.models.training import train
 from diagnostics import Diagnosis, Fault, FaultKind, FaultSet, SelfDiagnosis, SensorLayout, inject, line_fault
 
-_LOG_RECORDINGS = 20  # of the broken sensor, that the diagnosis gets to see
-_SHOWN = 8  # faults listed, of each kind of list; the report has all
+_LOG_RECORDINGS = 20  # of the broken sensor, for the diagnosis
+_SHOWN = 8  # faults printed of each list; the report has all
 
 
 @dataclass(frozen=True, eq=False)
 class DemoResult:
-    """Everything that the run measured.
+    """The results of the run.
 
     Attributes:
-        recordings: what it ran on.
-        seed: of everything.
+        recordings: the input.
+        seed: of the whole run.
         injected: the known faults.
         fault_free, broken, repaired: scores of the test windows: healthy sensor; broken sensor and the fault-free
             model; broken sensor and the adapted model.
@@ -113,7 +113,7 @@ def run_demo(
     progress: bool | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> DemoResult:
-    """Run the main job.
+    """Run the demonstration.
 
     Args:
         recordings: labelled and fault-free.
@@ -121,9 +121,9 @@ def run_demo(
         epochs, learning_rate: of training; epochs at most.
         network: other options of the network, as ``padding``.
         seed: of the split, the weights, training and the faults.
-        checkpoint: where training leaves what it needs to go on after a crash.
+        checkpoint: file from which training continues after a crash.
         progress: show or hide progress on stderr; None shows it on a terminal.
-        say: told each result when it is there, one line at a time.
+        say: called with each result as one line of text.
 
     Raises:
         ValueError: no labels, or too few recordings to split.
@@ -193,18 +193,18 @@ def _broken(
 def _diagnosed(
     layout: SensorLayout, healthy: Sequence[NDArray[Any]], log: Sequence[NDArray[np.float64]], clock: _Clock
 ) -> Diagnosis:
-    """Learn what healthy looks like, and diagnose the log."""
-    with clock("learning what healthy looks like"):
+    """Fit the healthy model, and diagnose the log."""
+    with clock("fitting the healthy model"):
         diagnoser = SelfDiagnosis(layout).fit(healthy)
     with clock("diagnosis"):
         return diagnoser.diagnose(log)
 
 
 def _summary(result: DemoResult) -> str:
-    """Say in one line what the faults did and what the repair brought back."""
+    """Return the accuracy before the faults, with them, and after the repair, in one line."""
     steps = {"fault-free": result.fault_free, "broken": result.broken, "repaired": result.repaired}
-    told = " -> ".join(f"{scores.accuracy:.3f} {name}" for name, scores in steps.items())
-    return f"accuracy     {told} ({result.recovered:.0%} of fault-free) in {result.seconds['adaptation']:.1f} s"
+    sequence = " -> ".join(f"{scores.accuracy:.3f} {name}" for name, scores in steps.items())
+    return f"accuracy     {sequence} ({result.recovered:.0%} of fault-free) in {result.seconds['adaptation']:.1f} s"
 
 
 def _list(say: Callable[[str], None], lines: Sequence[str]) -> None:
@@ -215,11 +215,14 @@ def _list(say: Callable[[str], None], lines: Sequence[str]) -> None:
 
 
 def _found(diagnosis: Diagnosis, injected: Sequence[Fault], n_log: int, seconds: float) -> str:
-    """Say what was found against what was injected."""
+    """Return the number of injected faults that were found, and of those that the log cannot show."""
     true = {cell for fault in injected for cell in fault.cells}
+    false = len(diagnosis.fault_set - true)
+    missed = len(true & set(diagnosis.coverage.untested.tolist()))
+    untested = f" ({missed} not tested by the log)" if missed else ""
     return (
-        f"diagnosis    found {len(diagnosis.fault_set & true)} of {len(true)} broken cells,"
-        f" {len(diagnosis.fault_set - true)} false alarms, from {n_log} recordings in {seconds:.2f} s;"
+        f"diagnosis    found {len(diagnosis.fault_set & true)} of {len(true)} broken cells{untested},"
+        f" {false} false alarm{'' if false == 1 else 's'}, from {n_log} recordings in {seconds:.2f} s;"
         f" {diagnosis.coverage}"
     )
 
@@ -258,7 +261,7 @@ def _labelled(windows: Windows, which: NDArray[np.int64], recordings: Recordings
 def _force_maps(
     normal: Sequence[NDArray[Any]], broken: Sequence[NDArray[Any]], adaptation: Adaptation, layout: SensorLayout
 ) -> dict[str, NDArray[np.float64]]:
-    """Return mean forces ``[D]`` as the healthy sensor, the broken sensor and the repaired model see them."""
+    """Return mean forces ``[D]`` of the healthy sensor, of the broken one, and after imputation."""
     import torch
 
     from adaptfault.adaptation.reduced_model import phi

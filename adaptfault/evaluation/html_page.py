@@ -1,4 +1,4 @@
-"""HTML pages that need nothing else: templates filled in, pictures inside, written whole."""
+"""Renders self-contained HTML pages: pictures are embedded, no network is needed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def render(path: str | Path, template: str, **values: Any) -> Path:
-    """Fill a template of the package in and write it; returns the path.
+    """Render a template of the package into a file; return the path.
 
     Raises:
         OSError: the folder cannot be written.
@@ -30,7 +30,7 @@ def render(path: str | Path, template: str, **values: Any) -> Path:
 
 
 def embedded(figure: Figure) -> str:
-    """Return a figure as the address of a PNG that holds its own data."""
+    """Return a figure as a data URI of a PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=130)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

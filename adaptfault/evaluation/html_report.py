@@ -1,4 +1,4 @@
-"""The report of a repair: one HTML file that needs nothing else, for the technician."""
+"""The report of a demonstration: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Row:
-    """An injected fault beside what was found of it."""
+    """An injected fault, with the number of its cells that were found and that the log did not test."""
 
     injected: str
     cells: int
     found: int
+    untested: int
     causes: tuple[str, ...]
 
 
@@ -50,12 +51,20 @@ def write_report(path: str | Path, result: DemoResult) -> Path:
 
 
 def _rows(result: DemoResult) -> list[_Row]:
-    faulty = result.diagnosis.fault_set
+    faulty, untested = result.diagnosis.fault_set, set(result.diagnosis.coverage.untested.tolist())
     rows = []
     for fault in result.injected:
         causes = tuple(f.reason for f in result.diagnosis.faults if set(f.cells) & set(fault.cells))
         found = sum(cell in faulty for cell in fault.cells)
-        rows.append(_Row(fault.describe(result.recordings.layout), len(fault.cells), found, causes))
+        rows.append(
+            _Row(
+                fault.describe(result.recordings.layout),
+                len(fault.cells),
+                found,
+                len(untested & set(fault.cells)),
+                causes,
+            )
+        )
     return rows
 
 
@@ -65,11 +74,11 @@ def _false_alarm_texts(result: DemoResult) -> list[str]:
 
 
 def _draw_maps(result: DemoResult) -> Figure:
-    """Draw mean forces as the paper's Figure 3, with a third row: what the repaired model sees."""
+    """Draw mean forces as the paper's Figure 3, with a third row: the forces after imputation."""
     layout = result.recordings.layout
     figure, axes = pads_figure(layout, n_rows=len(result.maps))
     masked = {name: np.where(layout.present.ravel(), values, np.nan) for name, values in result.maps.items()}
-    # One colour scale for all, from the healthy map: a short then stands out as what it is, off the scale.
+    # One colour scale for all, from the healthy map: a short is then off the scale.
     top = float(np.nanmax(masked["normal"])) or layout.full_scale
     marks = {"normal": FaultSet((), layout.n_cells), "broken": result.injected_set}
     for (name, values), row in zip(masked.items(), axes, strict=True):

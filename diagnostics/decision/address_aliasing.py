@@ -1,4 +1,10 @@
-"""From lines that read alike to their cause: a stuck address bit, a bridge of neighbours, or one line read twice."""
+"""Address aliasing: the cause of pairs of lines that read the same.
+
+Detects a stuck address bit (pairs whose indices differ in one bit), a bridge of two neighbouring lines, and one line
+read twice. A bit explains several pairs with one fault and is preferred; it is refuted when another pair of the same
+bit differs later. The level of a bit follows from the log ratio of the plausibility of the lines that it leaves intact,
+under the healthy model; below 3 both levels are reported. Lines that nothing loads are not detected here.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +21,22 @@ if TYPE_CHECKING:
     from diagnostics.evidence.stream_state import StreamState
     from diagnostics.healthy.prediction import Prediction
 
-_CLEAR = 3.0  # log ratio: below it the data cannot tell which level a bit is stuck at
+_CLEAR = 3.0  # log ratio of the two levels of a bit; below it both are reported
 
 
 @dataclass(frozen=True)
 class Aliasing:
-    """Lines that read each other.
+    """Lines that read the same.
 
     Attributes:
         line: the address bit, or the first of two lines.
-        value: the bit's level, or the number of the other line.
-        cells: those that do not read themselves.
-        onset: number of the first frame of it; 0: from the first on.
-        witnesses: how often two lines agreed on a moving load.
-        copies: pairs (line, line that it reads instead; -1: none is connected).
-        doubtful: cells that may be the misread ones instead.
-        alternatives: what else the data allow.
+        value: the level of the bit, or the index of the other line.
+        cells: indices of the cells that are misread.
+        onset: number of the first frame; 0: from the start.
+        witnesses: number of moving loads on which the lines agreed.
+        copies: pairs (line, line that is read instead; -1: none is connected).
+        alternatives: other causes that the data permit.
+        doubtful: indices of the cells that may be the misread ones instead.
     """
 
     line: Line
@@ -44,11 +50,11 @@ class Aliasing:
 
 
 def find_aliasing(stream: StreamState) -> tuple[Aliasing, ...]:
-    """Name the causes of all lines that read alike."""
+    """Return the causes of all lines that read the same."""
     pairs = stream.duplicates.duplicate_pairs(stream.reference.duplicates)
     found: list[Aliasing] = []
-    for pad, kind in sorted({(j.pad, j.kind) for j in pairs}):
-        found += _on_pad([j for j in pairs if (j.pad, j.kind) == (pad, kind)], stream)
+    for pad, kind in sorted({(pair.pad, pair.kind) for pair in pairs}):
+        found += _on_pad([pair for pair in pairs if (pair.pad, pair.kind) == (pad, kind)], stream)
     return tuple(found)
 
 
@@ -56,27 +62,29 @@ def _on_pad(pairs: list[DuplicatePair], stream: StreamState) -> list[Aliasing]:
     layout, pad, kind = stream.layout, pairs[0].pad, pairs[0].kind
     count = layout.rows if kind == "row" else layout.cols
     found = []
-    left = list(pairs)
+    remaining = list(pairs)
     for bit in range(address_bits(count)):
-        by_bit = [j for j in left if j.second - j.first == 1 << bit and not j.first & 1 << bit]
+        by_bit = [pair for pair in remaining if pair.second - pair.first == 1 << bit and not pair.first & 1 << bit]
         if not by_bit:
             continue
         others = [(i, i | 1 << bit) for i in range(count) if not i & 1 << bit and (i | 1 << bit) < count]
         differ_since = [stream.duplicates.apart_since(pad, kind, a, b) for a, b in others]
-        # The bit was stuck when the first two lines were seen to agree, so no two lines of its may differ after that.
-        refuted = max(differ_since) > min(j.seen_by for j in by_bit)
-        # One pair of neighbours may as well be bridged: a bit joins more of them, wherever there are more.
+        # The bit was stuck when the first pair agreed, so no other pair of this bit may differ after that.
+        refuted = max(differ_since) > min(pair.seen_by for pair in by_bit)
+        # A single pair of neighbours is rather bridged: bit 0 would join all of them.
         if refuted or (len(by_bit) == 1 and bit == 0 and len(others) > 1):
             continue
-        left = [j for j in left if j not in by_bit]
+        remaining = [pair for pair in remaining if pair not in by_bit]
         found.append(_stuck_bit(Line(pad, _address(kind), bit), by_bit, max(differ_since), stream))
-    for j in left:
-        line = Line(pad, kind, j.first)
-        other = Line(pad, kind, j.second)
+    for pair in remaining:
+        line = Line(pad, kind, pair.first)
+        other = Line(pad, kind, pair.second)
         cells = np.concatenate([layout.cells_on(line), layout.cells_on(other)])
         also = (f"{line} reads {other}, or the other way round: an address fault of this one line",)
         found.append(
-            Aliasing(line, j.second, tuple(cells.tolist()), j.since, j.witnesses, ((j.first, j.second),), also)
+            Aliasing(
+                line, pair.second, tuple(cells.tolist()), pair.since, pair.witnesses, ((pair.first, pair.second),), also
+            )
         )
     return found
 
@@ -95,14 +103,16 @@ def _stuck_bit(line: Line, pairs: list[DuplicatePair], onset: int, stream: Strea
     for cell, source in zip(cells.tolist(), sources.tolist(), strict=True):
         read = layout.position(source)[across] if source >= 0 else -1
         moved = layout.position(cell)[across]
-        copies[moved] = max(read, copies.get(moved, -1))  # a masked position reads nothing, the line still is read
+        copies[moved] = max(
+            read, copies.get(moved, -1)
+        )  # a position without a cell reads nothing, its line is read still
     clear = abs(ratio) >= _CLEAR
     return Aliasing(
         line,
         level,
         tuple(cells.tolist()),
         onset,
-        sum(j.witnesses for j in pairs),
+        sum(pair.witnesses for pair in pairs),
         tuple(sorted(copies.items())),
         () if clear else (f"{line} is stuck at {1 - level}",),
         () if clear else tuple(layout.misaddressed(line, 1 - level)[0].tolist()),
@@ -112,32 +122,32 @@ def _stuck_bit(line: Line, pairs: list[DuplicatePair], onset: int, stream: Strea
 def _level_ratio(line: Line, onset: int, stream: StreamState) -> float:
     """Return the log ratio of a bit stuck at 1 against stuck at 0.
 
-    Under each level other lines are read truly: which of the two sets makes sense, each cell given all the others?
+    Each level leaves other lines intact; the ratio compares their pseudo-likelihoods under the healthy model.
     """
     layout = stream.layout
     ratio = 0.0
     for level, sign in ((0, -1.0), (1, 1.0)):
         wrong, sources = layout.misaddressed(line, level)
-        true, empty = np.unique(sources[sources >= 0]), wrong[sources < 0]
+        intact, empty = np.unique(sources[sources >= 0]), wrong[sources < 0]
         predictors = stream.present.copy()
         predictors[wrong] = False
         loaded = False
-        for features, cells, judged, model in stream.views(onset):
-            those = judged[np.isin(cells[judged], true)]
-            if len(those):
-                ratio += sign * _plausible(features, model.predict(features, predictors[cells]), those)
+        for features, cells, modelled, model in stream.views(onset):
+            scored = modelled[np.isin(cells[modelled], intact)]
+            if len(scored):
+                ratio += sign * _plausible(features, model.predict(features, predictors[cells]), scored)
             loaded |= bool((features[:, 2, np.isin(cells, empty)] > 0).any())
-        # What nothing is connected to never reads a load.
+        # An address without a line never reads a load.
         if loaded:
             ratio -= sign * 10.0
     return ratio
 
 
 def _plausible(features: NDArray[np.float32], expected: Prediction, cells: NDArray[np.intp]) -> float:
-    """Return how well it fits what is expected whether the cells are loaded, and how hard, a log likelihood."""
+    """Return the log likelihood of being loaded, and of the load, summed over cells and averaged over events."""
     loaded = features[:, 2, cells] > 0
     p = np.where(loaded, 1 - expected.never[:, cells], expected.never[:, cells])
-    # Student's t with 4 degrees of freedom, from its top; nothing where it is unknown how a cell reads under load.
+    # Student's t with 4 degrees of freedom, relative to its mode; 0 where the spread is unknown.
     z = np.where(loaded, (features[:, 1, cells] - expected.mean[:, cells]) / expected.spread[cells], 0.0)
-    hard = -2.5 * np.log1p(np.nan_to_num(z) ** 2 / 4)
-    return float((np.log(np.maximum(p, 1e-3)) + hard).mean(axis=0).sum())
+    load = -2.5 * np.log1p(np.nan_to_num(z) ** 2 / 4)
+    return float((np.log(np.maximum(p, 1e-3)) + load).mean(axis=0).sum())

@@ -1,10 +1,15 @@
-"""Turns evidence into probability: fitted on faults of our own making, injected into the fault-free recordings.
+"""Calibration: log likelihood ratios to probabilities, fitted on faults injected into the fault-free recordings.
 
-A raw log likelihood ratio is too sure of itself: touches are few and alike, and an object's edge surprises everyone. So
-the reference is split, one part explains logs made of the other, with known faults in them, and a logistic
-regression learns what a ratio is worth: for cells that never moved in the log, that came to rest, and that came to hold
-a load. How common faults are is not learned there: it is estimated from the log at hand (empirical Bayes), because it
-differs from one robot to the next.
+Estimates, for each of three kinds of constant cells (never moved; came to rest; came to hold a load),
+
+    log odds = logit(prevalence) + a + b min(spatial, 6) + c max(spatial - 6, 0) + d temporal
+
+Raw ratios are overconfident, because events are few and correlated and models err at edges of objects. The reference is
+split; models of one part diagnose logs made of the other part, with known faults. Equals Platt scaling (Platt 1999),
+scikit-learn's ``CalibratedClassifierCV(method="sigmoid")``, with a second slope in the tail. The prevalence is not
+calibrated: it is estimated from each log by expectation maximisation (Saerens et al. 2002). The faulty set is the
+largest one whose expected false discovery rate meets the limit (:func:`faulty_at`). Faults unlike the injected ones are
+calibrated as well as these only by assumption.
 """
 
 from __future__ import annotations
@@ -29,35 +34,35 @@ from diagnostics.simulation.injection import inject
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
-_LOGS, _LOGS_OF_LARGE = 192, 32  # drawn to fit the weights; large arrays have more cells in each
+_LOGS, _LOGS_OF_LARGE = 192, 32  # simulated logs: sizes; large arrays have more cells in each
 _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
 _DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
 _FEWEST_RECORDINGS = 8  # below that the reference cannot be split
-_FEWEST_CELLS = 10  # broken and healthy, that teach what evidence is worth
-_ENOUGH = 100  # recordings that are held out, in turn where need be
-_FEW = 32  # recordings: fewer are cut, so that a single long one can be split too
-_PIECE = 100  # frames that are left of one, at least
-_MOST_FRAMES = 600  # of a recording in one log
-_LEARNED_SHARE = 0.75  # of the recordings teach what healthy looks like, the others make the logs
-_MOST_TEMPORAL = 1.0  # what temporal evidence may be worth, whatever the logs say: a jump alone proves nothing
+_FEWEST_CELLS = 10  # broken, and healthy, cells of a kind: with fewer it keeps the defaults
+_ENOUGH = 100  # recordings that are held out in all, over the splits
+_FEW = 32  # recordings: fewer are cut into pieces, so that one long recording can be split
+_PIECE = 100  # frames of a piece, at least
+_MOST_FRAMES = 600  # of a recording in one simulated log: a size
+_TRAINING_SHARE = 0.75  # of the recordings; the others make the simulated logs
+_MOST_TEMPORAL = 1.0  # upper limit of d: a jump alone proves no fault
 _KINDS = 3
-_LOADED_THROUGHOUT = 3  # a cell that never moved and holds a load: weighed as kind 0, but for what is beyond
-_SUSPICIOUS = 2.8  # log likelihood ratio from which on a cell is left out when others are judged
-_SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw one
-_DOUBT, _STRANGE = 0.5, 22.0  # so much of the evidence does not count where few recordings were held out, and how few
-_LOOSE = 10.0  # variance of the weights before any log is seen
-_ODD = 0.003  # of the healthy cells may be held for certain to be faulty: with all recordings the model errs less
-_CLIP = 6.0  # log ratios beyond this say "certain"; they must not steer the fit
-_SURE = 24.0  # and beyond this, not even more certain
-_EXPECTED, _EXPECTED_LATE = 0.02, 0.005  # share of faulty cells before a log is seen: from the start, and in it
-_EXPECTED_CELLS, _EXPECTED_CELLS_LATE = 35.0, 25.0  # worth so many cells
+_LOADED_THROUGHOUT = 3  # never moved and holds a load: calibrated as kind 0, without a second slope
+_SUSPICIOUS = 2.8  # calibrated log ratio from which on a cell is excluded from the predictors
+_SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw log ratio at that point
+_MAX_DISCOUNT, _HALF_DISCOUNT = 0.5, 22.0  # of the slopes; recordings held out that halve it (one split)
+_PRIOR_VARIANCE = 10.0  # of the weights
+_ODD = 0.003  # share of the healthy cells beyond the clip from which on a second slope is fitted
+_CLIP = 6.0  # raw log ratio at which the second slope begins: outliers must not steer the first
+_MAX_RATIO = 24.0  # raw log ratios are clipped here
+_EXPECTED, _EXPECTED_LATE = 0.02, 0.005  # prior shares: faulty from the start, failing in the log
+_EXPECTED_CELLS, _EXPECTED_CELLS_LATE = 35.0, 25.0  # pseudo-counts of these priors
 _MOVING_ODDS = -10.0  # log odds of a fault that holds one value, for a cell that moves
 
 Floats = NDArray[np.float64]
 
 
 class _Trial(NamedTuple):
-    """What a log with known faults says of its still cells, ``[n]`` each, and of the gains of all that work."""
+    """Evidence of the constant cells of a simulated log, ``[n]`` each, and of the gains of the working cells."""
 
     kind: NDArray[np.intp]
     ratio: Floats
@@ -68,16 +73,16 @@ class _Trial(NamedTuple):
 
 @dataclass(frozen=True)
 class Calibrator:
-    """What raw log likelihood ratios are worth, for each kind of still cell.
+    """Calibrated log ratio of each kind of constant cell; the defaults are those of a cold start.
 
-    Kind 0 never moved in the log, kind 1 came to rest, kind 2 came to hold a load. The defaults serve a cold start.
+    Kind 0 never moved in the log, kind 1 came to rest, kind 2 came to hold a load.
 
     Attributes:
-        offset, slope, temporal: log odds = ``offset + slope * spatial ratio + temporal * temporal ratio``, before how
-            common faults are; of each kind.
-        beyond: the slope for as much of the spatial ratio as says "certain"; of cells of kind 0 that hold a load it
-            is the slope, as ever: what expects too many loads is no reason to doubt them.
-        gains: share of the evidence of another gain that counts.
+        offset: a, by kind.
+        slope: b, by kind.
+        temporal: d, by kind.
+        tail_slope: c, by kind; cells of kind 0 that hold a load use b.
+        gains: factor on the evidence of a changed gain.
     """
 
     offset: tuple[float, ...] = (0.0, -1.0, -1.0)
@@ -88,12 +93,12 @@ class Calibrator:
 
     @classmethod
     def fit(cls, recordings: Sequence[Floats], layout: SensorLayout, *, seed: int = 0) -> Calibrator:
-        """Fit on fault-free recordings, ``[T, D]`` each; too few of them give the defaults."""
+        """Fit to fault-free recordings, ``[T, D]`` each; fewer than 8 give the defaults."""
         rng = np.random.default_rng(seed)
         n_logs = _LOGS if layout.present.sum() <= MOST_CELLS else _LOGS_OF_LARGE
         recordings, layout = calibration_subset(recordings, layout)
         cuts = -(-_FEW // len(recordings)) if recordings else 0
-        # What one recording holds is alike: its pieces stay together, here as when others are held out.
+        # Pieces of one recording are correlated: they stay on the same side of a split.
         recordings = [
             piece
             for i in rng.permutation(len(recordings)).tolist()
@@ -102,11 +107,11 @@ class Calibrator:
         if len(recordings) < _FEWEST_RECORDINGS:
             return cls()
         order = np.arange(len(recordings))
-        fit_stacking = round(_LEARNED_SHARE * len(order))
-        held_out = len(order) - fit_stacking
-        # Others are held out in turn, the more often the fewer there are: strange touches are among them the sooner.
+        n_training = round(_TRAINING_SHARE * len(order))
+        held_out = len(order) - n_training
+        # Repeated splits, more with fewer recordings: so unusual events are held out at least once.
         turns = max(2, min(len(order), _ENOUGH) // held_out)
-        parts = [np.split(np.roll(order, k * held_out), [fit_stacking]) for k in range(turns)]
+        parts = [np.split(np.roll(order, k * held_out), [n_training]) for k in range(turns)]
         references = [Reference.fit([recordings[i] for i in those], layout) for those, _ in parts]
         logs = []
         for i in range(n_logs):
@@ -117,12 +122,12 @@ class Calibrator:
             share = _DEAD_SHARES[i // len(_LOG_SIZES) % len(_DEAD_SHARES)]
             onset = int(rng.uniform(0, 0.8) * len(log)) if i % 2 else None
             logs.append((log, _random_faults(layout, share, onset, rng), layout, references[turn]))
-        # Evidence depends on who is suspected, and that on what evidence is worth: first roughly, then well.
+        # Evidence depends on the exclusion threshold and that on the calibration: fit roughly, then with all logs.
         weights = default = cls()
         for n in (n_logs // 3, n_logs):
             weights = cls._of([_trial(*log, weights.exclusion._replace(gains=1.0)) for log in logs[:n]])
-        # Few meet the strange touches; those held out in turn teach one another, and count for fewer.
-        counts = 1 - _DOUBT / (1 + turns * (held_out / _STRANGE) ** 2)
+        # Few held-out recordings contain few unusual events; repeated splits are correlated and count for less.
+        counts = 1 - _MAX_DISCOUNT / (1 + turns * (held_out / _HALF_DISCOUNT) ** 2)
         measured = np.array(weights.slope) != default.slope
         slope, tail_slope = (
             np.where(measured, counts * np.array(of), of) for of in (weights.slope, weights.tail_slope)
@@ -131,28 +136,28 @@ class Calibrator:
 
     @classmethod
     def _of(cls, trials: Sequence[_Trial]) -> Calibrator:
-        """Fit on trials; a kind of which they hold too few broken or healthy cells keeps the defaults."""
+        """Fit to simulated logs; a kind with too few broken or healthy cells keeps the defaults."""
         *measured, gain = zip(*trials, strict=True)
         kind, ratio, temporal, dead = (np.concatenate(column) for column in measured)
         evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
         default = cls()
         found = list(zip(default.offset, default.slope, default.temporal, default.tail_slope, strict=True))
         for k in range(_KINDS):
-            of, matching = kind % _KINDS == k, (kind % _KINDS > 0) == (k > 0)
+            of, same_origin = kind % _KINDS == k, (kind % _KINDS > 0) == (k > 0)
             if min(dead[of].sum(), (~dead[of]).sum()) >= _FEWEST_CELLS:
-                base = float(logit(dead[matching].mean()))
+                base = float(logit(dead[same_origin].mean()))
                 fitted = _bounded_logistic(evidence[of], dead[of], base)
                 if fitted[1] > 0:
                     these = kind == k
                     odds = base + fitted[0] + evidence[these] @ fitted[1:]
-                    found[k] = (*fitted, _slope_beyond(ratio[these], odds, dead[these], fitted[1]))
+                    found[k] = (*fitted, _tail_slope(ratio[these], odds, dead[these], fitted[1]))
         offset, slope, temporal_share, tail_slope = zip(*found, strict=True)
         return cls(offset, slope, temporal_share, tail_slope, gains_count(max(gain)))
 
     @property
     def exclusion(self) -> Exclusion:
-        """The ratio from which on a cell is no longer asked about the others, and what gains are worth."""
-        missing = _SUSPICIOUS - self.offset[0] - self.slope[0] * _CLIP  # where evidence says "certain"
+        """The raw log ratio from which on a cell is excluded from the predictors, and the factor of gains."""
+        missing = _SUSPICIOUS - self.offset[0] - self.slope[0] * _CLIP  # at the clip
         threshold = _CLIP + missing / (self.slope[0] if missing < 0 else max(self.tail_slope[0], 1e-9))
         return Exclusion(float(np.clip(threshold, *_SUSPICIOUS_BOUNDS)), self.gains)
 
@@ -167,67 +172,71 @@ class Calibrator:
         weights = self.offset, self.slope, self.temporal, self.tail_slope
         offset, slope, share, tail_slope = (np.array(of)[kind % _KINDS] for of in weights)
         tail_slope = np.where(kind == _LOADED_THROUGHOUT, slope, tail_slope)
-        certain = np.clip(ratio - _CLIP, 0.0, _SURE - _CLIP)
-        calibrate: Floats = offset + slope * np.clip(ratio, -_SURE, _CLIP) + tail_slope * certain + share * temporal
-        return calibrate
+        certain = np.clip(ratio - _CLIP, 0.0, _MAX_RATIO - _CLIP)
+        log_ratio: Floats = (
+            offset + slope * np.clip(ratio, -_MAX_RATIO, _CLIP) + tail_slope * certain + share * temporal
+        )
+        return log_ratio
 
-    def probability(self, calibrate: Floats, kind: NDArray[np.intp], scored: NDArray[np.bool_]) -> Floats:
-        """Return P(holds one value for ever) ``[D]``, from what the evidence is worth.
+    def probability(self, log_ratio: Floats, kind: NDArray[np.intp], scored: NDArray[np.bool_]) -> Floats:
+        """Return P(stuck), ``[D]``.
 
-        Only the cells that were ``scored`` (bool ``[D]``) are still; the others move, and are as good as alive.
+        Args:
+            log_ratio: float ``[D]``, calibrated log likelihood ratio.
+            kind: int ``[D]``, see the class.
+            scored: bool ``[D]``, constant cells; the others move and get log odds -10.
         """
-        probability = np.full(len(calibrate), float(expit(_MOVING_ODDS)))
-        began = kind % _KINDS > 0  # to be still
+        probability = np.full(len(log_ratio), float(expit(_MOVING_ODDS)))
+        began = kind % _KINDS > 0  # its run within the log
         late, early = scored & began, scored & ~began
-        probability[late] = _posterior(calibrate[late], _EXPECTED_LATE, _EXPECTED_CELLS_LATE)
-        # Of the cells that never moved as many broke in the log as of those that did, or they were broken before.
+        probability[late] = _posterior(log_ratio[late], _EXPECTED_LATE, _EXPECTED_CELLS_LATE)
+        # Cells that never moved failed before the log, or in it at the same rate as cells that moved.
         broke = probability[late].sum() / (began.sum() + _EXPECTED_CELLS)
-        probability[early] = _posterior(calibrate[early], _EXPECTED + float(broke), _EXPECTED_CELLS)
+        probability[early] = _posterior(log_ratio[early], _EXPECTED + float(broke), _EXPECTED_CELLS)
         return probability
 
 
-def _posterior(calibrate: Floats, expected: float, cells: float) -> Floats:
-    """Return P(faulty) ``[n]``; the share of faulty cells is found in these, ``expected`` counts like so many more."""
+def _posterior(log_ratio: Floats, expected: float, cells: float) -> Floats:
+    """Return P(faulty) ``[n]``; prevalence by EM, with the prior share ``expected`` worth ``cells`` cells."""
     share = expected
     for _ in range(100):
-        posterior = expit(calibrate + logit(share))
-        share, before = (posterior.sum() + expected * cells) / (len(calibrate) + cells), share
+        posterior = expit(log_ratio + logit(share))
+        share, before = (posterior.sum() + expected * cells) / (len(log_ratio) + cells), share
         if abs(share - before) < 1e-6:
             break
-    probability: Floats = expit(calibrate + logit(share))
+    probability: Floats = expit(log_ratio + logit(share))
     return probability
 
 
 def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) -> tuple[float, float, float]:
-    """Return offset, slope and the weight of the temporal ratio of a logistic regression, within bounds.
+    """Return a, b and d of a logistic regression with a <= 0, b >= 0, 0 <= d <= 1.
 
-    Evidence ``[n, 2]`` never speaks for what it speaks against, and none at all never speaks for a fault, however few
-    healthy cells a small reference shows in this state.
+    Without evidence the log ratio is never above 0, however few healthy cells a small reference has in this state.
 
     Args:
-        evidence: spatial and temporal ratio.
+        evidence: ``[n, 2]``, spatial and temporal log ratio.
         dead: bool ``[n]``.
-        base: log odds of a fault, before the evidence; how common faults were in these logs.
+        base: log odds of a fault in these logs.
     """
     bounds = [(None, 0.0), (0.0, None), (0.0, _MOST_TEMPORAL)]
-    offset, slope, temporal = _logistic(evidence, dead, base, np.array([0.0, 1.0, 0.5]), bounds, _LOOSE)
+    offset, slope, temporal = _logistic(evidence, dead, base, np.array([0.0, 1.0, 0.5]), bounds, _PRIOR_VARIANCE)
     return offset, slope, temporal
 
 
-def _slope_beyond(ratio: Floats, odds: Floats, dead: NDArray[np.bool_], default: float) -> float:
-    """Return what as much of a ratio is worth as says more than "certain", 0 to ``default``.
+def _tail_slope(ratio: Floats, odds: Floats, dead: NDArray[np.bool_], default: float) -> float:
+    """Return c, the slope above the clip, 0 to ``default``; ``default`` with too few healthy cells there.
 
     Args:
-        ratio: ``[n]``, of cells of one kind.
-        odds: log odds of a fault by all that is said up to there, ``[n]``.
+        ratio: ``[n]``, raw log ratio of cells of one kind.
+        odds: ``[n]``, log odds of a fault with the ratio clipped.
         dead: bool ``[n]``.
-        usual: what a ratio is worth up to there.
+        default: b.
     """
     certain = ratio > _CLIP
     if np.count_nonzero(certain & ~dead) <= _ODD * np.count_nonzero(~dead):
         return default
-    more = np.minimum(ratio[certain, None], _SURE) - _CLIP
-    # That it is less certain than said is another matter than what more of it is worth.
+    more = np.minimum(ratio[certain, None], _MAX_RATIO) - _CLIP
+    # The offset absorbs overconfidence at the clip; only the slope is used.
     _, slope = _logistic(more, dead[certain], odds[certain], np.zeros(2), [(None, 0.0), (0.0, default)])
     return slope
 
@@ -245,10 +254,10 @@ def _logistic(
     Args:
         evidence: ``[n, k]``.
         dead: bool ``[n]``.
-        base: log odds before the evidence, of all or of each ``[n]``.
-        start: ``[1 + k]``, where to begin.
+        base: offset of the log odds, one number or ``[n]``.
+        start: ``[1 + k]``, initial offset and weights.
         bounds: of each of these.
-        loose: variance of the weights before any of it is seen.
+        loose: prior variance of the weights.
     """
     from scipy.optimize import minimize
 
@@ -256,16 +265,16 @@ def _logistic(
 
     def loss(weights: Floats) -> tuple[float, Floats]:
         odds = base + x @ weights
-        slack = expit(odds) - dead
+        residual = expit(odds) - dead
         value = np.logaddexp(0, odds).sum() - odds[dead].sum() + 0.5 * (weights[1:] @ weights[1:]) / loose
-        return float(value), x.T @ slack + np.array([0, *weights[1:]]) / loose
+        return float(value), x.T @ residual + np.array([0, *weights[1:]]) / loose
 
     found: list[float] = minimize(loss, start, jac=True, bounds=bounds).x.tolist()
     return found
 
 
 def _excerpt(recording: Floats, rng: np.random.Generator) -> Floats:
-    """Return a recording, ``[T, D]``, or part of a long one."""
+    """Return a recording ``[T, D]``, or a random part of a long one."""
     begin = int(rng.integers(len(recording) - _MOST_FRAMES)) if len(recording) > _MOST_FRAMES else 0
     return recording[begin : begin + _MOST_FRAMES]
 
@@ -279,7 +288,7 @@ def kinds(stream: StreamState) -> NDArray[np.intp]:
 def _trial(
     log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference, exclusion: Exclusion
 ) -> _Trial:
-    """Return what is said when ``faults`` are in a log."""
+    """Return the evidence of a log with ``faults`` injected."""
     stream = StreamState(layout, reference, exclusion)
     stream.extend(inject(log, faults, layout))
     stream = stream.complete()
@@ -291,18 +300,18 @@ def _trial(
 
 
 def faulty_at(probability: Floats, false_discovery_rate: float) -> NDArray[np.bool_]:
-    """Return the set of cells whose expected share of false alarms comes near to the rate, bool ``[D]``.
+    """Return the faulty set at a Bayesian false discovery rate, bool ``[D]`` (Newton et al. 2004).
 
-    Near, and not below: few cells are found in one log, each is a bigger step than the last, and to stop short of the
-    rate every time would be to keep to a fraction of it: as far beyond it is as good. But the first keeps to it: most
-    robots are healthy. No cell that is rather alive than faulty is in the set, however good the others look.
+    Cells are taken in order of P(faulty) while the expected number of false ones, sum(1 - P), is as near as possible to
+    rate times size: an excess is accepted up to the shortfall before it, because sets are small and always stopping
+    below would meet only a fraction of the rate. The first cell must meet the rate, and each has P(faulty) > 0.5.
     """
     order = np.argsort(-probability, kind="stable")
     false = np.cumsum(1 - probability[order])  # expected among the first 1, 2, ...
     accepted = false_discovery_rate * np.arange(1, len(order) + 1)
-    tail_slope, short = false - accepted, accepted - np.concatenate([[0.0], false[:-1]])
-    short[:1] = 0.0
-    within = np.logical_and.accumulate(tail_slope <= np.maximum(short, 0.0))
+    excess, shortfall = false - accepted, accepted - np.concatenate([[0.0], false[:-1]])
+    shortfall[:1] = 0.0
+    within = np.logical_and.accumulate(excess <= np.maximum(shortfall, 0.0))
     chosen = np.zeros(len(probability), bool)
     chosen[order[within]] = True
     return chosen & (probability > 0.5)

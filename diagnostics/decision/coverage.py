@@ -1,4 +1,4 @@
-"""Coverage: what was tested, and which touches would test the rest."""
+"""Coverage: which cells a log has tested, and where to press to test the others."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How much of the array a log has put to the test, in the words of chip testing.
+    """Coverage of a log, in the terms of integrated-circuit testing (Bushnell and Agrawal 2000).
 
     Attributes:
-        fault_coverage: estimated share of the faulty cells that were found: what P(faulty) sums to over the cells in
-            F, out of what it sums to over all. One imaginary fault that may sit anywhere counts with them, found if
-            its cell was tested: so a log that tests nothing has 0, and one that tests all and finds nothing has 1.
-        test_coverage: share of the cells with a verdict other than UNTESTED.
-        untested: int ``[u]``, the cells that neither proved alive nor faulty.
-        advice: touches that would test them, one sentence a region, the largest first.
+        fault_coverage: estimated share of the faulty cells that are in F, 0 to 1: (sum of P(faulty) over F + test
+            coverage) / (sum of P(faulty) over all cells + 1). The 1 is a pseudo-count of one fault anywhere: a log that
+            tests nothing has coverage 0, one that tests all cells and finds no fault has 1.
+        test_coverage: share of the cells with a verdict other than UNTESTED, 0 to 1.
+        untested: int ``[u]``, indices of the cells without a verdict.
+        advice: where to press to test them, one sentence per region, the largest first.
     """
 
     fault_coverage: float
@@ -39,13 +39,13 @@ class Coverage:
 def coverage(
     untested: NDArray[np.bool_], faulty: NDArray[np.bool_], probability: NDArray[np.float64], layout: SensorLayout
 ) -> Coverage:
-    """Sum up a diagnosis.
+    """Return the coverage of a diagnosis.
 
     Args:
         untested: bool ``[D]``, cells without a verdict.
         faulty: bool ``[D]``, the cells in F.
         probability: float ``[D]``, P(faulty).
-        layout: the array; positions without a cell count nowhere.
+        layout: the array; positions without a cell do not count.
     """
     present = layout.present.ravel()
     tested = 1.0 - float(untested[present].mean())
@@ -55,12 +55,12 @@ def coverage(
         fault_coverage=(found + tested) / (expected + 1.0),
         test_coverage=tested,
         untested=np.flatnonzero(untested & present),
-        advice=_events(untested & present, layout),
+        advice=_advice(untested & present, layout),
     )
 
 
-def _events(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple[str, ...]:
-    """Return one sentence for each connected region of untested cells: where to press."""
+def _advice(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple[str, ...]:
+    """Return one sentence per connected region of untested cells, the largest first."""
     from scipy import ndimage
 
     regions: list[tuple[int, str]] = []

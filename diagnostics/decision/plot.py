@@ -1,4 +1,4 @@
-"""Draws pads as pictures: the verdict map, and force maps with the dead cells marked."""
+"""Figures of pads: the verdict map, and force maps with the dead cells marked."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def draw(layout: SensorLayout, verdicts: NDArray[np.intp], letters: Mapping[int,
     Args:
         layout: the array.
         verdicts: int ``[D]``, 0 alive, 1 faulty, 2 untested, as :class:`~diagnostics.Verdict` counts.
-        letters: what to print on a cell: the kind of its fault.
+        letters: letter of the fault kind, by cell.
     """
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch

@@ -1,4 +1,4 @@
-"""What a diagnosis says: a verdict for each cell, the root causes, the fault set F, and what was not tested."""
+"""Result of a diagnosis: a verdict for each cell, the root causes, the fault set F, and the coverage."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LETTERS = {
 
 
 class Verdict(IntEnum):
-    """What is known of a cell. UNTESTED is neither healthy nor faulty: nothing in the log could tell."""
+    """Verdict on one cell. UNTESTED is neither healthy nor faulty: no event of the log tested the cell."""
 
     ALIVE = 0
     FAULTY = 1
@@ -51,13 +51,12 @@ class Diagnosis:
         layout: the array.
         faults: one for each root cause: a broken row is one fault with many cells.
         probability: float ``[D]``, P(cell is faulty); 0 where the layout has no cell.
-        tested: bool ``[D]``: the log could tell whether the cell works.
-        evidence: what each kind of evidence says of each cell, ``[D]``: ``"spatial"`` and ``"temporal"``, log
-            likelihood ratios faulty : healthy (0: nothing), and ``"events"``, how many put the cell to the test. What
-            the wiring says is in ``faults``.
-        transport: lost frames and frozen streams: faults on the way of the frames, not of cells.
-        n_frames: length of the log.
-        n_recordings: recordings in the log.
+        tested: bool ``[D]``, the log tested whether the cell works.
+        n_frames: number of frames in the log.
+        n_recordings: number of recordings in the log.
+        transport: lost frames, frozen streams and invalid readings: faults of the link, not of cells.
+        evidence: float ``[D]`` each: ``"spatial"`` and ``"temporal"``, log likelihood ratios faulty : healthy (0: no
+            evidence), and ``"events"``, number of events that tested the cell. Evidence of wires is in ``faults``.
     """
 
     layout: SensorLayout
@@ -71,15 +70,15 @@ class Diagnosis:
 
     @cached_property
     def fault_set(self) -> FaultSet:
-        """F: the cells of all faults, which the adapter has to do without."""
+        """F: the cells of all faults; an adapter must not use their readings."""
         return FaultSet(tuple({c for fault in self.faults for c in fault.cells}), self.layout.n_cells)
 
     def suspects(self, probability: float = 0.02) -> FaultSet:
-        """F and every tested cell that is at least this probably faulty: what a classifier is better without.
+        """Return F and every tested cell with at least this P(faulty): the cells that a classifier should ignore.
 
-        F itself is cut where few are blamed wrongly. For a classifier that can fill cells in, a healthy cell lost costs
-        next to nothing, a faulty one kept a lot; ``examples/wrong_fault_set.py`` measures both. On real grasps they
-        weighed the same at a probability of 0.02 for cells that read 0 (at 0.001 for full scale).
+        F limits the false discovery rate. For a classifier that imputes cells, losing a healthy cell costs little and
+        keeping a faulty one much; ``examples/wrong_fault_set.py`` measures both. On real grasps the two costs are equal
+        at a probability of 0.02 for cells that read 0, and at 0.001 for full scale.
         """
         likely = np.flatnonzero(self.tested & (self.probability >= probability) & self.layout.present.ravel())
         return self.fault_set | FaultSet(tuple(likely.tolist()), self.layout.n_cells)
@@ -89,17 +88,17 @@ class Diagnosis:
         """Array ``[D]`` of :class:`Verdict`. A position without a cell is UNTESTED."""
         code = np.where(self.tested & self.layout.present.ravel(), Verdict.ALIVE, Verdict.UNTESTED)
         code[self.fault_set.mask] = Verdict.FAULTY
-        # Members, not the integers that numpy would make of them.
+        # Enum members: NumPy would convert them to integers.
         return np.array(list(Verdict), dtype=object)[code]
 
     @cached_property
     def coverage(self) -> Coverage:
-        """What was tested, what was not, and which touches would change that."""
+        """Which cells were tested, which were not, and where to press to test them."""
         return coverage(self.verdicts == Verdict.UNTESTED, self.fault_set.mask, self.probability, self.layout)
 
     @property
     def exit_code(self) -> int:
-        """0: no fault found. 1: faults found, all of single cells. 2: a wire is at fault, or a tenth of the cells."""
+        """0: no fault. 1: faults of single cells only. 2: a fault of a wire, or of a tenth of the cells."""
         few = len(self.fault_set) < 0.1 * self.layout.present.sum()
         return 0 if not self.faults else 1 if few and all(f.line is None for f in self.faults) else 2
 
@@ -123,11 +122,13 @@ class Diagnosis:
         found = f"{len(self.fault_set)} faulty cells" if len(self.fault_set) != 1 else "1 faulty cell"
         reasons = [line for fault in self.faults for line in (fault.reason, *(f"  or {a}" for a in fault.alternatives))]
         reasons += [fault.reason for fault in self.transport]
-        head = f"{found} in {self.n_recordings} recordings ({self.n_frames} frames); {self.coverage}"
+        recordings = "1 recording" if self.n_recordings == 1 else f"{self.n_recordings} recordings"
+        frames = "1 frame" if self.n_frames == 1 else f"{self.n_frames} frames"
+        head = f"{found} in {recordings} ({frames}); {self.coverage}"
         return "\n".join([head, self.map(), *reasons])
 
     def plot(self) -> Figure:
-        """Draw the verdict map; returns a matplotlib Figure."""
+        """Return the verdict map as a matplotlib Figure."""
         from diagnostics.decision.plot import draw
 
         letters = {cell: LETTERS[fault.kind] for fault in self.faults for cell in fault.cells}

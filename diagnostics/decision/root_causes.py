@@ -1,4 +1,9 @@
-"""Root causes: which fault, on which wire or cell, since when, said in one plain sentence."""
+"""Root causes: one fault per cause, with its wire or cell, onset, probability, reason, and what to check.
+
+Cells with the same kind of fault and the same value form a group. Each group is explained by the line cover
+(:mod:`~diagnostics.decision.line_cover`); pairs of lines that read the same by address aliasing. Causes that act
+through more than one group, as a broken supply wire of several chips, are reported as several faults.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +22,9 @@ from diagnostics.layout import Line, LineKind, SensorLayout
 if TYPE_CHECKING:
     from diagnostics.decision.address_aliasing import Aliasing
 
-_SAME_VALUE = 0.02  # of full scale: stuck cells this near to each other may share a cause
-_SAME_KIND = 1 / 3  # of the single faults: open, short or stuck
-_LEADING = 2.5  # log ratio of cells that tell when a wire broke, where none is faulty beyond doubt
+_SAME_VALUE = 0.02  # of full scale: stuck cells whose values differ by less may share a cause
+_SAME_KIND = 1 / 3  # share of the single faults that are of one kind: open, short or stuck
+_LEADING = 2.5  # log ratio of cells that date the break of a wire, where no cell is certainly faulty
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -27,22 +32,23 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class CellFindings:
-    """What is known of the cells, arrays ``[D]`` all.
+    """Findings about each cell, arrays ``[D]``; masks are bool.
 
     Attributes:
-        faulty: those beyond doubt.
-        alive: those that move, as no dead cell does.
-        silent: those that deliver no reading, or none any more.
-        rests: those that read what an untouched cell reads, and are still; full: the same with full scale.
-        intermittent, noisy, drifting: those that move, but wrongly.
-        gain: how many times their gain in the reference those read that drift in that; NaN: all others.
-        value: what still cells read, and what blinking ones blink to; NaN: nothing.
-        since: number of the first frame of what speaks for a fault.
-        probability: P(faulty).
-        weight: log likelihood ratio faulty : healthy.
-        doubt: how far a cell that is not beyond doubt is from being so, 0 to 1, see ``solve``.
-        touches: how many touches tested the cell, or how often it blinked.
-        known: those that were dead in the reference already.
+        faulty: certainly faulty cells.
+        alive: cells that move as no dead cell does.
+        silent: cells that deliver no reading, or no longer do.
+        rests: constant cells at their baseline.
+        full: constant cells at full scale.
+        intermittent, noisy, drifting: cells that move, but wrongly.
+        gain: float, gain relative to the reference of cells with a changed gain; NaN: others.
+        value: float, reading of constant cells, and reading to which intermittent cells blink; NaN: none.
+        since: int, number of the first frame of the fault.
+        probability: float, P(faulty).
+        weight: float, log likelihood ratio faulty : healthy.
+        doubt: float, 0: certain, 1: uncertain, see ``solve``.
+        events: int, number of events that tested the cell, or number of its blinks.
+        known: cells that were dead in the reference already.
     """
 
     faulty: Mask
@@ -63,16 +69,16 @@ class CellFindings:
     known: Mask
 
 
-def root_causes(found: CellFindings, find_aliasing: Sequence[Aliasing], layout: SensorLayout) -> tuple[Fault, ...]:
-    """Name the root causes of faulty cells, one fault each, the biggest first: that is where a technician starts."""
+def root_causes(found: CellFindings, aliasings: Sequence[Aliasing], layout: SensorLayout) -> tuple[Fault, ...]:
+    """Return the root causes of the faulty cells, one fault each, the one with most cells first."""
     aliased = np.zeros(layout.n_cells, bool)
-    for aliasing in find_aliasing:
+    for aliasing in aliasings:
         aliased[list(aliasing.cells)] = True
-    faults = [_aliased(aliasing, layout) for aliasing in find_aliasing]
+    faults = [_aliased(aliasing, layout) for aliasing in aliasings]
     causes = _causes(found, aliased, layout, 0.0)
     singles = sum(cause.line is None for _, _, cause in causes)
     if 0 < singles < len(causes):
-        # Where many cells fail one by one, some will be neighbours at the end of a wire: look at the wires once more.
+        # With many single faults, some are neighbours on a wire by chance: solve again with a higher prevalence.
         common = _SAME_KIND * singles / int((found.alive | found.faulty).sum())
         causes = _causes(found, aliased, layout, common)
     faults += [_fault(kind, value, cause, found, layout) for kind, value, cause in causes]
@@ -83,58 +89,58 @@ def root_causes(found: CellFindings, find_aliasing: Sequence[Aliasing], layout: 
 def _causes(
     found: CellFindings, aliased: Mask, layout: SensorLayout, common: float
 ) -> list[tuple[FaultKind, float | None, Cause]]:
-    """Return kind, value and cause of each fault; ``common``: the share of single faults of one kind, at least."""
+    """Return kind, value and cause of each fault; ``common``: lower limit of the prevalence of one kind."""
     causes = []
-    for kind, faulty, matching, value in _alike(found, layout.full_scale):
-        # A live cell contradicts a broken wire; so does one that is faulty in another way, or reads another value.
-        contradicting = found.alive | (found.faulty & ~matching) | aliased
+    for kind, faulty, consistent, value in _groups(found, layout.full_scale):
+        # A working cell contradicts a broken wire; so does one with another fault, or another value.
+        contradicting = found.alive | (found.faulty & ~consistent) | aliased
         if kind in (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK):
-            # What a cell did before the others broke says nothing of the wire.
-            leading = faulty if faulty.any() else matching & (found.weight >= _LEADING)
+            # A cell that became constant before the wire broke does not contradict it.
+            leading = faulty if faulty.any() else consistent & (found.weight >= _LEADING)
             begun = int(np.median(found.since[leading])) if leading.any() else 0
-            contradicting &= ~(matching & ~faulty & (found.since <= begun) & (begun > 0))
-            contradicting |= ~matching & ~found.silent
-        explained = _explained(faulty & ~aliased, matching & ~aliased, contradicting, found, layout, common)
+            contradicting &= ~(consistent & ~faulty & (found.since <= begun) & (begun > 0))
+            contradicting |= ~consistent & ~found.silent
+        explained = _explained(faulty & ~aliased, consistent & ~aliased, contradicting, found, layout, common)
         causes += [(kind, value, cause) for cause in explained]
     return causes
 
 
 def _explained(
-    faulty: Mask, matching: Mask, contradicting: Mask, found: CellFindings, layout: SensorLayout, common: float
+    faulty: Mask, consistent: Mask, contradicting: Mask, found: CellFindings, layout: SensorLayout, common: float
 ) -> tuple[Cause, ...]:
-    """Explain cells that misbehave in the same way; see ``solve``.
+    """Return the causes of cells with the same fault; see ``solve``.
 
-    Those that were dead in the reference already bear no witness of a wire that has broken since, though it may serve
-    them as well; and of one that was broken then, all cells were dead.
+    Cells that were dead in the reference are no evidence for a wire that broke later, though they may lie on it. A wire
+    that was broken in the reference explains such cells only.
     """
     known = found.known & faulty
 
-    def of(faulty: Mask, matching: Mask, contradicting: Mask) -> tuple[Cause, ...]:
-        return solve(faulty, matching, contradicting, found.weight, found.doubt, layout, common)
+    def of(faulty: Mask, consistent: Mask, contradicting: Mask) -> tuple[Cause, ...]:
+        return solve(faulty, consistent, contradicting, found.weight, found.doubt, layout, common)
 
-    causes = of(faulty & ~known, matching & ~known, contradicting & ~known)
+    causes = of(faulty & ~known, consistent & ~known, contradicting & ~known)
     known[[cell for cause in causes for cell in cause.cells]] = False
     return causes + of(known, known, ~known)
 
 
-def _alike(found: CellFindings, full_scale: float) -> list[tuple[FaultKind, Mask, Mask, float | None]]:
-    """Return (kind, faulty, all that could be faulty alike, value) of each group that could share a cause."""
+def _groups(found: CellFindings, full_scale: float) -> list[tuple[FaultKind, Mask, Mask, float | None]]:
+    """Return (kind, certainly faulty cells, all consistent cells, value) of each group that may share a cause."""
     faulty, value = found.faulty, found.value
     moving = found.intermittent | found.noisy | found.drifting
-    still = faulty & ~found.silent & ~moving
+    constant = faulty & ~found.silent & ~moving
     of_gain = found.drifting & np.isfinite(found.gain)
     of_offset = found.drifting & ~of_gain
     groups: list[tuple[FaultKind, Mask, Mask, float | None]] = [
         (FaultKind.OPEN, faulty & found.silent, found.silent, None),
-        (FaultKind.OPEN, still & found.rests, found.rests, None),
-        (FaultKind.SHORT, still & found.full, found.full, full_scale),
+        (FaultKind.OPEN, constant & found.rests, found.rests, None),
+        (FaultKind.SHORT, constant & found.full, found.full, full_scale),
         (FaultKind.INTERMITTENT, faulty & found.intermittent, found.intermittent, None),
         (FaultKind.NOISY, faulty & found.noisy, found.noisy, None),
         *((FaultKind.DRIFT, faulty & drifting, drifting, None) for drifting in (of_offset, of_gain)),
     ]
-    between = np.flatnonzero(still & ~found.rests & ~found.full)
-    between = between[np.argsort(value[between])]
-    for cells in np.split(between, np.flatnonzero(np.diff(value[between]) > _SAME_VALUE * full_scale) + 1):
+    intermediate = np.flatnonzero(constant & ~found.rests & ~found.full)
+    intermediate = intermediate[np.argsort(value[intermediate])]
+    for cells in np.split(intermediate, np.flatnonzero(np.diff(value[intermediate]) > _SAME_VALUE * full_scale) + 1):
         if len(cells):
             mask = np.zeros(len(faulty), bool)
             mask[cells] = True
@@ -173,7 +179,7 @@ def _aliased(a: Aliasing, layout: SensorLayout) -> Fault:
         text = f"{a.line} is stuck at {a.value}: {copies}"
         check = f"the {across} multiplexer and its address wires"
     since = "" if a.onset == 0 else f" from frame {a.onset} on ({a.onset / layout.rate:.1f} s)"
-    reason = f"{text}{since}; {a.witnesses} times they agreed on a moving load; check {check}"
+    reason = f"{text}{since}; they agreed on {a.witnesses} moving loads; check {check}"
     return Fault(
         FaultKind.ALIAS,
         a.cells,
@@ -190,7 +196,15 @@ def _aliased(a: Aliasing, layout: SensorLayout) -> Fault:
 _DOING = {
     FaultKind.INTERMITTENT: "blinks between its load and {value:.4g} {unit}",
     FaultKind.NOISY: "is far noisier than a healthy cell under the same load",
-    FaultKind.DRIFT: "moves, but never comes back to rest",
+    FaultKind.DRIFT: "moves, but never returns to its baseline",
+}
+
+
+_CHECKS = {
+    FaultKind.OPEN: "its solder joint and trace",
+    FaultKind.INTERMITTENT: "its solder joint and trace for a loose contact",
+    FaultKind.NOISY: "its connection and shielding",
+    FaultKind.DRIFT: "the cell for wear or dirt, and calibrate it again",
 }
 
 
@@ -206,23 +220,26 @@ def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
 
 
 def _reason(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayout) -> str:
-    """Say what was seen and what to check."""
+    """Return one sentence: what was observed, and what to check."""
     does = _does(fault, found, layout)
     already = ", and did so in the reference already" if found.known[list(cause.seen)].all() else ""
     since = "" if fault.onset is None else f" from frame {fault.onset} on ({fault.onset / layout.rate:.1f} s)"
     if fault.line is None:
         pad, row, column = layout.position(fault.cells[0])
-        whatever = "" if fault.kind in _DOING else ", whatever touches it"
-        return f"pad {pad}, row {row}, column {column} is {fault.kind}: it {does}{since}{whatever}{already}"
+        whatever = "" if fault.kind in _DOING or found.silent[fault.cells[0]] else ", whatever touches it"
+        check = _CHECKS.get(fault.kind, "the cell and its traces for a short circuit")
+        where = f"pad {pad}, row {row}, column {column}"
+        return f"{where} is {fault.kind}: it {does}{since}{whatever}{already}; check {check}"
     inferred = len(cause.cells) - len(cause.seen)
-    also = f"; {inferred} more, not tested, are inferred from the wire" if inferred else ""
+    are = "is" if inferred == 1 else "are"
+    also = f"; {inferred} more, not tested, {are} inferred from the wire" if inferred else ""
     where = "" if cause.whole else _span(fault, layout)
     seen = f"each of {len(cause.seen)} cells on it {does}{since}{already}{also}"
     return f"{fault.line} is {fault.kind}{where}: {seen}; check {_wire(fault.line)}"
 
 
 def _span(fault: Fault, layout: SensorLayout) -> str:
-    """Say behind which point of its line a fault lies: " from column 5 on" or " up to column 4"."""
+    """Return the part of its line that a fault affects, as " from column 5 on" or " up to column 4"."""
     assert fault.line is not None
     across, name = (2, "column") if fault.line.kind == "row" else (1, "row")
     dead = [layout.position(cell)[across] for cell in fault.cells]
@@ -231,7 +248,7 @@ def _span(fault: Fault, layout: SensorLayout) -> str:
 
 
 def _alternatives(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayout) -> tuple[str, ...]:
-    """Say what else would look the same: the address of a dead line, or a break a little elsewhere."""
+    """Return other causes with the same findings: the address of a dead line, or a break further along it."""
     assert fault.line is not None
     others = []
     cells = layout.cells_on(fault.line)
@@ -246,7 +263,7 @@ def _alternatives(fault: Fault, cause: Cause, found: CellFindings, layout: Senso
         i = int(np.searchsorted(cells, edge))
         beside = cells[i - 1] if edge == fault.cells[0] else cells[min(i + 1, len(cells) - 1)]
         if untested[beside]:
-            others.append("a break one or more untested cells nearer to the live end")
+            others.append("a break one or more untested cells closer to the working end")
     return tuple(others)
 
 
@@ -257,7 +274,7 @@ def _wire(line: Line) -> str:
 
 
 def _addresses_of_dead_rows(faults: list[Fault], found: CellFindings, layout: SensorLayout) -> list[Fault]:
-    """Put dead lines together that one stuck address bit would explain: it then reads lines that nothing touched."""
+    """Merge dead lines that one stuck address bit would explain: it selects lines without contact instead."""
     open_lines = Counter((f.line.pad, f.line.kind) for f in faults if f.line and f.kind is FaultKind.OPEN)
     for line in layout.lines:
         if line.kind not in ("row_address", "column_address"):
@@ -273,14 +290,13 @@ def _addresses_of_dead_rows(faults: list[Fault], found: CellFindings, layout: Se
                 if f.kind is FaultKind.OPEN and f.line is not None and (f.line.pad, f.line.kind) == (line.pad, kind)
                 and f.line.index in moved and set(layout.cells_on(f.line).tolist()) == set(f.cells)
             ]  # fmt: skip
-            # One broken bit is likelier than two broken wires; all the lines that it moves are dead, or never tested.
+            # One stuck bit is likelier than two broken wires. All lines that it moves must be dead or untested.
             if len(dead) < max(2, len(moved) / 2) or found.alive[[*cells, *sources[sources >= 0]]].any():
                 continue
             reads = _index(sources[sources >= 0], kind, layout)
-            instead = f"untouched {kind}s {', '.join(map(str, reads))}" if reads else f"addresses without a {kind}"
-            named = ", ".join(map(str, moved))
-            wires = ", ".join(str(f.line.index) for f in dead if f.line)
-            text = f"{line} is stuck at {level}: {kind}s {named} read nothing, as {instead} would"
+            instead = f"untouched {_named(kind, reads)}" if reads else f"addresses without a {kind}"
+            wires = _named(kind, [f.line.index for f in dead if f.line])
+            text = f"{line} is stuck at {level}: {_named(kind, moved)} read nothing, as {instead} would"
             merged = Fault(
                 FaultKind.ALIAS,
                 tuple(cells.tolist()),
@@ -290,14 +306,19 @@ def _addresses_of_dead_rows(faults: list[Fault], found: CellFindings, layout: Se
                 probability=min(f.probability or 0.0 for f in dead),
                 reason=f"{text}; check the {kind} multiplexer and its address wires",
                 evidence=sum(f.evidence or 0 for f in dead),
-                alternatives=(f"the wires of {kind}s {wires} are open, each for itself",),
+                alternatives=(f"the wires of {wires} are open, independently of each other",),
             )
             faults = [f for f in faults if f not in dead] + [merged]
     return faults
 
 
 def _index(cells: NDArray[np.intp], kind: LineKind, layout: SensorLayout) -> list[int]:
-    """Return the numbers of the rows, or columns, that cells lie on, ascending."""
+    """Return the indices of the rows, or columns, of the cells, ascending."""
     on = cells // layout.cols % layout.rows if kind == "row" else cells % layout.cols
     numbers: list[int] = np.unique(on).tolist()
     return numbers
+
+
+def _named(kind: LineKind, numbers: Sequence[int]) -> str:
+    """Return lines in words, as "row 1" or "rows 1, 3"."""
+    return f"{kind}{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}"

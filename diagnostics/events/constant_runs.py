@@ -1,7 +1,12 @@
-"""Temporal evidence: since when has a cell held one value, and how abruptly did it get there?
+"""Constant runs: since when each cell holds one value, and the jump into that run.
 
-A stuck cell holds its value from its onset to the end of the log, up to the converter's dither. So does a healthy one
-that nothing touches: stillness raises the question, and the other cells answer it (see ``spatial``).
+Detects, for each cell, the longest run at the end of the log within +- tolerance of one value:
+
+    start = min { s : max(x_s..x_T) - min(x_s..x_T) <= 2 tolerance }
+
+and scores the jump into it against the jumps of healthy cells (:class:`JumpHistogram`). A stuck cell is constant from
+its onset on, up to the dither of the converter. So is a healthy cell without contact, or under a static load: a
+constant run alone is no evidence of a fault; the spatial test decides (``diagnostics.evidence.spatial``).
 """
 
 from __future__ import annotations
@@ -16,27 +21,27 @@ from diagnostics.preprocessing.readings import held
 
 Floats = NDArray[np.float64]
 
-SHORTEST_RUN = 5  # frames; shorter stillness is not worth a question
-_JUMPS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 1.0])  # of full scale, edges of bins
-_LATELY = 64  # frames
-_MOST = 4.0  # log ratio: jumps alone prove nothing
-_COMPANY = 0.2  # share of the loaded cells: when so many jump at once, a grasp was released
+SHORTEST_RUN = 5  # frames; shorter runs are not tested
+_JUMPS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 1.0])  # of full scale, bin edges
+_RECENT = 64  # frames since a cell last moved, while it counts as able to jump
+_MOST = 4.0  # log ratio: a jump alone proves no fault
+_COMPANY = 0.2  # share of the loaded cells that jump together when a grasp is released
 
 
 @dataclass(frozen=True)
 class ConstantRuns:
-    """The still stretch that ends the log so far, for each cell. Knows nothing of frames before the last.
+    """The constant run at the end of the log, for each cell; readings in the layout's unit.
 
     Attributes:
-        start: int ``[D]``, number of the first frame of the stretch; 0 where the cell never moved.
-        length: int ``[D]``, its frames with a reading.
-        low, high: float ``[D]``, the lowest and highest reading of it; inf and -inf before the first reading.
-        jump: float ``[D]``, by how much the reading changed in the step before it; 0 where it never moved.
-        company: float ``[D]``, share of the loaded cells that fell, or rose, as drastically in that very step.
-        last: float ``[D]``, the last reading.
-        same: int ``[D]``, how many frames on end have had exactly that reading.
-        missed: int ``[D]``, how many frames on end have had none by now.
-        missed_since: int ``[D]``, number of the first of these; meaningless where there is none.
+        start: int ``[D]``, number of the first frame of the run; 0 where the cell never moved.
+        length: int ``[D]``, frames of the run with a reading.
+        low, high: float ``[D]``, range of the readings in the run; inf and -inf before the first reading.
+        jump: float ``[D]``, change of the reading in the step into the run; 0 where the cell never moved.
+        company: float ``[D]``, share of the loaded cells that jumped in the same direction in the same step.
+        last: float ``[D]``, the last reading; NaN: none yet.
+        same: int ``[D]``, consecutive frames with exactly that reading.
+        missed: int ``[D]``, consecutive frames without a reading, up to now.
+        missed_since: int ``[D]``, number of the first of these; meaningless where ``missed`` is 0.
     """
 
     start: NDArray[np.intp]
@@ -52,7 +57,7 @@ class ConstantRuns:
 
     @classmethod
     def begin(cls, n_cells: int) -> ConstantRuns:
-        """Nothing seen yet."""
+        """Return the state before any frame."""
         zero, nothing = np.zeros(n_cells, np.intp), np.full(n_cells, np.inf)
         jump, last = np.zeros(n_cells), np.full(n_cells, np.nan)
         return cls(zero, zero, nothing, -nothing, jump, jump, last, zero, zero, zero)
@@ -60,13 +65,13 @@ class ConstantRuns:
     def extend(
         self, frames: Floats, numbers: NDArray[np.intp], tolerance: float, baseline: Floats | float = 0.0
     ) -> ConstantRuns:
-        """Return the runs after more frames. A cell is still while it stays within +- ``tolerance`` of one value.
+        """Return the runs after more frames.
 
         Args:
-            frames: ``[t, D]``, t >= 1; NaN = missing, which neither breaks nor proves a run.
+            frames: ``[t, D]``, t >= 1; NaN = missing, which neither ends nor extends a run.
             numbers: int ``[t]``, of the frames, ascending.
-            tolerance: as far as a converter's dither goes.
-            resting: float ``[D]``, what untouched cells read.
+            tolerance: a run stays within +- this of one value.
+            baseline: float ``[D]``, readings without contact.
         """
         missing = np.isnan(frames)
         any_missing = bool(missing.any())
@@ -79,7 +84,7 @@ class ConstantRuns:
         broke = np.flatnonzero(high - low > 2 * tolerance)
         if len(broke):
             start, length, jump, company = start.copy(), length.copy(), jump.copy(), company.copy()
-            # Among these frames lies the first of the stretch that ends here: look for it from the end.
+            # The first frame of the new run lies in this block: search backwards.
             highest = np.maximum.accumulate(top[::-1, broke], axis=0)
             lowest = np.minimum.accumulate(bottom[::-1, broke], axis=0)
             count = (highest - lowest <= 2 * tolerance).sum(axis=0)  # the spread only grows: a prefix of True
@@ -89,18 +94,18 @@ class ConstantRuns:
                 first = (~missing[:, broke] & (np.arange(len(frames))[:, None] >= first)).argmax(axis=0)
             start[broke] = numbers[first]
             length[broke] = np.minimum(count, received[broke])
-            # What the cells did in the steps into those stretches.
+            # The changes of all cells in the steps into these runs.
             steps = np.flatnonzero(np.bincount(first))
             which = np.searchsorted(steps, first)
             before, after = readings[steps], readings[steps + 1]
             step, size = after - before, np.fmax(after, before) - baseline
             drastic = np.maximum(0.5 * size, 4 * tolerance)
-            # Cells broken from the start hold their value all along: only others could have jumped too.
+            # Cells that never moved may be broken from the start and could not have jumped.
             able = (high - low > 2 * tolerance) | self.moved
-            able |= self.length < _LATELY
+            able |= self.length < _RECENT
             loaded = np.maximum(_in_each((size > 4 * tolerance) & able), 1)
-            # A release lets cells fall together and none rise, a grasp the other way round: only cells that go the same
-            # way are company. When many break at once, some fall and some rise.
+            # At a release all cells fall, at a grasp all rise; when many break at once, some fall and some rise. So
+            # only changes in the same direction count.
             share = np.stack([_in_each(step < -drastic), _in_each(step > drastic)]) / loaded
             low[broke], high[broke] = lowest[count - 1, at], highest[count - 1, at]
             into = step[which, broke]
@@ -114,7 +119,7 @@ class ConstantRuns:
     def _missed(
         self, missing: NDArray[np.bool_], numbers: NDArray[np.intp]
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return how many frames on end each cell has missed, and the number of the first of these."""
+        """Return the consecutive frames without a reading of each cell, and the number of the first."""
         all_of_them = missing.all(axis=0)
         missed = np.where(all_of_them, self.missed + len(missing), (~missing[::-1]).argmax(axis=0))
         since = numbers[len(missing) - np.clip(missed, 1, len(missing))]
@@ -126,28 +131,28 @@ class ConstantRuns:
 
     @property
     def value(self) -> Floats:
-        """float ``[D]``, what each cell reads during its stretch; NaN for one that never delivered a reading."""
+        """float ``[D]``, centre of the readings in the run; NaN without any reading."""
         return np.where(np.isfinite(self.high), (np.nan_to_num(self.high) + np.nan_to_num(self.low)) / 2, np.nan)
 
     @property
     def moved(self) -> NDArray[np.bool_]:
-        """bool ``[D]``, True where the cell read something else before."""
+        """bool ``[D]``, True where the cell read another value before the run."""
         moved: NDArray[np.bool_] = self.start > 0
         return moved
 
     @property
     def alone(self) -> NDArray[np.bool_]:
-        """bool ``[D]``, False where a cell jumped into its stretch as many others did, as when a grasp ends."""
+        """bool ``[D]``, False where many cells jumped together with the cell, as when a grasp ends."""
         alone: NDArray[np.bool_] = self.company < _COMPANY
         return alone
 
 
 def same_for(readings: Floats, before: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return for how many frames on end each cell has read exactly the same, by the end of each frame, ``[t, D]``.
+    """Return the consecutive frames with exactly the same reading, at each frame, int ``[t, D]``.
 
     Args:
         readings: ``[1 + t, D]``, see ``readings.held``.
-        before: int ``[D]``, for how many frames on end it had been the first of these.
+        before: int ``[D]``, the same count at the first of these.
     """
     number = np.arange(1, len(readings))[:, None]
     since = np.maximum.accumulate(np.where(_changed(readings), number - 1, -before), axis=0)
@@ -155,7 +160,7 @@ def same_for(readings: Floats, before: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _changed(readings: Floats) -> NDArray[np.bool_]:
-    """Return where a reading differs from the one before it, bool ``[t, D]``."""
+    """Return where a reading differs from the one before, bool ``[t, D]``."""
     changed = np.asarray(readings[1:] != readings[:-1])
     if np.isnan(readings[0]).any():
         changed &= ~np.isnan(readings[:-1])
@@ -163,15 +168,15 @@ def _changed(readings: Floats) -> NDArray[np.bool_]:
 
 
 def _in_each(which: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Return how many cells of ``[t, D]`` there are in each frame."""
-    count: NDArray[np.int32] = which.sum(axis=1, dtype=np.int32)  # faster than what NumPy would count in
+    """Return the number of True cells in each frame of ``[t, D]``."""
+    count: NDArray[np.int32] = which.sum(axis=1, dtype=np.int32)  # int32: faster than NumPy's default
     return count
 
 
 def segments(
     recording: Floats, length: int, tolerance: float
 ) -> Iterator[tuple[Floats, NDArray[np.intp], NDArray[np.intp]]]:
-    """Yield a recording ``[T, D]`` in pieces: frames, their numbers, and from which on each cell ``[D]`` is still."""
+    """Yield pieces of a recording ``[T, D]``: frames, their numbers, and the start of each constant run ``[D]``."""
     runs = ConstantRuns.begin(recording.shape[1])
     for first in range(0, len(recording), length):
         frames = recording[first : first + length]
@@ -182,14 +187,14 @@ def segments(
 
 @dataclass(frozen=True)
 class JumpHistogram:
-    """How abruptly healthy cells become still: what the jump into a still stretch says of a fault.
+    """Scores the jump into a constant run against the jumps of healthy cells.
 
-    A broken cell jumps by whatever lies between its load and the value it sticks to; a healthy one is mostly let go
-    little by little, and when a whole grasp is released its neighbours fall with it. Few healthy ones rise in one step
-    to a load that they then hold.
+    The statistic is ``log(0.5 + 0.5 p(jump | fault) / p(jump | healthy))``, at most 4, with a uniform density for
+    faults and a histogram with one pseudo-count a bin for healthy cells. A broken cell jumps by any amount; a healthy
+    cell is mostly released gradually, or together with its neighbours. Jumps together with many cells are not scored.
 
     Attributes:
-        log_ratio: ``[2, bins]``, log likelihood ratio fault : healthy of a fall and of a rise of each size.
+        log_ratio: float ``[2, bins]``, log likelihood ratio fault : healthy of a fall and of a rise of each size.
     """
 
     log_ratio: Floats
@@ -198,7 +203,7 @@ class JumpHistogram:
     def fit(
         cls, recordings: Sequence[Floats], tolerance: float, full_scale: float, baseline: Floats | float = 0.0
     ) -> JumpHistogram:
-        """Count the jumps of healthy cells, recordings ``[T, D]`` each; untouched ones read ``baseline`` (``[D]``)."""
+        """Count the jumps in fault-free recordings, ``[T, D]`` each, with ``baseline`` (``[D]``) without contact."""
         healthy = np.ones((2, len(_JUMPS) - 1))
         for recording in recordings:
             runs = ConstantRuns.begin(recording.shape[1])
@@ -210,19 +215,19 @@ class JumpHistogram:
                     jumps = runs.jump[fresh & ((runs.jump > 0) == up)]
                     healthy[up] += np.histogram(np.abs(jumps) / full_scale, _JUMPS)[0]
         ratio = np.diff(_JUMPS) / (healthy / healthy.sum(axis=1, keepdims=True))
-        # A cell that rested when it broke did not jump: half of the faults look like anything healthy.
+        # A cell that was unloaded when it broke did not jump: half of the faults look healthy.
         return cls(np.minimum(np.log(0.5 + 0.5 * ratio), _MOST))
 
     @classmethod
     def silent(cls) -> JumpHistogram:
-        """Without a reference jumps say nothing."""
+        """Return the histogram of a cold start: no evidence from jumps."""
         return cls(np.zeros((2, len(_JUMPS) - 1)))
 
     def evidence(self, runs: ConstantRuns, full_scale: float) -> Floats:
-        """Return the log likelihood ratio ``[D]``, 0 where a cell never moved or jumped in company."""
+        """Return the log likelihood ratio ``[D]``, 0 where a cell never moved or jumped with others."""
         return np.where(runs.alone, self.size(runs, full_scale), 0.0)
 
     def size(self, runs: ConstantRuns, full_scale: float) -> Floats:
-        """Return what the size of each jump would say of a cell that jumped alone, ``[D]``; 0 where it never moved."""
+        """Return the log likelihood ratio ``[D]`` as if each cell jumped alone; 0 where it never moved."""
         which = np.searchsorted(_JUMPS[1:-1], np.abs(runs.jump) / full_scale, side="right")
         return np.where(runs.moved, self.log_ratio[(runs.jump > 0).astype(np.intp), which], 0.0)

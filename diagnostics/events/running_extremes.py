@@ -1,4 +1,4 @@
-"""The extremes of a few frames so far: of some hundred cells in half the time that NumPy's ``accumulate`` takes."""
+"""Running minimum and maximum over frames, in half the time of ``np.minimum.accumulate`` for some hundred cells."""
 
 from __future__ import annotations
 
@@ -9,18 +9,17 @@ Array = NDArray[np.float32]
 
 
 def lowest_so_far(frames: Array) -> Array:
-    """Return the lowest of the frames up to each, ``[t, D]``."""
+    """Return ``np.minimum.accumulate(frames)``, ``[t, D]``."""
     return _so_far(np.minimum, frames)
 
 
 def highest_so_far(frames: Array) -> Array:
-    """Return the highest of the frames up to each, ``[t, D]``."""
+    """Return ``np.maximum.accumulate(frames)``, ``[t, D]``."""
     return _so_far(np.maximum, frames)
 
 
 def _so_far(extreme: np.ufunc, frames: Array) -> Array:
-    # Over 1, 2, 4, ... frames (Hillis and Steele, Data parallel algorithms, 1986): whole rows at once, where
-    # accumulate goes from frame to frame.
+    # Parallel prefix scan over 1, 2, 4, ... frames (Hillis and Steele, Data parallel algorithms, 1986).
     running, reach = frames, 1
     while reach < len(frames):
         further = np.empty_like(running)

@@ -20,7 +20,7 @@ Cells = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class _Inputs:
-    """The inputs of all patches, one after the other: ``cells[starts[i]:starts[i + 1]]`` are those of patch i."""
+    """The inputs of all tiles, concatenated: ``cells[starts[i]:starts[i + 1]]`` are those of tile i."""
 
     cells: Cells
     starts: Cells
@@ -28,20 +28,21 @@ class _Inputs:
     @classmethod
     def of(cls, all_tiles: Sequence[Tile]) -> _Inputs:
         sizes = [len(tile.inputs) for tile in all_tiles]
-        return cls(np.concatenate([p.inputs for p in all_tiles]), np.concatenate([[0], np.cumsum(sizes)]))
+        return cls(np.concatenate([tile.inputs for tile in all_tiles]), np.concatenate([[0], np.cumsum(sizes)]))
 
     def with_any(self, mask: NDArray[np.bool_]) -> list[int]:
-        """Return the patches that have an input in ``mask`` (bool ``[D]``)."""
+        """Return the tiles that have an input in ``mask`` (bool ``[D]``)."""
         found: list[int] = np.flatnonzero(np.logical_or.reduceat(mask[self.cells], self.starts[:-1])).tolist()
         return found
 
 
 @dataclass(frozen=True, eq=False)
 class TiledEvents:
-    """The touches of each patch so far.
+    """The contact events of each tile so far.
 
     Attributes:
-        patches: of the array; of: the touches of each, over its inputs.
+        tiles: the tiles of the array.
+        of: the events of each tile, over its inputs.
     """
 
     tiles: tuple[Tile, ...]
@@ -51,7 +52,7 @@ class TiledEvents:
 
     @classmethod
     def begin(cls, all_tiles: tuple[Tile, ...], needed: NDArray[np.bool_] | None = None) -> TiledEvents:
-        """Nothing seen yet. Patches without an output that is ``needed`` (bool ``[D]``; None: all) stay so."""
+        """Return the state before any frame. Tiles without a ``needed`` output (bool ``[D]``) are skipped."""
         of_each = tuple(needed is None or bool(needed[tile.outputs].any()) for tile in all_tiles)
         return cls(all_tiles, (EventLog(),) * len(all_tiles), _Inputs.of(all_tiles), of_each)
 
@@ -63,7 +64,7 @@ class TiledEvents:
         start: Cells,
         jumped: NDArray[np.bool_],
     ) -> TiledEvents:
-        """Return the events after more frames, see ``EventLog.extend``; a still tile stays as it is."""
+        """Return the events after more frames, see ``EventLog.extend``; tiles in which nothing moves do not change."""
         if len(self.tiles) == 1:
             return self.replaced([self.of[0].extend(root, numbers, root_near, start, jumped)])
         of = list(self.of)
@@ -80,15 +81,15 @@ class TiledEvents:
         return self.replaced([old for old, _ in parts]), self.replaced([kept for _, kept in parts])
 
     def replaced(self, of: Sequence[EventLog]) -> TiledEvents:
-        """Return the same patches with other touches."""
+        """Return the same tiles with other events."""
         return replace(self, of=tuple(of))
 
     def holding(self, cells: NDArray[np.bool_]) -> Iterator[int]:
-        """Yield the patches that are needed and have one of the ``cells`` (bool ``[D]``) among their outputs."""
+        """Yield the needed tiles that have one of the ``cells`` (bool ``[D]``) among their outputs."""
         for i in self._inputs.with_any(cells):
             if self._needed[i] and cells[self.tiles[i].outputs].any():
                 yield i
 
     def kept(self) -> Iterator[tuple[int, EventLog]]:
-        """Yield the patches that were touched, and their touches."""
+        """Yield the tiles with events, and these."""
         return ((i, events) for i, events in enumerate(self.of) if events.kept)

@@ -1,9 +1,8 @@
-"""Large skins, patch by patch: each patch has touches of its own, and its cells are judged by what surrounds it.
+"""Tiles: a large array is divided into tiles of 8 x 8 cells with a halo of 4, each with its own contact events.
 
-On a skin of thousands of cells something is touched somewhere all the time, so "a touch of the skin" means nothing, and
-what happens at one end tells nothing of the other. So a large array is cut into patches that overlap: the cells of a
-patch (outputs) are judged by all cells within a few rows and columns (inputs). A patch in which nothing moves costs
-nothing; time and memory grow with the cells, never with their square. A small array is a single patch.
+On an array of thousands of cells some contact always changes somewhere, and distant cells are independent. The cells
+of a tile (outputs) are tested given all cells within the halo (inputs), as in domain decomposition with overlap. Time
+and memory are linear in the number of cells. An array of up to 400 cells is one tile.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
 
-TILE, HALO = 8, 4  # cells: a patch, and how far what surrounds it reaches
-MOST_CELLS = 400  # that are judged as one; beyond that, patches
+TILE, HALO = 8, 4  # cells: side of a tile, width of its halo
+MOST_CELLS = 400  # of a single tile: a size
 
 Cells = NDArray[np.intp]
 
@@ -28,7 +27,7 @@ class Tile:
     """Some neighbouring cells of one pad.
 
     Attributes:
-        inputs, outputs: cell indices, ascending; the inputs hold the outputs.
+        inputs, outputs: int, cell indices, ascending; the inputs include the outputs.
     """
 
     inputs: Cells
@@ -36,11 +35,11 @@ class Tile:
 
     @cached_property
     def place(self) -> Cells:
-        """Where the outputs lie among the inputs."""
+        """Position of each output among the inputs, int ``[outputs]``."""
         return np.searchsorted(self.inputs, self.outputs)
 
     def rectangle(self, layout: SensorLayout) -> Rectangle:
-        """Return the patch as an array of its own."""
+        """Return the bounding rectangle of the inputs."""
         row, col = self.inputs // layout.cols % layout.rows, self.inputs % layout.cols
         row, col = row - row.min(), col - col.min()
         present = np.zeros((1, int(row.max()) + 1, int(col.max()) + 1), bool)
@@ -51,10 +50,11 @@ class Tile:
 
 @dataclass(frozen=True)
 class Rectangle:
-    """The rectangle that the inputs of a patch lie in.
+    """The bounding rectangle of the inputs of a tile, as an array.
 
     Attributes:
-        layout: of an array that has no cells but the inputs; cells: int ``[inputs]``, where these are in it.
+        layout: its only cells are the inputs.
+        cells: int ``[inputs]``, index of each input in this layout.
     """
 
     layout: SensorLayout
@@ -66,7 +66,7 @@ class Rectangle:
         return len(self.cells) == self.layout.n_cells
 
     def on(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return ``values [..., inputs]`` as those of all positions of the rectangle, 0 where no cell is."""
+        """Return values ``[..., inputs]`` at all positions of the rectangle, 0 where there is no cell."""
         if self.full:
             return values
         out = np.zeros((*values.shape[:-1], self.layout.n_cells), values.dtype)
@@ -75,7 +75,7 @@ class Rectangle:
 
 
 def tiles(layout: SensorLayout) -> tuple[Tile, ...]:
-    """Return the patches of a layout, each cell an output of exactly one; a single one if the cells are few."""
+    """Return the tiles of a layout; each cell is an output of exactly one."""
     cells, present = layout.grid(np.arange(layout.n_cells)), layout.present
     if present.sum() <= MOST_CELLS:
         return (Tile(cells.ravel(), cells.ravel()),)
@@ -84,7 +84,7 @@ def tiles(layout: SensorLayout) -> tuple[Tile, ...]:
         for r in range(0, layout.rows, TILE):
             for c in range(0, layout.cols, TILE):
                 core = pad, slice(r, r + TILE), slice(c, c + TILE)
-                neighbourhood = pad, slice(max(0, r - HALO), r + TILE + HALO), slice(max(0, c - HALO), c + TILE + HALO)
+                halo = pad, slice(max(0, r - HALO), r + TILE + HALO), slice(max(0, c - HALO), c + TILE + HALO)
                 if present[core].any():
-                    found.append(Tile(cells[neighbourhood][present[neighbourhood]], cells[core][present[core]]))
+                    found.append(Tile(cells[halo][present[halo]], cells[core][present[core]]))
     return tuple(found)

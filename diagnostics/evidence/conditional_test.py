@@ -1,7 +1,14 @@
-"""The question that is put to the other cells: would healthy ones hold these values in these touches?
+"""Conditional test: probability of the constant value of each cell in each event, given the readings of the predictors.
 
-Now and then a touch is like none before, and then the model errs about many cells at once. The cells that work give
-that away, and the model is believed the less in that touch.
+Computes for event e and constant cell i the surprisal
+
+    -w_e log P(cell i reads v_i throughout e | healthy, predictors)
+
+with weight w_e = 1 / (1 + 0.15 r_e), r_e earlier events that load the same cells (effective sample size, Kish 1965).
+P is the predicted probability of staying unloaded for a cell at its baseline, and of staying loaded near v_i for one
+that holds a load. In unusual events the model errs about many cells at once. So the log odds are averaged over powers
+0.25 to 1 (tempered likelihoods), weighted by how well they fit the moving cells of the same event; the spread of loads
+is inflated by their median error. Errors that no moving cell shows are not recognised.
 """
 
 from __future__ import annotations
@@ -21,21 +28,21 @@ from diagnostics.preprocessing.scale import Array, Scale
 if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
 
-_ANYWHERE = 0.2  # of broken cells stick anywhere, of the rest as many to the low rail as to the high one
-P_MIN = 1e-4  # no touch is less likely than this: models err
-SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no witness
-_WORTHS = (0.25, 0.5, 0.75, 1.0)  # of the log odds of the model, in one touch or another
-_WITNESS_SHARE = 0.5  # of what the moving cells say of that counts: neighbours err together
-_USUALLY = 0.741  # spreads: half of all loads are farther off what is expected (Student's t, 4 degrees of freedom)
-_AS_USUAL, _STRANGEST = 4, 4.0  # cells that are off as usual, beside those seen in a touch; times as far, at most
-_REPEATS, _THE_SAME = 0.15, 0.95  # correlation of what touches say that load the cells alike, and the cosine of such
+_ANYWHERE = 0.2  # share of broken cells that stick at any value; the others stick to either rail equally often
+P_MIN = 1e-4  # lower limit of P in one event: models err
+SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
+_POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
+_FIT_WEIGHT = 0.5  # factor on the log likelihood of the moving cells: neighbours err together
+_MEDIAN_ERROR = 0.741  # median of |t| with 4 degrees of freedom
+_PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit of the inflation
+_REPEATS, _THE_SAME = 0.15, 0.95  # correlation of events that load the same cells, and cosine of their mean loads
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
 class Model(Protocol):
-    """Knows what healthy cells would do in a touch."""
+    """A healthy model."""
 
     def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
         """See ``HealthyModel.predict``."""
@@ -43,15 +50,15 @@ class Model(Protocol):
 
 @dataclass(frozen=True)
 class CellState:
-    """What is known of each cell before the others are asked, ``[D]``.
+    """State of each cell before the spatial test, ``[D]``.
 
     Attributes:
-        runs: the still stretch of each.
-        settled: float, evidence from earlier touches, of the stretches that still go on.
-        temporal: float, log likelihood ratio of what it holds and of the jump into it, where the cell jumped alone.
-        sudden: float, that of the jump, wherever it jumped.
-        askable: bool, where there is a cell that is not known to be faulty.
-        outlasted: bool, where a load is held since before something else was touched.
+        runs: the constant runs.
+        accumulated: float, evidence of earlier events for the runs that still last.
+        temporal: float, log likelihood ratio of the run and of the jump into it, if the cell jumped alone.
+        sudden: float, log likelihood ratio of the jump, even if the cell did not jump alone.
+        eligible: bool, cells that are present and not known to be faulty.
+        outlasted: bool, cells whose load is held since before an event elsewhere began.
     """
 
     runs: ConstantRuns
@@ -62,24 +69,24 @@ class CellState:
     outlasted: Mask
 
     def of(self, cells: NDArray[np.intp]) -> CellState:
-        """Return the same of some cells."""
+        """Return the state of some cells."""
         rest = (values[cells] for name, values in vars(self).items() if name != "runs")
         return CellState(self.runs.of(cells), *rest)
 
     @property
     def scored(self) -> Mask:
-        """bool ``[D]``, those that are still now, and not known to be faulty."""
+        """bool ``[D]``, constant cells that are not known to be faulty."""
         return self.eligible & (self.runs.length >= SHORTEST_RUN)
 
 
 @dataclass(frozen=True)
 class HeldValues:
-    """What still cells read, ``[D]``.
+    """Values of constant cells, ``[D]``.
 
     Attributes:
-        rests: bool, the reading of an untouched cell.
-        low, high: root loads between which a cell reads the same.
-        prior: log probability that a broken cell sticks to this value.
+        rests: bool, the value is at the baseline.
+        low, high: float, root loads that count as the value.
+        prior: float, log probability that a broken cell sticks to this value.
     """
 
     rests: Mask
@@ -89,13 +96,13 @@ class HeldValues:
 
     @classmethod
     def now(cls, cells: CellState, scale: Scale, tolerance: float) -> HeldValues:
-        """Of the cells that are still now; the others count as 0."""
-        still = cells.scored
-        return cls.of(np.where(still, np.nan_to_num(cells.runs.value), 0.0), scale, tolerance)
+        """Return the values of the constant cells; those of the others count as 0."""
+        constant = cells.scored
+        return cls.of(np.where(constant, np.nan_to_num(cells.runs.value), 0.0), scale, tolerance)
 
     @classmethod
     def of(cls, value: Floats, scale: Scale, tolerance: float) -> HeldValues:
-        """Of cells that read ``value`` (``[D]``)."""
+        """Return the values of cells that read ``value`` (``[D]``)."""
         rests = scale.root_load(value) <= scale.root_near
         full = value >= scale.full_scale - 2 * tolerance
         low = scale.root_load(value - 2 * tolerance).astype(np.float64)
@@ -106,14 +113,16 @@ class HeldValues:
 
 @dataclass(frozen=True)
 class ConditionalTest:
-    """What is asked of the cells that are still now, whoever answers.
+    """The test for any choice of predictors.
 
     Attributes:
-        cells, model: what is known of the cells, what healthy looks like.
-        values: what still cells read.
-        asked, askable: bool ``[D]``, the cells that are judged, and those that may be asked about others.
-        features, begins, counted: see :func:`_looked_at`.
-        worth: float ``[n, 1]``, of what each stretch says so much is new.
+        cells: state of the cells.
+        model: the healthy model.
+        values: values of the constant cells.
+        scored: bool ``[D]``, cells to be tested.
+        eligible: bool ``[D]``, cells that may be predictors.
+        features, begins, counted: see :func:`_excerpts`.
+        novelty: float ``[n, 1]``, weight w_e of each excerpt.
     """
 
     cells: CellState
@@ -130,39 +139,41 @@ class ConditionalTest:
     def of(
         cls, events: Sequence[ContactEvent], cells: CellState, model: Model, scale: Scale, tolerance: float
     ) -> ConditionalTest:
-        """Ask about one touch or more."""
-        still, runs, values = cells.scored, cells.runs, HeldValues.now(cells, scale, tolerance)
-        # A load that came all of a sudden, and is still held: a quick grasp, or many cells broken at once. While this
-        # touch lasts nobody can tell, so such cells are neither judged by it nor asked about the others.
-        held = still & ~values.rests & runs.moved & (runs.start >= events[-1].since) & ~cells.outlasted
+        """Prepare the test of one event or more."""
+        constant, runs, values = cells.scored, cells.runs, HeldValues.now(cells, scale, tolerance)
+        # A load that appeared in one step and is still held: a quick grasp, or many cells broken at once. Until the
+        # event ends the two cannot be distinguished, so such cells are neither tested nor predictors.
+        held = constant & ~values.rests & runs.moved & (runs.start >= events[-1].since) & ~cells.outlasted
         unsure = held & (cells.sudden >= SUDDEN_JUMP) & (cells.temporal < SUDDEN_JUMP)
-        scored = still & ~unsure
-        features, begins, counted = _looked_at(events, runs, scored)
+        scored = constant & ~unsure
+        features, begins, counted = _excerpts(events, runs, scored)
         novelty = 1 / (
-            1 + _REPEATS * count_repeats(events, _THE_SAME, values.rests | ~still)[begins.cumsum() - 1, None]
+            1 + _REPEATS * count_repeats(events, _THE_SAME, values.rests | ~constant)[begins.cumsum() - 1, None]
         )
         return cls(cells, model, values, scored, cells.eligible & ~unsure, features, begins, counted, novelty)
 
     def score(self, predictors: Mask) -> tuple[Prediction, Floats]:
-        """Return what the ``predictors`` cells (bool ``[D]``) expect, and the surprise of each stretch ``[n, D]``."""
+        """Return the prediction of the ``predictors`` (bool ``[D]``), and the surprisal of each excerpt ``[n, D]``."""
         expected = self.model.predict(self.features, predictors)
         held = np.flatnonzero(self.scored & ~self.values.rests)
-        likely = _shrunk_to_even(expected.never, self.features[:, 2] == 0, predictors & self.cells.runs.moved)
+        likely = _tempered(expected.never, self.features[:, 2] == 0, predictors & self.cells.runs.moved)
         inflation = _inflation(expected, self.features, predictors)
         within = expected.within(self.values.low[held], self.values.high[held], held, inflation)
         likely[:, held] = expected.always[:, held] * within
         return expected, np.where(self.counted, -self.novelty * np.log(np.maximum(likely, P_MIN)), 0.0)
 
     def summed(self, surprisal: Floats) -> Floats:
-        """Return the evidence ``[D]`` of all touches, those before included."""
+        """Return the evidence ``[D]`` of all events, earlier ones included."""
         return np.where(self.scored, self.cells.accumulated + surprisal.sum(axis=0), 0.0)
 
 
-def _looked_at(events: Sequence[ContactEvent], runs: ConstantRuns, scored: Mask) -> tuple[Array, Mask, Mask]:
-    """Return the stretches that tell something: features ``[n, 4, D]``, whole touches ``[n]``, those that count.
+def _excerpts(events: Sequence[ContactEvent], runs: ConstantRuns, scored: Mask) -> tuple[Array, Mask, Mask]:
+    """Return the excerpts of events that carry evidence.
 
-    For each cell that is ``scored`` (bool ``[D]``) one stretch of each touch counts, ``[n, D]``: the longest within its
-    still stretch.
+    For each ``scored`` cell (bool ``[D]``) one excerpt of each event counts: the longest within its constant run.
+
+    Returns:
+        Features ``[n, 4, D]``, whether the excerpt is a whole event ``[n]``, whether it counts for a cell ``[n, D]``.
     """
     suffixes = [suffix for event in events for suffix in event.suffixes()]
     first = np.array([suffix.first for suffix in suffixes])
@@ -175,34 +186,31 @@ def _looked_at(events: Sequence[ContactEvent], runs: ConstantRuns, scored: Mask)
 
 
 def _inflation(expected: Prediction, features: Array, working: Mask) -> Floats:
-    """Return how many times as far as usual loads are off what is expected, ``[n]``, 1 to 4.
+    """Return the factor on the spread in each excerpt, ``[n]``, 1 to 4.
 
-    So far off are half of those of the ``working`` (bool ``[D]``), cells that are known to work.
+    The median error of the ``working`` cells (bool ``[D]``) relative to that of Student's t.
     """
     known = working & np.isfinite(expected.spread)
     loaded = features[:, 2, known] > 0
     error = np.abs(features[:, 1, known] - expected.mean[:, known]) / expected.spread[known]
-    error = np.column_stack([np.where(loaded, error, np.inf), np.full((len(features), _AS_USUAL), _USUALLY)])
-    middle = (loaded.sum(axis=1) + _AS_USUAL) // 2
+    error = np.column_stack([np.where(loaded, error, np.inf), np.full((len(features), _PRIOR_CELLS), _MEDIAN_ERROR)])
+    middle = (loaded.sum(axis=1) + _PRIOR_CELLS) // 2
     half: Floats = np.sort(error, axis=1)[np.arange(len(features)), middle]
-    return np.clip(half / _USUALLY, 1.0, _STRANGEST)
+    return np.clip(half / _MEDIAN_ERROR, 1.0, _MAX_INFLATION)
 
 
-def _shrunk_to_even(never: Floats, unloaded: NDArray[np.bool_], working: NDArray[np.bool_]) -> Floats:
-    """Return P(unloaded throughout) ``[n, D]``, nearer to even in the touches in which the model errs.
-
-    A touch like none before surprises many cells at once, and those that move tell so: how well their own loads were
-    foreseen decides what the log odds are worth for all the others.
+def _tempered(never: Floats, unloaded: NDArray[np.bool_], working: NDArray[np.bool_]) -> Floats:
+    """Return P(unloaded throughout) ``[n, D]``, tempered in events in which the model errs about the working cells.
 
     Args:
-        never: ``[n, D]``, what the model says.
-        unloaded: bool ``[n, D]``, what the cells did.
-        witness: bool ``[D]``, those that are known to work.
+        never: ``[n, D]``, the probability predicted.
+        unloaded: bool ``[n, D]``, whether the cells stayed unloaded.
+        working: bool ``[D]``, cells that are known to work.
     """
     odds = logit(np.maximum(never, P_MIN))
-    right = np.where(unloaded | np.isinf(odds), odds, -odds)[:, working]  # where nothing is known, nothing is wrong
-    likelihood = -np.stack([np.log1p(np.exp(-novelty * right)).sum(axis=1) for novelty in _WORTHS])
-    share = softmax(_WITNESS_SHARE * likelihood, axis=0)  # (worths, n)
-    doubted = np.sum([p[:, None] * expit(w * odds) for p, w in zip(share, _WORTHS, strict=True)], axis=0)
-    believed: Floats = np.maximum(never, doubted)  # doubt is no evidence against cells expected to stay unloaded
-    return believed
+    right = np.where(unloaded | np.isinf(odds), odds, -odds)[:, working]  # infinite odds: no model of the cell
+    likelihood = -np.stack([np.log1p(np.exp(-power * right)).sum(axis=1) for power in _POWERS])
+    share = softmax(_FIT_WEIGHT * likelihood, axis=0)  # (powers, n)
+    averaged = np.sum([p[:, None] * expit(w * odds) for p, w in zip(share, _POWERS, strict=True)], axis=0)
+    tempered: Floats = np.maximum(never, averaged)  # tempering never adds evidence against a cell
+    return tempered

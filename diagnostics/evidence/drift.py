@@ -1,7 +1,14 @@
-"""Drift: cells that move, but never come back to rest, or read too little or too much of every load.
+"""Drift: cells that move, but never return to their baseline (offset), or scale every load wrongly (gain).
 
-An offset shows in touches that load nothing around the cell, a gain in those that load all of it. One touch says little
-of either: objects have edges, and a reading may hold a residue of the last load.
+The evidence of an offset is the sum of -log P(loaded throughout | other cells) over the last events, as far as the cell
+is loaded throughout each. That of a gain g is the log likelihood ratio
+
+    log sum_{g, s} P(g) P(s) L_s(g) / max_{0.75 <= h <= 1.33} L_s(h),    L_s(g) = prod_{e >= s} t_4(y_e; sqrt(g) m_e)
+
+over gains g and change points s, for root loads y and predicted means m, with a contaminated Student t: Bayesian change
+point detection (Barry and Hartigan 1993) for one change of scale. Both need several events, because objects have edges
+and a reading may hold a residue of the last load. Offsets below 2 % of full scale and gains
+between 0.75 and 1.33 are not detected.
 """
 
 from __future__ import annotations
@@ -16,46 +23,46 @@ if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
     from diagnostics.preprocessing.scale import Array
 
-_OFFSET = 9.5  # log evidence from which on a cell that does not come to rest is faulty: four touches
-_LEAST_OFFSET = 0.02  # of full scale, at the mean: a smaller one does no harm
-_MOST_OFFSET = 3.0  # log evidence of one touch that a moving cell does not come to rest
-_GAIN = 7.0  # log evidence from which on a cell with another gain is faulty: three touches
-_FEWEST = 3  # touches: fewer cannot prove it
-_MARGIN = 1.5  # so many times what any healthy cell reached, to be faulty
-_STRANGE = 0.05  # share of touches that tell nothing of a gain: so none says more than log 20
-_GAINS = np.array([0.1, 0.2, 0.35, 0.5, 2.0, 3.0])  # that are tried, times what it was
-_AS_GOOD = np.array([0.75, 1.0, 1.33])  # that are no fault, or what is expected of this cell may be off by as much
-_LOADED = 2.0  # times the least load: expected of a cell by a touch that tells its gain
-_ALL_THROUGH = 0.5  # chance that a wrong gain was wrong all through the log, not from a later touch on
+_OFFSET = 9.5  # log evidence from which on a cell has an offset: four events
+_MIN_OFFSET = 0.02  # of full scale, of the mean load: a smaller offset does no harm
+_MAX_PER_EVENT = 3.0  # log evidence of an offset that one event can bring
+_GAIN = 7.0  # log evidence from which on a cell has another gain: three events
+_FEWEST = 3  # events; fewer prove no gain
+_MARGIN = 1.5  # times the largest evidence that any healthy cell reached
+_OUTLIERS = 0.05  # share of events that are independent of the gain: none brings more than log 20
+_GAINS = np.array([0.1, 0.2, 0.35, 0.5, 2.0, 3.0])  # faulty gains: a grid
+_AS_GOOD = np.array([0.75, 1.0, 1.33])  # gains that are no fault: the mean may err by as much
+_LOADED = 2.0  # times the lowest root load that counts as loaded: expected in an event that tests the gain
+_FROM_START = 0.5  # prior that a wrong gain is wrong from the start of the log
 
-_MEDIAN = 0.741  # of the size of Student's t with 4 degrees of freedom
+_MEDIAN = 0.741  # median of |t| with 4 degrees of freedom
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
 def offset_evidence(whole: Array, always: Floats, moving: Mask) -> Floats:
-    """Return the log likelihood ratio that a moving cell never comes back to rest, ``[D]``, over the last touches.
+    """Return the log likelihood ratio ``[D]`` that a moving cell never returns to its baseline.
 
     Args:
-        whole: features ``[n, 4, D]`` of n touches (see ``Summary.features``), in time order.
+        whole: features ``[n, 4, D]`` of n events (see ``Summary.features``), in time order.
         always: ``[n, D]``, P(loaded throughout) of a healthy cell.
-        moving: bool ``[D]``, the cells that are judged.
+        moving: bool ``[D]``, cells that move.
     """
-    loaded = (whole[:, 3] == 1) & (whole[:, 1] ** 2 >= _LEAST_OFFSET)
+    loaded = (whole[:, 3] == 1) & (whole[:, 1] ** 2 >= _MIN_OFFSET)
     lasting = np.logical_and.accumulate(loaded[::-1])[::-1]  # unbroken up to the end
-    surprisal = -np.log(np.maximum(always, np.exp(-_MOST_OFFSET)))
+    surprisal = -np.log(np.maximum(always, np.exp(-_MAX_PER_EVENT)))
     return np.where(moving, np.where(lasting, surprisal, 0.0).sum(axis=0), 0.0)
 
 
 class Gain(NamedTuple):
-    """How cells read a load, ``[D]`` each.
+    """Gain of each cell relative to the reference, ``[D]`` each.
 
     Attributes:
-        evidence: float, log likelihood ratio of another gain than in the reference; 0: too few touches tell.
-        factor: float, how many times the gain of the reference it is most likely to be.
-        since: int, the touch from which on.
-        touches: int, how many tell, from that one on.
+        evidence: float, log likelihood ratio of a changed gain; 0: too few events.
+        factor: float, the most likely gain relative to the reference.
+        since: int, index of the event from which on it holds.
+        events: int, number of events from there on that test the gain.
     """
 
     evidence: Floats
@@ -67,73 +74,74 @@ class Gain(NamedTuple):
 def gain_evidence(
     whole: Array, expected: Prediction, moved: Mask, root_near: float, counts: Floats | float = 1.0
 ) -> Gain:
-    """Look for cells that are loaded when the others say, but not as much.
+    """Return the evidence of a changed gain.
 
-    Whether a cell is loaded at all is another question (see ``spatial``): touches that leave it unloaded do not count.
-    What holds of cells in general (cold start) tells nothing of the gain of one; where few touches taught what to
-    expect of it, evidence counts for less.
+    Events that leave a cell unloaded do not count (the spatial test covers these). A prediction that is not specific to
+    the cell (``Prediction.own`` = 0, cold start) carries no evidence of its gain.
 
     Args:
-        whole: features ``[n, 4, D]`` of n touches (see ``Summary.features``), in time order.
-        expected: what healthy cells would have done in them.
-        moved: bool ``[n, D]``, the touches up to which each cell has moved.
+        whole: features ``[n, 4, D]`` of n events (see ``Summary.features``), in time order.
+        expected: prediction for healthy cells.
+        moved: bool ``[n, D]``, events before the constant run of each cell.
         root_near: the root load from which on a cell counts as loaded.
-        counts: ``[n, 1]``, share of what each says that counts, see :func:`gains_count`.
+        counts: ``[n, 1]``, weight of each event, see :func:`gains_count`.
     """
-    tells = (
+    informative = (
         moved
         & np.isfinite(expected.spread)
         & (expected.own > 0)
         & (whole[:, 2] > 0)
         & (expected.mean > _LOADED * root_near)
     )
-    n, d = tells.shape
+    n, d = informative.shape
     result = Gain(np.zeros(d), np.ones(d), np.zeros(d, np.intp), np.zeros(d, np.intp))
-    cells = np.flatnonzero(tells.sum(axis=0) >= _FEWEST)
+    cells = np.flatnonzero(informative.sum(axis=0) >= _FEWEST)
     if not len(cells):
         return result
-    tells, root = tells[:, cells], whole[:, 1, cells]
+    informative, root = informative[:, cells], whole[:, 1, cells]
     mean, spread = (of.astype(np.float32) for of in (expected.mean[:, cells], expected.spread[cells]))
-    # How far what is expected errs in this log, all cells tell together.
-    spread *= max(1.0, float(np.median(np.abs((root - mean) / spread)[tells])) / _MEDIAN)
+    # The error of the predictions in this log is estimated from all cells.
+    spread *= max(1.0, float(np.median(np.abs((root - mean) / spread)[informative])) / _MEDIAN)
 
-    def said(gain: float) -> Array:
-        """Return what each touch and those after it say for a gain, ``[n, k]``."""
+    def log_likelihood(gain: float) -> Array:
+        """Return the log likelihood of a gain from each event on, ``[n, k]``."""
         u = 1 + ((root - np.float32(np.sqrt(gain)) * mean) / (2 * spread)) ** 2
-        of_event = np.log((1 - _STRANGE) / (u * u * np.sqrt(u)) + _STRANGE)  # as Student's t with 4 degrees
-        return np.where(tells, counts * of_event, 0.0)[::-1].cumsum(axis=0)[::-1]
+        of_event = np.log((1 - _OUTLIERS) / (u * u * np.sqrt(u)) + _OUTLIERS)  # Student's t, 4 degrees of freedom
+        return np.where(informative, counts * of_event, 0.0)[::-1].cumsum(axis=0)[::-1]
 
-    chance = np.full(n, (1 - _ALL_THROUGH) / max(n - 1, 1))
-    chance[0] = _ALL_THROUGH
-    wrong = np.stack([said(gain) for gain in _GAINS]) - np.max([said(gain) for gain in _AS_GOOD], axis=0)
+    chance = np.full(n, (1 - _FROM_START) / max(n - 1, 1))
+    chance[0] = _FROM_START
+    wrong = np.stack([log_likelihood(gain) for gain in _GAINS]) - np.max(
+        [log_likelihood(gain) for gain in _AS_GOOD], axis=0
+    )
     wrong += np.log(chance / len(_GAINS)).astype(np.float32)[:, None]  # (gains, n, k)
     likeliest = wrong.max(axis=1).argmax(axis=0)
     result.evidence[cells] = expected.own[cells] * logsumexp(wrong, axis=(0, 1))
     result.factor[cells] = _GAINS[likeliest]
     result.since[cells] = since = wrong[likeliest, :, np.arange(len(cells))].argmax(axis=1)
-    result.events[cells] = (tells & (np.arange(n)[:, None] >= since)).sum(axis=0)
+    result.events[cells] = (informative & (np.arange(n)[:, None] >= since)).sum(axis=0)
     return result
 
 
 def gains_count(reached: float) -> float:
-    """Return what share of the evidence of gains counts where healthy cells reached so much of it.
+    """Return the factor on the evidence of gains that keeps ``reached``, the most of healthy cells, below 7 / 1.5.
 
-    Touches may be alike, or a contact so small that its neighbours do not tell how hard a cell is pressed.
+    Events may be correlated, or contacts so small that the neighbours do not determine the load of a cell.
     """
     return _GAIN / max(_GAIN, _MARGIN * reached)
 
 
 def drifting(offset: Floats, gain: Floats | float = 0.0) -> Mask:
-    """Return the cells of which the evidence, ``[D]`` each, leaves no doubt."""
-    doubtless: Mask = (offset >= _OFFSET) | (gain >= _GAIN)
-    return doubtless
+    """Return the cells whose evidence of an offset or a gain, ``[D]`` each, exceeds the threshold, bool ``[D]``."""
+    certain: Mask = (offset >= _OFFSET) | (gain >= _GAIN)
+    return certain
 
 
 def misleading(offset: Floats, gain: Floats, known: Mask) -> Mask:
-    """Return the drifting cells to be left out next when others are judged, ``[D]``; not those that are ``known``.
+    """Return the drifting cells to exclude next from the predictors, bool ``[D]``, without those ``known`` already.
 
-    Beside a wrong gain all gains look wrong: they are left out one at a time, the surest first.
+    A wrong gain makes the gains of its neighbours look wrong: only the cell with most evidence is excluded at a time.
     """
     gain = np.where(known, 0.0, gain)
-    p_floor = np.arange(len(gain)) == gain.argmax()
-    return drifting(np.where(known, 0.0, offset), np.where(p_floor, gain, 0.0))
+    strongest = np.arange(len(gain)) == gain.argmax()
+    return drifting(np.where(known, 0.0, offset), np.where(strongest, gain, 0.0))

@@ -1,11 +1,14 @@
-"""Wiring evidence of addresses and bridges: lines that read exactly alike.
+"""Duplicate lines: pairs of rows or columns that read the same, as with a stuck address bit or a bridge.
 
-A stuck address bit selects the same line twice, a bridge joins two neighbours: either way two lines read the same,
-frame by frame, to within the converter's step. Healthy lines do that only while nothing touches them, or by chance when
-something lies evenly across both. So each pair of lines that one bit or one bridge could join is watched: since when
-they have not differed, how often they have agreed on a load that moved (a witness), and whether what they differ by
-is noise around zero, as of one cell read twice, or small but stays or comes and goes slowly, as of two cells under
-equal loads.
+Detects, among the pairs that one address bit or one bridge can join, those that agree within a tolerance in every frame
+while informative cells (loaded, moving, not saturated) support the agreement: a *coincidence*. A pair counts when it
+has at least 4 coincidences, and 3 more than any healthy pair, and when its difference d is white noise around zero, as
+of one cell read twice:
+
+    mean over cells of (sum d)^2 / sum d^2 <= 5        and        sqrt(n) sum d_t d_{t-1} / sum d^2 <= 3
+
+The second is a one-sided test of the lag-1 autocorrelation (Box and Pierce 1970). Two cells
+under equal loads differ by a constant or a slow difference. Lines that nothing loads are not detected.
 """
 
 from __future__ import annotations
@@ -24,26 +27,27 @@ from diagnostics.layout import LineKind, SensorLayout, address_bits
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Scale
 
-_EVERY = 4  # frames; a lasting fault does not hide between them
-_FEWEST_WITNESSES = 4  # and three more than healthy lines ever had
-_MOST_AT_ONCE = 3  # of these in one segment: neighbours under one thing are alike
-_STEADY = 5.0  # squared z value of a difference, mean over the cells: 1 if it is noise around zero
-_SMOOTH = 3.0  # standard deviations of the correlation of a difference with the one before: 0 if it is noise
-_STEP = 0.1  # of the tolerance: so small a difference is none
+_EVERY = 4  # every fourth frame is compared: faults last longer
+_FEWEST = 4  # coincidences, and three more than healthy lines ever had
+_MOST_AT_ONCE = 3  # coincidences counted in one segment: neighbours under one object are correlated
+_STEADY = 5.0  # mean squared z value of a difference; 1 for noise around zero
+_SMOOTH = 3.0  # standard deviations of the lag-1 autocorrelation of a difference; 0 for noise
+_STEP = 0.1  # of the tolerance: smaller differences are none
 
 Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class DuplicatePair:
-    """Two lines that read alike.
+    """Two lines that read the same.
 
     Attributes:
-        pad: the pad; kind: ``"row"`` or ``"column"``.
-        first, second: the lines, ascending.
+        pad: the pad.
+        kind: ``"row"`` or ``"column"``.
+        first, second: indices of the lines, ascending.
         since: number of the first frame from which on they did not differ.
-        told: number of the frame by which the first witness had been seen.
-        witnesses: how often they agreed on a moving load since.
+        seen_by: number of the frame of the first coincidence.
+        witnesses: number of coincidences since.
     """
 
     pad: int
@@ -65,15 +69,14 @@ def pairs(count: int) -> tuple[tuple[int, int], ...]:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """What is known of all pairs of rows, or of columns.
+    """All pairs of rows, or of columns.
 
     Attributes:
-        first, second: int ``[pairs]``, the lines of each.
-        there: bool ``[pads, pairs, positions]``, where both have a cell.
-        since, told, witnesses: int ``[pads, pairs]``, see :class:`DuplicatePair`.
-        sums: of what the cells of a pair differed by while both told something: the difference, its square, its product
-            with the one before, and 1 for each of these, float ``[4, pads, pairs, positions]``; squares are above 0
-            where there were witnesses.
+        first, second: int ``[pairs]``, indices of the lines.
+        there: bool ``[pads, pairs, positions]``, where both lines have a cell.
+        since, seen_by, witnesses: int ``[pads, pairs]``, see :class:`DuplicatePair`.
+        sums: float ``[4, pads, pairs, positions]``, sums over informative frames of the difference, its square, its
+            product with the one before, and of 1; the squares are above 0 where there were coincidences.
     """
 
     first: NDArray[np.intp]
@@ -86,7 +89,7 @@ class _Pairs:
 
     @classmethod
     def begin(cls, present: Mask) -> _Pairs:
-        """Nothing seen yet of lines ``[pads, lines, positions]``."""
+        """Return the state before any frame, for cells ``present`` (bool ``[pads, lines, positions]``)."""
         first, second = np.array(pairs(present.shape[1]) or np.empty((0, 2)), dtype=np.intp).reshape(-1, 2).T
         there = present[:, first] & present[:, second]
         nothing = np.zeros(there.shape[:2], np.intp)
@@ -95,8 +98,8 @@ class _Pairs:
     def extend(
         self, lines: NDArray[np.float32], numbers: NDArray[np.intp], informative: Mask, tolerance: float
     ) -> _Pairs:
-        """Return the pairs after readings ``[t, pads, lines, positions]`` of frames with these numbers."""
-        # A missing reading differs from nothing; a position without a cell neither.
+        """Return the pairs after readings ``[t, pads, lines, positions]`` of frames ``numbers``."""
+        # Missing readings and positions without a cell do not differ from anything.
         difference = np.take(lines, self.first, axis=2)
         difference -= np.take(lines, self.second, axis=2)
         differ = np.abs(difference, out=difference) > tolerance
@@ -116,7 +119,7 @@ class _Pairs:
         return _Pairs(self.first, self.second, self.there, since, seen_by, witnesses, sums)
 
     def _summed(self, lines: NDArray[np.float32], both: Mask, anew: Mask, tolerance: float) -> NDArray[np.float32]:
-        """Return the sums with what ``both`` cells of a pair tell; pairs that differ clearly begin ``anew``."""
+        """Return the sums with the informative cells (``both``) added; sums of pairs that differ begin ``anew``."""
         after = np.where(anew[..., None], np.float32(0), self.sums)
         pad, pair, position = np.nonzero(both)
         difference = lines[:, pad, self.first[pair], position] - lines[:, pad, self.second[pair], position]
@@ -128,28 +131,25 @@ class _Pairs:
         return after
 
     def matching(self, needed: int) -> list[tuple[int, int]]:
-        """Return (pad, pair) of those with so many witnesses, 1 or more, that differ by nothing but noise."""
+        """Return (pad, pair) of the pairs with at least ``needed`` coincidences that differ by noise only."""
         return [(pad, i) for pad, i in np.argwhere(self.witnesses >= needed).tolist() if not self._steady(pad, i)]
 
     def _steady(self, pad: int, pair: int) -> bool:
-        """Whether two lines differ by little, but not by noise: two cells under equal loads, not one read twice.
-
-        The difference is then always the same, or goes from one value to another by and by.
-        """
+        """Return whether the difference of two lines is constant or slow rather than noise, see the module."""
         difference, squares, products, count = self.sums[:, pad, pair]
-        seen_by = squares > 0
-        smooth = products[seen_by].sum() / squares[seen_by].sum() * np.sqrt(count[seen_by].sum())
-        return bool((difference[seen_by] ** 2 / squares[seen_by]).mean() > _STEADY or smooth > _SMOOTH)
+        coinciding = squares > 0
+        smooth = products[coinciding].sum() / squares[coinciding].sum() * np.sqrt(count[coinciding].sum())
+        return bool((difference[coinciding] ** 2 / squares[coinciding]).mean() > _STEADY or smooth > _SMOOTH)
 
 
 @dataclass(frozen=True)
 class DuplicateLines:
-    """What is known of all pairs of lines.
+    """All pairs of lines of an array.
 
     Attributes:
         layout: the array.
         of: the pairs of rows and of columns.
-        most: the most witnesses that any pair ever had that differed by nothing but noise.
+        most: largest number of coincidences of any pair that differed by noise only.
     """
 
     layout: SensorLayout
@@ -158,7 +158,7 @@ class DuplicateLines:
 
     @classmethod
     def begin(cls, layout: SensorLayout) -> DuplicateLines:
-        """Nothing seen yet."""
+        """Return the state before any frame."""
         present = layout.present
         return cls(layout, {"row": _Pairs.begin(present), "column": _Pairs.begin(present.swapaxes(1, 2))})
 
@@ -170,21 +170,23 @@ class DuplicateLines:
         Args:
             frames: ``[t, D]``.
             numbers: int ``[t]``, of the frames.
-            telling: bool ``[D]``, cells that are loaded and move in these frames.
-            tolerance: as far as two conversions of one cell may differ.
+            informative: bool ``[D]``, cells that are loaded and move in these frames.
+            tolerance: largest difference of two conversions of one cell.
         """
-        some = slice((len(frames) - 1) % _EVERY, None, _EVERY)  # up to the last, in which ``telling`` cells are loaded
-        grid, seen_by = self.layout.grid(frames[some].astype(np.float32)), self.layout.grid(informative)
+        some = slice(
+            (len(frames) - 1) % _EVERY, None, _EVERY
+        )  # includes the last frame, in which informative cells are loaded
+        grid, loaded = self.layout.grid(frames[some].astype(np.float32)), self.layout.grid(informative)
         of: dict[LineKind, _Pairs] = {
-            "row": self.of["row"].extend(grid, numbers[some], seen_by, tolerance),
-            "column": self.of["column"].extend(grid.swapaxes(2, 3), numbers[some], seen_by.swapaxes(1, 2), tolerance),
+            "row": self.of["row"].extend(grid, numbers[some], loaded, tolerance),
+            "column": self.of["column"].extend(grid.swapaxes(2, 3), numbers[some], loaded.swapaxes(1, 2), tolerance),
         }
         more = [int(each.witnesses[place]) for each in of.values() for place in each.matching(self.most + 1)]
         return DuplicateLines(self.layout, of, max([self.most, *more]))
 
     def duplicate_pairs(self, usual: int) -> list[DuplicatePair]:
-        """Return the pairs that differ by noise and have more witnesses than healthy ones, up to ``usual``."""
-        needed = max(_FEWEST_WITNESSES, usual + 3)
+        """Return the pairs that differ by noise and have more coincidences than healthy ones (``usual``)."""
+        needed = max(_FEWEST, usual + 3)
         return [
             DuplicatePair(
                 pad, kind, int(each.first[i]), int(each.second[i]),
@@ -202,7 +204,7 @@ class DuplicateLines:
 
 
 def informative(frames: NDArray[np.float64], still: Mask, scale: Scale) -> Mask:
-    """Return the cells ``[D]`` that are loaded, not saturated, and move in ``frames``: two alike are no chance."""
-    now = frames[-1]  # a missing reading is neither above nor below anything
+    """Return the cells ``[D]`` that are loaded, not saturated, and move in ``frames``."""
+    now = frames[-1]  # comparisons with NaN are False
     found: Mask = ~still & (now > scale.baseline + scale.near) & (now < scale.full_scale - scale.near)
     return found

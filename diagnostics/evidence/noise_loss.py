@@ -1,7 +1,14 @@
-"""Temporal evidence of missing noise: where even untouched cells flicker, one that does not any more is broken.
+"""Noise loss: cells that read exactly the same for longer than any healthy cell, on arrays with noise without contact.
 
-So a cell gives itself away untouched, whatever it holds. A skin that thresholds its readings has no such noise, nor has
-one whose converter is coarser than its noise: there it depends on a hair where a cell flickers, and nothing is said.
+Detects broken cells without any contact, whatever value they hold. The statistic is the number r of consecutive frames
+with an identical reading, against the longest run L of the cell in the reference:
+
+    12   if r >= max(2 L, 1.5 recordings)          (log likelihood ratio fault : healthy)
+    -2   if the constant run is as long but r <= L
+    0    else
+
+A runs test for a sensor "flatline", as in data quality control (QARTOD 2020). It detects nothing on arrays that
+threshold their readings, or whose converter step is larger than the noise; then it is switched off.
 """
 
 from __future__ import annotations
@@ -16,23 +23,20 @@ from diagnostics.events.constant_runs import ConstantRuns, same_for
 from diagnostics.preprocessing.baseline import FEWEST, untouched_evidence
 from diagnostics.preprocessing.readings import RecordingBlocks, held
 
-_CALM = 0.25  # of a recording: a cell that ever reads the same for longer does not flicker
-# Of the cells so many flicker at least, and of those that do not so many at most are elsewhere than at the rails.
-_FLICKERING, _QUIET = 0.5, 0.02
-# So often as long as ever is too long to read the same, and so often as long as a recording: rests change in between.
-_LONGER, _RECORDINGS = 2.0, 1.5
+_CALM = 0.25  # of a recording: a cell with a longer identical run has no noise
+_NOISY, _QUIET = 0.5, 0.02  # share of cells with noise, at least; share without noise off the rails, at most
+_LONGER, _RECORDINGS = 2.0, 1.5  # times the longest run, and times a recording: baselines change in between
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class NoiseLoss:
-    """How long healthy cells read exactly the same.
+    """Longest runs of identical readings of healthy cells.
 
     Attributes:
-        longest: float ``[D]``, frames on end in which each cell had the same reading; inf: it does not flicker, or not
-            known.
-        recording: frames of a recording.
+        longest: float ``[D]``, L in frames; inf: the cell has no noise, or unknown.
+        recording: median length of a recording, in frames.
     """
 
     longest: Floats
@@ -40,7 +44,7 @@ class NoiseLoss:
 
     @classmethod
     def fit(cls, recordings: Sequence[Floats], present: NDArray[np.bool_]) -> NoiseLoss:
-        """Learn from fault-free recordings, ``[T, D]`` each, of the cells that are ``present`` (bool ``[D]``)."""
+        """Fit to fault-free recordings, ``[T, D]`` each, of the ``present`` cells (bool ``[D]``)."""
         every = np.arange(len(present))
         longest, same = np.zeros(len(present), np.intp), np.zeros(len(present), np.intp)
         value, last = np.full((2, len(present)), np.nan)
@@ -57,24 +61,24 @@ class NoiseLoss:
         recording = float(np.median([len(r) for r in recordings]))
         has_noise = longest <= _CALM * recording
         quiet = ~has_noise & (value > lowest) & (value < highest)
-        few = len(recordings) < FEWEST or has_noise[present].mean() < _FLICKERING or quiet[present].mean() > _QUIET
+        few = len(recordings) < FEWEST or has_noise[present].mean() < _NOISY or quiet[present].mean() > _QUIET
         return cls.unknown(len(present)) if few else cls(np.where(has_noise, longest, np.inf), recording)
 
     @classmethod
     def unknown(cls, n_cells: int) -> NoiseLoss:
-        """Without a reference no cell is known to flicker."""
+        """Return the state of a cold start: no cell is known to have noise."""
         return cls(np.full(n_cells, np.inf), 1.0)
 
     def evidence(self, runs: ConstantRuns, rests: NDArray[np.bool_], present: NDArray[np.bool_], sunk: bool) -> Floats:
-        """Return what it says of a fault that a cell flickers, or does not, a log likelihood ratio ``[D]``.
+        """Return the log likelihood ratio fault : healthy, ``[D]``.
 
         Args:
-            runs: the still stretches.
-            rests: bool ``[D]``, cells that read what an untouched one does, or less.
+            runs: the constant runs.
+            rests: bool ``[D]``, cells at their baseline or below.
             present: bool ``[D]``.
-            sunk: all cells at rest read less than they ever did: at the low rail they do not flicker.
+            sunk: all cells at rest read less than ever in the reference; at the low rail they have no noise.
         """
         too_long = np.maximum(_LONGER * self.longest, _RECORDINGS * self.recording)
-        calm = present & (np.minimum(runs.same, runs.length) >= too_long)  # frames without a reading prove nothing
+        calm = present & (np.minimum(runs.same, runs.length) >= too_long)  # missing readings are not identical ones
         as_ever = present & rests & (runs.length >= too_long) & (runs.same <= self.longest)
         return untouched_evidence(calm, calm & ~(rests & sunk), as_ever, present)

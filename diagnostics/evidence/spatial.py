@@ -40,10 +40,10 @@ if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
     from diagnostics.preprocessing.scale import Scale
 
-_TELLING = 0.5  # log evidence from which on a touch counts as one that tested the cell
-_ONE_LOAD = 0.5  # correlation of what touches elsewhere say of a load that outlasts them
-_MOST_ROUNDS = 8  # of judging, leaving suspects out and putting others back
-_MOST_DRIFTING = 16  # cells that are left out for their drift, one by one
+_TESTED = 0.5  # log evidence from which on an event counts as one that tested the cell
+_ONE_LOAD = 0.5  # correlation of the evidence that events elsewhere give about one held load
+_MOST_ROUNDS = 8  # of scoring and updating the predictors
+_MOST_DRIFTING = 16  # rounds of excluding drifting cells
 
 Floats = NDArray[np.float64]
 
@@ -180,7 +180,7 @@ class SpatialTest:
             summed,
             self._initial,
             test.scored,
-            np.where(of_gain, gain.events, (surprisal > _TELLING).sum(axis=0)),
+            np.where(of_gain, gain.events, (surprisal > _TESTED).sum(axis=0)),
             offset,
             gain.evidence,
             factor=np.where(of_gain, gain.factor, np.nan),

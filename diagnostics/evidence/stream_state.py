@@ -174,7 +174,7 @@ class StreamState:
         low = reference.least.evidence(self.runs, rests, reference.tolerance, self.present, lower)
         noise = reference.noise_loss.evidence(self.runs, rests, self.present, lower < -reference.tolerance)
         untouched = np.where(np.abs(noise) > np.abs(low), noise, low)
-        return reference.jumps_seen.evidence(self.runs, self.layout.full_scale) + untouched
+        return reference.jumps_seen.evidence(self.runs, reference.scale.full_scale) + untouched
 
     def model_of(self, i: int, events: EventLog) -> Model:
         """Return the healthy model of tile i; without a reference, a model of its ``events``."""
@@ -249,7 +249,7 @@ class StreamState:
     def _with_held_loads(self, cells: CellState) -> CellState:
         """Return the cells with the evidence of loads that are held where nothing has moved for some events."""
         if self.reference.model is None:
-            return cells  # a log alone does not tell how healthy cells hold loads
+            return cells  # held loads cannot be predicted from one log alone
         loaded = cells.scored & (self.scale.root_load(self.runs.value) > self.scale.root_near)
         begun = np.array([event.first for event in self.events.kept])
         outlasted, accumulated = np.zeros(len(loaded), bool), cells.accumulated.copy()
@@ -266,7 +266,7 @@ class StreamState:
         return replace(cells, accumulated=accumulated, outlasted=outlasted)
 
     def _jumps(self) -> NDArray[np.float64]:
-        return self.reference.jumps_seen.size(self.runs, self.layout.full_scale)
+        return self.reference.jumps_seen.size(self.runs, self.reference.scale.full_scale)
 
     def _close(self) -> None:
         """Process a segment."""
@@ -286,7 +286,7 @@ class StreamState:
         if self.tiled:
             skin = self._skin.extend(root, numbers, scale.root_near, runs.start, jumped)
             self._skin = skin.split(KEPT_EVENTS)[1].without_loads()
-            # Of a hundred cells on a line one is always dead: cells that never moved do not tell two lines apart.
+            # On long lines some cell is always dead: cells that never moved are no difference between two lines.
             frames = np.where(runs.moved, frames, np.nan)
         self.intermittency = self.intermittency.extend(known, root, numbers, scale, self.reference.usual, still)
         self.duplicates = self.duplicates.extend(frames, numbers, informative(frames, still, scale), scale.near)

@@ -1,7 +1,7 @@
-"""A part of a large array that stands for all of it, where something is learned that is the same for every cell.
+"""Calibration subset: blocks of a large array with much contact, on which the calibration is fitted.
 
-What evidence is worth differs little from one end of a skin to the other. So it is learned on a few blocks of cells
-that were touched often, at a cost that does not grow with the array.
+Calibration differs little between places of one array, so a subset of about 1000 cells suffices and the cost does not
+grow with the array. The blocks are those with the most loaded readings; differences between places are not seen.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from diagnostics.events.tiles import MOST_CELLS
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.readings import RecordingBlocks
 
-_SIDE = 24  # rows and columns of a block, at most: nine patches
-_CELLS = 1000  # in all, about
-_EVERY = 5  # frames looked at to see where an array is touched
-_TOUCHED = 0.05  # of full scale, above a cell's lowest reading
+_SIDE = 24  # rows and columns of a block, at most: nine tiles
+_CELLS = 1000  # in all, about: a size
+_EVERY = 5  # every fifth frame is searched for loads
+_LOADED = 0.05  # of full scale, above the lowest reading of a cell
 
 Recordings = Sequence[NDArray[np.float64]]
 
 
 def calibration_subset(recordings: Recordings, layout: SensorLayout) -> tuple[Recordings, SensorLayout]:
-    """Return recordings of the blocks of an array that were touched most, as an array of their own; a small one as is.
+    """Return recordings of the blocks with the most contact, and their layout; a small array is returned as it is.
 
-    Of a large one those recordings are left out in which nothing touches these blocks.
+    Recordings without any load on these blocks are left out.
 
     Args:
         recordings: ``[T, D]`` each.
@@ -43,8 +43,8 @@ def calibration_subset(recordings: Recordings, layout: SensorLayout) -> tuple[Re
     if layout.present.sum() <= MOST_CELLS or len(blocks) <= wanted:
         return recordings, layout
     readings = RecordingBlocks.of(recordings)
-    touched = layout.grid(_touched(readings, layout))
-    busiest = np.argsort([-int(touched[block].sum()) for block in blocks], kind="stable")[:wanted]
+    loaded = layout.grid(_loaded_frames(readings, layout))
+    busiest = np.argsort([-int(loaded[block].sum()) for block in blocks], kind="stable")[:wanted]
     chosen = [blocks[i] for i in sorted(busiest.tolist())]
     index = layout.grid(np.arange(layout.n_cells))
     cells = np.concatenate([index[block].ravel() for block in chosen])
@@ -52,11 +52,11 @@ def calibration_subset(recordings: Recordings, layout: SensorLayout) -> tuple[Re
         wanted, rows, cols, full_scale=layout.full_scale, unit=layout.unit, rate=layout.rate,
         present=layout.present.ravel()[cells],
     )  # fmt: skip
-    return _moving(readings, cells, _TOUCHED * layout.full_scale), own
+    return _moving(readings, cells, _LOADED * layout.full_scale), own
 
 
 def _moving(readings: RecordingBlocks, cells: NDArray[np.intp], least: float) -> list[NDArray[np.float64]]:
-    """Return the recordings, of these cells, in which one of them moves by over ``least``."""
+    """Return the recordings of ``cells`` in which at least one of them moves by more than ``least``."""
     found = []
     for i in range(len(readings)):
         frames = readings.piece(i, slice(None), cells)
@@ -65,10 +65,10 @@ def _moving(readings: RecordingBlocks, cells: NDArray[np.intp], least: float) ->
     return found
 
 
-def _touched(readings: RecordingBlocks, layout: SensorLayout) -> NDArray[np.intp]:
-    """Return in how many of the frames looked at each cell was touched, ``[D]``."""
+def _loaded_frames(readings: RecordingBlocks, layout: SensorLayout) -> NDArray[np.intp]:
+    """Return in how many of the searched frames each cell is loaded, int ``[D]``."""
     count = np.zeros(layout.n_cells, np.intp)
     for recording in readings:
         load = recording[::_EVERY] - np.fmin.reduce(recording, axis=0)
-        count += (load > _TOUCHED * layout.full_scale).sum(axis=0)
+        count += (load > _LOADED * layout.full_scale).sum(axis=0)
     return count

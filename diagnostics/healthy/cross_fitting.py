@@ -1,6 +1,9 @@
-"""What a rim is taught by: cells left out at random, in touches that the regressions of these cells were not fitted on.
+"""Cross-fitting: training samples for the stacking from events that the local regressions were not fitted on.
 
-A rim is to learn how far the regressions can be believed when some of the cells are dead, or have not moved yet.
+Estimates nothing itself. The events are split into 4 folds; regressions fitted on 3 of them predict the fourth, with a
+random 3 to 95 % of the cells excluded from the predictors, as if they were dead or had not moved yet. So the stacking
+learns how reliable the regressions are. Equals scikit-learn's ``StackingClassifier(cv=GroupKFold(4))``, with dropout of
+inputs (Chernozhukov et al. 2018 name the scheme).
 """
 
 from __future__ import annotations
@@ -18,26 +21,24 @@ from diagnostics.preprocessing.scale import Array
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
-FOLDS = 4  # of what there is to learn from: each teaches how far to believe what the others taught
-_LEFT_OUT = (0.03, 0.06, 0.12, 0.2, 0.4, 0.7, 0.95)  # of the cells, in turn: so many may be dead, or not moved yet
-_LOOKED_AT = 0.12  # of the cells at most, among those left out
-_SAMPLES = 100_000  # cells left out of a stretch that are looked at in all, about
+FOLDS = 4  # of the sources
+_LEFT_OUT = (0.03, 0.06, 0.12, 0.2, 0.4, 0.7, 0.95)  # shares of the cells that are no predictors, in turn
+_SCORED = 0.12  # share of the cells, at most, that give samples in one round
+_SAMPLES = 100_000  # in all, about: a size
 
-CellState = NDArray[np.intp]
+Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
-RegressionFit = Callable[
-    [Array, Mask], RegressionOutput
-]  # of features [n, 4, D], where the cells bool [D] may be asked
+RegressionFit = Callable[[Array, Mask], RegressionOutput]  # features [n, 4, D], predictors bool [D]
 
 
 @dataclass(frozen=True)
 class CrossFitting:
-    """Cells of which it is known what they did.
+    """Samples for the stacking.
 
     Attributes:
-        samples: float64 ``[m, k]``, what there was to know of each, see ``stacking.neighbourhood``.
-        never, always: bool ``[m]``, whether it stayed unloaded, or loaded, throughout.
-        touches: that they are of.
+        samples: float64 ``[m, k]``, features, see ``stacking.neighbourhood``.
+        never, always: bool ``[m]``, whether the cell stayed unloaded, or loaded, throughout.
+        events: number of events behind the samples.
     """
 
     samples: NDArray[np.float64]
@@ -49,52 +50,53 @@ class CrossFitting:
     def of(
         cls,
         features: Array,
-        source: CellState,
+        source: Indices,
         events: int,
         layout: SensorLayout,
-        outputs: CellState,
+        outputs: Indices,
         fit: Callable[[Array], RegressionFit],
         share: float,
         rng: np.random.Generator,
     ) -> CrossFitting:
-        """Draw from stretches of touches of an array, cross-fitted in folds of the sources.
+        """Draw samples from excerpts of events.
 
         Args:
-            features: ``[n, 4, D]``; source: int ``[n]``, stretches of one source teach nothing of each other.
-            touches: that they are of.
+            features: ``[n, 4, D]``.
+            source: int ``[n]``; excerpts of one source lie in one fold.
+            events: number of events behind the excerpts.
             layout: the array.
-            outputs: the cells that regressions are for.
+            outputs: the cells that have regressions.
             fit: returns the regressions of the ``outputs``, fitted on features ``[m, 4, D]``.
-            share: of all lessons that this array gives.
+            share: of all samples that are drawn from this array.
             rng: draws them.
         """
         present = np.flatnonzero(layout.present)
-        looked_at = sum(min(left, _LOOKED_AT) for left in _LEFT_OUT) * len(outputs)
-        most = max(1, round(share * _SAMPLES / (FOLDS * looked_at)))  # stretches in each round
+        per_excerpt = sum(min(left, _SCORED) for left in _LEFT_OUT) * len(outputs)
+        most = max(1, round(share * _SAMPLES / (FOLDS * per_excerpt)))  # excerpts in each round
         fold = rng.permutation(source.max() + 1)[source] % FOLDS
         found = []
         for k in range(FOLDS):
-            regressed, held = fit(features[fold != k]), features[fold == k]
+            regressed, held_out = fit(features[fold != k]), features[fold == k]
             for left in _LEFT_OUT:
-                some = held[np.sort(rng.permutation(len(held))[:most])]
+                some = held_out[np.sort(rng.permutation(len(held_out))[:most])]
                 out = rng.permutation(present)[: max(1, round(left * len(present)))]
                 predictors = np.ones(layout.n_cells, bool)
                 predictors[out] = False
                 out = out[np.isin(out, outputs)]
-                out = np.sort(out[: max(1, round(_LOOKED_AT * len(outputs)))])
-                known_values = neighbourhood(regressed(some, predictors), some, predictors, layout, out)
-                samples = known_values.reshape(len(known_values), -1).T.astype(np.float64)
+                out = np.sort(out[: max(1, round(_SCORED * len(outputs)))])
+                described = neighbourhood(regressed(some, predictors), some, predictors, layout, out)
+                samples = described.reshape(len(described), -1).T.astype(np.float64)
                 found.append(cls(samples, (some[:, 2, out] == 0).T.ravel(), (some[:, 3, out] == 1).T.ravel(), 0))
         return replace(cls.joined(found), events=events)
 
     @classmethod
     def joined(cls, parts: Sequence[CrossFitting]) -> CrossFitting:
-        """Join the lessons of several arrays."""
+        """Concatenate the samples of several parts."""
         samples, never, always = (
             np.concatenate([getattr(part, name) for part in parts]) for name in ("samples", "never", "always")
         )
         return cls(samples, never, always, sum(part.events for part in parts))
 
     def fit_stacking(self) -> Stacking:
-        """Return what they teach."""
+        """Return the stacking fitted to the samples."""
         return Stacking.fit(self.samples, self.never, self.always, self.events)

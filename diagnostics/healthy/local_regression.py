@@ -1,7 +1,11 @@
-"""The regressions of cells, each from the others: what is fitted of a whole array, or of one of its patches.
+"""Local regressions: each cell of a tile regressed on the other cells around it.
 
-Two logistic ones say whether a cell stays unloaded throughout a touch and whether it stays loaded throughout, a linear
-one says how hard it is loaded. What cells that cannot be trusted would have read is filled in from the others.
+Estimates log odds that a cell stays unloaded, or loaded, throughout an event (two ridge logistic regressions on four
+features a cell), and its mean root load (a Gaussian conditional mean with a Ledoit-Wolf covariance). The logistic ones
+equal scikit-learn's ``LogisticRegression(C=1 / (n * ridge))`` with the weights of the cell itself fixed at 0; the
+conditional mean of cell i is ``-sum_j P_ij z_j / P_ii`` with the precision matrix P, as in Gaussian graphical models.
+Cells that are no predictors are replaced by their conditional mean given the predictors. Interactions between cells
+are not modelled; the stacking adds them.
 """
 
 from __future__ import annotations
@@ -19,22 +23,23 @@ from diagnostics.healthy.dual_ridge import logistic as dual_logistic
 from diagnostics.healthy.stacking import RegressionOutput
 from diagnostics.preprocessing.scale import Array
 
-FEATURES = 4  # of a cell in a touch, see Summary.features
-RIDGE = 0.03  # on standardised inputs, per sample
-_FREE = 1e-6  # the same for the bias
-_STEPS = 25  # of accelerated descent; the ridge makes it converge
-_LEAST_SPREAD = 0.02  # of the root load: nothing is predicted more exactly
-_FEWEST = 6  # stretches in which a cell was loaded; of fewer its own spread is not known
+FEATURES = 4  # per cell and event, see Summary.features
+RIDGE = 0.03  # per sample, on standardised inputs
+_BIAS_RIDGE = 1e-6  # the bias is free; above 0 so that the bound can be inverted
+_STEPS = 25  # of accelerated descent: converged, thanks to the ridge
+_MIN_SPREAD = 0.02  # of the root load: no reading is predicted more exactly
+_FEWEST = 6  # excerpts in which a cell is loaded; with fewer its spread is that of the other cells
 
 
 @dataclass(frozen=True)
 class Start:
-    """What is known of a patch before its own touches are seen.
+    """The shared prior of one tile.
 
     Attributes:
-        weight, bias: ``[4, inputs, 2, outputs]`` and ``[2]``, of features that are not standardised.
-        ridge: of what is learned on top of them.
-        taper: ``[inputs, inputs]``, how much two cells may have to do with each other.
+        weight: ``[4, inputs, 2, outputs]``, of features that are not standardised.
+        bias: ``[2]``.
+        ridge: per sample, on the difference from the prior.
+        taper: ``[inputs, inputs]``, factor on the covariance of two cells, 0 to 1.
     """
 
     weight: NDArray[np.float64]
@@ -45,16 +50,17 @@ class Start:
 
 @dataclass(frozen=True)
 class LocalRegression:
-    """The model of some cells (``outputs``) from those around them (``inputs``, which hold the outputs too).
+    """Regressions of the ``outputs`` of a tile on its ``inputs``.
 
     Attributes:
-        inputs, outputs: int, cell indices; ``place``: where the outputs lie among the inputs.
-        mean, scale: of the features of the inputs, ``[4, inputs]``.
-        weight: ``[4 inputs, 2 outputs]``, never loaded and always loaded; no cell speaks for itself.
-        bias: ``[2 outputs]``.
-        covariance, precision: of the mean root loads, standardised, ``[inputs, inputs]``.
-        spread: ``[outputs]``.
-        surest: no probability is taken for nearer to 0 or 1.
+        inputs, outputs: int, cell indices; the inputs include the outputs.
+        place: int ``[outputs]``, position of each output among the inputs.
+        mean, scale: float ``[4, inputs]``, of the features.
+        weight: float ``[4 inputs, 2 outputs]``, never and always loaded; 0 for the features of the cell itself.
+        bias: float ``[2 outputs]``.
+        covariance, precision: float ``[inputs, inputs]``, of the standardised mean root loads.
+        spread: float ``[outputs]``, root mean square error of the mean root load; NaN: never loaded.
+        p_floor: lower limit of the probabilities.
     """
 
     inputs: NDArray[np.intp]
@@ -70,13 +76,13 @@ class LocalRegression:
     p_floor: float
 
     def __post_init__(self) -> None:
-        # Matrix products round differently in another memory order: a stored and restored one must say the same.
+        # Matrix products round differently in another memory order; a restored model must predict the same bits.
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
                 object.__setattr__(self, name, np.ascontiguousarray(value))
 
     def at(self, cells: NDArray[np.intp]) -> LocalRegression:
-        """Return the same model of another array, whose ``cells`` are the inputs here."""
+        """Return the same model with its inputs at ``cells`` (int ``[inputs]``) of another array."""
         return replace(self, inputs=cells, outputs=cells[self.place])
 
     @classmethod
@@ -88,17 +94,21 @@ class LocalRegression:
         p_floor: float,
         start: Start | None = None,
     ) -> LocalRegression:
-        """Fit on features ``[n, 4, D]``.
+        """Fit to excerpts of events.
 
-        One patch of many, of few samples, has a ``start``.
+        Args:
+            features: ``[n, 4, D]``.
+            inputs, outputs: cell indices, ascending.
+            p_floor: lower limit of the probabilities.
+            start: the shared prior of a tile of a large array, which has fewer samples than inputs.
         """
         from sklearn.covariance import LedoitWolf
 
         x = features[:, :, inputs]
         mean, scale = x.mean(axis=0), x.std(axis=0)
         if start is None:
-            scale[scale < 1e-4] = np.inf  # what never changes tells nothing
-        else:  # or has not changed yet
+            scale[scale < 1e-4] = np.inf  # a constant feature gets no weight
+        else:  # a feature that is constant in a few samples may still change
             scale = np.broadcast_to(np.maximum(scale.mean(axis=1, keepdims=True), 1e-2), scale.shape).copy()
         z = (x - mean) / scale
         place = np.searchsorted(inputs, outputs)
@@ -119,16 +129,16 @@ class LocalRegression:
             weight += shared * scale.reshape(-1, 1)
             bias += mean.reshape(-1) @ shared + np.repeat(start.bias, len(outputs)).astype(np.float32)
             covariance, precision = covariance_and_precision(z[:, 1].astype(np.float64), start.taper)
-        if not z[:, 1].any():  # cells of which none was ever touched say nothing of each other
+        if not z[:, 1].any():  # no event in this tile: cells count as independent
             covariance = precision = np.eye(len(inputs))
         z1 = z[:, 1].astype(np.float64)
         error = (z1 @ precision / np.diag(precision))[:, place] * np.where(np.isfinite(scale[1]), scale[1], 0)[place]
-        # Where nothing is loaded nothing errs: the spread is that of the loaded stretches.
-        known_values = x[:, 2, place] > 0
-        spread = np.sqrt((error**2 * known_values).sum(axis=0) / np.maximum(known_values.sum(axis=0), 1))
-        usual = float(np.sqrt(np.mean(spread**2)))
-        spread = np.maximum(np.where(known_values.sum(axis=0) < _FEWEST, 2 * usual, spread), _LEAST_SPREAD)
-        spread[~known_values.any(axis=0)] = np.nan  # how a cell reads that was never loaded is unknown
+        # An unloaded cell is predicted almost exactly: only excerpts in which the cell is loaded count.
+        loaded = x[:, 2, place] > 0
+        spread = np.sqrt((error**2 * loaded).sum(axis=0) / np.maximum(loaded.sum(axis=0), 1))
+        typical = float(np.sqrt(np.mean(spread**2)))
+        spread = np.maximum(np.where(loaded.sum(axis=0) < _FEWEST, 2 * typical, spread), _MIN_SPREAD)
+        spread[~loaded.any(axis=0)] = np.nan
         return cls(
             inputs, outputs, place, mean, scale, weight, bias,
             covariance, precision, spread, p_floor,
@@ -141,7 +151,7 @@ class LocalRegression:
         self._fill(z, known)
         odds = (z.reshape(len(z), -1) @ self.weight + self.bias).astype(np.float64)
         never, always = odds[:, : len(self.outputs)], odds[:, len(self.outputs) :]
-        # What all the other cells say of a cell: for those filled in, just what they were filled with.
+        # The conditional mean given all other cells; for imputed cells it equals the imputed value.
         mean = z[:, 1].astype(np.float64)
         mean = mean[:, self.place] - mean @ self.precision[:, self.place] / np.diag(self.precision)[self.place]
         scale = np.where(np.isfinite(self.scale[1]), self.scale[1], 0)[self.place]
@@ -149,7 +159,7 @@ class LocalRegression:
         return never, always, mean * scale + self.mean[1][self.place], usual
 
     def _fill(self, z: Array, known: NDArray[np.bool_]) -> None:
-        """Write into ``z`` ``[n, 4, inputs]`` what the unknown cells would say, as the linear regression has it."""
+        """Replace the unknown cells in ``z`` (``[n, 4, inputs]``) by their conditional mean given the known ones."""
         unknown = ~known
         if not unknown.any():
             return
@@ -157,52 +167,55 @@ class LocalRegression:
             z[:] = 0
             return
         if unknown.sum() <= known.sum():
-            among, between = self.precision[np.ix_(unknown, unknown)], self.precision[np.ix_(unknown, known)]
-            regression = -linalg.solve(among, between, assume_a="pos")
+            within, across = self.precision[np.ix_(unknown, unknown)], self.precision[np.ix_(unknown, known)]
+            regression = -linalg.solve(within, across, assume_a="pos")
         else:
-            among, between = self.covariance[np.ix_(known, known)], self.covariance[np.ix_(known, unknown)]
-            regression = linalg.solve(among, between, assume_a="pos").T
+            within, across = self.covariance[np.ix_(known, known)], self.covariance[np.ix_(known, unknown)]
+            regression = linalg.solve(within, across, assume_a="pos").T
         z[:, :, unknown] = z[:, :, known] @ regression.T.astype(np.float32)
 
 
 def predict_regressions(
     local_regressions: Sequence[LocalRegression], features: Array, predictors: NDArray[np.bool_]
 ) -> RegressionOutput:
-    """Return what the models say of their cells, 0 for others; see :meth:`HealthyModel.predict`."""
+    """Return the outputs of all regressions, 0 for cells without one; see :meth:`HealthyModel.predict`."""
     shape = (len(features), features.shape[2])
     regressed = RegressionOutput(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape))
     for regression in local_regressions:
         of_regression = regression.predict(features, predictors)
-        for values, said in zip(vars(regressed).values(), of_regression, strict=True):
-            values[:, regression.outputs] = said
+        for values, predicted in zip(vars(regressed).values(), of_regression, strict=True):
+            values[:, regression.outputs] = predicted
     return regressed
 
 
 def _logistic(x: Array, y: Array, own: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Fit one ridge logistic regression for each column of ``y`` ``[n, k]``, in which some weights stay 0.
+    """Fit one ridge logistic regression for each column of ``y``, in which some weights are fixed at 0.
 
-    Each step minimises a parabola above the loss, of the same curvature for all (Boehning's bound), from a point ahead
-    of the last (Nesterov): a tenth of the steps that plain gradients take.
+    Minimises a quadratic upper bound of the loss with one curvature for all columns (Boehning 1992), accelerated
+    (Nesterov 1983).
 
     Args:
         x: ``[n, d]``.
         y: ``[n, k]``, 0 or 1.
-        own: int ``[k, f]``, the inputs whose weight stays 0, for each column.
+        own: int ``[k, f]``, the inputs whose weight is 0, for each column.
+
+    Returns:
+        Weights ``[d, k]`` and biases ``[k]``.
     """
     n, d = x.shape
     x = np.concatenate([x, np.ones((n, 1), np.float32)], axis=1)
     penalty = np.full((d + 1, 1), RIDGE, np.float32)
-    penalty[d] = _FREE
+    penalty[d] = _BIAS_RIDGE
     inverse = np.linalg.inv((x.T @ x).astype(np.float64) / (4 * n) + np.diag(penalty[:, 0])).astype(np.float32)
-    # What a step has to give up for the weights that stay 0 is shared out among the others.
+    # Project each step onto the subspace in which the fixed weights do not change (Lagrange multipliers).
     block = np.linalg.inv(inverse[own[:, :, None], own[:, None, :]].astype(np.float64)).astype(np.float32)  # (k, f, f)
-    given_up = np.einsum("dkf,kfg->kdg", inverse[:, own], block)
+    projection = np.einsum("dkf,kfg->kdg", inverse[:, own], block)
     weight = np.zeros((d + 1, y.shape[1]), np.float32)
-    weight[d] = logit((y.sum(axis=0) + 1) / (n + 2))  # an imaginary sample of each kind keeps it finite
+    weight[d] = logit((y.sum(axis=0) + 1) / (n + 2))  # Laplace smoothing keeps it finite
     ahead, column = weight, np.arange(len(own))[:, None]
     for step in range(_STEPS):
         change = inverse @ (x.T @ ((expit(x @ ahead) - y) / np.float32(n)) + penalty * ahead)
-        change -= np.matmul(given_up, change[own, column][:, :, None])[:, :, 0].T
+        change -= np.matmul(projection, change[own, column][:, :, None])[:, :, 0].T
         change[own, column] = 0
         following = ahead - change
         ahead = following + np.float32(step / (step + 3)) * (following - weight)

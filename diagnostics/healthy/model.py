@@ -1,10 +1,14 @@
-"""What healthy looks like: how a touch loads a cell, given how it loads the others.
+"""The healthy model: the distribution of a cell's load in a contact event, given the loads of the other cells.
 
-Regressions of each cell from the others (see ``local_regressions``), fitted on the touches of fault-free recordings,
-corrected by what all cells have in common (see ``stacking``). An open cell looks unloaded, and so does a healthy one
-beside the contact: everything turns on how sharply the two can be told apart. Models of single frames, nearest frames,
-trees, a neural network and one model shared by all cells were each worse on real grasps than regressions on whole
-touches.
+Estimates, for each cell i and event e with features x_e of the other cells,
+
+    P(unloaded throughout e | x_e),   P(loaded throughout e | x_e),   E[mean root load | x_e]
+
+from ridge logistic and linear regressions per cell (:mod:`~diagnostics.healthy.local_regression`), corrected by one
+small network on the neighbourhood of the cell (:mod:`~diagnostics.healthy.stacking`): stacked generalization
+(Wolpert 1992). An open cell reads the same as a healthy cell beside the contact, so the sharpness of the two
+probabilities decides what can be detected. The model assumes that events are independent. It does not describe the
+course of a load within an event.
 """
 
 from __future__ import annotations
@@ -29,14 +33,14 @@ from diagnostics.layout import SensorLayout
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Array, Scale
 
-_SAMPLES = 3000  # stretches of touches that the model is fitted on, about
-_MOST_DRAWS = 8  # stretches of one touch: more of them say the same
-_SHORTEST = 6  # frames of a stretch
-_SUREST = 0.002  # a probability is never taken for nearer to 0 or 1, however many touches there were
-_SOURCES = 12  # recordings: of fewer each touch is a source of its own, and counts
-_FAMILIAR, _STRANGE = 1 / 400, 1 / 100  # chance that a touch does with a cell what none did before
-_SHARED = 0.4  # of what is said of a cell where few touches teach: that is true of the cells around it as well
-_AT_ONCE = 6144  # cells of stretches looked at between two pauses
+_SAMPLES = 3000  # excerpts of events to fit on, about
+_MOST_DRAWS = 8  # excerpts of one event: more of them are nearly the same
+_SHORTEST = 6  # frames of an excerpt
+_MIN_P_FLOOR = 0.002  # lower limit of the probabilities, however many events there are: models err
+_MIN_RECORDINGS = 12  # with fewer recordings each event is a source of its own
+_EXPERIENCED, _INEXPERIENCED = 1 / 400, 1 / 100  # p_floor after 400 and after 100 events
+_SHARED = 0.4  # part of the evidence about a cell that also holds for its neighbours, where events are few
+_BATCH = 6144  # cells times excerpts in one batch: bounds memory
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,9 @@ class HealthyModel:
     """See the module.
 
     Attributes:
-        tiles: the models of all cells.
-        layout: the array; rim: corrects what they foresee. Without: believed as it is.
+        local_regressions: one per tile; each cell is an output of exactly one.
+        layout: the array of the ``stacking``.
+        stacking: corrects the regressions; None: too few events to fit one.
     """
 
     local_regressions: tuple[LocalRegression, ...]
@@ -56,13 +61,13 @@ class HealthyModel:
     def fit(
         cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale, seed: int = 0
     ) -> HealthyModel:
-        """Fit on fault-free recordings, ``[T, D]`` each, all cells together; large arrays: ``patch_models``."""
+        """Fit one tile to fault-free recordings, ``[T, D]`` each; ``fit_healthy_model`` fits several tiles."""
         rng = np.random.default_rng(seed)
         features, source, n_events = excerpts(recordings, scale, rng)
         every = np.flatnonzero(layout.present)
 
-        def regressions(of: Array) -> RegressionFit:
-            return partial(predict_regressions, (LocalRegression.fit(of, every, every, _SUREST),))
+        def regressions(training: Array) -> RegressionFit:
+            return partial(predict_regressions, (LocalRegression.fit(training, every, every, _MIN_P_FLOOR),))
 
         stacking = None
         if n_events >= FOLDS:
@@ -73,68 +78,68 @@ class HealthyModel:
         """Raise ValueError unless each cell of ``layout`` is an output of exactly one local regression."""
         outputs = [regression.outputs for regression in self.local_regressions]
         if not np.array_equal(np.sort(np.concatenate(outputs)) if outputs else [], np.flatnonzero(layout.present)):
-            raise ValueError(f"the models do not cover the cells of {layout}, each once")
+            raise ValueError(f"the local regressions do not cover each cell of {layout} exactly once")
         if not all(0 < regression.p_floor < 1 for regression in self.local_regressions):
             raise ValueError("expected p_floor between 0 and 1")
 
     def of_tile(self, i: int, cells: NDArray[np.intp], layout: SensorLayout) -> HealthyModel:
-        """Return the model of tile i as one of an array ``layout`` of its own, in which its inputs are ``cells``."""
+        """Return the model of tile i on its own ``layout``, in which the inputs of the tile are ``cells``."""
         return HealthyModel((self.local_regressions[i].at(cells),), layout, self.stacking)
 
     def p_floor(self, n_cells: int) -> NDArray[np.float64]:
-        """Return the chance ``[D]`` of D cells that a touch does with one what none did before; 1: nothing is known."""
+        """Return the lower limit ``[D]`` of the probabilities of each cell; 1: no model of the cell."""
         p_floor = np.ones(n_cells)
         for regression in self.local_regressions:
             p_floor[regression.outputs] = regression.p_floor
         return p_floor
 
     def inexperience(self, n_cells: int) -> NDArray[np.float64]:
-        """Return how little is known of healthy touches of D cells, ``[D]``: 0 where it holds 400, 1 with up to 100."""
+        """Return, for each of D cells, 0 with 400 reference events or more, 1 with 100 or fewer, ``[D]``."""
         return _inexperience(self.p_floor(n_cells))
 
     def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
-        """Say what healthy cells would do. A generator that pauses on its way, for those who cannot wait.
+        """Predict the loads of healthy cells.
 
         Args:
-            features: ``[n, 4, D]``, of n stretches (see ``Summary.features``).
-            trusted: bool ``[D]``, the cells that may be asked.
+            features: ``[n, 4, D]``, of n excerpts (see ``Summary.features``).
+            predictors: bool ``[D]``, the cells whose readings may be used.
         """
         regressed = predict_regressions(self.local_regressions, features, predictors)
-        shape = features.shape[2]
-        spread, p_floor, known = np.ones(shape), self.p_floor(shape), np.zeros(shape, bool)
+        n_cells = features.shape[2]
+        spread, p_floor, known = np.ones(n_cells), self.p_floor(n_cells), np.zeros(n_cells, bool)
         for regression in self.local_regressions:
             spread[regression.outputs], known[regression.outputs] = regression.spread, True
         never, always = expit(regressed.never), expit(regressed.always)
         if self.stacking is not None and self.layout is not None:
-            judged = np.flatnonzero(known)
-            step = max(1, _AT_ONCE // len(judged))
+            modelled = np.flatnonzero(known)
+            step = max(1, _BATCH // len(modelled))
             for first in range(0, len(features), step):
                 some = slice(first, first + step)
                 of_some = RegressionOutput(*(values[some] for values in vars(regressed).values()))
-                known_values = self.stacking.predict(
-                    neighbourhood(of_some, features[some], predictors, self.layout, judged)
-                )
-                corrected, always[some, judged] = (p.T for p in known_values)
-                # A cell that no touch of the reference reached may be out of reach, whatever those around it do.
-                never[some, judged] = np.where(np.isnan(spread[judged]), never[some, judged], corrected)
-        # Which cells a touch reaches is of a place; that no load is held without any around it, all touches teach.
-        held = p_floor if self.stacking is None else np.minimum(p_floor, p_floor_of(self.stacking.events))
+                samples = neighbourhood(of_some, features[some], predictors, self.layout, modelled)
+                corrected, always[some, modelled] = (p.T for p in self.stacking.predict(samples))
+                # A cell that no reference event loaded may be out of reach, whatever its neighbours read.
+                never[some, modelled] = np.where(np.isnan(spread[modelled]), never[some, modelled], corrected)
+        # Which cells an event loads depends on the place; that a load is never held alone is learned from all events.
+        always_floor = p_floor if self.stacking is None else np.minimum(p_floor, p_floor_of(self.stacking.events))
         never = np.where(known, np.clip(never, p_floor, 1 - p_floor), 1.0)
-        always = np.where(known, np.clip(always, held, 1 - held), 1.0)
+        always = np.where(known, np.clip(always, always_floor, 1 - always_floor), 1.0)
         return Prediction(never, always, regressed.mean, spread, 1 - _SHARED * _inexperience(p_floor))
 
 
 def _inexperience(p_floor: NDArray[np.float64]) -> NDArray[np.float64]:
-    inexperience: NDArray[np.float64] = np.log(p_floor / _FAMILIAR) / np.log(_STRANGE / _FAMILIAR)
+    inexperience: NDArray[np.float64] = np.log(p_floor / _EXPERIENCED) / np.log(_INEXPERIENCED / _EXPERIENCED)
     return np.clip(inexperience, 0.0, 1.0)
 
 
 class ReferenceEvent(NamedTuple):
-    """Where a touch was seen in fault-free recordings.
+    """Where a contact event lies in the fault-free recordings.
 
     Attributes:
-        recording: its number; first: that of the first frame; frames: how many.
-        again: it loads what an earlier one of the recording did, and tells little new: a pat, again and again.
+        recording: index of the recording.
+        first: number of the first frame.
+        frames: number of frames.
+        again: whether it loads the same cells as an earlier event of the recording.
     """
 
     recording: int
@@ -144,7 +149,7 @@ class ReferenceEvent(NamedTuple):
 
     @classmethod
     def of(cls, events: Sequence[ContactEvent], recording: int) -> list[ReferenceEvent]:
-        """Return where the touches of a recording were seen."""
+        """Return the events of one recording."""
         return [
             cls(recording, event.first, event.n, again > 0)
             for event, again in zip(events, count_repeats(events).tolist(), strict=True)
@@ -152,22 +157,23 @@ class ReferenceEvent(NamedTuple):
 
 
 def count_events(seen: Sequence[ReferenceEvent]) -> int:
-    """How many touches these are worth, those seen again not counted; all of them where there are few recordings."""
+    """Return the number of distinct events; with few recordings repeated ones count too."""
     few = _few_recordings(seen)
     return sum(few or not event.again for event in seen)
 
 
 def _few_recordings(seen: Sequence[ReferenceEvent]) -> bool:
-    """Whether there are too few recordings to take each for one source."""
-    return len({event.recording for event in seen}) < _SOURCES
+    """Return whether there are too few recordings for cross-fitting by recording."""
+    return len({event.recording for event in seen}) < _MIN_RECORDINGS
 
 
 def excerpts(
     recordings: Sequence[NDArray[np.float64]], scale: Scale, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.intp], int]:
-    """Return features ``[n, 4, D]`` of random stretches of touches in fault-free recordings, and their sources.
+    """Return random excerpts of the events in fault-free recordings.
 
-    And how many touches those are worth.
+    Returns:
+        Features ``[n, 4, D]``, source of each ``[n]``, number of distinct events.
     """
     seen = [
         event for i, recording in enumerate(recordings) for event in ReferenceEvent.of(_events(recording, scale), i)
@@ -182,9 +188,16 @@ def drawn(
     rng: np.random.Generator,
     most: int,
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Return features ``[n, 4, D]`` of random stretches of touches, and the source ``[n]`` of each.
+    """Return features ``[n, 4, D]`` of random excerpts of events, and the source ``[n]`` of each.
 
-    The touches of one recording are alike, and one source, unless there are too few recordings to tell them apart.
+    Events of one recording are correlated and share a source, unless recordings are few.
+
+    Args:
+        seen: the events.
+        read: returns the given frames of a recording, ``[t, D]``.
+        scale: baseline and full scale.
+        rng: draws the excerpts.
+        most: number of excerpts, about.
     """
     draws = int(np.clip(round(most / len(seen)), 1, _MOST_DRAWS))
     if len(seen) > most:
@@ -202,8 +215,8 @@ def drawn(
 
 
 def p_floor_of(n_events: int) -> float:
-    """What never happened in n touches may happen in the next with a chance of about 1 in n (rule of succession)."""
-    return max(_SUREST, 1 / (n_events + 2))
+    """Return the probability of what never happened in n events: 1 / (n + 2), Laplace's rule of succession."""
+    return max(_MIN_P_FLOOR, 1 / (n_events + 2))
 
 
 def _events(recording: NDArray[np.float64], scale: Scale) -> tuple[ContactEvent, ...]:

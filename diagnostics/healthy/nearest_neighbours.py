@@ -1,9 +1,13 @@
-"""A cold start's picture of health: how a touch loads cells of this skin whose surroundings look like this.
+"""The k-NN spatial model: the healthy model of a cold start, built from the log itself without a reference.
 
-Without a fault-free reference each cell is judged by all trusted cells together: from the mean of its four nearest
-trusted neighbours, of the four diagonal ones, and from how well they enclose it: the smaller load of two opposite
-neighbours, the best pair counting. Built from the log itself. It interpolates, never extrapolates: a cell at the rim
-of the contact is rightly unloaded, however loaded its neighbours on one side are.
+Estimates the load of a cell from 20 cells with the most similar surroundings, anywhere on the array and in any event.
+Surroundings are the mean load of the four adjacent predictors, of the four diagonal ones, and the enclosure (maximum
+over pairs of opposite neighbours of the smaller load), for highest and mean root load:
+
+    P(never loaded) = (count of never loaded neighbours + prior) / (k + 1)
+
+Equals scikit-learn's ``KNeighborsClassifier`` and ``KNeighborsRegressor`` (Cover and Hart 1967) with one pseudo-count.
+It interpolates and never extrapolates: it predicts nothing for cells that no two opposite predictors enclose.
 """
 
 from __future__ import annotations
@@ -22,28 +26,33 @@ from diagnostics.preprocessing.scale import Array
 if TYPE_CHECKING:
     from diagnostics.events.contact_events import ContactEvent
 
-_NEIGHBOURS = 20
-_PRIOR_WEIGHT = 1.0  # neighbours that the share over all samples counts for: few neighbours prove little
-_MOST_SAMPLES = 20_000
-_LEAST_SPREAD = 0.05  # of the root load
+_NEIGHBOURS = 20  # k
+_PRIOR_WEIGHT = 1.0  # pseudo-count of the share over all samples
+_MOST_SAMPLES = 20_000  # in the search tree: a size
+_MIN_SPREAD = 0.05  # of the root load: no reading is predicted more exactly
 
 
 @dataclass(frozen=True)
 class NearestNeighbours:
-    """The touches of the log at hand, ``[n, 4, D]`` features (see ``Summary.features``)."""
+    """The model of one log.
+
+    Attributes:
+        log: features ``[n, 4, D]`` of the events of the log (see ``Summary.features``).
+        layout: the array.
+    """
 
     log: Array
     layout: SensorLayout
 
     @classmethod
     def of(cls, events: Sequence[ContactEvent], layout: SensorLayout) -> NearestNeighbours:
-        """Learn from the touches of a log, and from each part of them."""
+        """Build the model from the events of a log and from each of their parts."""
         return cls(
             np.stack([part.features() for event in events for part in (*event.parts, event.suffixes()[0])]), layout
         )
 
     def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
-        """See ``HealthyModel.predict``. A cell between no two trusted neighbours is not judged: all is as expected."""
+        """See ``HealthyModel.predict``. Probabilities are 1 for a cell that no two opposite predictors enclose."""
         from scipy.spatial import cKDTree
 
         shape = (len(features), features.shape[2])
@@ -55,34 +64,34 @@ class NearestNeighbours:
         if not len(usable):
             return Prediction(never, always, mean, spread, own=np.zeros(shape[1]))
         samples = known[:, usable].reshape(-1, known.shape[2])
-        answers = np.moveaxis(self.log[:, :, usable], 1, -1).reshape(-1, self.log.shape[1])
+        targets = np.moveaxis(self.log[:, :, usable], 1, -1).reshape(-1, self.log.shape[1])
         kept = np.linspace(0, len(samples) - 1, min(len(samples), _MOST_SAMPLES)).astype(int)
-        tree, answers = cKDTree(samples[kept]), answers[kept]
+        tree, targets = cKDTree(samples[kept]), targets[kept]
         scored = _describe(features, predictors, self.layout)
-        judged = np.flatnonzero(np.isfinite(scored).all(axis=(0, 2)) & present)
-        neighbours = min(_NEIGHBOURS, len(answers))
-        # Most cells lie far from any load, and are surrounded alike: that is looked up once, as the first.
-        neighbourhood = scored[:, judged].reshape(-1, scored.shape[2])
+        predicted = np.flatnonzero(np.isfinite(scored).all(axis=(0, 2)) & present)
+        neighbours = min(_NEIGHBOURS, len(targets))
+        # Most cells lie far from any load and have the same surroundings, which are searched for once, as the first.
+        neighbourhood = scored[:, predicted].reshape(-1, scored.shape[2])
         loaded = neighbourhood.any(axis=1)
-        which = np.where(loaded, np.cumsum(loaded), 0).reshape(len(features), len(judged))
+        which = np.where(loaded, np.cumsum(loaded), 0).reshape(len(features), len(predicted))
         unloaded = np.zeros((1, scored.shape[2]))
         _, nearest = tree.query(np.concatenate([unloaded, neighbourhood[loaded]]), k=neighbours)
-        near = answers[nearest.reshape(-1, neighbours)]  # (m, K, 4)
+        near = targets[nearest.reshape(-1, neighbours)]  # (m, K, 4)
 
         def share(of: NDArray[np.bool_], overall: NDArray[np.bool_]) -> NDArray[np.float64]:
             prior = (overall.sum() + 0.5) / (len(overall) + 1)
             result: NDArray[np.float64] = (of.sum(axis=1) + prior * _PRIOR_WEIGHT) / (neighbours + _PRIOR_WEIGHT)
             return result[which]
 
-        never[:, judged] = share(near[..., 2] == 0, answers[:, 2] == 0)
-        always[:, judged] = share(near[..., 3] == 1, answers[:, 3] == 1)
-        mean[:, judged] = near[..., 1].mean(axis=1)[which]
-        spread[judged] = max(float(near[..., 1].std(axis=1)[which].mean()), _LEAST_SPREAD)
+        never[:, predicted] = share(near[..., 2] == 0, targets[:, 2] == 0)
+        always[:, predicted] = share(near[..., 3] == 1, targets[:, 3] == 1)
+        mean[:, predicted] = near[..., 1].mean(axis=1)[which]
+        spread[predicted] = max(float(near[..., 1].std(axis=1)[which].mean()), _MIN_SPREAD)
         return Prediction(never, always, mean, spread, own=np.zeros(shape[1]))
 
 
 def _describe(features: Array, predictors: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.float64]:
-    """Return what surrounds each cell in each stretch, ``[n, D, 6]``; NaN where no two opposite cells are trusted."""
+    """Return the surroundings of each cell in each excerpt, ``[n, D, 6]``; NaN without two opposite predictors."""
     grid = layout.grid(
         np.where(predictors & layout.present.ravel(), features[:, :2], np.nan)
     )  # (n, 2, pads, rows, cols)
@@ -95,7 +104,7 @@ def _describe(features: Array, predictors: NDArray[np.bool_], layout: SensorLayo
     beside, opposite = shifted((-1, 0), (0, -1)), shifted((1, 0), (0, 1))
     diagonal, across = shifted((-1, -1), (-1, 1)), shifted((1, 1), (1, -1))
     near, far = _mean(np.concatenate([beside, opposite])), _mean(np.concatenate([diagonal, across]))
-    # A cell that has one kind of neighbour only is described by that kind.
+    # A cell that has only adjacent, or only diagonal, neighbours is described by these.
     near, far = np.where(np.isnan(near), far, near), np.where(np.isnan(far), near, far)
     pairs = np.minimum(np.concatenate([beside, diagonal]), np.concatenate([opposite, across]))
     described = np.stack([near, far, np.fmax.reduce(pairs)], axis=2)  # (n, 2, 3, pads, rows, cols)
@@ -103,7 +112,7 @@ def _describe(features: Array, predictors: NDArray[np.bool_], layout: SensorLayo
 
 
 def _mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean over the first axis without the NaN, NaN where nothing else is there."""
+    """Return ``np.nanmean(values, axis=0)`` without its warning for columns of NaN."""
     count = (~np.isnan(values)).sum(axis=0)
     total = np.nansum(values, axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -1,4 +1,4 @@
-"""What healthy cells do in a contact event, as a model predicts it."""
+"""Prediction: the distribution of the loads of healthy cells in contact events, as a healthy model gives it."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-_NOVEL = 0.1  # share of touches that resemble nothing known
+_OUTLIERS = 0.1  # share of events in which any load is equally likely (contamination)
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What healthy cells would do in each of n stretches, given the trusted cells.
+    """Predicted loads of healthy cells in each of n excerpts, given the predictors.
 
     Attributes:
         never: float ``[n, D]``, P(unloaded throughout).
         always: float ``[n, D]``, P(loaded throughout).
-        mean: float ``[n, D]``, expected mean root load.
-        spread: float ``[D]``, scale of the error of ``mean``; NaN: cells of which nothing is known.
-        own: float ``[D]``, how far all that is of the very cell, and not of any that is surrounded alike, 0 to 1.
+        mean: float ``[n, D]``, expected mean root load, 0 to 1.
+        spread: float ``[D]``, scale of the Student t error of ``mean``; NaN: unknown.
+        own: float ``[D]``, 1: the prediction is specific to the cell; 0: to any cell with the same surroundings.
     """
 
     never: NDArray[np.float64]
@@ -29,7 +29,7 @@ class Prediction:
     own: NDArray[np.float64]
 
     def on(self, excerpts: NDArray[np.bool_] | slice, cells: NDArray[np.intp] | slice = slice(None)) -> Prediction:
-        """Return the same of some stretches and cells."""
+        """Return the prediction for some of the excerpts and cells."""
         never, always, mean = (values[excerpts][:, cells] for values in (self.never, self.always, self.mean))
         return Prediction(never, always, mean, self.spread[cells], self.own[cells])
 
@@ -40,22 +40,23 @@ class Prediction:
         cells: NDArray[np.intp],
         inflation: NDArray[np.float64] | float = 1.0,
     ) -> NDArray[np.float64]:
-        """Return P(mean root load from ``low`` to ``high``), ``[n, k]``, of k ``cells``; the bounds are ``[k]``.
+        """Return P(low <= mean root load <= high), ``[n, k]``.
 
-        ``inflation``: how many times as far as usual loads are off in each stretch, ``[n]``.
+        A contaminated Student t distribution: 0.9 F_4((x - mean) / (inflation * spread)) + 0.1 of a uniform one.
+
+        Args:
+            low, high: root loads ``[k]``.
+            cells: int ``[k]``.
+            inflation: factor on the spread in each excerpt, ``[n]``.
         """
         mean, spread = self.mean[:, cells], self.spread[cells] * np.reshape(inflation, (-1, 1))
         likely = _student_t((high - mean) / spread) - _student_t((low - mean) / spread)
-        # Now and then a touch is like none before: then any load is as likely as any other.
-        p = (1 - _NOVEL) * likely + _NOVEL * (np.minimum(high, 1.0) - low)
+        p = (1 - _OUTLIERS) * likely + _OUTLIERS * (np.minimum(high, 1.0) - low)
         return np.where(np.isnan(spread), 1.0, p)
 
 
 def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distribution function of Student's t with 4 degrees of freedom: objects have edges, edges surprise.
-
-    In closed form, ten times as fast as the general one.
-    """
+    """Return ``scipy.stats.t(4).cdf(x)`` in closed form, ten times as fast. Edges of objects make the tails heavy."""
     x = np.clip(x, -1e6, 1e6)
     u = x / np.sqrt(1 + x**2 / 4)
     return 0.5 + 0.375 * u * (1 - u**2 / 12)

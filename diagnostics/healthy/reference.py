@@ -1,4 +1,4 @@
-"""The reference: all that fitting on fault-free recordings leaves behind, and what stands in for it without any."""
+"""The reference: everything fitted on fault-free recordings, and default values for a cold start."""
 
 from __future__ import annotations
 
@@ -18,36 +18,37 @@ from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.baseline import LowerLimit, baseline
 from diagnostics.preprocessing.offset import ReferenceOffset
+from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.preprocessing.scale import Scale
 from diagnostics.preprocessing.transport import longest_repetition
 
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
-_TOLERANCE = 0.005  # of full scale: how far a stuck cell's reading may wander, a converter's dither
+_TOLERANCE = 0.005  # of full scale: half the range of a stuck cell's reading, the dither of a converter
 _STEPS = 1.5  # and at least so many converter steps
-_TWINS = 5  # witnesses that two healthy lines may have, where no reference tells
-_TELLING = 250  # recordings that tell how many; with half as many, one more may be
-_SAMPLED = 2000  # cells, about, that tell the converter's step
-_PATIENCE = 32  # a frame may come again so often, and twice as often as it ever did in the reference
+_DUPLICATES = 5  # coincidences that two healthy lines may have, in a cold start
+_MANY = 250  # recordings after which the largest count seen is the limit; one more for each halving
+_SAMPLED = 2000  # cells, about, from which the step of the converter is estimated: a size
+_PATIENCE = 32  # repetitions of one frame, and twice as many as ever in the reference
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What healthy looks like.
+    """Everything fitted on fault-free recordings.
 
     Attributes:
-        tolerance: how near to a value counts as that value, in the layout's unit.
-        scale: what a reading means.
-        onsets: how abruptly healthy cells come to rest.
-        least: that healthy cells read.
-        flicker: how long they read the same.
-        offset: of all cells together that is usual.
-        patience: a frame that comes again more often than this says nothing new.
-        usual: how restless healthy cells are.
-        twins: how many witnesses two healthy lines may have of being one.
-        model: how a touch loads a cell; None: to be learned from the log at hand (cold start).
-        dead: float ``[D]``, P(dead) of cells that were dead in it already, 0 for all others.
+        tolerance: readings within +- this of a value count as that value, in the layout's unit.
+        scale: baseline and full scale.
+        jumps_seen: sizes of the jumps of healthy cells into constant runs.
+        least: lower limit of the readings of healthy cells.
+        noise_loss: longest runs of identical readings of healthy cells.
+        offset: common offset of all cells.
+        patience: repetitions of a frame after which it counts as frozen.
+        usual: rates of blinks and excess noise of healthy cells.
+        duplicates: coincidences that two healthy lines may have.
+        model: the healthy model; None: the k-NN spatial model of the log (cold start).
+        dead: float ``[D]``, P(dead) of the reference faults, 0 for all other cells.
     """
 
     tolerance: float
@@ -63,10 +64,10 @@ class Reference:
     dead: NDArray[np.float64]
 
     def check(self, layout: SensorLayout) -> None:
-        """Check that the numbers are possible and that the model covers each cell of ``layout`` once.
+        """Check the numbers, and that the model covers each cell of ``layout`` once.
 
         Raises:
-            ValueError: they are not, or it does not.
+            ValueError: a number is not positive, or a cell is not covered once.
         """
         rates = (self.usual.blinks, self.usual.blinks_count, self.usual.noise_counts)
         positive = (self.tolerance, self.scale.near, self.noise_loss.recording, self.patience, *rates)
@@ -77,20 +78,20 @@ class Reference:
 
     @property
     def inexperience(self) -> NDArray[np.float64]:
-        """How little is known of healthy touches, float ``[D]``: 0 where it holds 400 of them, 1 with 100 or fewer."""
+        """Float ``[D]``: 0 for cells with 400 reference events or more, 1 with 100 or fewer."""
         return np.ones(len(self.dead)) if self.model is None else self.model.inexperience(len(self.dead))
 
     @classmethod
     def fit(
         cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, dead: NDArray[np.float64] | None = None
     ) -> Reference:
-        """Learn from fault-free recordings, ``[T, D]`` each; from cells that are ``dead`` in them (``[D]``) nothing."""
+        """Fit to fault-free recordings, ``[T, D]`` each, without the cells that are ``dead`` (P(dead) ``[D]``)."""
         tolerance = tolerance_of(recordings, layout)
         dead = np.zeros(layout.n_cells) if dead is None else dead
         layout = living(layout, dead)
         present = layout.present.ravel()
         rest, least = baseline(recordings, present, tolerance, layout.full_scale)
-        rest[dead > 0] = np.median(rest[present])  # where they would rest
+        rest[dead > 0] = np.median(rest[present])  # the baseline of a dead cell is unknown
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
         jumps_seen = JumpHistogram.fit(recordings, tolerance, layout.full_scale, rest)
         patience = max(_PATIENCE, 2 * max(longest_repetition(r) for r in recordings))
@@ -111,7 +112,7 @@ class Reference:
 
     @classmethod
     def unknown(cls, layout: SensorLayout, rest: NDArray[np.float64] | None = None) -> Reference:
-        """Stand in for a reference: untouched cells read ``rest`` (``[D]``; None: 0), and jumps say nothing."""
+        """Return the defaults of a cold start: baselines ``rest`` (``[D]``; None: 0), no evidence from jumps."""
         tolerance = _TOLERANCE * layout.full_scale
         rest = np.zeros(layout.n_cells) if rest is None else rest
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
@@ -124,7 +125,7 @@ class Reference:
             ReferenceOffset(0.0, tolerance),
             2 * _PATIENCE,
             HealthyRates.unknown(scale),
-            _TWINS,
+            _DUPLICATES,
             None,
             np.zeros(layout.n_cells),
         )
@@ -135,22 +136,32 @@ def living(layout: SensorLayout, dead: NDArray[np.float64]) -> SensorLayout:
     return replace(layout, present=layout.present & ~layout.grid(dead > 0)) if dead.any() else layout
 
 
+def highest_reading(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
+    """Return the highest reading of a present cell that moves; full scale, if none moves."""
+    present = layout.present.ravel()
+    low, high = np.full(layout.n_cells, np.inf), np.full(layout.n_cells, -np.inf)
+    for frames in RecordingBlocks.of(recordings).blocks():
+        low, high = np.fmin(low, np.fmin.reduce(frames)), np.fmax(high, np.fmax.reduce(frames))
+    moved = present & (high > low)
+    return float(high[moved].max()) if moved.any() else layout.full_scale
+
+
 def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
-    """Return how near to a value counts as that value: what a converter's dither needs, whatever its step."""
+    """Return the half range of a constant reading: 1.5 converter steps, within 0.5 to 1 % of full scale."""
     cells = slice(None, None, max(1, layout.n_cells // _SAMPLED))
     sample = np.concatenate([r[:: max(1, len(r) // 20), cells].ravel() for r in recordings])
     steps = np.diff(np.unique(sample[np.isfinite(sample)]))
-    steps = steps[steps > 1e-6 * layout.full_scale]  # what is finer is rounding
+    steps = steps[steps > 1e-6 * layout.full_scale]  # smaller differences are rounding
     step = float(steps.min()) if len(steps) else 0.0
     return max(_TOLERANCE * layout.full_scale, min(_STEPS * step, 2 * _TOLERANCE * layout.full_scale))
 
 
 def _usual_duplicates(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale) -> int:
-    """Return how many witnesses two healthy lines may have of being one: as ever, more if few recordings tell."""
+    """Return how many coincidences two healthy lines may have: the largest count seen, plus log2(250 / recordings)."""
     most = 0
     for recording in recordings:
         duplicates = DuplicateLines.begin(layout)
         for frames, numbers, start in segments(recording, SEGMENT, scale.near / 2):
             duplicates = duplicates.extend(frames, numbers, informative(frames, start <= numbers[0], scale), scale.near)
         most = max(most, duplicates.most)
-    return most + max(0, int(np.ceil(np.log2(_TELLING / len(recordings)))))
+    return most + max(0, int(np.ceil(np.log2(_MANY / len(recordings)))))

@@ -1,8 +1,10 @@
-"""What the cells of a large array have in common: how a touch loads a cell, given its nearest neighbours.
+"""Shared prior: one translation-invariant logistic regression for all cells of a large array.
 
-A patch sees a few dozen touches, too few to learn from them alone how sharp the edge of a contact is. All patches
-together see thousands. So one regression is shared by all cells, on the cells within three rows and columns of each;
-the model of each patch starts from it, and learns in what it differs.
+Estimates the log odds that a cell stays unloaded, or loaded, throughout an event from the 7 x 7 cells around it:
+``log odds = bias + sum w[feature, row offset, column offset] x``, fitted by Newton's method; equals scikit-learn's
+``LogisticRegression`` on the flattened neighbourhoods. A tile sees a few dozen events, all tiles together thousands.
+The regression of each tile adds its own weights, shrunk towards these (hierarchical shrinkage). The prior does not
+represent differences between places on the array.
 """
 
 from __future__ import annotations
@@ -23,21 +25,26 @@ if TYPE_CHECKING:
 
 REACH = 3  # rows and columns
 _FEATURES = 4  # see Summary.features
-_MOST, _QUIET = 20_000, 0.2  # samples; share of them without any load around
-_RIDGE = 1e-3  # per sample
-_STEPS = 12  # of Newton's method, each by the curvature there is at most
+_MOST, _UNLOADED = 20_000, 0.2  # samples; share of them without any load around, which are all equal
+_RIDGE = 1e-3  # per sample: keeps the Hessian regular
+_STEPS = 12  # of Newton's method: converged
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Neighbourhoods ``[n, 4, 7, 7]``, the cell itself 0, and what the cell did: never, always loaded, ``[n, 2]``."""
+    """Training samples.
+
+    Attributes:
+        neighbourhoods: features ``[n, 4, 7, 7]`` around a cell, 0 at the cell itself.
+        did: ``[n, 2]``, 1 where the cell was never, or always, loaded.
+    """
 
     neighbourhoods: Array
     did: Array
 
     @classmethod
     def of(cls, features: Array, tile: Tile, layout: SensorLayout, rng: np.random.Generator, most: int) -> Samples:
-        """Take at most so many from the stretches of a patch, features ``[n, 4, inputs]``."""
+        """Draw at most ``most`` loaded samples from excerpts of a tile, features ``[n, 4, inputs]``."""
         alone = tile.rectangle(layout)
         rows, cols = alone.layout.rows, alone.layout.cols
         grid = np.zeros((len(features), _FEATURES, rows + 2 * REACH, cols + 2 * REACH), np.float32)
@@ -49,19 +56,19 @@ class Samples:
         own = neighbourhoods[:, :, REACH, REACH].copy()
         neighbourhoods[:, :, REACH, REACH] = 0
         loaded = neighbourhoods[:, 2].any(axis=(1, 2))
-        some, quiet = np.flatnonzero(loaded), np.flatnonzero(~loaded)
+        some, unloaded = np.flatnonzero(loaded), np.flatnonzero(~loaded)
         some = rng.permutation(some)[:most]
-        chosen = np.concatenate([some, rng.permutation(quiet)[: round(_QUIET * len(some)) + 1]])
+        chosen = np.concatenate([some, rng.permutation(unloaded)[: round(_UNLOADED * len(some)) + 1]])
         did = np.stack([own[:, 2] == 0, own[:, 3] == 1], axis=1)[chosen]
         return cls(neighbourhoods[chosen], did.astype(np.float32))
 
 
 @dataclass(frozen=True)
 class SharedPrior:
-    """The shared regressions.
+    """The fitted prior.
 
     Attributes:
-        weight: float64 ``[2, 4, 7, 7]``, never and always loaded; of each feature of the cells around.
+        weight: float64 ``[2, 4, 7, 7]``, never and always loaded, by feature and offset.
         bias: ``[2]``.
     """
 
@@ -70,7 +77,7 @@ class SharedPrior:
 
     @classmethod
     def fit(cls, parts: list[Samples]) -> SharedPrior:
-        """Fit on samples of many patches."""
+        """Fit to samples of many tiles."""
         x = np.concatenate([part.neighbourhoods.reshape(len(part.neighbourhoods), -1) for part in parts]).astype(
             np.float64
         )[:_MOST]
@@ -80,15 +87,15 @@ class SharedPrior:
         for q in range(2):
             for _ in range(_STEPS):
                 p = expit(x @ w[:, q])
-                bend = np.maximum(p * (1 - p), 1e-3)
-                slope = x.T @ (p - y[:, q]) / len(x) + _RIDGE * w[:, q]
-                curve = (x * bend[:, None]).T @ x / len(x) + _RIDGE * np.eye(len(w))
-                w[:, q] -= linalg.solve(curve, slope, assume_a="pos")
+                variance = np.maximum(p * (1 - p), 1e-3)
+                gradient = x.T @ (p - y[:, q]) / len(x) + _RIDGE * w[:, q]
+                hessian = (x * variance[:, None]).T @ x / len(x) + _RIDGE * np.eye(len(w))
+                w[:, q] -= linalg.solve(hessian, gradient, assume_a="pos")
         side = 2 * REACH + 1
         return cls(w[:-1].T.reshape(2, _FEATURES, side, side), w[-1])
 
     def on(self, tile: Tile, layout: SensorLayout) -> NDArray[np.float64]:
-        """Return the weights of a patch, ``[4, inputs, 2, outputs]``."""
+        """Return the weights for a tile, ``[4, inputs, 2, outputs]``."""
         rows, cols = tile.inputs // layout.cols % layout.rows, tile.inputs % layout.cols
         down, across = (of[:, None] - of[tile.place] for of in (rows, cols))  # (inputs, outputs)
         near = (np.abs(down) <= REACH) & (np.abs(across) <= REACH)

@@ -1,10 +1,14 @@
-"""Where a contact ends: what the loads around a cell say of its own, learned once for all cells of a skin.
+"""Neighbourhood stacking: corrects the local regressions by the loads around each cell, with one model for all cells.
 
-The regressions of a cell know that cell, from the few touches that reached it. How a contact fades from cell to cell is
-the same everywhere: a small network, shared by all cells, corrects what each cell's own regressions foresee by what the
-three rings of cells around it do. Fitted on touches that the regressions were not fitted on, so that it learns how far
-those can be believed. Few touches teach no network: the fewer there are, the more two logistic regressions count beside
-it, which stay near to what the cell's own foresee.
+Estimates log odds of "never loaded" and "always loaded" from 28 features: the outputs of the regressions of the cell,
+its position, and mean loads of three rings of cells, of the pad and of the array:
+
+    log odds = x w + b + out' max(hidden' x + threshold, 0)
+
+A logistic regression plus a network with one hidden layer, weighted (1 - s) : s with s = events / (events + 20).
+Stacked generalization (Wolpert 1992) with scikit-learn's ``LogisticRegression`` (shrunk towards repeating the
+input odds) and ``MLPClassifier`` as second level. Fitted on events that the regressions were not fitted on (see
+:mod:`~diagnostics.healthy.cross_fitting`). Loads beyond two rows or columns enter only as means.
 """
 
 from __future__ import annotations
@@ -20,27 +24,26 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
     from diagnostics.preprocessing.scale import Array
 
-_SURE = 8.0  # log odds that a cell's own regressions are taken for at most
-# Of a ring's cells: so much the mean of the whole array counts, all there is where none is trusted.
-_EMPTY = np.float32(0.5)
-_RIDGE = 1.0  # of the regressions, towards believing the cells' own
-_HIDDEN, _DECAY, _EPOCHS, _BATCH, _RATE = 32, 0.3, 20, 512, 2e-3  # of the network: units, penalty, training
-_FEW = 20  # touches from which the network learns as much as the regressions
-_LEAST_SCALE = 1e-3
-_RARE = 0.005  # share that a cell was ever found loaded in, at least and at most
-N_FEATURES = 28  # of a cell, see around
+_MAX_ODDS = 8.0  # log odds of the regressions are clipped here
+_PRIOR_CELLS = np.float32(0.5)  # pseudo-count of a ring: the mean of the pad; of the pad: the mean of the array
+_RIDGE = 1.0  # of the regressions, towards repeating the odds of the cell itself: prior variance 1
+_HIDDEN, _DECAY, _EPOCHS, _BATCH, _RATE = 32, 0.3, 20, 512, 2e-3  # units, L2 penalty, epochs, batch, learning rate
+_FEW = 20  # events at which network and regressions have the same weight
+_MIN_SCALE = 1e-3  # of a standardised feature: avoids division by 0
+_RARE = 0.005  # lower and upper (1 -) limit of the share of events that load a cell
+N_FEATURES = 28  # per cell, see neighbourhood
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class RegressionOutput:
-    """What the regressions of each cell say of n stretches, ``[n, D]`` each.
+    """Outputs of the local regressions for n excerpts, ``[n, D]`` each.
 
     Attributes:
-        never, always: log odds that it stays unloaded, or loaded, throughout.
-        mean: expected mean root load.
-        usual: share of the touches of the reference in which it is loaded.
+        never, always: log odds that the cell stays unloaded, or loaded, throughout.
+        mean: expected mean root load, 0 to 1.
+        usual: share of the reference excerpts in which the cell is loaded.
     """
 
     never: Floats
@@ -51,13 +54,16 @@ class RegressionOutput:
 
 @dataclass(frozen=True)
 class Stacking:
-    """The regressions and the network, both part of the same log odds of never and of always loaded.
+    """The fitted second level, for k features, h hidden units, and the outputs (never, always).
 
     Attributes:
-        mean, scale: of what goes in, ``[k]``.
-        weight: ``[k, 2]``; bias: ``[2]``.
-        hidden: ``[k, h]``, of the network's units; threshold: ``[h]``; out: ``[h, 2]``.
-        touches: how many taught it.
+        mean, scale: float ``[k]``, of the features.
+        weight: float ``[k, 2]``, linear part.
+        bias: float ``[2]``.
+        hidden: float ``[k, h]``, input weights of the hidden units.
+        threshold: float ``[h]``, their biases.
+        out: float ``[h, 2]``, their output weights.
+        events: number of events it was fitted on.
     """
 
     mean: Floats
@@ -73,15 +79,16 @@ class Stacking:
     def fit(
         cls, samples: NDArray[np.float64], never: NDArray[np.bool_], always: NDArray[np.bool_], events: int
     ) -> Stacking:
-        """Fit on samples of cells that were not asked.
+        """Fit to samples of cells that were no predictors.
 
         Args:
-            samples: ``[m, k]``, see :func:`neighbourhood`; never, always: bool ``[m]``, what they did.
-            touches: that they are of.
+            samples: ``[m, k]``, see :func:`neighbourhood`.
+            never, always: bool ``[m]``, whether the cell stayed unloaded, or loaded, throughout.
+            events: number of events behind the samples.
         """
-        mean, scale = samples.mean(axis=0), np.maximum(samples.std(axis=0), _LEAST_SCALE)
+        mean, scale = samples.mean(axis=0), np.maximum(samples.std(axis=0), _MIN_SCALE)
         z = (samples - mean) / scale
-        fitted = [_corrected(z, did, column, mean, scale) for column, did in enumerate((never, always))]
+        fitted = [_logistic(z, y, column, mean, scale) for column, y in enumerate((never, always))]
         weight, bias = (np.stack(column, axis=-1) for column in zip(*fitted, strict=True))
         hidden, threshold, out, net_bias = _network(z, np.stack([never, always], axis=1))
         share = events / (events + _FEW)
@@ -92,9 +99,9 @@ class Stacking:
         """Return P(unloaded throughout) and P(loaded throughout), ``[...]`` each, of samples ``[k, ...]``."""
         weight = np.concatenate([self.weight, self.hidden], axis=1) / self.scale[:, None]
         bias = np.concatenate([self.bias, self.threshold]) - self.mean @ weight
-        said = weight.T.astype(np.float32) @ samples.reshape(len(samples), -1)
-        said += bias.astype(np.float32)[:, None]
-        odds, units = said[:2], np.maximum(said[2:], 0, out=said[2:])
+        linear = weight.T.astype(np.float32) @ samples.reshape(len(samples), -1)
+        linear += bias.astype(np.float32)[:, None]
+        odds, units = linear[:2], np.maximum(linear[2:], 0, out=linear[2:])
         odds += self.out.T.astype(np.float32) @ units
         never, always = expit(odds).astype(np.float64).reshape(2, *samples.shape[1:])
         return never, always
@@ -107,43 +114,43 @@ def neighbourhood(
     layout: SensorLayout,
     cells: NDArray[np.intp] | None = None,
 ) -> Array:
-    """Return what there is to know of each of k cells in each stretch, itself apart, ``[28, k, n]``.
+    """Return the stacking features of k cells in n excerpts, ``[28, k, n]``; none uses the reading of the cell itself.
 
     Args:
-        foreseen: by the cells' own regressions.
+        regressed: outputs of the local regressions.
         features: ``[n, 4, D]`` (see ``Summary.features``).
-        trusted: bool ``[D]``, the cells that may be asked.
+        predictors: bool ``[D]``, the cells whose readings may be used.
         layout: the array.
-        cells: int ``[k]``, ascending, those wanted; None: all D.
+        cells: int ``[k]``, ascending; None: all D.
     """
-    scored = (predictors & layout.present.ravel()).astype(np.float32)
-    n, wanted = len(features), slice(None) if cells is None or len(cells) == layout.n_cells else cells
-    # Four features of the trusted cells, and where these are. Stretches come last: long inner loops are fast.
+    usable = (predictors & layout.present.ravel()).astype(np.float32)
+    n, selected = len(features), slice(None) if cells is None or len(cells) == layout.n_cells else cells
+    # Four features of the predictors, and where these are. Excerpts come last: long inner loops are fast.
     known = np.empty((5, *layout.shape, n), np.float32)
     by_cell = known.reshape(5, -1, n)
-    np.multiply(features.transpose(1, 2, 0), scored[:, None], out=by_cell[:4])
-    by_cell[4] = scored[:, None]
+    np.multiply(features.transpose(1, 2, 0), usable[:, None], out=by_cell[:4])
+    by_cell[4] = usable[:, None]
 
     def of(values: Array) -> Array:
-        """Take the wanted of ``[..., pads, rows, cols, n]``."""
-        return values.reshape(*values.shape[:-4], layout.n_cells, values.shape[-1])[..., wanted, :]
+        """Select the cells from ``[..., pads, rows, cols, n]``."""
+        return values.reshape(*values.shape[:-4], layout.n_cells, values.shape[-1])[..., selected, :]
 
     cross, three, five = map(of, _windows(known))
     corners, itself = three - cross, of(known)
     # Means over the pad and over the array leave the cell itself out, as the rings do.
     pads = known.sum(axis=(2, 3))  # (5, pads, n)
-    pad = np.repeat(pads, layout.rows * layout.cols, axis=1)[:, wanted] - itself
+    pad = np.repeat(pads, layout.rows * layout.cols, axis=1)[:, selected] - itself
     whole = pads.sum(axis=1, keepdims=True) - itself
-    known_values = np.empty((N_FEATURES, *itself.shape[1:]), np.float32)
-    of_cells, of_place, *rings, on_pad, overall = known_values.reshape(7, 4, *itself.shape[1:])
+    described = np.empty((N_FEATURES, *itself.shape[1:]), np.float32)
+    of_cells, of_place, *rings, on_pad, overall = described.reshape(7, 4, *itself.shape[1:])
     own = (
-        np.clip(regressed.never[:, wanted], -_SURE, _SURE),
-        np.clip(regressed.always[:, wanted], -_SURE, _SURE),
-        regressed.mean[:, wanted],
-        logit(np.clip(regressed.usual[:, wanted], _RARE, 1 - _RARE)),
+        np.clip(regressed.never[:, selected], -_MAX_ODDS, _MAX_ODDS),
+        np.clip(regressed.always[:, selected], -_MAX_ODDS, _MAX_ODDS),
+        regressed.mean[:, selected],
+        logit(np.clip(regressed.usual[:, selected], _RARE, 1 - _RARE)),
     )
-    for values, said in zip(of_cells, own, strict=True):
-        values[:] = said.T
+    for values, output in zip(of_cells, own, strict=True):
+        values[:] = output.T
     of_place[0], of_place[1], of_place[2], of_place[3] = (
         cross[4],
         corners[4],
@@ -151,18 +158,18 @@ def neighbourhood(
         of(enclosed(known[1])),
     )
     np.divide(whole[:4], np.maximum(whole[4:], 1), out=overall)
-    np.divide(pad[:4] + _EMPTY * overall, pad[4:] + _EMPTY, out=on_pad)
+    np.divide(pad[:4] + _PRIOR_CELLS * overall, pad[4:] + _PRIOR_CELLS, out=on_pad)
     for total, ring in zip((cross, corners, five - three - itself), rings, strict=True):
-        np.divide(total[:4] + _EMPTY * on_pad, total[4:] + _EMPTY, out=ring)
-    return known_values
+        np.divide(total[:4] + _PRIOR_CELLS * on_pad, total[4:] + _PRIOR_CELLS, out=ring)
+    return described
 
 
 def _windows(known: Array) -> tuple[Array, Array, Array]:
-    """Return sums ``[..., rows, cols, n]`` over the four next cells, the eight next, and all 25 within two steps."""
+    """Return sums ``[..., rows, cols, n]`` over the 4 adjacent cells, the 8 adjacent cells, and the 5 x 5 block."""
     rows, cols = known.shape[2:4]
     padded = np.pad(known, ((0, 0), (0, 0), (2, 2), (2, 2), (0, 0)))
 
-    def beside(values: Array, axis: int, size: int, reach: int) -> Array:
+    def pair(values: Array, axis: int, size: int, reach: int) -> Array:
         def moved(by: int) -> Array:
             part = slice(2 + by, 2 + by + size)
             return values[:, :, :, part] if axis == 3 else values[:, :, part]
@@ -172,26 +179,26 @@ def _windows(known: Array) -> tuple[Array, Array, Array]:
 
     inner = slice(2, 2 + rows)
     centre = padded[:, :, :, 2 : 2 + cols]
-    across = beside(padded, 3, cols, 1)  # (5, pads, rows + 4, cols, n)
+    across = pair(padded, 3, cols, 1)  # (5, pads, rows + 4, cols, n)
     in_row = across + centre
-    cross = across[:, :, inner] + beside(centre, 2, rows, 1)
-    three = across[:, :, inner] + beside(in_row, 2, rows, 1)
-    wide = in_row + beside(padded, 3, cols, 2)
-    five = wide[:, :, inner] + beside(wide, 2, rows, 1) + beside(wide, 2, rows, 2)
+    cross = across[:, :, inner] + pair(centre, 2, rows, 1)
+    three = across[:, :, inner] + pair(in_row, 2, rows, 1)
+    wide = in_row + pair(padded, 3, cols, 2)
+    five = wide[:, :, inner] + pair(wide, 2, rows, 1) + pair(wide, 2, rows, 2)
     return cross, three, five
 
 
 def _inside(layout: SensorLayout) -> Array:
-    """Return 1 for cells with four neighbours, 0 at the border of what the skin covers, ``[pads, rows, cols, 1]``."""
-    there = np.pad(layout.present, ((0, 0), (1, 1), (1, 1)))
-    inside = there[:, 2:, 1:-1] & there[:, :-2, 1:-1] & there[:, 1:-1, 2:] & there[:, 1:-1, :-2]
+    """Return 1 for cells with four neighbours, 0 at the border of the array, ``[pads, rows, cols, 1]``."""
+    present = np.pad(layout.present, ((0, 0), (1, 1), (1, 1)))
+    inside = present[:, 2:, 1:-1] & present[:, :-2, 1:-1] & present[:, 1:-1, 2:] & present[:, 1:-1, :-2]
     return inside[..., None].astype(np.float32)
 
 
 def enclosed(load: NDArray[Any]) -> NDArray[Any]:
-    """Return how well the loads ``[pads, rows, cols, n]`` around each cell enclose it; of bool: whether they do.
+    """Return how far the loads around each cell enclose it, ``[pads, rows, cols, n]``.
 
-    That is the smaller of two opposite ones; the best of four pairs counts.
+    That is the maximum over the four pairs of opposite neighbours of the smaller load of the pair.
     """
     padded = np.pad(load, ((0, 0), (1, 1), (1, 1), (0, 0)))
     rows, cols = load.shape[1:3]
@@ -202,8 +209,8 @@ def enclosed(load: NDArray[Any]) -> NDArray[Any]:
     return best
 
 
-def _corrected(z: Floats, did: NDArray[np.bool_], column: int, mean: Floats, scale: Floats) -> tuple[Floats, float]:
-    """Return weights ``[k]`` and bias of one logistic regression, near to those that repeat input ``column``."""
+def _logistic(z: Floats, y: NDArray[np.bool_], column: int, mean: Floats, scale: Floats) -> tuple[Floats, float]:
+    """Return weights ``[k]`` and bias of a logistic regression shrunk towards one that repeats input ``column``."""
     from scipy.optimize import minimize
 
     start = np.zeros(z.shape[1] + 1)
@@ -212,33 +219,33 @@ def _corrected(z: Floats, did: NDArray[np.bool_], column: int, mean: Floats, sca
 
     def loss(weights: Floats) -> tuple[float, Floats]:
         odds, change = x @ weights, weights - start
-        value = np.logaddexp(0, odds).sum() - odds[did].sum() + 0.5 * _RIDGE * (change @ change)
-        return float(value), x.T @ (expit(odds) - did) + _RIDGE * change
+        value = np.logaddexp(0, odds).sum() - odds[y].sum() + 0.5 * _RIDGE * (change @ change)
+        return float(value), x.T @ (expit(odds) - y) + _RIDGE * change
 
-    def curvature(weights: Floats) -> Floats:
+    def hessian(weights: Floats) -> Floats:
         p = expit(x @ weights)
-        bent: Floats = x.T @ (x * (p * (1 - p))[:, None]) + _RIDGE * np.eye(len(start))
-        return bent
+        second: Floats = x.T @ (x * (p * (1 - p))[:, None]) + _RIDGE * np.eye(len(start))
+        return second
 
-    # Few weights and many samples: second derivatives are cheap, and a handful of steps is all it takes.
-    found = minimize(loss, start, jac=True, hess=curvature, method="trust-exact").x
+    # Few weights and many samples: the Hessian is cheap, and a few steps suffice.
+    found = minimize(loss, start, jac=True, hess=hessian, method="trust-exact").x
     return found[:-1], float(found[-1])
 
 
-def _network(z: Floats, did: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats, Floats]:
+def _network(z: Floats, y: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats, Floats]:
     """Fit a network with one hidden layer; return its weights ``[k, h]``, ``[h]``, ``[h, 2]``, ``[2]``."""
     from sklearn.neural_network import MLPClassifier
 
-    # Not trained to the end, which would be to learn these few touches by heart.
+    # Early stopping: training to convergence would overfit the few events.
     network = MLPClassifier(
         (_HIDDEN,),
         alpha=_DECAY,
         batch_size=min(_BATCH, len(z)),
         learning_rate_init=_RATE,
-        shuffle=False,  # done here, for all batches at once: a third faster
+        shuffle=False,  # done below, for all batches at once: a third faster
         random_state=0,
     )
-    inputs, targets, rng = z.astype(np.float32), did.astype(int), np.random.default_rng(0)
+    inputs, targets, rng = z.astype(np.float32), y.astype(int), np.random.default_rng(0)
     for _ in range(_EPOCHS):
         order = rng.permutation(len(z))
         network.partial_fit(inputs[order], targets[order], classes=[0, 1])

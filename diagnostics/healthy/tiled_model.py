@@ -1,7 +1,9 @@
-"""What healthy looks like on a large array: a model for each patch, on top of what all patches have in common.
+"""The healthy model of a large array: local regressions for each tile, shrunk towards a shared prior.
 
-Two things are shared: where the model of a patch starts from (see ``shared_prior``), and how far its cells are believed
-(see ``stacking``). The patches that were touched most teach both: the cost of that does not grow with the array.
+Tiles share the prior (:mod:`~diagnostics.healthy.shared_prior`) and the stacking
+(:mod:`~diagnostics.healthy.stacking`). Both are fitted on a limited number of tiles with many events, so their cost
+does not grow with the array. Equals a hierarchical (multi-task) ridge regression with fixed variances. Cells of two
+tiles that are further apart than the halo are independent in the model.
 """
 
 from __future__ import annotations
@@ -29,30 +31,30 @@ if TYPE_CHECKING:
     from diagnostics.healthy.stacking import Stacking
     from diagnostics.layout import SensorLayout
 
-_SAMPLES = 256  # stretches for the model of one patch out of many
-_RIDGE = 30.0  # of a patch, per touch: it sees far fewer of them than a whole array
-_FAR = 3.0  # cells: as far as correlations in a patch are believed
-_ASKED, _OF_EACH, _MOST_OF_EACH = 100, 64, 600  # patches that tell what all have in common; stretches, cells of each
-_TEACHERS = 12  # patches that teach the rim
+_SAMPLES = 256  # excerpts for the model of one tile: a size
+_RIDGE = 30.0  # towards the shared prior, divided by the number of events of the tile
+_TAPER = 3.0  # cells: standard deviation of the Gaussian taper of covariances in a tile
+_PRIOR_TILES, _EXCERPTS, _PRIOR_SAMPLES = 100, 64, 600  # tiles of the shared prior; excerpts and samples of each: sizes
+_STACKING_TILES = 12  # tiles with the most events, from which the stacking is fitted: a size
 
 
 def fit_healthy_model(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale) -> HealthyModel:
-    """Fit on fault-free recordings, ``[T, D]`` each; a small array as a whole, a large one patch by patch."""
+    """Fit to fault-free recordings, ``[T, D]`` each; a small array is one tile."""
     if layout.present.sum() <= MOST_CELLS:
         return HealthyModel.fit(recordings, layout, scale)
     rng = np.random.default_rng(0)
-    touched = _Touched.of(RecordingBlocks.of(recordings), layout, scale)
-    shared_prior = _shared_prior(touched, layout, rng)
+    events_of = _TileEvents.of(RecordingBlocks.of(recordings), layout, scale)
+    shared_prior = _shared_prior(events_of, layout, rng)
     local_regressions = []
-    for k, tile in enumerate(touched.tiles):
-        features, _ = touched.drawn(k, _SAMPLES, rng)
-        local_regressions.append(_fit_tile(features, touched.number(k), tile, shared_prior, layout).at(tile.inputs))
-    return HealthyModel(tuple(local_regressions), layout, _stacking(touched, shared_prior, layout, rng))
+    for k, tile in enumerate(events_of.tiles):
+        features, _ = events_of.drawn(k, _SAMPLES, rng)
+        local_regressions.append(_fit_tile(features, events_of.number(k), tile, shared_prior, layout).at(tile.inputs))
+    return HealthyModel(tuple(local_regressions), layout, _stacking(events_of, shared_prior, layout, rng))
 
 
 @dataclass(frozen=True)
-class _Touched:
-    """The touches of each patch."""
+class _TileEvents:
+    """The reference events of each tile."""
 
     readings: RecordingBlocks
     scale: Scale
@@ -60,8 +62,8 @@ class _Touched:
     seen: list[list[ReferenceEvent]]
 
     @classmethod
-    def of(cls, readings: RecordingBlocks, layout: SensorLayout, scale: Scale) -> _Touched:
-        """Find them in fault-free recordings."""
+    def of(cls, readings: RecordingBlocks, layout: SensorLayout, scale: Scale) -> _TileEvents:
+        """Find the events in fault-free recordings."""
         every = tiles(layout)
         seen: list[list[ReferenceEvent]] = [[] for _ in every]
         for i, recording in enumerate(readings):
@@ -74,62 +76,65 @@ class _Touched:
         return cls(readings, scale, every, seen)
 
     def number(self, k: int) -> int:
-        """How many touches taught patch k."""
+        """Return the number of distinct events of tile k."""
         return count_events(self.seen[k])
 
     def drawn(self, k: int, most: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.intp]]:
-        """Return random stretches of the touches of patch k, features ``[n, 4, inputs]``, and their sources."""
+        """Return random excerpts of the events of tile k, features ``[n, 4, inputs]``, and their sources ``[n]``."""
         cells = self.tiles[k].inputs
-        if not self.seen[k]:  # nothing is known of a patch that was never touched but what all have in common
+        if not self.seen[k]:  # no event in this tile: the shared prior alone
             return np.zeros((2, FEATURES, len(cells)), np.float32), np.zeros(2, np.intp)
         return drawn(self.seen[k], partial(self.readings.piece, cells=cells), self.scale.of(cells), rng, most)
 
 
-def _shared_prior(touched: _Touched, layout: SensorLayout, rng: np.random.Generator) -> SharedPrior | None:
-    """Return what all patches have in common; None if none was touched."""
-    some = rng.permutation(np.flatnonzero([bool(of) for of in touched.seen]))[:_ASKED].tolist()
-    parts = [Samples.of(touched.drawn(k, _OF_EACH, rng)[0], touched.tiles[k], layout, rng, _MOST_OF_EACH) for k in some]
+def _shared_prior(events_of: _TileEvents, layout: SensorLayout, rng: np.random.Generator) -> SharedPrior | None:
+    """Return the shared prior; None without any event."""
+    some = rng.permutation(np.flatnonzero([bool(of) for of in events_of.seen]))[:_PRIOR_TILES].tolist()
+    parts = [
+        Samples.of(events_of.drawn(k, _EXCERPTS, rng)[0], events_of.tiles[k], layout, rng, _PRIOR_SAMPLES) for k in some
+    ]
     return SharedPrior.fit(parts) if parts else None
 
 
 def _fit_tile(
     features: Array, events: int, tile: Tile, shared_prior: SharedPrior | None, layout: SensorLayout
 ) -> LocalRegression:
-    """Fit the model of a patch, whose inputs are all cells there are, on stretches of so many touches."""
+    """Fit the regressions of a tile; ``features`` (``[n, 4, inputs]``) hold its inputs alone."""
     weight = np.zeros((FEATURES, len(tile.inputs), 2, len(tile.outputs)))
-    usual = (weight, np.zeros(2)) if shared_prior is None else (shared_prior.on(tile, layout), shared_prior.bias)
-    start = Start(*usual, max(RIDGE, _RIDGE / max(events, 1)), _taper(tile, layout))
+    prior = (weight, np.zeros(2)) if shared_prior is None else (shared_prior.on(tile, layout), shared_prior.bias)
+    start = Start(*prior, max(RIDGE, _RIDGE / max(events, 1)), _taper(tile, layout))
     return LocalRegression.fit(features, np.arange(len(tile.inputs)), tile.place, p_floor_of(events), start)
 
 
 def _stacking(
-    touched: _Touched, shared_prior: SharedPrior | None, layout: SensorLayout, rng: np.random.Generator
+    events_of: _TileEvents, shared_prior: SharedPrior | None, layout: SensorLayout, rng: np.random.Generator
 ) -> Stacking | None:
-    """Return what the patches that were touched most teach; None if all were touched too seldom."""
-    number = [touched.number(k) for k in range(len(touched.tiles))]
-    busiest = [k for k in np.argsort(number)[::-1][:_TEACHERS].tolist() if number[k] >= FOLDS]
-    cross_fits = [_cross_fit(touched, k, shared_prior, layout, 1 / len(busiest), rng) for k in busiest]
+    """Return the stacking fitted on the tiles with the most events; None if all have too few."""
+    number = [events_of.number(k) for k in range(len(events_of.tiles))]
+    busiest = [k for k in np.argsort(number)[::-1][:_STACKING_TILES].tolist() if number[k] >= FOLDS]
+    cross_fits = [_cross_fit(events_of, k, shared_prior, layout, 1 / len(busiest), rng) for k in busiest]
     return CrossFitting.joined(cross_fits).fit_stacking() if cross_fits else None
 
 
 def _cross_fit(
-    touched: _Touched,
+    events_of: _TileEvents,
     k: int,
     shared_prior: SharedPrior | None,
     layout: SensorLayout,
     share: float,
     rng: np.random.Generator,
 ) -> CrossFitting:
-    """Return what patch k teaches the rim."""
-    tile = touched.tiles[k]
+    """Return the stacking samples of tile k."""
+    tile = events_of.tiles[k]
     own = tile.rectangle(layout)
-    features, source = touched.drawn(k, _SAMPLES, rng)
-    number = touched.number(k)
-    taught = number * (FOLDS - 1) // FOLDS
+    features, source = events_of.drawn(k, _SAMPLES, rng)
+    number = events_of.number(k)
+    training_events = number * (FOLDS - 1) // FOLDS
 
-    def regressions(of: Array) -> RegressionFit:
+    def regressions(training: Array) -> RegressionFit:
         return partial(
-            predict_regressions, (_fit_tile(of[:, :, own.cells], taught, tile, shared_prior, layout).at(own.cells),)
+            predict_regressions,
+            (_fit_tile(training[:, :, own.cells], training_events, tile, shared_prior, layout).at(own.cells),),
         )
 
     cells = own.cells[tile.place]
@@ -137,7 +142,7 @@ def _cross_fit(
 
 
 def _taper(tile: Tile, layout: SensorLayout) -> NDArray[np.float64]:
-    """Return how much two inputs may have to do with each other, by their distance."""
+    """Return the factor on the covariance of two inputs, exp(-distance^2 / (2 * 3^2)), ``[inputs, inputs]``."""
     rows, cols = tile.inputs // layout.cols % layout.rows, tile.inputs % layout.cols
     squared = (rows[:, None] - rows) ** 2 + (cols[:, None] - cols) ** 2
-    return np.asarray(np.exp(-squared / (2 * _FAR**2)))
+    return np.asarray(np.exp(-squared / (2 * _TAPER**2)))

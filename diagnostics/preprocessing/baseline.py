@@ -1,9 +1,12 @@
-"""Where cells rest, how far an untouched one wanders from there, and the least that each reads.
+"""Baseline: the reading of each cell without contact, its noise and drift, and the lower limit of healthy readings.
 
-Skins that threshold their readings rest at one value. Others have noise, and their offsets wander from one recording to
-the next: neither is to be taken for a touch. And on a skin whose cells rest above 0, or are never quite calm, a cell
-that lost its wire gives itself away untouched, by a steady 0, and one that reads what it always did has most likely not
-lost it.
+Estimates per cell ``q05(readings) + max(0, drift + 6 sigma - tolerance)``: the 0.05 quantile, plus the upward drift of
+the baseline between recordings (mirrored from the downward drift, which loads do not hide), plus noise. The noise sigma
+is a robust estimate from second differences, median(|x_{t+1} - 2 x_t + x_{t-1}|) / (0.6745 sqrt 6), as
+``scipy.stats.median_abs_deviation(scale="normal")`` of a series without trend.
+
+Detects open cells without contact (:class:`LowerLimit`): on arrays whose cells rest above 0, a cell that lost its wire
+reads a constant value below the lower limit. Where cells rest at 0 an open cell looks like any unloaded one.
 """
 
 from __future__ import annotations
@@ -22,29 +25,29 @@ if TYPE_CHECKING:
     from diagnostics.events.constant_runs import ConstantRuns
 
 _LOW = 0.05  # quantile of all readings of a cell
-_LEAST = 0.03  # quantile of its readings in one recording: where it rested in that, if it was let go at all
-_LIGHT = 0.05  # of full scale: a cell that never read less above its rest than this was touched all through
-_CALM = 0.25  # quantile of the noise of cells in recordings: touched cells have more
+_UNLOADED = 0.03  # quantile of the readings in one recording: its baseline there, unless loaded throughout
+_LIGHT = 0.05  # of full scale: a cell that stays further above its baseline was loaded throughout
+_CALM = 0.25  # quantile of the noise over cells and recordings: loaded cells have more
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
-_RARE = 0.001  # of the cells in recordings: what so few did is taken for none
-FEWEST = 8  # recordings: fewer do not tell how rests change from one to the next
-_OFTEN = 0.5  # share of the recordings: what a cell reads in so many is its rest, not a load
-_BEYOND = 1.5  # times as far as ever from the usual: no healthy cell reads that little
-_WORTH = 12.0  # log likelihood ratio of reading what no healthy cell does
-_AS_EVER = -2.0  # and of what the cell itself always did, where that is not what a broken one reads
-_CROWD = 0.5  # share of the cells: when so many are unlike ever, it is the skin that has changed
-_BLOCK = 4096  # cells looked at together
+_RARE = 0.001  # share of cells and recordings that is ignored
+FEWEST = 8  # recordings from which the change of baselines between recordings can be estimated
+_OFTEN = 0.5  # share of the recordings: a reading in so many of them is the baseline, not a load
+_BEYOND = 1.5  # times the largest deviation of healthy cells: no healthy cell reads less
+_BELOW = 12.0  # log likelihood ratio of a reading below the lower limit
+_AS_EVER = -2.0  # log likelihood ratio of a usual reading that an open cell does not give
+_CROWD = 0.5  # share of the cells: when so many deviate, the whole array has changed
+_BLOCK = 4096  # cells processed together: a size
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class LowerLimit:
-    """The least that each healthy cell reads at its highest, while it holds still.
+    """Lower limit of the highest reading of a healthy cell in a constant run.
 
     Attributes:
-        reading: float ``[D]``; full scale where the noise lets no cell hold still; -inf: not known.
-        usual: so far above it most untouched cells read at least; -inf: not known.
+        reading: float ``[D]``, in the layout's unit; full scale where noise permits no constant run; -inf: unknown.
+        usual: the lowest median, over recordings, of unloaded readings above ``reading``; -inf: unknown.
     """
 
     reading: Floats
@@ -52,7 +55,7 @@ class LowerLimit:
 
     @classmethod
     def unknown(cls, n_cells: int) -> LowerLimit:
-        """Without a reference nothing is less than healthy."""
+        """Return the limit of a cold start: no reading is too low."""
         return cls(np.full(n_cells, -np.inf), -np.inf)
 
     @classmethod
@@ -66,25 +69,25 @@ class LowerLimit:
         tolerance: float,
         full_scale: float,
     ) -> LowerLimit:
-        """Learn from what :func:`_low` returns of a reference in which untouched cells read ``most`` (``[D]``)."""
+        """Fit to the results of :func:`_low`, with unloaded readings up to ``most`` (``[D]``)."""
         peak_values = peaks[:, present]
         reading = np.full(
             len(low), np.quantile(peak_values[np.isfinite(peak_values)], _RARE, method="lower") - 2 * tolerance
         )
-        # Where most cells rest at 0, one that always reads more is loaded.
+        # Where most cells rest at 0, a cell that always reads more is loaded.
         if len(peaks) >= FEWEST and np.median(low[present]) > tolerance:
             peak = peaks - low
             unloaded = peak < _LIGHT * full_scale
             often = np.count_nonzero(unloaded, axis=0) >= _OFTEN * len(peaks)
             peak_values = peak[unloaded & present]
             rare = float(np.quantile(peak_values, _RARE, method="lower"))
-            tail_slope = max((_BEYOND - 1) * (float(np.median(peak_values)) - rare), tolerance)
-            reading = np.where(often, np.maximum(reading, low + rare - tail_slope), reading)
+            margin = max((_BEYOND - 1) * (float(np.median(peak_values)) - rare), tolerance)
+            reading = np.where(often, np.maximum(reading, low + rare - margin), reading)
         above = (np.median((row - reading)[rests]) for row in last if (rests := present & (row <= most)).any())
         return cls(reading, float(min(above, default=-np.inf)))
 
     def lower(self, runs: ConstantRuns, rests: NDArray[np.bool_]) -> float:
-        """Return by how much those that rest (bool ``[D]``) all read less than they ever did, 0 or below."""
+        """Return by how much all cells that rest (bool ``[D]``) read less than ever in the reference, 0 or below."""
         if not (np.isfinite(self.usual) and rests.any()):
             return 0.0
         return min(0.0, float(np.median((runs.value - self.reading)[rests])) - self.usual)
@@ -92,12 +95,14 @@ class LowerLimit:
     def evidence(
         self, runs: ConstantRuns, rests: NDArray[np.bool_], tolerance: float, present: NDArray[np.bool_], lower: float
     ) -> Floats:
-        """Return what a still stretch says of being open, whatever touches the cell, a log likelihood ratio ``[D]``.
+        """Return the log likelihood ratio open : healthy of a constant run without contact, ``[D]``.
+
+        12 for a run below the limit and below that of all cells, -2 for a usual one, 0 else.
 
         Args:
-            runs: the still stretches.
-            rests: bool ``[D]``, cells that read what an untouched one does, or less.
-            tolerance: a reading wanders so far around 0, the low rail.
+            runs: the constant runs.
+            rests: bool ``[D]``, cells at their baseline or below.
+            tolerance: readings within 2 tolerances of 0 are at the low rail.
             present: bool ``[D]``.
             lower: see :meth:`lower`.
         """
@@ -112,46 +117,50 @@ class LowerLimit:
 def untouched_evidence(
     unusual: NDArray[np.bool_], broken: NDArray[np.bool_], as_ever: NDArray[np.bool_], present: NDArray[np.bool_]
 ) -> Floats:
-    """Return what untouched cells give away, a log likelihood ratio ``[D]``; nothing where too many do.
+    """Return the log likelihood ratio fault : healthy of cells without contact, ``[D]``: 12, -2 or 0.
+
+    All are 0 where more than half of the cells are unusual.
 
     Args:
-        unlike: bool ``[D]``, cells that do what they never did.
-        broken: those of them that can only be broken.
-        as_ever: bool ``[D]``, cells that do what they always did, and broken ones do not.
+        unusual: bool ``[D]``, cells that behave as they never did in the reference.
+        broken: bool ``[D]``, those of them that only a fault explains: 12.
+        as_ever: bool ``[D]``, cells that behave as ever, unlike broken ones: -2.
         present: bool ``[D]``.
     """
     if unusual.sum() > _CROWD * present.sum():
         return np.zeros(len(present))
-    return np.where(broken, _WORTH, np.where(as_ever, _AS_EVER, 0.0))
+    return np.where(broken, _BELOW, np.where(as_ever, _AS_EVER, 0.0))
 
 
 def baseline(
     recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance: float, full_scale: float
 ) -> tuple[Floats, LowerLimit]:
-    """Return the most that each cell reads untouched, ``[D]``, and the least that healthy ones read.
+    """Return the highest reading of each cell without contact, ``[D]``, and the lower limit of healthy cells.
 
-    A cell without any reading rests at 0.
+    The baseline of a cell without any reading is 0.
 
     Args:
         recordings: ``[T, D]`` each.
-        present: bool ``[D]``, cells that tell how far they wander.
-        tolerance: a cell is still while it stays within +- this; a wander within it counts as rest anyway.
+        present: bool ``[D]``, cells from which drift and noise are estimated.
+        tolerance: a constant run stays within +- this; smaller drift is covered by it.
         full_scale: of the layout.
     """
     low, last, peaks = _low(recordings)
     cells, some = RecordingBlocks.of(recordings).sample(present)
-    offsets, bends = [], []
+    offsets, curvatures = [], []
     for frames in some:
         received = ~np.isnan(frames).any(axis=0)
         if len(frames) > 2 and received.any():
             whole = frames[:, received]
-            offsets.append(np.quantile(whole, _LEAST, axis=0) - low[cells[received]])
-            bends.append(np.median(np.abs(np.diff(whole, 2, axis=0)), axis=0))  # a load moves, but hardly bends
+            offsets.append(np.quantile(whole, _UNLOADED, axis=0) - low[cells[received]])
+            curvatures.append(
+                np.median(np.abs(np.diff(whole, 2, axis=0)), axis=0)
+            )  # a load changes slowly: its second difference is small
     if not offsets:
         return low, LowerLimit.unknown(len(low))
     offset = np.concatenate(offsets)
     light = offset[offset < _LIGHT * full_scale]
-    noise = float(np.quantile(np.concatenate(bends), _CALM)) / (0.6745 * np.sqrt(6))
+    noise = float(np.quantile(np.concatenate(curvatures), _CALM)) / (0.6745 * np.sqrt(6))
     most = low + max(0.0, _highest(light) + _NOISE * noise - tolerance)
     if noise > tolerance:
         return most, LowerLimit(np.full(len(low), full_scale), -np.inf)
@@ -159,9 +168,9 @@ def baseline(
 
 
 def _highest(offset: Floats) -> float:
-    """Return how far untouched cells wander up, from how far they wander down: light loads hide the other end.
+    """Return the upward drift of unloaded cells, mirrored from the downward drift: light loads hide the upper end.
 
-    As far as from the lowest to the median again, if there is a sharp lowest; tails may reach half as far again.
+    Equals twice the median minus the 0.001 quantile, between two and three times the median.
     """
     if not len(offset):
         return 0.0
@@ -171,9 +180,9 @@ def _highest(offset: Floats) -> float:
 
 
 def _low(recordings: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return a low quantile of each cell's readings, ``[D]``; 0 for a cell without any.
+    """Return the low quantile of the readings of each cell, and its last reading and lowest peak in each recording.
 
-    And the last in each recording, and the lowest that it read at its highest in half a segment, ``[recordings, D]``.
+    Shapes: ``[D]`` (0 without any reading), and twice ``[recordings, D]``.
     """
     readings, n_cells = RecordingBlocks.of(recordings), recordings[0].shape[1]
     low, (last, peaks) = np.zeros(n_cells), np.full((2, len(readings), n_cells), np.nan)
@@ -189,7 +198,7 @@ def _low(recordings: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
 
 
 def _lowest_peak(frames: Floats) -> Floats:
-    """Return the lowest of the highest readings in half a segment, ``[D]``: a still stretch of one shows as much."""
+    """Return the minimum over half segments of the highest reading in each, ``[D]``: that of a constant run."""
     length = min(SEGMENT // 2, len(frames))
     whole = len(frames) // length * length
     lowest: Floats = np.fmin.reduce(np.fmax.reduce(frames[:whole].reshape(-1, length, frames.shape[1]), axis=1), axis=0)

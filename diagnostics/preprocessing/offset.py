@@ -1,8 +1,13 @@
-"""Offsets that have moved since the reference was recorded, as with temperature, told from touches and taken off.
+"""Offset tracking: drift of the baselines since the reference, as with temperature, estimated and removed.
 
-What moves all cells is seen at those that are loaded least; what moves a single one, at its own lowest reading in the
-log. Small offsets only, and of all cells together larger ones than the reference itself shows: a cell that reads more
-all the time is loaded, or broken.
+Estimates two offsets above the reference baseline b:
+
+    common(t) = q25 over cells of (x_i(t) - b_i - own_i)        where it exceeds the usual one of the reference
+    own_i     = min over t of (x_i(t) - b_i) - common           where it exceeds the noise
+
+A quantile filter over cells and a running minimum over time, as in baseline correction by minimum statistics (Martin
+2001). Common offsets up to 5 % and own offsets up to 2 % of full scale are removed. Larger ones are not tracked: such a
+cell is loaded or faulty.
 """
 
 from __future__ import annotations
@@ -19,20 +24,20 @@ from diagnostics.preprocessing.readings import RecordingBlocks
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Scale
 
-_LEAST_LOADED = 0.25  # share of the cells that is hardly ever loaded all at once, and more than are open
-_COMMON, _OWN = 0.05, 0.02  # of full scale: the largest offset of all cells together, and of one beside that
-_USUAL = 0.95  # quantile of the offsets in the reference
-_FRAMES = 20  # of each recording that tell, about
+_LEAST_LOADED = 0.25  # quantile over the cells: more are unloaded than this, and fewer are open
+_COMMON, _OWN = 0.05, 0.02  # of full scale: largest common offset, and largest own offset
+_USUAL = 0.95  # quantile of the common offsets in the reference
+_FRAMES = 20  # of each recording, about: a size
 
 Floats = NDArray[np.float64]
 
 
 class ReferenceOffset(NamedTuple):
-    """Offsets of all cells together that healthy skins show.
+    """Common offsets in the reference, in the layout's unit.
 
     Attributes:
-        mostly: below 0 where cells mostly rest lower than they may, as their offsets wander.
-        most: an offset that is as in the reference.
+        mostly: median of the common offset, at most 0.
+        most: largest common offset that counts as usual.
     """
 
     mostly: float
@@ -40,7 +45,7 @@ class ReferenceOffset(NamedTuple):
 
     @classmethod
     def fit(cls, recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_]) -> ReferenceOffset:
-        """Look at a reference, recordings ``[T, D]`` each."""
+        """Fit to fault-free recordings, ``[T, D]`` each."""
         cells, some = RecordingBlocks.of(recordings).sample(present)
         common: list[float] = []
         for frames in some:
@@ -52,19 +57,19 @@ class ReferenceOffset(NamedTuple):
         return cls(mostly, max(mostly + scale.near / 2, float(np.quantile(common, _USUAL))))
 
     def excess(self, offset: ArrayLike) -> Floats:
-        """Return how far offsets ``[...]`` lie above where cells mostly rest; 0 for those that are usual."""
+        """Return offsets ``[...]`` relative to the median of the reference; 0 for usual ones."""
         offset = np.asarray(offset, dtype=np.float64)
         return np.where(offset > self.most, offset - self.mostly, 0.0)
 
 
 @dataclass(frozen=True)
 class OffsetTracker:
-    """How far untouched cells now read above where they rested in the reference.
+    """Offsets relative to the baseline of the reference, in the layout's unit.
 
     Attributes:
-        lowest: float ``[D]``, the lowest reading of each cell in the log, above that; inf where there was none.
-        own: float ``[D]``, the offset of each cell that follows from it, beside that of all.
-        common: that of all cells together, beside their own, in each of the last frames ``[t]``.
+        lowest: float ``[D]``, lowest reading of each cell in the log above its baseline; inf: no reading.
+        own: float ``[D]``, offset of each cell in addition to the common one.
+        common: float ``[t]``, common offset in each of the last frames.
     """
 
     lowest: Floats
@@ -73,7 +78,7 @@ class OffsetTracker:
 
     @classmethod
     def begin(cls, n_cells: int) -> OffsetTracker:
-        """Nothing seen yet."""
+        """Return the state before any frame."""
         return cls(np.full(n_cells, np.inf), np.zeros(n_cells), np.zeros(1))
 
     def extend(self, frames: Floats, scale: Scale, present: NDArray[np.bool_], usual: ReferenceOffset) -> OffsetTracker:
@@ -81,39 +86,39 @@ class OffsetTracker:
 
         Args:
             frames: ``[t, D]``, NaN = missing.
-            scale: where cells rested in the reference.
+            scale: baseline of the reference.
             present: bool ``[D]``.
-            usual: what the reference shows.
+            usual: common offsets of the reference.
         """
         lowest = np.fmin(self.lowest, np.fmin.reduce(frames) - scale.baseline)
         own = np.zeros(len(lowest))
         if (lowest > scale.near / 2).any():
-            joined = usual.excess(_least_loaded(lowest[present]))
-            alone = lowest - np.where(joined < _COMMON * scale.full_scale, joined, 0.0)
-            own = np.where((alone > scale.near / 2) & (alone < _OWN * scale.full_scale), alone, 0.0)
-        # Mostly all cells together have none: enough of them read no more than usual all through.
+            shared = usual.excess(_least_loaded(lowest[present]))
+            beyond = lowest - np.where(shared < _COMMON * scale.full_scale, shared, 0.0)
+            own = np.where((beyond > scale.near / 2) & (beyond < _OWN * scale.full_scale), beyond, 0.0)
+        # Usually there is no common offset: enough cells stay at their baseline throughout.
         calm = present & (np.fmax.reduce(frames) - scale.baseline - own <= usual.most)
         if np.count_nonzero(calm) > _LEAST_LOADED * np.count_nonzero(present):
             return OffsetTracker(lowest, own, np.zeros(len(frames)))
         common = usual.excess([_least_loaded(frame) for frame in (frames - scale.baseline - own)[:, present]])
         last = self.common[-1]
-        for t in np.flatnonzero(common >= _COMMON * scale.full_scale):  # nearly all cells are loaded: it stays
+        for t in np.flatnonzero(common >= _COMMON * scale.full_scale):  # nearly all cells are loaded: keep the last one
             common[t] = common[t - 1] if t else last
         return OffsetTracker(lowest, own, common)
 
     def on(self, scale: Scale) -> Scale:
-        """Return where cells rest now."""
+        """Return ``scale`` with the baseline of the last frame."""
         now = self.own + self.common[-1]
         return replace(scale, baseline=scale.baseline + now) if now.any() else scale
 
     def off(self, frames: Floats) -> Floats:
-        """Return the last frames ``[t, D]`` with the offset of the last of them throughout."""
+        """Return the last frames ``[t, D]`` with changes of the common offset removed."""
         drift = self.common - self.common[-1]
         return frames - drift[:, None] if drift.any() else frames
 
 
 def _least_loaded(above: Floats) -> float:
-    """Return how far the cells that are loaded least are above their rest, from that of all, ``[n]``."""
+    """Return the 0.25 quantile of the readings above baseline, ``[n]``; 0 without any reading."""
     received = above[np.isfinite(above)]
     k = int(_LEAST_LOADED * (len(received) - 1))
     return float(np.partition(received, k)[k]) if len(received) else 0.0

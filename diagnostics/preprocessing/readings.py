@@ -1,4 +1,4 @@
-"""Recordings as they came, turned into float64 only where they are read: large ones are never held twice."""
+"""Recordings in their own dtype, converted to float64 where they are read: large ones are never copied whole."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from diagnostics.preprocessing.transport import invalid
 
 Recording = NDArray[np.float64]
 
-_MOST_VALUES = 1 << 23  # of a block of frames
-_RECORDINGS, _CELLS = 200, 2000  # of a sample, about
+_MOST_VALUES = 1 << 23  # in a block of frames: a size
+_RECORDINGS, _CELLS = 200, 2000  # in a sample, about: sizes
 
 
 class RecordingBlocks(Sequence[Recording]):
-    """A sequence of recordings, float64 ``[T, D]`` each when asked for.
+    """A sequence of recordings; each item is converted to float64 ``[T, D]``.
 
     Args:
-        given: arrays ``[T, D]`` of numbers; kept as they are.
+        given: arrays ``[T, D]`` of numbers, not copied.
     """
 
     def __init__(self, given: Sequence[NDArray[Any]]) -> None:
@@ -43,14 +43,14 @@ class RecordingBlocks(Sequence[Recording]):
         return np.asarray(self._given[which][frames][:, cells], dtype=np.float64)
 
     def blocks(self) -> Iterator[Recording]:
-        """Yield all frames in order, so many at once that a block stays small."""
+        """Yield all frames in order, in blocks of limited size."""
         for given in self._given:
             step = max(1, _MOST_VALUES // given.shape[1])
             for first in range(0, len(given), step):
                 yield np.asarray(given[first : first + step], dtype=np.float64)
 
     def sample(self, present: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Iterator[Recording]]:
-        """Return some of the cells that are ``present`` (bool ``[D]``), and some recordings of these, spread evenly."""
+        """Return evenly spread indices of ``present`` cells (bool ``[D]``), and recordings of these cells."""
         cells = np.flatnonzero(present)
         cells = cells[:: max(1, len(cells) // _CELLS)]
         which = range(0, len(self), max(1, len(self) // _RECORDINGS))
@@ -65,10 +65,10 @@ class RecordingBlocks(Sequence[Recording]):
         return RecordingBlocks(checked)
 
     def whole(self, present: NDArray[np.bool_]) -> RecordingBlocks:
-        """Return the recordings with the last reading of a cell for each that is missing, without lost frames.
+        """Return the recordings without lost frames, each missing reading replaced by the last one of the cell.
 
-        NaN is left where a cell delivered nothing yet. What misses nothing of the cells that are ``present`` (bool
-        ``[D]``) is not copied.
+        NaN remains before the first reading. Recordings that miss no reading of a ``present`` cell (bool ``[D]``) are
+        not copied.
 
         Raises:
             ValueError: no frame with a reading.
@@ -80,12 +80,12 @@ class RecordingBlocks(Sequence[Recording]):
 
     @classmethod
     def of(cls, recordings: Sequence[NDArray[Any]]) -> RecordingBlocks:
-        """Return ``recordings`` if they are that already."""
+        """Return ``recordings`` as blocks."""
         return recordings if isinstance(recordings, RecordingBlocks) else cls(recordings)
 
 
 def held(frames: NDArray[Any], last: NDArray[Any]) -> NDArray[Any]:
-    """Return the last reading of each cell before ``frames`` and by the end of each, ``[1 + t, D]``; NaN: none yet.
+    """Return the last reading of each cell, before ``frames`` and at each of them, ``[1 + t, D]``; NaN: none yet.
 
     Args:
         frames: ``[t, D]``; NaN = missing.
@@ -102,5 +102,5 @@ def held(frames: NDArray[Any], last: NDArray[Any]) -> NDArray[Any]:
 def _whole(given: NDArray[Any], present: NDArray[np.bool_]) -> NDArray[Any]:
     if not np.isnan(given.min(axis=0)[present]).any():
         return given
-    came = given[~np.isnan(given).all(axis=1, where=present)]
-    return held(came, np.full(given.shape[1], np.nan))[1:]
+    received = given[~np.isnan(given).all(axis=1, where=present)]
+    return held(received, np.full(given.shape[1], np.nan))[1:]

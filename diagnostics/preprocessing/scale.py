@@ -1,4 +1,4 @@
-"""What a reading means: where cells rest, and how hard they are loaded."""
+"""Scale: readings as root loads, relative to the baseline of each cell and to full scale."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Scale:
-    """Where a cell rests, and from where on it is loaded.
+    """Baseline and full scale, in the layout's unit.
 
     Attributes:
-        resting: float ``[D]``, reading of an untouched cell.
-        near: how far from that still counts as resting.
+        baseline: float ``[D]``, reading of each cell without contact.
+        near: readings up to this far above the baseline count as unloaded.
         full_scale: of the layout.
     """
 
@@ -25,12 +25,12 @@ class Scale:
     full_scale: float
 
     def root_load(self, frames: NDArray[np.float64]) -> Array:
-        """Return the square root of the load, 0..1, ``[..., D]``: noise grows with load, its root does not.
+        """Return ``sqrt((reading - baseline) / full_scale)``, ``[..., D]``; 0 up to ``near`` and where missing.
 
-        A missing reading counts as resting.
+        The square root stabilises the variance of noise that grows with the load (Anscombe 1948).
         """
         load = ((frames - self.baseline) / self.full_scale).astype(np.float32)
-        # What rests is no load at all, so that a little noise at rest means nothing. Not a number counts as none.
+        # Comparisons with NaN are False: a missing reading is no load.
         root: Array = np.sqrt(np.where(load > np.float32(self.near / self.full_scale), load, np.float32(0)))
         return root
 
@@ -40,5 +40,5 @@ class Scale:
 
     @property
     def root_near(self) -> float:
-        """The root load from which on a cell counts as loaded."""
+        """The root load above which a cell counts as loaded."""
         return float(np.sqrt(self.near / self.full_scale))

@@ -1,8 +1,8 @@
-"""Faults on the way of the frames: lost ones, and a stream that is frozen. They say nothing about cells.
+"""Transport faults: lost frames, frozen streams and invalid readings between sensor and log; no faults of cells.
 
-A frozen stream repeats one frame again and again. Cell by cell that looks as if every cell were stuck, and so repeated
-frames must not count as evidence. Pads that send exact zeros repeat frames when nothing touches them, so a repetition
-is a fault only while something is loaded.
+Detects frames without any reading, one frame repeated more than ``patience`` times while at least 3 working cells are
+loaded, and readings that no converter gives. In a frozen stream every cell looks stuck, so repeated frames are not used
+as evidence. Arrays that send exact zeros repeat frames without contact: a repetition without load is no fault.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_LOADED_CELLS = 3  # so many working cells must be loaded in a repeated frame: else it may be idle
-_KEPT = 16  # repetitions remembered; the most recent ones
+_LOADED_CELLS = 3  # working cells that must be loaded in a repeated frame: fewer may be idle
+_KEPT = 16  # most recent repetitions: a size
 
 
 @dataclass(frozen=True)
 class TransportFault:
-    """Frames that did not arrive as they were taken.
+    """Frames or readings that did not arrive as they were measured.
 
     Attributes:
         kind: ``"lost"`` (frames without any reading), ``"frozen"`` (one frame repeated) or ``"invalid"`` (readings that
@@ -47,7 +47,13 @@ class TransportFault:
 
 @dataclass(frozen=True)
 class Repetition:
-    """A frame that came ``frames`` times in a row, first as number ``onset``."""
+    """One frame that was received several times in a row.
+
+    Attributes:
+        onset: number of its first occurrence.
+        frames: number of occurrences.
+        frame: float ``[D]``, its readings.
+    """
 
     onset: int
     frames: int
@@ -56,15 +62,18 @@ class Repetition:
 
 @dataclass(frozen=True)
 class TransportState:
-    """What is known of the transport so far.
+    """Counts of lost, repeated and invalid frames so far.
 
     Attributes:
         seen: frames so far, lost ones included.
-        lost: how many were lost; ``first_lost``: number of the first, -1: none.
-        last: the last frame that arrived, ``[D]``.
-        repeats: how often in a row it has come again; ``since``: number of its first coming.
-        repetitions: those beyond patience, the last one perhaps still going on.
-        invalid: readings that no converter gives; ``first_invalid``: number of the frame of the first, -1: none.
+        lost: number of lost frames.
+        first_lost: number of the first of them; -1: none.
+        last: float ``[D]``, the last frame received.
+        repeats: number of times in a row that it was repeated.
+        since: number of its first occurrence.
+        repetitions: the repetitions beyond patience; the last may continue.
+        invalid: number of readings that no converter gives.
+        first_invalid: number of the frame of the first of them; -1: none.
     """
 
     seen: int = 0
@@ -80,33 +89,33 @@ class TransportState:
     def receive(
         self, frames: NDArray[np.float64], present: NDArray[np.bool_], patience: int
     ) -> tuple[TransportState, NDArray[np.intp]]:
-        """Return the stream after more frames, and which of them say something, int ``[k]``, indices into ``frames``.
+        """Return the state after more frames, and the indices of those that carry information, int ``[k]``.
 
         Args:
             frames: ``[t, D]``, t >= 1.
             present: bool ``[D]``, where there is a cell.
-            patience: a frame that has come again more often than this says nothing new.
+            patience: a frame that was repeated more often than this carries none.
         """
         missing = np.isnan(frames)
         arrived = ~missing.all(axis=1, where=present) if missing.any() else np.ones(len(frames), bool)
-        there = np.flatnonzero(arrived)
-        gone = len(frames) - len(there)
-        lost, first_lost = self.lost + gone, self.first_lost
-        if gone and first_lost < 0:
+        arrived_at = np.flatnonzero(arrived)
+        missed = len(frames) - len(arrived_at)
+        lost, first_lost = self.lost + missed, self.first_lost
+        if missed and first_lost < 0:
             first_lost = self.seen + int((~arrived).argmax())
-        if not len(there):
-            return replace(self, seen=self.seen + len(frames), lost=lost, first_lost=first_lost), there
-        came = frames[there] if gone else frames
-        same = np.zeros(len(came), bool)
+        if not len(arrived_at):
+            return replace(self, seen=self.seen + len(frames), lost=lost, first_lost=first_lost), arrived_at
+        received = frames[arrived_at] if missed else frames
+        same = np.zeros(len(received), bool)
         if self.last is not None:
-            same[0] = np.array_equal(came[0], self.last, equal_nan=True)
-        same[1:] = _as_before(came)
-        counts = np.arange(1, len(came) + 1)
+            same[0] = np.array_equal(received[0], self.last, equal_nan=True)
+        same[1:] = _as_before(received)
+        counts = np.arange(1, len(received) + 1)
         fresh = np.maximum.accumulate(np.where(same, 0, counts))
         repeats = np.where(fresh > 0, counts - fresh, self.repeats + counts)
         repetitions = list(self.repetitions)
-        # Each repetition is noted once it is beyond patience, and lengthened when it goes on.
-        numbers = self.seen + there
+        # A repetition is recorded once it exceeds patience, and extended while it continues.
+        numbers = self.seen + arrived_at
         since = np.where(fresh > 0, numbers[fresh - 1], self.since)
         last_of_run = np.flatnonzero(np.append(~same[1:], True) & (repeats > patience))
         for i in last_of_run.tolist():
@@ -114,19 +123,19 @@ class TransportState:
             if known is not None:
                 repetitions[-1] = replace(known, frames=int(repeats[i]) + 1)
             else:
-                repetitions.append(Repetition(int(since[i]), int(repeats[i]) + 1, came[i].copy()))
+                repetitions.append(Repetition(int(since[i]), int(repeats[i]) + 1, received[i].copy()))
         state = TransportState(
             seen=self.seen + len(frames),
             lost=lost,
             first_lost=first_lost,
-            last=came[-1].copy(),
+            last=received[-1].copy(),
             repeats=int(repeats[-1]),
             since=int(since[-1]),
             repetitions=tuple(repetitions[-_KEPT:]),
             invalid=self.invalid,
             first_invalid=self.first_invalid,
         )
-        return state, there[repeats <= patience]
+        return state, arrived_at[repeats <= patience]
 
     def dropped(self, invalid: NDArray[np.bool_]) -> TransportState:
         """Return the state with the ``invalid`` readings of the next frames, bool ``[t, D]``, counted."""
@@ -134,23 +143,23 @@ class TransportState:
         return replace(self, invalid=self.invalid + int(invalid.sum()), first_invalid=first)
 
     def without(self, frames: int) -> TransportState:
-        """Return the stream after frames that never came."""
+        """Return the state after ``frames`` more frames were lost."""
         first = self.seen if self.first_lost < 0 else self.first_lost
         return replace(self, lost=self.lost + frames, first_lost=first)
 
     def faults(
         self, loaded_from: NDArray[np.float64], working: NDArray[np.bool_], rate: float
     ) -> tuple[TransportFault, ...]:
-        """Name what went wrong.
+        """Return the transport faults.
 
         Args:
             loaded_from: float ``[D]``, the reading from which on each cell is loaded.
-            working: bool ``[D]``, the cells that are not themselves stuck.
+            working: bool ``[D]``, cells that are known to work.
             rate: frames per second.
         """
         found = []
         if self.lost:
-            text = f"{self.lost} frames came without a reading or not at all, the first is number {self.first_lost}"
+            text = f"{_count(self.lost, 'frame')} lost (no reading, or never received), the first is {self.first_lost}"
             found.append(TransportFault("lost", self.first_lost, self.lost, f"{text}: check the link to the sensor"))
         if self.invalid:
             text = f"{_count(self.invalid, 'reading')} outside what a converter gives, the first in frame"
@@ -159,12 +168,15 @@ class TransportState:
         for r in self.repetitions:
             loaded = int((r.frame > loaded_from)[working].sum())
             if loaded >= _LOADED_CELLS:
-                text = (
-                    f"the frame {r.onset}, in which {loaded} working cells are loaded, came {r.frames} times in a row"
-                )
-                text += f" ({r.frames / rate:.1f} s)"
+                text = f"frame {r.onset}, in which {loaded} working cells are loaded, was received {r.frames} times"
+                text += f" in a row ({r.frames / rate:.1f} s)"
                 found.append(
-                    TransportFault("frozen", r.onset, r.frames, f"{text}: the stream was frozen, not the cells")
+                    TransportFault(
+                        "frozen",
+                        r.onset,
+                        r.frames,
+                        f"{text}: the stream was frozen, not the cells; check the link to the sensor",
+                    )
                 )
         return tuple(found)
 
@@ -185,16 +197,16 @@ def invalid(frames: NDArray[Any], full_scale: float) -> NDArray[np.bool_] | None
 
 
 def longest_repetition(frames: NDArray[np.float64]) -> int:
-    """Return how often in a row a frame of ``[T, D]`` came again at most."""
+    """Return the largest number of times in a row that a frame of ``[T, D]`` is repeated."""
     same = _as_before(frames)
     counts = np.arange(1, len(same) + 1)
     return int((counts - np.maximum.accumulate(np.where(same, 0, counts))).max(initial=0))
 
 
 def _as_before(frames: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return for each frame but the first, ``[T - 1]``, whether it equals the one before, missing readings included."""
-    matching, missing = frames[1:] == frames[:-1], np.isnan(frames)
+    """Return whether each frame but the first equals the one before, bool ``[T - 1]``; NaN equals NaN."""
+    equal, missing = frames[1:] == frames[:-1], np.isnan(frames)
     if missing.any():
-        matching |= missing[1:] & missing[:-1]
-    same: NDArray[np.bool_] = matching.all(axis=1)
+        equal |= missing[1:] & missing[:-1]
+    same: NDArray[np.bool_] = equal.all(axis=1)
     return same

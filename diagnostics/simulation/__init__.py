@@ -1,1 +1,1 @@
-"""Known faults: injected into recordings, or into a circuit model of the array."""
+"""Simulated faults: injected into recordings, or into a circuit model of the array."""

@@ -1,8 +1,8 @@
-"""The tactile array as a circuit: what the converter reads when the faults sit in the netlist, not in the readings.
+"""Circuit model of the array: readings of the converter with faults in the netlist, not in the readings.
 
 Each cell is a resistor between its row wire and its column wire. To read cell (i, j), row i is driven with the supply,
 column j goes to the load resistor of a voltage divider, and the converter measures across the load. With Y the matrix
-of conductances between wires, a scan solves Y v = s (nodal analysis: what flows into a wire flows out of it) once for
+of conductances between wires, a scan solves Y v = s (nodal analysis, Kirchhoff's current law) once for
 each driven row and frame. Which column is read changes one term on the diagonal of Y, so all columns follow from the
 same solution (Sherman-Morrison): v_j = u_j / (1 + d Z_jj) with Z = Y^-1, u = Z s, and d what column j's terminal gains.
 
@@ -16,12 +16,12 @@ difference, in % of full scale; "others" are the cells that the injector leaves 
   within 1.6, others within 0.4. A short of 1 kiloohm moves others by 2.4, of 1 ohm by 13: it halves the rest of its row
   and leaves 0.3 of the rest of its column.
 - A row on the supply never reads full scale: its cells stay alive (92 off at the median) and their forces are added to
-  those of all other rows of their column. Bridged lines read alike: the sum of the two where the line that is not
+  those of all other rows of their column. Bridged lines read the same: the sum of the two where the line that is not
   selected floats (within 1.5), their mean where a switch like the driver's grounds it, still less of two columns where
   the load is not small.
-- Floating lines: nothing but address bits and converters agrees on all cells. The median touched cell reads 28 too
-  high without any fault; an open cell reads 34 and cells beyond a cut 16 to 18 at the median, for currents sneak around
-  the break; a short moves others by 20, a line on ground by 30, a line on the supply by 85.
+- Floating lines: nothing but address bits and converters agrees on all cells. The median loaded cell reads 28 too
+  high without any fault; an open cell reads 34 and cells beyond a cut 16 to 18 at the median, because of sneak
+  currents around the break; a short moves others by 20, a line on ground by 30, a line on the supply by 85.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class BridgedLines:
 
 @dataclass(frozen=True)
 class StuckBit:
-    """An address bit stays at ``level`` 0 or 1: another line than asked is driven or read, or none."""
+    """An address bit stays at ``level`` 0 or 1: another line than addressed is driven or read, or none."""
 
     line: Line
     level: int
@@ -101,16 +101,16 @@ class Circuit:
         layout: the array; absent positions have no resistor and read 0.
         readout: ``"grounded"``, ``"floating"`` (all lines that are not selected), ``"floating_rows"`` (columns
             grounded) or ``"floating_columns"`` (rows grounded). Lines that float let current sneak through other cells.
-        faults: what is broken in the netlist; at most one cut for each line.
-        full_scale_ohms: what the force of a cell at full scale alone makes of it.
-        idle_ohms: an untouched cell.
+        faults: faults of the netlist; at most one cut for each line.
+        full_scale_ohms: resistance of a cell at full scale, without ``idle_ohms`` in parallel.
+        idle_ohms: resistance of an unloaded cell.
         load_ohms: the divider's lower resistor. Small against the cells, it keeps the other cells of a column from
             dividing the reading; near 0 it stands for an amplifier's virtual ground.
         switch_ohms: a closed switch of the multiplexer (70: a 74HC4067 at 4.5 V), also what holds a line at ground.
-        short_ohms: two conductors that touch.
-        leak_ohms: from every wire to ground, through air and dirt.
-        bits: of the converter; None: no rounding. Its range ends where a cell at full scale reads, as if an amplifier
-            stood before it.
+        short_ohms: contact of two conductors.
+        leak_ohms: from every wire to ground.
+        bits: of the converter; None: no rounding. Its range ends at the voltage of a cell at full scale, as with an
+            amplifier before it.
 
     Raises:
         ValueError: a resistance that is not positive, an unknown readout, a fault that fits no wire or cell.
@@ -152,7 +152,7 @@ class Circuit:
         return float(1 / self._conductance(np.float64(force)))
 
     def read(self, recording: ArrayLike) -> FloatArray:
-        """Return what the array reports under the forces of ``recording``.
+        """Return the readings of the array under the forces of ``recording``.
 
         The converter's calibration is that of a healthy cell alone in the divider; readings are clipped to its range.
 
@@ -178,7 +178,7 @@ class Circuit:
         return readings.reshape(forces.shape)
 
     def wire_voltages(self, recording: ArrayLike, pad: int, row: int, col: int) -> FloatArray:
-        """Return the voltage of every wire while one cell is asked for, as shares of the supply.
+        """Return the voltage of every wire while one cell is addressed, as shares of the supply.
 
         Args:
             recording: as for :meth:`read`.
@@ -186,7 +186,7 @@ class Circuit:
 
         Returns:
             float64 ``[T, rows + cols + cuts]``: rows, columns,
-            then what lies beyond each cut, in the order of ``faults``.
+            then the part beyond each cut, in the order of ``faults``.
         """
         forces = self.layout.grid(self.layout.check_recording(recording))[:, pad]
         wires = _Pad.build(self, pad)
@@ -212,8 +212,8 @@ class Circuit:
                 solved = np.linalg.solve(matrix, np.broadcast_to(sides, (len(matrix), *sides.shape)))
                 own = solved[:, columns, np.arange(1, len(columns) + 1)]  # Z_jj [t, cols]
                 at_load = solved[:, columns, 0] / (1 + self._reading_gain * own)
-                heard = np.where(wires.listen >= 0, at_load[:, np.maximum(wires.listen, 0)], 0.0)
-                out[part, wires.drive == driven] = heard[:, None]
+                received = np.where(wires.listen >= 0, at_load[:, np.maximum(wires.listen, 0)], 0.0)
+                out[part, wires.drive == driven] = received[:, None]
         out *= self.load_ohms / (self.load_ohms + self.switch_ohms)
         return out
 
@@ -240,7 +240,7 @@ class Circuit:
 
     @property
     def _reading_gain(self) -> float:
-        """What the terminal of a column gains in conductance when it is read."""
+        """Change of the conductance at the terminal of a column when it is read, in siemens."""
         return 1 / (self.switch_ohms + self.load_ohms) - (1 / self.switch_ohms if self._grounds("column") else 0.0)
 
     def _grounds(self, kind: str) -> bool:
@@ -263,7 +263,7 @@ class Circuit:
         return np.clip(force, 0.0, self.layout.full_scale)
 
 
-_BATCH = 4_000_000  # numbers held in one batch of nodal matrices: 32 MB, and as much again while it is solved
+_BATCH = 4_000_000  # numbers in one batch of nodal matrices: 32 MB, and as much again while it is solved
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +273,7 @@ class _Pad:
     rows: int
     static: FloatArray  # Y without cells and selection [wires, wires]
     source: FloatArray  # s without the driven row [wires]
-    row_wire: NDArray[np.intp]  # which wire each cell hangs on [rows * cols]
+    row_wire: NDArray[np.intp]  # wire of each cell [rows * cols]
     column_wire: NDArray[np.intp]
     stuck: FloatArray  # conductance of stuck and absent cells, NaN elsewhere [rows, cols]
     drive: NDArray[np.intp]  # which row each row address drives, -1: none [rows]
@@ -282,7 +282,7 @@ class _Pad:
     @classmethod
     def build(cls, circuit: Circuit, pad: int) -> _Pad:
         """Return the wires of a pad with the faults of the circuit in them."""
-        layout, touch = circuit.layout, 1 / circuit.short_ohms
+        layout, short = circuit.layout, 1 / circuit.short_ohms
         rows, cols = layout.rows, layout.cols
         row_wire, column_wire = (w.copy() for w in np.indices((rows, cols)))
         column_wire += rows
@@ -323,18 +323,18 @@ class _Pad:
         diagonal = np.full(n, 1 / circuit.leak_ohms)
         diagonal[:rows] += 1 / circuit.switch_ohms if circuit._grounds("row") else 0.0
         diagonal[rows : rows + cols] += 1 / circuit.switch_ohms if circuit._grounds("column") else 0.0
-        diagonal[grounded + supplied] += touch
-        source[supplied] = touch
+        diagonal[grounded + supplied] += short
+        source[supplied] = short
         static = np.diag(diagonal)
         for a, b in joined:
-            static[[a, b], [a, b]] += touch
-            static[[a, b], [b, a]] -= touch
+            static[[a, b], [a, b]] += short
+            static[[a, b], [b, a]] -= short
         drive, listen = np.where(drive < rows, drive, -1), np.where(listen < cols, listen, -1)
         return cls(rows, static, source, row_wire.ravel(), column_wire.ravel(), stuck, drive, listen)
 
 
 def _stick(addresses: NDArray[np.intp], bit: int, level: int) -> NDArray[np.intp]:
-    """Return the addresses that arrive with one more bit stuck."""
+    """Return the addresses with one bit stuck at ``level``."""
     return addresses | (1 << bit) if level else addresses & ~(1 << bit)
 
 

@@ -1,7 +1,6 @@
-"""Injects faults into recordings, as the converter would report them.
+"""Fault injection: changes recordings to what the converter would report, with one law for each kind of fault.
 
-The readings themselves are changed, one law for each kind of fault. ``diagnostics/circuit.py`` says where these laws
-hold and where a real array reads something else.
+:mod:`diagnostics.simulation.circuit` shows where these laws hold and where a real array reads something else.
 """
 
 from __future__ import annotations
@@ -15,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, SensorLayout
 
-# What a fault does when it does not say so itself, in shares of full scale.
+# Defaults of ``Fault.value`` and thresholds, as shares of full scale.
 _NOISE = 0.05  # NOISY: standard deviation of the added noise
 _DRIFT = 0.01  # DRIFT: offset gained per second
 _LOADED = 0.05  # INTERMITTENT: a loose contact blinks while its cell carries more than this
-# INTERMITTENT: chance per frame that a closed contact opens and that an open one closes again.
+# INTERMITTENT: probability per frame that a closed contact opens, and that an open one closes.
 _OPENS, _CLOSES = 0.2, 0.4
 
 
@@ -33,22 +32,22 @@ def inject(
     until: int | None = None,
     gain: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return a copy of ``recording`` in which ``faults`` happen, each from its onset on.
+    """Return a copy of ``recording`` with ``faults`` injected, each from its onset on.
 
     Faults are applied in order; every one reads the healthy recording, so an alias copies what the other cell would
-    have read without faults. What ``Fault.value`` means for each kind is written there.
+    have read without faults. See ``Fault.value`` for its meaning by kind.
 
     Args:
         recording: ``[T, D]`` or ``[T, pads, rows, cols]``, in the layout's unit.
         faults: root causes; empty leaves the values as they are.
         layout: the array.
         seed: for the kinds that draw (INTERMITTENT, NOISY) and for dither; None draws anew each time.
-        dither: the converter's unrest on OPEN, SHORT and STUCK cells: uniform within +- this share of full scale.
-        until: the faults end before this frame, and the cells read as before; None: they stay.
-        gain: what a DRIFT cell gains each second on top of its offset, as a share of its reading (negative: loses).
+        dither: noise of the converter on OPEN, SHORT and STUCK cells: uniform within +- this share of full scale.
+        until: the faults end before this frame; None: they last.
+        gain: change of the gain of a DRIFT cell per second, as a share of its reading, in addition to its offset.
 
     Returns:
-        float64 ``[T, D]``; faulty readings lie within 0..full_scale, all others are untouched, bit for bit. Missing
+        float64 ``[T, D]``; faulty readings lie within 0..full_scale, all others are unchanged, bit for bit. Missing
         readings (NaN) stay missing.
 
     Raises:
@@ -116,7 +115,7 @@ def _faulty_readings(
 
 
 def _alias_sources(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) -> NDArray[np.intp]:
-    """Return which cell each of ``cells`` reads instead of itself; -1: an address with nothing connected."""
+    """Return the cell that each of ``cells`` reads instead of itself; -1: an address with nothing connected."""
     line = fault.line
     if fault.value is None:
         raise ValueError("an ALIAS fault needs a value: the bit's level, or the row, column or cell read instead")
@@ -134,9 +133,9 @@ def _alias_sources(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) 
 
 
 def _bridge_partners(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) -> NDArray[np.intp] | None:
-    """Return which cell each of ``cells`` is bridged with; -1: an absent one. None: the alias is not a bridge.
+    """Return the cell that each of ``cells`` is bridged with; -1: an absent one. None: the alias is not a bridge.
 
-    It is one where it names the cells of both lines, for a line that reads another leaves that other one alone.
+    A bridge names the cells of both lines; a line that reads another names only its own.
     """
     line = fault.line
     if line is None or line.kind not in ("row", "column") or fault.value is None:
@@ -178,11 +177,11 @@ def line_fault(
     Args:
         layout: the array.
         line: the wire.
-        kind: how its cells misbehave.
+        kind: kind of the fault.
         value: as in :class:`~diagnostics.faults.Fault`.
         onset: first faulty frame; None: from the first frame on.
         break_at: a row or column is broken between positions ``break_at - 1`` and ``break_at`` along it (a row's
-            positions are column numbers, a column's are row numbers): the cells beyond are faulty, the others live.
+            positions are column numbers, a column's are row numbers): the cells beyond are faulty, the others work.
             None: the whole wire.
         driven_from: the end at which the wire is connected, position 0 or the last one.
 
@@ -214,7 +213,7 @@ def _broken_line(
 ) -> Fault:
     """Return the fault of the cells behind a break."""
     if line.kind not in ("row", "column"):
-        raise ValueError(f"break_at says where a row or column is broken; {line} has no positions")
+        raise ValueError(f"break_at is a position along a row or column; {line} has no positions")
     if kind is FaultKind.ALIAS:
         raise ValueError("break_at goes with a fault of the cells behind the break, not with an alias of a whole wire")
     along, positions = ("column", layout.cols) if line.kind == "row" else ("row", layout.rows)
@@ -241,7 +240,7 @@ def bridge(layout: SensorLayout, line: Line, *, onset: int | None = None) -> Fau
 
     In :func:`inject` both cells of a pair read the sum of their forces, clipped at full scale: their conductances are
     in parallel. That holds where lines float while they are not selected. Where a switch like the driver's holds the
-    other line at ground, a real array reads their mean (``diagnostics/circuit.py``).
+    other line at ground, a real array reads their mean (:mod:`diagnostics.simulation.circuit`).
 
     Raises:
         ValueError: the wire is no row or column, or there is no next one.
@@ -266,7 +265,7 @@ def bridge(layout: SensorLayout, line: Line, *, onset: int | None = None) -> Fau
 def freeze_stream(recording: ArrayLike, onset: int, until: int | None = None) -> NDArray[np.float64]:
     """Return a copy of ``recording`` ``[T, ...]`` that repeats frame ``onset`` to its end, or before frame ``until``.
 
-    A transport fault: the same frame is sent again and again, and no cell is broken.
+    A transport fault: one frame is repeated, and no cell is broken.
 
     Raises:
         ValueError: ``onset`` or ``until`` is negative.

@@ -33,6 +33,9 @@ GIVE_SCALE = "give the full scale and unit (--full-scale 3.3 --unit V; full_scal
 _SAMPLE = 20_000
 """Readings that the search for a converter step looks at."""
 
+_SHARE = 0.99
+"""Share of the distinct readings that are multiples of a converter's step: a stuck cell may read anything."""
+
 _WHOLE = 0.02
 """A reading is a multiple of a step if it is within this share of the step."""
 
@@ -129,8 +132,8 @@ def converter_step(contents: Sequence[Content]) -> float | None:
     """Return the step that all readings are multiples of; None where there is none, or it is a rounding to decimals.
 
     The candidate s is the least difference between two distinct readings v, refined by least squares:
-    s = sum(v k) / sum(k^2), k = round(v / s). 99.9 % of the readings have to be multiples of it. A step that is a power
-    of ten shows how the file was written, not the converter.
+    s = sum(v k) / sum(k^2), k = round(v / s). 99 % of the distinct readings have to be multiples of it. A step that is
+    a power of ten shows how the file was written, not the converter.
     """
     parts = [np.asarray(frames[np.isfinite(frames) & (frames > 0)]) for c in contents[:20] for frames in c.frames[:20]]
     values = np.concatenate(parts).astype(np.float64) if parts else np.empty(0)
@@ -145,7 +148,7 @@ def converter_step(contents: Sequence[Content]) -> float | None:
         multiples = np.rint(near / step)
         if multiples.any():
             step = float((near * multiples).sum() / (multiples**2).sum())
-    if np.mean(np.abs(values / step - np.rint(values / step)) < _WHOLE) < 0.999:
+    if np.mean(np.abs(values / step - np.rint(values / step)) < _WHOLE) < _SHARE:
         return None
     tens = np.log10(step)
     return None if abs(tens - np.rint(tens)) < 1e-3 else step

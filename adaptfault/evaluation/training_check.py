@@ -1,0 +1,87 @@
+"""Checks whether a training run has learned anything, and draws its curves and confusion matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from adaptfault.evaluation.scores import Scores
+from adaptfault.models.history import History
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_FALL = 0.02
+"""A training loss that falls by less than this share has not fallen."""
+
+
+def training_problems(scores: Scores, history: History, class_names: Sequence[str]) -> tuple[str, ...]:
+    """Return one sentence for each sign of a failed training, with likely causes; empty if there is none.
+
+    The signs are a test accuracy near chance, a class that is never predicted, and a training loss that did not fall.
+    Chance is the share m of the most frequent class. An accuracy is near it if it is below
+    m + 2 sqrt(m (1 - m) / n), two standard errors of n test windows. A run on unbalanced classes may be useful below
+    that limit; the sentence names both numbers.
+
+    Args:
+        scores: of the test windows.
+        history: of the run.
+        class_names: one name a class.
+    """
+    counts = scores.confusion.sum(axis=1)
+    problems = []
+    chance = counts.max() / counts.sum()
+    limit = chance + 2 * np.sqrt(chance * (1 - chance) / counts.sum())
+    if scores.accuracy < limit:
+        problems.append(
+            f"test accuracy {scores.accuracy:.3f} is near chance ({chance:.3f}): train longer (--epochs), and check the"
+            " labels, the full scale (adaptfault info) and that the classes differ in contact"
+        )
+    never = np.flatnonzero((scores.confusion.sum(axis=0) == 0) & (counts > 0))
+    if never.size:
+        names = ", ".join(class_names[i] if len(class_names) else str(i) for i in never[:5])
+        more = f" and {never.size - 5} more" if never.size > 5 else ""
+        classes = "class" if never.size == 1 else "classes"
+        causes = "too few recordings, labels that are mixed up, or too few epochs"
+        problems.append(f"{classes} never predicted: {names}{more}: {causes}")
+    losses = history.train_loss
+    if len(losses) > 1 and min(losses[1:]) > (1 - _FALL) * losses[0]:
+        problems.append(
+            f"the training loss did not fall ({losses[0]:.3f} to {losses[-1]:.3f}): check the full scale"
+            " (adaptfault info) and the labels"
+        )
+    return tuple(problems)
+
+
+def plot_training(scores: Scores, history: History, class_names: Sequence[str]) -> Figure:
+    """Draw loss and accuracy by epoch, and the confusion matrix of the test windows, rows summing to 1."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    n = len(scores.confusion)
+    side = float(np.clip(0.25 * n, 3.0, 9.0))
+    figure = Figure(figsize=(4.5 + side + 2.0, max(5.0, side + 2.0)), layout="constrained")
+    parts = figure.add_gridspec(2, 2, width_ratios=[4.5, side + 2.0])
+    epochs = np.arange(1, history.epochs + 1)
+    loss, accuracy = figure.add_subplot(parts[0, 0]), figure.add_subplot(parts[1, 0])
+    loss.plot(epochs, history.train_loss, ".-", label="training")
+    loss.plot(epochs, history.validation_loss, ".-", label="validation")
+    loss.set_ylabel("cross entropy")
+    loss.legend(fontsize=8)
+    accuracy.plot(epochs, history.validation_accuracy, ".-", label="validation accuracy")
+    accuracy.axhline(scores.accuracy, color="0.5", lw=1, ls="--", label=f"test accuracy {scores.accuracy:.3f}")
+    accuracy.set(xlabel="epoch", ylabel="accuracy", ylim=(0, 1))
+    for curves in (loss, accuracy):
+        curves.xaxis.set_major_locator(MaxNLocator(integer=True))
+    accuracy.legend(fontsize=8)
+    ax = figure.add_subplot(parts[:, 1])
+    rows = scores.confusion.sum(axis=1, keepdims=True)
+    image = ax.imshow(scores.confusion / np.maximum(rows, 1), vmin=0, vmax=1, cmap="Blues")
+    names = [class_names[i] if i < len(class_names) else str(i) for i in range(n)]
+    ax.set_xticks(range(n), names, rotation=90, fontsize=7)
+    ax.set_yticks(range(n), names, fontsize=7)
+    ax.set(xlabel="predicted", ylabel="true", title="confusion of the test windows")
+    figure.colorbar(image, ax=ax, shrink=0.7, label="share of the true class")
+    return figure

@@ -1,0 +1,80 @@
+#!/bin/sh
+# From raw files to a diagnosis, a model, a bundle, a broken sensor, maintenance and a report, with commands alone.
+#
+#   examples/first_hour.sh OUT [ARRAY...]        ARRAY: skin (simulated), icub, insole, sdh; default: all that are there
+#
+# The real arrays are read from DATA (default ../shared/data), and left out where it is absent. EPOCHS (default 8) is the
+# length of the training. A line of another verdict than expected ends the script with exit code 1.
+set -eu
+
+out=${1:?give a folder for the results}
+shift
+data=${DATA:-../shared/data}
+epochs=${EPOCHS:-8}
+adaptfault=${ADAPTFAULT:-adaptfault}
+
+run() { # WANTED COMMAND...: run a command whose exit code has to be among those wanted, as "0 1"
+    wanted=$1
+    shift
+    echo "\$ adaptfault $*"
+    code=0
+    $adaptfault "$@" || code=$?
+    case " $wanted " in
+    *" $code "*) ;;
+    *)
+        echo "first_hour: exit code $code where $wanted is expected: adaptfault $*" >&2
+        exit 1
+        ;;
+    esac
+}
+
+first_hour() { # NAME RAW LATER FAULT CAUSE: one array, the recordings kept back, the fault, the words of its cause
+    name=$1 raw=$2 later=$3 fault=$4 cause=$5
+    home=$out/$name
+    mkdir -p "$home"
+    run 0 info "$raw" --picture "$home/raw.png"
+    # The robot records these later: no model is trained on them.
+    run 0 convert "$raw" --leave "$later" --out "$home/healthy.npz"
+    run 0 convert "$raw" --take "$later" --out "$home/later.npz"
+    run "0 1" diagnose "$home/later.npz" --reference "$home/healthy.npz" --html "$home/later.html"
+    run 0 train "$home/healthy.npz" --epochs "$epochs" --out "$home/robot.bundle"
+    run 0 evaluate "$home/robot.bundle" "$home/later.npz"
+    # The sensor breaks.
+    run 0 convert "$home/later.npz" --inject "$fault" --out "$home/broken.npz"
+    run 2 diagnose "$home/broken.npz" --reference "$home/robot.bundle" --out "$home/diagnosis.json" \
+        --picture "$home/diagnosis.png" --html "$home/diagnosis.html"
+    grep -q "$cause" "$home/diagnosis.html" || {
+        echo "first_hour: $name: no \"$cause\" in $home/diagnosis.html" >&2
+        exit 1
+    }
+    run "1 2" maintain "$home/robot.bundle" "$home/broken.npz" --report "$home/maintenance.html"
+    run 0 evaluate "$home/robot.bundle" "$home/broken.npz"
+    run 0 report "$home/robot.bundle" --out "$home/report.html"
+    echo "first_hour: $name: verdict right"
+}
+
+[ $# -gt 0 ] || set -- skin icub insole sdh
+mkdir -p "$out"
+for array in "$@"; do
+    case $array in
+    skin)
+        # CSV files of one folder a class and a layout.json, as a user's own recordings would lie there.
+        [ -d "$out/skin-csv" ] || run 0 simulate --shape 10x10 --full-scale 3.3 --unit V --rate 20 \
+            --grasps "${GRASPS:-24}" --frames 60 --classes nothing normal softer harder --out "$out/skin-csv"
+        first_hour skin "$out/skin-csv" ::6 row:0:4=short "row 4 is short"
+        ;;
+    icub) file=icub5x1x12_grasps11 later=::6 fault=row:1:0=short cause="pad 1" ;;
+    insole) file=insole2x33x15 later=::8 fault=row:0:12=open cause="row 12 is open" ;;
+    sdh) file=sdh2x13x6_grasps36 later=::6 fault=row:0:9=short cause="row 9 is short" ;;
+    *)
+        echo "first_hour: no array $array: skin, icub, insole, sdh" >&2
+        exit 3
+        ;;
+    esac
+    [ "$array" = skin ] && continue
+    if [ -f "$data/$file.npz" ]; then
+        first_hour "$array" "$data/$file.npz" "$later" "$fault" "$cause"
+    else
+        echo "first_hour: $array: $data/$file.npz is not there; left out"
+    fi
+done

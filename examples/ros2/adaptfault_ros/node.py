@@ -1,0 +1,180 @@
+"""A ROS 2 node that monitors tactile frames and publishes their faults on /diagnostics, once a second.
+
+    ros2 run adaptfault_ros node --ros-args -p topic:=/tactile -p bundle:=/home/robot/robot.bundle
+
+Frames come as std_msgs/Float32MultiArray. Without ROS, ``python -m adaptfault_ros.node`` prints one message for a
+simulated sensor.
+
+Parameters:
+    topic: of the frames (default /tactile).
+    bundle: folder of ``adaptfault train --out X.bundle``: its layout and its healthy model.
+    layout: without a bundle: a layout file, or a shape as 2x11x10. Cells are then compared with their neighbours.
+    full_scale, unit, rate: override the layout; 0 and "" keep it.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from adaptfault.acquisition.ros import diagnostic_array, stale_array
+from adaptfault.data.recordings import parse_shape, read_layout
+from adaptfault.data.recordings.layout_file import looks_like_shape
+from diagnostics import Monitor, SelfDiagnosis, SensorLayout
+
+SILENCE = 2.0  # seconds without a frame, after which everything is STALE
+PERIOD = 10.0  # seconds between two diagnoses of all cells; the last one is published every second
+
+DEFAULTS = {"topic": "/tactile", "bundle": "", "layout": "", "full_scale": 0.0, "unit": "", "rate": 0.0}
+
+
+def diagnoser_of(parameters: Mapping[str, Any]) -> SelfDiagnosis:
+    """Return the diagnosis that the parameters describe.
+
+    Raises:
+        ValueError: neither bundle nor layout, or both.
+    """
+    if bool(parameters["bundle"]) == bool(parameters["layout"]):
+        raise ValueError("give the parameter bundle, or the parameter layout (a layout file or a shape as 2x11x10)")
+    if parameters["bundle"]:
+        from adaptfault import Bundle
+
+        return Bundle.open(parameters["bundle"]).diagnoser()
+    text = parameters["layout"]
+    layout = SensorLayout(*parse_shape(text)) if looks_like_shape(text) else read_layout(text)
+    stated = {name: parameters[name] for name in ("full_scale", "unit", "rate") if parameters[name]}
+    return SelfDiagnosis(replace(layout, **stated))
+
+
+class Watch:
+    """The work of the node, without ROS."""
+
+    def __init__(self, diagnoser: SelfDiagnosis, clock: Callable[[], float] = time.time):
+        self.monitor, self.layout, self.clock = Monitor(diagnoser), diagnoser.layout, clock
+        self.last = self.diagnosed = -np.inf
+        self.changed = False
+        self.array = stale_array(self.layout, "no frame yet")
+
+    def take(self, values) -> tuple:
+        """Take in one frame; return the faults that are new, changed or gone.
+
+        Raises:
+            ValueError: another number of values than cells.
+        """
+        if len(values) != self.layout.n_cells:
+            raise ValueError(f"{len(values)} values, expected {self.layout.n_cells}")
+        self.last = self.clock()
+        faults = self.monitor.update(np.asarray(values, dtype=float))
+        self.changed |= bool(faults)
+        return faults
+
+    def diagnostics(self) -> dict:
+        """Return the content of the DiagnosticArray to publish now."""
+        now = self.clock()
+        if now - self.last > SILENCE:
+            self.diagnosed = -np.inf
+            if np.isfinite(self.last):
+                return stale_array(self.layout, f"no frame for {now - self.last:.0f} s", stamp=now)
+            return stale_array(self.layout, "no frame yet", stamp=now)
+        if self.changed or now - self.diagnosed > PERIOD:
+            self.array = diagnostic_array(self.monitor.diagnosis())
+            self.changed, self.diagnosed = False, now
+        seconds, rest = divmod(round(now * 1e9), 10**9)
+        return {**self.array, "header": {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": ""}}
+
+
+def message_of(content: Mapping[str, Any], types: Mapping[str, Any], level: Callable[[int], Any]) -> Any:
+    """Return a DiagnosticArray message.
+
+    Args:
+        content: of :meth:`Watch.diagnostics`.
+        types: the message classes by name: "Time", "Header", "KeyValue", "DiagnosticStatus", "DiagnosticArray".
+        level: converts a level to the type of the field, which is one byte in rclpy.
+    """
+    header = types["Header"](stamp=types["Time"](**content["header"]["stamp"]), frame_id=content["header"]["frame_id"])
+    status = [
+        types["DiagnosticStatus"](
+            level=level(one["level"]),
+            name=one["name"],
+            message=one["message"],
+            hardware_id=one["hardware_id"],
+            values=[types["KeyValue"](**pair) for pair in one["values"]],
+        )
+        for one in content["status"]
+    ]
+    return types["DiagnosticArray"](header=header, status=status)
+
+
+def main() -> None:
+    """Run the node until it is shut down."""
+    import rclpy
+    from builtin_interfaces.msg import Time
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    from rclpy.node import Node
+    from std_msgs.msg import Float32MultiArray, Header
+
+    classes = (Time, Header, KeyValue, DiagnosticStatus, DiagnosticArray)
+    types = {kind.__name__: kind for kind in classes}
+
+    class TactileDiagnostics(Node):
+        def __init__(self):
+            super().__init__("tactile_diagnostics")
+            parameters = {name: self.declare_parameter(name, value).value for name, value in DEFAULTS.items()}
+            self.watch = Watch(diagnoser_of(parameters))
+            self.publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
+            self.create_subscription(Float32MultiArray, parameters["topic"], self.take, 10)
+            self.create_timer(1.0, self.publish)
+
+        def take(self, message):
+            try:
+                faults = self.watch.take(message.data)
+            except ValueError as error:
+                self.get_logger().warning(str(error), throttle_duration_sec=5.0)
+                return
+            for fault in faults:
+                self.get_logger().warning(fault.reason)
+
+        def publish(self):
+            self.publisher.publish(message_of(self.watch.diagnostics(), types, lambda number: bytes([number])))
+
+    rclpy.init()
+    try:
+        node = TactileDiagnostics()
+        rclpy.spin(node)
+        node.destroy_node()
+    except KeyboardInterrupt:
+        pass
+    except (ValueError, OSError) as error:
+        print(f"tactile_diagnostics: {error}", file=sys.stderr)
+        sys.exit(3)
+    finally:
+        rclpy.try_shutdown()
+
+
+def show() -> None:
+    """Print the message for a simulated sensor with a broken row."""
+    from adaptfault import simulate
+    from diagnostics import FaultKind, Line, inject, line_fault
+
+    layout = SensorLayout.paper()
+    watch = Watch(SelfDiagnosis(layout))
+    frames = np.concatenate(simulate(1, seed=0).frames)
+    for frame in inject(frames, [line_fault(layout, Line(0, "row", 5), FaultKind.SHORT)], layout):
+        watch.take(frame)
+    print(json.dumps(watch.diagnostics(), indent=1))
+
+
+if __name__ == "__main__":
+    try:
+        import rclpy  # noqa: F401
+    except ImportError:
+        print(
+            "no ROS 2 here (source /opt/ros/<distro>/setup.bash); the message of a simulated sensor:", file=sys.stderr
+        )
+        show()
+    else:
+        main()

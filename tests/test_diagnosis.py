@@ -50,7 +50,7 @@ def loaded(log: Sequence[np.ndarray], layout: SensorLayout = LAYOUT, n: int = 20
     return np.sort(order + most.shape[1] * np.arange(layout.pads)[:, None], axis=1).ravel()
 
 
-def touched(log: Sequence[np.ndarray]) -> np.ndarray:
+def often_loaded(log: Sequence[np.ndarray]) -> np.ndarray:
     """Cells that carry clear load in at least half of the recordings."""
     return np.flatnonzero(np.mean([r.max(axis=0) > 0.5 for r in log], axis=0) >= 0.5)
 
@@ -61,7 +61,7 @@ def touched(log: Sequence[np.ndarray]) -> np.ndarray:
 def test_what_is_injected_is_found_named_and_nothing_else(fitted, grasps: Recordings):
     log = [grasps.frames[i] for i in range(21, 140, 6)]
     row = line_fault(LAYOUT, Line(0, "row", 5), FaultKind.OPEN)
-    cells = touched(log)
+    cells = often_loaded(log)
     short, stuck = (int(c) for c in cells[cells >= 110][[5, 20]])
     faults = [row, Fault("short", (short,)), Fault("stuck", (stuck,), value=2.5)]
     diagnosis = fitted.diagnose(broken(log, faults))
@@ -206,7 +206,7 @@ def test_a_cell_that_has_lost_most_of_its_gain_is_found_with_that_reason(fitted,
     log = [grasps.frames[i] for i in range(1, 140, 3)]
     assert not fitted.diagnose(log).faults
     frames = np.concatenate(log)
-    cell = int(touched(log)[24])
+    cell = int(often_loaded(log)[24])
     frames[onset:, cell] *= 0.15
     (fault,) = fitted.diagnose(frames).faults
     assert (fault.kind, fault.cells) == (FaultKind.DRIFT, (cell,))
@@ -283,13 +283,13 @@ def test_the_value_of_a_stuck_cell_never_changes_the_verdict_on_the_others(fitte
     cells = loaded(log)[[2, 9]].tolist()
     dead = [Fault("open", (int(loaded(log)[15]),)), Fault("short", (int(loaded(log)[-5]),))]
     others = ~np.isin(np.arange(220), cells)
-    said = []
+    marked = []
     for value in values:
         stuck = [Fault("stuck", (c,), value=value) for c in cells]
         diagnosis = fitted.diagnose(broken(log, [*stuck, *dead]))
         assert set(cells) <= set(diagnosis.fault_set)
-        said.append(diagnosis.verdicts[others] == Verdict.FAULTY)
-    np.testing.assert_array_equal(*said)
+        marked.append(diagnosis.verdicts[others] == Verdict.FAULTY)
+    np.testing.assert_array_equal(*marked)
 
 
 def test_an_unloaded_cell_on_a_wire_proven_open_is_inferred_faulty_and_named_as_such(fitted, log):
@@ -457,7 +457,7 @@ def test_verdicts_compare_elementwise(fitted, log):
 
 
 def test_the_map_shows_each_cell_at_its_place(fitted, log):
-    cell = int(touched(log)[10])
+    cell = int(often_loaded(log)[10])
     diagnosis = fitted.diagnose(broken(log, [Fault("short", (cell,))]))
     pad, row, column = LAYOUT.position(cell)
     line = diagnosis.map().splitlines()[1 + row]
@@ -466,7 +466,7 @@ def test_the_map_shows_each_cell_at_its_place(fitted, log):
 
 
 def test_the_picture_marks_the_faulty_cell(fitted, log, tmp_path):
-    cell = int(touched(log)[10])
+    cell = int(often_loaded(log)[10])
     figure = fitted.diagnose(broken(log, [Fault("short", (cell,))])).plot()
     pad, row, column = LAYOUT.position(cell)
     (text,) = figure.axes[pad].texts

@@ -1,4 +1,4 @@
-"""Lines that read alike, and what joins them: twins and addresses."""
+"""Duplicate lines and address aliasing."""
 
 import numpy as np
 import pytest
@@ -29,18 +29,18 @@ def pressed(seed: int, presses: int = 25) -> np.ndarray:
     return np.concatenate([part for press in log for part in (press, np.zeros((4, 60)))])
 
 
-def remembered(log: np.ndarray) -> StreamState:
+def state_after(log: np.ndarray) -> StreamState:
     stream = StreamState(LAYOUT, Reference.unknown(LAYOUT), Exclusion(2.0))
     stream.extend(log)
     return stream.complete()
 
 
 def caused(log: np.ndarray) -> tuple[Aliasing, ...]:
-    return find_aliasing(remembered(log))
+    return find_aliasing(state_after(log))
 
 
 def duplicate_pairs(log: np.ndarray) -> list[DuplicatePair]:
-    return remembered(log).duplicates.duplicate_pairs(usual=2)
+    return state_after(log).duplicates.duplicate_pairs(usual=2)
 
 
 def duplicate_rows(first: np.ndarray, second: np.ndarray, noise: np.ndarray) -> list[tuple[int, int]]:
@@ -110,7 +110,7 @@ def test_lines_that_differ_by_what_comes_and_goes_slowly_are_distinguished_from_
 def test_a_load_that_comes_with_the_last_frames_of_a_segment_is_compared_before_it_is_a_coincidence(first: int):
     log = np.zeros((32, 2, 6, 5))
     log[first:, 0, 2], log[first:, 0, 3] = np.linspace(1.0, 2.0, 5), np.linspace(2.0, 3.0, 5)
-    stream = remembered(log.reshape(32, 60))
+    stream = state_after(log.reshape(32, 60))
     assert stream.duplicates.most == 0
     assert stream.duplicates.apart_since(0, "row", 2, 3) == (32 if first < 32 else 0)
 
@@ -145,7 +145,7 @@ def test_cells_that_hold_still_or_are_saturated_or_unloaded_are_not_informative(
 def test_the_most_coincidences_of_any_pair_are_kept():
     assert DuplicateLines.begin(LAYOUT).most == 0
     log = inject(pressed(1), [bridge(LAYOUT, Line(1, "row", 2))], LAYOUT, until=500)
-    assert remembered(log).duplicates.most >= duplicate_pairs(log[:500])[0].witnesses
+    assert state_after(log).duplicates.most >= duplicate_pairs(log[:500])[0].witnesses
 
 
 # What joins them

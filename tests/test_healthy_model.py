@@ -64,8 +64,8 @@ def test_the_reading_of_a_cell_does_not_change_its_own_prediction(model, unseen,
     spoiled = unseen.copy()
     spoiled[:, :, 4] = 1.0
     for name in ("never", "always", "mean"):
-        said, of_spoiled = (getattr(model.predict(f, predictors), name)[:, 4] for f in (unseen, spoiled))
-        np.testing.assert_allclose(of_spoiled, said, atol=1e-5, err_msg=name)
+        predicted, from_spoiled = (getattr(model.predict(f, predictors), name)[:, 4] for f in (unseen, spoiled))
+        np.testing.assert_allclose(from_spoiled, predicted, atol=1e-5, err_msg=name)
 
 
 def test_the_reading_of_a_cell_that_is_no_predictor_changes_no_prediction(model, unseen):
@@ -73,8 +73,8 @@ def test_the_reading_of_a_cell_that_is_no_predictor_changes_no_prediction(model,
     spoiled = unseen.copy()
     spoiled[:, :, [3, 6]] = 0.7
     for name in ("never", "always", "mean"):
-        said, of_spoiled = (getattr(model.predict(f, predictors), name) for f in (unseen, spoiled))
-        np.testing.assert_allclose(of_spoiled, said, atol=1e-5, err_msg=name)
+        predicted, from_spoiled = (getattr(model.predict(f, predictors), name) for f in (unseen, spoiled))
+        np.testing.assert_allclose(from_spoiled, predicted, atol=1e-5, err_msg=name)
 
 
 def test_the_load_of_a_cell_is_predicted_from_the_others_even_beside_excluded_ones(model, unseen):

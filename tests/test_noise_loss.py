@@ -12,7 +12,7 @@ STEP = 1 / 1023
 NOISE = 2 * STEP
 
 
-def flickering(seed: int, recordings: int = 24, noise: float = NOISE, rest: float = 0.0) -> list[np.ndarray]:
+def noisy_presses(seed: int, recordings: int = 24, noise: float = NOISE, rest: float = 0.0) -> list[np.ndarray]:
     """Presses on an array with noise, and a converter whose readings end at 0."""
     rng = np.random.default_rng(seed)
     rests = rest + np.random.default_rng(99).uniform(0, STEP, CELLS)
@@ -25,7 +25,7 @@ def runs_of(frames: np.ndarray) -> ConstantRuns:
 
 
 def test_the_longest_time_that_a_cell_read_the_same_is_found():
-    recordings = flickering(0)
+    recordings = noisy_presses(0)
     noise_loss = NoiseLoss.fit(recordings, PRESENT)
     frames, cell = np.concatenate(recordings), 60
     changed = np.flatnonzero(np.diff(frames[:, cell]))
@@ -35,29 +35,29 @@ def test_the_longest_time_that_a_cell_read_the_same_is_found():
 
 @pytest.mark.parametrize("noise", [0.0, 0.1 * STEP])
 def test_arrays_without_noise_or_with_less_than_a_converter_step_give_no_evidence(noise):
-    assert np.isinf(NoiseLoss.fit(flickering(0, noise=noise, rest=0.05), PRESENT).longest).all()
+    assert np.isinf(NoiseLoss.fit(noisy_presses(0, noise=noise, rest=0.05), PRESENT).longest).all()
 
 
 def test_few_recordings_give_no_evidence():
-    assert np.isinf(NoiseLoss.fit(flickering(0, recordings=7), PRESENT).longest).all()
+    assert np.isinf(NoiseLoss.fit(noisy_presses(0, recordings=7), PRESENT).longest).all()
 
 
 def test_a_cell_that_loses_its_noise_is_broken_unless_half_of_the_cells_do():
-    noise_loss = NoiseLoss.fit(flickering(0), PRESENT)
-    idle = np.concatenate(flickering(5, 4))[:200]
+    noise_loss = NoiseLoss.fit(noisy_presses(0), PRESENT)
+    idle = np.concatenate(noisy_presses(5, 4))[:200]
 
-    def said(dead: int) -> np.ndarray:
+    def evidence_of(dead: int) -> np.ndarray:
         frames = idle.copy()
         frames[:, CELLS - dead :] = 0.0
         return noise_loss.evidence(runs_of(frames), PRESENT, PRESENT, sunk=False)
 
-    assert np.flatnonzero(said(10) > 0).tolist() == list(range(CELLS - 10, CELLS))
-    assert not (said(40) > 0).any()
+    assert np.flatnonzero(evidence_of(10) > 0).tolist() == list(range(CELLS - 10, CELLS))
+    assert not (evidence_of(40) > 0).any()
 
 
 def test_missing_readings_are_not_identical_readings():
-    noise_loss = NoiseLoss.fit(flickering(0), PRESENT)
-    frames = np.concatenate(flickering(5, 5))
+    noise_loss = NoiseLoss.fit(noisy_presses(0), PRESENT)
+    frames = np.concatenate(noisy_presses(5, 5))
     frames[50:, 60] = np.nan
     assert not (noise_loss.evidence(runs_of(frames), PRESENT, PRESENT, sunk=False) > 0).any()
 
@@ -83,8 +83,8 @@ def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_suspected_for
 
 
 def test_dead_cells_without_contact_are_found_by_noise_loss_in_the_monitor_too():
-    fitted = SelfDiagnosis(LAYOUT).fit(flickering(0))
-    log = flickering(1, 4)
+    fitted = SelfDiagnosis(LAYOUT).fit(noisy_presses(0))
+    log = noisy_presses(1, 4)
     assert not fitted.diagnose(log).fault_set
     dead = {LAYOUT.cell(0, 7, 4): None, LAYOUT.cell(0, 7, 7): 0.4}
     faults = [Fault(FaultKind.STUCK if v else FaultKind.OPEN, (cell,), value=v) for cell, v in dead.items()]

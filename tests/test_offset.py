@@ -19,20 +19,20 @@ def fitted() -> SelfDiagnosis:
 
 
 def test_where_nothing_moved_the_scale_stays_as_it_is():
-    tare = OffsetTracker.begin(CELLS)
+    tracker = OffsetTracker.begin(CELLS)
     for frames in events(1):
-        tare = tare.extend(frames, SCALE, PRESENT, USUAL)
-        assert tare.on(SCALE) is SCALE
-        assert tare.off(frames) is frames
+        tracker = tracker.extend(frames, SCALE, PRESENT, USUAL)
+        assert tracker.on(SCALE) is SCALE
+        assert tracker.off(frames) is frames
 
 
 def test_what_moves_all_cells_is_taken_off_each_frame():
     frames = events(1)[0]
     drift = np.linspace(0.01, 0.03, len(frames))[:, None]
-    tare = OffsetTracker.begin(CELLS).extend(frames + drift, SCALE, PRESENT, USUAL)
-    moved = tare.on(SCALE)
+    tracker = OffsetTracker.begin(CELLS).extend(frames + drift, SCALE, PRESENT, USUAL)
+    moved = tracker.on(SCALE)
     np.testing.assert_allclose(moved.baseline, 0.03, atol=1e-12)
-    np.testing.assert_allclose(moved.root_load(tare.off(frames + drift)), SCALE.root_load(frames), atol=0.02)
+    np.testing.assert_allclose(moved.root_load(tracker.off(frames + drift)), SCALE.root_load(frames), atol=0.02)
 
 
 def test_an_offset_of_one_cell_is_its_lowest_reading_and_a_large_one_is_a_load():
@@ -62,9 +62,9 @@ def test_where_rests_wander_an_offset_counts_from_where_cells_mostly_rest():
 def test_a_large_offset_of_all_cells_is_not_taken_for_one_of_each():
     rng = np.random.default_rng(0)
     frames = events(1)[0] + 0.001 * rng.standard_normal(CELLS)
-    tare = OffsetTracker.begin(CELLS).extend(frames + 0.019, SCALE, PRESENT, USUAL)  # of single cells up to 0.02
-    assert tare.common == pytest.approx(0.019, abs=0.003)
-    assert not tare.own.any()
+    tracker = OffsetTracker.begin(CELLS).extend(frames + 0.019, SCALE, PRESENT, USUAL)  # of single cells up to 0.02
+    assert tracker.common == pytest.approx(0.019, abs=0.003)
+    assert not tracker.own.any()
 
 
 def test_a_small_offset_of_one_cell_is_no_load_where_the_reference_held_light_loads_throughout():
@@ -108,9 +108,9 @@ def test_a_monitor_takes_off_the_same(fitted):
 def test_while_nearly_all_cells_are_loaded_the_offset_stays():
     frames = events(1)[0] + 0.03
     frames[20:40] += 0.4
-    tare = (
+    tracker = (
         OffsetTracker.begin(CELLS).extend(frames[:32], SCALE, PRESENT, USUAL).extend(frames[32:], SCALE, PRESENT, USUAL)
     )
-    assert tare.common.min() > 0.025
+    assert tracker.common.min() > 0.025
     held = OffsetTracker.begin(CELLS).extend(np.full((40, CELLS), 0.5), SCALE, PRESENT, USUAL)
     assert not held.common.any()

@@ -104,7 +104,7 @@ def test_an_array_that_is_missing_misshapen_or_not_finite_is_refused_by_name(arr
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         ({"schema": "adaptfault.diagnoser/1"}, "schema"),
         ({"layout": {"rows": 3}}, "pads"),
@@ -116,9 +116,9 @@ def test_an_array_that_is_missing_misshapen_or_not_finite_is_refused_by_name(arr
         ({"reference": 3}, "damaged"),
     ],
 )
-def test_a_field_that_is_missing_or_wrong_is_refused(wrong, said):
+def test_a_field_that_is_missing_or_wrong_is_refused(wrong, message):
     about, arrays = small_fit(SensorLayout(1, 3, 3)).state()
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         SelfDiagnosis.from_state({**about, **wrong}, arrays)
 
 

@@ -91,12 +91,12 @@ def pressed(events: int) -> np.ndarray:
 
 @pytest.mark.parametrize("value", [0.0, 5.0])
 def test_each_event_adds_evidence_against_a_cell_that_holds_its_value_through_it(value: float):
-    said = []
+    outcomes = []
     for events in (1, 2, 4, 8):
         log = pressed(events)
         log[:, 3] = value
-        said.append(result_of(log).evidence[3])
-    assert (np.diff(said) > 2).all()
+        outcomes.append(result_of(log).evidence[3])
+    assert (np.diff(outcomes) > 2).all()
 
 
 def test_how_seldom_cells_stick_to_a_value_in_between_is_charged_once():
@@ -111,12 +111,12 @@ def test_how_seldom_cells_stick_to_a_value_in_between_is_charged_once():
 
 
 def test_an_unexpected_value_is_weaker_evidence_in_events_with_large_errors():
-    said = []
+    outcomes = []
     for force in (1.0, 0.1):
         log = force * pressed(4)
         log[:, 3] = 4.5
-        said.append(result_of(log, model=Holder()).surprisal[3])
-    assert 0 < said[1] < said[0] - 2
+        outcomes.append(result_of(log, model=Holder()).surprisal[3])
+    assert 0 < outcomes[1] < outcomes[0] - 2
 
 
 def test_a_cell_at_rest_is_not_suspected_without_any_event():
@@ -189,13 +189,13 @@ def test_evidence_of_earlier_events_is_kept():
 
 
 def test_an_event_that_surprises_the_moving_cells_is_weak_evidence_about_the_others():
-    said, slope = [], np.linspace(0.3, 1, CELLS)
+    outcomes, slope = [], np.linspace(0.3, 1, CELLS)
     for surprised in (0, 2, 4):
         log = pressed(2) * np.repeat([slope, slope[::-1]], FRAMES, axis=0)  # no event repeats the other
         log[:, 3] = 0.0
         log[FRAMES:, 4 : 4 + surprised] = 0.0
-        said.append(result_of(log, model=Presser()).surprisal[3])
-    assert said[0] > said[1] + 0.4 > said[2] + 0.6
+        outcomes.append(result_of(log, model=Presser()).surprisal[3])
+    assert outcomes[0] > outcomes[1] + 0.4 > outcomes[2] + 0.6
 
 
 @pytest.mark.parametrize("one_is_still", [True, False])

@@ -14,7 +14,7 @@ ALL = np.ones(60, bool)
 EXCERPTS = 7
 
 
-def touched(seed: int) -> np.ndarray:
+def random_features(seed: int) -> np.ndarray:
     """Return features of excerpts in which each cell is loaded at random."""
     rng = np.random.default_rng(seed)
     features = rng.random((EXCERPTS, 4, 60)).astype(np.float32)
@@ -33,7 +33,7 @@ def means(features: np.ndarray, predictors: np.ndarray = ALL) -> np.ndarray:
 
 @pytest.mark.parametrize("predictors", [ALL, np.random.default_rng(5).random(60) < 0.6], ids=["all", "some"])
 def test_each_ring_is_the_shrunk_mean_of_its_predictors(predictors: np.ndarray):
-    features = touched(0)
+    features = random_features(0)
     rings = means(features, predictors)
     scored = predictors & LAYOUT.present.ravel()
     for cell in range(60):
@@ -57,14 +57,16 @@ def test_each_ring_is_the_shrunk_mean_of_its_predictors(predictors: np.ndarray):
 
 def test_features_of_some_cells_are_those_of_all():
     rng, cells = np.random.default_rng(6), np.array([1, 8, 33, 59])
-    said = RegressionOutput(*rng.normal(size=(4, EXCERPTS, 60)))
+    outputs = RegressionOutput(*rng.normal(size=(4, EXCERPTS, 60)))
     predictors = rng.random(60) < 0.7
-    of_all = neighbourhood(said, touched(4), predictors, LAYOUT)
-    np.testing.assert_array_equal(neighbourhood(said, touched(4), predictors, LAYOUT, cells), of_all[:, cells])
+    of_all = neighbourhood(outputs, random_features(4), predictors, LAYOUT)
+    np.testing.assert_array_equal(
+        neighbourhood(outputs, random_features(4), predictors, LAYOUT, cells), of_all[:, cells]
+    )
 
 
 def test_the_features_of_a_cell_do_not_use_its_own_reading():
-    features = touched(1)
+    features = random_features(1)
     for cell in (0, 14, 40):
         changed = features.copy()
         changed[:, :, cell] = 1 - changed[:, :, cell]
@@ -73,7 +75,7 @@ def test_the_features_of_a_cell_do_not_use_its_own_reading():
 
 
 def test_no_feature_uses_a_cell_that_is_no_predictor():
-    features = touched(2)
+    features = random_features(2)
     predictors = ~np.isin(np.arange(60), (8, 45))
     changed = features.copy()
     changed[:, :, [8, 45]] = np.array([1.0, 0.5, 1.0, 0.3])[:, None]
@@ -89,8 +91,8 @@ def test_a_cell_between_two_loaded_ones_is_enclosed_and_one_beside_them_is_not()
 
 
 def test_without_predictors_all_features_are_finite_and_loads_0():
-    assert np.isfinite(neighbourhood(regressed(), touched(3), ~ALL, LAYOUT)).all()
-    assert not means(touched(3), ~ALL).any()
+    assert np.isfinite(neighbourhood(regressed(), random_features(3), ~ALL, LAYOUT)).all()
+    assert not means(random_features(3), ~ALL).any()
 
 
 @pytest.mark.parametrize("events", [5, 500])
@@ -124,6 +126,6 @@ def test_it_learns_an_interaction_of_two_rings_from_many_events_only(events: int
     samples[:, :2] = 0
     one_of_two = (samples[:, 10] > 0) ^ (samples[:, 14] > 0)
     never, always = Stacking.fit(samples, ~one_of_two, one_of_two, events).predict(samples.T.astype(np.float32))
-    for said in (1 - never, always):
-        sure = (said > 0.8)[one_of_two].mean()
+    for outputs in (1 - never, always):
+        sure = (outputs > 0.8)[one_of_two].mean()
         assert sure > 0.7 if events > 1 else sure < 0.01

@@ -59,10 +59,12 @@ def test_a_tile_is_predicted_as_a_small_array_of_the_same_cells(fitted: SelfDiag
     padded, scored = np.full((9, 4, small.n_cells), 0.5, np.float32), np.ones(small.n_cells, bool)
     padded[:, :, cells], scored[cells] = features, predictors
     expected = alone.predict(padded, scored)
-    said = fitted.stream().model_of(i, EventLog()).predict(features, predictors)
+    predicted = fitted.stream().model_of(i, EventLog()).predict(features, predictors)
     for name in ("never", "always", "mean"):
         expected_values = getattr(expected, name)[:, cells[regression.place]]
-        np.testing.assert_allclose(getattr(said, name)[:, regression.place], expected_values, atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(predicted, name)[:, regression.place], expected_values, atol=1e-5, err_msg=name
+        )
     without = HealthyModel(alone.local_regressions, small).predict(padded, scored)
     assert np.abs(without.never - expected.never).max() > 0.05  # the stacking matters
 

@@ -78,9 +78,9 @@ def test_a_tile_in_which_nothing_moves_is_not_processed():
     scale = Scale(np.zeros(SKIN.n_cells), 0.05, 5.0)
     start, none = np.where(still, 0, 31), np.zeros_like(still)
     after = events.extend(scale.root_load(frames), numbers, scale.root_near, start, none)
-    touched = {i for i, tile in enumerate(events.tiles) if not still[tile.inputs].all()}
-    assert {i for i, (a, b) in enumerate(zip(events.of, after.of, strict=True)) if a is not b} == touched
-    assert 0 < len(touched) < len(events.tiles)
+    changed = {i for i, tile in enumerate(events.tiles) if not still[tile.inputs].all()}
+    assert {i for i, (a, b) in enumerate(zip(events.of, after.of, strict=True)) if a is not b} == changed
+    assert 0 < len(changed) < len(events.tiles)
 
 
 def test_dead_cells_rows_and_a_bridge_are_found_and_hardly_a_healthy_cell_is_reported(fitted):

@@ -109,9 +109,8 @@ def main() -> int:
     )
     parser.add_argument("--quick", action="store_true", help="the main rows of a few arrays: minutes")
     parser.add_argument("--splits", type=int, nargs="+", default=[0, 1], help="halves of the recordings (default 0 1)")
-    parser.add_argument(
-        "--arrays", nargs="+", metavar="TEXT", help="only these arrays, or these kinds: fabric, posture"
-    )
+    arrays_help = "only these arrays, or these kinds: fabric, posture"
+    parser.add_argument("--arrays", nargs="+", metavar="TEXT", help=arrays_help)
     parser.add_argument("--rows", nargs="+", choices=ROWS, metavar="ROW", help="only these rows")
     parser.add_argument("--speed", action="store_true", help="only speed, in one process")
     parser.add_argument("--jobs", type=int, default=-1, help="processes (default: one a core)")

@@ -58,11 +58,12 @@ def training_problems(scores: Scores, history: History, class_names: Sequence[st
 def plot_training(scores: Scores, history: History, class_names: Sequence[str]) -> Figure:
     """Draw loss and accuracy by epoch, and the confusion matrix of the test windows, rows summing to 1."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     n = len(scores.confusion)
     side = float(np.clip(0.25 * n, 3.0, 9.0))
-    figure = Figure(figsize=(4.5 + side + 1.5, max(4.0, side + 1.2)), layout="constrained")
-    parts = figure.add_gridspec(2, 2, width_ratios=[4.5, side + 1.5])
+    figure = Figure(figsize=(4.5 + side + 2.0, max(5.0, side + 2.0)), layout="constrained")
+    parts = figure.add_gridspec(2, 2, width_ratios=[4.5, side + 2.0])
     epochs = np.arange(1, history.epochs + 1)
     loss, accuracy = figure.add_subplot(parts[0, 0]), figure.add_subplot(parts[1, 0])
     loss.plot(epochs, history.train_loss, ".-", label="training")
@@ -72,6 +73,8 @@ def plot_training(scores: Scores, history: History, class_names: Sequence[str]) 
     accuracy.plot(epochs, history.validation_accuracy, ".-", label="validation accuracy")
     accuracy.axhline(scores.accuracy, color="0.5", lw=1, ls="--", label=f"test accuracy {scores.accuracy:.3f}")
     accuracy.set(xlabel="epoch", ylabel="accuracy", ylim=(0, 1))
+    for curves in (loss, accuracy):
+        curves.xaxis.set_major_locator(MaxNLocator(integer=True))
     accuracy.legend(fontsize=8)
     ax = figure.add_subplot(parts[:, 1])
     rows = scores.confusion.sum(axis=1, keepdims=True)

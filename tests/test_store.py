@@ -97,8 +97,8 @@ def test_a_damaged_or_foreign_manifest_is_refused(tmp_path: Path, model: Tactile
     path = tmp_path / "manifest.json"
     whole = json.loads(path.read_text())
     for text, message in [
-        ("{", "damaged or of another program"),
-        ("[]", "damaged or of another program"),
+        ("{", "damaged or from another program"),
+        ("[]", "damaged or from another program"),
         (json.dumps(whole | {"schema": "adaptfault.model/9"}), "has schema 'adaptfault.model/9', expected"),
         (json.dumps({k: v for k, v in whole.items() if k != "weights"}), "is damaged"),
         (json.dumps(whole | {"config": whole["config"] | {"surprise": 1}}), "is damaged"),
@@ -115,7 +115,7 @@ def test_a_damaged_or_foreign_manifest_is_refused(tmp_path: Path, model: Tactile
 
 def test_what_json_cannot_hold_is_refused_before_anything_is_written(tmp_path: Path, model: TactileTransformer):
     for extra in ({"x": float("nan")}, {"x": object()}):
-        with pytest.raises(ValueError, match="does not fit into JSON"):
+        with pytest.raises(ValueError, match="cannot be written as JSON"):
             save_model(tmp_path, model, extra=extra)
     with pytest.raises(ValueError, match="3 classes need as many class names, got 1"):
         save_model(tmp_path, model, class_names=("a",))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from adaptfault.adaptation import adapter as adapter_module
+from adaptfault.adaptation import fault_free
 from adaptfault.adaptation.adapter import Adapter
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.data.windows import Windows
@@ -115,7 +115,7 @@ def test_memory_for_a_cell_does_not_grow_with_the_number_of_cells():
 
 @pytest.mark.filterwarnings("ignore:.*nested tensors")
 def test_an_adapter_of_a_large_array_fills_patch_by_patch_and_comes_back_from_disk(tmp_path, monkeypatch):
-    monkeypatch.setattr(adapter_module, "LARGE", 50)
+    monkeypatch.setattr(fault_free, "LARGE", 50)
     layout = SensorLayout(1, 8, 8)
     windows = presses(layout, 24, 0)
     windows = Windows(np.repeat(windows.x, 2, axis=1), windows.y, windows.recording)

@@ -23,11 +23,14 @@ if TYPE_CHECKING:
     from adaptfault.data.simulated_grasps import simulate
     from adaptfault.data.summary import Summary, summarise
     from adaptfault.data.windows import Windows, make_windows, split
-    from adaptfault.evaluation.scores import Scores, evaluate
+    from adaptfault.evaluation.scores import Scores, ValueScores, evaluate
     from adaptfault.evaluation.sensitivity import Sensitivity, analyse, sensitivity
     from adaptfault.fleet.listing import Fleet
     from adaptfault.fleet.run import maintain_fleet
     from adaptfault.fleet.summary import FleetReport
+    from adaptfault.imputation.restorer import Restorer
+    from adaptfault.imputation.scikit_learn import CellImputer, FaultTolerantClassifier, FaultTolerantRegressor
+    from adaptfault.models.builders import allow_model, build_model
     from adaptfault.models.export import add_onnx
     from adaptfault.models.history import History
     from adaptfault.models.inference import Inference
@@ -46,6 +49,9 @@ __all__ = [
     "Bundle",
     "Calibration",
     "CausalCorrection",
+    "CellImputer",
+    "FaultTolerantClassifier",
+    "FaultTolerantRegressor",
     "Fleet",
     "FleetReport",
     "Forecast",
@@ -58,14 +64,18 @@ __all__ = [
     "Recorder",
     "Recordings",
     "ReducedModel",
+    "Restorer",
     "Scores",
     "Sensitivity",
     "Station",
     "Summary",
     "TactileTransformer",
+    "ValueScores",
     "Windows",
     "add_onnx",
+    "allow_model",
     "analyse",
+    "build_model",
     "correct",
     "diagnostic_array",
     "evaluate",
@@ -94,6 +104,9 @@ _HOMES = {
     "Bundle": "robot.bundle",
     "Calibration": "data.calibration",
     "CausalCorrection": "adaptation.baselines.correction",
+    "CellImputer": "imputation.scikit_learn",
+    "FaultTolerantClassifier": "imputation.scikit_learn",
+    "FaultTolerantRegressor": "imputation.scikit_learn",
     "Fleet": "fleet.listing",
     "FleetReport": "fleet.summary",
     "Forecast": "adaptation.forecast",
@@ -106,14 +119,18 @@ _HOMES = {
     "Recorder": "acquisition",
     "Recordings": "data.recordings",
     "ReducedModel": "adaptation.reduced_model",
+    "Restorer": "imputation.restorer",
     "Station": "acquisition",
     "Scores": "evaluation.scores",
     "Summary": "data.summary",
     "Sensitivity": "evaluation.sensitivity",
     "TactileTransformer": "models.network",
+    "ValueScores": "evaluation.scores",
     "Windows": "data.windows",
     "add_onnx": "models.export",
+    "allow_model": "models.builders",
     "analyse": "evaluation.sensitivity",
+    "build_model": "models.builders",
     "correct": "adaptation.baselines.correction",
     "diagnostic_array": "acquisition.ros",
     "evaluate": "evaluation.scores",

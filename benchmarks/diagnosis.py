@@ -98,13 +98,19 @@ def table(counts: list[dict], against: list[dict] | None) -> list[str]:
     return worse
 
 
+def chosen(name: str, wanted: list[str]) -> bool:
+    """Return whether an array is named, or is one of a kind: ``fabric`` for ``fabric, 16 x 16``."""
+    return name in wanted or (name.split(",")[0] in wanted and name.split(",")[0] not in {a.name for a in ARRAYS})
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         description="Measures the diagnosis on all arrays", epilog=f"rows: {', '.join(ROWS)}"
     )
     parser.add_argument("--quick", action="store_true", help="the main rows of a few arrays: minutes")
     parser.add_argument("--splits", type=int, nargs="+", default=[0, 1], help="halves of the recordings (default 0 1)")
-    parser.add_argument("--arrays", nargs="+", metavar="TEXT", help="only arrays whose name begins so")
+    arrays_help = "only these arrays, or these kinds: fabric, posture"
+    parser.add_argument("--arrays", nargs="+", metavar="TEXT", help=arrays_help)
     parser.add_argument("--rows", nargs="+", choices=ROWS, metavar="ROW", help="only these rows")
     parser.add_argument("--speed", action="store_true", help="only speed, in one process")
     parser.add_argument("--jobs", type=int, default=-1, help="processes (default: one a core)")
@@ -121,7 +127,7 @@ def main() -> int:
     for array in SPEED if options.speed else ARRAYS:
         logs, rows = (array.quick, array.quick_rows) if options.quick else (array.logs, array.rows)
         rows = tuple(row for row in rows if not options.rows or row in options.rows)
-        if not logs or not rows or (options.arrays and not array.name.startswith(tuple(options.arrays))):
+        if not logs or not rows or (options.arrays and not chosen(array.name, options.arrays)):
             continue
         if not array.available:
             absent.append(array.name)

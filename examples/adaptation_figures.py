@@ -28,7 +28,7 @@ from sklearn.svm import SVC
 import adaptfault as af
 from adaptfault.adaptation.reduced_model import ReducedModel, phi, reduce_windows
 from adaptfault.imputation.dropout import random_fault_set
-from adaptfault.imputation.linear import CellStatistics
+from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.models.network import logits_of
 from diagnostics import FaultSet, SensorLayout
 

@@ -111,8 +111,8 @@ def measure(layout: SensorLayout, frames: int) -> None:
     import sklearn.covariance  # noqa: F401
 
     from adaptfault.data.windows import make_windows
-    from adaptfault.imputation.linear import CellStatistics
-    from adaptfault.imputation.tiled import LARGE, PatchStatistics
+    from adaptfault.imputation.statistics import CellStatistics
+    from adaptfault.imputation.tiled_statistics import LARGE, TiledStatistics
     from diagnostics import FaultSet, Monitor, SelfDiagnosis
 
     empty = peak()
@@ -144,7 +144,7 @@ def measure(layout: SensorLayout, frames: int) -> None:
     measured("windows", 0.0)
     began = time.process_time()
     large = layout.n_cells > LARGE
-    fill = (PatchStatistics.fit(windows, layout) if large else CellStatistics.fit(windows)).nearest(fault_set)
+    fill = (TiledStatistics.fit(windows, layout) if large else CellStatistics.fit(windows)).nearest(fault_set)
     measured("fill build", time.process_time() - began)
     held_out = make_windows(log[:1], None, layout).x
     began = time.process_time()

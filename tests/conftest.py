@@ -151,7 +151,7 @@ def export_versions(home: Path) -> None:
     from adaptfault.adaptation.reduced_model import ReducedModel, phi
     from adaptfault.adaptation.result import Adaptation, Stage
     from adaptfault.data.windows import Windows
-    from adaptfault.imputation.linear import CellStatistics
+    from adaptfault.imputation.statistics import CellStatistics
     from adaptfault.models.export import add_onnx
     from adaptfault.models.network import TactileTransformer
 

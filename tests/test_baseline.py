@@ -21,13 +21,13 @@ def events(seed: int, recordings: int = 24, frames: int = 64) -> list[np.ndarray
 
 
 def noisy(recordings: list[np.ndarray], sigma: float, rest: float, seed: int = 9) -> list[np.ndarray]:
-    """The same from a skin with noise, whose cells rest at ``rest`` or somewhat more."""
+    """Return the same of an array with noise, whose cells rest at ``rest`` or somewhat more."""
     rng = np.random.default_rng(seed)
     offset = np.random.default_rng(1).uniform(rest, 1.5 * rest, CELLS)
     return [np.clip(r + offset + sigma * rng.standard_normal(r.shape), 0, 1) for r in recordings]
 
 
-def test_a_skin_that_thresholds_rests_at_its_one_value():
+def test_an_array_that_thresholds_rests_at_one_value():
     most, least = baseline(events(0), PRESENT, TOLERANCE, 1.0)
     np.testing.assert_array_equal(most, np.zeros(CELLS))
     np.testing.assert_array_equal(least.reading, np.full(CELLS, -2 * TOLERANCE))  # nothing is less than 0
@@ -38,7 +38,7 @@ def test_noise_at_rest_is_no_load():
     idle = noisy([np.zeros((2000, CELLS))], 0.01, 0.1, seed=3)[0]
     assert (idle > most + 2 * TOLERANCE).mean() < 1e-3
     assert most.max() < 0.25
-    np.testing.assert_array_equal(least.reading, np.ones(CELLS))  # no healthy cell holds still there
+    np.testing.assert_array_equal(least.reading, np.ones(CELLS))  # no healthy cell is constant there
 
 
 def test_offsets_that_wander_between_recordings_are_no_load():
@@ -75,14 +75,14 @@ def test_a_cell_that_was_never_heard_rests_at_0():
     assert most.tolist() == pytest.approx([0.4, 0, 0.4])
 
 
-def test_two_frames_tell_nothing_of_noise_and_no_cell_reads_less_than_they_show():
+def test_two_frames_give_no_noise_estimate_and_no_lower_limit():
     most, least = baseline([np.full((2, 3), 0.4)], np.ones(3, bool), TOLERANCE, 1.0)
     assert most.tolist() == [0.4] * 3
     assert (least.reading == -np.inf).all()
 
 
-def said(readings: np.ndarray, least: LowerLimit) -> np.ndarray:
-    """What 40 frames of these readings say."""
+def evidence_of(readings: np.ndarray, least: LowerLimit) -> np.ndarray:
+    """Return the evidence of 40 frames of these readings."""
     frames, every = np.tile(readings, (40, 1)), np.ones(len(readings), bool)
     runs = ConstantRuns.begin(len(readings)).extend(frames, np.arange(40), TOLERANCE)
     return least.evidence(runs, every, TOLERANCE, every, least.lower(runs, every))
@@ -90,22 +90,22 @@ def said(readings: np.ndarray, least: LowerLimit) -> np.ndarray:
 
 def test_reading_less_than_ever_is_evidence_unless_half_of_the_cells_do():
     least = LowerLimit(np.full(10, 0.08), 0.02)
-    assert (said(np.repeat([0.0, 0.1], [3, 7]), least) > 0).tolist() == [True] * 3 + [False] * 7
-    assert not said(np.repeat([0.0, 0.1], [6, 4]), least).any()
+    assert (evidence_of(np.repeat([0.0, 0.1], [3, 7]), least) > 0).tolist() == [True] * 3 + [False] * 7
+    assert not evidence_of(np.repeat([0.0, 0.1], [6, 4]), least).any()
 
 
-def test_reading_what_it_always_did_speaks_for_a_cell_that_rests_above_the_rail():
+def test_a_usual_reading_above_the_rail_is_evidence_for_a_healthy_cell():
     least = LowerLimit(np.array([0.08, 0.08, 0.004, -0.01]), 0.02)
-    assert (said(np.array([0.1, 0.09, 0.01, 0.0]), least) < 0).tolist() == [True, True, False, False]
+    assert (evidence_of(np.array([0.1, 0.09, 0.01, 0.0]), least) < 0).tolist() == [True, True, False, False]
 
 
 def test_where_all_rest_lower_by_now_less_is_not_less_than_healthy():
     least = LowerLimit(np.full(10, 0.04), 0.01)
     warm = np.full(10, 0.05)
     warm[:2] = 0
-    assert (said(warm, least) > 0).tolist() == [True] * 2 + [False] * 8
-    assert (said(np.maximum(warm - 0.03, 0), least) > 0).tolist() == [True] * 2 + [False] * 8
-    assert not (said(np.maximum(warm - 0.045, 0), least) > 0).any()  # healthy ones read next to nothing, too
+    assert (evidence_of(warm, least) > 0).tolist() == [True] * 2 + [False] * 8
+    assert (evidence_of(np.maximum(warm - 0.03, 0), least) > 0).tolist() == [True] * 2 + [False] * 8
+    assert not (evidence_of(np.maximum(warm - 0.045, 0), least) > 0).any()  # healthy ones read next to nothing, too
 
 
 def test_cells_that_wander_as_ever_have_not_all_sunk():
@@ -139,7 +139,7 @@ def test_a_cell_that_is_always_loaded_has_no_rest_to_fall_short_of():
 
 
 @pytest.mark.parametrize(("sigma", "rest"), [(0.0, 0.08), (0.01, 0.1)])
-def test_an_open_cell_of_a_skin_that_rests_above_0_gives_itself_away_untouched(sigma, rest):
+def test_an_open_cell_is_found_without_contact_where_cells_rest_above_0(sigma, rest):
     fitted = SelfDiagnosis(LAYOUT).fit(noisy(events(0), sigma, rest))
     log = noisy(events(1, 3), sigma, rest, seed=11)
     assert not fitted.diagnose(log).fault_set

@@ -151,7 +151,7 @@ def test_two_stuck_address_bits_act_together():
     np.testing.assert_array_equal(read, healthy[:, [4, 5, 4, 5, 4, 5, 4]])  # row 3 alone would go to 7, which is none
 
 
-def test_a_converter_of_4_bits_knows_16_voltages():
+def test_a_converter_of_4_bits_has_16_voltages():
     read = Circuit(LAYOUT, bits=4).read(np.linspace(0, 5, 500)[:, None] * np.eye(LAYOUT.n_cells)[CELL])[:, CELL]
     assert len(np.unique(read)) == 16
     assert read[-1] == pytest.approx(5)

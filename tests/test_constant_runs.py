@@ -27,7 +27,7 @@ def steps(rng: np.random.Generator, frames: int, cells: int) -> np.ndarray:
     return np.take_along_axis(levels, at, axis=0) + rng.uniform(-0.9, 0.9, (frames, cells)) * TOLERANCE
 
 
-def test_a_still_stretch_starts_where_a_cell_last_moved():
+def test_a_constant_run_starts_where_a_cell_last_moved():
     runs = runs_of(np.array([[1, 1, 0], [2, 1, 0], [2, 1, 4], [2, 1.01, 4]], float))
     assert runs.start.tolist() == [1, 0, 2]
     assert runs.length.tolist() == [3, 4, 2]
@@ -42,7 +42,7 @@ def test_a_cell_that_never_moved_starts_at_frame_0():
     assert runs.jump.tolist() == [0, 3]
 
 
-def test_a_missing_reading_neither_breaks_nor_proves_stillness():
+def test_a_missing_reading_neither_ends_nor_extends_a_run():
     runs = runs_of(np.array([[1, np.nan, 1], [np.nan, np.nan, 2], [1, np.nan, np.nan]]))
     assert runs.start[:2].tolist() == [0, 0]
     assert runs.length[:2].tolist() == [2, 0]
@@ -51,7 +51,7 @@ def test_a_missing_reading_neither_breaks_nor_proves_stillness():
     assert runs.last[[0, 2]].tolist() == [1, 2]
 
 
-def test_a_stretch_starts_with_a_reading_and_the_jump_into_it_spans_a_gap():
+def test_a_run_starts_with_a_reading_and_the_jump_into_it_spans_a_gap():
     log = np.array([[3, 3], [3, np.nan], [np.nan, np.nan], [0, 3], [np.nan, 3], [0, 0]])
     for size in range(1, 6):
         runs = runs_of(log, size)
@@ -70,7 +70,7 @@ def test_how_long_a_cell_has_been_silent_is_counted_over_blocks():
         assert silent.missed_since[1:].tolist() == [0, 2]
 
 
-def test_dither_is_stillness_and_a_slow_drift_is_not():
+def test_dither_is_constant_and_a_slow_drift_is_not():
     t = np.arange(200)
     log = np.column_stack([2 + TOLERANCE * np.sin(t), 2 + 0.002 * t])
     runs = runs_of(log, 50, 50, 50)
@@ -79,7 +79,7 @@ def test_dither_is_stillness_and_a_slow_drift_is_not():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_stretch_is_the_longest_ending_the_log_in_which_the_cell_held_one_value(seed: int):
+def test_the_run_is_the_longest_at_the_end_of_the_log_with_one_value(seed: int):
     log = steps(np.random.default_rng(seed), 60, 30)
     runs = runs_of(log)
     for cell, start in enumerate(runs.start.tolist()):
@@ -134,7 +134,7 @@ def gentle() -> list[np.ndarray]:
     return [np.maximum(0, 3 * np.sin(t / 12 + rng.uniform(0, 6, 20))) for _ in range(10)]
 
 
-def test_a_cell_that_jumps_further_than_healthy_ones_do_is_suspect_and_one_that_was_let_go_gently_is_not(gentle):
+def test_a_cell_that_jumps_further_than_healthy_ones_do_is_suspect_and_one_released_gradually_is_not(gentle):
     jumps_seen = JumpHistogram.fit(gentle, TOLERANCE, FULL_SCALE)
     log = gentle[0][:60].copy()
     log[30:, 4] = 5.0
@@ -144,7 +144,7 @@ def test_a_cell_that_jumps_further_than_healthy_ones_do_is_suspect_and_one_that_
     assert jumps_seen.evidence(let_go, FULL_SCALE)[5] < 0
 
 
-def test_jumps_in_company_and_cells_that_never_moved_say_nothing(gentle):
+def test_jumps_in_company_and_cells_that_never_moved_are_no_evidence(gentle):
     jumps_seen = JumpHistogram.fit(gentle, TOLERANCE, FULL_SCALE)
     released = np.tile(np.linspace(1, 2, 20)[:, None], 10)
     released[12:] = 0.0
@@ -152,7 +152,7 @@ def test_jumps_in_company_and_cells_that_never_moved_say_nothing(gentle):
     assert (jumps_seen.evidence(runs_of(released), FULL_SCALE) == 0).all()
 
 
-def test_without_a_reference_no_jump_says_anything():
+def test_without_a_reference_no_jump_is_evidence():
     log = np.tile(np.linspace(1, 2, 20)[:, None], 10)
     log[12:, 3] = 5.0
     assert (JumpHistogram.silent().evidence(runs_of(log), FULL_SCALE) == 0).all()

@@ -3,7 +3,7 @@ import pytest
 
 from adaptfault.adaptation.baselines.correction import STEP, CausalCorrection, correct
 from adaptfault.data.windows import Windows, make_windows
-from adaptfault.imputation.linear import CellStatistics
+from adaptfault.imputation.statistics import CellStatistics
 from diagnostics import FaultSet
 
 
@@ -119,5 +119,5 @@ def test_what_does_not_fit_is_said():
 
 
 def test_statistics_of_another_array_are_refused(statistics):
-    with pytest.raises(ValueError, match="statistics are of 220 cells, the readings of 3"):
+    with pytest.raises(ValueError, match="statistics have 220 cells, the readings 3"):
         correct(np.ones((2, 3)), neutral=statistics)

@@ -1,4 +1,4 @@
-"""What a rim is taught by."""
+"""Training samples of the stacking."""
 
 import numpy as np
 
@@ -10,22 +10,22 @@ PRESENT = np.ones((1, 6, 7), bool)
 PRESENT[0, 0, :2] = False
 LAYOUT = SensorLayout(1, 6, 7, present=PRESENT)
 OUTPUTS = np.array([9, 10, 16, 17, 24, 30])
-TOUCHES, DRAWS = 12, 3
+EVENTS, DRAWS = 12, 3
 
 
 class Spy:
-    """Regressions that write down what they were fitted on, what they were asked, and of which cells."""
+    """Regressions that record the events they were fitted on, those they predicted, and the predictors."""
 
     def __init__(self) -> None:
-        self.taught: list[set[int]] = []
+        self.trained_on: list[set[int]] = []
         self.scored: list[tuple[set[int], np.ndarray]] = []
 
     def fit(self, features: np.ndarray) -> object:
-        fold = len(self.taught)
-        self.taught.append(numbers(features))
+        fold = len(self.trained_on)
+        self.trained_on.append(numbers(features))
 
         def regressed(held: np.ndarray, predictors: np.ndarray) -> RegressionOutput:
-            assert not numbers(held) & self.taught[fold]
+            assert not numbers(held) & self.trained_on[fold]
             self.scored.append((numbers(held), predictors))
             return RegressionOutput(*np.zeros((4, len(held), LAYOUT.n_cells)))
 
@@ -33,28 +33,28 @@ class Spy:
 
 
 def numbers(features: np.ndarray) -> set[int]:
-    """The touches that features are of: each bears its number."""
+    """Return the numbers of the events behind features."""
     return set(np.rint(features[:, 0, 20] * 100).astype(int).tolist())
 
 
 def cross_fits(spy: Spy) -> CrossFitting:
-    event = np.arange(TOUCHES * DRAWS) // DRAWS
+    event = np.arange(EVENTS * DRAWS) // DRAWS
     features = np.random.default_rng(0).random((len(event), 4, LAYOUT.n_cells)).astype(np.float32)
     features[:, 0, 20] = event / 100
     features[:, 2] = features[:, 2] > 0.5
     features[:, 3] = (features[:, 3] > 0.5) & (features[:, 2] > 0)
-    return CrossFitting.of(features, event, TOUCHES, LAYOUT, OUTPUTS, spy.fit, 1.0, np.random.default_rng(1))
+    return CrossFitting.of(features, event, EVENTS, LAYOUT, OUTPUTS, spy.fit, 1.0, np.random.default_rng(1))
 
 
-def test_each_touch_is_foreseen_by_regressions_that_were_taught_by_the_other_folds():
+def test_each_event_is_predicted_by_regressions_fitted_on_the_other_folds():
     spy = Spy()
     cross_fits(spy)
-    assert len(spy.taught) == FOLDS
-    assert all(len(taught) == TOUCHES - TOUCHES // FOLDS for taught in spy.taught)
-    assert set().union(*(held for held, _ in spy.scored)) == set(range(TOUCHES))
+    assert len(spy.trained_on) == FOLDS
+    assert all(len(trained_on) == EVENTS - EVENTS // FOLDS for trained_on in spy.trained_on)
+    assert set().union(*(held for held, _ in spy.scored)) == set(range(EVENTS))
 
 
-def test_cells_are_left_out_few_and_many_of_all_there_are():
+def test_few_to_nearly_all_cells_are_left_out_of_the_predictors():
     spy = Spy()
     cross_fits(spy)
     shares = [1 - predictors[PRESENT.ravel()].mean() for _, predictors in spy.scored]
@@ -63,7 +63,7 @@ def test_cells_are_left_out_few_and_many_of_all_there_are():
     assert (everywhere == PRESENT.ravel()).all()
 
 
-def test_those_of_several_arrays_are_learned_from_together():
+def test_samples_of_several_arrays_are_pooled():
     one = cross_fits(Spy())
     both = CrossFitting.joined([one, one])
     assert one.samples.shape == (len(one.never), N_FEATURES) == (len(one.always), N_FEATURES)

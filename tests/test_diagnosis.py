@@ -106,7 +106,7 @@ def test_a_static_hold_is_no_fault(fitted, log):
         assert not diagnoser.diagnose([hold, *log, hold]).faults
 
 
-def test_cells_that_nothing_touched_are_untested_neither_faulty_nor_alive(fitted):
+def test_cells_without_any_contact_are_untested_neither_faulty_nor_alive(fitted):
     diagnosis = fitted.diagnose(np.zeros((300, 220)))
     assert (diagnosis.verdicts == Verdict.UNTESTED).all()
     assert diagnosis.coverage.test_coverage == 0
@@ -202,7 +202,7 @@ def test_a_cell_whose_offset_drifts_away_is_found(fitted, log):
 
 
 @pytest.mark.parametrize("onset", [None, 2000])
-def test_a_cell_that_has_lost_most_of_its_gain_is_found_and_says_so(fitted, grasps: Recordings, onset):
+def test_a_cell_that_has_lost_most_of_its_gain_is_found_with_that_reason(fitted, grasps: Recordings, onset):
     log = [grasps.frames[i] for i in range(1, 140, 3)]
     assert not fitted.diagnose(log).faults
     frames = np.concatenate(log)
@@ -279,7 +279,7 @@ def test_a_cell_that_delivers_nothing_is_open(fitted, log):
 
 
 @pytest.mark.parametrize("values", [(0.4, 4.1), (1.2, 2.9), (3.3, 4.6)])
-def test_the_value_a_cell_is_stuck_at_never_changes_what_is_said_of_the_others(fitted, log, values):
+def test_the_value_of_a_stuck_cell_never_changes_the_verdict_on_the_others(fitted, log, values):
     cells = loaded(log)[[2, 9]].tolist()
     dead = [Fault("open", (int(loaded(log)[15]),)), Fault("short", (int(loaded(log)[-5]),))]
     others = ~np.isin(np.arange(220), cells)
@@ -292,7 +292,7 @@ def test_the_value_a_cell_is_stuck_at_never_changes_what_is_said_of_the_others(f
     np.testing.assert_array_equal(*said)
 
 
-def test_an_untouched_cell_on_a_wire_proven_open_is_inferred_faulty_and_its_fault_says_so(fitted, log):
+def test_an_unloaded_cell_on_a_wire_proven_open_is_inferred_faulty_and_named_as_such(fitted, log):
     column = Line(0, "column", 6)
     cells = LAYOUT.cells_on(column)
     untouched = cells[np.max([r[:, cells].max(axis=0) for r in log], axis=0) == 0]
@@ -308,7 +308,7 @@ def open_and_short(cells: np.ndarray, rng: np.random.Generator) -> dict[int, Fau
 
 
 @pytest.mark.parametrize("share", [0.4, 0.8])
-def test_many_dead_cells_hardly_mislead_it(fitted, log, share: float):
+def test_many_dead_cells_are_found_with_hardly_a_false_one(fitted, log, share: float):
     rng = np.random.default_rng(1)
     faults = open_and_short(rng.choice(220, round(share * 220), replace=False), rng)
     found = fitted.diagnose(broken(log, list(faults.values()))).fault_set
@@ -325,7 +325,7 @@ def test_where_every_cell_is_dead_none_is_alive_shorts_are_found_and_no_kind_is_
     assert all(faults[cell].kind is fault.kind for fault in diagnosis.faults for cell in fault.cells)
 
 
-def test_a_cell_beside_dead_ones_is_not_dragged_along(fitted, log):
+def test_a_healthy_cell_beside_dead_ones_is_not_reported(fitted, log):
     cells = loaded(log)
     dead = cells[::3].tolist()
     found = fitted.diagnose(broken(log, [Fault("short", (c,)) for c in dead])).fault_set
@@ -342,7 +342,7 @@ def test_without_a_reference_shorts_and_opens_in_the_contact_are_still_found(log
     assert len(SelfDiagnosis(LAYOUT).diagnose(log).faults) == 0
 
 
-def test_a_reference_that_touched_nothing_or_one_corner_only_is_no_evidence_of_faults(small_grasps: Recordings):
+def test_a_reference_with_contact_nowhere_or_in_one_corner_only_is_no_evidence_of_faults(small_grasps: Recordings):
     layout, log = small_grasps.layout, small_grasps.frames[31::6]
     n = layout.n_cells
     for reference in ([np.zeros((50, n))] * 3, [np.where(np.arange(n) < 6, r, 0.0) for r in log]):
@@ -353,7 +353,7 @@ def test_a_reference_that_touched_nothing_or_one_corner_only_is_no_evidence_of_f
         assert np.isfinite(diagnosis.probability).all()
 
 
-def test_masked_positions_are_never_judged():
+def test_positions_without_a_cell_have_no_verdict():
     present = np.ones((2, 6, 5), bool)
     present[:, 0] = False
     layout = SensorLayout(2, 6, 5, present=present)
@@ -399,7 +399,7 @@ def test_readings_that_are_missing_here_and_there_are_no_fault(fitted, log, cold
     assert not (COLD if cold else fitted).diagnose(gappy(log, share)).faults
 
 
-def test_what_is_missing_from_the_reference_teaches_no_rest(small_grasps: Recordings):
+def test_faults_are_found_with_a_reference_that_misses_many_readings(small_grasps: Recordings):
     layout, log = small_grasps.layout, small_grasps.frames[31::3]
     fitted = SelfDiagnosis(layout).fit(gappy(small_grasps.frames[::7], 0.4))
     cells = loaded(log, layout, 8)[::3].tolist()
@@ -494,7 +494,7 @@ def test_a_log_that_cannot_be_diagnosed_is_refused_in_one_line(recordings, messa
     assert "\n" not in str(error.value)
 
 
-def test_recordings_without_a_reading_teach_nothing(small_grasps: Recordings):
+def test_recordings_without_a_reading_do_not_change_the_fit(small_grasps: Recordings):
     diagnoser = SelfDiagnosis(small_grasps.layout)
     lost = np.full((5, small_grasps.layout.n_cells), np.nan)
     with pytest.raises(ValueError, match="no frame with a reading: nothing to learn"):

@@ -10,7 +10,7 @@ CELLS, NEAR = 30, 0.1
 SPREAD = 0.05
 
 
-def touched(n: int, gain: np.ndarray | float = 1.0, *, error: float = SPREAD / 2, own: float = 1.0):
+def events(n: int, gain: np.ndarray | float = 1.0, *, error: float = SPREAD / 2, own: float = 1.0):
     """Touches that load all cells, what is expected of them, and that all cells moved in each."""
     rng = np.random.default_rng(0)
     mean = rng.uniform(0.3, 0.8, (n, CELLS))
@@ -25,58 +25,58 @@ def one_has(gain: float, cell: int = 4) -> np.ndarray:
 
 
 @pytest.mark.parametrize("gain", [0.15, 0.35, 0.5, 2.5])
-def test_a_wrong_gain_is_told_by_touches_and_no_other_cell_is_accused(gain: float):
-    known_values = gain_evidence(*touched(20, one_has(gain)), NEAR)
-    assert drifting(np.zeros(CELLS), known_values.evidence).nonzero()[0].tolist() == [4]
-    assert 0.6 < known_values.factor[4] / gain < 1.6
-    assert (known_values.since[4], known_values.events[4]) == (0, 20)
-    assert (np.delete(known_values.evidence, 4) < 0).all()
+def test_a_wrong_gain_is_found_from_events_and_no_other_cell_is_reported(gain: float):
+    result = gain_evidence(*events(20, one_has(gain)), NEAR)
+    assert drifting(np.zeros(CELLS), result.evidence).nonzero()[0].tolist() == [4]
+    assert 0.6 < result.factor[4] / gain < 1.6
+    assert (result.since[4], result.events[4]) == (0, 20)
+    assert (np.delete(result.evidence, 4) < 0).all()
 
 
-def test_it_says_from_which_touch_on():
+def test_the_change_point_is_the_first_event_with_another_gain():
     gain = np.ones((12, CELLS))
     gain[7:, 4] = 0.2
-    known_values = gain_evidence(*touched(12, gain), NEAR)
-    assert drifting(np.zeros(CELLS), known_values.evidence)[4]
-    assert known_values.since[4] == 7
+    result = gain_evidence(*events(12, gain), NEAR)
+    assert drifting(np.zeros(CELLS), result.evidence)[4]
+    assert result.since[4] == 7
 
 
 @pytest.mark.parametrize("gain", [0.8, 1.25])
-def test_a_gain_that_is_a_little_off_is_no_fault_however_many_touches_tell(gain: float):
-    assert (gain_evidence(*touched(60, one_has(gain)), NEAR).evidence < 0).all()
+def test_a_gain_that_is_a_little_off_is_no_fault_however_many_events_there_are(gain: float):
+    assert (gain_evidence(*events(60, one_has(gain)), NEAR).evidence < 0).all()
 
 
 @pytest.mark.parametrize("n", [1, 2])
-def test_one_or_two_touches_prove_nothing(n: int):
-    assert (gain_evidence(*touched(n, one_has(0.1)), NEAR).evidence == 0).all()
+def test_one_or_two_events_prove_nothing(n: int):
+    assert (gain_evidence(*events(n, one_has(0.1)), NEAR).evidence == 0).all()
 
 
 def test_where_all_that_is_expected_errs_no_cell_is_accused():
-    inflation = gain_evidence(*touched(8, error=5 * SPREAD), NEAR)
+    inflation = gain_evidence(*events(8, error=5 * SPREAD), NEAR)
     assert not drifting(np.zeros(CELLS), inflation.evidence).any()
 
 
-def test_the_fewer_touches_taught_what_to_expect_the_less_is_told():
-    sure, half = (gain_evidence(*touched(8, one_has(0.2), own=own), NEAR).evidence for own in (1.0, 0.5))
+def test_evidence_is_weaker_with_fewer_reference_events():
+    sure, half = (gain_evidence(*events(8, one_has(0.2), own=own), NEAR).evidence for own in (1.0, 0.5))
     np.testing.assert_allclose(half, sure / 2)
 
 
-def test_touches_that_tell_nothing_of_a_gain_do_not_count():
-    whole, expected, moved = touched(8, one_has(0.2))
+def test_events_without_information_about_a_gain_do_not_count():
+    whole, expected, moved = events(8, one_has(0.2))
     unloaded = whole.copy()
-    unloaded[:, :, 4] = 0.0  # another question
+    unloaded[:, :, 4] = 0.0  # tested by the spatial evidence
     unmoved = moved.copy()
     unmoved[:, 4] = False
     unknown = replace(expected, spread=np.where(one_has(0.0) == 0, np.nan, SPREAD))
     faint = replace(expected, mean=np.minimum(expected.mean, 1.9 * NEAR))
-    for known_values in (
+    for result in (
         gain_evidence(unloaded, expected, moved, NEAR),
         gain_evidence(whole, expected, unmoved, NEAR),
         gain_evidence(whole, unknown, moved, NEAR),
         gain_evidence(whole, faint, moved, NEAR),
-        gain_evidence(*touched(8, one_has(0.2), own=0.0), NEAR),
+        gain_evidence(*events(8, one_has(0.2), own=0.0), NEAR),
     ):
-        assert (known_values.evidence[4], known_values.factor[4], known_values.events[4]) == (0.0, 1.0, 0)
+        assert (result.evidence[4], result.factor[4], result.events[4]) == (0.0, 1.0, 0)
 
 
 def test_cells_that_mislead_are_left_out_the_surest_gain_first_and_all_offsets_at_once():
@@ -91,7 +91,7 @@ def test_cells_that_mislead_are_left_out_the_surest_gain_first_and_all_offsets_a
 
 
 def test_what_counts_for_less_proves_less_and_what_healthy_cells_reached_proves_nothing():
-    whole, expected, moved = touched(20, one_has(0.35))
+    whole, expected, moved = events(20, one_has(0.35))
     full, some, none = (
         gain_evidence(whole, expected, moved, NEAR, np.full((20, 1), counts)).evidence[4] for counts in (1.0, 0.5, 0.0)
     )

@@ -4,7 +4,7 @@ import torch
 
 from adaptfault.data.windows import Windows
 from adaptfault.imputation.dropout import RandomRepairs, random_fault_set
-from adaptfault.imputation.linear import CellStatistics
+from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.models.network import TactileTransformer
 from adaptfault.models.training import train
 from diagnostics import SensorLayout

@@ -5,7 +5,7 @@ from diagnostics.healthy import dual_ridge
 
 
 def problem() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """40 samples of 15 cells with 2 columns each; two questions about each of the first 5 cells."""
+    """40 samples of 15 cells with 2 columns each; two targets for each of the first 5 cells."""
     rng = np.random.default_rng(0)
     x = rng.normal(size=(40, 2, 15)).astype(np.float32)
     y = np.stack([x[:, 0, 5:10] + rng.normal(size=(40, 5)) > 0, x[:, 1, :5] > 0.3], axis=1).astype(np.float32)
@@ -19,7 +19,7 @@ def weights(x: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     return found
 
 
-def test_at_the_minimum_of_the_ridge_loss_the_slope_is_0(monkeypatch):
+def test_at_the_minimum_of_the_ridge_loss_the_gradient_is_0(monkeypatch):
     monkeypatch.setattr(dual_ridge, "_STEPS", 400)
     x, y, own = problem()
     usual = np.float32(0.7)
@@ -32,7 +32,7 @@ def test_at_the_minimum_of_the_ridge_loss_the_slope_is_0(monkeypatch):
     assert np.abs(error.mean(axis=0) + 0.1 * bias).max() < 1e-3
 
 
-def test_the_few_steps_come_near_to_it(monkeypatch):
+def test_the_default_number_of_steps_comes_near_the_minimum(monkeypatch):
     x, y, own = problem()
     soon = weights(x, dual_ridge.logistic(x.reshape(40, -1), y, own, 1.0, np.float32(0))[0])
     monkeypatch.setattr(dual_ridge, "_STEPS", 400)
@@ -40,7 +40,7 @@ def test_the_few_steps_come_near_to_it(monkeypatch):
     assert np.linalg.norm(soon - late) < 0.1 * np.linalg.norm(late)
 
 
-def test_what_a_cell_reads_itself_does_not_matter(monkeypatch):
+def test_the_reading_of_a_cell_does_not_change_its_own_weights(monkeypatch):
     x, y, _ = problem()
     spoiled = x.copy()
     spoiled[:, :, 2] = np.random.default_rng(1).normal(size=(40, 2))

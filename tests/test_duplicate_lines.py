@@ -43,8 +43,8 @@ def duplicate_pairs(log: np.ndarray) -> list[DuplicatePair]:
     return remembered(log).duplicates.duplicate_pairs(usual=2)
 
 
-def rows_joined(first: np.ndarray, second: np.ndarray, noise: np.ndarray) -> list[tuple[int, int]]:
-    """Return the rows that are joined where two of pad 0 read ``[t, 5]`` each, and nothing touches the others."""
+def duplicate_rows(first: np.ndarray, second: np.ndarray, noise: np.ndarray) -> list[tuple[int, int]]:
+    """Return the duplicate rows where two rows of pad 0 read ``[t, 5]`` each, and the others are unloaded."""
     log = np.zeros((len(first), 2, 6, 5))
     log[:, 0, 2], log[:, 0, 3] = np.stack([first, second]) + noise
     return [(j.first, j.second) for j in duplicate_pairs(log.reshape(len(log), 60)) if j.kind == "row"]
@@ -63,11 +63,11 @@ def test_all_pairs_that_a_bit_or_a_bridge_can_join_are_watched_each_once():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_healthy_lines_are_not_joined(seed: int):
+def test_healthy_lines_are_no_duplicates(seed: int):
     assert duplicate_pairs(pressed(seed)) == []
 
 
-def test_lines_that_nothing_touches_are_not_joined():
+def test_unloaded_lines_are_no_duplicates():
     assert duplicate_pairs(np.zeros((300, 60))) == []
 
 
@@ -86,28 +86,28 @@ def test_lines_that_have_read_alike_since_some_frame_are_dated():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_lines_under_equal_loads_are_told_from_one_line_read_twice(seed: int):
+def test_lines_under_equal_loads_are_distinguished_from_one_line_read_twice(seed: int):
     rng = np.random.default_rng(seed)
     force = 1 + 0.2 * np.sin(np.arange(400) / 9)[:, None]
     bar = rng.uniform(0.5, 0.8, 5)  # it lies evenly across two rows
     other, noise = force * (bar + rng.uniform(-0.02, 0.02, 5)), rng.normal(0, 0.004, (2, 400, 5))
-    assert rows_joined(force * bar, other, noise) == []
-    assert rows_joined(force * bar, force * bar, noise) == [(2, 3)]
+    assert duplicate_rows(force * bar, other, noise) == []
+    assert duplicate_rows(force * bar, force * bar, noise) == [(2, 3)]
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_lines_that_differ_by_what_comes_and_goes_slowly_are_told_from_one_line_read_twice(seed: int):
+def test_lines_that_differ_by_what_comes_and_goes_slowly_are_distinguished_from_one_line_read_twice(seed: int):
     rng = np.random.default_rng(seed)
     force = 1 + 0.2 * np.sin(np.arange(400) / 9)[:, None]
     thing = force * rng.uniform(0.5, 0.8, 5)  # it rocks on two rows: neither has more on the whole
     other = thing + 0.03 * np.sin(np.arange(400)[:, None] / 12 + rng.uniform(0, 6, 5))
     noise = rng.normal(0, 0.004, (2, 400, 5))
-    assert rows_joined(thing, other, noise) == []
-    assert rows_joined(thing, thing, noise) == [(2, 3)]
+    assert duplicate_rows(thing, other, noise) == []
+    assert duplicate_rows(thing, thing, noise) == [(2, 3)]
 
 
 @pytest.mark.parametrize("first", range(29, 33))
-def test_a_load_that_comes_with_the_last_frames_of_a_segment_is_compared_before_it_is_a_witness(first: int):
+def test_a_load_that_comes_with_the_last_frames_of_a_segment_is_compared_before_it_is_a_coincidence(first: int):
     log = np.zeros((32, 2, 6, 5))
     log[first:, 0, 2], log[first:, 0, 3] = np.linspace(1.0, 2.0, 5), np.linspace(2.0, 3.0, 5)
     stream = remembered(log.reshape(32, 60))
@@ -134,7 +134,7 @@ def test_a_missing_reading_differs_from_nothing_and_a_position_without_a_cell_ne
     assert len(stream.complete().duplicates.duplicate_pairs(usual=2)) == 1
 
 
-def test_cells_that_hold_still_or_are_saturated_or_unloaded_tell_nothing():
+def test_cells_that_hold_still_or_are_saturated_or_unloaded_are_not_informative():
     scale = Reference.unknown(LAYOUT).scale
     frames = np.zeros((3, 60))
     frames[:, :4] = [[1.0, 1.0, 5.0, 0.01]]
@@ -142,7 +142,7 @@ def test_cells_that_hold_still_or_are_saturated_or_unloaded_tell_nothing():
     assert np.flatnonzero(informative(frames, still, scale)).tolist() == [0]
 
 
-def test_the_most_witnesses_any_pair_had_are_remembered():
+def test_the_most_coincidences_of_any_pair_are_kept():
     assert DuplicateLines.begin(LAYOUT).most == 0
     log = inject(pressed(1), [bridge(LAYOUT, Line(1, "row", 2))], LAYOUT, until=500)
     assert remembered(log).duplicates.most >= duplicate_pairs(log[:500])[0].witnesses
@@ -158,7 +158,7 @@ def test_a_stuck_address_bit_is_named_with_its_level_and_its_copies(kind: str, b
     fault = line_fault(LAYOUT, line, FaultKind.ALIAS, value=level, onset=120)
     (cause,) = caused(inject(pressed(2, 50), [fault], LAYOUT))
     assert cause.line == line
-    # With hardly any cell left that reads itself the level may stay open, but then that is said.
+    # With hardly any cell left that reads itself the level may stay open, and both are reported.
     assert cause.value == level or cause.alternatives == (f"{line} is stuck at {level}",)
     assert 100 <= cause.onset <= 160
     if cause.value == level:
@@ -169,7 +169,7 @@ def test_a_stuck_address_bit_is_named_with_its_level_and_its_copies(kind: str, b
         assert all(j in (i | 1 << bit, i & ~(1 << bit), -1) for i, j in cause.copies)
 
 
-def test_its_level_is_told_by_how_hard_the_lines_that_read_themselves_are_loaded(grasps, fitted):
+def test_its_level_follows_from_the_loads_of_the_intact_lines(grasps, fitted):
     bits = [line for line in grasps.layout.lines if line.kind in ("row_address", "column_address")]
     rng = np.random.default_rng(0)
     for level in (0, 1):
@@ -181,14 +181,14 @@ def test_its_level_is_told_by_how_hard_the_lines_that_read_themselves_are_loaded
 
 
 @pytest.mark.parametrize("line", [Line(0, "row", 1), Line(0, "row", 2), Line(1, "column", 1), Line(1, "column", 3)])
-def test_a_bridge_of_neighbours_is_told_from_a_stuck_bit(line: Line):
+def test_a_bridge_of_neighbours_is_distinguished_from_a_stuck_bit(line: Line):
     (cause,) = caused(inject(pressed(3), [bridge(LAYOUT, line)], LAYOUT))
     assert (cause.line, cause.value) == (line, line.index + 1)
     assert set(cause.cells) == set(bridge(LAYOUT, line).cells)
     assert cause.alternatives
 
 
-def test_a_single_line_read_twice_is_told_from_a_stuck_bit():
+def test_a_single_line_read_twice_is_distinguished_from_a_stuck_bit():
     cells = tuple(LAYOUT.cells_on(Line(0, "row", 4)).tolist())
     (cause,) = caused(inject(pressed(3), [Fault("alias", cells, line=Line(0, "row", 4), value=3)], LAYOUT))
     assert (cause.line, cause.value) == (Line(0, "row", 3), 4)

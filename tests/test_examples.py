@@ -20,6 +20,7 @@ EXAMPLES = sorted(HOME.glob("*.py"))
 # What an example takes on recordings, as small as it goes.
 ON_RECORDINGS = {
     "adaptation_figures.py": ["--epochs", "1", "--cases", "1", "--only", "fill"],
+    "any_model.py": ["--small", "--only", "MLP"],
     "compare_classification.py": ["--small", "--only", "adaptfault"],
     "compare_keras.py": ["--epochs", "1", "--windows", "32"],
     "esp32_sender.py": ["--frames", "20"],
@@ -27,9 +28,11 @@ ON_RECORDINGS = {
     "wrong_fault_set.py": ["--draws", "1"],
 }
 LESS = {  # they take minutes
+    "any_model.py": ["--small"],
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
 }
 SLOW = {  # more than 7 s of CPU time
+    "any_model.py",
     "adaptation_figures.py",
     "compare_classification.py",
     "compare_keras.py",

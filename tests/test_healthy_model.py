@@ -47,7 +47,7 @@ def test_a_cell_between_loaded_ones_is_hardly_ever_unloaded_and_one_far_from_the
     assert never[:, 10][~loaded[:, 8:].any(axis=1)].min() > 0.9
 
 
-def test_it_tells_more_about_touches_not_seen_than_each_cells_own_share(model, unseen):
+def test_it_predicts_new_events_better_than_the_share_of_each_cell(model, unseen):
     cells = np.arange(1, 9)
     unloaded = unseen[:, 2, cells] == 0
     seen = excerpts(blobs(0), SCALE, np.random.default_rng(0))[0]
@@ -60,7 +60,7 @@ def test_it_tells_more_about_touches_not_seen_than_each_cells_own_share(model, u
 
 
 @pytest.mark.parametrize("predictors", [ALL, all_but(4)])
-def test_what_a_cell_reads_itself_does_not_matter(model, unseen, predictors):
+def test_the_reading_of_a_cell_does_not_change_its_own_prediction(model, unseen, predictors):
     spoiled = unseen.copy()
     spoiled[:, :, 4] = 1.0
     for name in ("never", "always", "mean"):
@@ -68,7 +68,7 @@ def test_what_a_cell_reads_itself_does_not_matter(model, unseen, predictors):
         np.testing.assert_allclose(of_spoiled, said, atol=1e-5, err_msg=name)
 
 
-def test_what_an_untrusted_cell_reads_matters_to_no_cell(model, unseen):
+def test_the_reading_of_a_cell_that_is_no_predictor_changes_no_prediction(model, unseen):
     predictors = all_but(3, 6)
     spoiled = unseen.copy()
     spoiled[:, :, [3, 6]] = 0.7
@@ -77,21 +77,21 @@ def test_what_an_untrusted_cell_reads_matters_to_no_cell(model, unseen):
         np.testing.assert_allclose(of_spoiled, said, atol=1e-5, err_msg=name)
 
 
-def test_the_load_of_a_cell_is_foreseen_from_the_others_even_beside_untrusted_ones(model, unseen):
+def test_the_load_of_a_cell_is_predicted_from_the_others_even_beside_excluded_ones(model, unseen):
     truth = unseen[:, 1, 4]
     for predictors, share in ((ALL, 0.3), (all_but(4, 5), 0.5)):
         error = model.predict(unseen, predictors).mean[:, 4] - truth
         assert np.sqrt(np.mean(error**2)) < share * truth.std()
 
 
-def test_without_a_trusted_cell_the_usual_is_expected(model, unseen):
+def test_without_predictors_the_prediction_is_the_average(model, unseen):
     expected = model.predict(unseen, ~ALL)
     assert np.ptp(expected.never, axis=0).max() < 1e-5
     assert expected.mean[0] == pytest.approx(model.predict(unseen, ~ALL).mean[-1])
     assert expected.never[0, 10] > expected.never[0, 4]
 
 
-def test_a_cell_that_was_never_loaded_is_expected_to_stay_so(model, unseen):
+def test_a_cell_that_was_never_loaded_is_predicted_to_stay_unloaded(model, unseen):
     assert model.predict(unseen, ALL).never[:, 11].min() > 0.99
 
 
@@ -113,7 +113,7 @@ def test_a_wider_range_of_loads_is_likelier_and_that_of_an_unknown_cell_is_certa
     assert narrow[0, 1] == far[0, 1] == 1
 
 
-def test_large_arrays_are_modelled_in_tiles_that_know_every_cell():
+def test_large_arrays_are_modelled_in_tiles_that_cover_every_cell():
     layout = SensorLayout(1, 2, 260)
     rng = np.random.default_rng(0)
     column = np.arange(520) % 260
@@ -134,11 +134,11 @@ def test_large_arrays_are_modelled_in_tiles_that_know_every_cell():
 
 
 def patted(recordings: int, times: int) -> list[np.ndarray]:
-    """Recordings of one press each, that comes again and again."""
+    """Return recordings of one press each, repeated several times."""
     return [np.tile(np.concatenate([np.zeros((8, 12)), press]), (times, 1))[8:-4] for press in blobs(3, recordings)]
 
 
-def test_a_press_that_comes_again_and_again_teaches_as_much_as_once():
+def test_repeated_presses_count_as_one_event():
     rng = np.random.default_rng(0)
     *_, once = excerpts(patted(20, 1), SCALE, rng)
     features, source, again = excerpts(patted(20, 6), SCALE, rng)

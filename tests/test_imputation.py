@@ -3,7 +3,8 @@ import pytest
 import torch
 
 from adaptfault.data.windows import Windows
-from adaptfault.imputation.linear import AffineFill, CellStatistics
+from adaptfault.imputation.linear import AffineFill
+from adaptfault.imputation.statistics import CellStatistics
 from diagnostics import FaultSet
 
 D = 12

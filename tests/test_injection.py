@@ -85,7 +85,7 @@ def test_missing_readings_stay_missing(recording):
     assert broken[6, 1] == 5
 
 
-def test_what_cannot_be_injected_is_said():
+def test_impossible_faults_are_refused_with_a_reason():
     frames = np.zeros((3, 220))
     with pytest.raises(ValueError, match="names cell 220"):
         inject(frames, [Fault("open", (220,))], LAYOUT)
@@ -138,7 +138,7 @@ def test_a_broken_line_loses_the_cells_beyond_the_break_seen_from_its_driven_end
     assert (inject(recording, [fault], LAYOUT)[4:] == 0).any(0).sum() == len(dead)
 
 
-def test_a_break_says_where_it_is():
+def test_the_reason_of_a_break_names_its_position():
     first = line_fault(LAYOUT, Line(0, "row", 3), FaultKind.OPEN, break_at=5)
     last = line_fault(LAYOUT, Line(0, "column", 3), FaultKind.SHORT, break_at=5, driven_from="last")
     assert first.reason == "pad 0, row 3 is open from column 5 on"

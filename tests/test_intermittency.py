@@ -8,7 +8,7 @@ from diagnostics.preprocessing.scale import Scale
 LAYOUT = SensorLayout(1, 4, 5)
 CELLS = 20
 SCALE = Scale(np.zeros(CELLS), 0.05, 5.0)
-STILL = np.zeros(CELLS, bool)
+CONSTANT = np.zeros(CELLS, bool)
 
 
 def healthy(seed: int, frames: int = 640) -> np.ndarray:
@@ -24,7 +24,7 @@ def usual() -> HealthyRates:
     return HealthyRates.fit([healthy(seed) for seed in range(10)], SCALE, LAYOUT)
 
 
-def unrest_of(log: np.ndarray, usual: HealthyRates, still: np.ndarray = STILL) -> Intermittency:
+def evidence_of(log: np.ndarray, usual: HealthyRates, still: np.ndarray = CONSTANT) -> Intermittency:
     intermittency = Intermittency.begin(LAYOUT)
     for first in range(0, len(log), 32):
         frames = log[first : first + 32]
@@ -40,14 +40,14 @@ def cells(mask: np.ndarray) -> list[int]:
 @pytest.mark.parametrize("seed", range(20, 25))
 def test_healthy_cells_neither_blink_nor_are_noisy(usual, seed: int):
     for reference in (usual, HealthyRates.unknown(SCALE)):
-        intermittency = unrest_of(healthy(seed), reference)
+        intermittency = evidence_of(healthy(seed), reference)
         assert cells(intermittency.intermittent | intermittency.excess) == []
 
 
 @pytest.mark.parametrize("value", [0.0, 5.0])
 def test_a_cell_that_blinks_to_a_rail_is_intermittent_and_dated(usual, value: float):
     log = inject(healthy(30), [Fault("intermittent", (7,), value=value, onset=320)], LAYOUT, seed=0)
-    intermittency = unrest_of(log, usual)
+    intermittency = evidence_of(log, usual)
     assert cells(intermittency.intermittent) == [7]
     assert cells(intermittency.excess) == []
     assert 288 <= intermittency.blinks_since[7] <= 384
@@ -57,7 +57,7 @@ def test_a_cell_that_blinks_to_a_rail_is_intermittent_and_dated(usual, value: fl
 
 def test_a_cell_with_excess_noise_is_noisy_and_dated(usual):
     log = inject(healthy(31), [Fault("noisy", (7,), value=0.5, onset=320)], LAYOUT, seed=0)
-    intermittency = unrest_of(log, usual)
+    intermittency = evidence_of(log, usual)
     assert cells(intermittency.excess) == [7]
     assert cells(intermittency.intermittent) == []
     assert 288 <= intermittency.noisy_since[7] <= 384
@@ -66,7 +66,7 @@ def test_a_cell_with_excess_noise_is_noisy_and_dated(usual):
 def test_a_fault_that_has_gone_is_forgotten(usual):
     faults = [Fault("intermittent", (7,)), Fault("noisy", (12,), value=0.5)]
     log = inject(healthy(32, 1600), faults, LAYOUT, seed=0, until=480)
-    during, after = unrest_of(log[:480], usual), unrest_of(log, usual)
+    during, after = evidence_of(log[:480], usual), evidence_of(log, usual)
     assert cells(during.intermittent) == [7]
     assert cells(during.excess) == [12]
     assert cells(after.intermittent | after.excess) == []
@@ -75,54 +75,54 @@ def test_a_fault_that_has_gone_is_forgotten(usual):
 def test_a_fast_grasp_that_shakes_many_cells_alike_is_no_fault(usual):
     rng = np.random.default_rng(0)
     shaken = healthy(33) * (1 + rng.normal(0, 0.3, (640, 1)))
-    intermittency = unrest_of(shaken, usual)
+    intermittency = evidence_of(shaken, usual)
     assert cells(intermittency.intermittent | intermittency.excess) == []
 
 
-def test_a_load_that_is_let_go_does_not_blink(usual):
+def test_a_load_that_is_released_does_not_blink(usual):
     log = healthy(34)
     log[::64, 7] = 0  # the last frame of each other segment, and then it stays away
     log[300:, 7] = 0
     for start in range(0, 300, 64):
         log[start : start + 30, 7] = 0
-    assert cells(unrest_of(log, usual).intermittent) == []
+    assert cells(evidence_of(log, usual).intermittent) == []
 
 
-def test_still_cells_have_no_part_in_it(usual):
+def test_constant_cells_do_not_count(usual):
     log = inject(healthy(35), [Fault("intermittent", (7,)), Fault("noisy", (12,), value=0.5)], LAYOUT, seed=0)
-    intermittency = unrest_of(log, usual, np.isin(np.arange(CELLS), [7, 12]))
+    intermittency = evidence_of(log, usual, np.isin(np.arange(CELLS), [7, 12]))
     assert cells(intermittency.intermittent | intermittency.excess) == []
 
 
-def test_noise_under_load_is_learned_from_the_reference():
+def test_noise_under_load_is_fitted_to_the_reference():
     rng = np.random.default_rng(0)
-    restless = [healthy(seed) + rng.normal(0, 0.4, (640, CELLS)) for seed in range(10)]
+    blinking_reference = [healthy(seed) + rng.normal(0, 0.4, (640, CELLS)) for seed in range(10)]
     log = healthy(36)
     log[:, 7] += rng.normal(0, 0.4, 640)
-    assert cells(unrest_of(log, HealthyRates.fit(restless, SCALE, LAYOUT)).excess) == []
-    assert cells(unrest_of(log, HealthyRates.fit([healthy(seed) for seed in range(10)], SCALE, LAYOUT)).excess) == [7]
+    assert cells(evidence_of(log, HealthyRates.fit(blinking_reference, SCALE, LAYOUT)).excess) == []
+    assert cells(evidence_of(log, HealthyRates.fit([healthy(seed) for seed in range(10)], SCALE, LAYOUT)).excess) == [7]
 
 
 @pytest.mark.parametrize("recordings", [1, 2, 4])
-def test_a_few_recordings_do_not_tell_how_noisy_a_load_can_be(recordings: int):
+def test_a_few_recordings_do_not_lower_the_noise_limit(recordings: int):
     # The harder a cell is pressed, the noisier; now and then, and seldom in so few frames, one far more than that.
-    def restless(seed: int, frames: int = 128) -> np.ndarray:
+    def blinking_reference(seed: int, frames: int = 128) -> np.ndarray:
         rng = np.random.default_rng(seed)
         load = healthy(seed, frames)
         noise = 0.02 * np.exp(rng.normal(0, 0.4, (frames // 32, CELLS))).repeat(32, axis=0)
         return np.maximum(0, load * (1 + rng.normal(0, noise)))
 
-    usual = HealthyRates.fit([restless(seed) for seed in range(recordings)], SCALE, LAYOUT)
-    assert [cells(unrest_of(restless(seed, 640), usual).excess) for seed in range(50, 60)] == [[]] * 10
-    noisy = inject(restless(60, 640), [Fault("noisy", (7,), value=0.5)], LAYOUT, seed=0)
-    assert cells(unrest_of(noisy, usual).excess) == [7]
+    usual = HealthyRates.fit([blinking_reference(seed) for seed in range(recordings)], SCALE, LAYOUT)
+    assert [cells(evidence_of(blinking_reference(seed, 640), usual).excess) for seed in range(50, 60)] == [[]] * 10
+    noisy = inject(blinking_reference(60, 640), [Fault("noisy", (7,), value=0.5)], LAYOUT, seed=0)
+    assert cells(evidence_of(noisy, usual).excess) == [7]
 
 
 def test_a_load_that_saturates_now_and_then_does_not_blink(usual):
     log = healthy(35)
     log[:, 3] = np.minimum(4.6 + 0.6 * np.sin(np.arange(len(log))), 5.0)
     for reference in (usual, HealthyRates.unknown(SCALE)):
-        assert cells(unrest_of(log, reference).intermittent) == []
+        assert cells(evidence_of(log, reference).intermittent) == []
 
 
 def tapped(seed: int, cells: list[int], frames: int = 640, rate: float = 5.0) -> np.ndarray:
@@ -136,7 +136,7 @@ def tapped(seed: int, cells: list[int], frames: int = 640, rate: float = 5.0) ->
 
 
 @pytest.fixture(scope="module")
-def restless() -> HealthyRates:
+def blinking_reference() -> HealthyRates:
     """Learned where fingers tap and scratch, on two cells or more."""
     rng = np.random.default_rng(2)
     recordings = [tapped(seed, [6, 7] if seed % 2 else [12, 13, 17], 128) for seed in range(100, 140)]
@@ -147,41 +147,45 @@ def restless() -> HealthyRates:
     return usual
 
 
-def test_the_cells_beside_are_asked_only_where_healthy_unrest_is_shared(usual):
+def test_neighbours_are_compared_only_where_healthy_changes_are_shared(usual):
     assert not usual.alone
     log = inject(healthy(30), [Fault("intermittent", (cell,)) for cell in (6, 7, 12)], LAYOUT, seed=0)
-    assert cells(unrest_of(log, usual).intermittent) == [6, 7, 12]
+    assert cells(evidence_of(log, usual).intermittent) == [6, 7, 12]
 
 
 @pytest.mark.parametrize("finger", [[6, 7, 11, 12], [0, 1], [4, 9], [7, 13]])
-def test_a_tapping_finger_is_no_loose_contact(restless, finger: list[int]):
-    for reference in (restless, HealthyRates.unknown(SCALE)):
-        intermittency = unrest_of(tapped(40, finger), reference)
+def test_a_tapping_finger_is_no_loose_contact(blinking_reference, finger: list[int]):
+    for reference in (blinking_reference, HealthyRates.unknown(SCALE)):
+        intermittency = evidence_of(tapped(40, finger), reference)
         assert cells(intermittency.intermittent | intermittency.excess) == []
 
 
-def test_a_wire_with_a_loose_contact_is_told_from_a_finger_by_the_cells_beside_it(restless):
-    intermittency = unrest_of(tapped(41, [5, 6, 7, 8, 9]), restless)  # a row; of its ends only one side is known
+def test_a_wire_with_a_loose_contact_is_distinguished_from_a_finger_by_its_neighbours(blinking_reference):
+    intermittency = evidence_of(
+        tapped(41, [5, 6, 7, 8, 9]), blinking_reference
+    )  # a row; of its ends only one side is known
     assert {6, 7, 8} <= set(cells(intermittency.intermittent))
     assert cells(intermittency.intermittent | intermittency.excess)[0] >= 5
     assert cells(intermittency.intermittent | intermittency.excess)[-1] <= 9
 
 
-def test_noise_that_the_cells_beside_share_is_the_touch(restless):
+def test_noise_that_neighbours_share_is_the_contact(blinking_reference):
     rng, finger = np.random.default_rng(1), [6, 7, 11, 12]
     log = healthy(42)
     log[:, finger] += rng.normal(0, 0.5, (640, 1)) * rng.uniform(0.7, 1, 4)
-    assert cells(unrest_of(log, restless).excess) == []
+    assert cells(evidence_of(log, blinking_reference).excess) == []
     alone = healthy(42)
     alone[:, 7] += rng.normal(0, 1.5, 640)
-    assert cells(unrest_of(alone, restless).excess) == [7]
+    assert cells(evidence_of(alone, blinking_reference).excess) == [7]
 
 
 def test_where_healthy_cells_blink_in_bursts_it_takes_more_to_be_faulty():
-    blinking = [tapped(seed, [seed % CELLS], 96, rate=8.0) for seed in range(30)]  # on one cell: nothing beside tells
+    blinking = [
+        tapped(seed, [seed % CELLS], 96, rate=8.0) for seed in range(30)
+    ]  # on one cell, without neighbours to compare
     calm = [healthy(seed, 320) for seed in range(100, 130)]
     bursts = HealthyRates.fit([*blinking, *calm], SCALE, LAYOUT)
     assert bursts.blinks_count < 1
     for seed in range(50, 60):
-        assert cells(unrest_of(tapped(seed, [seed % CELLS], 96, rate=8.0), bursts).intermittent) == []
+        assert cells(evidence_of(tapped(seed, [seed % CELLS], 96, rate=8.0), bursts).intermittent) == []
     assert HealthyRates.fit(calm, SCALE, LAYOUT).blinks_count == 1

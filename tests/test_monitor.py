@@ -50,40 +50,40 @@ def mixes(middle: list[int]) -> dict[str, list[Fault]]:
 
 def watched(diagnoser: SelfDiagnosis, frames: np.ndarray) -> tuple[Monitor, list[tuple[int, Fault]]]:
     """Feed a log frame by frame; return the monitor and (frame, what it reported)."""
-    monitor, news = Monitor(diagnoser), []
+    monitor, changes = Monitor(diagnoser), []
     for i, frame in enumerate(frames):
-        news += [(i, fault) for fault in monitor.update(frame)]
-    return monitor, news
+        changes += [(i, fault) for fault in monitor.update(frame)]
+    return monitor, changes
 
 
-def said(diagnosis) -> dict:
+def without_recordings(diagnosis) -> dict:
     return {key: value for key, value in diagnosis.to_dict().items() if key != "n_recordings"}
 
 
 @pytest.mark.parametrize("mix", mixes([0, 1, 2, 3, 4]))
 @pytest.mark.parametrize("cold", [False, True])
-def test_frame_by_frame_it_says_what_diagnose_says_of_all_frames(fitted, log, middle, mix: str, cold: bool):
+def test_frame_by_frame_it_gives_the_diagnosis_of_all_frames(fitted, log, middle, mix: str, cold: bool):
     diagnoser = COLD if cold else fitted
     frames = inject(log, mixes(middle)[mix], LAYOUT, seed=0, dither=0.004)[:970]
     frames = lose_frames(freeze_stream(frames, 700, 800), 0.02, seed=0)
     monitor, _ = watched(diagnoser, frames)
-    assert said(monitor.diagnosis()) == said(diagnoser.diagnose(frames))
+    assert without_recordings(monitor.diagnosis()) == without_recordings(diagnoser.diagnose(frames))
 
 
-def test_asking_for_a_diagnosis_in_between_changes_nothing(fitted, log, middle):
+def test_a_diagnosis_in_between_changes_nothing(fitted, log, middle):
     frames = inject(log, mixes(middle)["cells"], LAYOUT)
     monitor = Monitor(fitted)
     for i, frame in enumerate(frames):
         monitor.update(frame)
         if i % 111 == 50:
-            assert said(monitor.diagnosis()) == said(fitted.diagnose(frames[: i + 1]))
-    assert said(monitor.diagnosis()) == said(fitted.diagnose(frames))
+            assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames[: i + 1]))
+    assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames))
 
 
-def test_a_fault_is_reported_once_soon_after_it_shows(fitted, log, middle):
+def test_a_fault_is_reported_once_soon_after_it_is_detectable(fitted, log, middle):
     cell = middle[3]
-    _, news = watched(fitted, inject(log, [Fault("short", (cell,), onset=300)], LAYOUT))
-    ((frame, fault),) = news
+    _, changes = watched(fitted, inject(log, [Fault("short", (cell,), onset=300)], LAYOUT))
+    ((frame, fault),) = changes
     assert (fault.kind, fault.cells) == (FaultKind.SHORT, (cell,))
     assert 300 <= frame < 300 + 2 * 32  # it looks every 32 frames
     assert fault.probability > 0.9
@@ -96,8 +96,8 @@ def test_a_healthy_run_is_silent(fitted, log):
 
 def test_a_fault_that_goes_away_is_reported_as_gone_with_probability_0(fitted, log, middle):
     cell = middle[3]
-    _, news = watched(fitted, inject(log, [Fault("short", (cell,), onset=200)], LAYOUT, until=600))
-    (_, came), (frame, gone) = news
+    _, changes = watched(fitted, inject(log, [Fault("short", (cell,), onset=200)], LAYOUT, until=600))
+    (_, came), (frame, gone) = changes
     assert came.cells == gone.cells == (cell,)
     assert came.probability > 0.9
     assert gone.probability == 0
@@ -111,19 +111,19 @@ def test_a_fault_that_spreads_is_reported_as_changed_and_no_cell_of_it_as_gone(f
     first = Fault("short", LAYOUT.cells_on(row)[4:6], onset=100)
     rest = line_fault(LAYOUT, row, FaultKind.SHORT, onset=500)
     _, reported = watched(fitted, inject(log, [first, rest], LAYOUT))
-    news = [fault for _, fault in reported if set(fault.cells) & set(rest.cells)]
-    assert (news[-1].line, news[-1].cells) == (row, rest.cells)
-    assert all(fault.probability > 0 for fault in news)
+    changes = [fault for _, fault in reported if set(fault.cells) & set(rest.cells)]
+    assert (changes[-1].line, changes[-1].cells) == (row, rest.cells)
+    assert all(fault.probability > 0 for fault in changes)
 
 
 def test_while_a_row_breaks_hardly_a_cell_beside_it_is_reported_and_none_for_long(fitted, log):
     row = line_fault(LAYOUT, Line(0, "row", 5), FaultKind.SHORT, onset=500)
-    monitor, news = watched(fitted, inject(log, [row], LAYOUT))
-    assert len({c for _, fault in news for c in fault.cells} - set(row.cells)) <= 2
+    monitor, changes = watched(fitted, inject(log, [row], LAYOUT))
+    assert len({c for _, fault in changes for c in fault.cells} - set(row.cells)) <= 2
     assert set(monitor.diagnosis().fault_set) == set(row.cells)
 
 
-def test_frames_that_the_clock_says_are_missing_are_counted(fitted, log):
+def test_frames_missing_according_to_the_clock_are_counted(fitted, log):
     monitor = Monitor(fitted)
     for i, frame in enumerate(log[:200]):
         if i not in (40, 41, 42, 150):
@@ -132,7 +132,7 @@ def test_frames_that_the_clock_says_are_missing_are_counted(fitted, log):
     assert (fault.kind, fault.frames, fault.onset) == ("lost", 4, 40)
 
 
-def test_a_clock_that_jitters_or_stands_still_or_runs_back_loses_no_frames(fitted, log):
+def test_a_clock_that_jitters_or_stops_or_runs_back_loses_no_frames(fitted, log):
     jitter = np.random.default_rng(0).uniform(-0.02, 0.02, 100)
     for times in (np.arange(100) / 10 + jitter, np.zeros(100), -np.arange(100) / 10):
         monitor = Monitor(fitted)
@@ -148,20 +148,20 @@ def test_a_frame_may_be_a_grid_and_hold_missing_readings(fitted, log):
     for frame in frames:
         flat.update(frame)
         grid.update(LAYOUT.grid(frame))
-    assert said(flat.diagnosis()) == said(grid.diagnosis())
+    assert without_recordings(flat.diagnosis()) == without_recordings(grid.diagnosis())
 
 
-def test_a_cell_that_falls_silent_is_told_soon_and_so_is_that_it_is_back(fitted, log, middle):
+def test_a_cell_that_falls_silent_is_reported_soon_and_so_is_its_return(fitted, log, middle):
     frames, cell = log[:800].copy(), middle[10]
     frames[300:600, cell] = np.nan
-    monitor, news = watched(fitted, frames)
-    (silent, first), (back, last) = [(i, fault) for i, fault in news if fault.cells == (cell,)]
+    monitor, changes = watched(fitted, frames)
+    (silent, first), (back, last) = [(i, fault) for i, fault in changes if fault.cells == (cell,)]
     assert first.kind is FaultKind.OPEN
     assert "delivers no reading from frame 300 on" in first.reason
     assert 300 + 64 <= silent < 300 + 64 + 2 * 32
     assert "gone since about frame" in last.reason
     assert 600 <= back < 600 + 2 * 32
-    assert said(monitor.diagnosis()) == said(fitted.diagnose(frames))
+    assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames))
 
 
 @pytest.mark.parametrize("share", [0.1, 0.4])
@@ -169,16 +169,16 @@ def test_online_equals_batch_where_readings_are_missing(fitted, log, middle, sha
     frames = inject(log, mixes(middle)["cells"], LAYOUT)
     frames[np.random.default_rng(0).random(frames.shape) < share] = np.nan
     monitor, _ = watched(fitted, frames)
-    assert said(monitor.diagnosis()) == said(fitted.diagnose(frames))
+    assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames))
 
 
 @pytest.mark.parametrize("size", [0, 219, 221])
-def test_a_frame_of_the_wrong_size_says_what_came_and_what_was_expected(size: int):
+def test_a_frame_of_the_wrong_size_is_refused_with_both_sizes(size: int):
     with pytest.raises(ValueError, match=rf"expected a frame of 220 readings .*, got {size}"):
         Monitor(COLD).update(np.zeros(size))
 
 
-def test_before_any_reading_has_come_there_is_nothing_to_diagnose():
+def test_before_any_reading_there_is_nothing_to_diagnose():
     monitor = Monitor(COLD)
     with pytest.raises(ValueError, match="no frame with a reading"):
         monitor.diagnosis()

@@ -38,13 +38,13 @@ def test_a_cell_enclosed_by_loaded_ones_is_expected_to_be_loaded_and_one_far_fro
     far = np.zeros_like(grid)
     for r in range(1, 8):
         for c in range(1, 8):
-            neighbourhood = grid[:, r - 1 : r + 2, c - 1 : c + 2]
-            enclosed[:, r, c], far[:, r, c] = neighbourhood.all(axis=(1, 2)), ~neighbourhood.any(axis=(1, 2))
+            block = grid[:, r - 1 : r + 2, c - 1 : c + 2]
+            enclosed[:, r, c], far[:, r, c] = block.all(axis=(1, 2)), ~block.any(axis=(1, 2))
     assert never[enclosed.reshape(-1, 81)].mean() < 0.05
     assert never[far.reshape(-1, 81)].mean() > 0.95
 
 
-def test_what_a_cell_reads_itself_does_not_matter_where_it_is_not_trusted(events, features):
+def test_the_reading_of_a_cell_that_is_no_predictor_does_not_matter(events, features):
     centre = LAYOUT.cell(0, 4, 4)
     predictors = ALL.copy()
     predictors[centre] = False
@@ -54,7 +54,7 @@ def test_what_a_cell_reads_itself_does_not_matter_where_it_is_not_trusted(events
     np.testing.assert_array_equal(model.predict(spoiled, predictors).never, model.predict(features, predictors).never)
 
 
-def test_a_cell_between_no_two_trusted_neighbours_is_not_judged(events, features):
+def test_a_cell_without_two_opposite_predictors_is_not_predicted(events, features):
     corner = LAYOUT.cell(0, 0, 0)
     expected = NearestNeighbours.of(events, LAYOUT).predict(features, ALL)
     assert (expected.never[:, corner] == 1).all()
@@ -63,13 +63,13 @@ def test_a_cell_between_no_two_trusted_neighbours_is_not_judged(events, features
     assert np.isfinite(expected.spread[LAYOUT.cell(0, 4, 4)])
 
 
-def test_without_trusted_cells_everything_is_as_expected(events, features):
+def test_without_predictors_all_probabilities_are_1(events, features):
     expected = NearestNeighbours.of(events, LAYOUT).predict(features, ~ALL)
     assert (expected.never == 1).all()
     assert np.isnan(expected.spread).all()
 
 
-def test_positions_without_a_cell_are_not_judged(events, features):
+def test_positions_without_a_cell_are_not_predicted(events, features):
     present = np.ones(LAYOUT.shape, bool)
     present[0, 4, 4] = False
     layout = SensorLayout(1, 9, 9, present=present)

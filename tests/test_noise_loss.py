@@ -13,7 +13,7 @@ NOISE = 2 * STEP
 
 
 def flickering(seed: int, recordings: int = 24, noise: float = NOISE, rest: float = 0.0) -> list[np.ndarray]:
-    """Presses on a skin with noise, and a converter whose readings end at 0."""
+    """Presses on an array with noise, and a converter whose readings end at 0."""
     rng = np.random.default_rng(seed)
     rests = rest + np.random.default_rng(99).uniform(0, STEP, CELLS)
     read = [r + rests + noise * rng.standard_normal(r.shape) for r in events(seed, recordings)]
@@ -34,15 +34,15 @@ def test_the_longest_time_that_a_cell_read_the_same_is_found():
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1 * STEP])
-def test_skins_without_noise_or_with_less_than_a_converter_step_tell_nothing(noise):
+def test_arrays_without_noise_or_with_less_than_a_converter_step_give_no_evidence(noise):
     assert np.isinf(NoiseLoss.fit(flickering(0, noise=noise, rest=0.05), PRESENT).longest).all()
 
 
-def test_few_recordings_tell_nothing():
+def test_few_recordings_give_no_evidence():
     assert np.isinf(NoiseLoss.fit(flickering(0, recordings=7), PRESENT).longest).all()
 
 
-def test_a_cell_that_does_not_flicker_any_more_is_broken_unless_half_of_them_do_not():
+def test_a_cell_that_loses_its_noise_is_broken_unless_half_of_the_cells_do():
     noise_loss = NoiseLoss.fit(flickering(0), PRESENT)
     idle = np.concatenate(flickering(5, 4))[:200]
 
@@ -55,14 +55,14 @@ def test_a_cell_that_does_not_flicker_any_more_is_broken_unless_half_of_them_do_
     assert not (said(40) > 0).any()
 
 
-def test_a_cell_that_is_not_heard_for_long_is_not_said_to_read_the_same():
+def test_missing_readings_are_not_identical_readings():
     noise_loss = NoiseLoss.fit(flickering(0), PRESENT)
     frames = np.concatenate(flickering(5, 5))
     frames[50:, 60] = np.nan
     assert not (noise_loss.evidence(runs_of(frames), PRESENT, PRESENT, sunk=False) > 0).any()
 
 
-def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_blamed_for_want_of_noise():
+def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_suspected_for_noise_loss():
     rng = np.random.default_rng(4)
     rests = np.linspace(0.004, 0.04, CELLS)
 
@@ -82,7 +82,7 @@ def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_blamed_for_wa
     assert not (stream.temporal() > 10).any()
 
 
-def test_dead_cells_that_nothing_touches_are_found_for_want_of_noise_by_a_monitor_too():
+def test_dead_cells_without_contact_are_found_by_noise_loss_in_the_monitor_too():
     fitted = SelfDiagnosis(LAYOUT).fit(flickering(0))
     log = flickering(1, 4)
     assert not fitted.diagnose(log).fault_set

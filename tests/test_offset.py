@@ -77,7 +77,7 @@ def test_a_small_offset_of_one_cell_is_no_load_where_the_reference_held_light_lo
 
 
 @pytest.mark.parametrize("offset", [0.007, 0.015, 0.03])
-def test_a_skin_that_has_warmed_up_has_no_fault_and_its_dead_cells_are_found_all_the_same(fitted, offset):
+def test_an_array_that_has_warmed_up_has_no_fault_and_its_dead_cells_are_found(fitted, offset):
     log = events(1, 8)
     assert not fitted.diagnose([r + offset for r in log]).fault_set
     dead = LAYOUT.cell(0, 2, 3)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from adaptfault.data.windows import make_windows
-from adaptfault.imputation.linear import CellStatistics
+from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.robot.plausibility import contradiction, implausible
 from diagnostics import FaultSet
 

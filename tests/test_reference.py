@@ -39,7 +39,7 @@ def test_a_fitted_reference_has_a_model_and_one_that_is_not_has_none(reference):
 
 
 @pytest.mark.parametrize(("events", "inexperience"), [(20, 1.0), (98, 1.0), (198, 0.5), (398, 0.0), (5000, 0.0)])
-def test_healthy_touches_are_the_less_unfamiliar_the_more_the_reference_holds(reference, events, inexperience):
+def test_inexperience_falls_with_the_number_of_reference_events(reference, events, inexperience):
     regression = SimpleNamespace(outputs=np.arange(CELLS), p_floor=p_floor_of(events))
     known = replace(reference, model=replace(reference.model, local_regressions=(regression,)))
     np.testing.assert_allclose(known.inexperience, inexperience, atol=1e-9)
@@ -53,23 +53,23 @@ def test_the_tolerance_grows_with_the_converters_step_up_to_a_bound():
     assert fine == Reference.unknown(LAYOUT).tolerance
 
 
-def test_cells_rest_where_they_rest_in_the_reference():
+def test_the_baseline_is_that_of_the_reference():
     offset = np.linspace(0, 1, CELLS)
     reference = Reference.fit([r + offset for r in healthy(0)], LAYOUT)
     np.testing.assert_allclose(reference.scale.baseline, offset, atol=0.02)
 
 
-def test_who_often_repeats_a_frame_is_given_more_patience(reference):
+def test_a_reference_with_repeated_frames_raises_the_patience(reference):
     holds = [freeze_stream(r, 10, 80) for r in healthy(0)]
     assert Reference.fit(holds, LAYOUT).patience > 70
     assert reference.patience < 70
 
 
-def test_lines_that_often_agree_when_healthy_need_more_witnesses_to_be_joined(reference):
-    matching = [r.copy() for r in healthy(0)]
-    for r in matching:
+def test_lines_that_agree_when_healthy_need_more_coincidences_to_count(reference):
+    agreeing = [r.copy() for r in healthy(0)]
+    for r in agreeing:
         r[:, 4:8] = r[:, 0:4]
-    assert Reference.fit(matching, LAYOUT).duplicates > reference.duplicates
+    assert Reference.fit(agreeing, LAYOUT).duplicates > reference.duplicates
 
 
 def test_missing_readings_and_lost_frames_in_the_reference_do_no_harm():

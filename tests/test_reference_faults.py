@@ -20,7 +20,7 @@ FAULTS = [
 DEAD = {OPEN, SHORT, STUCK}
 
 
-def looked_for(recordings: list[np.ndarray], layout: SensorLayout = LAYOUT) -> np.ndarray:
+def reference_faults(recordings: list[np.ndarray], layout: SensorLayout = LAYOUT) -> np.ndarray:
     readings = RecordingBlocks(recordings)
     return find_reference_faults(
         readings, layout, tolerance_of(readings, layout), lambda log, *_: SelfDiagnosis(layout).diagnose(list(log))
@@ -38,7 +38,7 @@ def fitted(worn: list[np.ndarray]) -> SelfDiagnosis:
 
 
 def test_cells_that_are_dead_throughout_are_found_and_no_other(worn):
-    assert set(np.flatnonzero(looked_for(worn)).tolist()) == DEAD
+    assert set(np.flatnonzero(reference_faults(worn)).tolist()) == DEAD
 
 
 def test_a_fault_free_reference_has_none_and_costs_no_diagnosis():
@@ -47,27 +47,27 @@ def test_a_fault_free_reference_has_none_and_costs_no_diagnosis():
 
     moved = [frames + 0.1 * np.arange(len(frames))[:, None] for frames in GRASPS]
     assert not find_reference_faults(RecordingBlocks(moved), LAYOUT, 0.025, never).any()
-    assert not looked_for(GRASPS).any()
+    assert not reference_faults(GRASPS).any()
 
 
-def test_a_reference_that_touched_next_to_nothing_accuses_nobody():
-    assert not looked_for([np.zeros((50, 64))] * 10).any()
+def test_a_reference_with_hardly_any_contact_has_no_faults():
+    assert not reference_faults([np.zeros((50, 64))] * 10).any()
 
 
 def test_a_cell_that_moved_once_was_not_dead(worn):
     moved = [worn[0].copy(), *worn[1:]]
     moved[0][5, SHORT] = 1.0
-    assert SHORT not in np.flatnonzero(looked_for(moved))
+    assert SHORT not in np.flatnonzero(reference_faults(moved))
 
 
-def test_a_cell_that_delivered_nothing_is_not_taken_for_one_that_stood_still(worn):
+def test_a_cell_without_readings_is_not_a_constant_cell(worn):
     silent = [frames.copy() for frames in worn]
     for frames in silent:
         frames[:, SHORT] = np.nan
-    assert set(np.flatnonzero(looked_for(silent)).tolist()) == DEAD - {SHORT}
+    assert set(np.flatnonzero(reference_faults(silent)).tolist()) == DEAD - {SHORT}
 
 
-def test_they_are_called_faulty_in_every_log_by_what_they_do(worn, fitted):
+def test_they_are_faulty_in_every_log_with_the_kind_of_what_they_read(worn, fitted):
     for log in (worn[1:12:2], worn[1:2]):
         diagnosis = fitted.diagnose(log)
         assert diagnosis.fault_set == DEAD
@@ -88,13 +88,13 @@ def test_new_faults_are_found_beside_them(worn, fitted):
     assert fitted.diagnose(log).fault_set == DEAD | {new}
 
 
-def test_a_stored_diagnosis_knows_them(worn, fitted):
+def test_a_stored_diagnosis_keeps_them(worn, fitted):
     about, arrays = fitted.state()
     again = SelfDiagnosis.from_state(about, arrays).diagnose(worn[1:12:2])
     np.testing.assert_array_equal(again.probability, fitted.diagnose(worn[1:12:2]).probability)
 
 
-def test_of_a_large_skin_only_what_lies_around_suspects_is_judged_and_tells_the_same():
+def test_on_a_large_array_only_tiles_of_candidates_are_scored_with_the_same_result():
     skin, rng = SensorLayout(1, 40, 40), np.random.default_rng(0)
     places = np.argwhere(np.ones((40, 40)))
 
@@ -106,10 +106,10 @@ def test_of_a_large_skin_only_what_lies_around_suspects_is_judged_and_tells_the_
     dead = [skin.cell(0, 9, 9), *(skin.cell(0, 14, col) for col in range(8, 18)), skin.cell(0, 16, 11)]
     for recording in reference:
         recording[:, dead] = 0
-    asked_about: list[np.ndarray] = []
+    requested: list[np.ndarray] = []
 
     def all_of(log: RecordingBlocks, needed: np.ndarray, *_: object) -> Diagnosis:
-        asked_about.append(needed)
+        requested.append(needed)
         return SelfDiagnosis(skin).diagnose(list(log))
 
     def some_of(log: RecordingBlocks, needed: np.ndarray, *_: object) -> Diagnosis:
@@ -124,4 +124,4 @@ def test_of_a_large_skin_only_what_lies_around_suspects_is_judged_and_tells_the_
     )  # nothing else moved there
     whole, part = (find_reference_faults(readings, skin, 0.01, diagnose) for diagnose in (all_of, some_of))
     assert set(np.flatnonzero(whole)) == set(np.flatnonzero(part)) == set(dead)
-    assert set(dead) <= set(np.flatnonzero(asked_about[0]))
+    assert set(dead) <= set(np.flatnonzero(requested[0]))

@@ -5,7 +5,7 @@ from diagnostics.events.running_extremes import highest_so_far, lowest_so_far
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 8, 31, 32])
-def test_they_are_what_accumulate_says(frames: int, rng: np.random.Generator):
+def test_they_equal_numpy_accumulate(frames: int, rng: np.random.Generator):
     given = rng.random((frames, 7)).astype(np.float32)
     before = given.copy()
     np.testing.assert_array_equal(lowest_so_far(given), np.minimum.accumulate(given))

@@ -38,7 +38,7 @@ def small_fit(layout: SensorLayout, recordings: int = 3) -> SelfDiagnosis:
     return SelfDiagnosis(layout).fit([force * rng.uniform(0, 3, layout.n_cells) for _ in range(recordings)])
 
 
-def test_a_restored_diagnosis_says_the_same_of_a_log_to_the_last_bit(fitted, log):
+def test_a_restored_diagnosis_gives_the_same_result_to_the_last_bit(fitted, log):
     assert fitted.diagnose(log).faults
     assert stored(fitted).diagnose(log).to_dict() == fitted.diagnose(log).to_dict()
 
@@ -51,7 +51,7 @@ def test_one_without_a_reference_does_too(grasps, log):
     assert restored.diagnose(log).to_dict() == cold.diagnose(log).to_dict()
 
 
-def test_frame_by_frame_it_says_the_same_too(fitted, log):
+def test_frame_by_frame_it_gives_the_same_result(fitted, log):
     was, restored = Monitor(fitted), Monitor(stored(fitted))
     news = [(was.update(frame), restored.update(frame)) for frame in log[:420]]
     assert any(one for one, _ in news)

@@ -14,7 +14,7 @@ NONE = np.zeros(CELLS, bool)
 
 
 class Copycat:
-    """A skin on which all cells are always loaded alike: each does what the trusted ones do on average."""
+    """An array on which all cells are always loaded alike: each does what the predictors do on average."""
 
     def predict(self, features: Array, predictors: np.ndarray) -> Prediction:
         shape = features[:, 0].shape
@@ -28,7 +28,7 @@ class Copycat:
 
 
 class Presser:
-    """Is sure that every touch loads all cells."""
+    """Predicts that every event loads all cells."""
 
     def predict(self, features: Array, predictors: np.ndarray) -> Prediction:
         even = np.ones(features[:, 0].shape)
@@ -57,7 +57,7 @@ class Row:
 
 
 def seen(log: np.ndarray) -> tuple[ConstantRuns, list[ContactEvent]]:
-    """Look at a log that is made of touches of 20 frames each."""
+    """Return the state after a log of events of 20 frames each."""
     runs, events = ConstantRuns.begin(CELLS), []
     for first in range(0, len(log), FRAMES):
         frames = log[first : first + FRAMES]
@@ -68,14 +68,14 @@ def seen(log: np.ndarray) -> tuple[ConstantRuns, list[ContactEvent]]:
     return runs, events
 
 
-def judged(
+def result_of(
     log: np.ndarray,
     wrong: np.ndarray = NONE,
     accumulated: np.ndarray | None = None,
     jump: float = 0.0,
     model: Model | None = None,
 ) -> Spatial:
-    """Judge a log that is made of touches of 20 frames each."""
+    """Test a log of events of 20 frames each."""
     runs, events = seen(log)
     accumulated = np.zeros(CELLS) if accumulated is None else accumulated
     jumps = np.full(CELLS, jump)
@@ -84,18 +84,18 @@ def judged(
 
 
 def pressed(events: int) -> np.ndarray:
-    """All cells are loaded in each touch, from rest to 2 N and back."""
+    """All cells are loaded in each event, from rest to 2 N and back."""
     force = 2 * np.sin(np.linspace(0, np.pi, FRAMES))
     return np.tile(np.repeat(force[:, None], CELLS, axis=1), (events, 1))
 
 
 @pytest.mark.parametrize("value", [0.0, 5.0])
-def test_each_touch_adds_evidence_against_a_cell_that_holds_its_value_through_it(value: float):
+def test_each_event_adds_evidence_against_a_cell_that_holds_its_value_through_it(value: float):
     said = []
     for events in (1, 2, 4, 8):
         log = pressed(events)
         log[:, 3] = value
-        said.append(judged(log).evidence[3])
+        said.append(result_of(log).evidence[3])
     assert (np.diff(said) > 2).all()
 
 
@@ -104,31 +104,31 @@ def test_how_seldom_cells_stick_to_a_value_in_between_is_charged_once():
     for events in (3, 6):
         log = pressed(events)
         log[:, 3], log[:, 4] = 0.0, 2.5
-        spatial = judged(log)
+        spatial = result_of(log)
         charged.append((spatial.surprisal - spatial.evidence)[[3, 4]])
     assert charged[0][1] > charged[0][0] + 2
     assert charged[1] == pytest.approx(charged[0])
 
 
-def test_a_value_that_was_not_expected_says_less_in_touches_in_which_all_loads_are_off():
+def test_an_unexpected_value_is_weaker_evidence_in_events_with_large_errors():
     said = []
     for force in (1.0, 0.1):
         log = force * pressed(4)
         log[:, 3] = 4.5
-        said.append(judged(log, model=Holder()).surprisal[3])
+        said.append(result_of(log, model=Holder()).surprisal[3])
     assert 0 < said[1] < said[0] - 2
 
 
-def test_a_cell_at_rest_is_not_suspected_while_nothing_touches_the_array():
-    spatial = judged(np.zeros((100, CELLS)))
+def test_a_cell_at_rest_is_not_suspected_without_any_event():
+    spatial = result_of(np.zeros((100, CELLS)))
     assert spatial.scored.all()
     assert (spatial.evidence <= 0).all()
 
 
-def test_cells_that_move_are_not_asked_and_have_no_evidence():
+def test_cells_that_move_are_not_scored_and_have_no_evidence():
     log = pressed(4)
     log[:, 3] = 0
-    spatial = judged(log)
+    spatial = result_of(log)
     assert spatial.scored.tolist() == [cell == 3 for cell in range(CELLS)]
     assert (spatial.evidence[~spatial.scored] == 0).all()
     assert spatial.events[3] == 4
@@ -138,73 +138,73 @@ def test_cells_that_move_are_not_asked_and_have_no_evidence():
 def test_cells_that_broke_together_do_not_vouch_for_each_other():
     log = pressed(1)
     log[:, 5:] = 0
-    assert (judged(log, model=Row()).surprisal[5:] < 0.1).all()
+    assert (result_of(log, model=Row()).surprisal[5:] < 0.1).all()
     runs, events = seen(log)
     zero, predictors = np.zeros(CELLS), np.ones(CELLS, bool)
     cells = CellState(runs, zero, zero, zero, predictors, NONE)
     groups = [np.array([5, 6, 7]), np.array([6])]
-    joined, alone = group_excluded_evidence(events, cells, Row(), SCALE, 0.025, predictors, groups)
-    assert (joined[5:] > 1).all()
-    assert alone[6] < 0.1  # the others of its row are asked
+    together, alone = group_excluded_evidence(events, cells, Row(), SCALE, 0.025, predictors, groups)
+    assert (together[5:] > 1).all()
+    assert alone[6] < 0.1  # the others of its row are predictors
 
 
 def test_only_what_came_after_the_onset_speaks_against_a_cell():
     early, late = pressed(6), pressed(6)
     early[:, 3] = 0
     late[80:, 3] = 0
-    assert judged(late).evidence[3] < judged(early).evidence[3] - 4
-    assert judged(late).events[3] == 2
+    assert result_of(late).evidence[3] < result_of(early).evidence[3] - 4
+    assert result_of(late).events[3] == 2
 
 
-def test_a_cell_that_fails_in_the_middle_of_a_touch_is_judged_by_what_came_after():
+def test_a_cell_that_fails_within_an_event_is_tested_on_the_rest_of_it():
     log = pressed(1)
     log[8:, 3] = 0
-    assert judged(log).events[3] == 1
-    assert judged(log).surprisal[3] > 1
+    assert result_of(log).events[3] == 1
+    assert result_of(log).surprisal[3] > 1
 
 
 def test_two_broken_cells_do_not_excuse_each_other():
     one, two = pressed(4), pressed(4)
     one[:, 3] = 0
     two[:, [3, 4, 5]] = 0
-    assert judged(two).evidence[[3, 4, 5]].min() > 5
-    assert judged(two).evidence[3] == pytest.approx(judged(one).evidence[3], abs=2)
+    assert result_of(two).evidence[[3, 4, 5]].min() > 5
+    assert result_of(two).evidence[3] == pytest.approx(result_of(one).evidence[3], abs=2)
 
 
-def test_cells_known_to_be_wrong_are_neither_asked_nor_judged():
+def test_cells_known_to_be_faulty_are_neither_predictors_nor_scored():
     log = pressed(4)
     log[:, 3] = 0
     log[:, 6] = 4 - log[:, 6]
     wrong = np.arange(CELLS) == 3
-    spatial = judged(log, wrong)
+    spatial = result_of(log, wrong)
     assert not spatial.scored[3]
     assert spatial.evidence[3] == 0
 
 
-def test_evidence_of_earlier_touches_is_kept():
+def test_evidence_of_earlier_events_is_kept():
     log = pressed(2)
     log[:, 3] = 0
     accumulated = np.full(CELLS, 7.0)
-    assert judged(log, accumulated=accumulated).evidence[3] == pytest.approx(judged(log).evidence[3] + 7)
+    assert result_of(log, accumulated=accumulated).evidence[3] == pytest.approx(result_of(log).evidence[3] + 7)
 
 
-def test_a_touch_that_surprises_the_cells_that_move_says_little_about_the_others():
+def test_an_event_that_surprises_the_moving_cells_is_weak_evidence_about_the_others():
     said, slope = [], np.linspace(0.3, 1, CELLS)
     for surprised in (0, 2, 4):
-        log = pressed(2) * np.repeat([slope, slope[::-1]], FRAMES, axis=0)  # no touch repeats the other
+        log = pressed(2) * np.repeat([slope, slope[::-1]], FRAMES, axis=0)  # no event repeats the other
         log[:, 3] = 0.0
         log[FRAMES:, 4 : 4 + surprised] = 0.0
-        said.append(judged(log, model=Presser()).surprisal[3])
+        said.append(result_of(log, model=Presser()).surprisal[3])
     assert said[0] > said[1] + 0.4 > said[2] + 0.6
 
 
 @pytest.mark.parametrize("one_is_still", [True, False])
-def test_a_cell_that_moves_but_never_comes_to_rest_has_an_offset(one_is_still: bool):
+def test_a_cell_that_moves_but_never_returns_to_its_baseline_has_an_offset(one_is_still: bool):
     log = pressed(6)
     log[:, 3] = 2 + 0.2 * log[:, 3] + np.linspace(0, 1, len(log))
     if one_is_still:
         log[:, 7] = 0
-    offset = judged(log).offset
+    offset = result_of(log).offset
     assert offset[3] > 4
     assert (np.delete(offset, 3) == 0).all()
 
@@ -213,21 +213,21 @@ def test_an_offset_that_ended_is_forgotten():
     log = pressed(6)
     log[:100, 3] = 2 + 0.2 * log[:100, 3]
     log[:, 7] = 0
-    assert judged(log).offset[3] == 0
+    assert result_of(log).offset[3] == 0
 
 
 def test_beside_a_cell_with_a_wrong_gain_no_other_is_accused():
     log = pressed(12)
     log[:, 3] *= 0.1
-    known_values = judged(log)
-    assert np.flatnonzero(known_values.drifting).tolist() == [3]
-    assert known_values.factor[3] == 0.1
-    assert np.isnan(np.delete(known_values.factor, 3)).all()
+    result = result_of(log)
+    assert np.flatnonzero(result.drifting).tolist() == [3]
+    assert result.factor[3] == 0.1
+    assert np.isnan(np.delete(result.factor, 3)).all()
 
 
 def test_a_cell_that_got_stuck_has_no_wrong_gain():
     log = pressed(12)
     log[60:, 3] = 0.3
-    known_values = judged(log)
-    assert known_values.evidence[3] > 4
-    assert not known_values.drifting.any()
+    result = result_of(log)
+    assert result.evidence[3] > 4
+    assert not result.drifting.any()

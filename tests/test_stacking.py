@@ -1,4 +1,4 @@
-"""What the loads around a cell say of its own."""
+"""Stacking of the local regressions with the loads around each cell."""
 
 import numpy as np
 import pytest
@@ -11,30 +11,30 @@ PRESENT = np.ones((2, 5, 6), bool)
 PRESENT[1, 0, :2] = False
 LAYOUT = SensorLayout(2, 5, 6, present=PRESENT)
 ALL = np.ones(60, bool)
-STRETCHES = 7
+EXCERPTS = 7
 
 
 def touched(seed: int) -> np.ndarray:
-    """Features of stretches in which each cell is loaded or not, by chance."""
+    """Return features of excerpts in which each cell is loaded at random."""
     rng = np.random.default_rng(seed)
-    features = rng.random((STRETCHES, 4, 60)).astype(np.float32)
+    features = rng.random((EXCERPTS, 4, 60)).astype(np.float32)
     features[:, 2] = features[:, 2] > 0.5
     return features * LAYOUT.present.ravel()
 
 
 def regressed(value: float = 0.0) -> RegressionOutput:
-    return RegressionOutput(*np.full((4, STRETCHES, 60), value))
+    return RegressionOutput(*np.full((4, EXCERPTS, 60), value))
 
 
-def known_values(features: np.ndarray, predictors: np.ndarray = ALL) -> np.ndarray:
-    """The means over rings, pad and array, ``[5, 4, D, n]``."""
-    return neighbourhood(regressed(), features, predictors, LAYOUT)[8:].reshape(5, 4, 60, STRETCHES)
+def means(features: np.ndarray, predictors: np.ndarray = ALL) -> np.ndarray:
+    """Return the means over rings, pad and array, ``[5, 4, D, n]``."""
+    return neighbourhood(regressed(), features, predictors, LAYOUT)[8:].reshape(5, 4, 60, EXCERPTS)
 
 
 @pytest.mark.parametrize("predictors", [ALL, np.random.default_rng(5).random(60) < 0.6], ids=["all", "some"])
-def test_each_ring_is_the_mean_of_its_trusted_cells_nearly(predictors: np.ndarray):
+def test_each_ring_is_the_shrunk_mean_of_its_predictors(predictors: np.ndarray):
     features = touched(0)
-    rings = known_values(features, predictors)
+    rings = means(features, predictors)
     scored = predictors & LAYOUT.present.ravel()
     for cell in range(60):
         pad, row, column = LAYOUT.position(cell)
@@ -55,15 +55,15 @@ def test_each_ring_is_the_mean_of_its_trusted_cells_nearly(predictors: np.ndarra
         np.testing.assert_allclose(rings[4][:, cell].T, overall, atol=1e-5)
 
 
-def test_of_some_cells_it_says_what_it_says_of_all():
+def test_features_of_some_cells_are_those_of_all():
     rng, cells = np.random.default_rng(6), np.array([1, 8, 33, 59])
-    said = RegressionOutput(*rng.normal(size=(4, STRETCHES, 60)))
+    said = RegressionOutput(*rng.normal(size=(4, EXCERPTS, 60)))
     predictors = rng.random(60) < 0.7
     of_all = neighbourhood(said, touched(4), predictors, LAYOUT)
     np.testing.assert_array_equal(neighbourhood(said, touched(4), predictors, LAYOUT, cells), of_all[:, cells])
 
 
-def test_what_a_cell_does_itself_says_nothing_of_it():
+def test_the_features_of_a_cell_do_not_use_its_own_reading():
     features = touched(1)
     for cell in (0, 14, 40):
         changed = features.copy()
@@ -72,7 +72,7 @@ def test_what_a_cell_does_itself_says_nothing_of_it():
         np.testing.assert_allclose(after, before, atol=1e-5)
 
 
-def test_what_an_untrusted_cell_does_says_nothing_of_any():
+def test_no_feature_uses_a_cell_that_is_no_predictor():
     features = touched(2)
     predictors = ~np.isin(np.arange(60), (8, 45))
     changed = features.copy()
@@ -88,13 +88,13 @@ def test_a_cell_between_two_loaded_ones_is_enclosed_and_one_beside_them_is_not()
     assert enclosed.sum() == pytest.approx(0.8)
 
 
-def test_with_no_cell_to_ask_there_is_no_load_and_all_is_finite():
+def test_without_predictors_all_features_are_finite_and_loads_0():
     assert np.isfinite(neighbourhood(regressed(), touched(3), ~ALL, LAYOUT)).all()
-    assert not known_values(touched(3), ~ALL).any()
+    assert not means(touched(3), ~ALL).any()
 
 
 @pytest.mark.parametrize("events", [5, 500])
-def test_it_learns_to_doubt_regressions_that_are_wrong_and_to_believe_those_that_are_right(events: int):
+def test_it_weights_regressions_by_their_accuracy(events: int):
     rng = np.random.default_rng(0)
     samples = rng.normal(size=(20_000, N_FEATURES))
     sure = rng.normal(0, 3, 20_000)
@@ -107,7 +107,7 @@ def test_it_learns_to_doubt_regressions_that_are_wrong_and_to_believe_those_that
     assert np.abs(always - 0.5).mean() < 0.1
 
 
-def test_it_hears_the_rings_where_the_regressions_say_nothing():
+def test_it_uses_the_rings_where_the_regressions_are_uninformative():
     rng = np.random.default_rng(1)
     samples = rng.normal(size=(4000, N_FEATURES))
     samples[:, :2] = 0
@@ -118,7 +118,7 @@ def test_it_hears_the_rings_where_the_regressions_say_nothing():
 
 
 @pytest.mark.parametrize("events", [1, 500])
-def test_many_touches_teach_it_what_only_two_rings_together_say_and_few_do_not(events: int):
+def test_it_learns_an_interaction_of_two_rings_from_many_events_only(events: int):
     rng = np.random.default_rng(2)
     samples = rng.normal(size=(20_000, N_FEATURES))
     samples[:, :2] = 0

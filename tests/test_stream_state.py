@@ -86,7 +86,7 @@ def test_looking_at_it_in_between_changes_nothing():
     same(stream.complete(), remembered(log))
 
 
-def test_a_completed_memory_leaves_the_first_one_as_it_was():
+def test_completing_a_state_leaves_it_as_it_was():
     log = pressed(3)[:50]
     stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
     stream.extend(log)
@@ -109,7 +109,7 @@ def test_it_stays_of_constant_size_over_a_long_log():
     assert len(stream.transport.repetitions) < 100
 
 
-def test_evidence_of_touches_that_were_let_go_still_counts():
+def test_evidence_of_dropped_events_still_counts():
     cell = LAYOUT.cell(0, 2, 2)
     log = inject(pressed(200), [Fault("open", (cell,))], LAYOUT)
     stream = remembered(log)
@@ -120,7 +120,7 @@ def test_evidence_of_touches_that_were_let_go_still_counts():
     assert evidence > without + 5
 
 
-def test_settled_evidence_ends_with_the_stretch_that_it_belongs_to():
+def test_accumulated_evidence_ends_with_its_constant_run():
     cell = LAYOUT.cell(0, 2, 2)
     log = inject(pressed(250), [Fault("open", (cell,))], LAYOUT, until=5500)
     stream = remembered(log[:5500])
@@ -128,7 +128,7 @@ def test_settled_evidence_ends_with_the_stretch_that_it_belongs_to():
     assert remembered(log).accumulated[cell] < 3
 
 
-def test_missed_frames_are_counted_and_say_nothing_of_cells():
+def test_missed_frames_are_counted_and_are_no_evidence_about_cells():
     log = pressed(10)
     stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
     stream.extend(log[:100])
@@ -147,7 +147,7 @@ def test_a_cell_that_delivers_a_reading_now_and_then_was_heard():
     assert remembered(log).received.tolist() == [cell != 7 for cell in range(60)]
 
 
-def test_a_frozen_stream_makes_no_cell_still(grasps: Recordings):
+def test_a_frozen_stream_makes_no_cell_constant(grasps: Recordings):
     layout = grasps.layout
     log = np.concatenate([grasps.frames[i] for i in (30, 50, 70)]).astype(float)
     stream = StreamState(layout, Reference.unknown(layout), Exclusion(2.0))

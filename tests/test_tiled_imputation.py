@@ -8,8 +8,9 @@ from adaptfault.adaptation import adapter as adapter_module
 from adaptfault.adaptation.adapter import Adapter
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.data.windows import Windows
-from adaptfault.imputation.linear import CellStatistics
-from adaptfault.imputation.tiled import TiledFill, TiledStatistics
+from adaptfault.imputation.statistics import CellStatistics
+from adaptfault.imputation.tiled import TiledFill
+from adaptfault.imputation.tiled_statistics import TiledStatistics
 from adaptfault.models.network import TactileTransformer
 from diagnostics import FaultSet, Line, SensorLayout
 
@@ -127,3 +128,20 @@ def test_an_adapter_of_a_large_array_fills_patch_by_patch_and_comes_back_from_di
     x = torch.from_numpy(windows.x[..., fault_set.healthy])
     with torch.no_grad():
         torch.testing.assert_close(again.model(x), adaptation.model(x), rtol=0, atol=0)
+
+
+def test_broken_wires_of_a_skin_with_few_contacts_are_imputed_better_than_by_the_mean():
+    layout = SensorLayout(6, 16, 16)
+    pair = (*layout.cells_on(Line(2, "row", 6)), *layout.cells_on(Line(2, "row", 7)))
+    wires = FaultSet((*(int(cell) for cell in pair), *layout.cells_on(Line(4, "column", 9)).tolist()), layout.n_cells)
+    fill = TiledStatistics.fit(presses(layout, 12, 0), layout).nearest(wires)
+    assert explained(fill, presses(layout, 200, 1).x, wires) > 0.5
+
+
+def test_noise_is_imputed_by_its_mean_and_the_deviation_is_the_noise():
+    noise = np.random.default_rng(0).uniform(0.2, 0.6, (4000, 1, SKIN.n_cells)).astype(np.float32)
+    statistics = TiledStatistics.fit(Windows(noise, np.zeros(4000), np.arange(4000)), SKIN)
+    parts, _ = statistics.parts(F)
+    assert max(np.linalg.norm(part.weight, axis=1).max() for part in parts) < 0.25  # of the deviation of a cell
+    deviation = np.concatenate([part.deviation for part in parts])
+    np.testing.assert_allclose(deviation, 0.4 / 12**0.5, rtol=0.15)

@@ -1,4 +1,4 @@
-"""What healthy looks like on a large array: each patch is judged as a small array of its own."""
+"""The healthy model of a large array: each tile is predicted as a small array of its own."""
 
 import json
 
@@ -28,7 +28,7 @@ def grasps(n: int, seed: int) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    return SelfDiagnosis(SKIN).fit(grasps(2, 0))  # so few that the weights are the usual ones
+    return SelfDiagnosis(SKIN).fit(grasps(2, 0))  # so few that the calibration is the default
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +36,8 @@ def model(fitted: SelfDiagnosis) -> HealthyModel:
     return fitted.reference_.model
 
 
-def touched(tile: Tile) -> tuple[np.ndarray, np.ndarray]:
-    """Features ``[n, 4, inputs]`` of touches by chance, and whether each cell may be asked."""
+def random_events(tile: Tile) -> tuple[np.ndarray, np.ndarray]:
+    """Return random features ``[n, 4, inputs]`` of events, and random predictors."""
     rng = np.random.default_rng(0)
     n = len(tile.inputs)
     features = rng.random((9, 4, n)).astype(np.float32)
@@ -46,7 +46,7 @@ def touched(tile: Tile) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("i", [0, 2, 4], ids=["a corner without cells", "a corner", "the middle, one cell absent"])
-def test_a_patch_is_judged_as_a_small_array_of_the_same_cells(fitted: SelfDiagnosis, model: HealthyModel, i: int):
+def test_a_tile_is_predicted_as_a_small_array_of_the_same_cells(fitted: SelfDiagnosis, model: HealthyModel, i: int):
     regression, tile = model.local_regressions[i], model.local_regressions[i].tile
     positions = np.array([SKIN.position(c) for c in tile.inputs.tolist()])[:, 1:]
     (top, left), (bottom, right) = positions.min(axis=0), positions.max(axis=0)
@@ -55,19 +55,19 @@ def test_a_patch_is_judged_as_a_small_array_of_the_same_cells(fitted: SelfDiagno
     arrays = {name: value for name, value in vars(regression).items() if name not in ("inputs", "outputs")}
     alone = HealthyModel((LocalRegression(cells, cells[regression.place], **arrays),), small, model.stacking)
 
-    features, predictors = touched(tile)
+    features, predictors = random_events(tile)
     padded, scored = np.full((9, 4, small.n_cells), 0.5, np.float32), np.ones(small.n_cells, bool)
     padded[:, :, cells], scored[cells] = features, predictors
     expected = alone.predict(padded, scored)
     said = fitted.stream().model_of(i, EventLog()).predict(features, predictors)
     for name in ("never", "always", "mean"):
-        wanted = getattr(expected, name)[:, cells[regression.place]]
-        np.testing.assert_allclose(getattr(said, name)[:, regression.place], wanted, atol=1e-5, err_msg=name)
+        expected_values = getattr(expected, name)[:, cells[regression.place]]
+        np.testing.assert_allclose(getattr(said, name)[:, regression.place], expected_values, atol=1e-5, err_msg=name)
     without = HealthyModel(alone.local_regressions, small).predict(padded, scored)
-    assert np.abs(without.never - expected.never).max() > 0.05  # the rim has a say
+    assert np.abs(without.never - expected.never).max() > 0.05  # the stacking matters
 
 
-def test_a_diagnosis_that_has_judged_is_stored_with_its_rim_to_the_last_bit(fitted: SelfDiagnosis):
+def test_a_diagnosis_is_stored_with_its_stacking_to_the_last_bit(fitted: SelfDiagnosis):
     log = inject(np.concatenate(grasps(1, 1)), [Fault(FaultKind.OPEN, (210,))], SKIN)
     before = fitted.diagnose(log)
     about, arrays = fitted.state()
@@ -86,7 +86,7 @@ def test_what_absent_cells_read_changes_nothing_and_they_are_never_faulty(fitted
     assert not diagnosis.probability[~PRESENT.ravel()].any()
 
 
-def test_dead_cells_of_a_large_array_are_found_and_no_healthy_one_is_blamed(fitted: SelfDiagnosis):
+def test_dead_cells_of_a_large_array_are_found_and_no_healthy_one_is_reported(fitted: SelfDiagnosis):
     healthy = np.concatenate(grasps(3, 3))
     often = np.flatnonzero((healthy > 0.5).mean(axis=0) > 0.2)  # held in many of the grasps
     dead = np.random.default_rng(0).choice(often, 12, replace=False).tolist()
@@ -97,6 +97,6 @@ def test_dead_cells_of_a_large_array_are_found_and_no_healthy_one_is_blamed(fitt
     assert not fitted.diagnose(healthy).faults
 
 
-def test_patches_that_were_hardly_touched_teach_no_rim():
+def test_tiles_with_hardly_any_event_give_no_stacking():
     scale = Scale(np.zeros(SKIN.n_cells), 0.05, 5.0)
     assert fit_healthy_model(grasps(1, 0)[:1], SKIN, scale).stacking is None

@@ -37,7 +37,7 @@ def fitted() -> SelfDiagnosis:
     return SelfDiagnosis(SKIN).fit([log(SKIN, 199, seed) for seed in range(7)])
 
 
-def test_each_cell_is_judged_in_one_patch_by_all_cells_near_it_on_its_pad():
+def test_each_cell_is_an_output_of_one_tile_with_all_cells_near_it_on_its_pad_as_inputs():
     present = np.ones((2, 30, 21), bool)
     present[0, :9, :9] = False
     layout = SensorLayout(2, 30, 21, present=present)
@@ -53,7 +53,7 @@ def test_each_cell_is_judged_in_one_patch_by_all_cells_near_it_on_its_pad():
             assert set(np.flatnonzero(block & present).tolist()) <= near
 
 
-def test_cells_of_a_row_that_runs_through_several_patches_are_judged_with_none_of_them_asked(fitted):
+def test_a_row_across_several_tiles_is_excluded_from_the_predictors_as_a_group(fitted):
     row = SKIN.cells_on(Line(0, "row", 11))
     stream = fitted.stream()
     stream.extend(inject(log(SKIN, 100, 40), [line_fault(SKIN, Line(0, "row", 11), FaultKind.OPEN)], SKIN))
@@ -65,12 +65,12 @@ def test_cells_of_a_row_that_runs_through_several_patches_are_judged_with_none_o
     assert of_one[row[0]] == pytest.approx(spatial.surprisal[row[0]], abs=0.5)
 
 
-def test_an_array_of_a_few_hundred_cells_is_one_patch():
+def test_an_array_of_a_few_hundred_cells_is_one_tile():
     assert len(tiles(SensorLayout.paper())) == 1
     assert len(tiles(SensorLayout(2, 13, 6))) == 1
 
 
-def test_a_patch_in_which_nothing_moves_costs_nothing():
+def test_a_tile_in_which_nothing_moves_is_not_processed():
     events, still, numbers = TiledEvents.begin(tiles(SKIN)), np.ones(SKIN.n_cells, bool), np.arange(32)
     still[SKIN.cell(1, 12, 12)] = False
     frames = np.zeros((32, SKIN.n_cells))
@@ -83,7 +83,7 @@ def test_a_patch_in_which_nothing_moves_costs_nothing():
     assert 0 < len(touched) < len(events.tiles)
 
 
-def test_dead_cells_rows_and_a_bridge_are_found_and_hardly_a_healthy_cell_is_blamed(fitted):
+def test_dead_cells_rows_and_a_bridge_are_found_and_hardly_a_healthy_cell_is_reported(fitted):
     rng = np.random.default_rng(0)
     faults = [Fault(FaultKind.SHORT, (int(c),)) for c in rng.choice(SKIN.n_cells // 2, 12, replace=False)]
     faults += [line_fault(SKIN, Line(0, "row", 15), FaultKind.OPEN), bridge(SKIN, Line(1, "column", 10))]
@@ -105,9 +105,9 @@ def test_a_healthy_log_raises_no_alarm(fitted):
     assert not fitted.diagnose([log(SKIN, 300, 70), log(SKIN, 300, 71)]).faults
 
 
-def test_a_cell_shorted_where_nothing_touches_is_found_and_what_lies_there_is_no_fault(fitted):
+def test_a_short_without_any_contact_is_found_and_an_object_at_rest_there_is_no_fault(fitted):
     frames = log(SKIN, 400, 80)
-    frames.reshape(400, *SKIN.shape)[:, 1] = 0.0  # nothing touches pad 1
+    frames.reshape(400, *SKIN.shape)[:, 1] = 0.0  # no contact on pad 1
     short = SKIN.cell(1, 12, 12)
     found = fitted.diagnose(inject(frames, [Fault(FaultKind.SHORT, (short,))], SKIN)).fault_set
     assert found == {short}
@@ -119,7 +119,7 @@ def test_a_cell_shorted_where_nothing_touches_is_found_and_what_lies_there_is_no
         assert not fitted.diagnose(lies).fault_set
 
 
-def test_the_monitor_says_what_the_diagnosis_says(fitted):
+def test_monitor_and_diagnosis_agree(fitted):
     fault = line_fault(SKIN, Line(0, "column", 9), FaultKind.SHORT, onset=40)
     frames = inject(log(SKIN, 200, 80), [fault], SKIN)
     monitor = Monitor(fitted)
@@ -128,11 +128,11 @@ def test_the_monitor_says_what_the_diagnosis_says(fitted):
     assert monitor.diagnosis().to_dict() == fitted.diagnose(frames).to_dict()
 
 
-def test_touches_that_are_let_go_leave_their_evidence(fitted, monkeypatch):
+def test_dropped_events_leave_their_evidence(fitted, monkeypatch):
     monkeypatch.setattr("diagnostics.evidence.stream_state.MAX_EVENTS", 3)
     monkeypatch.setattr("diagnostics.evidence.stream_state.KEPT_EVENTS", 2)
     healthy, stream = log(SKIN, 600, 90), fitted.stream()
-    dead = np.argsort((healthy > 0.5).sum(axis=0))[[-1, -100, -200]]  # often touched
+    dead = np.argsort((healthy > 0.5).sum(axis=0))[[-1, -100, -200]]  # often loaded
     frames = inject(healthy, [Fault(FaultKind.OPEN, (int(cell),)) for cell in dead], SKIN)
     stream.extend(frames)
     assert max(len(events.kept) for events in stream.local.of) <= 5
@@ -143,7 +143,7 @@ def test_touches_that_are_let_go_leave_their_evidence(fitted, monkeypatch):
     np.testing.assert_array_equal(frame_by_frame.complete().accumulated, stream.complete().accumulated)
 
 
-def test_a_dead_row_of_a_skin_of_10000_cells_is_found_without_a_reference():
+def test_a_dead_row_of_an_array_of_10000_cells_is_found_without_a_reference():
     layout = SensorLayout(1, 100, 100, rate=20.0)
     fault = line_fault(layout, Line(0, "row", 50), FaultKind.SHORT)
     found = SelfDiagnosis(layout).diagnose(inject(log(layout, 120, 0, (46, 54)), [fault], layout))
@@ -151,7 +151,7 @@ def test_a_dead_row_of_a_skin_of_10000_cells_is_found_without_a_reference():
     assert set(fault.cells) <= set(found.fault_set)
 
 
-def test_memory_for_a_cell_grows_with_the_cells_neither_in_fitting_nor_in_diagnosing():
+def test_memory_per_cell_does_not_grow_with_the_array_in_fitting_or_diagnosing():
     peaks = []
     for pads in (2, 6):
         layout = SensorLayout(pads, 16, 16)

@@ -1,4 +1,4 @@
-"""The adapter on disk, small enough for a robot: weights, and fault-free windows in converter steps. No pickle."""
+"""The adapter on disk, small enough for a robot: weights and quantised fault-free windows. No pickle."""
 
 from __future__ import annotations
 
@@ -13,30 +13,38 @@ from torch import Tensor
 
 from adaptfault.adaptation.adapter import Adapter
 from adaptfault.data.windows import Windows, evenly
-from adaptfault.imputation.linear import CellStatistics
-from adaptfault.models.network import TactileTransformer
+from adaptfault.imputation.statistics import CellStatistics
+from adaptfault.models.any_model import network_from_config
+from adaptfault.models.builders import ModelNotAllowed
 from adaptfault.models.store import load_tensors, save_tensors
 
 SCHEMA = "adaptfault.adapter/1"
 WINDOWS_SCHEMA = "adaptfault.windows/1"
-LIMIT = 20_000_000  # bytes: what the paper's layout must fit into
+LIMIT = 20_000_000  # bytes of an adapter
 
-_SHARE = 0.5  # of the limit is the most that windows take if the weights then still fit
-_FINEST = 1 / 4095  # step for readings that show no converter steps: a 12-bit converter's
+_SHARE = 0.5  # of the limit: the most that windows take
+_FINEST = 1 / 4095  # step for readings without visible converter steps: a 12-bit converter
 _MOST_STEPS = 65_535
 _OVERHEAD = 100_000  # bytes for names, labels and JSON
 
 
 def save_adapter(path: str | Path, adapter: Adapter, *, limit: int = LIMIT) -> None:
-    """Write all that an adaptation needs into a folder of at most ``limit`` bytes.
+    """Write everything an adaptation needs into a folder of at most ``limit`` bytes.
 
-    Readings are kept exactly where they are whole converter steps, else to 12 bits. If the windows need more than half
-    of the room, they are thinned evenly. The weights take what is left: 32-bit floats, or 16-bit ones, or 8-bit
-    integers with a scale for each row, the first that fits. What was kept is told in ``manifest.json``.
+    Readings that are whole converter steps are stored exactly, others with 12 bits. Windows that need more than half of
+    the limit are thinned evenly. The weights use the first format that fits the rest: 32-bit floats, 16-bit floats, or
+    8-bit integers with a scale for each row. ``manifest.json`` records the choices.
 
     Raises:
-        ValueError: it does not fit, even so.
+        ValueError: the smallest format does not fit, or the model can not be rebuilt (a module without builder).
     """
+    if "module" in adapter.model.config and adapter.model.config["builder"] is None:
+        raise ValueError(
+            f"{adapter.model.config['module']} cannot be rebuilt from a file: make it with"
+            " build_model('package.module:function', layout, n_classes)"
+        )
+    if adapter.task == "regression":
+        raise ValueError("the adapter of a regression cannot be saved: its targets are no classes")
     statistics = adapter.statistics
     upper = np.triu_indices(len(statistics.mean))
     tensors: dict[str, Tensor] = {
@@ -48,9 +56,9 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int = LIMIT) -> N
     parts = {"train": (adapter.train, adapter.targets), "validation": (adapter.validation, adapter.validation_targets)}
     n = sum(len(windows) for windows, _ in parts.values())
     for name, (windows, targets) in parts.items():
-        packed, told = _pack_thinned(windows, targets, int(_SHARE * room * len(windows) / n))
+        packed, packing = _pack_thinned(windows, targets, int(_SHARE * room * len(windows) / n))
         tensors |= {f"{name}.{key}": value for key, value in packed.items()}
-        about[name] = told
+        about[name] = packing
     room = limit - _OVERHEAD - _bytes(tensors)
     choices = {"float32": _whole, "float16": _half, "int8": _eighth}
     for about["weights_as"], shrink in choices.items():
@@ -67,12 +75,12 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int = LIMIT) -> N
 
 def save_windows(path: str | Path, windows: Windows, *, limit: int = LIMIT // 4) -> None:
     """Write windows into a folder as :func:`save_adapter` does, thinned evenly to ``limit`` bytes."""
-    packed, told = _pack_thinned(windows, np.zeros((len(windows), 0), np.float32), limit)
-    save_tensors(path, WINDOWS_SCHEMA, {"windows": told}, {f"windows.{key}": value for key, value in packed.items()})
+    packed, packing = _pack_thinned(windows, np.zeros((len(windows), 0), np.float32), limit)
+    save_tensors(path, WINDOWS_SCHEMA, {"windows": packing}, {f"windows.{key}": value for key, value in packed.items()})
 
 
 def load_windows(path: str | Path) -> Windows:
-    """Read what :func:`save_windows` wrote; raises what :func:`load_adapter` raises."""
+    """Read windows written by :func:`save_windows`; raises the errors of :func:`load_adapter`."""
     about, tensors = load_tensors(path, WINDOWS_SCHEMA)
     try:
         return _unpack(about["windows"], tensors, "windows")
@@ -81,7 +89,7 @@ def load_windows(path: str | Path) -> Windows:
 
 
 def load_adapter(path: str | Path) -> Adapter:
-    """Read what :func:`save_adapter` wrote.
+    """Read an adapter written by :func:`save_adapter`.
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -89,7 +97,7 @@ def load_adapter(path: str | Path) -> Adapter:
     """
     about, tensors = load_tensors(path, SCHEMA)
     try:
-        model = TactileTransformer.from_config(about["network"])
+        model = network_from_config(about["network"])
         model.load_state_dict(_restore({k.removeprefix("model."): v for k, v in tensors.items() if k[:6] == "model."}))
         adapter = Adapter(model.eval(), *(_unpack(about[name], tensors, name) for name in ("train", "validation")))
         adapter.targets, adapter.validation_targets = (
@@ -101,6 +109,8 @@ def load_adapter(path: str | Path) -> Adapter:
         covariance = np.triu(covariance) + np.triu(covariance, 1).T
         frames = CellStatistics.reference(adapter.train)
         adapter.statistics = CellStatistics(tensors["statistics.mean"].numpy(), covariance, frames)
+    except ModelNotAllowed:
+        raise
     except (KeyError, TypeError, ValueError, RuntimeError, zlib.error) as error:
         raise ValueError(f"the adapter in {path} is damaged: {str(error).splitlines()[0]}") from None
     return adapter
@@ -111,13 +121,13 @@ def _bytes(tensors: dict[str, Tensor]) -> int:
 
 
 def _pack_thinned(windows: Windows, targets: NDArray[Any], room: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Pack windows, as many as fit, and say how they are packed."""
+    """Pack as many windows as fit; return them and the packing parameters."""
     keep = len(windows)
     while True:
         which = evenly(len(windows), keep)
-        packed, told = _pack(windows.select(which), targets[which])
+        packed, packing = _pack(windows.select(which), targets[which])
         if (size := _bytes(packed)) <= room or keep == 1:
-            return packed, {**told, "of": len(windows)}
+            return packed, {**packing, "of": len(windows)}
         keep = max(1, min(keep - 1, int(keep * room / size)))
 
 
@@ -136,18 +146,18 @@ def _pack(windows: Windows, targets: NDArray[Any]) -> tuple[dict[str, Tensor], d
     return packed, {"shape": list(windows.x.shape), "low": low, "step": step}
 
 
-def _unpack(told: dict[str, Any], tensors: dict[str, Tensor], name: str) -> Windows:
-    n, t, d = told["shape"]
+def _unpack(packing: dict[str, Any], tensors: dict[str, Tensor], name: str) -> Windows:
+    n, t, d = packing["shape"]
     size = 2 * n * t * d
-    data = zlib.decompressobj().decompress(tensors[f"{name}.x"].numpy().tobytes(), size)  # never more than it should be
+    data = zlib.decompressobj().decompress(tensors[f"{name}.x"].numpy().tobytes(), size)  # at most the expected size
     counts = np.frombuffer(data, np.uint8).reshape(2, -1).T.copy().view(np.uint16).reshape(n, t, d)
     counts = np.cumsum(counts, axis=1, dtype=np.uint16)
-    x = (told["low"] + counts * told["step"]).astype(np.float32)
+    x = (packing["low"] + counts * packing["step"]).astype(np.float32)
     return Windows(x, tensors[f"{name}.y"].numpy(), tensors[f"{name}.recording"].numpy())
 
 
 def _steps(x: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the lowest reading and the converter's step, or a fine enough one where the readings show none."""
+    """Return the lowest reading and the converter step, or a 12-bit step if the readings show none."""
     values = np.unique(x).astype(np.float64)
     low, width = float(values[0]), float(values[-1] - values[0])
     gaps = np.diff(values)
@@ -189,7 +199,7 @@ _SCALE = ":scale"
 
 
 def _restore(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Undo :func:`_half` or :func:`_eighth`, as far as can be."""
+    """Undo :func:`_half` or :func:`_eighth`, up to rounding."""
     whole = {}
     for name, tensor in state.items():
         if name.endswith(_SCALE):

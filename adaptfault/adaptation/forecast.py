@@ -1,4 +1,4 @@
-"""What accuracy to expect after a repair, said before it is made."""
+"""Expected accuracy after a repair, estimated before the repair."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.evaluation.scores import accuracy_interval
+from adaptfault.evaluation.scores import accuracy_interval, mean_interval
 from diagnostics import FaultSet
 
 SCHEMA = "adaptfault.forecast/1"
@@ -17,12 +17,12 @@ SCHEMA = "adaptfault.forecast/1"
 
 @dataclass(frozen=True)
 class Expected:
-    """An accuracy to expect.
+    """An expected accuracy, or R2 of a regression.
 
     Attributes:
         accuracy: on the validation windows.
-        low, high: 95 % interval for as many *new* recordings as validation has: theirs vary as much as these, so it is
-            wider by the root of 2 than the interval of the mean, which is clustered by recording.
+        low, high: 95 % interval for as many *new* recordings as validation has. It is wider by the root of 2 than the
+            interval of the mean (clustered by recording), because the new recordings vary as much.
     """
 
     accuracy: float
@@ -35,16 +35,16 @@ class Expected:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What accuracy to expect of each stage of a repair, in the order of their cost.
+    """Expected accuracy of each stage of a repair, in the order of their cost.
 
     Attributes:
         fault_set: F.
         stages: "fault-free", "fill" and "head", measured on validation windows with F taken away; "finetune" and
-            "scratch", which only training could measure: the head's accuracy, with an interval that reaches up to the
-            fault-free one's. With F empty, "fault-free" alone.
-        worst_class: the class that loses most at the best measured stage; None with F empty.
-        worst_loss: of its recall, 0..1.
-        n_recordings: that it rests on.
+            "scratch" need training, so they have the accuracy of the best measured stage and an interval that extends
+            to that of the fault-free model. With F empty, "fault-free" alone.
+        worst_class: the class that loses most recall at the best measured stage; None with F empty or a regression.
+        worst_loss: loss of its recall, 0..1.
+        n_recordings: number of validation recordings.
     """
 
     fault_set: FaultSet
@@ -66,14 +66,33 @@ class Forecast:
         count = len(np.unique(recording))
         if len(predicted) == 1:
             return cls(fault_set, stages, None, 0.0, count)
-        best = max(stages["fill"], stages["head"], key=lambda e: e.accuracy)
-        trained = Expected(best.accuracy, best.low, max(best.high, stages["fault-free"].high))
-        stages |= {"finetune": trained, "scratch": trained}
+        best = _add_trained(stages)
         last = predicted["fill" if best is stages["fill"] else "head"]
         classes = np.unique(y)
         lost = [((predicted["fault-free"] == y) * 1.0 - (last == y))[y == c].mean() for c in classes]
         worst = int(np.argmax(lost))
         return cls(fault_set, stages, int(classes[worst]), float(lost[worst]), count)
+
+    @classmethod
+    def of_values(
+        cls,
+        fault_set: FaultSet,
+        y: NDArray[np.float32],
+        recording: NDArray[np.int64],
+        predicted: Mapping[str, NDArray[np.float32]],
+    ) -> Forecast:
+        """Build a forecast from the values ``[N, k]`` that each measured stage predicted for validation windows."""
+        total = ((y - y.mean(axis=0)) ** 2).mean(axis=0)
+        total = np.where(total > 0, total, 1.0)
+        stages = {}
+        for name, values in predicted.items():
+            explained = 1 - ((values - y) ** 2 / total).mean(axis=1)  # its mean is R2
+            low, high = mean_interval(explained, recording)
+            r2, wider = float(explained.mean()), np.sqrt(2)
+            stages[name] = Expected(r2, r2 - wider * (r2 - low), min(1.0, r2 + wider * (high - r2)))
+        if len(predicted) > 1:
+            _add_trained(stages)
+        return cls(fault_set, stages, None, 0.0, len(np.unique(recording)))
 
     def __str__(self) -> str:
         k = len(self.fault_set)
@@ -93,6 +112,14 @@ class Forecast:
             "worst_loss": self.worst_loss,
             "n_recordings": self.n_recordings,
         }
+
+
+def _add_trained(stages: dict[str, Expected]) -> Expected:
+    """Add the stages that need training; return the best measured one."""
+    best = max(stages["fill"], stages["head"], key=lambda e: e.accuracy)
+    trained = Expected(best.accuracy, best.low, max(best.high, stages["fault-free"].high))
+    stages |= {"finetune": trained, "scratch": trained}
+    return best
 
 
 def _expected(right: NDArray[np.bool_], recording: NDArray[np.int64]) -> Expected:

@@ -1,4 +1,4 @@
-"""A forest of randomised trees as a torch module: on some arrays a classic classifier knows the healthy cells best."""
+"""A forest of randomised trees as a torch module: a second classifier of the healthy cells."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Forest(nn.Module):
     """Extremely randomised trees (Geurts, Ernst and Wehenkel 2006), grown by scikit-learn, run by torch.
 
     Args:
-        nodes: int64 ``[trees, nodes, 3]``: feature, and where to go if it is at most the threshold, or above. A leaf
-            goes to itself, and its feature is its class.
+        nodes: int64 ``[trees, nodes, 3]``: feature, next node if it is at most the threshold, next node if above. A
+            leaf is its own next node, and its feature is its class.
         thresholds: float32 ``[trees, nodes]``; infinite at a leaf.
         depth: of the deepest tree.
         n_classes: number of logits.
@@ -34,7 +34,7 @@ class Forest(nn.Module):
 
     @classmethod
     def fit(cls, x: Tensor, y: NDArray[np.int64], n_classes: int, *, seed: int = 0) -> Forest:
-        """Grow trees on ``x [M, p]`` and classes ``y [M]``, with as many threads as torch; they come to x's device."""
+        """Fit trees to ``x [M, p]`` and classes ``y [M]``, with as many threads as torch, on the device of x."""
         from sklearn.ensemble import ExtraTreesClassifier
 
         # The number of threads does not change the trees: each has a seed of its own.
@@ -61,26 +61,26 @@ class Forest(nn.Module):
 
     @property
     def about(self) -> dict[str, Any]:
-        """What :meth:`empty` needs; JSON-safe."""
+        """Arguments of :meth:`empty`; JSON-safe."""
         return {"shape": list(self.thresholds.shape), "depth": self.depth, "n_classes": self.n_classes}
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map ``[N, p]`` to logits ``[N, n_classes]``: logarithms of shares of the votes, one being spread evenly."""
+        """Map ``[N, p]`` to logits ``[N, n_classes]``: log vote shares with one extra vote spread evenly."""
         trees, nodes = self.thresholds.shape
         first = nodes * torch.arange(trees, device=x.device)  # of each tree's nodes, all being in one row
         feature, below, above = self.nodes.long().unbind(-1)
-        asked = feature.masked_fill(torch.isinf(self.thresholds), 0).flatten()
+        tested = feature.masked_fill(torch.isinf(self.thresholds), 0).flatten()
         thresholds, below, above = (
             of.flatten() for of in (self.thresholds, below + first[:, None], above + first[:, None])
         )
         at = first.expand(x.shape[0], trees)
         for _ in range(self.depth):
-            at = torch.where(torch.gather(x, 1, asked[at]) <= thresholds[at], below[at], above[at])
+            at = torch.where(torch.gather(x, 1, tested[at]) <= thresholds[at], below[at], above[at])
         votes = nn.functional.one_hot(feature.flatten()[at], self.n_classes).sum(1)
         return ((votes + 1 / self.n_classes) / (trees + 1)).log()
 
 
 def _as_float32(threshold: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the largest float32 that is not above each threshold, which decides as the double does."""
+    """Return the largest float32 not above each threshold, which gives the same decisions as the double."""
     single = threshold.astype(np.float32)
     return np.where(single > threshold, np.nextafter(single, np.float32(-np.inf)), single)

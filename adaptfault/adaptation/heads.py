@@ -1,10 +1,10 @@
-"""Heads fitted in closed form, without a gradient, on what the network's features and the healthy cells say.
+"""Heads fitted in closed form, without a gradient, to the features of the network and to the healthy cells.
 
-The kernel head is a kernel ridge regression on the classes' indicators (as a classifier: Suykens and Vandewalle 1999).
-Its kernel is a weighted sum over two views of a window, each at its own width: the network's penultimate features,
-which know what the fault-free training learnt, and each healthy cell's mean and maximum, which no fill has touched. On
-real grasps either alone was the better one on some fault sets; their sum was about as good as the better one on all.
-A forest of randomised trees may have a say where it knows better, as on simulated grasps with a network trained little.
+The kernel head is a kernel ridge regression on class indicators (as a classifier: Suykens and Vandewalle 1999) or on
+values. Its kernel is a weighted sum over two views of a window, each with its own bandwidth: the penultimate features
+of the network, and mean and maximum of each healthy cell, which do not depend on imputation. On real grasps each view
+alone is better on some fault sets; the sum is about as good as the better one on all. For classes, the probabilities
+may be averaged with a forest of randomised trees, where held-out windows favour it.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ _WIDTH = 0.7  # of the Gaussian kernel, in units of the median squared distance
 _RIDGE = 0.05  # added to the kernel's diagonal, which is 1
 _LINEAR_C = 0.3  # inverse strength of the linear head's ridge penalty
 _VIEW_SHARES = ((0.5, 0.5), (1.0, 0.0), (0.0, 1.0))  # of features and healthy cells in the kernel
+_RIDGES = (0.05, 0.005, 0.0005)  # of a regression, chosen on held-out windows
 _KERNEL_SHARES = (1.0, 0.67, 0.5, 0.33, 0.0)  # of the kernel head beside the forest
 _NO_CLASS = -1e4  # logit of a class without training windows
 MOST_WINDOWS = 5_000  # a kernel head's cost grows with their cube
@@ -31,13 +32,13 @@ MOST_WINDOWS = 5_000  # a kernel head's cost grows with their cube
 def summarise(x: Tensor) -> Tensor:
     """Map windows ``[N, T, H]`` on the 0..1 scale to ``[N, 2 H]``: the roots of each cell's mean and maximum.
 
-    The root makes a light touch beside an object's edge count beside a firm one.
+    The root stabilises the variance: it raises the weight of light contact.
     """
     return torch.cat([x.mean(1), x.amax(1)], dim=1).clamp_min(0.0).sqrt()
 
 
 class KernelHead(nn.Module):
-    """Weighs each known window by how alike it is.
+    """Kernel expansion: each known window is weighted by its similarity to the input.
 
     Args:
         views: of the M windows it was fitted on, each ``[M, p]``.
@@ -77,16 +78,16 @@ class KernelHead(nn.Module):
 
     @property
     def shapes(self) -> list[list[int]]:
-        """What :meth:`empty` needs."""
+        """Arguments of :meth:`empty`."""
         return [list(view.shape) for view in self.known]
 
     def scaled(self, scale: float) -> KernelHead:
-        """Return the head with its logits multiplied; classes that it never answers stay so."""
+        """Return the head with its logits multiplied by ``scale``; excluded classes stay excluded."""
         return KernelHead(self.known, self.widths.tolist(), self.shares.tolist(), self.weights * scale, self.bias)
 
     def forward(self, views: Sequence[Tensor]) -> Tensor:
         """Map views of N windows, each ``[N, p]``, to logits ``[N, n_classes]``."""
-        # In double precision: large weights of both signs nearly cancel, in single a probability was off by up to 4e-4.
+        # Double precision: large weights of both signs nearly cancel; the error in single precision is up to 4e-4.
         kernel = sum(
             share * torch.exp(-_squared_distance(view.double(), other.double()) / width)
             for view, other, width, share in zip(views, self.known, self.widths, self.shares, strict=True)
@@ -99,8 +100,8 @@ class Blend(nn.Module):
     """The head of a reduced model: a kernel head, or its probabilities averaged with those of a forest.
 
     Args:
-        kernel: weighs both views.
-        forest: votes on the second view, the healthy cells; None does without.
+        kernel: uses both views.
+        forest: uses the second view, the healthy cells; None: kernel head alone.
         share: of the kernel head in the probabilities.
         scale: of the forest's logits.
     """
@@ -119,7 +120,7 @@ class Blend(nn.Module):
 
     @property
     def about(self) -> dict[str, Any]:
-        """What :meth:`empty` needs; JSON-safe."""
+        """Arguments of :meth:`empty`; JSON-safe."""
         forest = None if self.forest is None else self.forest.about
         return {"kernel": self.kernel.shapes, "forest": forest, "share": self.share, "scale": self.scale}
 
@@ -130,61 +131,68 @@ class Blend(nn.Module):
 
 
 def blend(one: Tensor, other: Tensor, share: float) -> Tensor:
-    """Return the logarithms of two logits' probabilities averaged, ``share`` of them ``one``'s."""
+    """Return the logarithm of the weighted mean of two softmax outputs, with weight ``share`` on ``one``."""
     mixed = share * torch.softmax(one, 1) + (1 - share) * torch.softmax(other, 1)
     return mixed.clamp_min(torch.finfo(mixed.dtype).tiny).log()
 
 
 class KernelFit:
-    """Kernel heads for known windows, with several shares of the views, each tried on windows held out of it.
+    """Kernel heads for known windows with several shares of the views, each evaluated on held-out windows.
 
     Args:
-        views: of the M known windows, each ``[M, p]``, on the device that is to do the work.
-        targets: ``[M, n_classes]``, 1 at each window's class, or probabilities; a class with none is never the answer.
+        views: of the M known windows, each ``[M, p]``, on the device of the computation.
+        targets: ``[M, n_classes]``, class indicators or probabilities; a class without windows is never predicted.
         folds: int ``[n]``; the last n windows are held out in turn, those of one fold together.
+        values: the targets are standardised values, not classes.
     """
 
-    def __init__(self, views: Sequence[Tensor], targets: NDArray[np.float32], folds: NDArray[np.int64]) -> None:
-        self.views, self.targets, self.folds = views, targets, folds
+    def __init__(
+        self,
+        views: Sequence[Tensor],
+        targets: NDArray[np.float32],
+        folds: NDArray[np.int64],
+        *,
+        values: bool = False,
+    ) -> None:
+        self.views, self.targets, self.folds, self.values = views, targets, folds, values
         distances = [_squared_distance(view, view) for view in views]
         self.widths = [_WIDTH * (float(d.median()) or 1.0) for d in distances]
         self.kernels = [d.div_(-width).exp_() for d, width in zip(distances, self.widths, strict=True)]
 
-    def fit(self, shares: Sequence[float]) -> tuple[KernelHead, Tensor]:
+    def fit(self, shares: Sequence[float], ridge: float = _RIDGE) -> tuple[KernelHead, Tensor]:
         """Fit a head on all windows.
 
-        The windows that are never held out are eliminated first, which leaves a small system (the Schur complement) to
-        solve for each fold.
+        The windows that are never held out are eliminated first; the remaining Schur complement is a small system for
+        each fold.
 
         Returns:
             The head, whose logits have no scale yet (:func:`calibrate`), and on the CPU ``[n, n_classes]``, the logits
-            that each held-out window gets from a head fitted without its fold.
+            of each held-out window by a head fitted without its fold.
         """
         kernel = torch.zeros_like(self.kernels[0])
         for share, of_view in zip(shares, self.kernels, strict=True):
             if share:
                 kernel.add_(of_view, alpha=share)
-        kernel.diagonal().add_(_RIDGE)
+        kernel.diagonal().add_(ridge)
         n_classes, n = self.targets.shape[1], len(self.folds)
-        targets = torch.from_numpy(self.targets - np.float32(1 / n_classes)).to(kernel.device)
+        targets = torch.from_numpy(self.targets - np.float32(0 if self.values else 1 / n_classes)).to(kernel.device)
         m = len(targets) - n  # never held out
         root = torch.linalg.cholesky(kernel[:m, :m])
-        # Halfway through the solve: the rest needs no more than products of this.
         half = torch.linalg.solve_triangular(root, torch.cat([kernel[:m, m:], targets[:m]], dim=1), upper=False)
         between, first = half[:, :n], half[:, n:]
         expected = between.T @ first  # of the held-out windows by the others
-        rest, surprise = kernel[m:, m:] - between.T @ between, targets[m:] - expected
+        rest, residual = kernel[m:, m:] - between.T @ between, targets[m:] - expected
 
-        held_out = torch.empty_like(surprise)
+        held_out = torch.empty_like(residual)
         folds = torch.from_numpy(self.folds).to(kernel.device)
         for fold in torch.unique(folds):
             out, known = folds == fold, folds != fold
             within = torch.linalg.cholesky(rest[known][:, known])
-            held_out[out] = expected[out] + rest[out][:, known] @ torch.cholesky_solve(surprise[known], within)
-        last = torch.cholesky_solve(surprise, torch.linalg.cholesky(rest))
+            held_out[out] = expected[out] + rest[out][:, known] @ torch.cholesky_solve(residual[known], within)
+        last = torch.cholesky_solve(residual, torch.linalg.cholesky(rest))
         weights = torch.cat([torch.linalg.solve_triangular(root.T, first - between @ last, upper=True), last])
 
-        lacking = torch.from_numpy(self.targets.max(axis=0) == 0)
+        lacking = torch.from_numpy((self.targets.max(axis=0) == 0) & (not self.values))
         bias = torch.zeros(n_classes).masked_fill(lacking, _NO_CLASS)
         weights = weights.masked_fill(lacking.to(weights.device), 0.0)
         head = KernelHead(self.views, self.widths, shares, weights, bias.to(weights.device))
@@ -198,9 +206,7 @@ def fit_head(
     held_targets: NDArray[np.float32],
     folds: NDArray[np.int64],
 ) -> tuple[Blend, Tensor]:
-    """Fit a head on all windows; what it is made of is chosen on those that are held out in turn.
-
-    Of the choices, the one with the lowest cross entropy is taken: it is steadier than the accuracy.
+    """Fit a head to all windows; views, kernel share and scale minimise the cross entropy of held-out windows.
 
     Args:
         training, held: both views of windows, each ``[M, p]`` and ``[n, p]``.
@@ -208,7 +214,7 @@ def fit_head(
         folds: int ``[n]``; the windows of a fold are held out together.
 
     Returns:
-        The head, and the logits ``[n, n_classes]`` of the held windows, each by a head that did not learn from it.
+        The head, and the logits ``[n, n_classes]`` of the held windows, each by a head fitted without its fold.
     """
     both = [torch.cat(pair) for pair in zip(training, held, strict=True)]
     classes, y = training_targets.argmax(axis=1), held_targets.argmax(axis=1)
@@ -233,8 +239,43 @@ def fit_head(
     return Blend(kernel, forest, share, scale), blend(logits, scale * voted, share)
 
 
+def fit_value_head(
+    training: Sequence[Tensor],
+    held: Sequence[Tensor],
+    training_values: NDArray[np.float32],
+    held_values: NDArray[np.float32],
+    folds: NDArray[np.int64],
+) -> tuple[Blend, Tensor]:
+    """Fit a kernel ridge regression; views and ridge minimise the squared error of held-out windows.
+
+    Equivalent to ``sklearn.kernel_ridge.KernelRidge`` on standardised values with a precomputed kernel.
+
+    Args:
+        training, held: both views of windows, each ``[M, p]`` and ``[n, p]``.
+        training_values, held_values: ``[M, k]`` and ``[n, k]``.
+        folds: int ``[n]``; the windows of a fold are held out together.
+
+    Returns:
+        The head, and the values ``[n, k]`` of the held windows, each by a head fitted without its fold.
+    """
+    both = [torch.cat(pair) for pair in zip(training, held, strict=True)]
+    values = np.concatenate([training_values, held_values]).astype(np.float64)
+    mean, deviation = values.mean(axis=0), values.std(axis=0)
+    deviation[deviation == 0] = 1.0
+    fit = KernelFit(both, ((values - mean) / deviation).astype(np.float32), folds, values=True)
+    fitted = [fit.fit(shares, ridge) for shares in _VIEW_SHARES for ridge in _RIDGES]
+    truth = torch.from_numpy(((held_values - mean) / deviation).astype(np.float32))
+    head, found = fitted[int(np.argmin([float((out - truth).square().mean()) for _, out in fitted]))]
+    scale, offset = (torch.as_tensor(v, dtype=torch.float32) for v in (deviation, mean))
+    on = head.weights.device
+    weights, bias = head.weights * scale.to(on), head.bias * scale.to(on) + offset.to(on)
+    return Blend(KernelHead(head.known, head.widths.tolist(), head.shares.tolist(), weights, bias)), (
+        found * scale + offset
+    )
+
+
 def calibrate(logits: Tensor, y: NDArray[np.int64]) -> tuple[float, float]:
-    """Return the scale of logits ``[N, n_classes]`` whose softmax fits the classes ``[N]`` best, and the cross entropy.
+    """Return the scale of logits ``[N, n_classes]`` with the lowest cross entropy for classes ``[N]``, and that loss.
 
     One scale does not change the order of the classes (temperature scaling, Guo et al. 2017).
     """

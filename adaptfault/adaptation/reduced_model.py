@@ -1,8 +1,8 @@
-"""The reduced-input model: phi drops the faulty cells, a front end says what they would most likely read (Section IV).
+"""The reduced-input model: phi drops the faulty cells, a front end imputes them (Section IV).
 
-The paper's D - k inputs no longer form the grid that its convolutions need. So the reduced model owns a front end from
-the healthy cells to the whole grid (:mod:`adaptfault.imputation.linear`): the identity on the healthy ones, what these
-say about them on the missing ones.
+The D - k inputs of the paper do not form the grid that its convolutions need. The reduced model therefore has a front
+end from the healthy cells to the whole grid (:mod:`adaptfault.imputation.linear`): the identity on healthy cells, the
+conditional mean on missing ones.
 """
 
 from __future__ import annotations
@@ -16,27 +16,28 @@ from torch import Tensor, nn
 
 from adaptfault.adaptation.heads import Blend, summarise
 from adaptfault.data.windows import Windows
+from adaptfault.models.any_model import AnyModel
 from adaptfault.models.network import TactileTransformer
 from diagnostics import FaultSet
 
 
 class ReducedModel(nn.Module):
-    """A classifier of the D - k healthy cells: front end, then the fault-free model's network, perhaps a new head.
+    """A model of the D - k healthy cells: front end, network, and a new head or the head of the network.
 
-    With F empty it is the fault-free model, bit for bit: there is no front end.
+    With F empty there is no front end, and the outputs are those of the network, bit for bit.
 
     Args:
-        network: the classifier of windows ``[N, T, D]``.
-        fault_set: F, the cells that no longer enter.
+        network: maps windows ``[N, T, D]`` to logits or values.
+        fault_set: F, the dropped cells.
         front: from ``[N, T, D-k]`` to ``[N, T, D]``; None where F is empty.
-        head: weighs the network's features and the healthy cells themselves; None: the network's own head does.
+        head: uses the features of the network and the healthy cells; None: the head of the network.
     """
 
     seen: Tensor
 
     def __init__(
         self,
-        network: TactileTransformer,
+        network: TactileTransformer | AnyModel,
         fault_set: FaultSet,
         front: nn.Module | None,
         head: Blend | None = None,
@@ -44,7 +45,7 @@ class ReducedModel(nn.Module):
         super().__init__()
         self.network, self.fault_set, self.head = network, fault_set, head
         self.front = front if len(fault_set) else None
-        seen = network.layout.present.ravel()[fault_set.healthy]  # positions that the layout lacks say nothing
+        seen = network.layout.present.ravel()[fault_set.healthy]  # without absent positions
         self.register_buffer("seen", torch.from_numpy(np.flatnonzero(seen)), persistent=False)
 
     def complete(self, x: Tensor) -> Tensor:
@@ -59,10 +60,10 @@ class ReducedModel(nn.Module):
         return x if self.front is None else self.front(x)
 
     def views(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Map windows of the healthy cells ``[N, T, D-k]`` to what a head weighs.
+        """Map windows of the healthy cells ``[N, T, D-k]`` to the input of a head.
 
         Returns:
-            The network's features ``[N, 128]``, and ``[N, 2 H]``, the summary of the H healthy cells that exist.
+            The features of the network ``[N, p]``, and ``[N, 2 H]``, the summary of the H healthy cells.
         """
         return self.network.features(self.complete(x)), summarise(x[..., self.seen])
 

@@ -1,11 +1,11 @@
-"""A model adapted to a fault set F: what it predicts, what it cost, and how it is kept on disk."""
+"""A model adapted to a fault set F: predictions, cost of each stage, scores, storage."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,22 +14,24 @@ from torch import Tensor, nn
 from adaptfault.adaptation.heads import Blend
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
 from adaptfault.data.windows import Windows
-from adaptfault.evaluation.scores import Scores, evaluate
+from adaptfault.evaluation.scores import Scores, ValueScores, evaluate
 from adaptfault.imputation.linear import AffineFill, NearestFill
 from adaptfault.imputation.tiled import TiledFill
-from adaptfault.models.network import TactileTransformer, logits_of
+from adaptfault.models.any_model import network_from_config
+from adaptfault.models.builders import ModelNotAllowed
+from adaptfault.models.network import logits_of
 from adaptfault.models.store import ADAPTATION, load_tensors, save_tensors
 from diagnostics import FaultSet
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What one stage of an adaptation cost and reached.
+    """Cost and validation score of one stage of an adaptation.
 
     Attributes:
         name: "fill", "head", "finetune" or "scratch".
         seconds: wall clock, without the scoring.
-        accuracy: on validation; None where it was not needed to go on.
+        accuracy: on validation (R2 of a regression); None where it was not computed.
     """
 
     name: str
@@ -46,25 +48,37 @@ class Adaptation:
     """A model adapted to F.
 
     Attributes:
-        model: the reduced model, from the D - k healthy cells to logits.
-        fault_set: F, the cells it does without.
-        stages: what each stage cost and reached, in the order they ran.
+        model: the reduced model, from the D - k healthy cells to logits or values.
+        fault_set: F, the dropped cells.
+        stages: cost and score of each stage, in the order they ran.
+        task: "classification" or "regression".
     """
 
     model: ReducedModel
     fault_set: FaultSet
     stages: tuple[Stage, ...]
+    task: Literal["classification", "regression"] = "classification"
     _validation: Windows | None = field(default=None, repr=False)
-    _held_out: NDArray[np.int64] | None = field(default=None, repr=False)
-    _scores: Scores | None = field(default=None, repr=False)
+    _held_out: NDArray[Any] | None = field(default=None, repr=False)
+    _scores: Scores | ValueScores | None = field(default=None, repr=False)
 
-    def predict(self, x: NDArray[Any] | Tensor) -> NDArray[np.int64]:
-        """Return the class of each window ``[N, T, D]``, int64 ``[N]``; F's cells may hold anything, NaN too."""
-        classes: NDArray[np.int64] = self._logits(x).argmax(1).numpy()
-        return classes
+    def predict(self, x: NDArray[Any] | Tensor) -> NDArray[Any]:
+        """Return the class of each window ``[N, T, D]``, int64 ``[N]``, or its values, float32 ``[N, k]``.
+
+        The cells in F may hold anything, NaN included.
+        """
+        outputs = self._logits(x)
+        answers: NDArray[Any] = (outputs if self.task == "regression" else outputs.argmax(1)).numpy()
+        return answers
 
     def predict_proba(self, x: NDArray[Any] | Tensor) -> NDArray[np.float32]:
-        """Return class probabilities ``[N, n_classes]`` of windows ``[N, T, D]``."""
+        """Return class probabilities ``[N, n_classes]`` of windows ``[N, T, D]``.
+
+        Raises:
+            ValueError: the model is a regression.
+        """
+        if self.task == "regression":
+            raise ValueError("a regression has no class probabilities: use predict")
         probabilities: NDArray[np.float32] = self._logits(x).softmax(1).numpy()
         return probabilities
 
@@ -72,24 +86,29 @@ class Adaptation:
         return logits_of(self.model, phi(np.asarray(x, dtype=np.float32), self.fault_set))
 
     @cached_property
-    def scores(self) -> Scores:
-        """Scores on the fault-free validation windows with F taken away; computed when first asked for.
+    def scores(self) -> Scores | ValueScores:
+        """Scores on the fault-free validation windows without F, computed on first use.
 
-        A head learns from the validation windows too. They are scored by heads fitted without their fifth of the
-        recordings.
+        A head is fitted to the validation windows too. Each fifth of their recordings is scored by a head fitted
+        without it.
         """
         if self._scores is not None:
             return self._scores
         if self._validation is None:
             raise ValueError("this adaptation was loaded without scores")
+        if self.task == "regression":
+            values = self.predict(self._validation.x) if self._held_out is None else self._held_out
+            return ValueScores.of(self._validation.y, values)
         if self._held_out is None:
-            return evaluate(self, self._validation)
+            scores: Scores = evaluate(self, self._validation)
+            return scores
         return Scores.of(self._validation.y, self._held_out, n_classes=self.model.network.n_classes)
 
     def save(self, path: str | Path) -> None:
         """Write to a folder: weights as safetensors, the rest as JSON, no pickle."""
         model = self.model
         about = {
+            "task": self.task,
             "network": model.network.config,
             "fault_set": list(self.fault_set),
             "reference_frames": len(model.front.roots) if isinstance(model.front, NearestFill) else None,
@@ -101,30 +120,39 @@ class Adaptation:
         save_tensors(path, ADAPTATION, about, model.state_dict())
 
     @classmethod
-    def load(cls, path: str | Path) -> Adaptation:
-        """Read what :meth:`save` wrote.
+    def load(cls, path: str | Path, *, network: nn.Module | None = None, features: Any = None) -> Adaptation:
+        """Read an adaptation written by :meth:`save`.
+
+        Args:
+            path: the folder.
+            network: an instance of the adapted model; its weights are replaced. None: a ``TactileTransformer``, or a
+                model with an allowed builder (:func:`~adaptfault.models.builders.allow_model`).
+            features: the function that computed its features, if a function was given.
 
         Raises:
-            FileNotFoundError: there is nothing, or a file is missing.
-            ValueError: a file is damaged or of another kind.
+            FileNotFoundError: the folder or a file is missing.
+            ValueError: a file is damaged or of another kind, or ``network`` is needed.
         """
         about, tensors = load_tensors(path, ADAPTATION)
         try:
-            network = TactileTransformer.from_config(about["network"])
-            fault_set = FaultSet(tuple(about["fault_set"]), network.layout.n_cells)
+            inner = network_from_config(about["network"], network, features)
+            fault_set = FaultSet(tuple(about["fault_set"]), inner.layout.n_cells)
             front = _empty_front(about, fault_set)
-            head = None if about["head"] is None else Blend.empty(about["head"], network.n_classes)
-            model = ReducedModel(network, fault_set, front, head)
+            head = None if about["head"] is None else Blend.empty(about["head"], inner.n_classes)
+            model = ReducedModel(inner, fault_set, front, head)
             model.load_state_dict(tensors)
             stages = tuple(Stage(**stage) for stage in about["stages"])
-            scores = Scores.from_dict(about["scores"])
+            task = about.get("task", "classification")
+            scores = (ValueScores if task == "regression" else Scores).from_dict(about["scores"])
+        except ModelNotAllowed:
+            raise
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise ValueError(f"the adaptation in {path} is damaged: {str(error).splitlines()[0]}") from None
-        return cls(model.eval(), fault_set, stages, _scores=scores)
+        return cls(model.eval(), fault_set, stages, task, _scores=scores)
 
 
 def _empty_front(about: dict[str, Any], fault_set: FaultSet) -> nn.Module:
-    """Build the front end that a state was saved of, to load it into."""
+    """Build the front end to load a state into."""
     if about.get("patches") is not None:
         return TiledFill(fault_set, about["patches"])
     linear, frames = AffineFill.empty(fault_set), about["reference_frames"]

@@ -1,185 +1,178 @@
-"""One adaptation under way: stages that grow dearer, and the training that they ask for."""
+"""One adaptation: imputation, a new head, fine-tuning or training anew, each kept only if validation improves."""
 
 from __future__ import annotations
 
 import copy
 import math
 import time
-from collections.abc import Generator
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.adaptation.heads import MOST_WINDOWS, Blend, calibrate, fit_head, linear_head
+from adaptfault.adaptation.fault_free import FaultFreeModel, Network
+from adaptfault.adaptation.heads import MOST_WINDOWS, Blend, calibrate, fit_head, fit_value_head, linear_head
 from adaptfault.adaptation.reduced_model import ReducedModel, reduce_windows
 from adaptfault.adaptation.result import Adaptation, Stage
 from adaptfault.data.windows import Windows, evenly
-from adaptfault.models.compact import CompactNetwork, compacted
+from adaptfault.models.any_model import device_of
+from adaptfault.models.compact import CompactNetwork
 from adaptfault.models.history import History
-from adaptfault.models.network import TactileTransformer, as_tensor, logits_of
+from adaptfault.models.network import as_tensor, logits_of
 from adaptfault.models.training import train
 from diagnostics import FaultSet
-
-if TYPE_CHECKING:
-    from adaptfault.adaptation.adapter import Adapter
 
 Method = Literal["auto", "fill", "head", "finetune", "scratch"]
 
 _ENOUGH = 0.99  # auto stops at the first stage that keeps this share of the fault-free validation accuracy
 _ROUND_EPOCHS, _ROUNDS, _ROUND_PATIENCE = 2, 6, 1  # of fine-tuning
 _FOLDS = 5  # of validation recordings, each held out of a head in turn
-_BATCH, _PILOT = 256, 500  # windows run at once; of a head made to see how long a whole one takes
+_BATCH, _PILOT = 256, 500  # windows run at once; windows of a trial fit that measures the time of a head
 _SCRATCH_EPOCHS, _SCRATCH_PATIENCE = 50, 10  # Section III-B: 50 at most
 
 
-@dataclass(frozen=True, eq=False)
-class Lesson:
-    """Training that an adaptation asks for: as :func:`~adaptfault.models.training.train` takes it."""
-
-    reduced: ReducedModel
-    epochs: int
-    seed: int
-    patience: int | None
-    reserve: float = 0.0  # seconds to be left of a budget
-
-
-Trained = Generator[Lesson, History, None]  # asks for training, and is told how it went
-Work = Generator[Lesson, History, Adaptation]
-
-
 class Run:
-    """One adaptation under way: ``reduced`` is the best model so far, ``logits`` its answers to the validation windows.
+    """One adaptation in progress: ``reduced`` is the best model so far, ``logits`` its validation outputs.
 
-    Each answer is by a head that did not learn from that window.
+    The outputs for each validation window come from a head that was fitted without this window.
     """
 
     def __init__(
-        self, adapter: Adapter, fault_set: FaultSet, budget: float | None, seed: int, progress: bool | None
+        self,
+        fault_free: FaultFreeModel,
+        fault_set: FaultSet,
+        budget: float | None,
+        seed: int,
+        progress: bool | None,
     ) -> None:
-        self.adapter, self.fault_set, self.seed, self.progress = adapter, fault_set, seed, progress
-        self.budget, self.device = budget, adapter.model.head.weight.device
-        self.training = reduce_windows(adapter.train, fault_set)
-        self.validation = reduce_windows(adapter.validation, fault_set)
+        self.fault_free, self.fault_set, self.seed, self.progress = fault_free, fault_set, seed, progress
+        self.budget, self.device = budget, device_of(fault_free.model)
+        self.training = reduce_windows(fault_free.train, fault_set)
+        self.validation = reduce_windows(fault_free.validation, fault_set)
         self.logits: Tensor | None = None
-        self.quick: CompactNetwork | None = None  # the network of the weights at hand, on fewer numbers
+        self.quick: CompactNetwork | None = None  # low-rank form of the network with its present weights
         self.head_seconds = 0.0
-        fills = adapter.fills  # estimated once, not a cost of this F
+        imputation = fault_free.imputation  # estimated once, not a cost of this F
         began = time.perf_counter()
-        front = fills.nearest(fault_set) if len(fault_set) else None
+        front = imputation.nearest(fault_set) if len(fault_set) else None
         self.stages = [Stage("fill", time.perf_counter() - began)]
-        self.reduced = self._behind(front, copy.deepcopy(adapter.model))
+        self.reduced = self._behind(front, copy.deepcopy(fault_free.model))
 
-    def go(self, method: Method) -> Adaptation:
-        """Run the stages of a method, each training as it comes."""
-        work = self.stages_of(method)
-        try:
-            lesson = next(work)
-            while True:
-                lesson = work.send(self._train(lesson))
-        except StopIteration as end:
-            adaptation: Adaptation = end.value
-            return adaptation
-
-    def stages_of(self, method: Method) -> Work:
-        """Run the stages of a method, but for the training: that is asked of the caller, who may train several F."""
+    def execute(self, method: Method) -> Adaptation:
+        """Run the stages of a method and return the adaptation."""
         if not len(self.fault_set) and method != "scratch":
             return self.done()  # nothing to repair: the fault-free model, bit for bit
         if method not in ("fill", "scratch"):
-            self.quick = self.adapter.compact  # made once, not a cost of this F
+            self.quick = self.fault_free.compact  # computed once, not a cost of this F
         self.began = time.perf_counter()
         match method:
             case "scratch":
-                yield from self.scratch()
+                self.scratch()
             case "head":
                 self.head()
             case "finetune":
                 self.head()
-                yield from self.finetune()
+                self.finetune()
             case "auto":
-                if self.accuracy() < _ENOUGH * self.adapter.fault_free_accuracy:
+                if not self._enough():
                     self.head()
-                    if self.budget is not None and self.accuracy() < _ENOUGH * self.adapter.fault_free_accuracy:
-                        yield from self.finetune()
+                    if self.budget is not None and not self._enough():
+                        self.finetune()
         return self.done()
 
+    def _enough(self) -> bool:
+        return self.accuracy() >= _ENOUGH * self.fault_free.fault_free_accuracy
+
     def head(self) -> None:
-        """Fit a new head in closed form; kept if validation agrees that it is better."""
-        self._keep_better("head", self._behind(self.adapter.fills.linear(self.fault_set), self.reduced.network))
+        """Fit a new head in closed form; keep it if validation improves. A model without features keeps its own."""
+        if self.fault_free.has_features:
+            linear = self.fault_free.imputation.linear(self.fault_set)
+            self._keep_better("head", self._behind(linear, self.reduced.network))
 
-    def finetune(self) -> Trained:
-        """Train on, front end included, in rounds that each end with a new head; stop when a round brings nothing.
+    def finetune(self) -> None:
+        """Train all parameters, front end included, in rounds that each end with a new head.
 
-        A larger budget only allows more of the same rounds, so it never ends worse.
+        It stops when rounds no longer improve validation. A larger budget allows more of the same rounds, so its result
+        is never worse.
         """
-        network = copy.deepcopy(self.adapter.model)
-        reduced = self._behind(self.adapter.fills.linear(self.fault_set), network)
-        features = self._views(reduced, self.training)[0].cpu().double().numpy()
-        weight, bias = linear_head(features, self.training.y, network.n_classes)
-        network.head.load_state_dict({"weight": weight, "bias": bias})
+        network = copy.deepcopy(self.fault_free.model)
+        reduced = self._behind(self.fault_free.imputation.linear(self.fault_set), network)
+        if self.fault_free.task == "classification" and network.head is not None:
+            features = self._views(reduced, self.training)[0].cpu().double().numpy()
+            weight, bias = linear_head(features, self.training.y, network.n_classes)
+            with torch.no_grad():
+                network.head.weight.copy_(weight)
+                if network.head.bias is not None:
+                    network.head.bias.copy_(bias)
         idle, took = 0, 0.0
         for number in range(_ROUNDS):
             if idle > _ROUND_PATIENCE or self.left() < took + self.head_seconds:
                 break
             began = time.perf_counter()
-            self.quick = None  # of other weights
-            history = yield Lesson(reduced, _ROUND_EPOCHS, self.seed * _ROUNDS + number, None, self.head_seconds)
+            self.quick = None  # holds other weights
+            history = self._train(reduced, _ROUND_EPOCHS, self.seed * _ROUNDS + number, reserve=self.head_seconds)
             if history.stopped == "budget":
                 break
-            self.quick = compacted(network, len(self.training) + len(self.validation))
+            self.quick = self.fault_free.compacted(network)
             took = time.perf_counter() - began
             better = self._keep_better("finetune", copy.deepcopy(reduced), began)
             idle = 0 if better else idle + 1
 
-    def scratch(self) -> Trained:
-        """Train a new network behind the fill, as the paper does for each F."""
-        model = self.adapter.model
-        fresh = type(model).from_config({**model.config, "seed": self.seed + 1})
-        self.reduced = self._behind(self.adapter.fills.linear(self.fault_set), fresh)
+    def scratch(self) -> None:
+        """Train a new network behind the linear front end, as the paper does for each F."""
+        fresh = self.fault_free.fresh(self.seed + 1).to(self.device)
+        self.reduced = self._behind(self.fault_free.imputation.linear(self.fault_set), fresh)
         self.stages.clear()
         began = time.perf_counter()
-        history = yield Lesson(self.reduced, _SCRATCH_EPOCHS, self.seed, _SCRATCH_PATIENCE)
+        history = self._train(self.reduced, _SCRATCH_EPOCHS, self.seed, patience=_SCRATCH_PATIENCE)
         self.stages.append(Stage("scratch", time.perf_counter() - began, history.best_accuracy))
         self.logits = None
 
     def held_out(self) -> Tensor:
-        """Return the logits ``[N, n_classes]`` of the validation windows, from what did not learn from them."""
+        """Return the outputs ``[N, n]`` for the validation windows, each from a head fitted without it."""
         if self.logits is None:
             self.logits = logits_of(self._quickly(self.reduced), self.validation.x)
         return self.logits
 
     def accuracy(self) -> float:
-        """Return the validation accuracy as things stand."""
-        accuracy = self._accuracy(self.held_out())
+        """Return the validation accuracy (R2 of a regression) of the best model so far."""
+        accuracy = self.fault_free.score(self.held_out())
         if self.stages[-1].accuracy is None:
             self.stages[-1] = replace(self.stages[-1], accuracy=accuracy)
         return accuracy
 
-    def _accuracy(self, logits: Tensor) -> float:
-        return float((logits.argmax(1).numpy() == self.validation.y).mean())
+    def _quality(self, outputs: Tensor) -> tuple[float, float]:
+        """Return accuracy and negative cross entropy at its best scale, or R2 and negative mean squared error."""
+        score = self.fault_free.score(outputs)
+        if self.fault_free.task == "regression":
+            return score, -float(((outputs.numpy() - self.validation.y) ** 2).mean())
+        return score, -calibrate(outputs, self.validation.y)[1]
 
     def left(self) -> float:
-        """Return the seconds that are left; infinite without a budget."""
+        """Return the seconds left; infinite without a budget."""
         return math.inf if self.budget is None else self.budget - (time.perf_counter() - self.began)
 
     def done(self) -> Adaptation:
-        """Return the adaptation as it stands."""
+        """Return the best adaptation so far."""
         return Adaptation(
             self.reduced.eval(),
             self.fault_set,
             tuple(self.stages),
-            _validation=self.adapter.validation,
-            _held_out=None if self.logits is None else self.logits.argmax(1).numpy(),
+            task=self.fault_free.task,
+            _validation=self.fault_free.validation,
+            _held_out=None if self.logits is None else self._answers(self.logits),
         )
 
-    def _keep_better(self, name: str, reduced: ReducedModel, began: float | None = None) -> bool:
-        """Give ``reduced`` a new head and keep it if that is better; False where it is not, or time is short.
+    def _answers(self, outputs: Tensor) -> NDArray[np.int64] | NDArray[np.float32]:
+        return outputs.numpy() if self.fault_free.task == "regression" else outputs.argmax(1).numpy()
 
-        Better is a higher validation accuracy, or the same at a lower cross entropy, each at its best scale.
-        """
-        before = self.accuracy(), -calibrate(self.held_out(), self.validation.y)[1]
+    def _keep_better(self, name: str, reduced: ReducedModel, began: float | None = None) -> bool:
+        """Give ``reduced`` a new head and keep it if validation improves; False if it does not, or time is short."""
+        self.accuracy()
+        before = self._quality(self.held_out())
         start = time.perf_counter()
         began = start if began is None else began
         fitted = self._head(reduced)
@@ -187,7 +180,7 @@ class Run:
             return False
         head, logits = fitted
         self.head_seconds = time.perf_counter() - start
-        reached = self._accuracy(logits), -calibrate(logits, self.validation.y)[1]
+        reached = self._quality(logits)
         better = reached > before
         if better:
             reduced.head = head
@@ -195,23 +188,38 @@ class Run:
         self.stages.append(Stage(name, time.perf_counter() - began, max(before, reached)[0]))
         return better
 
-    def _head(self, reduced: ReducedModel) -> tuple[Blend, Tensor] | None:
-        """Return a head, and the logits of validation windows that it did not learn from; None if time is short."""
-        adapter = self.adapter
+    def _head(self, reduced: ReducedModel) -> tuple[Blend | None, Tensor] | None:
+        """Return a head, and the outputs for validation windows of heads fitted without them; None if time is short.
+
+        A model without features keeps its own head.
+        """
+        if not self.fault_free.has_features:
+            return None, logits_of(reduced, self.validation.x)
         if self._too_long(reduced, len(self.training) + len(self.validation)):
             return None
-        learnt = evenly(len(self.training), MOST_WINDOWS - len(self.validation))
-        training = self.training.select(learnt)
-        first, second = (self._views(reduced, windows) for windows in (training, self.validation))
+        used = evenly(len(self.training), MOST_WINDOWS - len(self.validation))
+        first, second = (self._views(reduced, of) for of in (self.training.select(used), self.validation))
         folds = np.unique(self.validation.recording, return_inverse=True)[1] % _FOLDS
-        return fit_head(first, second, adapter.targets[learnt], adapter.validation_targets, folds)
+        return self._fit(first, second, self.fault_free.targets[used], self.fault_free.validation_targets, folds)
 
-    def _behind(self, front: nn.Module | None, network: TactileTransformer) -> ReducedModel:
-        """Return the reduced model of a front end and a network, on the adapter's device."""
+    def _fit(
+        self,
+        first: list[Tensor] | tuple[Tensor, ...],
+        second: list[Tensor] | tuple[Tensor, ...],
+        targets: NDArray[np.float32],
+        held_targets: NDArray[np.float32],
+        folds: NDArray[np.int64],
+    ) -> tuple[Blend, Tensor]:
+        if self.fault_free.task == "regression":
+            return fit_value_head(first, second, targets, held_targets, folds)
+        return fit_head(first, second, targets, held_targets, folds)
+
+    def _behind(self, front: nn.Module | None, network: Network) -> ReducedModel:
+        """Return the reduced model of a front end and a network, on the device of the adapter."""
         return ReducedModel(network, self.fault_set, front).to(self.device).eval()
 
     def _quickly(self, reduced: ReducedModel) -> ReducedModel:
-        """Return the same model with its network on fewer numbers, where there is such a one of these weights."""
+        """Return the same model with its network in low-rank form, if there is one for these weights."""
         if self.quick is None:
             return reduced
         same = ReducedModel(reduced.network, self.fault_set, reduced.front, reduced.head)
@@ -219,14 +227,14 @@ class Run:
         return same.eval()
 
     def _views(self, reduced: ReducedModel, windows: Windows) -> tuple[Tensor, Tensor]:
-        """Return both views of windows, computed in batches, on the adapter's device."""
+        """Return both views of windows, computed in batches, on the device of the adapter."""
         quick = self._quickly(reduced.eval())
         with torch.no_grad():
             views = [quick.views(x.to(self.device)) for x in torch.split(as_tensor(windows.x), _BATCH)]
         return torch.cat([v[0] for v in views]), torch.cat([v[1] for v in views])
 
     def _too_long(self, reduced: ReducedModel, n: int) -> bool:
-        """Say whether a head on n windows would not fit into the time left, going by what a few take."""
+        """Return whether a head on n windows exceeds the time left, extrapolated from a trial on a few windows."""
         if self.budget is None:
             return False
         few = self.training.select(slice(0, _BATCH))
@@ -235,22 +243,28 @@ class Run:
         pace = (time.perf_counter() - began) / len(few)
         m = min(n, _PILOT)
         known = [view[torch.arange(m) % len(few)] for view in views]
+        held, k = m // 5, self.fault_free.targets.shape[1]
+        targets = np.eye(k, dtype=np.float32)[np.arange(m) % k]
+        if self.fault_free.task == "regression":
+            targets = self.fault_free.targets[np.arange(m) % len(self.fault_free.targets)]
         began = time.perf_counter()
-        held, targets = m // 5, np.eye(self.adapter.targets.shape[1], dtype=np.float32)
-        targets = targets[np.arange(m) % len(targets)]
         first, second = [v[held:] for v in known], [v[:held] for v in known]
-        fit_head(first, second, targets[held:], targets[:held], np.arange(held) % _FOLDS)
-        fit = (time.perf_counter() - began) * (n / m) ** 1.8  # between the forest's 1 and the kernel's 3
+        self._fit(first, second, targets[held:], targets[:held], np.arange(held) % _FOLDS)
+        fit = (time.perf_counter() - began) * (n / m) ** 1.8  # between the exponents of forest (1) and kernel (3)
         return bool(pace * n + fit > self.left())
 
-    def _train(self, lesson: Lesson) -> History:
+    def _train(
+        self, reduced: ReducedModel, epochs: int, seed: int, *, patience: int | None = None, reserve: float = 0.0
+    ) -> History:
+        """Train a reduced model; ``reserve`` seconds of the budget stay for a head."""
         return train(
-            lesson.reduced,
+            reduced,
             self.training,
             self.validation,
-            epochs=lesson.epochs,
-            patience=lesson.patience,
-            budget=None if self.budget is None else max(0.0, self.left() - lesson.reserve),
-            seed=lesson.seed,
+            epochs=epochs,
+            patience=patience,
+            budget=None if self.budget is None else max(0.0, self.left() - reserve),
+            seed=seed,
+            loss=self.fault_free.loss,
             progress=self.progress,
         )

@@ -23,7 +23,9 @@ from adaptfault.cli.options import (
 if TYPE_CHECKING:
     from adaptfault.data.recordings import Recordings
     from adaptfault.data.windows import Windows
+    from adaptfault.models.any_model import AnyModel
     from adaptfault.models.network import TactileTransformer
+    from diagnostics import SensorLayout
 
 _EXAMPLE = """  adaptfault train grasps/ --out model --epochs 20
       grasps/<class>/<recording>.csv; after a crash the same command continues the training
@@ -45,6 +47,13 @@ def add(commands: Commands) -> None:
         help="remove random cells while training: imputation alone then repairs more; needs about twice the epochs",
     )
     parser.add_argument("--strict", action="store_true", help="exit code 1 if the training shows a sign of failure")
+    parser.add_argument(
+        "--model",
+        dest="builder",
+        metavar="PACKAGE:FUNCTION",
+        help="train the torch module that this function returns for (layout, n_classes, length)"
+        " (default: the paper's network)",
+    )
     add_device(parser)
     parser.set_defaults(run=run)
 
@@ -67,7 +76,12 @@ def run(args: argparse.Namespace) -> int:
     windows = make_windows(recordings.frames, recordings.labels, recordings.layout, length=args.length)
     parts = split(windows, seed=args.seed)
     say(args, f"{recordings.layout}; {windows}")
-    model = TactileTransformer(recordings.layout, len(recordings.class_names), length=args.length, seed=args.seed)
+    n_classes = len(recordings.class_names)
+    model: TactileTransformer | AnyModel
+    if args.builder:
+        model = _built(args.builder, windows, recordings.layout, n_classes)
+    else:
+        model = TactileTransformer(recordings.layout, n_classes, length=args.length, seed=args.seed)
     folder = out.with_name(f".{out.name}.training") if bundled else out
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / "training.safetensors"
@@ -106,11 +120,25 @@ def run(args: argparse.Namespace) -> int:
     return int(args.strict and bool(problems))
 
 
+def _built(builder: str, windows: Windows, layout: SensorLayout, n_classes: int) -> TactileTransformer | AnyModel:
+    """Build the user's model; naming the builder on the command line allows it."""
+    from adaptfault.models.any_model import AnyModel
+    from adaptfault.models.builders import allow_model, build_model
+    from adaptfault.models.network import as_tensor
+
+    allow_model(builder)
+    model = build_model(builder, layout, n_classes, length=windows.x.shape[1])
+    wrapped = AnyModel.probe(model, layout, as_tensor(windows.x[:8]))
+    if wrapped.n_classes != n_classes:
+        raise ValueError(f"--model {builder} has {wrapped.n_classes} outputs, the recordings have {n_classes} classes")
+    return wrapped
+
+
 def _bundle(
     args: argparse.Namespace,
     out: Path,
     recordings: Recordings,
-    model: TactileTransformer,
+    model: TactileTransformer | AnyModel,
     parts: tuple[Windows, Windows, Windows],
 ) -> None:
     """Make the bundle; new versions are tested on the windows of the test recordings."""

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from adaptfault.adaptation.fault_free import Network
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.cli.options import load_recordings
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, make_windows, split
-from adaptfault.models.network import TactileTransformer
 from adaptfault.models.store import SCHEMA, load_model, read_manifest
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class TrainedModel:
         calibration: the bundle's table from raw counts to the layout's unit.
     """
 
-    network: TactileTransformer
+    network: Network
     class_names: tuple[str, ...]
     split_seed: int | None
     adaptation: Adaptation | None = None

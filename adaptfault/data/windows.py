@@ -19,7 +19,8 @@ class Windows:
 
     Attributes:
         x: float32 ``[N, T, D]``, readings divided by the layout's full scale: 0..1.
-        y: int64 ``[N]``, class of each window; -1 where there is no label.
+        y: int64 ``[N]``, class of each window, -1 where there is no label; or float32 ``[N, k]``, the target
+            values of a regression.
         recording: int64 ``[N]``, which recording a window came from; splits keep these together.
 
     Raises:
@@ -27,7 +28,7 @@ class Windows:
     """
 
     x: NDArray[np.float32]
-    y: NDArray[np.int64]
+    y: NDArray[Any]
     recording: NDArray[np.int64]
 
     def __post_init__(self) -> None:
@@ -37,6 +38,9 @@ class Windows:
         object.__setattr__(self, "x", x)
         for name in ("y", "recording"):
             values = np.asarray(getattr(self, name))
+            if name == "y" and values.ndim == 2 and len(values) == len(x):
+                object.__setattr__(self, name, values.astype(np.float32, copy=False))
+                continue
             if values.shape != (len(x),):
                 raise ValueError(f"{len(x)} windows need {name} of shape [{len(x)}], got {list(values.shape)}")
             object.__setattr__(self, name, values.astype(np.int64, copy=False))

@@ -1,4 +1,4 @@
-"""How good a classifier is: accuracy and the macro averages of Section III-B."""
+"""Scores of a model: accuracy and macro averages of classes (Section III-B), R2 and absolute error of values."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 from adaptfault.data.windows import Windows
 
 SCHEMA = "adaptfault.scores/1"
+VALUES_SCHEMA = "adaptfault.value_scores/1"
 
 
 class Classifier(Protocol):
-    """Anything that names the class of windows ``[N, T, D]``."""
+    """Anything with ``predict`` for windows ``[N, T, D]``."""
 
     def predict(self, x: NDArray[np.float32], /) -> ArrayLike:
         """Return int ``[N]``."""
@@ -107,18 +108,87 @@ class Scores:
         return ax
 
 
+@dataclass(frozen=True)
+class ValueScores:
+    """Scores of a regression of k values.
+
+    Attributes:
+        r2: coefficient of determination, mean over the values (``sklearn.metrics.r2_score``); 1 is perfect, 0 is the
+            mean of the values.
+        mae: mean absolute error of each value, in its unit.
+        n: number of windows.
+    """
+
+    r2: float
+    mae: tuple[float, ...]
+    n: int
+
+    @classmethod
+    def of(cls, true: ArrayLike, predicted: ArrayLike) -> ValueScores:
+        """Score predicted against true values, both float ``[N, k]``.
+
+        Raises:
+            ValueError: no windows, or arrays of different shapes.
+        """
+        t, p = np.asarray(true, dtype=np.float64), np.asarray(predicted, dtype=np.float64)
+        if t.ndim != 2 or t.shape != p.shape or not len(t):
+            raise ValueError(f"expected values of shape {list(t.shape)} [N, k], got {list(p.shape)}")
+        return cls(r2(t, p), tuple(np.abs(t - p).mean(axis=0).tolist()), len(t))
+
+    def __str__(self) -> str:
+        errors = ", ".join(f"{error:.4g}" for error in self.mae)
+        return f"R2 {self.r2:.3f}, mean absolute error {errors} on {self.n} windows"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict that :meth:`from_dict` reads."""
+        return {"schema": VALUES_SCHEMA, "r2": self.r2, "mae": list(self.mae), "n": self.n}
+
+    @classmethod
+    def from_dict(cls, d: Mapping[str, Any]) -> ValueScores:
+        """Build scores from the dict of :meth:`to_dict`.
+
+        Raises:
+            ValueError: another schema.
+        """
+        if d.get("schema") != VALUES_SCHEMA:
+            raise ValueError(f"expected schema {VALUES_SCHEMA!r}, got {d.get('schema')!r}")
+        return cls(d["r2"], tuple(d["mae"]), d["n"])
+
+
+def r2(true: ArrayLike, predicted: ArrayLike) -> float:
+    """Return the coefficient of determination of values ``[N, k]``, mean over those that vary; 0 if none varies."""
+    t, p = np.asarray(true, dtype=np.float64), np.asarray(predicted, dtype=np.float64)
+    total = ((t - t.mean(axis=0)) ** 2).sum(axis=0)
+    varies = total > 0
+    return float((1 - ((t - p) ** 2).sum(axis=0)[varies] / total[varies]).mean()) if varies.any() else 0.0
+
+
+def mean_interval(values: ArrayLike, recording: ArrayLike, *, level: float = 0.95) -> tuple[float, float]:
+    """Return the cluster-robust t interval of the mean of ``values [N]``, clustered by recording ``[N]``.
+
+    A single recording has no spread between recordings; its interval is unbounded.
+    """
+    from statsmodels.regression.linear_model import OLS
+
+    v, recording = np.asarray(values, dtype=float), np.asarray(recording)
+    if len(np.unique(recording)) < 2:
+        return -np.inf, np.inf
+    fit = OLS(v, np.ones((len(v), 1))).fit(cov_type="cluster", cov_kwds={"groups": recording}, use_t=True)
+    low, high = fit.conf_int(1 - level)[0]
+    return float(low), float(high)
+
+
 def accuracy_interval(right: ArrayLike, recording: ArrayLike, *, level: float = 0.95) -> tuple[float, float]:
     """Return the confidence interval of an accuracy, clustered by recording.
 
-    The windows of one recording stand and fall together, so the recordings are what is counted: a cluster-robust
-    t interval, or where no window (or each) is wrong, the exact binomial one over recordings.
+    Windows of one recording are correlated, so the recordings count as samples: a cluster-robust t interval, or the
+    exact binomial interval over recordings where all windows are right or all are wrong.
 
     Args:
-        right: bool ``[N]``, which windows were classified rightly.
-        recording: int ``[N]``, the recording that each window came from.
+        right: bool ``[N]``, whether each window was classified correctly.
+        recording: int ``[N]``, the recording of each window.
         level: of confidence.
     """
-    from statsmodels.regression.linear_model import OLS
     from statsmodels.stats.proportion import proportion_confint
 
     right, recording = np.asarray(right, dtype=bool), np.asarray(recording)
@@ -126,15 +196,22 @@ def accuracy_interval(right: ArrayLike, recording: ArrayLike, *, level: float = 
     if right.all() or not right.any() or count < 2:
         low, high = proportion_confint(count * int(right.all()), count, 1 - level, method="beta")
         return float(low), float(high)
-    fit = OLS(right.astype(float), np.ones((len(right), 1))).fit(
-        cov_type="cluster", cov_kwds={"groups": recording}, use_t=True
-    )
-    low, high = fit.conf_int(1 - level)[0]
-    return max(0.0, float(low)), min(1.0, float(high))
+    low, high = mean_interval(right, recording, level=level)
+    return max(0.0, low), min(1.0, high)
 
 
-def evaluate(model: Classifier | Any, windows: Windows) -> Scores:
-    """Score ``model`` on labelled windows.
+def _evaluate_values(model: Any, windows: Windows) -> ValueScores:
+    from torch import nn
+
+    from adaptfault.models.network import logits_of
+
+    if isinstance(model, nn.Module):
+        return ValueScores.of(windows.y, logits_of(model, windows.x).numpy())
+    return ValueScores.of(windows.y, model.predict(windows.x))
+
+
+def evaluate(model: Classifier | Any, windows: Windows) -> Any:
+    """Score ``model`` on labelled windows: :class:`Scores` of classes, :class:`ValueScores` of values.
 
     Args:
         model: anything with ``predict(x [N, T, D]) -> int [N]``, or a torch module that returns logits.
@@ -145,6 +222,8 @@ def evaluate(model: Classifier | Any, windows: Windows) -> Scores:
         TypeError: ``model`` is neither.
     """
     n_classes = getattr(model, "n_classes", None)
+    if windows.y.ndim == 2:
+        return _evaluate_values(model, windows)
     if callable(getattr(model, "predict", None)):
         return Scores.of(windows.y, model.predict(windows.x), n_classes=n_classes)
     from torch import nn  # a plain classifier is scored without torch

@@ -1,8 +1,8 @@
-"""Which cell must not fail: what each cell, row, column and address bit costs when it is stuck (the paper's abstract).
+"""Sensitivity to single faults: accuracy lost when a cell, row, column or address bit is stuck (the paper's abstract).
 
-Exact by enumeration: every cell is stuck at every value in every window. For the paper's network that takes a third of
-the time of as many passes with unpadded convolutions, and a tenth with padded ones
-(:mod:`adaptfault.evaluation.stuck_cell_logits`).
+The result is exact: each cell is stuck at each value in each window. For the paper's network a low-rank form
+(:mod:`adaptfault.evaluation.stuck_cell_logits`) takes a tenth of the time of full passes (a third with unpadded
+convolutions).
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ _StuckAnswers = Callable[[NDArray[np.float32], NDArray[np.intp], NDArray[np.floa
 
 @dataclass(frozen=True)
 class WireLoss:
-    """What one broken wire costs.
+    """Loss by one broken wire.
 
     Attributes:
         line: the wire.
-        value: what its cells read, on the 0..1 scale; for an address bit the level that it is stuck at.
-        cells: how many cells misread.
+        value: reading of its cells on the 0..1 scale; for an address bit the level that it is stuck at.
+        cells: number of cells affected.
         accuracy_lost, confidence_lost: as in :class:`Sensitivity`.
     """
 
@@ -58,9 +58,9 @@ class WireLoss:
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """What single faults cost a classifier. V values, D cells, C classes.
+    """Loss of a classifier by single faults. V values, D cells, C classes.
 
-    "Lost" is fault-free minus faulty, so above 0 is worse. Confidence is the probability given to the true class.
+    "Lost" is fault-free minus faulty, so positive is worse. Confidence is the probability of the true class.
 
     Attributes:
         layout: the array.
@@ -71,7 +71,7 @@ class Sensitivity:
         accuracy_lost_by_class, confidence_lost_by_class: ``[V, D, C]``, among the windows of one class; NaN for a class
             without windows.
         gradient: ``[V, D]``, the first-order estimate of the loss (rise of the cross entropy), from one backward pass.
-        wires: broken wires, the worst first; empty if they were not asked for.
+        wires: broken wires, the worst first; empty with ``wires=False``.
     """
 
     layout: SensorLayout
@@ -88,7 +88,7 @@ class Sensitivity:
 
     @property
     def rank_correlation(self) -> Floats:
-        """Spearman's of the gradient estimate and the exact confidence lost, over the present cells, ``[V]``."""
+        """Spearman correlation of the gradient estimate and the exact confidence lost, over present cells, ``[V]``."""
         from scipy.stats import spearmanr
 
         present = self.layout.present.ravel()
@@ -114,7 +114,7 @@ class Sensitivity:
         return "\n".join([*lines, *(f"  {wire}" for wire in self.wires[:_NUMBERED])])
 
     def plot(self) -> Any:
-        """Draw a map of each pad and value: the darker a cell, the less it may fail. Returns matplotlib's figure."""
+        """Draw the accuracy lost on a map of each pad and value; return the matplotlib figure."""
         from diagnostics.decision.plot import draw_forces, pads_figure
 
         figure, axes = pads_figure(self.layout, n_rows=len(self.values))
@@ -156,7 +156,7 @@ def sensitivity(
     values: Sequence[float] = (0.0, 1.0),
     progress: bool | None = False,
 ) -> Floats:
-    """Return the accuracy lost when one cell is stuck at one value, ``[len(values), D]``; below 0 it even helps.
+    """Return the accuracy lost when one cell is stuck at one value, ``[len(values), D]``; negative is a gain.
 
     Args:
         model: a network, or anything with ``predict(x) -> int [N]``.
@@ -180,9 +180,9 @@ def analyse(
     wires: bool = True,
     progress: bool | None = False,
 ) -> Sensitivity:
-    """Return what every single fault costs: of a cell, and with ``wires`` of a row, a column, an address bit too.
+    """Return the loss by each single fault: of a cell, and with ``wires`` also of a row, a column, an address bit.
 
-    The wires of the paper's array take as long as its cells do. Otherwise as :func:`sensitivity`.
+    The wires of the paper's array take as long as its cells. Otherwise as :func:`sensitivity`.
 
     Raises:
         ValueError: no windows or values, or windows without labels.
@@ -287,7 +287,7 @@ def _answers(model: Classifier | nn.Module, windows: Windows) -> tuple[_Answer, 
             return answer, _by_coordinates(model), n_classes
     elif callable(getattr(model, "predict", None)):
         classifier = model
-        n_classes = int(windows.y.max()) + 2  # the last one for whatever else it predicts
+        n_classes = int(windows.y.max()) + 2  # the last one stands for any other prediction
 
         def answer(x: NDArray[np.float32]) -> Floats:
             return np.asarray(np.asarray(classifier.predict(x))[:, None] == np.arange(n_classes), float)
@@ -298,7 +298,7 @@ def _answers(model: Classifier | nn.Module, windows: Windows) -> tuple[_Answer, 
 
 
 def _one_by_one(answer: _Answer) -> _StuckAnswers:
-    """Return the answers of a whole pass for each stuck cell."""
+    """Return a function that runs the classifier once for each stuck cell."""
 
     def answers(window: NDArray[np.float32], cells: NDArray[np.intp], levels: NDArray[np.float32]) -> Floats:
         parts = []
@@ -313,7 +313,7 @@ def _one_by_one(answer: _Answer) -> _StuckAnswers:
 
 
 def _by_coordinates(model: TactileTransformer) -> _StuckAnswers:
-    """Return the answers of the paper's network, by the shorter way."""
+    """Return the same function for the paper's network, in low-rank form."""
     import torch
 
     from adaptfault.evaluation.stuck_cell_logits import StuckCells
@@ -346,7 +346,7 @@ def _gradient(model: TactileTransformer, windows: Windows, values: Sequence[floa
 def _wires(
     model: TactileTransformer, windows: Windows, values: Sequence[float], usual: _Tally, progress: bool | None
 ) -> tuple[WireLoss, ...]:
-    """Return what each broken wire costs, the worst first."""
+    """Return the loss by each broken wire, the worst first."""
     answer, hide = _answers(model, windows)[0], None if progress is None else not progress
     losses: list[WireLoss] = []
     for line in tqdm(model.layout.lines, desc="wires", unit="wire", disable=hide):

@@ -1,12 +1,12 @@
-"""What a network says with one cell stuck, for every cell in turn, at a fraction of the cost of running it each time.
+"""Logits of the paper's network with one cell stuck, for all cells, at a fraction of the cost of a pass for each.
 
-A window with a stuck cell differs from the window itself by one number a frame. Everything up to the first attention is
-linear (the convolutions have no ReLU), and from there on the residual stream of width d stays a combination of few
-vectors: what the frame itself gives (r), what one unit in the stuck cell gives, straight and through each head (a, five
-vectors), and what all stuck cells of a window have in common (B): what the frames give through each head, and the
-columns of the later linear layers. So the stream is kept as coordinates (sigma, tau, y) of sigma r + tau a + y B. A
-LayerNorm maps the vectors once for all and divides the coordinates; its variance is a quadratic form in them. Frames
-are sums of cells. So no vector of width d is made for a window, and the result is the network's own up to rounding.
+A window with a stuck cell differs from the window itself by one number a frame. The network is linear up to the first
+attention (the convolutions have no ReLU). After it, the residual stream of width d is a combination of few vectors: the
+contribution of the frame (r), the contributions of one unit in the stuck cell, direct and through each head (a, five
+vectors), and vectors that all stuck cells of a window share (B): the frames through each head, and the columns of the
+later linear layers. The stream is stored as coordinates (sigma, tau, y) of sigma r + tau a + y B. A LayerNorm maps
+these vectors once and scales the coordinates; its variance is a quadratic form in the coordinates. No vector of width d
+is computed for a window, and the result equals the logits of the network up to rounding.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from torch import Tensor, nn
 
 from adaptfault.models.network import HEAD_DIM, HEADS, EncoderBlock, TactileTransformer, attend, logits_of
 
-_TIE = 2e-4  # of the largest; closer logits are computed again by the network itself, so that rounding decides nothing
+_TIE = 2e-4  # relative to the largest; closer logits are recomputed by the network, so that rounding decides no class
 _BATCH = 512  # stuck cells at once
-_VALUES = HEADS * HEAD_DIM  # what the first attention gives, before it is known to mix few values
+_VALUES = HEADS * HEAD_DIM  # width of the output of the first attention
 _PARTS = 4  # of a quadratic form
 
 
 class StuckCells:
     """The network's logits for windows in which one cell is stuck.
 
-    Dropout is left out, whatever mode the model is in. Its weights must stay as they are.
+    Dropout is left out in any mode. The weights of the model must not change.
     """
 
     def __init__(self, model: TactileTransformer) -> None:
         self.model = model
         with torch.no_grad():
-            cells = torch.diag(model.present.to(model.head.weight.dtype))  # absent positions give nothing
+            cells = torch.diag(model.present.to(model.head.weight.dtype))  # absent positions contribute 0
             frames = _convolved(model, torch.cat([cells, torch.zeros_like(cells[:1])]))
             frames[:-1] -= frames[-1]  # of one unit in each cell; the last is that of no pressure, (D + 1, d)
             reader = cast(EncoderBlock, model.blocks[0]).qkv
@@ -68,11 +68,11 @@ class StuckCells:
         return torch.cat([self._answers(own, seen, *batch) for batch in batches])
 
     def _answers(self, own: Tensor, seen: list[_Seen], cells: Tensor, delta: Tensor) -> Tensor:
-        """Return the logits of P stuck cells whose readings move by ``delta [P, T]``."""
+        """Return the logits of P stuck cells whose readings change by ``delta [P, T]``."""
         shares = self._attention(own, cells, delta)  # (heads, P, T, T)
         through = (shares @ delta[..., None]).squeeze(3).permute(1, 2, 0)
         sigma, tau = torch.ones_like(delta), torch.cat([delta[..., None], through], dim=2)
-        # One buffer takes all coordinates as they come; 1 is the coordinate of a bias, of a layer or of a norm.
+        # One buffer for all coordinates; the coordinate of a bias, of a layer or of a norm is 1.
         y = delta.new_ones(*delta.shape, len(seen[-1].read))
         mixed = shares.permute(1, 2, 3, 0).flatten(2)
         y[..., : mixed.shape[2]] = mixed
@@ -98,7 +98,7 @@ class StuckCells:
         return cast(Tensor, self.model.head(F.relu(pooled)))
 
     def _attention(self, own: Tensor, cells: Tensor, delta: Tensor) -> Tensor:
-        """Return the share that each frame takes of each frame in the first attention, ``[heads, P, T, T]``."""
+        """Return the weights of the first attention, ``[heads, P, T, T]``."""
         query, key = (self.first[i][:, cells] for i in (0, 1))  # of one unit in the stuck cell, (heads, P, 64)
         key_side = query @ own[1].mT + (query * key).sum(2, keepdim=True) * delta
         scores = delta[:, :, None] * key_side[:, :, None]
@@ -109,14 +109,14 @@ class StuckCells:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """A layer as one window of T frames has it, in m coordinates: those of :class:`_Layer`, the first 256 replaced.
+    """A :class:`_Layer` for one window of T frames, in m coordinates; the first 256 are replaced.
 
     Attributes:
         gram: ``[m, m]``, for :func:`_half_product`.
         read: ``[m + 1, k]``.
         frames_along: ``[T, m]``, inner products of the frames with the vectors of the layer.
         frames_square: ``[T]``, of the frames with themselves.
-        frames_read: ``[T, k]``, what is read of them.
+        frames_read: ``[T, k]``, their output by the next linear layer.
         cells_along: ``[D, K, m]``.
         across: ``[D, T, K]``, inner products of frames and cells.
     """
@@ -132,23 +132,23 @@ class _Seen:
 
 @dataclass(frozen=True, eq=False)
 class _Layer:
-    """A LayerNorm, the vectors that it finds in the stream, and what reads the stream next.
+    """A LayerNorm, the vectors that span its input, and the linear layer after it.
 
-    These are m that linear layers have written (the first 256 by the first attention), and K = 1 + heads for each of D
-    cells: what one unit in the cell gives straight, and through each head.
+    The vectors are m outputs of linear layers (the first 256 by the first attention), and K = 1 + heads for each of D
+    cells: the contribution of one unit in the cell, direct and through each head.
 
     Attributes:
         norm: the LayerNorm.
-        gram: ``[m, m]``, inner products of what has been written, each vector without its mean.
-        read: ``[m + 1, k]``, what the next linear layer reads of it after the norm, of the norm's bias, of its own.
-        attends: what it reads are queries, keys and values.
-        straight: ``[D + 1, D + 1]``, inner products of the cells' first vectors, and of what no pressure gives.
-        straight_along: ``[D + 1, m]``, those with what has been written.
-        straight_read: ``[D + 1, k]``, what is read of them.
-        through: ``[D, heads, 256]``, the cells' other vectors as coordinates of the first 256.
-        cells_along: ``[D, K, m]``, inner products with what has been written.
-        products: ``[D, K, K]``, of the vectors of one cell.
-        cells_read: ``[D, K, k]``, what is read of them.
+        gram: ``[m, m]``, inner products of the m centred vectors.
+        read: ``[m + 1, k]``, output of the next linear layer for each after the norm; the last row has the biases.
+        attends: whether the next layer computes queries, keys and values.
+        straight: ``[D + 1, D + 1]``, inner products of the direct vectors of the cells and of the empty frame.
+        straight_along: ``[D + 1, m]``, inner products of these with the m vectors.
+        straight_read: ``[D + 1, k]``, output of the next linear layer for these.
+        through: ``[D, heads, 256]``, the other vectors of the cells as coordinates of the first 256.
+        cells_along: ``[D, K, m]``, inner products of the vectors of the cells with the m vectors.
+        products: ``[D, K, K]``, inner products of the vectors of one cell.
+        cells_read: ``[D, K, k]``, output of the next linear layer for the vectors of the cells.
     """
 
     norm: nn.LayerNorm
@@ -165,7 +165,7 @@ class _Layer:
 
     @classmethod
     def of(cls, norm: nn.LayerNorm, reader: nn.Linear, written: Tensor, cells: Tensor, through: Tensor) -> _Layer:
-        """Work out what is needed of centred vectors, ``written [m, d]`` and ``cells [D + 1, d]``."""
+        """Compute the products of centred vectors ``written [m, d]`` and ``cells [D + 1, d]``."""
         gram, along = written @ written.T, cells @ written.T
         read = torch.cat([written * norm.weight, norm.bias[None]]) @ reader.weight.T
         read[-1] += reader.bias  # the coordinate of the norm's bias is 1
@@ -181,7 +181,7 @@ class _Layer:
         )
 
     def within(self, frames: Tensor, shared: Tensor) -> _Seen:
-        """Return what a window of ``frames [T, D + 1]`` has; ``shared [n, 256]`` replace the first 256 vectors."""
+        """Return the layer for a window of ``frames [T, D + 1]``; ``shared [n, 256]`` replace the first 256 vectors."""
         along, straight = frames @ self.straight_along, frames @ self.straight
         return _Seen(
             gram=_half_gram(_mix(_mix(self.gram, shared).T, shared)),
@@ -195,7 +195,7 @@ class _Layer:
 
 
 def _layers(model: TactileTransformer, cells: Tensor, through: Tensor) -> list[_Layer]:
-    """Follow what is written, and what cells ``[D + 1, d]`` give, through the norms."""
+    """Propagate the outputs of the layers and the cells ``[D + 1, d]`` through the norms."""
     first, second = (cast(EncoderBlock, block) for block in model.blocks)
     layers: list[_Layer] = []
     written = cells.new_zeros(0, cells.shape[1])
@@ -214,19 +214,19 @@ def _layers(model: TactileTransformer, cells: Tensor, through: Tensor) -> list[_
 
 
 def _convolved(model: TactileTransformer, frames: Tensor) -> Tensor:
-    """Return what the convolutions make of frames ``[n, D]``, ``[n, d]``."""
+    """Return the output ``[n, d]`` of the convolutions for frames ``[n, D]``."""
     frames = torch.where(model.present, frames, 0.0)
     out: Tensor = model.conv2(model.conv1(frames.reshape(-1, *model.layout.shape))).flatten(1)
     return out
 
 
 def _spread(values: Tensor) -> Tensor:
-    """Put the values ``[n, heads, 64]`` of each head at their place among those of all, ``[n, heads, 256]``."""
+    """Place the values ``[n, heads, 64]`` of each head among those of all heads, ``[n, heads, 256]``."""
     return torch.diag_embed(values.mT).permute(0, 2, 3, 1).flatten(2)
 
 
 def _mix(products: Tensor, shared: Tensor) -> Tensor:
-    """Turn inner products ``[..., m]`` with the first 256 vectors into those with ``shared [n, 256]`` of them."""
+    """Replace inner products ``[..., m]`` with the first 256 vectors by those with ``shared [n, 256]``."""
     return torch.cat([products[..., :_VALUES] @ shared.T, products[..., _VALUES:]], dim=-1)
 
 

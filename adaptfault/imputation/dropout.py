@@ -1,4 +1,4 @@
-"""A base made to be repaired: while it trains, random cells go missing and are filled in, as a repair will do later."""
+"""Training augmentation: random cells are removed and imputed, so that the model tolerates imputed cells."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ import torch
 from torch import Tensor
 
 from adaptfault.data.windows import Windows
-from adaptfault.imputation.linear import AffineFill, CellStatistics
+from adaptfault.imputation.linear import AffineFill
+from adaptfault.imputation.statistics import CellStatistics
 from diagnostics import FaultSet, SensorLayout
 
-_WHOLE = 0.2  # share of the parts of a batch that keep all cells
-_PARTS = 2  # of a batch, each with a fault set of its own
-_MOST = 0.9  # of scattered cells are missing at most
-_VALIDATED = 16  # fault sets that validation looks at, each on its share of the recordings
+_WHOLE = 0.2  # share of batch parts that keep all cells
+_PARTS = 2  # of a batch, one fault set each
+_MOST = 0.9  # largest share of scattered missing cells
+_VALIDATED = 16  # fault sets of validation, each applied to a share of the recordings
 
 
 def random_fault_set(layout: SensorLayout, rng: np.random.Generator) -> FaultSet:
     """Draw a fault set of any shape and size: scattered cells, lines, a block or a whole pad.
 
-    Lines are rows or columns, up to half of them, at random or side by side, of one pad or the same ones of all pads
-    (as a broken address does). Where there is one pad only, no pad is lost as a whole. One cell at least stays healthy.
+    Lines are rows or columns, up to half of them, at random or adjacent, of one pad or at the same index on all pads
+    (as a broken address wire does). A whole pad is lost only if there are several. At least one cell stays healthy.
     """
     pads, rows, cols = layout.shape
     lost = np.zeros(layout.shape, dtype=bool)
@@ -47,7 +48,7 @@ def random_fault_set(layout: SensorLayout, rng: np.random.Generator) -> FaultSet
 
 
 class RandomRepairs:
-    """For the ``augment`` of training: each part of a batch loses a random fault set, and the linear fill repairs it.
+    """The ``augment`` of training: each part of a batch loses a random fault set, imputed by the conditional mean.
 
     Args:
         layout: the array.
@@ -63,7 +64,7 @@ class RandomRepairs:
         return torch.cat([x if rng.random() < _WHOLE else self._repair(x, rng) for x in torch.chunk(x, _PARTS)])
 
     def beside(self, windows: Windows, seed: int) -> Windows:
-        """Return windows twice: as they are, and repaired after random losses, the same for each seed."""
+        """Return windows twice: as they are, and imputed after random losses; the same for each seed."""
         rng = np.random.default_rng(seed)
         group = np.unique(windows.recording, return_inverse=True)[1] % _VALIDATED
         repaired = windows.x.copy()

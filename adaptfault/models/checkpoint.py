@@ -1,4 +1,4 @@
-"""A training run on disk: tensors and JSON in one safetensors file, bound to the settings that it was made with."""
+"""A training run on disk: tensors and JSON in one safetensors file, valid for one set of training settings."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ SCHEMA = "adaptfault.training/1"
 def write_checkpoint(
     path: Path, tensors: Mapping[str, Tensor], *, settings: Mapping[str, Any], state: Mapping[str, Any]
 ) -> None:
-    """Write a checkpoint; a crash at any moment leaves the one before it.
+    """Write a checkpoint; a crash at any moment leaves the earlier one.
 
     Args:
         path: the file.
         tensors: contiguous tensors that share no memory.
-        settings: what must be the same to continue; JSON-safe.
-        state: where the run is; JSON-safe.
+        settings: must be equal for a run to continue; JSON-safe.
+        state: progress of the run; JSON-safe.
     """
     about = {"schema": SCHEMA, "settings": _json(settings), "state": _json(state)}
     atomic_write(path, save({name: tensor.cpu() for name, tensor in tensors.items()}, about))
@@ -39,7 +39,7 @@ def read_checkpoint(path: Path, settings: Mapping[str, Any]) -> tuple[dict[str, 
     """Return tensors and state of a checkpoint.
 
     Raises:
-        ValueError: it is damaged, no checkpoint, or was made with other settings, which are named.
+        ValueError: the file is damaged or no checkpoint, or the settings differ; the message names them.
     """
     mend = "delete it or give another path"
     try:
@@ -68,7 +68,7 @@ def fingerprint_windows(*windows: Windows) -> str:
 
 
 def fingerprint_weights(model: nn.Module) -> str:
-    """Hash a model's weights, their names, and which of them are trained."""
+    """Hash a model's weights, their names, and which of them are trainable."""
     digest = hashlib.blake2b(digest_size=16)
     trained = {name for name, parameter in model.named_parameters() if parameter.requires_grad}
     for name, tensor in model.state_dict().items():

@@ -1,10 +1,10 @@
-"""The same network on fewer numbers, for deployment: exact algebra, a third of the multiplications and of the weights.
+"""Exact low-rank form of the paper's network: a third of the multiplications and of the weights.
 
-What is d wide in the paper's network (3520 values for its sensor) never fills that space. The convolutions are linear,
-so a frame there is an affine map of its cells; attention and feed-forward block each add an affine map of their 256 and
-128 values. So a frame is kept as a few hundred coordinates y with x = y @ basis + offset, and every layer that reads x
-is folded with the basis. LayerNorm needs the variance of x alone: with an orthonormal basis of what is centred, from a
-QR decomposition, that is the length of y.
+The residual stream of the paper's network has d = 3520 values for its sensor, but spans a subspace of a few hundred
+dimensions. The convolutions are linear, so the stream starts as an affine map of the cells. Attention and feed-forward
+block each add an affine map of 256 and 128 values. A frame is therefore stored as coordinates y with
+x = y @ basis + offset, and each layer that reads x is multiplied with the basis. LayerNorm needs only the variance of
+x. With an orthonormal basis of the centred vectors (QR decomposition) the variance is the squared length of y over d.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from torch import Tensor, nn
 from adaptfault.models.network import BLOCKS, HEAD_DIM, HEADS, HIDDEN, EncoderBlock, TactileTransformer, attend
 
 _UPDATES = BLOCKS * (HEADS * HEAD_DIM + HIDDEN + 2)  # numbers that the blocks add to those of a frame's cells
-_MOST = 20_000_000  # numbers in a basis; beyond that the decomposition costs more than it is worth
-_DEPENDENT = 1e-5  # columns of which less is left beside the others are not decomposed by the quick way
-_WORTH = 2000  # windows that take the network as long as it takes to be folded and to run the folded one, twice over
+_MOST = 20_000_000  # values in a basis; a larger decomposition costs more time than it saves
+_DEPENDENT = 1e-5  # relative Cholesky diagonal below which the columns count as linearly dependent
+_WORTH = 2000  # windows from which on the decomposition saves time: about twice its break-even
 
 
 class _Wide:
-    """Where x lies while a network is folded: ``x = y @ basis + offset``, ``[k, d]`` and ``[d]``, both double."""
+    """Affine subspace of the residual stream: ``x = y @ basis + offset``, ``[k, d]`` and ``[d]``, both double."""
 
     def __init__(self, basis: Tensor, offset: Tensor) -> None:
         self.basis, self.offset = basis, offset
 
     def fold(self, layer: nn.Linear) -> nn.Linear:
-        """Return the layer that reads y as ``layer`` reads x."""
+        """Return the layer whose output for y equals the output of ``layer`` for x."""
         return _linear(layer.weight @ self.basis.T, layer.weight @ self.offset + layer.bias)
 
     def add_and_norm(self, layer: nn.Linear, norm: nn.LayerNorm) -> tuple[CompactNorm, _Wide]:
-        """Return what maps y and the values that ``layer`` reads to the new y, after ``norm(x + layer(values))``."""
+        """Return the map from y and the inputs of ``layer`` to the new y of ``norm(x + layer(inputs))``."""
         rows = torch.cat([self.basis, layer.weight.T, (self.offset + layer.bias)[None]])
         directions, lengths = _orthonormal((rows - rows.mean(1, keepdim=True)).T)  # (d, k'), (k', rows)
         folded = CompactNorm(_linear(lengths[:, :-1], lengths[:, -1]), rows.shape[1], norm.eps)
@@ -42,7 +42,7 @@ class _Wide:
 
 
 class CompactNorm(nn.Module):
-    """Residual sum and LayerNorm of ``width`` values, on their coordinates."""
+    """Residual sum and LayerNorm of ``width`` values, computed on coordinates."""
 
     def __init__(self, sum_: nn.Linear, width: int, eps: float) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class CompactNorm(nn.Module):
 
 
 class CompactBlock(nn.Module):
-    """An encoder block on coordinates."""
+    """Encoder block computed on coordinates."""
 
     def __init__(self, qkv: nn.Linear, norm1: CompactNorm, up: nn.Linear, norm2: CompactNorm) -> None:
         super().__init__()
@@ -63,7 +63,7 @@ class CompactBlock(nn.Module):
 
     @classmethod
     def fold(cls, block: EncoderBlock, wide: _Wide) -> tuple[CompactBlock, _Wide]:
-        """Return a block for coordinates, and where x lies after it."""
+        """Return the block on coordinates, and the subspace of its output."""
         qkv = wide.fold(block.qkv)
         norm1, wide = wide.add_and_norm(block.out, block.norm1)
         up = wide.fold(block.up)
@@ -78,10 +78,10 @@ class CompactBlock(nn.Module):
 
 
 class CompactNetwork(nn.Module):
-    """Gives the features and logits of a :class:`TactileTransformer` in eval mode, to within rounding.
+    """Low-rank form of a :class:`TactileTransformer`: the same features and logits in eval mode, up to rounding.
 
     Args:
-        network: the network; it is copied, and its training mode does not matter.
+        network: the network; it is copied. Dropout is left out.
     """
 
     present: Tensor
@@ -94,11 +94,11 @@ class CompactNetwork(nn.Module):
         self.register_buffer("present", precise.present.nonzero().flatten())
         frames = torch.eye(self.layout.n_cells, dtype=torch.float64)[self.present]
         frames = torch.cat([frames, torch.zeros_like(frames[:1])]).reshape(-1, *self.layout.shape)
-        seen = precise.conv2(precise.conv1(frames)).flatten(1)  # (cells + 1, d): of each cell at 1, and of none
+        seen = precise.conv2(precise.conv1(frames)).flatten(1)  # (cells + 1, d): one cell at 1 each, and no cell
         wide = _Wide(seen[:-1] - seen[-1], seen[-1])
         self.blocks = nn.ModuleList()
         for block in precise.blocks:
-            assert isinstance(block, EncoderBlock)  # for the type checker: torch does not say
+            assert isinstance(block, EncoderBlock)  # for the type checker
             compact, wide = CompactBlock.fold(block, wide)
             self.blocks.append(compact)
         self.dense, self.head = wide.fold(precise.dense), copy.deepcopy(network.head).cpu()
@@ -106,11 +106,11 @@ class CompactNetwork(nn.Module):
 
     @staticmethod
     def suits(network: TactileTransformer) -> bool:
-        """Whether the array is small enough for the decompositions to be worth it."""
+        """Return whether the basis is small enough for the decomposition to save time."""
         return network.dense.in_features * (network.layout.n_cells + _UPDATES) <= _MOST
 
     def features(self, x: Tensor) -> Tensor:
-        """Map windows ``[N, T, D]`` to the values ``[N, 128]`` that the head weighs."""
+        """Map windows ``[N, T, D]`` to features ``[N, 128]``, the input of the head."""
         y = x[..., self.present]
         for block in self.blocks:
             y = block(y)
@@ -123,14 +123,14 @@ class CompactNetwork(nn.Module):
 
 
 def compacted(network: TactileTransformer, n: int) -> CompactNetwork | None:
-    """Return a network on fewer numbers, on its device, where making it is worth its while for ``n`` windows."""
+    """Return the low-rank network on the same device if it saves time for ``n`` windows, else None."""
     if n < _WORTH or not CompactNetwork.suits(network):
         return None
     return CompactNetwork(network).to(network.head.weight.device)
 
 
 def _orthonormal(columns: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the QR decomposition of double ``columns [d, n]``; by Cholesky, half the time, where that is as exact."""
+    """Return the QR decomposition of double ``columns [d, n]``; Cholesky QR where the columns are well conditioned."""
     root, failed = torch.linalg.cholesky_ex(columns.T @ columns)
     left = root.diagonal()
     if failed or left.min() < _DEPENDENT * left.max():

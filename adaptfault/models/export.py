@@ -1,4 +1,4 @@
-"""Exports an adapted model to one ONNX file, from whole windows to probabilities, and proves it before accepting it."""
+"""Exports an adapted model to one ONNX file, from whole windows to outputs, and compares the file with the model."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ from adaptfault.adaptation.reduced_model import ReducedModel
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.models.compact import CompactNetwork
 from adaptfault.models.inference import ONNX_FILE, open_session, run_session
+from adaptfault.models.network import TactileTransformer
 from adaptfault.models.store import attach
 
 TOLERANCE = 1e-5  # of a probability
 
-_EXAMPLE = 2  # windows of the batch that the export is traced with
-_BATCHES = (1, 7)  # that the file is tried on: a wrong request for a dynamic batch fixes it at the example's, silently
+_EXAMPLE = 2  # windows in the batch of the export
+_BATCHES = (1, 7)  # of the comparison: an export with a fixed batch size raises no error by itself
 
 
 class ExportError(RuntimeError):
-    """A model that could not be exported, or whose file says something else than the model."""
+    """The export failed, or the outputs of the exported file differ from the outputs of the model."""
 
 
 class _WholeWindows(nn.Module):
-    """Gathers the healthy cells first: what a dropped one reads, NaN or infinity too, goes nowhere."""
+    """Selects the healthy cells first, so that NaN or infinity in a dropped cell cannot reach the output."""
 
     healthy: Tensor
 
@@ -48,11 +49,11 @@ class _WholeWindows(nn.Module):
 def add_onnx(folder: str | Path) -> Path:
     """Export the adaptation that :meth:`Adaptation.save` wrote into ``folder``, and return the new file's path.
 
-    The file lies beside the weights, and ``manifest.json`` states its hash. Not for a folder that a robot runs from at
-    this moment: of a power cut between the two writes, a file would be left that is not the stated one.
+    The file lies beside the weights, and ``manifest.json`` states its hash. Do not call it on a folder that a robot
+    is running from: a power cut between the two writes leaves a file that does not match its hash.
 
     Raises:
-        ExportError: the file does not say what the model says.
+        ExportError: the export failed, or the outputs differ from the model.
         ImportError: the packages for the export are not installed.
         FileNotFoundError, ValueError: there is no whole adaptation in the folder.
     """
@@ -63,13 +64,13 @@ def add_onnx(folder: str | Path) -> Path:
 def to_onnx(model: ReducedModel) -> bytes:
     """Return a model as the content of an ONNX file.
 
-    Its input ``x`` are whole windows, float32 ``[N, T, D]`` on the 0..1 scale, N at will; its output are
-    ``probabilities``, float32 ``[N, n_classes]``. It holds the network on fewer numbers
-    (:mod:`adaptfault.models.compact`). It was run on batches of 1 and 7 windows, and said what the model says to within
-    1e-5.
+    The input ``x`` is a batch of whole windows, float32 ``[N, T, D]`` on the 0..1 scale, any N. The output
+    ``probabilities`` is float32 ``[N, n_classes]``. The paper's network is stored in its low-rank form
+    (:mod:`adaptfault.models.compact`). The file is run on batches of 1 and 7 windows; its outputs agree with the model
+    within 1e-5.
 
     Raises:
-        ExportError: the export failed, or says something else.
+        ExportError: the export failed, or the outputs differ.
         ImportError: the packages for it are not installed.
     """
     model = copy.deepcopy(model).cpu().eval()
@@ -79,8 +80,8 @@ def to_onnx(model: ReducedModel) -> bytes:
 
 
 def _compacted(model: ReducedModel) -> ReducedModel:
-    """Return the model on fewer numbers; a very large one as it is."""
-    if not CompactNetwork.suits(model.network):
+    """Return the model with its network in low-rank form, where the network has one."""
+    if not isinstance(model.network, TactileTransformer) or not CompactNetwork.suits(model.network):
         return model
     compact = copy.deepcopy(model)
     compact.add_module("network", CompactNetwork(model.network))
@@ -111,7 +112,7 @@ def _translate(whole: _WholeWindows, example: Tensor) -> bytes:
 
 
 def _verify(data: bytes, model: ReducedModel) -> None:
-    """Run the file on batches of other sizes than the example's, and compare it with the model."""
+    """Run the file on batch sizes other than that of the export, and compare its outputs with the model."""
     session, whole = open_session(data), _WholeWindows(model).eval()
     for n in _BATCHES:
         x = _probes(model, n)
@@ -122,11 +123,13 @@ def _verify(data: bytes, model: ReducedModel) -> None:
         except Exception as error:  # ONNX Runtime has its own kinds, all straight from Exception
             raise ExportError(f"the exported file does not run on {n} windows: {str(error).splitlines()[0]}") from None
         if given.shape != expected.shape or not np.abs(given - expected).max() <= TOLERANCE:
-            raise ExportError(f"the exported file says something else than the model on {n} windows: it is not used")
+            raise ExportError(
+                f"the outputs of the exported file differ from the model on {n} windows: the file is not used"
+            )
 
 
 def _probes(model: ReducedModel, n: int) -> NDArray[np.float32]:
-    """Draw windows ``[n, T, D]``: half of the cells untouched, and nothing of use in those that were dropped."""
+    """Draw windows ``[n, T, D]``: half of the cells at 0, NaN or infinity in the dropped cells."""
     network = model.network
     rng = np.random.default_rng(n)
     shape = (n, network.length, network.layout.n_cells)
@@ -137,7 +140,7 @@ def _probes(model: ReducedModel, n: int) -> NDArray[np.float32]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence what the exporter says of itself: a deprecated call of its own, and packages that it can do without."""
+    """Silence warnings of the exporter about its own deprecated calls and optional packages."""
     log = logging.getLogger("torch.onnx._internal.exporter._registration")
     level = log.level
     log.setLevel(logging.ERROR)

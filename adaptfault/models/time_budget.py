@@ -1,4 +1,4 @@
-"""A budget of seconds for a training run, kept by looking ahead."""
+"""Time budget of a training run: predicts whether the next batch and validation still fit."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from contextlib import contextmanager
 
 
 class Clock:
-    """Tells when to stop a run, so that the next batch and the validation after it still fit into the budget."""
+    """Decides when to stop, so that the next batch and the validation after it fit into the budget."""
 
     def __init__(self, budget: float | None) -> None:
         self.began, self.budget, self.spent = time.perf_counter(), math.inf if budget is None else budget, 0.0
-        self.pace = 0.0  # seconds that training takes a window
-        self.close = 0.0  # seconds that the last validation and checkpoint took
+        self.pace = 0.0  # seconds of training per window
+        self.close = 0.0  # seconds of the last validation and checkpoint
         self.over = False  # an epoch was cut short
 
     @contextmanager
     def closing(self, share: float = 1.0) -> Iterator[None]:
-        """Time the end of an epoch, or this share of one."""
+        """Measure the time of a validation and checkpoint, or of this share of one."""
         began = time.perf_counter()
         yield
         self.close = (time.perf_counter() - began) / share
 
     def late(self, batch: int) -> bool:
-        """Say whether another batch would be too much."""
+        """Return whether another batch of this many windows would exceed the budget."""
         return time.perf_counter() - self.began + self.spent + self.close + self.pace * batch > self.budget

@@ -1,4 +1,4 @@
-"""The one training loop: Adam, early stopping, a time budget, and checkpoints that survive kill -9 (Section III-B)."""
+"""The training loop: Adam, early stopping, a time budget and crash-safe checkpoints (Section III-B)."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from adaptfault.data.windows import Windows
+from adaptfault.evaluation.scores import r2
 from adaptfault.imputation.dropout import RandomRepairs
-from adaptfault.imputation.linear import CellStatistics
+from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.models.checkpoint import fingerprint_weights, fingerprint_windows, read_checkpoint, write_checkpoint
 from adaptfault.models.history import History, Stopped
 from adaptfault.models.network import as_tensor, logits_of
@@ -27,17 +28,18 @@ from adaptfault.models.time_budget import Clock
 from diagnostics import SensorLayout
 
 Augment = Callable[[Tensor, torch.Generator], Tensor]
+Loss = Callable[[Tensor, Tensor], Tensor]
 
 
 class MoreWindows(Protocol):
-    """Training windows that are made when they are needed; ``str`` of it tells one set from another."""
+    """Training windows generated on demand; ``str`` of it identifies the set."""
 
     @property
     def y(self) -> NDArray[np.int64]:
-        """The class of each, int ``[M]``."""
+        """Class of each window, int ``[M]``."""
 
     def draw(self, index: NDArray[np.int64], /) -> NDArray[np.float32]:
-        """Return those with these numbers, ``[B, T, D]``; the same each time."""
+        """Return the windows with these indices, ``[B, T, D]``; the same for each call."""
 
 
 def train(
@@ -51,6 +53,7 @@ def train(
     seed: int = 0,
     patience: int | None = 10,
     averaging: float = 0.995,
+    loss: Loss | None = None,
     budget: float | None = None,
     evaluate_start: bool = False,
     augment: Augment | None = None,
@@ -60,39 +63,41 @@ def train(
     on_epoch: Callable[[History], None] | None = None,
     progress: bool | None = None,
 ) -> History:
-    """Train ``model`` in place and leave it in eval mode with the weights that did best on ``validation``.
+    """Train ``model`` in place and leave it in eval mode with the weights that are best on ``validation``.
 
-    Best is the highest validation accuracy, of equals the lowest loss. (The loss alone turns upwards while the accuracy
-    still climbs; over five runs on real grasps it chose weights of 0.681 on the test, the accuracy of 0.702.)
-    Parameters with ``requires_grad`` False stay as they are. The best weights are also in the model when an exception
-    (Ctrl-C too) ends the run. For one seed the result is the same bit for bit on one machine with as many threads; the
-    global random state is left alone.
+    Best is the highest validation accuracy (R2 for values), of equals the lowest loss. The loss alone is a worse
+    criterion: it rises while the accuracy still improves (0.681 against 0.702 on the test, five runs on real grasps).
+    Parameters with ``requires_grad`` False stay as they are. The model also holds the best weights after an exception,
+    Ctrl-C included. A seed gives bit-identical results on one machine with the same number of threads. The global
+    random state does not change.
 
     Args:
-        model: maps windows float32 ``[B, T, D]`` to logits ``[B, n]``.
-        train, validation: fault-free windows, labels 0 to n - 1.
+        model: maps windows float32 ``[B, T, D]`` to logits or values ``[B, n]``.
+        train, validation: fault-free windows, labels 0 to n - 1 or values float ``[N, n]``.
         epochs, learning_rate, batch_size: of Adam; Section III-B has 50 at most, 1e-4 and 32.
         seed: of the order of the windows, of dropout and of ``augment``.
         patience: epochs without a better validation before stopping; None trains all epochs.
-        averaging: what is validated and kept is the exponential average of the weights over the last
-            1 / (1 - averaging) steps (over fewer at first), which is steadier than any single step's; 0 keeps those of
-            the last step, as Section III-B does.
-        budget: seconds, validation included. An epoch that does not fit is left out, but for the first, which is cut
-            short; so a larger budget never ends worse. The time before a resume counts.
-        evaluate_start: let the starting weights compete, so that fine-tuning never ends worse than it began.
+        averaging: the exponential average of the weights over the last 1 / (1 - averaging) steps (fewer at first) is
+            validated and kept; it varies less than the weights of a single step. 0 keeps the weights of the last step,
+            as Section III-B does.
+        loss: (outputs ``[B, n]``, y ``[B]`` or ``[B, k]``) -> scalar. None: cross entropy, or the mean squared error of
+            values.
+        budget: seconds, validation included. The first epoch is cut short to fit, a later one that does not fit is left
+            out, so a larger budget never gives a worse result. Time before a resume counts.
+        evaluate_start: the starting weights are a candidate too, so that fine-tuning never makes validation worse.
         augment: ``(x [B, T, D], generator) -> x``, applied to each training batch, a copy that it may change.
-        repairable: make a base that is easy to repair: in parts of each batch random cells, lines, blocks or a pad go
-            missing and are filled in from the rest, as :class:`~adaptfault.adaptation.adapter.Adapter` will do.
-            Validation then looks at the windows twice, whole and repaired. Needs about twice the epochs.
-        more: windows to train on besides, made when they are needed; an epoch passes over all of them.
-        checkpoint: file written after each epoch. If it exists, training continues from it, and ends as it would have
-            ended without the interruption; ``epochs``, ``patience`` and ``budget`` may differ from the earlier run's.
-        on_epoch: called with the history so far after each epoch, once its checkpoint is on disk.
+        repairable: train a model that loses less when cells are imputed: in parts of each batch random cells, lines,
+            blocks or a pad are removed and imputed, as :class:`~adaptfault.adaptation.adapter.Adapter` does.
+            Validation uses each window twice, whole and imputed. Needs about twice the epochs.
+        more: additional training windows, generated on demand; an epoch uses all of them.
+        checkpoint: file written after each epoch. If it exists, training continues from it, with the same result as
+            without the interruption; ``epochs``, ``patience`` and ``budget`` may differ from the earlier run's.
+        on_epoch: called with the history after each epoch, once the checkpoint is on disk.
         progress: True or False shows or hides the bar on stderr; None shows it on a terminal.
 
     Raises:
-        ValueError: windows that are empty, not finite or have labels the model lacks; a checkpoint of another run; a
-            loss that is no longer finite; ``repairable`` together with ``augment``.
+        ValueError: windows that are empty or not finite, or labels beyond the outputs of the model; a checkpoint of
+            another run; a loss that is not finite; ``repairable`` together with ``augment``.
         TypeError: ``repairable`` for a model without a layout.
     """
     _check_options(epochs, batch_size, learning_rate, averaging)
@@ -103,6 +108,7 @@ def train(
             raise ValueError("repairable is an augmentation itself: give augment or repairable, not both")
         augment, validation = _random_repairs(model, train, validation, seed)
     run = _Run(model, learning_rate, averaging, Path(checkpoint) if checkpoint is not None else None)
+    run.loss = _default_loss(train) if loss is None else loss
     if run.path is not None:
         run.settings = {
             "learning_rate": learning_rate,
@@ -110,6 +116,7 @@ def train(
             "seed": seed,
             "averaging": averaging,
             "evaluate_start": evaluate_start,
+            **({} if loss is None else {"loss": getattr(loss, "__qualname__", type(loss).__qualname__)}),
             "augment": None if augment is None else getattr(augment, "__qualname__", type(augment).__qualname__),
             "data": fingerprint_windows(train, validation),
             "more": None if more is None else str(more),
@@ -127,8 +134,8 @@ def train(
                 if history is None:
                     continue
                 bar.update()
-                loss, accuracy = history.train_loss[-1], history.validation_accuracy[-1]
-                bar.set_postfix(loss=f"{loss:.4f}", accuracy=f"{accuracy:.4f}", best=history.best_epoch)
+                last, accuracy = history.train_loss[-1], history.validation_accuracy[-1]
+                bar.set_postfix(loss=f"{last:.4f}", accuracy=f"{accuracy:.4f}", best=history.best_epoch)
                 if on_epoch is not None:
                     on_epoch(history)
     finally:
@@ -138,14 +145,14 @@ def train(
 
 
 def _begin(run: _Run, validation: Windows, clock: Clock, evaluate_start: bool) -> None:
-    """Validate the starting weights if they compete; else, with a budget, see what a validation takes."""
+    """Validate the starting weights if they are a candidate; else, with a budget, measure the time of a validation."""
     if evaluate_start and run.history.start is None:
         with clock.closing():
-            run.record(replace(run.history, start=_validate(run.model, validation)))
+            run.record(replace(run.history, start=_validate(run.model, validation, run.loss)))
     elif clock.budget < math.inf:  # the first epoch, too, has to leave time for its validation
         sample = validation.select(slice(0, 32))
         with clock.closing(len(sample) / len(validation)):
-            _validate(run.model, sample)
+            _validate(run.model, sample, run.loss)
 
 
 def _epoch(
@@ -157,7 +164,7 @@ def _epoch(
     augment: Augment | None,
     clock: Clock,
 ) -> History | None:
-    """Train for an epoch, validate, and keep both; None if the time ran out in the midst of a later epoch."""
+    """Train for an epoch, validate and record; None if time ran out within a later epoch."""
     began, n, device = time.perf_counter(), len(source.y), next(run.model.parameters()).device
     run.model.train()
     with seeded(seed, run.history.epochs, device) as generator:
@@ -167,9 +174,9 @@ def _epoch(
         return None
     with clock.closing():
         with run.averaged():
-            scores = _validate(run.model, validation)
+            scores = _validate(run.model, validation, run.loss)
         history = run.history.longer(loss, scores, time.perf_counter() - began)
-        run.record(history, save=seen == n)  # a cut epoch is no place to resume from
+        run.record(history, save=seen == n)  # a run cannot resume within an epoch
     return history
 
 
@@ -181,7 +188,7 @@ def _pass(
     generator: torch.Generator,
     clock: Clock,
 ) -> tuple[float, int]:
-    """Train on batches until they or the time run out; return the mean loss and how many windows were seen."""
+    """Train on batches until they or the time run out; return the mean loss and the number of windows used."""
     device, total, seen, began = next(run.model.parameters()).device, 0.0, 0, time.perf_counter()
     for index in order:
         if seen and clock.late(len(index)):
@@ -189,7 +196,7 @@ def _pass(
             break
         x, y = source.take(index), source.y[index]  # copies
         x = x if augment is None else augment(x, generator)
-        loss = F.cross_entropy(run.model(x.to(device)), y.to(device))
+        loss = run.loss(run.model(x.to(device)), y.to(device))
         run.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         run.optimizer.step()
@@ -202,14 +209,14 @@ def _pass(
 
 
 class _Source:
-    """The training windows, and more of them where there are."""
+    """The training windows and the additional ones."""
 
     def __init__(self, windows: Windows, more: MoreWindows | None) -> None:
         self.x, self.more, self.known = as_tensor(windows.x), more, len(windows)
         self.y = as_tensor(windows.y if more is None else np.concatenate([windows.y, more.y]))
 
     def take(self, index: Tensor) -> Tensor:
-        """Return a copy of the windows with these numbers, ``[B, T, D]``."""
+        """Return a copy of the windows with these indices, ``[B, T, D]``."""
         if self.more is None:
             return self.x[index]
         added = index >= self.known
@@ -226,21 +233,21 @@ class Optimisation:
         self.trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
         if not self.trained:
             raise ValueError("nothing to train: every parameter of the model has requires_grad False")
-        # Fused: one pass over weights, gradients and moments. The default took 2 to 5 times as long, a sixth of a step.
+        # Fused: one pass over weights, gradients and moments, 2 to 5 times faster than the default.
         self.optimizer = torch.optim.Adam(self.trained.values(), lr=learning_rate, fused=True)
         self.average = {name: p.detach().clone() for name, p in self.trained.items()}
         self.steps = 0
 
     @torch.no_grad()
     def follow(self) -> None:
-        """Let the average follow the weights after a step."""
+        """Update the average after a step."""
         self.steps += 1
         kept = min(self.averaging, self.steps / (self.steps + 10))  # at first over the last tenth of few steps
         torch._foreach_lerp_(list(self.average.values()), list(self.trained.values()), 1 - kept)
 
     @contextmanager
     def averaged(self) -> Iterator[None]:
-        """Put the averaged weights into the model for a while."""
+        """Put the averaged weights into the model within a context."""
         self._swap()
         try:
             yield
@@ -253,15 +260,16 @@ class Optimisation:
 
 
 class _Run(Optimisation):
-    """A run's moving parts: model, best weights, Adam's moments and history, on disk too where there is a path."""
+    """State of a run: model, best weights, moments of Adam and history, also on disk if a path is given."""
 
     def __init__(self, model: nn.Module, learning_rate: float, averaging: float, path: Path | None) -> None:
         super().__init__(model, learning_rate, averaging)
         self.model, self.path, self.history = model, path, History()
         frozen = {name for name, p in model.named_parameters() if not p.requires_grad}
-        self.names = [name for name in model.state_dict() if name not in frozen]  # what training changes
+        self.names = [name for name in model.state_dict() if name not in frozen]  # training changes these
         self.best = self._weights()
         self.settings: dict[str, Any] = {}
+        self.loss: Loss = F.cross_entropy
 
     def _weights(self) -> dict[str, Tensor]:
         state = self.model.state_dict()
@@ -271,7 +279,7 @@ class _Run(Optimisation):
         self.model.load_state_dict(self.best, strict=False)
 
     def record(self, history: History, *, save: bool = True) -> None:
-        """Take a longer history, keep the weights if they are its best, write the checkpoint."""
+        """Set the history, store the weights if the last epoch is the best, write the checkpoint."""
         if history.best_epoch == history.epochs:
             with self.averaged():
                 self.best = self._weights()
@@ -286,7 +294,7 @@ class _Run(Optimisation):
         write_checkpoint(self.path, tensors, settings=self.settings, state=history.to_dict())
 
     def resume(self) -> None:
-        """Continue from the checkpoint where there is one."""
+        """Continue from the checkpoint if there is one."""
         if self.path is None or not self.path.exists():
             return
         tensors, state = read_checkpoint(self.path, self.settings)
@@ -312,7 +320,7 @@ def _check_options(epochs: int, batch_size: int, learning_rate: float, averaging
 
 
 def _check(model: nn.Module, train: Windows, validation: Windows) -> None:
-    """Refuse windows that would train nonsense, before any time is spent."""
+    """Refuse unusable windows before any training."""
     for name, windows in (("training", train), ("validation", validation)):
         if not len(windows):
             raise ValueError(f"no {name} windows")
@@ -321,6 +329,10 @@ def _check(model: nn.Module, train: Windows, validation: Windows) -> None:
                 f"{bad} of {len(windows)} {name} windows hold NaN or infinite readings: make_windows holds them"
             )
         n = logits_of(model, windows.x[:1]).shape[1]
+        if windows.y.ndim == 2:
+            if windows.y.shape[1] != n or not np.isfinite(windows.y).all():
+                raise ValueError(f"{name} targets need {n} finite values a window, got {list(windows.y.shape)}")
+            continue
         if windows.y.min() < 0 or windows.y.max() >= n:
             raise ValueError(
                 f"{name} labels run from {windows.y.min()} to {windows.y.max()}, the model has {n} classes"
@@ -335,17 +347,23 @@ def _random_repairs(model: nn.Module, train: Windows, validation: Windows, seed:
     return repairs, repairs.beside(validation, seed)
 
 
-def _validate(model: nn.Module, windows: Windows) -> tuple[float, float]:
-    """Return loss and accuracy."""
+def _default_loss(windows: Windows) -> Loss:
+    return F.mse_loss if windows.y.ndim == 2 else F.cross_entropy
+
+
+def _validate(model: nn.Module, windows: Windows, criterion: Loss) -> tuple[float, float]:
+    """Return loss, and accuracy or R2."""
     logits, labels = logits_of(model, windows.x), as_tensor(windows.y)
-    loss = F.cross_entropy(logits, labels).item()
+    loss = criterion(logits, labels).item()
     if not math.isfinite(loss):
         raise ValueError(f"the validation loss became {loss}: lower learning_rate")
+    if windows.y.ndim == 2:
+        return loss, r2(windows.y, logits.numpy())
     return loss, (logits.argmax(1) == labels).double().mean().item()
 
 
 def _stop(history: History, epochs: int, patience: int | None, clock: Clock, whole: int) -> Stopped | None:
-    """Say why the run is over; None while it is not. After the first epoch, a whole one has to fit."""
+    """Return why the run ends; None while it continues. After the first epoch a whole epoch has to fit."""
     if clock.over:
         return "budget"
     if patience is not None and history.epochs - history.best_epoch >= patience:
@@ -357,7 +375,7 @@ def _stop(history: History, epochs: int, patience: int | None, clock: Clock, who
 
 @contextmanager
 def seeded(seed: int, epoch: int, device: torch.device) -> Iterator[torch.Generator]:
-    """Give an epoch its own random numbers, dropout's too, so that a resumed run draws what an unbroken one would."""
+    """Seed an epoch, dropout included, so that a resumed run draws the same numbers as an uninterrupted one."""
     state = int(np.random.SeedSequence([seed, epoch]).generate_state(1, np.uint64)[0] >> np.uint64(1))
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         torch.default_generator.manual_seed(state)
@@ -368,5 +386,5 @@ def seeded(seed: int, epoch: int, device: torch.device) -> Iterator[torch.Genera
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors below a prefix, without it."""
+    """Return the tensors whose names start with a prefix, without the prefix."""
     return {name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)}

@@ -1,1 +1,1 @@
-"""The paper's experiments, repeated and taken further: settings, bench, ledger, figures, claims, page."""
+"""The paper's experiments and extensions: settings, bench, ledger, figures, claims, page."""

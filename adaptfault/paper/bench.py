@@ -1,4 +1,4 @@
-"""The bench of one seed: split, networks, faults and strategies; networks are kept in the run's folder."""
+"""Experiments of one seed: split, networks, faults and strategies; networks are stored in the folder of the run."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from adaptfault.models.training import train
 from adaptfault.paper.settings import WIRING, Settings, Task, is_aware
 from diagnostics import Fault, FaultKind, FaultSet, SelfDiagnosis, inject
 
-_LOG, _REFERENCE = 20, 200  # recordings of the broken sensor that the diagnosis sees; healthy ones that it learns from
-_SPREAD = 50_000  # seeds of different draws lie apart
+_LOG, _REFERENCE = 20, 200  # recordings of the faulty sensor for the diagnosis; healthy recordings for its fit
+_SPREAD = 50_000  # offset between the seeds of different draws
 
 Floats = NDArray[np.float32]
 Classes = NDArray[np.int64]
@@ -35,16 +35,16 @@ Classes = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What all seeds share.
+    """Data and settings that all seeds share.
 
     Attributes:
         recordings: labelled and fault-free.
         windows: cut from them.
-        settings: how thoroughly to measure.
+        settings: extent of the measurements.
         folder: of the run; networks go into ``models``.
-        device: that networks are trained on.
-        progress: show or hide it.
-        say: told what is being done.
+        device: of training.
+        progress: show or hide progress.
+        say: receives status messages.
     """
 
     recordings: Recordings
@@ -57,7 +57,7 @@ class Setup:
 
 
 class Bench:
-    """Everything that the tasks of one seed need, made when first needed."""
+    """Data, networks and faults of one seed, created on first use."""
 
     def __init__(self, setup: Setup, seed: int) -> None:
         self.setup, self.seed, self.layout = setup, seed, setup.recordings.layout
@@ -83,7 +83,7 @@ class Bench:
         return self._answers(task.strategy, x)
 
     def _answers(self, strategy: str, x: Floats) -> Classes:
-        """Answer windows ``[N, T, D]`` of all test recordings by a strategy that needs no diagnosis."""
+        """Predict windows ``[N, T, D]`` of all test recordings by a strategy without diagnosis."""
         if (more := is_aware(strategy)) is not None:
             return self.aware(*more).predict(x[self.kept])
         match strategy:
@@ -113,10 +113,10 @@ class Bench:
     # Faults
 
     def broken(self, faults: str, k: int) -> Floats:
-        """Return the test windows with k faults in each recording, drawn for each anew, ``[N, T, D]``.
+        """Return the test windows ``[N, T, D]`` with k faults in each recording, drawn independently.
 
-        So one pass averages over as many fault sets as there are recordings. Open and short ones hit the same cells,
-        and fewer are among the more.
+        One pass averages over as many fault sets as there are recordings. Open and short faults affect the same cells,
+        and the cells of a smaller k are a subset of those of a larger k.
         """
         x = self.whole.x.copy()
         frames = np.arange(x.shape[1])
@@ -133,7 +133,7 @@ class Bench:
         return x
 
     def _wiring(self, kind: str, k: int, rng: np.random.Generator) -> list[tuple[NDArray[np.intp], float]]:
-        """Draw k broken lines or blocks: their cells, and what they read on the 0..1 scale."""
+        """Draw k broken lines or blocks: their cells and readings on the 0..1 scale."""
         return RandomFaults(self.layout, cast("FaultPattern", kind)).draw(k, rng)
 
     def fault_set(self, k: int) -> FaultSet:
@@ -154,7 +154,7 @@ class Bench:
         )
 
     def aware(self, n: int, kind: str = "cells") -> TactileTransformer:
-        """Return the network trained with n more windows with faults of a kind ("none": without); n = 0: the base."""
+        """Return the network trained with n additional windows with faults of a kind; n = 0: the base network."""
         if not n:
             return self.base
         settings, name = self.setup.settings, f"aware{self.seed}-{n}-{kind}"
@@ -179,7 +179,7 @@ class Bench:
         return TactileTransformer(self.layout, n_classes, seed=seed, **self.setup.settings.network)
 
     def _options(self, name: str) -> dict[str, Any]:
-        """Return what all trainings have in common."""
+        """Return the options that all trainings share."""
         settings = self.setup.settings
         return {
             "learning_rate": settings.learning_rate,
@@ -192,10 +192,10 @@ class Bench:
     def _kept(
         self, name: str, model: TactileTransformer, fit: Callable[[TactileTransformer], object]
     ) -> TactileTransformer:
-        """Return the network of this name from the run's folder, or train one and keep it."""
+        """Return the network of this name from the folder of the run, or train and store it."""
         folder = self.setup.folder / "models" / name
         if (folder / MANIFEST).exists():
-            return load_model(folder)
+            return cast(TactileTransformer, load_model(folder))
         folder.parent.mkdir(parents=True, exist_ok=True)
         self.setup.say(f"seed {self.seed}: training {name}")
         fit(model.to(self.setup.device))
@@ -207,11 +207,11 @@ class Bench:
 
     @cached_property
     def adapter(self) -> Adapter:
-        """Of the base."""
+        """The adapter of the base network."""
         return Adapter(self.base, self.train, self.validation)
 
     def _adapted(self, faults: FaultSet, x: Floats | None = None) -> Classes:
-        """Answer by the base adapted to F; the cells in F read NaN unless ``x`` is given."""
+        """Predict by the base network adapted to F; the cells in F read NaN unless ``x`` is given."""
         if faults not in self._adaptations:
             self._adaptations[faults] = self.adapter.adapt(faults, seed=self.seed, progress=False)
         if x is None:
@@ -224,7 +224,7 @@ class Bench:
         return {}
 
     def _trained_anew(self, faults: FaultSet) -> Classes:
-        """Answer by a network trained on the healthy cells alone, the paper's protocol (Section IV)."""
+        """Predict by a network trained on the healthy cells alone, the paper's protocol (Section IV)."""
         reduced = ReducedModel(self._fresh(self.seed + 1), faults, self.adapter.statistics.linear(faults))
         name = f"anew{self.seed}-{len(faults)}"
         train(
@@ -238,17 +238,17 @@ class Bench:
         (self.setup.folder / "models" / f"{name}.training").unlink(missing_ok=True)
         return predicted
 
-    # Noise, drift, blinking, wiring: the same faults in all recordings, as a diagnosis needs them
+    # Noise, drift, intermittency, wiring: the same faults in all recordings, as a diagnosis needs them
 
     def causes(self, kind: str, k: int) -> list[Fault]:
-        """Return k faults of one kind, those of this seed."""
+        """Return k faults of one kind for this seed."""
         if kind not in WIRING:
             return [Fault(FaultKind(kind), (cell,)) for cell in self.fault_set(k)]
         drawn = self._wiring(kind, k, np.random.default_rng(_SPREAD + self.seed))
         return [Fault(FaultKind.SHORT if end else FaultKind.OPEN, tuple(cells.tolist())) for cells, end in drawn]
 
     def _against(self, task: Task) -> Classes:
-        """Answer the test recordings of a sensor that has k faults of one kind."""
+        """Predict the test recordings of a sensor with k faults of one kind."""
         causes = self.causes(task.faults, task.k)
         x = self._injected(causes).x
         if task.strategy == "adapted":
@@ -259,7 +259,7 @@ class Bench:
         return self._answers(task.strategy, x)
 
     def _injected(self, faults: list[Fault]) -> Windows:
-        """Return the windows of the test recordings with these faults; all of them, in their order."""
+        """Return all windows of the test recordings with these faults, in order."""
         frames, length = self.setup.recordings.frames, self.whole.x.shape[1]
         broken = [
             inject(frames[i], faults, self.layout, seed=_SPREAD * self.seed + i)
@@ -268,7 +268,7 @@ class Bench:
         return make_windows(broken, None, self.layout, length=length)
 
     def _combined(self, x: Floats) -> Classes:
-        """Correct while the sensor is not diagnosed yet; diagnose it from that log; adapt, and answer the rest."""
+        """Correct the first recordings, diagnose from them, adapt, and predict the rest with the adapted model."""
         numbers = np.unique(self.whole.recording)
         log = np.random.default_rng(self.seed).permutation(numbers)[: min(_LOG, len(numbers) // 2)]
         full_scale = self.layout.full_scale
@@ -283,7 +283,7 @@ class Bench:
 
     @cached_property
     def diagnoser(self) -> SelfDiagnosis:
-        """Knows fault-free recordings."""
+        """Self-diagnosis fitted on fault-free recordings."""
         known = np.unique(self.train.recording)
         return SelfDiagnosis(self.layout).fit(
             [self.setup.recordings.frames[i] for i in known[evenly(len(known), _REFERENCE)]]

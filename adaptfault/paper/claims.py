@@ -1,4 +1,4 @@
-"""What the paper states in words, and whether it holds here."""
+"""Statements of the paper, and whether the measurements support them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _NEAR, _MODERATE, _HIGH = 0.1, 0.8, 0.9  # shares of the fault-free accuracy (ab
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of the paper beside what was measured.
+    """A statement of the paper beside the measurement.
 
     Attributes:
-        statement: with the section it is from.
-        here: what was measured, with 95 % intervals.
+        statement: with its section.
+        here: the measurement, with 95 % intervals.
         verdict: whether it holds.
-        criterion: what "holds" was taken to mean.
+        criterion: the definition of "holds".
     """
 
     statement: str
@@ -32,7 +32,7 @@ class Claim:
 
 
 def judge(ledger: Ledger, settings: Settings, *, n_classes: int, present: int) -> list[Claim]:
-    """Return the claims that the results so far can decide."""
+    """Return the claims that the available results decide."""
     free = ledger.mean(2, "none", 0, "nothing") or ledger.mean(4, "none", 0, aware(0))
     if free is None:
         return []

@@ -152,7 +152,7 @@ def force_maps(
         maps[f"{len(cells)} {name}"][cells] = value
     figure, axes = pads_figure(layout, n_rows=len(maps))
     size = layout.rows * layout.cols
-    # One scale from the healthy map: a short stands out as what it is, off the scale.
+    # One scale from the healthy map; shorts exceed it.
     top = float(normal[present].max()) or layout.full_scale
     for i, (name, values) in enumerate(maps.items()):
         masked = layout.grid(np.where(layout.present.ravel(), values, np.nan))

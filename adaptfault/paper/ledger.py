@@ -1,4 +1,4 @@
-"""What a run has measured so far: a line of JSON for each task, so that a killed run never measures twice."""
+"""Results of a run: a line of JSON for each task, so that an interrupted run repeats no measurement."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from adaptfault.paper.settings import Task
 
 @dataclass(frozen=True)
 class Result:
-    """What one task gave.
+    """Result of one task.
 
     Attributes:
         task: the task.
         accuracy, precision, recall, f1: on the test windows, macro averages (Section III-B).
-        recordings: (number, windows, windows classified rightly) of each test recording.
-        seconds: wall clock, training included where it was not done before.
+        recordings: (number, windows, windows classified correctly) of each test recording.
+        seconds: wall clock, including training if the network was new.
     """
 
     task: Task
@@ -37,7 +37,7 @@ class Result:
 
     @classmethod
     def of(cls, task: Task, test: Windows, predicted: NDArray[np.int64], seconds: float) -> Result:
-        """Score the answers to the test windows."""
+        """Score the predictions for the test windows."""
         scores = Scores.of(test.y, predicted)
         right = predicted == test.y
         counts = []
@@ -65,7 +65,7 @@ class Mean:
         accuracy, precision, recall, f1: means over the seeds.
         low, high: 95 % interval of the accuracy, clustered by recording.
         spread: standard deviation of the accuracy between seeds.
-        seeds: how many.
+        seeds: number of seeds.
     """
 
     accuracy: float
@@ -82,14 +82,14 @@ class Mean:
 
 
 def mean(results: Iterable[Result]) -> Mean:
-    """Sum up results; a recording that several seeds tested is one cluster.
+    """Average results; a recording tested by several seeds is one cluster.
 
     Raises:
         ValueError: there are none.
     """
     results = list(results)
     if not results:
-        raise ValueError("no results to sum up")
+        raise ValueError("no results to average")
     number, n, right = np.array([c for result in results for c in result.recordings]).T
     wrong_then_right = np.stack([n - right, right], axis=1).ravel()
     low, high = accuracy_interval(np.repeat(np.tile([False, True], len(n)), wrong_then_right), np.repeat(number, n))
@@ -104,7 +104,7 @@ class Ledger:
     """The results on disk.
 
     Args:
-        path: the file; what a kill left of a last line is dropped.
+        path: the file; an incomplete last line is dropped.
     """
 
     def __init__(self, path: Path) -> None:
@@ -113,12 +113,12 @@ class Ledger:
         self.results: dict[Task, Result] = {result.task: result for result in results}
 
     def add(self, result: Result) -> None:
-        """Keep a result."""
+        """Add a result."""
         self.results[result.task] = result
         self._lines.add(result.to_dict())
 
     def arrange(self, tasks: Iterable[Task]) -> None:
-        """Read the results in the order of these tasks, whatever order they were measured in."""
+        """Sort the results by the order of these tasks."""
         place = {task: i for i, task in enumerate(tasks)}
         known = sorted(self.results.items(), key=lambda pair: place.get(pair[0], len(place)))
         self.results = dict(known)

@@ -1,4 +1,4 @@
-"""The page of a run: claims and verdicts, every figure with its table, and what it was made with."""
+"""The page of a run: claims and verdicts, each figure with its table, versions and settings."""
 
 from __future__ import annotations
 
@@ -28,11 +28,12 @@ _NOTES = {
     5: "One F for each seed, the smaller ones part of the larger. *adapted*: the missing cells are filled in, and where"
     " that is not enough a head is fitted in closed form; it sees the healthy cells besides the network's features, and"
     " may do better than the network's own. *trained anew*: the paper's protocol.",
-    6: "*to 0* as in the paper; *to half*: its other proposal, 2.5 N, for full scale alone; *to the mean*: what the"
-    " other cells say, for full scale alone; *wait 5*: only a cell that has stayed at a rail for 5 frames.",
+    6: "*to 0* as in the paper; *to half*: its other proposal, 2.5 N, for full scale alone; *to the mean*: the"
+    " conditional mean given the other cells, for full scale alone; *wait 5*: only a cell that has stayed"
+    " at a rail for 5 frames.",
     7: "The same faulty cells in all recordings of a seed; also two broken lines or blocks, each open or short."
-    " *adapted* is told which cells; *combined* is not: it corrects to the mean while a log is recorded, diagnoses"
-    " that, and adapts. Drift starts anew with each recording.",
+    " *adapted* is given the faulty cells. *combined* is not: it corrects to the mean while a log is recorded,"
+    " diagnoses the log, and adapts. Drift starts anew with each recording.",
 }
 
 _ERRATA = """\
@@ -40,14 +41,14 @@ _ERRATA = """\
 
 - It prints 2^n - 1 fault combinations. Each cell is healthy, open or short: 3^n - 1, and its 10^105 is 3^220.
 - Correcting short cells to 0 gives the very input that open cells give, so that Figure 6 equals the open half of Figure
-  2 by construction, unless healthy cells press to the rail: then it costs accuracy. Full scale replaced by what the
-  other cells say does better.
+  2 by construction, unless healthy cells press to the rail: then it costs accuracy. The conditional mean given the
+  other cells is better.
 - Its other neutral value, 2.5 N for 0 *and* 5 N, ruins a healthy sensor: cells that nothing touches read exactly 0.
   Here 2.5 N stands for full scale alone.
 - "Equal to 5.0" is 1.0 after its own scaling, and no equality survives calibration: a tolerance of 1.5 converter steps.
 - More fault-aware samples also mean more training steps. The paper does not separate the two; here the control does.
 - Its faults are scattered cells. Arrays lose lines and patches: Figure 4 and the last comparison have those as well.
-- The D - k inputs of its reduced model do not fill the grid of its convolutions: a front end fills in what is missing.
+- The D - k inputs of its reduced model do not fill the grid of its convolutions: a front end imputes the missing cells.
 - The feed-forward block must return to width d for the residual sum. Text and tensors disagree on rows and columns:
   here the first axis has 11. Padding, initial weights and |F| of Figures 2 and 6 are not stated.
 """

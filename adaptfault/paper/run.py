@@ -1,4 +1,4 @@
-"""A reproduction from start to end: measure what is not measured yet, then draw, judge the claims, write the page."""
+"""A reproduction: run the tasks without a result, then draw the figures, decide the claims and write the page."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ def reproduce(
     progress: bool | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Path:
-    """Measure, draw and write the page; returns its path. Run again after a kill, it goes on where it was.
+    """Measure, draw and write the page; return its path. A second run continues an interrupted one.
 
     Args:
         recordings: labelled and fault-free.
-        settings: how thoroughly.
-        folder: of the run; made if need be.
-        figures: of the paper's, and 7 for what it leaves to future work.
-        source: what the recordings are, for the page.
-        command: that made the run, for the page.
-        device: that networks are trained on.
+        settings: extent of the measurements.
+        folder: of the run; created if missing.
+        figures: numbers of the paper's figures, and 7 for its future work.
+        source: name of the recordings, for the page.
+        command: command line of the run, for the page.
+        device: of training.
         progress: show or hide it on stderr; None shows it on a terminal.
-        say: told what is being done, a line at a time.
+        say: receives status messages, a line at a time.
 
     Raises:
         ValueError: no labels, or the folder holds a run with other settings or recordings.
@@ -83,7 +83,7 @@ def _settle(path: Path, config: dict[str, Any]) -> None:
 
 
 def _measure(setup: Setup, ledger: Ledger, figures: tuple[int, ...]) -> None:
-    """Do the tasks that have no result yet."""
+    """Run the tasks that have no result yet."""
     present = int(setup.recordings.layout.present.sum())
     tasks = list(setup.settings.tasks(present, figures))
     left = [task for task in tasks if task not in ledger.results]

@@ -1,4 +1,4 @@
-"""What a reproduction measures, and how thoroughly: the quick run and the full one."""
+"""Tasks and settings of a reproduction: the quick run and the full one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 PAPER_CELLS = 220
 FUTURE = ("open", "short", "noisy", "drift", "intermittent")  # the last three are the paper's future work
-WIRING = ("lines", "blocks")  # what breaks together on real arrays; the paper has scattered cells only
+WIRING = ("lines", "blocks")  # faults of real arrays; the paper has scattered cells only
 
 CORRECTIONS = ("correct to 0", "correct to half", "correct to the mean", "correct to 0, wait 5")
 
@@ -18,11 +18,11 @@ class Task:
     """One cell of work: a strategy on a kind of fault.
 
     Attributes:
-        figure: number of the paper's figure; 7 is what the paper leaves to future work.
+        figure: number of the figure in the paper; 7 is the paper's future work.
         seed: of split, weights, training and faults.
         faults: "none", "open", "short", "mixed" (each with equal chance), a kind of :data:`FUTURE` or :data:`WIRING`.
         k: number of faulty cells (of lines or blocks, for :data:`WIRING`).
-        strategy: what is done about it.
+        strategy: the repair.
     """
 
     figure: int
@@ -34,7 +34,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Settings:
-    """How thoroughly to measure.
+    """Extent of the measurements.
 
     Attributes:
         seeds: each has its own split, weights, training and faults.
@@ -52,8 +52,8 @@ class Settings:
         controls: seeds, at most, of the control: fault-aware training's steps without its faults.
         judged: validation windows, at most, that networks and repairs are judged on.
         wiring: faulty lines or blocks there and in Figure 4.
-        windows: tested of each recording, at most: more of the same grasp say little more.
-        single: windows for the sensitivity to single faults.
+        windows: tested of each recording, at most: windows of one grasp are strongly correlated.
+        single: number of windows for the sensitivity to single faults.
     """
 
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -83,9 +83,9 @@ class Settings:
 
     @classmethod
     def quick(cls, *, simulated: bool) -> Settings:
-        """Everything but the networks trained anew, smaller: about 14 minutes on two free cores on simulated grasps.
+        """All but the networks trained anew, smaller: about 14 minutes on two free cores on simulated grasps.
 
-        Most of it is training: three bases, three fault-aware networks, one for the control.
+        Most of the time is training: three base networks, three fault-aware networks, one control.
         """
         small: dict[str, Any] = {
             "patience": None,
@@ -101,7 +101,7 @@ class Settings:
             "windows": 2,
             "single": 50,
         }
-        if simulated:  # unpadded convolutions cost a third; Keras's initial weights learn in three epochs
+        if simulated:  # unpadded convolutions take a third of the time; Keras's initial weights train in three epochs
             return cls(epochs=3, learning_rate=2e-4, network={"padding": "valid", "init": "glorot"}, **small)
         return cls(epochs=20, **small)
 
@@ -115,9 +115,9 @@ class Settings:
         return tuple(sorted({k for k in scaled if k < present}))
 
     def tasks(self, present: int, figures: tuple[int, ...]) -> Iterator[Task]:
-        """Yield the work for these figures on an array of ``present`` cells: what costs most training comes last.
+        """Yield the tasks of these figures on an array of ``present`` cells, those with most training last.
 
-        Figure 6 is drawn beside what Figure 2 shows, and so needs that too.
+        Figure 6 also shows curves of Figure 2, and so needs its tasks.
         """
         figures = (*figures, 2) if 6 in figures else figures
         for part in (self._stuck, self._adapted, self._future, self._fault_aware, self._trained_anew):

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.data.calibration import Calibration
     from adaptfault.data.windows import Windows
+    from adaptfault.models.any_model import AnyModel
     from adaptfault.models.network import TactileTransformer
 
 SCHEMA = "adaptfault.bundle/1"
@@ -102,7 +103,7 @@ class Bundle:
     def create(
         cls,
         path: str | Path,
-        model: TactileTransformer,
+        model: TactileTransformer | AnyModel,
         adapter: Adapter,
         diagnoser: SelfDiagnosis,
         *,
@@ -310,7 +311,7 @@ def _save(adaptation: Adaptation, folder: Path) -> None:
         _log.warning("no ONNX export, this version runs on torch: %s", error)
 
 
-def _fault_free(model: TactileTransformer, validation: Windows) -> Adaptation:
+def _fault_free(model: TactileTransformer | AnyModel, validation: Windows) -> Adaptation:
     """Return the model as an adaptation to the empty fault set, with identical logits."""
     from adaptfault.adaptation.reduced_model import ReducedModel
     from adaptfault.adaptation.result import Adaptation

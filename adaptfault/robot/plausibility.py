@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from adaptfault.data.windows import hold_missing, scale
-from adaptfault.imputation.linear import CellStatistics
+from adaptfault.imputation.statistics import CellStatistics
 from diagnostics import FaultSet, SensorLayout
 
 _MARGIN = 0.05  # of full scale: calibrated readings may lie outside the range by so much

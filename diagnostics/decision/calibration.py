@@ -49,7 +49,7 @@ _KINDS = 3
 _LOADED_THROUGHOUT = 3  # never moved and holds a load: calibrated as kind 0, without a second slope
 _SUSPICIOUS = 2.8  # calibrated log ratio from which on a cell is excluded from the predictors
 _SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw log ratio at that point
-_DOUBT, _STRANGE = 0.5, 22.0  # largest discount of the slopes, and recordings held out at which it halves
+_MAX_DISCOUNT, _HALF_DISCOUNT = 0.5, 22.0  # of the slopes; recordings held out that halve it (one split)
 _PRIOR_VARIANCE = 10.0  # of the weights
 _ODD = 0.003  # share of the healthy cells beyond the clip from which on a second slope is fitted
 _CLIP = 6.0  # raw log ratio at which the second slope begins: outliers must not steer the first
@@ -127,7 +127,7 @@ class Calibrator:
         for n in (n_logs // 3, n_logs):
             weights = cls._of([_trial(*log, weights.exclusion._replace(gains=1.0)) for log in logs[:n]])
         # Few held-out recordings contain few unusual events; repeated splits are correlated and count for less.
-        counts = 1 - _DOUBT / (1 + turns * (held_out / _STRANGE) ** 2)
+        counts = 1 - _MAX_DISCOUNT / (1 + turns * (held_out / _HALF_DISCOUNT) ** 2)
         measured = np.array(weights.slope) != default.slope
         slope, tail_slope = (
             np.where(measured, counts * np.array(of), of) for of in (weights.slope, weights.tail_slope)

@@ -288,7 +288,7 @@ def count_repeats(
     Args:
         events: in time order.
         least: cosine between mean loads from which on two events load the same cells.
-        among: bool ``[D]``, the cells compared; cells stuck under load would make all events alike.
+        among: bool ``[D]``, the cells compared; cells stuck under load would make all events similar.
     """
     if not events:
         return np.zeros(0, np.intp)

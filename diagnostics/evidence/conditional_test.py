@@ -28,7 +28,7 @@ from diagnostics.preprocessing.scale import Array, Scale
 if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
 
-_ANYWHERE = 0.2  # share of broken cells that stick at any value; the others stick to either rail alike
+_ANYWHERE = 0.2  # share of broken cells that stick at any value; the others stick to either rail equally often
 P_MIN = 1e-4  # lower limit of P in one event: models err
 SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
 _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
@@ -212,5 +212,5 @@ def _tempered(never: Floats, unloaded: NDArray[np.bool_], working: NDArray[np.bo
     likelihood = -np.stack([np.log1p(np.exp(-power * right)).sum(axis=1) for power in _POWERS])
     share = softmax(_FIT_WEIGHT * likelihood, axis=0)  # (powers, n)
     averaged = np.sum([p[:, None] * expit(w * odds) for p, w in zip(share, _POWERS, strict=True)], axis=0)
-    believed: Floats = np.maximum(never, averaged)  # tempering never adds evidence against a cell
-    return believed
+    tempered: Floats = np.maximum(never, averaged)  # tempering never adds evidence against a cell
+    return tempered

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 REACH = 3  # rows and columns
 _FEATURES = 4  # see Summary.features
-_MOST, _UNLOADED = 20_000, 0.2  # samples; share of them without any load around, which are all alike
+_MOST, _UNLOADED = 20_000, 0.2  # samples; share of them without any load around, which are all equal
 _RIDGE = 1e-3  # per sample: keeps the Hessian regular
 _STEPS = 12  # of Newton's method: converged
 

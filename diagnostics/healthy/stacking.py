@@ -6,7 +6,7 @@ its position, and mean loads of three rings of cells, of the pad and of the arra
     log odds = x w + b + out' max(hidden' x + threshold, 0)
 
 A logistic regression plus a network with one hidden layer, weighted (1 - s) : s with s = events / (events + 20).
-Equals stacked generalization (Wolpert 1992) with scikit-learn's ``LogisticRegression`` (shrunk towards repeating the
+Stacked generalization (Wolpert 1992) with scikit-learn's ``LogisticRegression`` (shrunk towards repeating the
 input odds) and ``MLPClassifier`` as second level. Fitted on events that the regressions were not fitted on (see
 :mod:`~diagnostics.healthy.cross_fitting`). Loads beyond two rows or columns enter only as means.
 """

@@ -16,7 +16,7 @@ difference, in % of full scale; "others" are the cells that the injector leaves 
   within 1.6, others within 0.4. A short of 1 kiloohm moves others by 2.4, of 1 ohm by 13: it halves the rest of its row
   and leaves 0.3 of the rest of its column.
 - A row on the supply never reads full scale: its cells stay alive (92 off at the median) and their forces are added to
-  those of all other rows of their column. Bridged lines read alike: the sum of the two where the line that is not
+  those of all other rows of their column. Bridged lines read the same: the sum of the two where the line that is not
   selected floats (within 1.5), their mean where a switch like the driver's grounds it, still less of two columns where
   the load is not small.
 - Floating lines: nothing but address bits and converters agrees on all cells. The median loaded cell reads 28 too

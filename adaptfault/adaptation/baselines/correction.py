@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.imputation.linear import CellStatistics
+from adaptfault.imputation.statistics import CellStatistics
 
 STEP = 1 / 4095  # of a 12-bit converter, as the paper's ESP32 has, on the 0..1 scale
-TOLERANCE = 1.5 * STEP  # a cell at the rail that is unrestful by one step is still at the rail
+TOLERANCE = 1.5 * STEP  # a cell at the rail may vary by one converter step
 
 Neutral = float | ArrayLike | CellStatistics
 
@@ -42,14 +42,14 @@ def correct(
 ) -> NDArray[Any]:
     """Return scaled readings ``[..., D]`` in which abnormal ones are replaced by a neutral value (Section V).
 
-    Each frame is looked at alone, so this corrects windows, recordings and single frames alike.
+    Frames are corrected independently, so windows, recordings and single frames are all valid input.
 
     Args:
         x: on the 0..1 scale. NaN is left as it is.
-        abnormal: values taken for faults. The paper's 0 and 5 N are 0 and 1 on this scale.
-        neutral: what they become: one value; an array ``[D]``, one for each cell (its median, say); or
-            :class:`~adaptfault.imputation.linear.CellStatistics`: the mean of the abnormal cells given the others,
-            within 0..1. With true zeros among ``abnormal`` that leaves it little to go by: use ``abnormal=(1.0,)``.
+        abnormal: values that count as faults. The paper's 0 and 5 N are 0 and 1 on this scale.
+        neutral: the replacement: one value; an array ``[D]``, one for each cell (as its median); or
+            :class:`~adaptfault.imputation.statistics.CellStatistics`: the conditional mean of the abnormal cells given
+            the others, within 0..1. It needs ``abnormal=(1.0,)`` where healthy cells read exactly 0.
         tolerance: how far from an abnormal value a reading may be. The default is 1.5 steps of a 12-bit converter; for
             b bits use ``1.5 / (2**b - 1)``. Exact equality, as the paper has it, fails on calibrated readings.
 
@@ -74,10 +74,10 @@ def at_rail(x: NDArray[Any], abnormal: Sequence[float], tolerance: float) -> NDA
 
 
 class CausalCorrection:
-    """Correction frame by frame that waits: only a cell that has stayed at one rail for ``wait`` frames is abnormal.
+    """Frame-by-frame correction with a delay: a cell is abnormal after ``wait`` frames at one rail.
 
-    A real press to the rail that is shorter than ``wait`` frames passes unchanged, and so do the first ``wait - 1``
-    frames of a fault. A cell that leaves the rail is trusted again at once.
+    Contact that saturates a cell for fewer than ``wait`` frames passes unchanged, and so do the first ``wait - 1``
+    frames of a fault. A cell that leaves the rail is used again at once.
 
     Args:
         wait: frames; 1 corrects at once, as :func:`correct` does.
@@ -102,7 +102,7 @@ class CausalCorrection:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the frames seen, as at the start of a recording."""
+        """Clear the state, as at the start of a recording."""
         self._stayed: NDArray[np.int64] | None = None  # [rails, D], frames in a row at each rail
 
     def update(self, frame: ArrayLike) -> NDArray[Any]:
@@ -159,10 +159,10 @@ def _replaced(x: NDArray[Any], hit: NDArray[np.bool_], neutral: Neutral) -> NDAr
 
 
 def _expected(x: NDArray[Any], hit: NDArray[np.bool_], statistics: CellStatistics) -> NDArray[Any]:
-    """Replace by the Gaussian mean given the cells that were not hit; one solve for each set of cells that were."""
+    """Replace by the conditional mean given the other cells; one solve for each set of abnormal cells."""
     d = len(statistics.mean)
     if x.shape[-1] != d:
-        raise ValueError(f"the statistics are of {d} cells, the readings of {x.shape[-1]}: {list(x.shape)}")
+        raise ValueError(f"the statistics have {d} cells, the readings {x.shape[-1]}: {list(x.shape)}")
     out, hit = x.reshape(-1, d).copy(), hit.reshape(-1, d)
     unknown = hit | np.isnan(out)
     which = np.flatnonzero(hit.any(axis=1))

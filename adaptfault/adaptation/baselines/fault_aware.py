@@ -1,8 +1,8 @@
 """Fault-aware training (Section III-C): windows with random faults are added to the training data.
 
-The paper adds 10 000, 100 000 or 200 000 of them. Here they are numbered, and each is made anew from its number when
-it is trained on: the same set in every epoch, and never stored. The paper breaks scattered cells only; real arrays lose
-lines and patches, so ``kind`` offers those as well.
+The paper adds 10 000, 100 000 or 200 000 windows. Here each window is generated from its index when training needs it:
+the same set in every epoch, without storage. The paper has faults in scattered cells only; real arrays also lose lines
+and patches, which ``kind`` selects.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from diagnostics import SensorLayout
 
 
 class FaultySamples:
-    """Windows with random faults, made when asked for: sample i is always the same.
+    """Windows with random faults, generated on demand: sample i is always the same.
 
     Sample i is a window drawn from ``windows`` with k cells open (0) or short (full scale), each with equal chance;
     k is drawn from ``n_faults``. A faulty line or block reads one of the two as a whole.
@@ -33,7 +33,7 @@ class FaultySamples:
         n: number of samples.
         n_faults: numbers of faults to draw from: of cells, or of lines or blocks; (0,) gives the same windows healthy.
         kind: "cells", "lines" or "blocks" (:class:`~adaptfault.adaptation.baselines.random_faults.RandomFaults`).
-        seed: of it all.
+        seed: of windows and faults.
 
     Raises:
         ValueError: no windows, another number of cells than the layout's, an unknown kind, faults that do not fit.
@@ -66,7 +66,7 @@ class FaultySamples:
         return f"{len(self)} windows with {self.n_faults} faulty {self.kind}, seed {self.seed}"
 
     def draw(self, index: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return the samples with these numbers, ``[B, T, D]``."""
+        """Return the samples with these indices, ``[B, T, D]``."""
         x = self.windows.x[self.source[index]]
         for window, i in zip(x, index.tolist(), strict=True):
             rng = np.random.default_rng([self.seed, i])
@@ -88,8 +88,8 @@ def train_fault_aware(
 ) -> History:
     """Train ``model`` in place on fault-free windows and on ``n_samples`` more with random faults (Section III-C).
 
-    The weights kept are those that do best on the validation windows, half of them with faults of the same kind. (The
-    paper chooses on fault-free ones, which cannot tell how well faults are borne.)
+    The selected weights are best on validation windows of which half have faults of the same kind. (The paper selects
+    on fault-free windows, which do not measure the robustness to faults.)
 
     Args:
         model: a network of a known layout.
@@ -99,7 +99,7 @@ def train_fault_aware(
         n_samples: windows with faults in an epoch, the same in each epoch.
         kind: "cells" as in the paper, "lines" or "blocks" (:class:`FaultySamples`).
         seed: of the faults, and of training.
-        options: further ones of :func:`adaptfault.train`, as ``epochs``.
+        options: further arguments of :func:`adaptfault.train`, as ``epochs``.
 
     Raises:
         ValueError: as :class:`FaultySamples` and :func:`adaptfault.train`.

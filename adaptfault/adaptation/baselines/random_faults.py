@@ -1,4 +1,4 @@
-"""Random faults of one shape: scattered cells as in the paper, whole lines, or patches as a blow or a spill leaves."""
+"""Random faults of one shape: scattered cells as in the paper, whole lines, or rectangular patches."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class RandomFaults:
             overlap).
 
     Attributes:
-        most: as many faults can be drawn at once.
+        most: the largest number of faults that can be drawn at once.
 
     Raises:
         ValueError: an unknown kind.
@@ -38,7 +38,7 @@ class RandomFaults:
         self.most = len(self.lines if kind == "lines" else self.cells)
 
     def draw(self, k: int, rng: np.random.Generator) -> list[tuple[Any, Any]]:
-        """Return the cells of k faults, and what they read on the 0..1 scale (scattered cells come all in one)."""
+        """Return cells and readings (0..1 scale) of k faults; scattered cells come as one pair of arrays."""
         values = rng.integers(0, 2, k).astype(np.float32)
         match self.kind:
             case "cells":
@@ -50,7 +50,7 @@ class RandomFaults:
                 return [(self._block(rng), value) for value in values]
 
     def _block(self, rng: np.random.Generator) -> NDArray[np.intp]:
-        """Draw a patch around one of the cells."""
+        """Draw a patch around a random cell."""
         pad, row, col = self.layout.position(int(rng.choice(self.cells)))
         high, wide = rng.integers(1, _WIDEST + 1, 2)
         top, left = max(0, row - high // 2), max(0, col - wide // 2)

@@ -1,0 +1,162 @@
+"""The fault-free model with its windows: the data from which each adaptation starts."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from adaptfault.adaptation.heads import MOST_WINDOWS
+from adaptfault.data.windows import Windows, evenly
+from adaptfault.evaluation.scores import r2
+from adaptfault.imputation.statistics import CellStatistics
+from adaptfault.imputation.tiled_statistics import LARGE, TiledStatistics
+from adaptfault.models.any_model import AnyModel, Features, device_of
+from adaptfault.models.compact import CompactNetwork, compacted
+from adaptfault.models.network import TactileTransformer, as_tensor, logits_of
+from diagnostics import SensorLayout
+
+Task = Literal["classification", "regression"]
+Network = TactileTransformer | AnyModel
+
+
+class FaultFreeModel:
+    """A model, fault-free windows, and the statistics that all adaptations share.
+
+    Args:
+        model, train, validation, layout, features, task, loss: as in :class:`~adaptfault.adaptation.adapter.Adapter`.
+
+    Attributes:
+        model: the network; other modules are wrapped in :class:`~adaptfault.models.any_model.AnyModel`.
+        task: "classification" or "regression".
+        targets, validation_targets: ``[N, n]``, class indicators or probabilities; values of a regression.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        train: Windows,
+        validation: Windows,
+        *,
+        layout: SensorLayout | None = None,
+        features: Features | None = None,
+        task: Task | Literal["auto"] = "auto",
+        loss: Callable[[Tensor, Tensor], Tensor] | None = None,
+    ) -> None:
+        if not len(train) or not len(validation):
+            raise ValueError("an adapter needs fault-free windows to learn from and to validate on; one set is empty")
+        self.task, self.loss = _task(task, train, validation), loss
+        self.model = _wrapped(model, train, layout, features)
+        _check_targets(self.model, self.task, train, validation)
+        most = MOST_WINDOWS // 2  # enough to compare accuracies
+        validation = validation.select(evenly(len(validation), most))
+        self.train, self.targets = _labelled(self.model, self.task, train)
+        self.validation, self.validation_targets = _labelled(self.model, self.task, validation)
+
+    @property
+    def layout(self) -> SensorLayout:
+        """The array."""
+        return self.model.layout
+
+    @cached_property
+    def statistics(self) -> CellStatistics:
+        """Moments of the fault-free frames, estimated once and used for each F."""
+        return CellStatistics.fit(self.train)
+
+    @cached_property
+    def compact(self) -> CompactNetwork | None:
+        """Low-rank form of the paper's network; None for other models, few windows or large arrays."""
+        return self.compacted(self.model)
+
+    def compacted(self, network: Network) -> CompactNetwork | None:
+        """Return the low-rank form of a network on its device, where it saves time."""
+        windows = len(self.train) + len(self.validation)
+        return compacted(network, windows) if isinstance(network, TactileTransformer) else None
+
+    @cached_property
+    def imputation(self) -> CellStatistics | TiledStatistics:
+        """The source of front ends: ``statistics``, or tiles on a large array."""
+        return TiledStatistics.fit(self.train, self.layout) if self.layout.n_cells > LARGE else self.statistics
+
+    @cached_property
+    def fault_free_accuracy(self) -> float:
+        """Accuracy (R2 of a regression) of the fault-free model on the fault-free validation windows."""
+        return self.score(logits_of(self.compact or self.model, self.validation.x))
+
+    def score(self, outputs: Tensor) -> float:
+        """Return accuracy or R2 of outputs ``[N, n]`` for the validation windows."""
+        if self.task == "regression":
+            return r2(self.validation.y, outputs.numpy())
+        return float((outputs.argmax(1).numpy() == self.validation.y).mean())
+
+    @property
+    def has_features(self) -> bool:
+        """Whether a new head can be fitted."""
+        return isinstance(self.model, TactileTransformer) or self.model.has_features
+
+    def fresh(self, seed: int) -> Network:
+        """Return the network with new initial weights."""
+        model = self.model
+        if isinstance(model, TactileTransformer):
+            return type(model).from_config({**model.config, "seed": seed})
+        return model.fresh(seed)
+
+
+def _wrapped(model: nn.Module, train: Windows, layout: SensorLayout | None, features: Features | None) -> Network:
+    if not isinstance(model, nn.Module):
+        raise TypeError(
+            f"an adapter repairs a torch.nn.Module, got {type(model).__name__}; use FaultTolerantClassifier or"
+            " FaultTolerantRegressor for scikit-learn"
+        )
+    own = getattr(model, "layout", None)
+    layout = own if layout is None else layout
+    if not isinstance(layout, SensorLayout):
+        raise ValueError(f"{type(model).__name__} has no layout: give layout=SensorLayout(pads, rows, cols)")
+    d = train.x.shape[2]
+    if layout.n_cells != d:
+        raise ValueError(f"the layout {layout} has {layout.n_cells} cells, the windows have {d}")
+    if device_of(model).type != "cpu":
+        model = copy.deepcopy(model).cpu()
+    if isinstance(model, AnyModel) or (isinstance(model, TactileTransformer) and features is None):
+        return model
+    return AnyModel.probe(model, layout, as_tensor(train.x[:8]), features)
+
+
+def _task(task: str, train: Windows, validation: Windows) -> Task:
+    if task not in (*get_args(Task), "auto"):
+        raise ValueError(f"unknown task {task!r}: use 'classification', 'regression' or 'auto'")
+    if train.y.ndim != validation.y.ndim:
+        raise ValueError("training and validation windows have different targets: classes [N] and values [N, k]")
+    found: Task = "regression" if train.y.ndim == 2 else "classification"
+    if task not in ("auto", found):
+        raise ValueError(f"task {task!r} needs {'y float [N, k]' if found == 'classification' else 'y int [N]'}")
+    return found
+
+
+def _check_targets(model: Network, task: Task, *parts: Windows) -> None:
+    name = type(model.module if isinstance(model, AnyModel) else model).__name__
+    for windows in parts:
+        if task == "regression" and windows.y.shape[1] != model.n_classes:
+            raise ValueError(f"{name} has {model.n_classes} outputs, the targets have {windows.y.shape[1]} values")
+        if task == "regression" and not np.isfinite(windows.y).all():
+            raise ValueError("the targets hold NaN or infinity: leave these windows out")
+        if task == "classification" and windows.y.max() >= model.n_classes:
+            raise ValueError(f"labels run to {windows.y.max()}, the model has {model.n_classes} classes")
+
+
+def _labelled(model: Network, task: Task, windows: Windows) -> tuple[Windows, NDArray[np.float32]]:
+    """Return windows with classes, and targets ``[N, n]``: without a label the probabilities of the model."""
+    if task == "regression":
+        return windows, windows.y.astype(np.float32)
+    targets = np.eye(model.n_classes, dtype=np.float32)[np.maximum(windows.y, 0)]
+    unknown = windows.y < 0
+    if unknown.any():
+        targets[unknown] = logits_of(model, windows.x[unknown]).softmax(1).numpy()
+    y: NDArray[Any] = np.where(unknown, targets.argmax(1), windows.y)
+    return replace(windows, y=y), targets

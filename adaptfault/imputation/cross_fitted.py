@@ -1,0 +1,45 @@
+"""Conditional mean with a recalibration and an error that are measured on held-out frames."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.data.windows import evenly
+from adaptfault.imputation.recalibration import Recalibration
+from adaptfault.imputation.statistics import CellStatistics
+from diagnostics import FaultSet
+
+_HELD_OUT = 2_000  # frames of each fold on which the error is measured
+
+Floats = NDArray[np.float64]
+
+
+class CrossFitted:
+    """Gaussian conditional mean of any missing cells, recalibrated by two-fold cross-fitting.
+
+    Args:
+        frames: ``[M, D]``, healthy.
+        fold: bool ``[M]``; the frames of each fold are predicted by the other.
+    """
+
+    def __init__(self, frames: NDArray[Any], fold: NDArray[np.bool_]) -> None:
+        self._whole = CellStatistics.of_frames(frames)
+        self._halves = [CellStatistics.of_frames(frames[fold == side]) for side in (False, True)]
+        self._held_out = [(of := frames[fold == side])[evenly(len(of), _HELD_OUT)] for side in (True, False)]
+
+    def affine(self, fault_set: FaultSet) -> tuple[Floats, Floats, Floats]:
+        """Return weight ``[k, D-k]``, bias ``[k]`` and standard deviation of the error ``[k]`` for F."""
+        healthy, missing = fault_set.healthy, np.flatnonzero(fault_set.mask)
+        mean = self._whole.mean[missing]
+        pairs = []
+        for half, frames in zip(self._halves, self._held_out, strict=True):
+            weight, bias = half.conditional_mean(fault_set)
+            pairs.append((frames[:, healthy] @ weight.T + (bias - mean), frames[:, missing] - mean))
+        predicted, readings = (np.concatenate(values) for values in zip(*pairs, strict=True))
+        correction = Recalibration.fit(predicted, readings, total=len(readings))
+        weight, bias = self._whole.conditional_mean(fault_set)
+        bias = mean + correction.gain * (bias - mean) + correction.offset
+        return correction.gain[:, None] * weight, bias, correction.deviation

@@ -1,0 +1,286 @@
+"""Repair of any consumer of tactile data: python examples/any_model.py [RECORDINGS ...] [--small] [--out any_model]
+
+A 1-D CNN over time, an LSTM, a small 3-D CNN, an MLP on statistics and the paper's network; ExtraTrees, SVC and
+histogram boosting from scikit-learn; a regression of total force and its centre. For each kind of fault (10 % and 50 %
+of the cells at random, five rows, one pad, two lines) the table has the test score with the faults ignored, with zeros,
+restored, restored + head, fine-tuned for 60 s and trained anew, and the seconds of head and training. Faulty cells read
+0 or full scale. Without RECORDINGS, grasps are simulated. Writes OUT.csv and OUT.png; ``--small`` takes seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from sklearn.ensemble import ExtraTreesClassifier, HistGradientBoostingClassifier
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import SVC
+from torch import nn
+
+from adaptfault import (
+    Adapter,
+    CellImputer,
+    FaultTolerantClassifier,
+    TactileTransformer,
+    Windows,
+    evaluate,
+    load,
+    make_windows,
+    simulate,
+    split,
+    train,
+)
+from diagnostics import FaultSet, SensorLayout
+
+SEEDS = (20, 21, 22)
+COLUMNS = ("fault-free", "nothing", "zeros", "restored", "head", "finetuned", "anew", "head s", "anew s")
+
+
+class OverTime(nn.Module):
+    """A 1-D CNN over time."""
+
+    def __init__(self, layout: SensorLayout, length: int, n: int) -> None:
+        super().__init__()
+        d = layout.n_cells
+        self.net = nn.Sequential(nn.Conv1d(d, 64, 3, padding=1), nn.ReLU(), nn.Conv1d(64, 64, 3, padding=1), nn.ReLU())
+        self.last = nn.Linear(64, n)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.last(self.net(x.transpose(1, 2)).amax(2))
+
+
+class Lstm(nn.Module):
+    """An LSTM over the frames."""
+
+    def __init__(self, layout: SensorLayout, length: int, n: int) -> None:
+        super().__init__()
+        self.lstm, self.last = nn.LSTM(layout.n_cells, 64, batch_first=True), nn.Linear(64, n)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.last(self.lstm(x)[0].mean(1))
+
+
+class Volume(nn.Module):
+    """A 3-D CNN, which takes [N, C, T, H, W]."""
+
+    def __init__(self, layout: SensorLayout, length: int, n: int) -> None:
+        super().__init__()
+        self.shape = layout.shape
+        self.net = nn.Sequential(
+            nn.Conv3d(layout.pads, 8, 3, padding=1), nn.ReLU(), nn.AdaptiveAvgPool3d((1, layout.rows, layout.cols))
+        )
+        self.last = nn.Linear(8 * layout.rows * layout.cols, n)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        grid = x.reshape(len(x), -1, *self.shape).transpose(1, 2)
+        return self.last(self.net(grid).flatten(1))
+
+
+class Statistics(nn.Module):
+    """An MLP on mean and maximum of each cell."""
+
+    def __init__(self, layout: SensorLayout, length: int, n: int) -> None:
+        super().__init__()
+        self.hidden, self.last = nn.Linear(2 * layout.n_cells, 128), nn.Linear(128, n)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.last(torch.relu(self.hidden(torch.cat([x.mean(1), x.amax(1)], 1))))
+
+
+def transformer(layout: SensorLayout, length: int, n: int) -> nn.Module:
+    return TactileTransformer(layout, n, length=length)
+
+
+NETWORKS: dict[str, Callable[[SensorLayout, int, int], nn.Module]] = {
+    "1-D CNN": OverTime,
+    "LSTM": Lstm,
+    "3-D CNN": Volume,
+    "MLP": Statistics,
+    "TactileTransformer": transformer,
+}
+CLASSIFIERS = {
+    "ExtraTrees": ExtraTreesClassifier(200, random_state=0),
+    "SVC": make_pipeline(StandardScaler(), SVC()),
+    "boosting": HistGradientBoostingClassifier(max_iter=50, random_state=0),
+}
+
+
+def fault_sets(layout: SensorLayout, rng: np.random.Generator) -> dict[str, FaultSet]:
+    """Return the kinds of fault; one pad only where there are several."""
+    d, present = layout.n_cells, np.flatnonzero(layout.present)
+    rows = [line for line in layout.lines if line.kind == "row" and len(layout.cells_on(line))]
+    wires = [line for line in layout.lines if line.kind in ("row", "column") and len(layout.cells_on(line))]
+
+    def lines(of: list, n: int) -> FaultSet:
+        chosen = rng.choice(len(of), min(n, len(of) // 2), replace=False)
+        return FaultSet(tuple(int(c) for i in chosen for c in layout.cells_on(of[i])), d)
+
+    kinds = {
+        f"{share:.0%} random": FaultSet(tuple(rng.permutation(present)[: round(share * len(present))].tolist()), d)
+        for share in (0.1, 0.5)
+    }
+    kinds |= {"five rows": lines(rows, 5), "two lines": lines(wires, 2)}
+    if layout.pads > 1:
+        kinds["one pad"] = FaultSet(tuple(c for c in present.tolist() if c < layout.rows * layout.cols), d)
+    return kinds
+
+
+def spoilt(windows: Windows, fault_set: FaultSet, rng: np.random.Generator) -> Windows:
+    """Return windows in which each cell of F reads 0 or full scale."""
+    x = windows.x.copy()
+    x[..., fault_set.mask] = rng.integers(0, 2, len(fault_set))
+    return Windows(x, windows.y, windows.recording)
+
+
+def score(model: object, windows: Windows) -> float:
+    """Return the accuracy, or R2 of a regression."""
+    scores = evaluate(model, windows)
+    return scores.r2 if windows.y.ndim == 2 else scores.accuracy
+
+
+def of_network(build, layout: SensorLayout, parts, kinds, args, rng) -> dict[str, dict[str, float]]:
+    """Measure one torch model under all kinds of fault."""
+    training, validation, test = parts
+    n = training.y.shape[1] if training.y.ndim == 2 else int(training.y.max()) + 1
+    model = build(layout, test.x.shape[1], n)
+    options = {"epochs": args.epochs, "learning_rate": 1e-3, "progress": False}
+    train(model, training, validation, **options)
+    adapter, rows = Adapter(model, training, validation, layout=layout), {}
+    for kind, fault_set in kinds.items():
+        broken = spoilt(test, fault_set, rng)
+        zeros = Windows(np.where(fault_set.mask, 0, broken.x), test.y, test.recording)
+        row = {"fault-free": score(model, test), "nothing": score(model, broken), "zeros": score(model, zeros)}
+        row["restored"] = score(adapter.adapt(fault_set, method="fill"), broken)
+        began = time.perf_counter()
+        row["head"] = score(adapter.adapt(fault_set, method="head"), broken)
+        row["head s"] = time.perf_counter() - began
+        if args.finetune:
+            tuned = adapter.adapt(fault_set, method="finetune", budget=args.finetune, progress=False)
+            row["finetuned"] = score(tuned, broken)
+        began, fresh = time.perf_counter(), build(layout, test.x.shape[1], n)
+        without = [Windows(np.where(fault_set.mask, 0, w.x), w.y, w.recording) for w in (training, validation)]
+        train(fresh, *without, **options)
+        row["anew"], row["anew s"] = score(fresh, zeros), time.perf_counter() - began
+        rows[kind] = row
+    return rows
+
+
+def of_classifier(estimator, parts, kinds, args, rng) -> dict[str, dict[str, float]]:
+    """Measure one scikit-learn classifier; "head" is what FaultTolerantClassifier chose, "anew" the refit."""
+    from sklearn.base import clone
+
+    def table(windows: Windows) -> np.ndarray:
+        return np.concatenate([windows.x.mean(1), windows.x.max(1)], axis=1)
+
+    training, _, test = parts
+    x, rows = table(training), {}
+    tolerant = FaultTolerantClassifier(estimator).fit(x, training.y, groups=training.recording)
+    for kind, fault_set in kinds.items():
+        broken = table(spoilt(test, fault_set, rng))
+        columns = np.tile(fault_set.mask, 2)
+        whole = tolerant.set_faults(None).estimator_
+        row = {"fault-free": whole.score(table(test), test.y), "nothing": whole.score(broken, test.y)}
+        row["zeros"] = whole.score(np.where(columns, 0, broken), test.y)
+        row["restored"] = whole.score(CellImputer(fault_set).fit(x).transform(broken), test.y)
+        began = time.perf_counter()
+        row["head"] = tolerant.set_faults(fault_set).score(broken, test.y)
+        row["head s"] = time.perf_counter() - began
+        began = time.perf_counter()
+        refit = clone(estimator).fit(x[:, ~columns], training.y)
+        row["anew"], row["anew s"] = refit.score(broken[:, ~columns], test.y), time.perf_counter() - began
+        rows[kind] = row
+    return rows
+
+
+def forces(windows: Windows, layout: SensorLayout) -> Windows:
+    """Return the windows with contact; their values are total force and its centre, scaled to about -1 to 1."""
+    mean = windows.x.mean(1)
+    total = np.maximum(mean.sum(1), 1e-6)
+    row, col = np.arange(layout.n_cells) // layout.cols % layout.rows, np.arange(layout.n_cells) % layout.cols
+    centre = (mean @ row / total / max(1, layout.rows - 1), mean @ col / total / max(1, layout.cols - 1))
+    touched = total > np.percentile(total, 20)
+    y = np.stack([np.log(total / np.median(total)), 2 * centre[0] - 1, 2 * centre[1] - 1], axis=1)
+    return Windows(windows.x[touched], y[touched], windows.recording[touched])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", nargs="*", help="labelled recordings; none: simulated grasps")
+    parser.add_argument("--small", action="store_true", help="one seed, little training, two models")
+    parser.add_argument("--only", nargs="+", help="names of consumers")
+    parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
+    parser.add_argument("--epochs", type=int, default=20)
+    parser.add_argument("--finetune", type=float, default=60.0, help="seconds; 0 leaves it out")
+    parser.add_argument("--out", default="any_model", help="name of the table and the picture")
+    args = parser.parse_args()
+    if args.small:
+        args.epochs, args.finetune = 2, 0.0
+        args.only = args.only or ["MLP", "ExtraTrees", "forces"]
+    if args.recordings:
+        recordings = load(args.recordings).recordings
+    elif args.small:
+        classes = ("nothing", "softer", "harder")
+        recordings = simulate(20, SensorLayout(2, 6, 5), n_frames=40, seed=1, classes=classes)
+    else:
+        recordings = simulate(60, seed=0)
+    layout = recordings.layout
+    windows = make_windows(recordings.frames, recordings.labels, layout)
+    found: dict[tuple[str, str], list[dict[str, float]]] = {}
+    for seed in args.seeds[: 1 if args.small else None]:
+        rng = np.random.default_rng(seed)
+        torch.manual_seed(seed)
+        parts = split(windows, seed=seed)
+        kinds = fault_sets(layout, rng)
+        of_forces = tuple(forces(w, layout) for w in parts)
+        for name in [*NETWORKS, *CLASSIFIERS, "forces"]:
+            if args.only and name not in args.only:
+                continue
+            if name in CLASSIFIERS:
+                rows = of_classifier(CLASSIFIERS[name], parts, kinds, args, rng)
+            else:
+                build = NETWORKS.get(name, Statistics)
+                rows = of_network(build, layout, of_forces if name == "forces" else parts, kinds, args, rng)
+            print(f"seed {seed}: {name} done", file=sys.stderr, flush=True)
+            for kind, row in rows.items():
+                found.setdefault((name, kind), []).append(row)
+    report(found, args.out)
+
+
+def report(found: dict[tuple[str, str], list[dict[str, float]]], out: str) -> None:
+    """Print the table of means over the seeds, write it, and draw it."""
+    from matplotlib.figure import Figure
+
+    table = {}
+    for key, rows in found.items():
+        table[key] = {c: float(np.mean([r[c] for r in rows])) for c in COLUMNS if all(c in r for r in rows)}
+    print(f"{'consumer':20s}{'faults':12s}" + "".join(f"{c:>11s}" for c in COLUMNS))
+    for (name, kind), row in table.items():
+        print(f"{name:20s}{kind:12s}" + "".join(f"{row[c]:11.3f}" if c in row else f"{'-':>11s}" for c in COLUMNS))
+    with open(f"{out}.csv", "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["consumer", "faults", *COLUMNS])
+        writer.writerows([*key, *(row.get(c, "") for c in COLUMNS)] for key, row in table.items())
+    names = list(dict.fromkeys(name for name, _ in table))
+    figure = Figure(figsize=(9, 2.2 * len(names)), layout="constrained")
+    axes = figure.subplots(len(names), 1, squeeze=False)[:, 0]
+    shown = ("nothing", "zeros", "restored", "head", "finetuned", "anew")
+    for ax, name in zip(axes, names, strict=True):
+        kinds = [kind for of, kind in table if of == name]
+        for i, column in enumerate(shown):
+            heights = [table[name, kind].get(column, np.nan) for kind in kinds]
+            ax.bar(np.arange(len(kinds)) + 0.13 * (i - 2.5), heights, 0.13, label=column)
+        ax.axhline(table[name, kinds[0]]["fault-free"], color="0.5", linestyle="--", linewidth=1)
+        ax.set(title=name, ylabel="test score", ylim=(-0.2, 1))
+        ax.set_xticks(range(len(kinds)), kinds)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
+    figure.savefig(f"{out}.png", dpi=110)
+
+
+if __name__ == "__main__":
+    main()

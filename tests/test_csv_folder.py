@@ -7,6 +7,7 @@ import pytest
 from recording_files import PAPER, messages, newtons, refusal, rng, text, write
 
 from adaptfault.data.recordings import load
+from adaptfault.data.recordings.blocks import Stream
 
 
 def test_a_csv_of_100_rows_and_220_columns_is_the_papers_sensor(tmp_path):
@@ -232,3 +233,34 @@ def test_no_function_is_called_for_each_number_of_a_file(tmp_path):
         sys.setprofile(None)
     assert len(loaded.recordings) == 10
     assert calls < 0.3 * 10 * 100 * 220
+
+
+@pytest.mark.parametrize(
+    ("header", "times", "rate"),
+    [
+        ("timestamp", 1_700_000_000 + np.arange(50) / 20, 20),
+        ("time_ms", np.arange(50) * 50, 20),
+        ("t [us]", np.arange(50) * 20_000.0, 50),
+        ("time", np.arange(50) * 100, 10),  # neither 0.01 Hz nor 10 kHz
+    ],
+)
+def test_a_time_column_gives_the_rate_and_is_no_reading(tmp_path, header, times, rate, monkeypatch):
+    values = newtons(50)
+    rows = [f"{time:.6f},{row}" for time, row in zip(times, text(values).splitlines(), strict=True)]
+    rows[7] = rows[7].rpartition(",")[0] + ","  # a missing reading takes the slower parser
+    names = ",".join([header, *(f"cell{i}" for i in range(220))])
+    file = write(tmp_path / "a.csv", "\n".join([names, *rows]) + "\n")
+    loaded = load(file)
+    assert loaded.recordings.layout.rate == rate
+    assert f"rate {rate} Hz (time column of a.csv); otherwise give --rate" in loaded.inferred
+    np.testing.assert_allclose(loaded.recordings.frames[0][:7], values[:7])
+    assert load(file, rate=30).recordings.layout.rate == 30
+    monkeypatch.setattr("adaptfault.data.recordings.blocks._CSV", 5000)
+    stream = Stream(file)
+    assert stream.layout == loaded.recordings.layout
+    np.testing.assert_array_equal(np.concatenate(list(stream)), loaded.recordings.frames[0])
+
+
+def test_a_file_of_times_alone_is_refused(tmp_path):
+    file = write(tmp_path / "a.csv", "Time_MS\n0\n50\n100\n")
+    assert "line 2: holds a column of times and no readings" in refusal(file)

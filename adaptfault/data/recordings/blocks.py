@@ -227,7 +227,9 @@ def _csv(path: Path, problems: list[Problem], largest: bool) -> Source:
         pairs = [(_sample([block]), np.array_equal(block, np.rint(block), equal_nan=True)) for block in blocks([])]
         sample, counts = np.concatenate([one for one, _ in pairs]), all(whole for _, whole in pairs)
     lines = np.resize(first.lines, len(sample))
-    return Source(Content(path, (sample,), counts, lines=lines), lambda: blocks(problems), 1)
+    reason = "" if first.rate is None else f"time column of {path.name}"
+    head = Content(path, (sample,), counts, lines=lines, rate=first.rate, rate_reason=reason)
+    return Source(head, lambda: blocks(problems), 1)
 
 
 def _npy(path: Path, given: Shape | None, largest: bool) -> Source | None:

@@ -31,6 +31,7 @@ class Content:
         shape: ``(pads, rows, cols)``.
         present: bool ``[pads, rows, cols]``, False = no sensing element.
         full_scale, unit, rate: as in SensorLayout.
+        rate_reason: what the rate was measured from; empty where the file states it.
         stored: shape of the array in the file, where it holds one.
         problems: errors and warnings of the reader.
     """
@@ -47,6 +48,7 @@ class Content:
     full_scale: float | None = None
     unit: str | None = None
     rate: float | None = None
+    rate_reason: str = ""
     stored: tuple[int, ...] = ()
     problems: tuple[Problem, ...] = ()
 

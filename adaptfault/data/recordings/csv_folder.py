@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,15 +17,22 @@ from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.sizes import LONGEST_LINE
 from adaptfault.data.recordings.text import decoded, numbered_lines, read_bytes, shown
 
+_TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # a second
+
+_TIME = re.compile(
+    r"(?:time(?:[_ ]?stamp)?|stamp|t)(?:[_ ]?[\[(]?(s|sec|seconds|ms|us|ns)[\])]?)?", re.IGNORECASE | re.ASCII
+)
+
 _LARGEST = float(np.finfo(np.float32).max)
 
 
 def read_csv(path: Path) -> Content:
     """Read a CSV file of T lines x D readings, comma separated, with or without a header line.
 
-    An empty cell and ``nan`` are missing readings and become NaN. Blank lines are skipped. A last line that a
-    power failure cut off is left out with a warning, and so are the zero bytes that may follow it. A cut inside the
-    last number of a full line cannot be detected.
+    A first column that the header names as a time (``time``, ``timestamp``, ``t``, with a unit as in ``time_ms``) is no
+    reading; it gives the rate. An empty cell and ``nan`` are missing readings and become NaN. Blank lines are skipped.
+    A last line that a power failure cut off is left out with a warning, and so are the zero bytes that may follow it. A
+    cut inside the last number of a full line cannot be detected.
 
     Raises:
         InputError: not text, no readings, lines of different lengths, a cell that is no number.
@@ -34,7 +42,16 @@ def read_csv(path: Path) -> Content:
         raise InputError.at(path, "holds no readings; record it again or remove it")
     with np.errstate(invalid="ignore"):
         counts = bool(np.all((parsed.values == np.rint(parsed.values)) | np.isnan(parsed.values)))
-    return Content(path, (parsed.values,), counts, lines=parsed.lines, problems=parsed.problems)
+    rate = parsed.rate
+    return Content(
+        path,
+        (parsed.values,),
+        counts,
+        lines=parsed.lines,
+        rate=rate,
+        rate_reason="" if rate is None else f"time column of {path.name}",
+        problems=parsed.problems,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +62,29 @@ class Piece:
         values: float32 ``[t, D]``; None where the lines hold no frame.
         lines: int ``[t]``, their numbers.
         problems: errors and warnings.
+        times: float64 ``[t]``, of a time column; None where there is none.
+        unit: of the times, where the header states it: "s", "ms", "us" or "ns".
     """
 
     values: NDArray[np.float32] | None
     lines: NDArray[np.intp]
     problems: tuple[Problem, ...] = ()
+    times: NDArray[np.float64] | None = None
+    unit: str | None = None
+
+    @property
+    def rate(self) -> float | None:
+        """Frames per second from the median period of the times; None where there are none that rise.
+
+        Without a unit in the header, the times are in the first of s, ms, us and ns that gives 0.5 to 2000 Hz.
+        """
+        if self.times is None or len(self.times) < 2:
+            return None
+        period = float(np.nanmedian(np.diff(self.times)))
+        if not period > 0:
+            return None
+        rates = [_TICKS[unit] / period for unit in ([self.unit] if self.unit else _TICKS)]
+        return next((float(f"{rate:.3g}") for rate in rates if self.unit or 0.5 <= rate <= 2000), None)
 
 
 def csv_pieces(path: Path, size: int) -> Iterator[Piece]:
@@ -77,7 +112,7 @@ def csv_pieces(path: Path, size: int) -> Iterator[Piece]:
                         what = f"{_values(here)} where the lines before it have {width}; correct it"
                         raise InputError.at(path, what, f"line {parsed.lines[0]}")
                     yield parsed
-                    before = before.behind(piece)
+                    before = before.behind(piece, parsed)
                 if not data:
                     return
     except OSError as error:
@@ -86,14 +121,17 @@ def csv_pieces(path: Path, size: int) -> Iterator[Piece]:
 
 @dataclass(frozen=True)
 class _Before:
-    """The lines before a piece of a file: how many, and the last one."""
+    """The lines before a piece of a file: how many, the last one, and whether the first column is a time."""
 
     lines: int = 0
     last: str = ""
+    timed: bool = False
+    unit: str | None = None
 
-    def behind(self, piece: bytes) -> _Before:
+    def behind(self, piece: bytes, parsed: Piece) -> _Before:
+        timed, unit = self.timed or parsed.times is not None, self.unit or parsed.unit
         last = piece.rstrip(b"\r\n").rpartition(b"\n")[2]
-        return _Before(self.lines + piece.count(b"\n"), last.decode("utf-8", "replace"))
+        return _Before(self.lines + piece.count(b"\n"), last.decode("utf-8", "replace"), timed, unit)
 
 
 def _parse(path: Path, data: bytes, before: _Before) -> Piece:
@@ -107,16 +145,26 @@ def _parse(path: Path, data: bytes, before: _Before) -> Piece:
         what = "cut off in this line: the lines before it are kept"
         problems = (Problem("warning", located(path, what, f"line {before.lines + numbers[-1]}")),)
         rows, numbers = rows[:-1], numbers[:-1]
+    timed, unit = before.timed, before.unit
     if rows and not before.lines and _is_header(rows[0]):
+        if clock := _TIME.fullmatch(_bare(rows[0].split(",")[0])):
+            unit = (clock[1] or "").lower() or None
+            timed, unit = True, "s" if unit in ("sec", "seconds") else unit
         rows, numbers = rows[1:], numbers[1:]
     lines = np.array(numbers, dtype=np.intp) + before.lines
     if not rows:
         return Piece(None, lines, problems)
+    kind = np.float64 if timed else np.float32  # float32 holds a unix time to two minutes
     try:
-        values = np.loadtxt(rows, dtype=np.float32, delimiter=",", comments=None, ndmin=2)
+        values = np.loadtxt(rows, dtype=kind, delimiter=",", comments=None, ndmin=2)
     except ValueError:  # numpy's parser is fast, but does not name the cell
-        values = _read_by_cell(path, rows, lines.tolist())
-    return Piece(values, lines, problems)
+        values = _read_by_cell(path, rows, lines.tolist(), kind)
+    if not timed:
+        return Piece(values.astype(np.float32, copy=False), lines, problems)
+    if values.shape[1] < 2:
+        raise InputError.at(path, "holds a column of times and no readings; add one column a cell", f"line {lines[0]}")
+    with np.errstate(all="ignore"):  # a reading that float32 cannot hold becomes infinite, and is refused as such
+        return Piece(values[:, 1:].astype(np.float32), lines, problems, values[:, 0].astype(np.float64), unit)
 
 
 def _is_cut(line: str, before: str) -> bool:
@@ -141,7 +189,7 @@ def _is_header(line: str) -> bool:
     return len(numbers) > 3 and any(numbers == list(range(start, start + len(numbers))) for start in (0, 1))
 
 
-def _read_by_cell(path: Path, rows: Sequence[str], numbers: Sequence[int]) -> NDArray[np.float32]:
+def _read_by_cell(path: Path, rows: Sequence[str], numbers: Sequence[int], kind: type) -> NDArray[Any]:
     """Parse cell by cell: accepts missing readings, and names the line and column of a cell that is no number."""
     for separator, name in ((";", "';'"), ("\t", "tabs")):
         if separator in rows[0]:
@@ -157,14 +205,14 @@ def _read_by_cell(path: Path, rows: Sequence[str], numbers: Sequence[int]) -> ND
                 remedy = "the recording was cut off here: remove the line"
             what = f"{_values(len(cells))} where the other lines have {width}; {remedy}"
             raise InputError.at(path, what, f"line {number}")
-    values = np.empty((len(table), width), dtype=np.float32)
+    values: NDArray[Any] = np.empty((len(table), width), dtype=kind)
     for frame, (number, cells) in enumerate(zip(numbers, table, strict=True)):
         for column, cell in enumerate(cells):
             reading = _number(_bare(cell)) if cell.strip() else np.nan
             if reading is None:
                 what = f"{shown(cell)} is not a number; write the reading, or leave the cell empty if it is missing"
                 if column == 0 and len(cells) > 1:
-                    what += " (a column of times does not belong here: remove it)"
+                    what += " (name a column of times in a header line, or remove it)"
                 raise InputError.at(path, what, f"line {number}, column {column + 1}")
             values[frame, column] = reading
     return values

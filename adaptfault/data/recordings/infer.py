@@ -85,7 +85,7 @@ def describe_width(content: Content, expected: int) -> str:
     if width == expected + 1 and content.lines is not None:
         if len(frames) and np.isnan(frames[:, -1].astype(np.float64)).all():
             return f"{text}: each line ends with a comma, remove it"
-        return f"{text}: if the first column is a time or a number of the frame, remove it"
+        return f"{text}: if the first column is a time or a number of the frame, remove it (or head a time with 'time')"
     if width == expected - 1 and content.lines is not None:
         return f"{text}: a column is missing, write an empty cell for a missing reading"
     return text

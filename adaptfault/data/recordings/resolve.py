@@ -99,6 +99,9 @@ def resolve_layout(
         layout = SensorLayout(*shape, **{name: value for name, value in stated.items() if value is not None})
     except (TypeError, ValueError) as error:
         raise InputError(f"layout: {error}; correct the option") from None
+    measured = next((c.rate_reason for c in contents if c.rate_reason and c.rate == stated["rate"]), "")
+    if rate is None and measured:
+        inferred.append(f"rate {layout.rate:g} Hz ({measured}); otherwise give --rate")
     if stated["rate"] is None:
         inferred.append(f"rate {layout.rate:g} Hz (assumed: no file states one); otherwise give --rate")
     problems += [] if tables is not None else _contradicted(contents, layout)

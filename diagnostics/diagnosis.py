@@ -149,6 +149,7 @@ class SelfDiagnosis:
         explained = np.zeros(self.layout.n_cells, bool)
         explained[[cell for aliasing in aliased for cell in (*aliasing.cells, *aliasing.doubtful)]] = True
         test = stream.spatial(explained)
+        yield
         while not test.step():
             yield
         spatial = test.result

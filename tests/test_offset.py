@@ -71,12 +71,12 @@ def test_a_small_offset_of_one_cell_is_no_load_where_the_reference_held_light_lo
     recordings = [np.asarray(r, dtype=np.float64) for r in simulate(10, SensorLayout(2, 8, 6), n_frames=60).frames]
     full_scale, cells = 5.0, 96
     fitted = SelfDiagnosis(SensorLayout(2, 8, 6)).fit(recordings[::2])
-    offsets = np.linspace(0, 0.018, cells) * full_scale
+    offsets = np.linspace(0, 0.018, cells) * 2.0  # of the range seen, 2 N
     for k in range(1, 13, 2):
         assert not fitted.diagnose([np.minimum(r + offsets, full_scale) for r in recordings[k::12]]).fault_set
 
 
-@pytest.mark.parametrize("offset", [0.007, 0.015, 0.03])
+@pytest.mark.parametrize("offset", [0.004, 0.009, 0.018])  # of a range of 0.6
 def test_an_array_that_has_warmed_up_has_no_fault_and_its_dead_cells_are_found(fitted, offset):
     log = events(1, 8)
     assert not fitted.diagnose([r + offset for r in log]).fault_set

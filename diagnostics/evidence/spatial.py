@@ -141,11 +141,14 @@ class SpatialTest:
         self._drifts = np.zeros(len(plausible), bool)
         self._initial: Floats | None = None
         self._rounds = self._exclusions = 0
+        self._agreed: tuple[Prediction, Floats, Floats, Floats] | None = None  # scores with the final predictors
 
     def step(self) -> bool:
-        """Score all cells once, and update the predictors. Return whether the result is final."""
+        """Score all cells once and update the predictors, or look for drift. Return whether the result is final."""
         if not self._events:
             return True
+        if self._agreed is not None:
+            return self._drift(*self._agreed)
         test, predictors = self._test, self._predictors & self._test.eligible
         expected, surprisal = test.score(predictors)
         summed = test.summed(surprisal)
@@ -154,9 +157,9 @@ class SpatialTest:
             self._initial = summed
         self._rounds += 1
         self._predictors = test.eligible & (evidence + self._cells.temporal < self._exclusion.threshold)
-        if self._rounds < _MOST_ROUNDS and (self._predictors != predictors).any():
-            return False
-        return self._drift(expected, surprisal, summed, evidence)
+        if self._rounds == _MOST_ROUNDS or (self._predictors == predictors).all():
+            self._agreed = expected, surprisal, summed, evidence
+        return False
 
     def finish(self) -> Spatial:
         """Run all rounds and return the result."""
@@ -192,7 +195,7 @@ class SpatialTest:
             return True
         self._drifts = self._drifts | more
         self._test = replace(test, eligible=test.eligible & ~more)
-        self._rounds = 0
+        self._rounds, self._agreed = 0, None
         return False
 
 

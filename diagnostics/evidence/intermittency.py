@@ -96,7 +96,8 @@ class HealthyRates:
         for k, of_level in enumerate(noise):
             # One pseudo-sample with the noise of a cold start: rare noise is not seen in few samples.
             limit[k] = np.quantile(np.concatenate([*of_level, [_UNKNOWN_NOISE]]), 1 - _NOISIER)
-        limit = np.maximum.accumulate(np.maximum(limit, scale.near / scale.full_scale))
+        # Readings within +- tolerance (near / 2) have second differences up to 2 near.
+        limit = np.maximum.accumulate(np.maximum(limit, 2 * scale.near / scale.full_scale))
         # One pseudo-blink, in as many frames as it takes at the rate of a cold start.
         usual = cls(max(_RAREST, (blinks + 1) / (loaded + 1 / _UNKNOWN_BLINKS)), limit, alone=alone)
         intermittency = Intermittency.begin(layout)

@@ -47,7 +47,8 @@ def random_events(tile: Tile) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("i", [0, 2, 4], ids=["a corner without cells", "a corner", "the middle, one cell absent"])
 def test_a_tile_is_predicted_as_a_small_array_of_the_same_cells(fitted: SelfDiagnosis, model: HealthyModel, i: int):
-    regression, tile = model.local_regressions[i], model.local_regressions[i].tile
+    regression = model.local_regressions[i]
+    tile = Tile(regression.inputs, regression.outputs)
     positions = np.array([SKIN.position(c) for c in tile.inputs.tolist()])[:, 1:]
     (top, left), (bottom, right) = positions.min(axis=0), positions.max(axis=0)
     small = SensorLayout(1, bottom - top + 1, right - left + 1, present=PRESENT[:, top : bottom + 1, left : right + 1])

@@ -264,7 +264,8 @@ def test_a_fault_is_found_through_lost_frames(fitted, log):
 
 def test_a_stuck_cell_is_found_through_the_converters_dither(fitted, log):
     cells = loaded(log)[[3, -3]].tolist()
-    diagnosis = fitted.diagnose(broken(log, [Fault("stuck", (c,), value=1.7) for c in cells], dither=0.002))  # 0.4 % of the range
+    stuck = [Fault("stuck", (c,), value=1.7) for c in cells]
+    diagnosis = fitted.diagnose(broken(log, stuck, dither=0.002))  # 0.4 % of the range seen
     assert diagnosis.fault_set == set(cells)
 
 

@@ -323,7 +323,7 @@ def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp
     ("arguments", "message"),
     [
         (["--port", "70000"], "expected 0 to 65535"),
-        (["--port", "0", "--when", "always"], "give --record FOLDER"),
+        (["--port", "0", "--when", "always"], "--when needs --record FOLDER"),
         (["--port", "0", "--shape", "2xx6"], "2xx6"),
         (["--port", "0", "--record", "{tmp}/new", "--when", "never"], "--when never: expected always"),
         (["--port", "0", "--record", "{tmp}/file/new"], "Not a directory"),

@@ -14,7 +14,14 @@ from hypothesis.extra import numpy as npst
 from adaptfault.acquisition import PacketError, format_packet, parse_packet
 from adaptfault.acquisition.packet import DEVICE
 from adaptfault.data.recordings import InputError, Recordings, load, save_npz
-from adaptfault.robot.checksummed_json import Damaged, damage, read_either, read_sealed, write_sealed, write_twice
+from adaptfault.robot.checksummed_json import (
+    Damaged,
+    damage,
+    read_checksummed,
+    read_with_copy,
+    write_checksummed,
+    write_with_copy,
+)
 from adaptfault.robot.journal import Journal
 from adaptfault.robot.pointer import Pointer
 from diagnostics import Fault, FaultKind, FaultSet, SensorLayout, inject, line_fault
@@ -261,10 +268,10 @@ DOCUMENTS = st.dictionaries(WORDS.filter(lambda key: key not in ("sha256", "sche
 def test_a_sealed_document_comes_back_and_another_schema_is_refused(document: dict):
     document = {"schema": SCHEMA, **document}
     with TemporaryDirectory() as folder:
-        write_sealed(Path(folder) / "a.json", document)
-        assert read_sealed(Path(folder) / "a.json", SCHEMA) == document
+        write_checksummed(Path(folder) / "a.json", document)
+        assert read_checksummed(Path(folder) / "a.json", SCHEMA) == document
         with pytest.raises(Damaged, match="expected 'other/1'"):
-            read_sealed(Path(folder) / "a.json", "other/1")
+            read_checksummed(Path(folder) / "a.json", "other/1")
 
 
 @given(DOCUMENTS, st.integers(0, 10**6), st.integers(0, 7), st.booleans())
@@ -272,17 +279,17 @@ def test_no_flipped_bit_and_no_cut_passes_and_the_copy_mends_it(document: dict, 
     document = {"schema": SCHEMA, **document}
     with TemporaryDirectory() as folder:
         path = Path(folder) / "a.json"
-        write_twice(path, document)
-        assert damage(path, SCHEMA, mend=False) == []
+        write_with_copy(path, document)
+        assert damage(path, SCHEMA, repair=False) == []
         data = bytearray(path.read_bytes())
         place %= len(data)
         data[place] ^= 1 << bit
         path.write_bytes(data[:place] if cut else data)
         with pytest.raises(Damaged):
-            read_sealed(path, SCHEMA)
-        assert read_either(path, SCHEMA) == document
-        assert len(damage(path, SCHEMA, mend=True)) == 1
-        assert read_sealed(path, SCHEMA) == document
+            read_checksummed(path, SCHEMA)
+        assert read_with_copy(path, SCHEMA) == document
+        assert len(damage(path, SCHEMA, repair=True)) == 1
+        assert read_checksummed(path, SCHEMA) == document
 
 
 NUMBERS = st.integers(1, 99)
@@ -318,4 +325,4 @@ def test_a_journal_returns_its_runs_in_order_and_the_recordings_that_they_saw(do
         added = [{**d, "id": i + 1, "time": f"t{i}", "what": "deployed"} for i, d in enumerate(documents)]
         assert Journal(Path(folder)).runs() == added
         assert journal.seen([*digests, "never seen"]) == (digests if documents else set())
-        assert journal.damage(mend=False) == []
+        assert journal.damage(repair=False) == []

@@ -94,7 +94,7 @@ def test_a_robot_that_crashes_is_an_error_with_one_worker_too():
 def test_a_robot_that_kills_a_dask_worker_stops_no_other(cluster):
     found = errors(done("a b killer c d", dask=cluster))
     assert set(found) == {"killer"}, found
-    assert "every Dask worker that had it died" in found["killer"]
+    assert "every Dask worker that processed it died" in found["killer"]
 
 
 def test_two_workers_work_at_the_same_time(where, tmp_path):

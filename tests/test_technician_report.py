@@ -83,7 +83,6 @@ class Links(HTMLParser):
 def test_the_page_needs_nothing_else_and_escapes_what_it_shows(bundle, log, capsys, tmp_path):
     told(capsys, "maintain", bundle.path, log, "--quiet")
     bundle.journal.add("2026-01-01T00:00:00+00:00", "kept", {"version": 2, "reason": "<script>alert(1)</script>"})
-    (tmp_path / "sub").mkdir()
     code, out = told(capsys, "report", bundle.path, "--out", tmp_path / "sub" / "page.html")
     assert (code, out) == (0, f"report: {tmp_path / 'sub' / 'page.html'}\n")
     text = (tmp_path / "sub" / "page.html").read_text()

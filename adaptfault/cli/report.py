@@ -13,7 +13,7 @@ def add(commands: Commands) -> None:
     parser = command(commands, "report", "write the technician's report: what is broken, what to check", example)
     parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
     parser.add_argument("--out", default="report.html", metavar="FILE", help="default report.html")
-    parser.set_defaults(run=run, writes=("out",))
+    parser.set_defaults(run=run)  # the folder of the page is made
 
 
 def run(args: argparse.Namespace) -> int:

@@ -126,6 +126,7 @@ class SpatialTest:
     ) -> None:
         self.result = Spatial.before(cells)
         self._events, self._cells, self._scale, self._exclusion = events, cells, scale, exclusion
+        self._final = not events
         if not events:
             prior, known = HeldValues.now(cells, scale, tolerance).prior, self.result
             evidence = np.where(known.surprisal > 0, prior + known.surprisal, known.evidence)
@@ -145,10 +146,11 @@ class SpatialTest:
 
     def step(self) -> bool:
         """Score all cells once and update the predictors, or look for drift. Return whether the result is final."""
-        if not self._events:
+        if self._final:
             return True
         if self._agreed is not None:
-            return self._drift(*self._agreed)
+            self._final = self._drift(*self._agreed)
+            return self._final
         test, predictors = self._test, self._predictors & self._test.eligible
         expected, surprisal = test.score(predictors)
         summed = test.summed(surprisal)

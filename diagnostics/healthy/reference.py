@@ -137,12 +137,9 @@ def living(layout: SensorLayout, dead: NDArray[np.float64]) -> SensorLayout:
 
 
 def highest_reading(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
-    """Return the highest reading of a present cell that moves; full scale, if none moves."""
-    present = layout.present.ravel()
-    low, high = np.full(layout.n_cells, np.inf), np.full(layout.n_cells, -np.inf)
-    for frames in RecordingBlocks.of(recordings).blocks():
-        low, high = np.fmin(low, np.fmin.reduce(frames)), np.fmax(high, np.fmax.reduce(frames))
-    moved = present & (high > low)
+    """Return the highest reading of a present cell that moves; full scale, if none moves above 0."""
+    low, high = RecordingBlocks.of(recordings).extremes()
+    moved = layout.present.ravel() & (high > low) & (high > 0)
     return float(high[moved].max()) if moved.any() else layout.full_scale
 
 

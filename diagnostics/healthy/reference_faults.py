@@ -59,11 +59,8 @@ def find_reference_faults(
 
 def _constant(recordings: RecordingBlocks, most: float) -> NDArray[np.bool_]:
     """Return the cells whose readings span at most ``most``, bool ``[D]``; False without any reading."""
-    low, high = np.inf, -np.inf
-    for frames in recordings.blocks():
-        low, high = np.fmin(low, np.fmin.reduce(frames)), np.fmax(high, np.fmax.reduce(frames))
-    constant: NDArray[np.bool_] = np.asarray((high >= low) & (high - low <= most))
-    return constant
+    low, high = recordings.extremes()
+    return np.asarray(high - low <= most)
 
 
 def _enclosed_groups(never_moved: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.bool_]:

@@ -56,6 +56,13 @@ class RecordingBlocks(Sequence[Recording]):
         which = range(0, len(self), max(1, len(self) // _RECORDINGS))
         return cells, (self.piece(i, slice(None), cells) for i in which)
 
+    def extremes(self) -> tuple[Recording, Recording]:
+        """Return the lowest and the highest reading of each cell, ``[D]``; NaN for a cell without any reading."""
+        low = high = np.full(self._given[0].shape[1], np.nan)
+        for frames in self.blocks():
+            low, high = np.fmin(low, np.fmin.reduce(frames)), np.fmax(high, np.fmax.reduce(frames))
+        return low, high
+
     def valid(self, full_scale: float) -> RecordingBlocks:
         """Return the recordings with readings that no converter gives as missing, see ``transport.invalid``."""
         checked = []

@@ -16,6 +16,7 @@ from diagnostics.decision.line_cover import candidate_groups
 from diagnostics.decision.result import Diagnosis
 from diagnostics.decision.root_causes import CellFindings, root_causes
 from diagnostics.decision.serialization import Arrays, from_state, to_state
+from diagnostics.evidence.rewiring import Rewiring, find_rewiring
 from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference import Reference, highest_reading, living, tolerance_of
@@ -89,6 +90,20 @@ class SelfDiagnosis:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
         return self._diagnosed(_recordings(recordings, self.layout))
+
+    def rewiring(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Rewiring | None:
+        """Return the rows, columns or pads that answer in each other's place, None where the data show none.
+
+        ``Rewiring.undo`` puts the readings back; diagnose and predict with those. Without :meth:`fit` always None.
+
+        Args:
+            recordings: a log, as for :meth:`diagnose`.
+
+        Raises:
+            ValueError: recordings that do not fit the layout, or hold no frame.
+        """
+        log = _recordings(recordings, self.layout).valid(self.layout.full_scale)
+        return None if self.reference_ is None else find_rewiring(log, self.reference_, self.layout)
 
     def state(self) -> tuple[dict[str, Any], Arrays]:
         """Return the fitted state: a JSON-safe dict and arrays by name, as :meth:`from_state` reads them."""

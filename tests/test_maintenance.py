@@ -3,10 +3,12 @@ import json
 import numpy as np
 import pytest
 
+from adaptfault.data.windows import make_windows, scale
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.deployment_test import Judgement
 from adaptfault.robot.lock import Busy
 from adaptfault.robot.maintenance import maintain
+from adaptfault.robot.predictor import Predictor
 from diagnostics import FaultKind, Line, SensorLayout, inject, line_fault
 
 LAYOUT = SensorLayout(2, 6, 5)
@@ -223,3 +225,44 @@ def test_a_candidate_in_which_a_class_collapses_is_refused(bundle, later_grasps,
     assert (report.decision, report.version) == ("refused", 1)
     assert bundle.class_names[1] in report.reason
     assert bundle.versions.numbers == [1]
+
+
+def exchanged_rows(recordings, bundle):
+    grid = bundle.layout.grid(np.arange(bundle.layout.n_cells))
+    grid[0, [1, 4]] = grid[0, [4, 1]]
+    return [recording[:, grid.ravel()] for recording in recordings]
+
+
+def test_exchanged_rows_are_undone_in_software_and_the_robot_predicts_as_before(bundle, later_grasps):
+    x = make_windows(later_grasps, np.zeros(len(later_grasps), int), bundle.layout).x
+    before = Predictor.load(bundle.path).predict(x)
+    swapped = exchanged_rows(later_grasps, bundle)
+    report = maintain(bundle, swapped)
+    assert (report.decision, report.version, report.exit_code) == ("deployed", 2, 1)
+    assert report.rewiring == ("rows 1 and 4 of pad 0 are exchanged",)
+    assert not report.fault_set
+    assert report.reason.startswith("wiring changed: rows 1 and 4 of pad 0 are exchanged")
+    predictor = Predictor.load(bundle.path)
+    y = make_windows(swapped, np.zeros(len(swapped), int), bundle.layout).x
+    np.testing.assert_array_equal(predictor.predict(y), before)
+    for frame in swapped[0]:
+        label = predictor.stream(frame).label
+    assert label == Predictor.load(bundle.path).predict(scale(swapped[0][-10:], bundle.layout)[None])[0]
+
+
+def test_the_next_run_starts_from_the_undone_wiring(bundle, later_grasps, broken_row):
+    maintain(bundle, exchanged_rows(later_grasps[:12], bundle))
+    again = maintain(bundle, exchanged_rows(broken(later_grasps[12:], broken_row), bundle))
+    assert again.rewiring == ()
+    assert again.fault_set == set(broken_row.cells)
+    repaired = maintain(bundle, later_grasps)  # somebody mended the cable
+    assert repaired.rewiring == ("rows 1 and 4 of pad 0 are exchanged",)
+    np.testing.assert_array_equal(bundle.active().source, np.arange(bundle.layout.n_cells))
+
+
+def test_a_dry_run_tells_of_exchanged_rows_and_changes_nothing(bundle, later_grasps):
+    before = files(bundle)
+    report = maintain(bundle, exchanged_rows(later_grasps, bundle), dry_run=True)
+    assert (report.decision, report.version, report.exit_code) == ("deployed", 1, 1)
+    assert "a new version would undo it" in report.reason
+    assert files(bundle) == before

@@ -343,7 +343,7 @@ from adaptfault.models.store import ADAPTATION, read_manifest
 from diagnostics import SelfDiagnosis, SensorLayout
 folder = Path(sys.argv[1])
 layout = SensorLayout.from_dict(read_manifest(folder, ADAPTATION)["network"]["layout"])
-version = SimpleNamespace(number=1, folder=folder)
+version = SimpleNamespace(number=1, folder=folder, source=np.arange(layout.n_cells))
 predictor = Predictor(lambda: SimpleNamespace(
     layout=layout, class_names=(), pointer=folder, active=lambda: version, begin=lambda starter: version,
     diagnoser=lambda: SelfDiagnosis(layout),

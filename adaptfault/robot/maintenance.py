@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.data.windows import Windows
+    from adaptfault.robot.versions import Version
+    from diagnostics.evidence.rewiring import Rewiring
 
 SCHEMA = "adaptfault.maintenance/1"
 Decision = Literal["unchanged", "deployed", "kept", "refused"]
@@ -55,6 +57,7 @@ class MaintenanceReport:
         accuracy: of the version that runs now, under the known faults, on the held-out windows; None if not measured.
         fault_free_accuracy: of version 1 on the same windows without faults; None if not measured.
         change: of the whole sensor against the reference (gain, offset); None where none was found.
+        rewiring: rows, columns or pads that answer in each other's place, as text; the deployed version undoes it.
         stages: cost and result of each adaptation stage, as text.
         used: names of the recordings whose diagnosis entered the known faults; empty where they were refused.
         left_out: recordings, or readings of them, that were not used, with the reason.
@@ -74,6 +77,7 @@ class MaintenanceReport:
     accuracy: float | None = None
     fault_free_accuracy: float | None = None
     change: SensorChange | None = None
+    rewiring: tuple[str, ...] = ()
     stages: tuple[str, ...] = ()
     used: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
@@ -117,6 +121,7 @@ class MaintenanceReport:
             "accuracy": self.accuracy,
             "fault_free_accuracy": self.fault_free_accuracy,
             "change": None if self.change is None else vars(self.change),
+            "rewiring": list(self.rewiring),
             "stages": list(self.stages),
             "used": list(self.used),
             "left_out": list(self.left_out),
@@ -230,12 +235,37 @@ class _Maintenance:
         if not usable:
             return self._report("refused", _UNKNOWN, "no recording is usable", self.before)
         self.say(f"diagnosing {len(usable)} new recordings")
-        frames = [r.frames for r in usable if r.frames is not None]
+        frames = [r.frames[:, self.version.source] for r in usable if r.frames is not None]
+        rewiring = bundle.diagnoser().rewiring(frames)
+        if rewiring is not None:
+            frames = [rewiring.undo(recording) for recording in frames]
+            if not self.dry_run:
+                self.version = self._undone(rewiring)
         report = self._decide(bundle.diagnoser().diagnose(frames), frames, tuple(r.name for r in usable))
         report = self._with_change(self._with_coverage(report), frames)
+        if rewiring is not None:
+            undone = "a new version would undo it" if self.dry_run else f"version {self.version.number} undoes it"
+            report = replace(
+                report,
+                decision="deployed" if report.decision == "unchanged" else report.decision,
+                exit_code=max(1, report.exit_code),
+                reason=f"{rewiring.reason}; {undone}; {report.reason}",
+                rewiring=rewiring.steps,
+            )
         if not self.dry_run:
             self._write(report, usable)
         return report
+
+    def _undone(self, rewiring: Rewiring) -> Version:
+        """Deploy the running model as a version that puts the readings back."""
+        from adaptfault.adaptation.result import Adaptation
+
+        self.say(rewiring.reason)
+        source = self.version.source[rewiring.source]
+        about = {**self.version.about, "reason": rewiring.reason, "source": source.tolist()}
+        version = self.bundle.write_version(Adaptation.load(self.version.folder), about)
+        self.bundle.deploy(version.number)
+        return version
 
     def _with_coverage(self, report: MaintenanceReport) -> MaintenanceReport:
         """Return the report with the exit code of recordings that test nothing."""
@@ -346,7 +376,8 @@ class _Maintenance:
             return None
         for number in reversed(self.bundle.versions.numbers):
             with suppress(Damaged, FileNotFoundError):
-                if (version := self.bundle.versions[number]).fault_set == faulty:
+                version = self.bundle.versions[number]
+                if version.fault_set == faulty and np.array_equal(version.source, self.version.source):
                     return version
         return None
 
@@ -387,6 +418,7 @@ class _Maintenance:
         about = {
             "reason": f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}",
             "knowledge": known.to_dict(),
+            "source": self.version.source.tolist(),
             "accuracy": judgement.candidate,
             "fault_free_accuracy": free,
         }

@@ -64,6 +64,7 @@ class _Running:
     version: Version
     model: Inference
     bundle: Bundle
+    source: NDArray[np.intp]  # see Version.source
 
 
 class Predictor:
@@ -127,12 +128,12 @@ class Predictor:
     def predict(self, x: NDArray[Any]) -> NDArray[np.int64]:
         """Return the class of each window ``[N, T, D]`` on the 0..1 scale, int64 ``[N]``."""
         self._keep_up()
-        return self._running.model.predict(_finite(x))
+        return self._running.model.predict(self._rewired(_finite(x)))
 
     def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
         """Return class probabilities ``[N, n_classes]`` of windows ``[N, T, D]``; F's cells may hold anything."""
         self._keep_up()
-        return self._running.model.predict_proba(_finite(x))
+        return self._running.model.predict_proba(self._rewired(_finite(x)))
 
     def stream(self, frame: ArrayLike, time: float | None = None) -> Reading:
         """Process one frame and classify the window that ends with it.
@@ -154,7 +155,7 @@ class Predictor:
             )
         if time is not None and not np.isfinite(time):
             raise ValueError(f"time {time}: expected seconds, or None where it is unknown")
-        given = given.reshape(-1)
+        given = given.reshape(-1)[self._running.source]
         reading, outside = within_range(given, self.layout)
         if outside and not self.outside:
             _log.warning("%d readings outside the range of %s count as missing", outside, self.layout)
@@ -197,6 +198,11 @@ class Predictor:
     def __str__(self) -> str:
         return f"version {self.version}: {self._running.model}"
 
+    def _rewired(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return windows with each reading at its cell, where the running version undoes a changed wiring."""
+        source = self._running.source
+        return x[..., source] if x.shape[-1:] == source.shape else x  # the model refuses another shape
+
     def _keep_up(self) -> None:
         """Switch to a new version once it is loaded; check for one every second."""
         if self._loading is not None:
@@ -204,7 +210,10 @@ class Predictor:
                 return
             self._loading = None
             if self._ready is not None:
-                self._running, self._ready = self._ready, None
+                before, self._running, self._ready = self._running, self._ready, None
+                if not np.array_equal(before.source, self._running.source):  # the frames so far are of another order
+                    self._monitor = Monitor(_reference(self._running.bundle))
+                    self.reset()
                 _log.info("version %d runs now", self.version)
         now = monotonic()
         if now < self._next_look:
@@ -246,7 +255,7 @@ def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
     if model.layout != layout:
         raise ValueError(f"the version is for {model.layout}, the bundle for {layout}")
     model.predict_proba(np.zeros((1, model.length, layout.n_cells), np.float32))
-    return _Running(version, model, bundle)
+    return _Running(version, model, bundle, version.source)
 
 
 def _finite(x: NDArray[Any]) -> NDArray[np.float32]:

@@ -9,7 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from adaptfault.robot.checksummed_json import (
+    Damaged,
     check_files,
     decoding,
     hash_files,
@@ -37,7 +41,7 @@ class Version:
         class_names: one name for each class.
         length: frames in a window.
         fault_set: F, the cells that it does not use.
-        about: origin of the version, JSON.
+        about: origin of the version, JSON. ``source``, where given: a permutation that undoes a changed wiring.
     """
 
     number: int
@@ -47,6 +51,15 @@ class Version:
     length: int
     fault_set: FaultSet
     about: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def source(self) -> NDArray[np.intp]:
+        """int ``[D]``: cell i of the array answers at index ``source[i]``; its own index unless the wiring changed."""
+        every = np.arange(self.layout.n_cells)
+        source = np.asarray(self.about.get("source", every), dtype=np.intp)
+        if not np.array_equal(np.sort(source), every):
+            raise Damaged(f"{self.folder / ABOUT}: source is no permutation of {self.layout.n_cells} cells")
+        return source
 
     def __str__(self) -> str:
         return f"version {self.number}, without {len(self.fault_set)} of {self.layout.present.sum()} cells"

@@ -176,7 +176,9 @@ def excerpts(
         Features ``[n, 4, D]``, source of each ``[n]``, number of distinct events.
     """
     seen = [
-        event for i, recording in enumerate(recordings) for event in ReferenceEvent.of(_events(recording, scale), i)
+        event
+        for i, recording in enumerate(recordings)
+        for event in ReferenceEvent.of(contact_events(recording, scale), i)
     ]
     return *drawn(seen, lambda i, frames: recordings[i][frames], scale, rng, _SAMPLES), count_events(seen)
 
@@ -219,7 +221,8 @@ def p_floor_of(n_events: int) -> float:
     return max(_MIN_P_FLOOR, 1 / (n_events + 2))
 
 
-def _events(recording: NDArray[np.float64], scale: Scale) -> tuple[ContactEvent, ...]:
+def contact_events(recording: NDArray[np.float64], scale: Scale) -> tuple[ContactEvent, ...]:
+    """Return the contact events of a recording ``[T, D]`` of the whole skin."""
     events = EventLog()
     for frames, numbers, start in segments(recording, SEGMENT, scale.near / 2):
         events = events.extend(scale.root_load(frames), numbers, scale.root_near, start, np.zeros(len(start), bool))

@@ -1,0 +1,228 @@
+"""Swapped, mirrored or shifted wiring: rows, columns or pads that answer in each other's place after a repair.
+
+Every cell works, so no cell is faulty; the readings arrive at the wrong index. A permutation of the wiring is scored by
+the pseudo-likelihood (Besag 1975) of the contact events under the healthy model, with the readings put back,
+
+    l_e(P) = sum_i log P(what cell i did in event e | other cells),    never, sometimes or always loaded, and its load
+
+Candidates are exchanges of two rows or two columns of a pad, a pad mirrored along either axis, its rows or columns
+shifted by one, and exchanged pads. The best is taken, and the search goes on from there, so that combinations are
+found. A permutation is reported if the gain sum_e w_e (l_e(P) - l_e(identity)) exceeds 24, is positive without the two
+events that favour it most, exceeds that of any other candidate by 12, and explains half of what a random order leaves
+unexplained; w_e discounts repeated events. Where the array is loaded symmetrically two wirings read alike, and nothing
+is reported. Lines that no event loads differently are not distinguished.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.events.contact_events import Summary, count_repeats
+from diagnostics.healthy.model import contact_events
+from diagnostics.preprocessing.readings import held
+
+if TYPE_CHECKING:
+    from diagnostics.healthy.prediction import Prediction
+    from diagnostics.healthy.reference import Reference
+    from diagnostics.layout import SensorLayout
+    from diagnostics.preprocessing.scale import Array, Scale
+
+_EVENTS = 32  # contact events that are scored: a size
+_FRAMES = 64  # of an event, evenly spread: a size
+_FEWEST = 4  # events; fewer prove nothing
+_LINES = 16  # lines of one kind on a pad, the least expected ones, whose exchange is tried: a size
+_LIMIT = 24.0  # log likelihood gained, all events together
+_WITHOUT = 2  # events without which there must be a gain too: one odd contact proves nothing
+_MOST_STEPS = 4  # permutations that are combined
+_OUTLIERS = 0.1  # share of loads that the model does not predict
+_UNEXPLAINED = 0.5  # of what a random order leaves: with more it is another sensor
+_LEAST_P = 1e-3  # lower limit of a probability: models err
+
+Floats = NDArray[np.float64]
+Cells = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Rewiring:
+    """A permutation of the wiring.
+
+    Attributes:
+        source: int ``[D]``; cell i of the array now answers at index ``source[i]``.
+        steps: what was exchanged, as text, in order.
+        gain: log likelihood gained in the events of the log.
+        events: number of events that were scored.
+    """
+
+    source: Cells
+    steps: tuple[str, ...]
+    gain: float
+    events: int
+
+    @property
+    def reason(self) -> str:
+        """One sentence."""
+        return f"wiring changed: {', then '.join(self.steps)}; check the connectors"
+
+    def undo(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return frames ``[..., D]`` with each reading at the index of the cell that gave it."""
+        return frames[..., self.source]
+
+
+class _Candidate(NamedTuple):
+    source: Cells
+    text: str
+
+
+class _Event(NamedTuple):
+    """Frames ``[t, D]`` of one event, and its weight."""
+
+    frames: Floats
+    weight: float
+
+
+def find_rewiring(
+    recordings: Sequence[NDArray[np.float64]],
+    reference: Reference,
+    layout: SensorLayout,
+) -> Rewiring | None:
+    """Return the permutation of the wiring that explains a log; None where there is none, or the data do not tell.
+
+    Args:
+        recordings: ``[T, D]`` each; NaN = missing.
+        reference: of the array, fitted.
+        layout: the array.
+    """
+    if reference.model is None:
+        return None
+    events = _events(recordings, reference.scale)
+    if len(events) < _FEWEST:
+        return None
+    # Constant cells may be broken: they are neither scored nor predictors.
+    moved = np.ptp(np.concatenate([event.frames for event in events]), axis=0) > reference.scale.near
+    test = _Test(events, reference, layout, moved)
+    source, total = np.arange(layout.n_cells), 0.0
+    steps: list[str] = []
+    now = test.score(source)
+    for _ in range(_MOST_STEPS):
+        candidates = list(_candidates(layout, now.surplus, source))
+        gains = np.array([test.score(candidate.source).by_event - now.by_event for candidate in candidates])
+        sums = gains.sum(axis=1)
+        best = int(sums.argmax())
+        rivals = np.delete(sums, best)
+        if not _certain(gains[best]) or (len(rivals) and sums[best] - rivals.max() < _LIMIT / 2):
+            break
+        source, total = candidates[best].source, total + float(sums[best])
+        steps.append(candidates[best].text)
+        now = test.score(source)
+    at_random = test.score(np.random.default_rng(0).permutation(layout.n_cells))
+    if not steps or now.surplus.sum() < _UNEXPLAINED * at_random.surplus.sum():
+        return None
+    return Rewiring(source, tuple(steps), total, len(events))
+
+
+def _certain(gain: Floats) -> bool:
+    """Return whether the gains of the events, ``[n]``, prove a permutation, even without the two largest."""
+    return bool(gain.sum() >= _LIMIT and np.sort(gain)[:-_WITHOUT].sum() > 0)
+
+
+class _Score(NamedTuple):
+    """Log likelihood of each event, ``[n]``, and by how much that of each cell exceeds its expectation, ``[D]``."""
+
+    by_event: Floats
+    surplus: Floats
+
+
+class _Test:
+    """Scores permutations on the same events."""
+
+    def __init__(
+        self, events: Sequence[_Event], reference: Reference, layout: SensorLayout, moved: NDArray[np.bool_]
+    ) -> None:
+        assert reference.model is not None
+        self._events, self._model, self._scale = events, reference.model, reference.scale
+        self._present, self._moved = layout.present.ravel(), moved
+        self.weight = np.array([event.weight for event in events])
+
+    def score(self, source: Cells) -> _Score:
+        """Return the score of one permutation."""
+        features = np.stack([self._features(event, source) for event in self._events])
+        predictors = self._moved[source] & self._present
+        expected = self._model.predict(features, predictors)
+        likely, usual = _log_likelihood(expected, features)
+        # The same readings count for each permutation; a load where no cell is, is as good as impossible.
+        likely = np.where(self._present, likely, np.where(features[:, 2] > 0, np.log(_LEAST_P), 0.0))
+        likely, usual = (np.where(self._moved[source], of, 0.0) for of in (likely, usual * self._present))
+        return _Score(self.weight * likely.sum(axis=1), (self.weight[:, None] * (likely - usual)).sum(axis=0))
+
+    def _features(self, event: _Event, source: Cells) -> Array:
+        root = self._scale.root_load(event.frames[:, source])
+        return Summary.of(root, 0, self._scale.root_near).features()
+
+
+def _log_likelihood(expected: Prediction, features: Array) -> tuple[Floats, Floats]:
+    """Return the log likelihood ``[n, D]`` of what each cell did, and its expectation under the model."""
+    never, always = expected.never, expected.always
+    p = np.clip(np.stack([never, always, 1 - never - always]), _LEAST_P, 1.0)
+    did = np.where(features[:, 2] == 0, 0, np.where(features[:, 3] == 1, 1, 2))
+    logs = np.log(p)
+    state = np.take_along_axis(logs, did[None], axis=0)[0]
+    error = np.nan_to_num((features[:, 1] - expected.mean) / expected.spread, nan=np.inf)  # no load is known
+    load = np.where(did > 0, np.log((1 - _OUTLIERS) / (1 + error**2 / 4) ** 2.5 + _OUTLIERS), 0.0)
+    return state + load, (p * logs).sum(axis=0)
+
+
+def _events(recordings: Sequence[NDArray[np.float64]], scale: Scale) -> list[_Event]:
+    """Return the strongest contact events of the log."""
+    found: list[tuple[float, _Event]] = []
+    for recording in recordings:
+        frames = np.nan_to_num(held(recording, np.full(recording.shape[1], np.nan))[1:], nan=0.0)
+        events = contact_events(frames, scale)
+        for event, again in zip(events, count_repeats(events).tolist(), strict=True):
+            own = frames[event.first : event.end]
+            own = own[np.linspace(0, len(own) - 1, min(len(own), _FRAMES)).astype(int)]
+            amplitude = event.amplitude(np.ones(frames.shape[1], np.float32))
+            found.append((amplitude, _Event(own, 1 / (1 + again))))
+    found.sort(key=lambda pair: -pair[0])
+    return [event for _, event in found[:_EVENTS]]
+
+
+def _candidates(layout: SensorLayout, surplus: Floats, source: Cells) -> Iterator[_Candidate]:
+    """Yield the permutations that are tried, each on top of ``source``."""
+    grid, score = layout.grid(np.arange(layout.n_cells)), layout.grid(surplus)
+
+    def on_top(changed: NDArray[np.intp], text: str) -> _Candidate:
+        return _Candidate(source[changed.ravel()], text)
+
+    for pad in range(layout.pads):
+        for axis, kind in enumerate(("row", "column")):
+            size = grid.shape[axis + 1]
+            of_line = score[pad].sum(axis=1 - axis)
+            worst = np.sort(np.argsort(of_line)[:_LINES]).tolist()
+            for a, b in combinations(worst, 2):
+                order = np.arange(size)
+                order[[a, b]] = b, a
+                yield on_top(_reordered(grid, pad, axis, order), f"{kind}s {a} and {b} of pad {pad} are exchanged")
+            if size > 2:
+                order = np.arange(size)[::-1]
+                yield on_top(_reordered(grid, pad, axis, order), f"the {kind}s of pad {pad} are in reverse order")
+            if size > 3:
+                for by in (1, -1):
+                    order = np.roll(np.arange(size), -by)
+                    text = f"the {kind}s of pad {pad} are shifted by {by:+d}"
+                    yield on_top(_reordered(grid, pad, axis, order), text)
+    for a, b in combinations(range(layout.pads), 2):
+        order = np.arange(layout.pads)
+        order[[a, b]] = b, a
+        yield on_top(grid[order], f"pads {a} and {b} are exchanged")
+
+
+def _reordered(grid: NDArray[np.intp], pad: int, axis: int, order: NDArray[np.intp]) -> NDArray[np.intp]:
+    changed = grid.copy()
+    changed[pad] = np.take(grid[pad], order, axis=axis)
+    return changed

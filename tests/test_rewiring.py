@@ -1,0 +1,87 @@
+"""Swapped, mirrored and shifted wiring, on simulated grasps."""
+
+import numpy as np
+import pytest
+
+from diagnostics import SelfDiagnosis, SensorLayout
+
+LAYOUT = SensorLayout(2, 6, 5)
+GRID = LAYOUT.grid(np.arange(LAYOUT.n_cells))
+
+
+@pytest.fixture(scope="module")
+def fitted(small_grasps):
+    return SelfDiagnosis(LAYOUT).fit(small_grasps.frames[:60])
+
+
+def log(small_grasps, seed):
+    chosen = 60 + np.random.default_rng(seed).choice(30, 12, replace=False)
+    return [np.asarray(small_grasps.frames[i]) for i in chosen]
+
+
+def exchanged_rows(pad, a, b):
+    grid = GRID.copy()
+    grid[pad, [a, b]] = grid[pad, [b, a]]
+    return grid.ravel()
+
+
+def reverse_rows():
+    grid = GRID.copy()
+    grid[0] = grid[0, ::-1]
+    return grid.ravel()
+
+
+def shifted_columns():
+    grid = GRID.copy()
+    grid[1] = np.roll(grid[1], 1, axis=1)
+    return grid.ravel()
+
+
+@pytest.mark.parametrize(
+    ("wired", "said"),
+    [
+        (exchanged_rows(0, 1, 4), "rows 1 and 4 of pad 0 are exchanged"),
+        (reverse_rows(), "the rows of pad 0 are in reverse order"),
+        (shifted_columns(), "the columns of pad 1 are shifted by +1"),
+    ],
+)
+def test_a_changed_wiring_is_named_and_undone(fitted, small_grasps, wired, said):
+    healthy = log(small_grasps, 0)
+    found = fitted.rewiring([frames[:, wired] for frames in healthy])
+    assert found is not None
+    assert found.steps == (said,)
+    for frames in healthy:
+        np.testing.assert_array_equal(found.undo(frames[:, wired]), frames)
+
+
+def test_the_recordings_do_not_decide_for_pads_that_an_object_loads_alike(fitted, small_grasps):
+    opposite = GRID[::-1].ravel()
+    found = fitted.rewiring([frames[:, opposite] for frames in log(small_grasps, 0)])
+    assert found is None or found.steps == ("pads 0 and 1 are exchanged",)
+
+
+def test_two_changes_are_found_together(fitted, small_grasps):
+    wired = exchanged_rows(0, 1, 4)[exchanged_rows(1, 0, 3)]
+    found = fitted.rewiring([frames[:, wired] for frames in log(small_grasps, 1)])
+    assert found is not None
+    assert len(found.steps) == 2
+    np.testing.assert_array_equal(found.undo(wired), np.arange(LAYOUT.n_cells))
+
+
+def test_healthy_logs_show_no_change(fitted, small_grasps):
+    assert [fitted.rewiring(log(small_grasps, seed)) for seed in range(20)] == [None] * 20
+
+
+def test_dead_cells_are_no_change_of_the_wiring(fitted, small_grasps):
+    dead = np.random.default_rng(2).choice(LAYOUT.n_cells, 10, replace=False)
+    broken = [frames.copy() for frames in log(small_grasps, 3)]
+    for frames in broken:
+        frames[:, dead[:5]], frames[:, dead[5:]] = 0.0, LAYOUT.full_scale
+    assert fitted.rewiring(broken) is None
+
+
+def test_what_the_data_cannot_tell_is_not_reported(fitted, small_grasps):
+    idle = [np.zeros((50, LAYOUT.n_cells))] * 6
+    assert fitted.rewiring(idle) is None
+    assert fitted.rewiring(log(small_grasps, 0)[:1]) is None
+    assert SelfDiagnosis(LAYOUT).rewiring(log(small_grasps, 0)) is None

@@ -20,7 +20,7 @@ HAND, FINGERTIPS, SOLES = "sdh2x13x6_grasps36.npz", "icub5x1x12_grasps11.npz", "
 MAIN = ("cells", "onset", "healthy")
 EVERY = (
     "cells", "onset", "dither", "missing", "many", "cold", "reference_faults", "lines", "cut", "address", "healthy",
-    "holds", "untouched", "kind", "calibration", "changing", "gain", "transport",
+    "holds", "untouched", "kind", "calibration", "changing", "gain", "rewired", "transport",
 )  # fmt: skip
 
 
@@ -76,12 +76,15 @@ ARRAYS = [
     Array("hand", EVERY, real(HAND), 50, 2, 40, (*MAIN, "lines", "calibration", "cold"), HAND),
     Array(
         "fingertips",
-        (*MAIN, "many", "cold", "reference_faults", "holds", "untouched", "calibration", "transport"),
+        (*MAIN, "many", "cold", "reference_faults", "holds", "untouched", "calibration", "rewired", "transport"),
         real(FINGERTIPS), 60, 2, 40, (*MAIN, "cold"), FINGERTIPS,
     ),
     Array(
         "soles",
-        (*MAIN, "many", "cold", "reference_faults", "lines", "cut", "holds", "untouched", "calibration", "changing"),
+        (
+            *MAIN, "many", "cold", "reference_faults", "lines", "cut", "holds", "untouched", "calibration", "changing",
+            "rewired",
+        ),
         real(SOLES), 30, 2, 12, (*MAIN, "cold"), SOLES,
     ),
     *(Array(f"hand, {name}", MAIN, sensor(name), 30, file=HAND) for name in (*SENSORS, *DRIFTS) if name != "as it is"),
@@ -94,7 +97,9 @@ ARRAYS = [
         for name, skin in static_holds.SKINS.items()
     ),
     Array("grasps, 2 x 11 x 10", (*MAIN, "lines", "cold"), simulated(grasps(SensorLayout.paper())), 30),
-    Array("grasps, 1 x 12 x 12", (*MAIN, "lines", "address"), simulated(grasps(SensorLayout(1, 12, 12))), 30),
+    Array(
+        "grasps, 1 x 12 x 12", (*MAIN, "lines", "address", "rewired"), simulated(grasps(SensorLayout(1, 12, 12))), 30
+    ),
 ]  # fmt: skip
 SPEED = [
     Array("hand", ("speed",), real(HAND), 1, 3, 1, ("speed",), HAND),

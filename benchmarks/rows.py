@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+from itertools import combinations
 
 import numpy as np
 
@@ -391,6 +392,57 @@ def gain(bench: Bench) -> Iterator[Count]:
     yield Count("  other cells blamed in a log", false, bench.count, higher=False)
 
 
+def wirings(layout: SensorLayout) -> dict[str, list[np.ndarray]]:
+    """Return by kind the changed wirings of an array: index i reads cell ``wiring[i]``."""
+    grid = layout.grid(np.arange(layout.n_cells))
+    found: dict[str, list[np.ndarray]] = {}
+
+    def add(kind: str, pad: int, axis: int, order: np.ndarray) -> None:
+        changed = grid.copy()
+        changed[pad] = np.take(grid[pad], order, axis=axis)
+        found.setdefault(kind, []).append(changed.ravel())
+
+    for pad in range(layout.pads):
+        for axis, size in enumerate(layout.shape[1:]):
+            for pair in combinations(range(size), 2):
+                order = np.arange(size)
+                order[list(pair)] = order[list(pair[::-1])]
+                add("two lines exchanged", pad, axis, order)
+            if size > 3:
+                add("a pad mirrored", pad, axis, np.arange(size)[::-1])
+                for by in (1, -1):
+                    add("lines shifted by one", pad, axis, np.roll(np.arange(size), by))
+    for a, b in combinations(range(layout.pads), 2):
+        order = np.arange(layout.pads)
+        order[[a, b]] = b, a
+        found.setdefault("two pads exchanged", []).append(grid[order].ravel())
+    return found
+
+
+def rewired(bench: Bench) -> Iterator[Count]:
+    """Wirings that change a visible number of readings; told right: put back as they were."""
+    layout, choice = bench.layout, wirings(bench.layout)
+    right, told, asked, false = Counter(), Counter(), Counter(), 0
+    for _, log, rng in bench.logs():
+        whole = np.concatenate(log)
+        false += bench.fitted.rewiring(log) is not None
+        for case, of_case in choice.items():
+            wiring = of_case[rng.integers(len(of_case))]
+            if differs(whole[:, wiring], whole, layout).any(axis=1).sum() < TESTABLE:
+                continue
+            asked[case] += 1
+            found = bench.fitted.rewiring([frames[:, wiring] for frames in log])
+            if found is not None:
+                told[case] += 1
+                right[case] += not differs(found.undo(whole[:, wiring]), whole, layout)[:, layout.present.ravel()].any()
+    for case in choice:
+        yield Count(f"{case}: undone", right[case], asked[case])
+    yield Count(
+        "changed wiring: undone wrongly", sum(told.values()) - sum(right.values()), sum(asked.values()), "", False
+    )
+    yield Count("healthy: a changed wiring named in a log", false, bench.count, higher=False)
+
+
 def transport(bench: Bench) -> Iterator[Count]:
     layout, told, blamed = bench.layout, 0, 0
     for seed, log, rng in bench.logs():
@@ -455,6 +507,6 @@ ROWS: dict[str, Callable[[Bench], Iterator[Count]]] = {
     row.__name__: row
     for row in (
         cells, onset, dither, missing, many, cold, reference_faults, lines, cut, address, healthy, holds, untouched,
-        kind, calibration, changing, gain, transport, speed,
+        kind, calibration, changing, gain, rewired, transport, speed,
     )
 }  # fmt: skip

@@ -30,8 +30,6 @@ _CERTAIN = 0.999  # P(faulty) of silent, intermittent, noisy and drifting cells,
 _SUSPICIOUS_COLD = 3.0  # raw log ratio from which on a cell is no predictor, in a cold start
 _KNOWN = 9.0  # log likelihood ratio of a cell that was dead in the reference already
 _GROUP_SHARE = 0.5  # share of the evidence added with a group excluded, see _weight_of_groups
-# Certainty that a cell lends its wire, where it is likely to be faulty and where not; less with few reference events.
-_LIKELY, _LEADING = 0.8, (0.75, 0.4)
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
 
 
@@ -257,7 +255,7 @@ class SelfDiagnosis:
             probability=probability,
             # A cell at rest supports a broken line by the events alone, without the prior of its value.
             weight=np.where(known, _KNOWN, self.calibrator_.calibrate(spatial.surprisal, temporal, kind)),
-            doubt=1 - (1 - reference.inexperience) * np.where(probability > _LIKELY, *_LEADING),
+            doubt=np.ones(len(stuck)),
             events=np.where(intermittent, intermittency.blinks, spatial.events),
             known=known,
         )
@@ -268,15 +266,13 @@ class SelfDiagnosis:
         """Return the function from a summed surprisal with a group excluded to the weights ``[D]`` for the line cover.
 
         By the chain rule of probability each cell of a group is conditioned on those before it: on half of them, about
-        the mean of conditioning on all and on none. With few reference events the predictions from few predictors
-        are poor, so the share is smaller.
+        the mean of conditioning on all and on none.
         """
         temporal, kind = stream.temporal(), kinds(stream)
-        share = _GROUP_SHARE * (1 - stream.reference.inexperience)
 
         def weight_of(surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
             more = self.calibrator_.calibrate(surprisal, temporal, kind) - found.weight
-            return found.weight + share * np.maximum(more, 0.0)
+            return found.weight + _GROUP_SHARE * np.maximum(more, 0.0)
 
         return weight_of
 
@@ -284,7 +280,7 @@ class SelfDiagnosis:
         self, found: CellFindings, stream: StreamState, weight: NDArray[np.float64], explained: NDArray[np.bool_]
     ) -> list[NDArray[np.intp]]:
         """Return the groups of cells at rest that one broken line would explain."""
-        if (stream.reference.inexperience == 1).all():
+        if stream.reference.model is None:
             return []
         consistent = found.rests & ~found.known & ~explained
         contradicting = found.alive | ~(found.rests | found.silent) & stream.present

@@ -8,7 +8,7 @@ from sklearn.linear_model import LogisticRegression
 from adaptfault.data.recordings import Recordings
 from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
 from diagnostics.decision import calibration
-from diagnostics.decision.calibration import Calibrator, _bounded_logistic, _tail_slope, faulty_at
+from diagnostics.decision.calibration import Calibrator, _bounded_logistic, faulty_at
 
 SCORED = np.ones(100, bool)
 EARLY = np.zeros(100, int)  # of the kind that never moved
@@ -165,20 +165,3 @@ def test_within_the_bounds_it_is_a_logistic_regression():
     free = LogisticRegression(C=10.0).fit(evidence, dead)
     expected = (free.intercept_[0] + 0.5, *free.coef_[0])
     assert _bounded_logistic(evidence, dead, base=-0.5) == pytest.approx(expected, abs=2e-3)
-
-
-def test_the_tail_slope_is_lower_the_farther_healthy_cells_reach():
-    far = np.linspace(0, 18, 40)
-    dead = np.arange(80) < 40
-    odds = np.full(80, 3.0)
-    assert _tail_slope(6.1 + np.concatenate([far, far]), odds, dead, 1.5) < 0.1  # healthy ones go as far
-    assert _tail_slope(6.1 + np.concatenate([far, far / 20]), odds, dead, 1.5) == pytest.approx(1.5)
-    few = np.concatenate([6.1 + far, 6.1 + far[:3], np.zeros(1500)])  # of so many a model errs about some
-    assert _tail_slope(few, np.full(len(few), 3.0), np.arange(len(few)) < 40, 1.5) == 1.5
-
-
-def test_a_cell_that_holds_a_load_throughout_has_no_second_slope():
-    weights = Calibrator(tail_slope=(0.1, 0.1, 0.1))
-    baseline, loaded = (weights.calibrate(np.array([6.0, 16.0]), np.zeros(2), np.full(2, kind)) for kind in (0, 3))
-    assert baseline[0] == loaded[0] == pytest.approx(3.6)
-    assert (baseline[1], loaded[1]) == pytest.approx((4.6, 9.6))

@@ -104,7 +104,7 @@ def test_cells_may_rest_at_any_value():
 
 def test_a_wider_range_of_loads_is_likelier_and_that_of_an_unknown_cell_is_certain():
     one = np.ones((1, 2))
-    expected = Prediction(one, one, np.array([[0.5, 0.5]]), np.array([0.1, np.nan]), np.ones(2))
+    expected = Prediction(one, one, np.array([[0.5, 0.5]]), np.array([0.1, np.nan]))
     cells = np.arange(2)
     narrow = expected.within(np.array([0.45, 0.45]), np.array([0.55, 0.55]), cells)
     wide = expected.within(np.array([0.3, 0.3]), np.array([0.7, 0.7]), cells)

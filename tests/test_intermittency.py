@@ -189,3 +189,17 @@ def test_where_healthy_cells_blink_in_bursts_it_takes_more_to_be_faulty():
     for seed in range(50, 60):
         assert cells(evidence_of(tapped(seed, [seed % CELLS], 96, rate=8.0), bursts).intermittent) == []
     assert HealthyRates.fit(calm, SCALE, LAYOUT).blinks_count == 1
+
+
+@pytest.mark.parametrize("fitted", [True, False])
+def test_weak_loads_that_a_threshold_hides_do_not_blink(fitted: bool):
+    def thresholded(seed: int) -> np.ndarray:
+        load = healthy(seed) + np.random.default_rng(seed).normal(0, 0.15, (640, CELLS))
+        return np.where(load < 0.7, 0.0, load)
+
+    reference = (
+        HealthyRates.fit([thresholded(s) for s in range(5)], SCALE, LAYOUT) if fitted else HealthyRates.unknown(SCALE)
+    )
+    assert cells(evidence_of(thresholded(9), reference).intermittent) == []
+    broken = inject(thresholded(9), [Fault("intermittent", (7,), value=0.0)], LAYOUT, seed=0)
+    assert 7 in cells(evidence_of(broken, reference).intermittent)

@@ -1,11 +1,7 @@
-from dataclasses import replace
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from diagnostics import SensorLayout, freeze_stream
-from diagnostics.healthy.model import p_floor_of
 from diagnostics.healthy.reference import Reference
 
 LAYOUT = SensorLayout(1, 4, 4)
@@ -36,14 +32,6 @@ def test_a_fitted_reference_has_a_model_and_one_that_is_not_has_none(reference):
     assert reference.model is not None
     features = np.zeros((1, 4, CELLS), np.float32)
     assert reference.model.predict(features, np.ones(CELLS, bool)).never.shape == (1, CELLS)
-
-
-@pytest.mark.parametrize(("events", "inexperience"), [(20, 1.0), (98, 1.0), (198, 0.5), (398, 0.0), (5000, 0.0)])
-def test_inexperience_falls_with_the_number_of_reference_events(reference, events, inexperience):
-    regression = SimpleNamespace(outputs=np.arange(CELLS), p_floor=p_floor_of(events))
-    known = replace(reference, model=replace(reference.model, local_regressions=(regression,)))
-    np.testing.assert_allclose(known.inexperience, inexperience, atol=1e-9)
-    assert (Reference.unknown(LAYOUT).inexperience == 1).all()
 
 
 def test_the_tolerance_grows_with_the_converters_step_up_to_a_bound():

@@ -24,7 +24,7 @@ class Copycat:
             of.mean(axis=1, keepdims=True) for of in (of_known[:, 2], of_known[:, 3] == 1, of_known[:, 1])
         )
         p = np.clip(np.broadcast_to(np.stack([1 - loaded, always]), (2, *shape)), 0.02, 0.98)
-        return Prediction(p[0], p[1], np.broadcast_to(mean, shape), np.full(CELLS, 0.05), np.ones(CELLS))
+        return Prediction(p[0], p[1], np.broadcast_to(mean, shape), np.full(CELLS, 0.05))
 
 
 class Presser:
@@ -32,7 +32,7 @@ class Presser:
 
     def predict(self, features: Array, predictors: np.ndarray) -> Prediction:
         even = np.ones(features[:, 0].shape)
-        return Prediction(0.02 * even, 0.02 * even, 0.5 * even, np.full(CELLS, 0.05), np.ones(CELLS))
+        return Prediction(0.02 * even, 0.02 * even, 0.5 * even, np.full(CELLS, 0.05))
 
 
 class Holder:

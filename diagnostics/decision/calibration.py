@@ -2,11 +2,11 @@
 
 Estimates, for each of three kinds of constant cells (never moved; came to rest; came to hold a load),
 
-    log odds = logit(prevalence) + a + b min(spatial, 6) + c max(spatial - 6, 0) + d temporal
+    log odds = logit(prevalence) + a + b spatial + d temporal
 
 Raw ratios are overconfident, because events are few and correlated and models err at edges of objects. The reference is
 split; models of one part diagnose logs made of the other part, with known faults. Equals Platt scaling (Platt 1999),
-scikit-learn's ``CalibratedClassifierCV(method="sigmoid")``, with a second slope in the tail. The prevalence is not
+scikit-learn's ``CalibratedClassifierCV(method="sigmoid")``. The prevalence is not
 calibrated: it is estimated from each log by expectation maximisation (Saerens et al. 2002). The faulty set is the
 largest one whose expected false discovery rate meets the limit (:func:`faulty_at`). Faults unlike the injected ones are
 calibrated as well as these only by assumption.
@@ -46,13 +46,11 @@ _MOST_FRAMES = 600  # of a recording in one simulated log: a size
 _TRAINING_SHARE = 0.75  # of the recordings; the others make the simulated logs
 _MOST_TEMPORAL = 1.0  # upper limit of d: a jump alone proves no fault
 _KINDS = 3
-_LOADED_THROUGHOUT = 3  # never moved and holds a load: calibrated as kind 0, without a second slope
 _SUSPICIOUS = 2.8  # calibrated log ratio from which on a cell is excluded from the predictors
 _SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw log ratio at that point
 _MAX_DISCOUNT, _HALF_DISCOUNT = 0.5, 22.0  # of the slopes; recordings held out that halve it (one split)
 _PRIOR_VARIANCE = 10.0  # of the weights
-_ODD = 0.003  # share of the healthy cells beyond the clip from which on a second slope is fitted
-_CLIP = 6.0  # raw log ratio at which the second slope begins: outliers must not steer the first
+_CLIP = 6.0  # raw log ratios are clipped here for the fit: outliers must not steer the slope
 _MAX_RATIO = 24.0  # raw log ratios are clipped here
 _EXPECTED, _EXPECTED_LATE = 0.02, 0.005  # prior shares: faulty from the start, failing in the log
 _EXPECTED_CELLS, _EXPECTED_CELLS_LATE = 35.0, 25.0  # pseudo-counts of these priors
@@ -81,14 +79,12 @@ class Calibrator:
         offset: a, by kind.
         slope: b, by kind.
         temporal: d, by kind.
-        tail_slope: c, by kind; cells of kind 0 that hold a load use b.
         gains: factor on the evidence of a changed gain.
     """
 
     offset: tuple[float, ...] = (0.0, -1.0, -1.0)
     slope: tuple[float, ...] = (0.6, 0.6, 0.6)
     temporal: tuple[float, ...] = (1.0, 0.5, 0.5)
-    tail_slope: tuple[float, ...] = (0.6, 0.6, 0.6)
     gains: float = 1.0
 
     @classmethod
@@ -129,10 +125,8 @@ class Calibrator:
         # Few held-out recordings contain few unusual events; repeated splits are correlated and count for less.
         counts = 1 - _MAX_DISCOUNT / (1 + turns * (held_out / _HALF_DISCOUNT) ** 2)
         measured = np.array(weights.slope) != default.slope
-        slope, tail_slope = (
-            np.where(measured, counts * np.array(of), of) for of in (weights.slope, weights.tail_slope)
-        )
-        return replace(weights, slope=tuple(slope.tolist()), tail_slope=tuple(tail_slope.tolist()))
+        slope = np.where(measured, counts * np.array(weights.slope), weights.slope)
+        return replace(weights, slope=tuple(slope.tolist()))
 
     @classmethod
     def _of(cls, trials: Sequence[_Trial]) -> Calibrator:
@@ -141,24 +135,21 @@ class Calibrator:
         kind, ratio, temporal, dead = (np.concatenate(column) for column in measured)
         evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
         default = cls()
-        found = list(zip(default.offset, default.slope, default.temporal, default.tail_slope, strict=True))
+        found = list(zip(default.offset, default.slope, default.temporal, strict=True))
         for k in range(_KINDS):
-            of, same_origin = kind % _KINDS == k, (kind % _KINDS > 0) == (k > 0)
+            of, same_origin = kind == k, (kind > 0) == (k > 0)
             if min(dead[of].sum(), (~dead[of]).sum()) >= _FEWEST_CELLS:
                 base = float(logit(dead[same_origin].mean()))
                 fitted = _bounded_logistic(evidence[of], dead[of], base)
                 if fitted[1] > 0:
-                    these = kind == k
-                    odds = base + fitted[0] + evidence[these] @ fitted[1:]
-                    found[k] = (*fitted, _tail_slope(ratio[these], odds, dead[these], fitted[1]))
-        offset, slope, temporal_share, tail_slope = zip(*found, strict=True)
-        return cls(offset, slope, temporal_share, tail_slope, gains_count(max(gain)))
+                    found[k] = fitted
+        offset, slope, temporal_share = zip(*found, strict=True)
+        return cls(offset, slope, temporal_share, gains_count(max(gain)))
 
     @property
     def exclusion(self) -> Exclusion:
         """The raw log ratio from which on a cell is excluded from the predictors, and the factor of gains."""
-        missing = _SUSPICIOUS - self.offset[0] - self.slope[0] * _CLIP  # at the clip
-        threshold = _CLIP + missing / (self.slope[0] if missing < 0 else max(self.tail_slope[0], 1e-9))
+        threshold = (_SUSPICIOUS - self.offset[0]) / max(self.slope[0], 1e-9)
         return Exclusion(float(np.clip(threshold, *_SUSPICIOUS_BOUNDS)), self.gains)
 
     def calibrate(self, ratio: Floats, temporal: Floats, kind: NDArray[np.intp]) -> Floats:
@@ -169,13 +160,8 @@ class Calibrator:
             temporal: float ``[D]``, temporal log likelihood ratio.
             kind: int ``[D]``, see the class.
         """
-        weights = self.offset, self.slope, self.temporal, self.tail_slope
-        offset, slope, share, tail_slope = (np.array(of)[kind % _KINDS] for of in weights)
-        tail_slope = np.where(kind == _LOADED_THROUGHOUT, slope, tail_slope)
-        certain = np.clip(ratio - _CLIP, 0.0, _MAX_RATIO - _CLIP)
-        log_ratio: Floats = (
-            offset + slope * np.clip(ratio, -_MAX_RATIO, _CLIP) + tail_slope * certain + share * temporal
-        )
+        offset, slope, share = (np.array(of)[kind] for of in (self.offset, self.slope, self.temporal))
+        log_ratio: Floats = offset + slope * np.clip(ratio, -_MAX_RATIO, _MAX_RATIO) + share * temporal
         return log_ratio
 
     def probability(self, log_ratio: Floats, kind: NDArray[np.intp], scored: NDArray[np.bool_]) -> Floats:
@@ -187,7 +173,7 @@ class Calibrator:
             scored: bool ``[D]``, constant cells; the others move and get log odds -10.
         """
         probability = np.full(len(log_ratio), float(expit(_MOVING_ODDS)))
-        began = kind % _KINDS > 0  # its run within the log
+        began = kind > 0  # its run within the log
         late, early = scored & began, scored & ~began
         probability[late] = _posterior(log_ratio[late], _EXPECTED_LATE, _EXPECTED_CELLS_LATE)
         # Cells that never moved failed before the log, or in it at the same rate as cells that moved.
@@ -218,47 +204,6 @@ def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) ->
         dead: bool ``[n]``.
         base: log odds of a fault in these logs.
     """
-    bounds = [(None, 0.0), (0.0, None), (0.0, _MOST_TEMPORAL)]
-    offset, slope, temporal = _logistic(evidence, dead, base, np.array([0.0, 1.0, 0.5]), bounds, _PRIOR_VARIANCE)
-    return offset, slope, temporal
-
-
-def _tail_slope(ratio: Floats, odds: Floats, dead: NDArray[np.bool_], default: float) -> float:
-    """Return c, the slope above the clip, 0 to ``default``; ``default`` with too few healthy cells there.
-
-    Args:
-        ratio: ``[n]``, raw log ratio of cells of one kind.
-        odds: ``[n]``, log odds of a fault with the ratio clipped.
-        dead: bool ``[n]``.
-        default: b.
-    """
-    certain = ratio > _CLIP
-    if np.count_nonzero(certain & ~dead) <= _ODD * np.count_nonzero(~dead):
-        return default
-    more = np.minimum(ratio[certain, None], _MAX_RATIO) - _CLIP
-    # The offset absorbs overconfidence at the clip; only the slope is used.
-    _, slope = _logistic(more, dead[certain], odds[certain], np.zeros(2), [(None, 0.0), (0.0, default)])
-    return slope
-
-
-def _logistic(
-    evidence: Floats,
-    dead: NDArray[np.bool_],
-    base: Floats | float,
-    start: Floats,
-    bounds: Sequence[tuple[float | None, float | None]],
-    loose: float = np.inf,
-) -> list[float]:
-    """Return offset and weights of a logistic regression, within ``bounds``.
-
-    Args:
-        evidence: ``[n, k]``.
-        dead: bool ``[n]``.
-        base: offset of the log odds, one number or ``[n]``.
-        start: ``[1 + k]``, initial offset and weights.
-        bounds: of each of these.
-        loose: prior variance of the weights.
-    """
     from scipy.optimize import minimize
 
     x = np.column_stack([np.ones(len(evidence)), evidence])
@@ -266,11 +211,12 @@ def _logistic(
     def loss(weights: Floats) -> tuple[float, Floats]:
         odds = base + x @ weights
         residual = expit(odds) - dead
-        value = np.logaddexp(0, odds).sum() - odds[dead].sum() + 0.5 * (weights[1:] @ weights[1:]) / loose
-        return float(value), x.T @ residual + np.array([0, *weights[1:]]) / loose
+        value = np.logaddexp(0, odds).sum() - odds[dead].sum() + 0.5 * (weights[1:] @ weights[1:]) / _PRIOR_VARIANCE
+        return float(value), x.T @ residual + np.array([0, *weights[1:]]) / _PRIOR_VARIANCE
 
-    found: list[float] = minimize(loss, start, jac=True, bounds=bounds).x.tolist()
-    return found
+    bounds = [(None, 0.0), (0.0, None), (0.0, _MOST_TEMPORAL)]
+    offset, slope, temporal = minimize(loss, [0.0, 1.0, 0.5], jac=True, bounds=bounds).x.tolist()
+    return offset, slope, temporal
 
 
 def _excerpt(recording: Floats, rng: np.random.Generator) -> Floats:
@@ -281,8 +227,7 @@ def _excerpt(recording: Floats, rng: np.random.Generator) -> Floats:
 
 def kinds(stream: StreamState) -> NDArray[np.intp]:
     """Return the kind of each cell, ``[D]``, see :class:`Calibrator`."""
-    rests = stream.rests()
-    return np.where(stream.runs.moved, np.where(rests, 1, 2), np.where(rests, 0, _LOADED_THROUGHOUT))
+    return np.where(stream.runs.moved, np.where(stream.rests(), 1, 2), 0)
 
 
 def _trial(

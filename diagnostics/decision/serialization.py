@@ -41,6 +41,11 @@ def _names(cls: Any) -> list[str]:
     return [field.name for field in fields(cls)] if is_dataclass(cls) else list(cls._fields)
 
 
+def _newer(cls: Any) -> set[str]:
+    """Return the fields that a file of an earlier version may lack."""
+    return {field.name for field in fields(cls) if "newer" in field.metadata} if is_dataclass(cls) else set()
+
+
 def _structured(cls: Any) -> bool:
     return is_dataclass(cls) or hasattr(cls, "_fields")
 
@@ -78,7 +83,8 @@ def _read(kind: Any, about: Any, arrays: Mapping[str, ArrayLike], name: str) -> 
         if not isinstance(about, Mapping):
             raise TypeError(f"expected the fields of {name}, got {about!r}")
         hints = get_type_hints(kind)
-        return kind(**{key: _read(hints[key], about[key], arrays, key) for key in _names(kind)})
+        given = [key for key in _names(kind) if key in about or key not in _newer(kind)]
+        return kind(**{key: _read(hints[key], about[key], arrays, key) for key in given})
     if isinstance(about, bool) != (kind is bool) or not isinstance(about, int | float | str):
         raise TypeError(f"expected {kind.__name__} for {name}, got {about!r}")
     return kind(about)

@@ -20,9 +20,8 @@ def converted(
 ) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Return the state and the arrays of schema 8 as those of the present schema."""
     layout = SensorLayout.from_dict(about["layout"])
-    weights = dict(about["weights"])
     state = {name: about[name] for name in ("layout", "false_discovery_rate")}
-    state["calibrator"] = {**weights, "tail_slope": weights.pop("beyond")}
+    state["calibrator"] = {name: value for name, value in about["weights"].items() if name != "beyond"}
     found: dict[str, NDArray[Any]] = {name: np.asarray(value) for name, value in arrays.items()}
 
     def array(name: str) -> dict[str, Any]:

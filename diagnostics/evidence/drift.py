@@ -77,7 +77,7 @@ def gain_evidence(
     """Return the evidence of a changed gain.
 
     Events that leave a cell unloaded do not count (the spatial test covers these). A prediction that is not specific to
-    the cell (``Prediction.own`` = 0, cold start) carries no evidence of its gain.
+    the cell (``Prediction.own``: not in a cold start) carries no evidence of its gain.
 
     Args:
         whole: features ``[n, 4, D]`` of n events (see ``Summary.features``), in time order.
@@ -87,11 +87,7 @@ def gain_evidence(
         counts: ``[n, 1]``, weight of each event, see :func:`gains_count`.
     """
     informative = (
-        moved
-        & np.isfinite(expected.spread)
-        & (expected.own > 0)
-        & (whole[:, 2] > 0)
-        & (expected.mean > _LOADED * root_near)
+        moved & np.isfinite(expected.spread) & expected.own & (whole[:, 2] > 0) & (expected.mean > _LOADED * root_near)
     )
     n, d = informative.shape
     result = Gain(np.zeros(d), np.ones(d), np.zeros(d, np.intp), np.zeros(d, np.intp))
@@ -116,7 +112,7 @@ def gain_evidence(
     )
     wrong += np.log(chance / len(_GAINS)).astype(np.float32)[:, None]  # (gains, n, k)
     likeliest = wrong.max(axis=1).argmax(axis=0)
-    result.evidence[cells] = expected.own[cells] * logsumexp(wrong, axis=(0, 1))
+    result.evidence[cells] = logsumexp(wrong, axis=(0, 1))
     result.factor[cells] = _GAINS[likeliest]
     result.since[cells] = since = wrong[likeliest, :, np.arange(len(cells))].argmax(axis=1)
     result.events[cells] = (informative & (np.arange(n)[:, None] >= since)).sum(axis=0)

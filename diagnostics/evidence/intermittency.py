@@ -7,16 +7,17 @@ whenever it begins, and cleared when it has gone:
     blinks:  g = n log(0.05 / r) - m (0.05 - r)         n blinks in m loaded frames, Poisson, healthy rate r
     noise:   g = log(0.8 / 0.002) if noisier than the limit of its load, else log(0.2 / 0.998)       Bernoulli
 
-A blink leaves a load in one step and returns to it in one step within 6 frames. Noise is the median absolute second
-difference. The factor c <= 1 keeps all but 1 % of healthy cells below 14 / 1.5 (overdispersion, as in a
-quasi-likelihood: McCullagh and Nelder 1989). Segments in which many cells blink or are noisy together do not count: the
-contact moves. Blinks without load, and noise of constant cells, are not detected.
+A blink leaves a load in one step and returns to it in one step within 6 frames. The load must exceed 1.5 times the
+lowest load that any cell shows: where a threshold hides small loads, weak ones come and go in one step. Noise is the
+median absolute second difference. The factor c <= 1 keeps all but 1 % of healthy cells below 14 / 1.5 (overdispersion,
+as in a quasi-likelihood: McCullagh and Nelder 1989). Segments in which many cells blink or are noisy together do not
+count: the contact moves. Blinks without load, and noise of constant cells, are not detected.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 _LOADED = 0.05  # of full scale: smaller loads are not tested for blinks
+_CLEAR = 1.5  # times the lowest load of all cells
 _BLINK_RATE = 0.05  # blinks per loaded frame of a loose contact
 _LONGEST_BLINK = 6  # frames
 _ON_ROW, _ON_COLUMN = [3, 4], [1, 6]  # neighbours on the same row and column, see SensorLayout.beside
@@ -59,6 +61,7 @@ class HealthyRates:
         noise: float ``[levels]``, limit of the noise by load, as a share of full scale.
         blinks_count, noise_counts: factor c of either evidence.
         alone: count only changes that no neighbour shares, as needed where fingers slide.
+        lowest: lowest load that is no noise, in the layout's unit; inf: unknown.
     """
 
     blinks: float
@@ -66,6 +69,7 @@ class HealthyRates:
     blinks_count: float = 1.0
     noise_counts: float = 1.0
     alone: bool = True
+    lowest: float = field(default=np.inf, metadata={"newer": True})
 
     @classmethod
     def fit(cls, recordings: Sequence[Floats], scale: Scale, layout: SensorLayout) -> HealthyRates:
@@ -79,13 +83,14 @@ class HealthyRates:
     @classmethod
     def _counted(cls, recordings: Sequence[Floats], scale: Scale, layout: SensorLayout, alone: bool) -> HealthyRates:
         every = np.arange(layout.n_cells)
+        lowest = min((_lowest_load(recording, scale) for recording in recordings), default=np.inf)
         blinks = loaded = 0.0
         noise: list[list[Floats]] = [[] for _ in _LEVELS]
         for recording in recordings:
             for first in range(0, len(recording), SEGMENT):
                 frames = recording[first : first + SEGMENT]
                 low, high, under_load, noise_level, level = _measure(
-                    frames, scale.root_load(frames), scale, every, layout, alone
+                    frames, scale.root_load(frames), scale, every, layout, alone, lowest
                 )
                 blinks += float((low + high).sum())
                 loaded += float(under_load.sum())
@@ -99,7 +104,7 @@ class HealthyRates:
         # Readings within +- tolerance (near / 2) have second differences up to 2 near.
         limit = np.maximum.accumulate(np.maximum(limit, 2 * scale.near / scale.full_scale))
         # One pseudo-blink, in as many frames as it takes at the rate of a cold start.
-        usual = cls(max(_RAREST, (blinks + 1) / (loaded + 1 / _UNKNOWN_BLINKS)), limit, alone=alone)
+        usual = cls(max(_RAREST, (blinks + 1) / (loaded + 1 / _UNKNOWN_BLINKS)), limit, alone=alone, lowest=lowest)
         intermittency = Intermittency.begin(layout)
         reached = np.stack([intermittency.blinking, intermittency.noisy])
         for recording in recordings:
@@ -127,6 +132,7 @@ class Intermittency:
         blinking, noisy: float ``[D]``, CUSUM of the log likelihood ratio against healthy.
         blinks: int ``[D]``, number of blinks since ``blinking`` was last 0.
         high: int ``[D]``, number of these to full scale.
+        lowest: lowest load so far that is no noise.
         blinks_since, noisy_since: int ``[D]``, number of the frame at which either sum was last 0.
     """
 
@@ -137,6 +143,7 @@ class Intermittency:
     high: NDArray[np.intp]
     blinks_since: NDArray[np.intp]
     noisy_since: NDArray[np.intp]
+    lowest: float = np.inf
 
     @classmethod
     def begin(cls, layout: SensorLayout) -> Intermittency:
@@ -168,7 +175,11 @@ class Intermittency:
         if len(frames) < _SHORTEST or constant.all():
             return self
         moving = np.flatnonzero(~constant)
-        low, high, loaded, noise_level, level = _measure(frames, root, scale, moving, self.layout, usual.alone)
+        lowest = min(
+            self.lowest,
+            usual.lowest if np.isfinite(usual.lowest) else _lowest_load(frames[:, moving], scale.of(moving)),
+        )
+        low, high, loaded, noise_level, level = _measure(frames, root, scale, moving, self.layout, usual.alone, lowest)
         events = low + high
         crowd = max(1.0, _ALONE * float((loaded > 0).sum()))
         if (events > 0).sum() > crowd:
@@ -200,6 +211,7 @@ class Intermittency:
             np.where(calm, 0, self.high) + to_full,
             np.where(calm, numbers[0], self.blinks_since),
             np.where(quiet, numbers[0], self.noisy_since),
+            lowest,
         )
 
     @property
@@ -216,7 +228,7 @@ class Intermittency:
 
 
 def _measure(
-    frames: Floats, root: Array, scale: Scale, cells: NDArray[np.intp], layout: SensorLayout, alone: bool
+    frames: Floats, root: Array, scale: Scale, cells: NDArray[np.intp], layout: SensorLayout, alone: bool, lowest: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, Floats, NDArray[np.intp]]:
     """Return for each of the ``cells``: blinks to the baseline, blinks to full scale, loaded frames, noise, load level.
 
@@ -227,7 +239,7 @@ def _measure(
     if np.isnan(x).any():
         x = np.nan_to_num(x)
     near, top = scale.near, scale.full_scale - scale.near
-    loaded = x > _LOADED * scale.full_scale
+    loaded = x > max(_LOADED * scale.full_scale, _CLEAR * lowest)
     rests, full = x <= near, frames >= top
     moderate = loaded & ~full
 
@@ -263,6 +275,12 @@ def _measure(
     far = moderate & ((1 + _ALIKE) * x < np.float32(top))
     low, high = blinks(moderate, rests), blinks(far, full)
     return low, high, loaded.sum(axis=0, dtype=np.float64), noise_level, np.maximum(level, 0)
+
+
+def _lowest_load(frames: Floats, scale: Scale) -> float:
+    """Return the lowest load above the noise in frames ``[t, D]``, in the layout's unit; inf without any."""
+    load = frames - scale.baseline
+    return float(np.min(load, where=load > scale.near, initial=np.inf))
 
 
 def _shared(neighbours: NDArray[np.intp], change: Floats, own: Floats | Array) -> NDArray[np.bool_]:

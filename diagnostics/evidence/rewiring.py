@@ -172,7 +172,7 @@ def _log_likelihood(expected: Prediction, features: Array) -> tuple[Floats, Floa
     did = np.where(features[:, 2] == 0, 0, np.where(features[:, 3] == 1, 1, 2))
     logs = np.log(p)
     state = np.take_along_axis(logs, did[None], axis=0)[0]
-    error = np.nan_to_num((features[:, 1] - expected.mean) / expected.spread, nan=np.inf)  # no load is known
+    error = np.nan_to_num((features[:, 1] - expected.mean) / expected.spread, nan=np.inf)  # never loaded
     load = np.where(did > 0, np.log((1 - _OUTLIERS) / (1 + error**2 / 4) ** 2.5 + _OUTLIERS), 0.0)
     return state + load, (p * logs).sum(axis=0)
 

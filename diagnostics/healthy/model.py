@@ -38,8 +38,6 @@ _MOST_DRAWS = 8  # excerpts of one event: more of them are nearly the same
 _SHORTEST = 6  # frames of an excerpt
 _MIN_P_FLOOR = 0.002  # lower limit of the probabilities, however many events there are: models err
 _MIN_RECORDINGS = 12  # with fewer recordings each event is a source of its own
-_EXPERIENCED, _INEXPERIENCED = 1 / 400, 1 / 100  # p_floor after 400 and after 100 events
-_SHARED = 0.4  # part of the evidence about a cell that also holds for its neighbours, where events are few
 _BATCH = 6144  # cells times excerpts in one batch: bounds memory
 
 
@@ -93,10 +91,6 @@ class HealthyModel:
             p_floor[regression.outputs] = regression.p_floor
         return p_floor
 
-    def inexperience(self, n_cells: int) -> NDArray[np.float64]:
-        """Return, for each of D cells, 0 with 400 reference events or more, 1 with 100 or fewer, ``[D]``."""
-        return _inexperience(self.p_floor(n_cells))
-
     def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
         """Predict the loads of healthy cells.
 
@@ -124,12 +118,7 @@ class HealthyModel:
         always_floor = p_floor if self.stacking is None else np.minimum(p_floor, p_floor_of(self.stacking.events))
         never = np.where(known, np.clip(never, p_floor, 1 - p_floor), 1.0)
         always = np.where(known, np.clip(always, always_floor, 1 - always_floor), 1.0)
-        return Prediction(never, always, regressed.mean, spread, 1 - _SHARED * _inexperience(p_floor))
-
-
-def _inexperience(p_floor: NDArray[np.float64]) -> NDArray[np.float64]:
-    inexperience: NDArray[np.float64] = np.log(p_floor / _EXPERIENCED) / np.log(_INEXPERIENCED / _EXPERIENCED)
-    return np.clip(inexperience, 0.0, 1.0)
+        return Prediction(never, always, regressed.mean, spread)
 
 
 class ReferenceEvent(NamedTuple):

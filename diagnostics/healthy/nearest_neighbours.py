@@ -62,7 +62,7 @@ class NearestNeighbours:
         known = _describe(self.log, predictors, self.layout)
         usable = np.flatnonzero(predictors & present & np.isfinite(known).all(axis=(0, 2)))
         if not len(usable):
-            return Prediction(never, always, mean, spread, own=np.zeros(shape[1]))
+            return Prediction(never, always, mean, spread, own=False)
         samples = known[:, usable].reshape(-1, known.shape[2])
         targets = np.moveaxis(self.log[:, :, usable], 1, -1).reshape(-1, self.log.shape[1])
         kept = np.linspace(0, len(samples) - 1, min(len(samples), _MOST_SAMPLES)).astype(int)
@@ -87,7 +87,7 @@ class NearestNeighbours:
         always[:, predicted] = share(near[..., 3] == 1, targets[:, 3] == 1)
         mean[:, predicted] = near[..., 1].mean(axis=1)[which]
         spread[predicted] = max(float(near[..., 1].std(axis=1)[which].mean()), _MIN_SPREAD)
-        return Prediction(never, always, mean, spread, own=np.zeros(shape[1]))
+        return Prediction(never, always, mean, spread, own=False)
 
 
 def _describe(features: Array, predictors: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.float64]:

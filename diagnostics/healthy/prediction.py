@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,40 +20,43 @@ class Prediction:
         always: float ``[n, D]``, P(loaded throughout).
         mean: float ``[n, D]``, expected mean root load, 0 to 1.
         spread: float ``[D]``, scale of the Student t error of ``mean``; NaN: unknown.
-        own: float ``[D]``, 1: the prediction is specific to the cell; 0: to any cell with the same surroundings.
+        own: whether it is specific to each cell, not to any cell with the same surroundings.
     """
 
     never: NDArray[np.float64]
     always: NDArray[np.float64]
     mean: NDArray[np.float64]
     spread: NDArray[np.float64]
-    own: NDArray[np.float64]
+    own: bool = True
 
     def on(self, excerpts: NDArray[np.bool_] | slice, cells: NDArray[np.intp] | slice = slice(None)) -> Prediction:
         """Return the prediction for some of the excerpts and cells."""
         never, always, mean = (values[excerpts][:, cells] for values in (self.never, self.always, self.mean))
-        return Prediction(never, always, mean, self.spread[cells], self.own[cells])
+        return Prediction(never, always, mean, self.spread[cells], self.own)
 
     def within(
         self,
         low: NDArray[np.float64],
         high: NDArray[np.float64],
         cells: NDArray[np.intp],
-        inflation: NDArray[np.float64] | float = 1.0,
     ) -> NDArray[np.float64]:
         """Return P(low <= mean root load <= high), ``[n, k]``.
 
-        A contaminated Student t distribution: 0.9 F_4((x - mean) / (inflation * spread)) + 0.1 of a uniform one.
+        A contaminated Student t distribution: 0.9 F_4((x - mean) / spread) + 0.1 of a uniform one.
 
         Args:
             low, high: root loads ``[k]``.
             cells: int ``[k]``.
-            inflation: factor on the spread in each excerpt, ``[n]``.
         """
-        mean, spread = self.mean[:, cells], self.spread[cells] * np.reshape(inflation, (-1, 1))
+        mean, spread = self.mean[:, cells], self.spread[cells]
         likely = _student_t((high - mean) / spread) - _student_t((low - mean) / spread)
         p = (1 - _OUTLIERS) * likely + _OUTLIERS * (np.minimum(high, 1.0) - low)
         return np.where(np.isnan(spread), 1.0, p)
+
+    def density(self, load: NDArray[Any], cells: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Return the density of mean root loads ``[n, k]`` of some cells, without contamination; 1: unknown."""
+        error = (load - self.mean[:, cells]) / self.spread[cells]
+        return np.nan_to_num(0.375 / (1 + error**2 / 4) ** 2.5 / self.spread[cells], nan=1.0)
 
 
 def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:

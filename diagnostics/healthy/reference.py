@@ -76,11 +76,6 @@ class Reference:
         if self.model is not None:
             self.model.check(living(layout, self.dead))
 
-    @property
-    def inexperience(self) -> NDArray[np.float64]:
-        """Float ``[D]``: 0 for cells with 400 reference events or more, 1 with 100 or fewer."""
-        return np.ones(len(self.dead)) if self.model is None else self.model.inexperience(len(self.dead))
-
     @classmethod
     def fit(
         cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, dead: NDArray[np.float64] | None = None

@@ -33,7 +33,7 @@ from diagnostics import SelfDiagnosis
 Result = TypeVar("Result")
 PRECISION, RECALL, SLACK = 0.995, 0.98, 0.01
 SHARE = 0.16
-NOT_DIAGNOSING = ("circuit", "injection", "plot", "version_8")  # public tools and the injector
+NOT_DIAGNOSING = ("circuit", "injection", "plot", "earlier_versions")  # public tools and the injector
 COUNTS = ("FEATURES", "N_FEATURES", "_KINDS")  # of what there is: nobody chose them
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.decision import version_8
+from diagnostics.decision import earlier_versions
 from diagnostics.decision.address_aliasing import find_aliasing
 from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
 from diagnostics.decision.line_cover import candidate_groups
@@ -24,7 +24,7 @@ from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.readings import RecordingBlocks
 
-SCHEMA = "adaptfault.diagnoser/9"
+SCHEMA = "adaptfault.diagnoser/10"
 
 _CERTAIN = 0.999  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
 _SUSPICIOUS_COLD = 3.0  # raw log ratio from which on a cell is no predictor, in a cold start
@@ -116,11 +116,11 @@ class SelfDiagnosis:
             ValueError: another schema; a field or an array is missing, or of a wrong kind or shape.
         """
         schema = about.get("schema")
-        if schema not in (SCHEMA, version_8.SCHEMA):
+        if schema not in (SCHEMA, *earlier_versions.SCHEMAS):
             raise ValueError(f"expected schema {SCHEMA!r}, got {schema!r}")
         try:
-            if schema == version_8.SCHEMA:
-                about, arrays = version_8.converted(about, arrays)
+            if schema != SCHEMA:
+                about, arrays = earlier_versions.converted(about, arrays)
             fitted = from_state(Fitted, about, arrays)
             diagnoser = cls(fitted.layout, false_discovery_rate=fitted.false_discovery_rate)
             diagnoser.calibrator_, diagnoser.reference_ = fitted.calibrator, fitted.reference

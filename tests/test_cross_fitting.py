@@ -69,4 +69,4 @@ def test_samples_of_several_arrays_are_pooled():
     assert one.samples.shape == (len(one.never), N_FEATURES) == (len(one.always), N_FEATURES)
     assert 0 < one.always.sum() < len(one.never) - one.never.sum() < len(one.never)
     np.testing.assert_array_equal(both.never, np.concatenate([one.never, one.never]))
-    assert both.fit_stacking().weight.shape == (N_FEATURES, 2)
+    assert both.fit_stacking().hidden.shape[0] == N_FEATURES

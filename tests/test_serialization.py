@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -57,6 +58,29 @@ def test_frame_by_frame_it_gives_the_same_result(fitted, log):
     assert any(one for one, _ in news)
     assert all(one == other for one, other in news)
     assert restored.diagnosis().to_dict() == was.diagnosis().to_dict()
+
+
+@pytest.mark.parametrize("schema", [8, 9])
+def test_a_diagnosis_stored_by_an_earlier_version_opens_and_finds_the_same(schema):
+    layout = SensorLayout(1, 4, 4)
+    with np.load(Path(__file__).parent / "earlier" / f"diagnoser-{schema}.npz") as file:
+        arrays = dict(file)
+    about, before = json.loads(str(arrays.pop("about"))), arrays.pop("probability")
+    assert about["schema"] == f"adaptfault.diagnoser/{schema}"
+    faults = [Fault("open", (5,)), Fault("short", (10,))]
+    log = [inject(press(100 + i, layout), faults, layout) for i in range(8)]
+    diagnosis = SelfDiagnosis.from_state(about, arrays).diagnose(log)
+    assert diagnosis.fault_set == {10}
+    np.testing.assert_allclose(diagnosis.probability, before, atol=0.1)
+
+
+def press(seed: int, layout: SensorLayout) -> np.ndarray:
+    """One press of a round tip, as the stored diagnoses were fitted on."""
+    rng = np.random.default_rng(seed)
+    course = np.sin(np.arange(40) / 39 * np.pi)[:, None]
+    row, column = np.divmod(np.arange(layout.n_cells), layout.cols)
+    y, x = rng.uniform(0, 3, 2)
+    return np.maximum(0, course * (4 - 1.2 * ((row - y) ** 2 + (column - x) ** 2)))
 
 
 def test_masked_positions_and_arrays_in_tiles_come_back():

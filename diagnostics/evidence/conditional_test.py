@@ -6,13 +6,9 @@ Computes for event e and constant cell i the surprisal
 
 with weight w_e = 1 / (1 + 0.15 r_e), r_e earlier events that load the same cells (effective sample size, Kish 1965).
 P is the predicted probability of staying unloaded for a cell at its baseline, and of staying loaded near v_i for one
-that holds a load. In unusual events the model errs about many cells at once. So the likelihood is contaminated
-(Huber 1964),
-
-    P = (1 - eps_e) P_model + eps_e / 2
-
-with the posterior mean of eps_e given states and loads of the moving cells of the same event, on a grid; they count
-half, because neighbours err together. Errors that no moving cell shows are not recognised.
+that holds a load. In unusual events the model errs about many cells at once. So the log odds are averaged over powers
+0.25 to 1 (tempered likelihoods), weighted by how well they fit the moving cells of the same event; the spread of loads
+is inflated by their median error. Errors that no moving cell shows are not recognised.
 """
 
 from __future__ import annotations
@@ -23,7 +19,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import softmax
+from scipy.special import expit, logit, softmax
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, count_repeats
@@ -35,8 +31,10 @@ if TYPE_CHECKING:
 _ANYWHERE = 0.2  # share of broken cells that stick at any value; the others stick to either rail equally often
 P_MIN = 1e-4  # lower limit of P in one event: models err
 SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
-_OUTLIER_SHARES = np.geomspace(0.01, 1.0, 6)  # eps: a grid with a uniform prior
+_POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 _FIT_WEIGHT = 0.5  # factor on the log likelihood of the moving cells: neighbours err together
+_MEDIAN_ERROR = 0.741  # median of |t| with 4 degrees of freedom
+_PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit of the inflation
 _REPEATS, _THE_SAME = 0.15, 0.95  # correlation of events that load the same cells, and cosine of their mean loads
 
 Floats = NDArray[np.float64]
@@ -158,12 +156,10 @@ class ConditionalTest:
         """Return the prediction of the ``predictors`` (bool ``[D]``), and the surprisal of each excerpt ``[n, D]``."""
         expected = self.model.predict(self.features, predictors)
         held = np.flatnonzero(self.scored & ~self.values.rests)
-        eps = _outlier_share(expected, self.features, predictors & self.cells.runs.moved)
-        # Contamination never adds evidence against a cell.
-        likely = np.maximum(expected.never, (1 - eps) * expected.never + eps / 2)
-        always = expected.always[:, held]
-        within = expected.within(self.values.low[held], self.values.high[held], held)
-        likely[:, held] = np.maximum(always, (1 - eps) * always + eps / 2) * within
+        likely = _tempered(expected.never, self.features[:, 2] == 0, predictors & self.cells.runs.moved)
+        inflation = _inflation(expected, self.features, predictors)
+        within = expected.within(self.values.low[held], self.values.high[held], held, inflation)
+        likely[:, held] = expected.always[:, held] * within
         return expected, np.where(self.counted, -self.novelty * np.log(np.maximum(likely, P_MIN)), 0.0)
 
     def summed(self, surprisal: Floats) -> Floats:
@@ -189,22 +185,32 @@ def _excerpts(events: Sequence[ContactEvent], runs: ConstantRuns, scored: Mask) 
     return np.stack([suffixes[i].features() for i in needed]), begins[needed], counted[needed]
 
 
-def _outlier_share(expected: Prediction, features: Array, working: NDArray[np.bool_]) -> Floats:
-    """Return eps, the share of cells about which the model errs in each excerpt, ``[n, 1]``: its posterior mean.
+def _inflation(expected: Prediction, features: Array, working: Mask) -> Floats:
+    """Return the factor on the spread in each excerpt, ``[n]``, 1 to 4.
+
+    The median error of the ``working`` cells (bool ``[D]``) relative to that of Student's t.
+    """
+    known = working & np.isfinite(expected.spread)
+    loaded = features[:, 2, known] > 0
+    error = np.abs(features[:, 1, known] - expected.mean[:, known]) / expected.spread[known]
+    error = np.column_stack([np.where(loaded, error, np.inf), np.full((len(features), _PRIOR_CELLS), _MEDIAN_ERROR)])
+    middle = (loaded.sum(axis=1) + _PRIOR_CELLS) // 2
+    half: Floats = np.sort(error, axis=1)[np.arange(len(features)), middle]
+    return np.clip(half / _MEDIAN_ERROR, 1.0, _MAX_INFLATION)
+
+
+def _tempered(never: Floats, unloaded: NDArray[np.bool_], working: NDArray[np.bool_]) -> Floats:
+    """Return P(unloaded throughout) ``[n, D]``, tempered in events in which the model errs about the working cells.
 
     Args:
-        expected: what the model predicts.
-        features: ``[n, 4, D]`` of the excerpts.
+        never: ``[n, D]``, the probability predicted.
+        unloaded: bool ``[n, D]``, whether the cells stayed unloaded.
         working: bool ``[D]``, cells that are known to work.
     """
-    known = working & (expected.never < 1).any(axis=0)  # 1: no model of the cell
-    never, loaded = expected.never[:, known], features[:, 2, known] > 0
-    p, density = np.where(loaded, 1 - never, never), expected.density(features[:, 1, known], np.flatnonzero(known))
-    likelihood = np.stack(
-        [
-            (np.log((1 - eps) * p + eps / 2) + np.where(loaded, np.log((1 - eps) * density + eps), 0.0)).sum(axis=1)
-            for eps in _OUTLIER_SHARES
-        ]
-    )
-    posterior: Floats = softmax(_FIT_WEIGHT * likelihood, axis=0)
-    return (_OUTLIER_SHARES @ posterior)[:, None]
+    odds = logit(np.maximum(never, P_MIN))
+    right = np.where(unloaded | np.isinf(odds), odds, -odds)[:, working]  # infinite odds: no model of the cell
+    likelihood = -np.stack([np.log1p(np.exp(-power * right)).sum(axis=1) for power in _POWERS])
+    share = softmax(_FIT_WEIGHT * likelihood, axis=0)  # (powers, n)
+    averaged = np.sum([p[:, None] * expit(w * odds) for p, w in zip(share, _POWERS, strict=True)], axis=0)
+    tempered: Floats = np.maximum(never, averaged)  # tempering never adds evidence against a cell
+    return tempered

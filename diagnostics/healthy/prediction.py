@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,24 +38,21 @@ class Prediction:
         low: NDArray[np.float64],
         high: NDArray[np.float64],
         cells: NDArray[np.intp],
+        inflation: NDArray[np.float64] | float = 1.0,
     ) -> NDArray[np.float64]:
         """Return P(low <= mean root load <= high), ``[n, k]``.
 
-        A contaminated Student t distribution: 0.9 F_4((x - mean) / spread) + 0.1 of a uniform one.
+        A contaminated Student t distribution: 0.9 F_4((x - mean) / (inflation * spread)) + 0.1 of a uniform one.
 
         Args:
             low, high: root loads ``[k]``.
             cells: int ``[k]``.
+            inflation: factor on the spread in each excerpt, ``[n]``.
         """
-        mean, spread = self.mean[:, cells], self.spread[cells]
+        mean, spread = self.mean[:, cells], self.spread[cells] * np.reshape(inflation, (-1, 1))
         likely = _student_t((high - mean) / spread) - _student_t((low - mean) / spread)
         p = (1 - _OUTLIERS) * likely + _OUTLIERS * (np.minimum(high, 1.0) - low)
         return np.where(np.isnan(spread), 1.0, p)
-
-    def density(self, load: NDArray[Any], cells: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Return the density of mean root loads ``[n, k]`` of some cells, without contamination; 1: unknown."""
-        error = (load - self.mean[:, cells]) / self.spread[cells]
-        return np.nan_to_num(0.375 / (1 + error**2 / 4) ** 2.5 / self.spread[cells], nan=1.0)
 
 
 def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:

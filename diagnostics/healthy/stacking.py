@@ -3,12 +3,11 @@
 Estimates log odds of "never loaded" and "always loaded" from 28 features: the outputs of the regressions of the cell,
 its position, and mean loads of three rings of cells, of the pad and of the array:
 
-    log odds = x w + b + out' max(hidden' x + threshold, 0)
+    log odds = b + out' max(hidden' x + threshold, 0)
 
-A logistic regression plus a network with one hidden layer, weighted (1 - s) : s with s = events / (events + 20).
-Stacked generalization (Wolpert 1992) with scikit-learn's ``LogisticRegression`` (shrunk towards repeating the
-input odds) and ``MLPClassifier`` as second level. Fitted on events that the regressions were not fitted on (see
-:mod:`~diagnostics.healthy.cross_fitting`). Loads beyond two rows or columns enter only as means.
+Stacked generalization (Wolpert 1992) with scikit-learn's ``MLPClassifier`` as second level. Fitted on events that the
+regressions were not fitted on (see :mod:`~diagnostics.healthy.cross_fitting`). Loads beyond two rows or columns enter
+only as means.
 """
 
 from __future__ import annotations
@@ -26,9 +25,7 @@ if TYPE_CHECKING:
 
 _MAX_ODDS = 8.0  # log odds of the regressions are clipped here
 _PRIOR_CELLS = np.float32(0.5)  # pseudo-count of a ring: the mean of the pad; of the pad: the mean of the array
-_RIDGE = 1.0  # of the regressions, towards repeating the odds of the cell itself: prior variance 1
 _HIDDEN, _DECAY, _EPOCHS, _BATCH, _RATE = 32, 0.3, 20, 512, 2e-3  # units, L2 penalty, epochs, batch, learning rate
-_FEW = 20  # events at which network and regressions have the same weight
 _MIN_SCALE = 1e-3  # of a standardised feature: avoids division by 0
 _RARE = 0.005  # lower and upper (1 -) limit of the share of events that load a cell
 N_FEATURES = 28  # per cell, see neighbourhood
@@ -58,7 +55,6 @@ class Stacking:
 
     Attributes:
         mean, scale: float ``[k]``, of the features.
-        weight: float ``[k, 2]``, linear part.
         bias: float ``[2]``.
         hidden: float ``[k, h]``, input weights of the hidden units.
         threshold: float ``[h]``, their biases.
@@ -68,7 +64,6 @@ class Stacking:
 
     mean: Floats
     scale: Floats
-    weight: Floats
     bias: Floats
     hidden: Floats
     threshold: Floats
@@ -87,22 +82,15 @@ class Stacking:
             events: number of events behind the samples.
         """
         mean, scale = samples.mean(axis=0), np.maximum(samples.std(axis=0), _MIN_SCALE)
-        z = (samples - mean) / scale
-        fitted = [_logistic(z, y, column, mean, scale) for column, y in enumerate((never, always))]
-        weight, bias = (np.stack(column, axis=-1) for column in zip(*fitted, strict=True))
-        hidden, threshold, out, net_bias = _network(z, np.stack([never, always], axis=1))
-        share = events / (events + _FEW)
-        weight, bias, out = (1 - share) * weight, (1 - share) * bias + share * net_bias, share * out
-        return cls(mean, scale, weight, bias, hidden, threshold, out, events)
+        hidden, threshold, out, bias = _network((samples - mean) / scale, np.stack([never, always], axis=1))
+        return cls(mean, scale, bias, hidden, threshold, out, events)
 
     def predict(self, samples: Array) -> tuple[Floats, Floats]:
         """Return P(unloaded throughout) and P(loaded throughout), ``[...]`` each, of samples ``[k, ...]``."""
-        weight = np.concatenate([self.weight, self.hidden], axis=1) / self.scale[:, None]
-        bias = np.concatenate([self.bias, self.threshold]) - self.mean @ weight
-        linear = weight.T.astype(np.float32) @ samples.reshape(len(samples), -1)
-        linear += bias.astype(np.float32)[:, None]
-        odds, units = linear[:2], np.maximum(linear[2:], 0, out=linear[2:])
-        odds += self.out.T.astype(np.float32) @ units
+        weight = self.hidden / self.scale[:, None]
+        units = weight.T.astype(np.float32) @ samples.reshape(len(samples), -1)
+        units += (self.threshold - self.mean @ weight).astype(np.float32)[:, None]
+        odds = self.out.T.astype(np.float32) @ np.maximum(units, 0, out=units) + self.bias.astype(np.float32)[:, None]
         never, always = expit(odds).astype(np.float64).reshape(2, *samples.shape[1:])
         return never, always
 
@@ -207,29 +195,6 @@ def enclosed(load: NDArray[Any]) -> NDArray[Any]:
         one, other = (padded[:, 1 + s * r : 1 + s * r + rows, 1 + s * c : 1 + s * c + cols] for s in (1, -1))
         np.maximum(best, np.minimum(one, other), out=best)
     return best
-
-
-def _logistic(z: Floats, y: NDArray[np.bool_], column: int, mean: Floats, scale: Floats) -> tuple[Floats, float]:
-    """Return weights ``[k]`` and bias of a logistic regression shrunk towards one that repeats input ``column``."""
-    from scipy.optimize import minimize
-
-    start = np.zeros(z.shape[1] + 1)
-    start[column], start[-1] = scale[column], mean[column]
-    x = np.column_stack([z, np.ones(len(z))])
-
-    def loss(weights: Floats) -> tuple[float, Floats]:
-        odds, change = x @ weights, weights - start
-        value = np.logaddexp(0, odds).sum() - odds[y].sum() + 0.5 * _RIDGE * (change @ change)
-        return float(value), x.T @ (expit(odds) - y) + _RIDGE * change
-
-    def hessian(weights: Floats) -> Floats:
-        p = expit(x @ weights)
-        second: Floats = x.T @ (x * (p * (1 - p))[:, None]) + _RIDGE * np.eye(len(start))
-        return second
-
-    # Few weights and many samples: the Hessian is cheap, and a few steps suffice.
-    found = minimize(loss, start, jac=True, hess=hessian, method="trust-exact").x
-    return found[:-1], float(found[-1])
 
 
 def _network(z: Floats, y: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats, Floats]:

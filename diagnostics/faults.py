@@ -79,14 +79,17 @@ class Fault:
         if self.line is not None:
             where = str(self.line)
         else:
-            where = "; ".join("pad {}, row {}, column {}".format(*layout.position(cell)) for cell in self.cells)
+            where = "; ".join(layout.place(cell) for cell in self.cells)
         at = "" if self.value is None or self.kind is FaultKind.ALIAS else f" at {self.value:.4g} {layout.unit}"
         return f"{where}: {self.kind}{at}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict that :meth:`from_dict` reads."""
         lists = {"cells": list(self.cells), "alternatives": list(self.alternatives)}
-        return {**asdict(self), "kind": str(self.kind), **lists}
+        about = {**asdict(self), "kind": str(self.kind), **lists}
+        if self.line is not None and not self.line.name:
+            del about["line"]["name"]  # only groups have one
+        return about
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Fault:

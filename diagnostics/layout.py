@@ -1,8 +1,8 @@
-"""The shape of a tactile array and the wires that serve its cells."""
+"""The shape of a tactile array, and the wires or named groups that serve its cells."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal, get_args
@@ -10,7 +10,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-LineKind = Literal["row", "column", "row_address", "column_address", "converter"]
+from diagnostics.wiring import members, nested
+
+LineKind = Literal["row", "column", "row_address", "column_address", "converter", "bus", "group"]
+Wiring = Literal["matrix", "bus"]
+Rest = Literal["low", "high", "middle", "learn"]
 
 SCHEMA = "adaptfault.layout/1"
 
@@ -19,15 +23,18 @@ _MOST_CELLS = 10_000_000  # larger sizes are errors of a file
 
 @dataclass(frozen=True, order=True)
 class Line:
-    """One wire of a pad.
+    """One wire of a pad, or a group of cells that share a fate.
 
     ``kind`` is ``"row"`` or ``"column"`` (``index`` counts the wires), ``"row_address"`` or ``"column_address"``
-    (``index`` is the bit, 0 the least significant) or ``"converter"`` (``index`` 0: each pad has one channel).
+    (``index`` is the bit, 0 the least significant), ``"converter"`` (``index`` 0: each pad has one channel), ``"bus"``
+    (``index`` 0: the pad is one bus) or ``"group"`` (``index`` counts the groups of the layout, ``name`` is that of the
+    group, and ``pad`` the pad of its first cell).
     """
 
     pad: int
     kind: LineKind
     index: int
+    name: str = ""
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(LineKind):
@@ -43,13 +50,17 @@ class Line:
                 return f"pad {self.pad}, column address bit {self.index}"
             case "converter":
                 return f"pad {self.pad}, converter channel"
+            case "bus":
+                return f"pad {self.pad}, bus"
+            case "group":
+                return self.name or f"group {self.index}"
             case kind:
                 return f"pad {self.pad}, {kind} {self.index}"
 
 
 @dataclass(frozen=True, eq=False)
 class SensorLayout:
-    """A tactile array: ``pads`` arrays of ``rows`` x ``cols`` cells behind row and column multiplexers.
+    """A tactile array: ``pads`` arrays of ``rows`` x ``cols`` cells, by default behind row and column multiplexers.
 
     A cell's index runs pad, then row, then column (C order of ``[pads, rows, cols]``). Positions where ``present``
     is False hold no sensing element (a masked corner); they keep their index, so that D is always
@@ -61,9 +72,17 @@ class SensorLayout:
         unit: name of the unit of recordings.
         rate: frames per second.
         present: bool ``[pads, rows, cols]`` (or flat ``[D]``); None means every position is a cell.
+        wiring: ``"matrix"``: each pad has row and column wires; ``"bus"``: each pad is one bus without rows and columns.
+        groups: cells that share a fate, as a chip, triangle, patch, board or connector: lists of cells or of the names
+            of other groups, by name. Two groups are disjoint, or one contains the other. With groups, causes are
+            groups and cells, and no rows or columns, whatever ``wiring`` says.
+        rest: what a cell reads without load: ``"low"``: its lower end, and load raises it; ``"high"``: its upper end,
+            and load lowers it; ``"middle"``: in between, and load moves it either way; ``"learn"``: whichever the
+            healthy recordings show, ``"low"`` without any.
 
     Raises:
-        ValueError: a size below 1, a full scale or rate that is not positive, ``present`` of another shape.
+        ValueError: a size below 1, a full scale or rate that is not positive, ``present`` of another shape, an unknown
+            ``wiring`` or ``rest``, groups that overlap without nesting or name what is not there.
     """
 
     pads: int
@@ -73,6 +92,9 @@ class SensorLayout:
     unit: str = field(default="N", kw_only=True)
     rate: float = field(default=10.0, kw_only=True)
     present: NDArray[np.bool_] = field(default=None, kw_only=True, repr=False)  # type: ignore[arg-type]
+    wiring: Wiring = field(default="matrix", kw_only=True)
+    groups: Mapping[str, Sequence[int | str]] | None = field(default=None, kw_only=True, repr=False)
+    rest: Rest = field(default="learn", kw_only=True)
 
     def __post_init__(self) -> None:
         for name in ("pads", "rows", "cols"):
@@ -99,6 +121,14 @@ class SensorLayout:
             raise ValueError("present is False everywhere: a layout needs at least one cell")
         present.setflags(write=False)
         object.__setattr__(self, "present", present)
+        for name, choices in (("wiring", get_args(Wiring)), ("rest", get_args(Rest))):
+            if getattr(self, name) not in choices:
+                also = "; groups of cells are given as groups={name: cells}" if name == "wiring" else ""
+                raise ValueError(f"{name} is one of {', '.join(choices)}; got {getattr(self, name)!r}{also}")
+        if self.groups is not None:
+            members_of = members(self.groups, self.n_cells)
+            object.__setattr__(self, "groups", {name: tuple(x if isinstance(x, str) else int(x) for x in self.groups[name]) for name in members_of})
+        _ = self._wires  # raises ValueError for groups that overlap
 
     @classmethod
     def paper(cls) -> SensorLayout:
@@ -131,7 +161,12 @@ class SensorLayout:
 
     @cached_property
     def lines(self) -> tuple[Line, ...]:
-        """Every wire a fault can sit on: rows, columns, address bits of both, one converter channel a pad."""
+        """Every wire a fault can sit on: rows, columns, address bits of both, one converter channel a pad.
+
+        With declared wiring: the buses and groups, an inner group before those that contain it.
+        """
+        if not self.is_matrix:
+            return tuple(self._wires)
         counts: dict[LineKind, int] = {
             "row": self.rows,
             "column": self.cols,
@@ -140,6 +175,46 @@ class SensorLayout:
             "converter": 1,
         }
         return tuple(Line(pad, kind, i) for pad in range(self.pads) for kind, n in counts.items() for i in range(n))
+
+    @property
+    def is_matrix(self) -> bool:
+        """Whether the cells are read through rows and columns."""
+        return self.wiring == "matrix" and self.groups is None
+
+    @cached_property
+    def _wires(self) -> dict[Line, NDArray[np.intp]]:
+        """The cells of each bus and group, by line, an inner one before those that contain it."""
+        size = self.rows * self.cols
+        served = {}
+        if self.wiring == "bus":
+            served = {Line(pad, "bus", 0): np.arange(pad * size, (pad + 1) * size) for pad in range(self.pads)}
+        if self.groups is not None:
+            for i, (name, cells) in enumerate(members(self.groups, self.n_cells).items()):
+                served[Line(int(cells[0]) // size, "group", i, name)] = cells
+        return nested(served)
+
+    @cached_property
+    def _innermost(self) -> dict[int, Line]:
+        return {cell: line for line in reversed(self._wires) for cell in self._wires[line].tolist()}
+
+    def place(self, cell: int) -> str:
+        """Return where a cell is, in words: "pad 0, row 4, column 5", or "triangle 7, cell 72" with declared wiring."""
+        pad, row, col = self.position(cell)
+        if self.is_matrix:
+            return f"pad {pad}, row {row}, column {col}"
+        line = self._innermost.get(cell)
+        return f"{line if line and line.kind == 'group' else f'pad {pad}'}, cell {cell}"
+
+    def parts(self, line: Line) -> tuple[Line, ...]:
+        """Return the groups directly within a bus or group that together hold all its cells; none if there are none."""
+        own = set(self.cells_on(line).tolist())
+        within = []
+        for other in self.lines[: self.lines.index(line)][::-1]:
+            cells = set(self.cells_on(other).tolist())
+            if cells and cells < own and not any(cells <= set(self.cells_on(w).tolist()) for w in within):
+                within.append(other)
+        whole = sum(len(self.cells_on(w)) for w in within) == len(own)
+        return tuple(sorted(within)) if whole else ()
 
     @cached_property
     def _grid(self) -> NDArray[np.intp]:
@@ -175,6 +250,7 @@ class SensorLayout:
         for line in self.lines:
             pad = self._grid[line.pad]
             cells = pad[line.index] if line.kind == "row" else pad[:, line.index] if line.kind == "column" else pad
+            cells = self._wires.get(line, cells)
             served[line] = cells.ravel()[present[cells.ravel()]]
             served[line].setflags(write=False)
         return served
@@ -229,7 +305,10 @@ class SensorLayout:
         d |= {"full_scale": self.full_scale, "unit": self.unit, "rate": self.rate}
         if not self.present.all():
             d["present"] = self.present.tolist()
-        return d
+        if self.groups is not None:
+            d["groups"] = {name: list(of) for name, of in self.groups.items()}
+        # Only what differs from the default, so that earlier versions read the layouts that they know.
+        return d | {name: getattr(self, name) for name, usual in _DEFAULTS.items() if getattr(self, name) != usual}
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> SensorLayout:
@@ -242,7 +321,7 @@ class SensorLayout:
             raise ValueError(f"expected a layout, a dict with pads, rows and cols; got {str(d)[:60]}")
         if d.get("schema", SCHEMA) != SCHEMA:
             raise ValueError(f"expected schema {SCHEMA!r}, got {d['schema']!r}")
-        known = ("pads", "rows", "cols", "full_scale", "unit", "rate", "present")
+        known = ("pads", "rows", "cols", "full_scale", "unit", "rate", "present", "groups", *_DEFAULTS)
         if unknown := set(d) - set(known) - {"schema"}:
             raise ValueError(f"a layout has no field {sorted(unknown, key=str)[0]!r}: use {', '.join(known)}")
         if missing := [name for name in known[:3] if name not in d]:
@@ -266,7 +345,12 @@ class SensorLayout:
         return f"{text}, {masked} position{'s' if masked > 1 else ''} masked" if masked else text
 
     def _key(self) -> tuple[Any, ...]:
-        return (*self.shape, self.full_scale, self.unit, self.rate, self.present.tobytes())
+        groups = tuple((self.groups or {}).items())
+        declared = tuple(getattr(self, name) for name in _DEFAULTS)
+        return (*self.shape, self.full_scale, self.unit, self.rate, self.present.tobytes(), groups, *declared)
+
+
+_DEFAULTS = {"wiring": "matrix", "rest": "learn"}
 
 
 def address_bits(wires: int) -> int:

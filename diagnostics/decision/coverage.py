@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
 
+_NAMED = 8  # cells of a group that are named: a size
+
+
 @dataclass(frozen=True)
 class Coverage:
     """Coverage of a log, in the terms of integrated-circuit testing (Bushnell and Agrawal 2000).
@@ -64,6 +67,8 @@ def _advice(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple[str, ...
     from scipy import ndimage
 
     regions: list[tuple[int, str]] = []
+    if not layout.is_matrix:
+        return _advice_by_group(untested, layout)
     for pad, grid in enumerate(layout.grid(untested)):
         labelled, _ = ndimage.label(grid, structure=np.ones((3, 3)))
         sizes = np.bincount(labelled.ravel())
@@ -72,6 +77,18 @@ def _advice(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple[str, ...
             where = f"pad {pad}, {_span('row', rows)}, {_span('column', cols)}"
             regions.append((size, f"press {where} ({size} {'cell' if size == 1 else 'cells'} untested)"))
     return tuple(text for _, text in sorted(regions, key=lambda region: -region[0]))
+
+
+def _advice_by_group(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple[str, ...]:
+    """Return one sentence per group, or pad, with untested cells, the one with most first."""
+    cells: dict[str, list[int]] = {}
+    for cell in np.flatnonzero(untested).tolist():
+        cells.setdefault(layout.place(cell).rpartition(", ")[0], []).append(cell)
+    named = {where: ", ".join(map(str, some[:_NAMED])) + ", ..." * (len(some) > _NAMED) for where, some in cells.items()}
+    return tuple(
+        f"press {where}, {'cell' if len(cells[where]) == 1 else 'cells'} {named[where]} ({len(cells[where])} untested)"
+        for where in sorted(cells, key=lambda where: -len(cells[where]))
+    )
 
 
 def _span(name: str, span: slice) -> str:

@@ -10,6 +10,9 @@ the log ratio of "broken wire" against "single fault or none", where w is its lo
 correlation rho of the n uncertain cells on the wire (design effect, Kish 1965): neighbours at the edge of a contact err
 together. Minimum weight set cover, solved by enumeration or by ``scipy.optimize.milp``; q is re-estimated from the
 solution until it no longer changes. Wires with fewer than two tested cells are not found.
+
+With declared wiring the wires are buses and nested groups (:attr:`~diagnostics.layout.SensorLayout.groups`), which are
+broken as a whole. Of those that explain the same cells the innermost is named.
 """
 
 from __future__ import annotations
@@ -36,7 +39,8 @@ _MIN_RATIO = -1.0  # log ratio that one uncertain cell can bring against its wir
 _UNCERTAIN_COST = np.log(10.0)  # more, where no cell on the wire is certain: at the edge of a contact errors are common
 _PROVEN = np.log(9.0)  # log odds from which on a wire is reported: single cells are the safer answer
 _ROUNDS = 5  # of re-estimating q, at most: a size
-_WIRES = "row", "column", "converter"  # wires that may be broken; address wires: see ``address_aliasing``
+_WIRES = "row", "column", "converter", "bus", "group"  # that may be broken; address wires: see ``address_aliasing``
+_IN_MIDDLE = "row", "column"  # wires that may be broken in their middle
 _FEW = 8  # wires up to which all sets are enumerated: a size
 
 Mask = NDArray[np.bool_]
@@ -93,6 +97,8 @@ def solve(
     if consistent.sum() < 2:  # too few for a wire
         return tuple(Cause(None, (cell,), (cell,), 1.0) for cell in np.flatnonzero(faulty).tolist())
     causes: list[Cause] = []
+    if not layout.is_matrix:  # a group may extend over several pads
+        return tuple(_explain_pad(faulty, consistent, contradicting, weight, doubt, layout, common))
     pads = layout.grid(consistent).any(axis=(1, 2))
     for pad in np.flatnonzero(pads).tolist():
         own = _one_pad(layout.rows, layout.cols, layout.present[pad].tobytes())
@@ -117,8 +123,9 @@ def candidate_groups(
     """
     supporting, groups = consistent & (weight >= _SUPPORTING), []
     pads = set(np.flatnonzero(layout.grid(supporting).sum(axis=(1, 2)) >= _MIN_SUPPORT).tolist())
-    for line in layout.lines if pads else ():
-        if line.pad in pads:
+    enough = bool(pads) if layout.is_matrix else supporting.sum() >= _MIN_SUPPORT
+    for line in layout.lines if enough else ():
+        if line.pad in pads or not layout.is_matrix:
             groups += [
                 cells[consistent[cells]]
                 for cells in _silenced(line, contradicting, layout)
@@ -139,10 +146,10 @@ def _silenced(line: Line, contradicting: Mask, layout: SensorLayout) -> Sequence
 def _ends(line: Line, cells: NDArray[np.intp], contradicting: Mask) -> tuple[NDArray[np.intp], ...]:
     """Return the cells beyond the last working one, seen from either end of a wire; none if none works.
 
-    A converter cannot be broken in its middle.
+    A converter, bus or group cannot be broken in its middle.
     """
     alive = np.flatnonzero(contradicting[cells])
-    if line.kind == "converter" or not len(alive):
+    if line.kind not in _IN_MIDDLE or not len(alive):
         return ()
     return cells[alive[-1] + 1 :], cells[: alive[0]][::-1]
 
@@ -178,6 +185,8 @@ def _explain_pad(
     for line in lines:
         if line.kind in _WIRES:
             candidates += _candidates(line, layout.cells_on(line), contradicting, supporting, tested_cells, doubt)
+    if not layout.is_matrix:  # of groups that explain the same cells, the innermost: it comes first
+        candidates = list({tuple(c.cells[supporting[c.cells]].tolist()): c for c in candidates[::-1]}.values())
     present = layout.present.ravel()
     found = np.flatnonzero(faulty & present)
     tested = int((contradicting & present).sum()) + len(found)

@@ -2,7 +2,8 @@
 
 Cells with the same kind of fault and the same value form a group. Each group is explained by the line cover
 (:mod:`~diagnostics.decision.line_cover`); pairs of lines that read the same by address aliasing. Causes that act
-through more than one group, as a broken supply wire of several chips, are reported as several faults.
+through more than one group, as a broken supply wire of several chips, are reported as several faults. With declared
+wiring the wires are buses and nested groups, see :mod:`~diagnostics.wiring`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from diagnostics.decision.line_cover import Cause, solve
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, LineKind, SensorLayout
+from diagnostics.wiring import action, counted
 
 if TYPE_CHECKING:
     from diagnostics.decision.address_aliasing import Aliasing
@@ -225,17 +227,29 @@ def _reason(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayou
     already = ", and did so in the reference already" if found.known[list(cause.seen)].all() else ""
     since = "" if fault.onset is None else f" from frame {fault.onset} on ({fault.onset / layout.rate:.1f} s)"
     if fault.line is None:
-        pad, row, column = layout.position(fault.cells[0])
         whatever = "" if fault.kind in _DOING or found.silent[fault.cells[0]] else ", whatever touches it"
         check = _CHECKS.get(fault.kind, "the cell and its traces for a short circuit")
-        where = f"pad {pad}, row {row}, column {column}"
-        return f"{where} is {fault.kind}: it {does}{since}{whatever}{already}; check {check}"
+        return f"{layout.place(fault.cells[0])} is {fault.kind}: it {does}{since}{whatever}{already}; check {check}"
     inferred = len(cause.cells) - len(cause.seen)
     are = "is" if inferred == 1 else "are"
+    if fault.line.kind in ("bus", "group"):
+        silent = "are silent" if found.silent[fault.cells[0]] else f"are {fault.kind}: each cell {does}"
+        also = f"; {inferred} of the cells, not tested, {are} inferred" if inferred else ""
+        return f"{action(fault.line)}: {_behind(fault, layout)} {silent}{since}{already}{also}"
     also = f"; {inferred} more, not tested, {are} inferred from the wire" if inferred else ""
     where = "" if cause.whole else _span(fault, layout)
     seen = f"each of {len(cause.seen)} cells on it {does}{since}{already}{also}"
     return f"{fault.line} is {fault.kind}{where}: {seen}; check {_wire(fault.line)}"
+
+
+def _behind(fault: Fault, layout: SensorLayout) -> str:
+    """Return what a dead bus or group holds, as "all 4 triangles behind it"."""
+    assert fault.line is not None
+    cells = len(layout.cells_on(fault.line))
+    if len(fault.cells) < cells:
+        return f"{len(fault.cells)} of {cells} cells on it"
+    parts = layout.parts(fault.line)
+    return f"all {counted(parts)} behind it" if len(parts) > 1 else f"all {cells} cells on it"
 
 
 def _span(fault: Fault, layout: SensorLayout) -> str:

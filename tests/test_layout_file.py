@@ -82,3 +82,56 @@ def test_a_shape_that_is_none_is_refused(words):
 def test_an_option_that_makes_no_layout_is_refused(tmp_path, options):
     assert refusal(write(tmp_path / "a.csv", newtons(3)), **options).startswith("layout: ")
     assert "frames 0" in refusal(tmp_path / "a.csv", frames=0)
+
+
+TOML = """
+pads = 1
+rows = 2
+cols = 6
+full_scale = 255
+unit = "count"
+rate = 20
+rest = "high"
+wiring = "bus"
+present = [[[1, 1, 1, 1, 1, 1], [1, 1, 1, 1, 1, 0]]]
+
+[groups]
+"triangle 0" = [0, 1, 2]
+"triangle 1" = [3, 4, 5]
+"connector J3" = ["triangle 0", "triangle 1"]
+"""
+
+
+def test_a_layout_with_its_wiring_is_read_from_toml_as_from_json(tmp_path):
+    layout = read_layout(write(tmp_path / "skin.toml", TOML))
+    assert (layout.rest, layout.wiring, layout.full_scale) == ("high", "bus", 255)
+    assert [str(line) for line in layout.lines] == ["triangle 0", "triangle 1", "connector J3", "pad 0, bus"]
+    assert read_layout(write(tmp_path / "skin.json", json.dumps(layout.to_dict()))) == layout
+
+
+def test_recordings_keep_the_wiring_of_the_layout_file_beside_or_given(tmp_path):
+    layout = read_layout(write(tmp_path / "layout.toml", TOML))
+    frames = "\n".join(",".join("0" * 12) for _ in range(20))
+    file = write(tmp_path / "a.csv", frames)
+    assert load(file).recordings.layout == layout
+    assert load(file, layout=tmp_path / "layout.toml", rate=40).recordings.layout.lines == layout.lines
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("pads = ", "is not TOML"),
+        (TOML.replace('"triangle 1"]', '"triangle 9"]'), "names 'triangle 9', which is no group"),
+        (TOML.replace("[3, 4, 5]", "[2, 3]"), "'triangle 0' and 'triangle 1' overlap"),
+        (TOML.replace('"bus"', '"star"'), "wiring is one of matrix, bus"),
+        (TOML.replace('"high"', "3"), "rest is one of low, high"),
+        (TOML.replace("[0, 1, 2]", "3"), "'triangle 0' needs a list of cells"),
+    ],
+)
+def test_a_bad_toml_layout_is_refused_in_one_line(tmp_path, content, expected):
+    path = write(tmp_path / "layout.toml", content)
+    with pytest.raises(InputError) as caught:
+        read_layout(path)
+    assert str(caught.value).startswith(str(path))
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)

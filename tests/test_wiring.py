@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from adaptfault.acquisition.ros import diagnostic_array, stale_array
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Diagnosis, Fault, FaultKind, Line, Monitor, SelfDiagnosis, SensorLayout, inject
 from diagnostics.decision.line_cover import Cause, solve
@@ -208,3 +209,11 @@ def test_a_dead_bus_is_one_fault(grasps: list[np.ndarray]):
     (fault,) = fitted.diagnose(log).faults
     assert fault.line == Line(1, "bus", 0)
     assert fault.reason.startswith("check the cable and the connectors of pad 1, bus: all 48 cells on it are open")
+
+
+def test_ros_has_one_status_for_the_groups_of_each_pad(fitted: SelfDiagnosis, grasps: list[np.ndarray]):
+    diagnosis = fitted.diagnose(silenced(grasps[1:12:2], BLOCKS["triangle 4"]))
+    statuses = {status["name"]: status for status in diagnostic_array(diagnosis)["status"]}
+    assert set(statuses) == {"tactile: pad 0", "tactile: pad 0 groups", "tactile: stream"}
+    assert statuses["tactile: pad 0 groups"]["message"] == "triangle 4"
+    assert [status["name"] for status in stale_array(WIRED)["status"]] == list(statuses)

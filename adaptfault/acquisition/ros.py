@@ -26,6 +26,7 @@ _GROUPS = {
     "addresses": ("row_address", "column_address"),
     "converter": ("converter",),
 }
+_DECLARED = {"groups": ("bus", "group")}
 
 
 class Level(IntEnum):
@@ -43,7 +44,7 @@ def diagnostic_array(
     """Return a DiagnosticArray: one status for each pad, each group of its wires, and the stream of frames.
 
     The names depend on the layout only: "tactile: pad 0", "tactile: pad 0 rows" (``columns``, ``addresses``,
-    ``converter``), ..., "tactile: stream". Single faulty cells of a pad are a WARN; a tenth of its cells, or a wire, is
+    ``converter``; with declared wiring ``groups``), ..., "tactile: stream". Single faulty cells of a pad are a WARN; a tenth of its cells, or a wire, is
     an ERROR, also of the wire's group. Lost or frozen frames are a WARN of the stream. Untested cells are counted in
     the values and do not change the level.
 
@@ -58,7 +59,7 @@ def diagnostic_array(
     for pad in range(layout.pads):
         on_pad = [f for f in diagnosis.faults if layout.position(f.cells[0])[0] == pad]
         statuses.append(_pad(diagnosis, pad, on_pad))
-        for group, kinds in _GROUPS.items():
+        for group, kinds in _groups(layout).items():
             faults = [f for f in on_pad if f.line is not None and f.line.kind in kinds]
             statuses.append(_wires(layout, pad, group, kinds, faults))
     statuses.append(_stream(diagnosis))
@@ -74,7 +75,7 @@ def stale_array(
     hardware_id: str = "tactile",
 ) -> dict[str, Any]:
     """Return the same statuses, all STALE with this message, for a sensor that sends no frames."""
-    names = [one for pad in range(layout.pads) for one in (f"pad {pad}", *(f"pad {pad} {group}" for group in _GROUPS))]
+    names = [one for pad in range(layout.pads) for one in (f"pad {pad}", *(f"pad {pad} {group}" for group in _groups(layout)))]
     statuses = [_status(one, Level.STALE, message, {}) for one in (*names, "stream")]
     return _array(statuses, stamp, name, hardware_id)
 
@@ -101,6 +102,10 @@ def write_diagnostics(path: str | os.PathLike[str], arrays: Iterable[Mapping[str
             stamp = array["header"]["stamp"]
             data = store.serialize_cdr(_message(store.types, array), kind)
             writer.write(connection, stamp["sec"] * 10**9 + stamp["nanosec"], data)
+
+
+def _groups(layout: SensorLayout) -> dict[str, tuple[str, ...]]:
+    return _GROUPS if layout.is_matrix else _DECLARED
 
 
 def _pad(diagnosis: Diagnosis, pad: int, faults: list[Fault]) -> dict[str, Any]:
@@ -139,14 +144,15 @@ def _stream(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _places(layout: SensorLayout, cells: list[int]) -> str:
-    """Return at most 20 cells as "row.column", and the number of the others."""
-    places = ["{1}.{2}".format(*layout.position(cell)) for cell in cells[:_LISTED]]
+    """Return at most 20 cells as "row.column", or by index with declared wiring, and the number of the others."""
+    pattern = "{1}.{2}" if layout.is_matrix else "{3}"
+    places = [pattern.format(*layout.position(cell), cell) for cell in cells[:_LISTED]]
     more = [f"and {len(cells) - _LISTED} more"] if len(cells) > _LISTED else []
     return " ".join([*places, *more])
 
 
 def _short(line: Line | None) -> str:
-    return str(line).partition(", ")[2]
+    return str(line).partition(", ")[2] or str(line)
 
 
 def _status(name: str, level: Level, message: str, values: Mapping[str, Any]) -> dict[str, Any]:

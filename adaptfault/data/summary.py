@@ -103,7 +103,7 @@ class Summary:
         silent = self.silent
         if not silent.size:
             return "no cell: every cell changes"
-        places = ["pad {}, row {}, column {}".format(*self.layout.position(int(c))) for c in silent[:_LISTED]]
+        places = [self.layout.place(int(c)) for c in silent[:_LISTED]]
         more = [f"and {silent.size - _LISTED} more"] if silent.size > _LISTED else []
         change = "changes" if silent.size == 1 else "change"
         text = f"{silent.size} of {int(self.layout.present.sum())} cells never {change} (not loaded, or faulty)"

@@ -70,7 +70,7 @@ def _rows(result: DemoResult) -> list[_Row]:
 
 def _false_alarm_texts(result: DemoResult) -> list[str]:
     layout = result.recordings.layout
-    return ["pad {}, row {}, column {}".format(*layout.position(c)) for c in result.false_alarms]
+    return [layout.place(c) for c in result.false_alarms]
 
 
 def _draw_maps(result: DemoResult) -> Figure:

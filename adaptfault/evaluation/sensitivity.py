@@ -146,7 +146,7 @@ class Sensitivity:
 
 
 def _place(layout: SensorLayout, cell: int) -> str:
-    return "pad {}, row {}, column {}".format(*layout.position(cell))
+    return layout.place(cell)
 
 
 def sensitivity(

@@ -33,7 +33,7 @@ class RandomFaults:
             raise ValueError(f"unknown kind {kind!r}: use one of {', '.join(get_args(FaultPattern))}")
         self.layout, self.kind = layout, kind
         self.cells = np.flatnonzero(layout.present)
-        wires = [layout.cells_on(line) for line in layout.lines if line.kind in ("row", "column")]
+        wires = [layout.cells_on(line) for line in layout.lines if line.kind in ("row", "column", "bus", "group")]
         self.lines = [cells for cells in wires if len(cells)]
         self.most = len(self.lines if kind == "lines" else self.cells)
 

@@ -1,8 +1,9 @@
-"""Reads the description of an array from a JSON file, or from its shape as text ("2x13x6")."""
+"""Reads the description of an array from a JSON or TOML file, or from its shape as text ("2x13x6")."""
 
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
@@ -10,13 +11,18 @@ from typing import Any
 
 import numpy as np
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 from adaptfault.data.recordings.content import Shape
 from adaptfault.data.recordings.errors import InputError
-from adaptfault.data.recordings.text import read_json_object, shown
+from adaptfault.data.recordings.text import read_json_object, read_text, shown
 from diagnostics import SensorLayout
 
 LAYOUT_NAME = "layout.json"
-"""The name of the layout that is read from a folder of recordings without an option."""
+"""The name of the layout that is read from a folder of recordings without an option; ``layout.toml`` is read too."""
 
 MOST_CELLS = 1_000_000
 """A layout with more positions is a typing error, and would fill the memory."""
@@ -55,6 +61,7 @@ def layout_beside(paths: Sequence[Path]) -> SensorLayout | None:
         InputError: such a file is no layout.
     """
     files = [(path if path.is_dir() else path.parent) / LAYOUT_NAME for path in paths]
+    files = [file if file.is_file() else file.with_suffix(".toml") for file in files]
     if not files or not all(file.is_file() for file in files):
         return None
     layouts = {read_layout(file) for file in dict.fromkeys(files)}
@@ -62,13 +69,15 @@ def layout_beside(paths: Sequence[Path]) -> SensorLayout | None:
 
 
 def read_layout(path: str | PathLike[str]) -> SensorLayout:
-    """Read a layout from a JSON file of the schema "adaptfault.layout/1", as ``SensorLayout.to_dict`` gives it.
+    """Read a layout from a file of the schema "adaptfault.layout/1", as ``SensorLayout.to_dict`` gives it.
+
+    A name that ends in ``.toml`` is TOML, any other JSON.
 
     Raises:
-        InputError: the file cannot be read, is no JSON, or a field is missing, unknown or of a wrong kind; named.
+        InputError: the file cannot be read, is no JSON or TOML, or a field is missing, unknown or of a wrong kind; named.
     """
     path = Path(path)
-    document = read_json_object(path)
+    document = _read_toml(path) if path.suffix.lower() == ".toml" else read_json_object(path)
     for name, kind in (
         ("pads", int),
         ("rows", int),
@@ -90,6 +99,15 @@ def read_layout(path: str | PathLike[str]) -> SensorLayout:
         return SensorLayout.from_dict(document)
     except (ValueError, TypeError, OverflowError) as error:
         raise InputError.at(path, f"is no layout: {error}; correct the file") from None
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError.at(path, f"is not TOML ({error}); correct it") from None
+    except RecursionError:
+        raise InputError.at(path, "is not TOML that can be read; write it again") from None
 
 
 def _is(value: Any, kind: type) -> bool:

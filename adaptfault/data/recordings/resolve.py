@@ -19,6 +19,8 @@ from diagnostics import SensorLayout
 if TYPE_CHECKING:
     from adaptfault.data.calibration import Calibration
 
+_KEPT = "present", "wiring", "groups", "rest"
+"""What a layout states besides the shape and what the options override."""
 
 _SAME_RATE = 0.05
 """Rates that differ by less are the same: those of bags are measured."""
@@ -69,7 +71,7 @@ def resolve_layout(
     problems: list[Problem] = []
     overrides = {"full_scale": full_scale, "unit": unit, "rate": rate}
     if isinstance(array, SensorLayout):
-        stated: dict[str, Any] = {name: getattr(array, name) for name in (*overrides, "present")}
+        stated: dict[str, Any] = {name: getattr(array, name) for name in (*overrides, *_KEPT)}
         shape = array.shape
         if tables is not None and array.unit != "N":  # that was the layout of the counts
             stated |= {"full_scale": None, "unit": None}

@@ -22,6 +22,7 @@ from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference import Reference, highest_reading, living, tolerance_of
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
+from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
 
 SCHEMA = "adaptfault.diagnoser/10"
@@ -41,6 +42,7 @@ class Fitted:
     false_discovery_rate: float
     calibrator: Calibrator
     reference: Reference | None
+    load: LoadDirection | None = None
 
 
 class SelfDiagnosis:
@@ -53,6 +55,7 @@ class SelfDiagnosis:
     Attributes:
         reference_: the healthy reference, after :meth:`fit`; None: cold start.
         calibrator_: calibration of the log likelihood ratios; defaults before :meth:`fit`.
+        load_: how readings become loads; None: load raises the reading.
     """
 
     reference_: Reference | None = None
@@ -60,6 +63,7 @@ class SelfDiagnosis:
 
     def __init__(self, layout: SensorLayout, *, false_discovery_rate: float = 0.006) -> None:
         self.layout = layout
+        self.load_ = LoadDirection.declared(layout)
         self.false_discovery_rate = false_discovery_rate
 
     def fit(self, recordings: ArrayLike | Sequence[ArrayLike]) -> SelfDiagnosis:
@@ -72,8 +76,11 @@ class SelfDiagnosis:
             ValueError: recordings that do not fit the layout, or hold no frame with a reading.
         """
         healthy = _recordings(recordings, self.layout).valid(self.layout.full_scale).whole(self.layout.present.ravel())
+        self.load_, layout = LoadDirection.fit(healthy, self.layout), self.layout
+        if self.load_ is not None:
+            healthy, layout = RecordingBlocks([self.load_.loads(r) for r in healthy]), replace(layout, rest="low")
         # Fractions of full scale refer to the range that was seen: a stated one may be too high.
-        layout = replace(self.layout, full_scale=min(self.layout.full_scale, highest_reading(healthy, self.layout)))
+        layout = replace(layout, full_scale=min(layout.full_scale, highest_reading(healthy, layout)))
         dead = find_reference_faults(healthy, layout, tolerance_of(healthy, layout), self._diagnosed_cold)
         self.reference_ = Reference.fit(healthy, layout, dead)
         self.calibrator_ = Calibrator.fit(healthy, living(layout, dead))
@@ -105,7 +112,9 @@ class SelfDiagnosis:
 
     def state(self) -> tuple[dict[str, Any], Arrays]:
         """Return the fitted state: a JSON-safe dict and arrays by name, as :meth:`from_state` reads them."""
-        fitted, arrays = to_state(Fitted(self.layout, self.false_discovery_rate, self.calibrator_, self.reference_))
+        fitted, arrays = to_state(
+            Fitted(self.layout, self.false_discovery_rate, self.calibrator_, self.reference_, self.load_)
+        )
         return {"schema": SCHEMA, **fitted}, arrays
 
     @classmethod
@@ -124,6 +133,9 @@ class SelfDiagnosis:
             fitted = from_state(Fitted, about, arrays)
             diagnoser = cls(fitted.layout, false_discovery_rate=fitted.false_discovery_rate)
             diagnoser.calibrator_, diagnoser.reference_ = fitted.calibrator, fitted.reference
+            diagnoser.load_ = fitted.load
+            if fitted.load is not None:
+                fitted.load.check(fitted.layout)
             if fitted.reference is not None:
                 fitted.reference.check(fitted.layout)
         except KeyError as error:
@@ -136,7 +148,7 @@ class SelfDiagnosis:
         """Return the state before any frame. Only tiles with a ``needed`` cell (bool ``[D]``; None: all) are scored."""
         reference = self.reference_ or Reference.unknown(self.layout)
         exclusion = self.calibrator_.exclusion if reference.model else Exclusion(_SUSPICIOUS_COLD)
-        return StreamState(self.layout, reference, exclusion, needed)
+        return StreamState(self.layout, reference, exclusion, needed, self.load_)
 
     def evaluate(self, stream: StreamState, *, n_recordings: int = 1) -> Diagnosis:
         """Return the diagnosis of the log behind ``stream``.
@@ -231,22 +243,21 @@ class SelfDiagnosis:
         faulty = faulty_at(np.where(certain, 0.0, probability), self.false_discovery_rate)
         faulty = (faulty | certain) & present & ~explained
         value, rests = runs.value, spatial.scored & stream.rests()
+        blinks_to = np.where(2 * intermittency.high > intermittency.blinks, self.layout.full_scale, 0.0)
+        held, beyond = stream.reading(value), spatial.scored & ~rests
         return CellFindings(
             faulty=faulty,
             # A cell that moved is alive, unless it is suspected since.
             alive=present & ~explained & ~faulty & runs.moved & (probability < _DOUBTED),
             silent=silent,
             rests=rests,
-            full=spatial.scored & ~rests & (value >= self.layout.full_scale - 2 * reference.tolerance),
+            full=beyond & (held >= self.layout.full_scale - 2 * reference.tolerance),
+            zero=None if stream.load is None else beyond & (held <= 2 * reference.tolerance),
             intermittent=intermittent,
             noisy=noisy,
             drifting=drifting,
             gain=np.where(drifting, spatial.factor, np.nan),
-            value=np.where(
-                intermittent,
-                np.where(2 * intermittency.high > intermittency.blinks, self.layout.full_scale, 0.0),
-                value,
-            ),
+            value=np.where(intermittent, stream.reading(blinks_to), held),
             since=np.select(
                 [silent, intermittent, noisy, drifting],
                 [runs.missed_since, intermittency.blinks_since, intermittency.noisy_since, spatial.since],

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics import SensorLayout
+from diagnostics.preprocessing.load import LoadDirection
 
 Rule = Callable[[NDArray[np.float64], NDArray[np.bool_], datetime], bool]
 """Returns whether to record a frame ``[D]``, given the faulty cells (bool ``[D]``) and the local time."""
@@ -23,14 +24,16 @@ _HOURS = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)-([01]?\d|2[0-3]):([0-5]\d)", re
 
 @dataclass(frozen=True)
 class Contact:
-    """Record while at least ``cells`` cells without a known fault read more than ``threshold``."""
+    """Record while at least ``cells`` cells without a known fault are loaded by more than ``threshold``."""
 
     threshold: float
     cells: int = _CELLS
+    load: LoadDirection | None = None
 
     def __call__(self, values: NDArray[np.float64], faulty: NDArray[np.bool_], clock: datetime) -> bool:
         """Return whether to record this frame."""
-        return int(np.count_nonzero((values > self.threshold) & ~faulty)) >= self.cells
+        loads = values if self.load is None else self.load.loads(values)
+        return int(np.count_nonzero((loads > self.threshold) & ~faulty)) >= self.cells
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ def parse_when(text: str, layout: SensorLayout) -> Rule:
         except ValueError:
             threshold = -1.0
         if 0 <= threshold < layout.full_scale:
-            return Contact(threshold, cells)
+            return Contact(threshold, cells, LoadDirection.declared(layout))
         raise ValueError(f"--when {text}: expected a threshold from 0 to {layout.full_scale:g} {layout.unit}")
     if match := _HOURS.fullmatch(text):
         first, second, third, fourth = (int(part) for part in match.groups())

@@ -289,13 +289,21 @@ class _Maintenance:
             train.x[train.recording == number].reshape(-1, layout.n_cells) * layout.full_scale
             for number in np.unique(train.recording)
         )
-        change = sensor_change(frames, reference, layout, healthy)
+        load = self.bundle.diagnoser().load_
+        if load is None:
+            change = sensor_change(frames, reference, layout, healthy)
+        else:
+            change = sensor_change(map(load.loads, frames), map(load.loads, reference), layout, healthy)
         if change is None:
             return report
         windows = with_faults(self.bundle.parts.check_windows(), report.faults, layout)
         model = Adaptation.load(self.bundle.versions[report.version].folder)
         before = float((model.predict(windows.x) == windows.y).mean())
         changed = (windows.x * change.gain + change.offset / layout.full_scale).astype(np.float32)
+        if load is not None:
+            readings = windows.x.astype(np.float64) * layout.full_scale
+            loads = load.loads(readings) * change.gain + change.offset
+            changed = (load.readings(loads, readings < load.rest) / layout.full_scale).astype(np.float32)
         after = float((model.predict(changed) == windows.y).mean())
         effect = f"{change.reason}; accuracy of version {report.version} {before:.3f} -> {after:.3f} with this change"
         code = max(report.exit_code, 2 if after < _TECHNICIAN_BELOW * before else 1)

@@ -41,10 +41,11 @@ class CellFindings:
         alive: cells that move as no dead cell does.
         silent: cells that deliver no reading, or no longer do.
         rests: constant cells at their baseline.
-        full: constant cells at full scale.
+        full: constant cells at full scale, and not at their baseline.
+        zero: constant cells at 0, and not at their baseline; None for sensors that rest low.
         intermittent, noisy, drifting: cells that move, but wrongly.
         gain: float, gain relative to the reference of cells with a changed gain; NaN: others.
-        value: float, reading of constant cells, and reading to which intermittent cells blink; NaN: none.
+        value: float, reading (not load) of constant cells, and reading to which intermittent cells blink; NaN: none.
         since: int, number of the first frame of the fault.
         probability: float, P(faulty).
         weight: float, log likelihood ratio faulty : healthy.
@@ -69,6 +70,7 @@ class CellFindings:
     doubt: Floats
     events: NDArray[np.intp]
     known: Mask
+    zero: Mask | None = None
 
 
 def root_causes(found: CellFindings, aliasings: Sequence[Aliasing], layout: SensorLayout) -> tuple[Fault, ...]:
@@ -136,11 +138,13 @@ def _groups(found: CellFindings, full_scale: float) -> list[tuple[FaultKind, Mas
         (FaultKind.OPEN, faulty & found.silent, found.silent, None),
         (FaultKind.OPEN, constant & found.rests, found.rests, None),
         (FaultKind.SHORT, constant & found.full, found.full, full_scale),
+        *([] if found.zero is None else [(FaultKind.OPEN, constant & found.zero, found.zero, 0.0)]),
         (FaultKind.INTERMITTENT, faulty & found.intermittent, found.intermittent, None),
         (FaultKind.NOISY, faulty & found.noisy, found.noisy, None),
         *((FaultKind.DRIFT, faulty & drifting, drifting, None) for drifting in (of_offset, of_gain)),
     ]
-    intermediate = np.flatnonzero(constant & ~found.rests & ~found.full)
+    at_an_end = found.full if found.zero is None else found.full | found.zero
+    intermediate = np.flatnonzero(constant & ~found.rests & ~at_an_end)
     intermediate = intermediate[np.argsort(value[intermediate])]
     for cells in np.split(intermediate, np.flatnonzero(np.diff(value[intermediate]) > _SAME_VALUE * full_scale) + 1):
         if len(cells):
@@ -154,6 +158,9 @@ def _fault(kind: FaultKind, value: float | None, cause: Cause, found: CellFindin
     seen = list(cause.seen)
     if kind in (FaultKind.STUCK, FaultKind.OPEN, FaultKind.INTERMITTENT) and not found.silent[seen[0]]:
         value = float(np.median(found.value[seen]))
+        if found.zero is not None and kind is FaultKind.OPEN:  # at rest, which is not the lower end
+            low, high = _SAME_VALUE * layout.full_scale, (1 - _SAME_VALUE) * layout.full_scale
+            kind = FaultKind.SHORT if value >= high else FaultKind.OPEN if value <= low else FaultKind.STUCK
     start = int(np.median(found.since[seen]))
     fault = Fault(
         kind,

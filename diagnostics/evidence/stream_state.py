@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
     from diagnostics.healthy.reference import Reference
     from diagnostics.layout import SensorLayout
+    from diagnostics.preprocessing.load import LoadDirection
     from diagnostics.preprocessing.scale import Array, Scale
 
 MAX_EVENTS, KEPT_EVENTS = 40, 32  # with more events in a tile, all but the last are scored and dropped
@@ -67,6 +68,7 @@ class StreamState:
         reference: the healthy reference.
         exclusion: when a cell is excluded from the predictors.
         needed: bool ``[D]``, the cells to be scored; None: all. Tiles without such a cell are skipped.
+        load: how readings become loads; None: they are.
 
     Attributes:
         transport: lost and repeated frames.
@@ -77,10 +79,16 @@ class StreamState:
         duplicates: pairs of lines that read the same.
         touched: bool ``[D]``, cells that were loaded at least once.
         scale: baseline with the present offsets, and full scale.
+        below: bool ``[D]``, cells that last read less than at rest.
     """
 
     def __init__(
-        self, layout: SensorLayout, reference: Reference, exclusion: Exclusion, needed: Mask | None = None
+        self,
+        layout: SensorLayout,
+        reference: Reference,
+        exclusion: Exclusion,
+        needed: Mask | None = None,
+        load: LoadDirection | None = None,
     ) -> None:
         model = reference.model
         every = tiles(layout) if model is None else tuple(Tile(r.inputs, r.outputs) for r in model.local_regressions)
@@ -88,6 +96,7 @@ class StreamState:
         self.tiled = len(every) > 1
         self.exclusion = exclusion._replace(threshold=_EXCLUDED) if self.tiled else exclusion
         self.present = layout.present.ravel()
+        self.load, self.below = load, np.zeros(layout.n_cells, bool)
         self.transport = TransportState()
         self.runs = ConstantRuns.begin(layout.n_cells)
         self.local = TiledEvents.begin(every if self.tiled else tiles(layout), needed)
@@ -110,7 +119,11 @@ class StreamState:
         return self._skin if self.tiled else self.local.of[0]
 
     def extend(self, frames: NDArray[np.float64]) -> bool:
-        """Take in frames ``[t, D]``; return whether a segment was completed."""
+        """Take in frames ``[t, D]`` of readings; return whether a segment was completed."""
+        if self.load is not None:
+            side = np.where(np.isnan(frames), self.below, frames < self.load.rest)
+            self.below = side[-1].astype(bool) if len(side) else self.below
+            frames = self.load.loads(frames)
         wrong = invalid(frames, self.layout.full_scale)
         if wrong is not None:
             frames, self.transport = np.where(wrong, np.nan, frames), self.transport.dropped(wrong)
@@ -152,6 +165,10 @@ class StreamState:
         other = copy(self)
         other._close()  # reads the buffered frames and changes none of them
         return other
+
+    def reading(self, load: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the readings of loads ``[D]``, where they are not the same."""
+        return load if self.load is None else self.load.readings(load, self.below)
 
     @property
     def received(self) -> Mask:

@@ -26,6 +26,11 @@ class RecordingBlocks(Sequence[Recording]):
     def __init__(self, given: Sequence[NDArray[Any]]) -> None:
         self._given = list(given)
 
+    @property
+    def given(self) -> list[NDArray[Any]]:
+        """The recordings in their own dtype."""
+        return self._given
+
     def __len__(self) -> int:
         return len(self._given)
 

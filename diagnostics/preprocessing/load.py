@@ -1,0 +1,120 @@
+"""Loads: readings of sensors that fall with load, or rest in the middle, as readings that rise with it from 0.
+
+    low      load = reading
+    high     load = full scale - reading
+    middle   load = |reading - rest|        rest: median of the quiet readings of each cell in the healthy recordings
+
+Everything after this sees loads only; faults are reported as readings. ``learn`` decides for one of the three, for the
+whole array: of the cells that move, it compares how far each goes above its median with how far it goes below. Sensors
+that are loaded most of the time have no rest that repeats; they count as low, as do sensors without a reference and
+all doubtful ones: a direction that is known is better declared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.preprocessing.transport import invalid
+
+if TYPE_CHECKING:
+    from diagnostics.layout import Rest, SensorLayout
+
+_QUIET = 0.02  # of full scale: readings so near the rest of a cell are quiet
+_OFTEN = 0.5  # share of its frames in which a cell is quiet, at the median over cells
+_MOVES = 0.1  # of full scale: range of a cell that was loaded
+_ONE_WAY = 0.1  # share of the range on the other side of the rest, at most, where load moves all cells one way
+_BOTH_WAYS = 0.15  # from half of the range, at most, where load moves cells either way: offsets drift less than that
+_FRAMES, _CELLS, _BLOCK = 2000, 1000, 1000  # frames and cells that are looked at, about: sizes
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LoadDirection:
+    """How readings become loads, in the layout's unit.
+
+    Attributes:
+        direction: ``"high"`` or ``"middle"``; readings of sensors that rest low are loads already.
+        rest: float ``[D]``, what each cell reads without load.
+        full_scale: of the layout.
+    """
+
+    direction: str
+    rest: Floats
+    full_scale: float
+
+    @classmethod
+    def declared(cls, layout: SensorLayout) -> LoadDirection | None:
+        """Return the direction without any recording: cells that rest in the middle rest at half of full scale."""
+        if layout.rest not in ("high", "middle"):
+            return None
+        share = 1.0 if layout.rest == "high" else 0.5
+        return cls(layout.rest, np.full(layout.n_cells, share * layout.full_scale), layout.full_scale)
+
+    @classmethod
+    def fit(cls, recordings: Sequence[NDArray[Any]], layout: SensorLayout) -> LoadDirection | None:
+        """Learn what the layout leaves open from fault-free recordings, ``[T, D]`` each; None: readings are loads."""
+        if layout.rest in ("low", "high"):
+            return cls.declared(layout)
+        readings = RecordingBlocks.of(recordings)
+        direction = layout.rest if layout.rest == "middle" else _learned(readings, layout)
+        if direction != "middle":
+            return cls.declared(replace(layout, rest=direction))
+        cells, rest = np.arange(layout.n_cells), np.full(layout.n_cells, 0.5 * layout.full_scale)
+        for some in np.split(cells, range(_BLOCK, len(cells), _BLOCK)):
+            sample = _sample(readings, some)
+            received = ~np.isnan(sample).all(axis=0)
+            rest[some[received]] = np.nanmedian(sample[:, received], axis=0)
+        return cls(direction, rest, layout.full_scale)
+
+    def check(self, layout: SensorLayout) -> None:
+        """Raise ValueError unless this is a direction of ``layout``."""
+        if self.direction not in ("high", "middle") or self.rest.shape != (layout.n_cells,) or not self.full_scale > 0:
+            raise ValueError(f"expected a direction of load, high or middle, of {layout}; got {self.direction!r}")
+
+    def loads(self, frames: Floats) -> Floats:
+        """Return the loads of readings ``[T, D]``; readings that no converter gives stay so."""
+        if self.direction == "high":
+            return self.full_scale - frames
+        wrong = invalid(frames, self.full_scale)
+        loads: Floats = np.abs(frames - self.rest)
+        return loads if wrong is None else np.where(wrong, np.inf, loads)
+
+    def readings(self, loads: Floats, below: NDArray[np.bool_]) -> Floats:
+        """Return the readings of loads ``[D]``; ``below`` (bool ``[D]``): cells that read less than at rest."""
+        down = below | (self.direction == "high")
+        return np.clip(np.where(down, self.rest - loads, self.rest + loads), 0.0, self.full_scale)
+
+
+def _sample(readings: RecordingBlocks, cells: NDArray[np.intp]) -> Floats:
+    """Return evenly spread readings of some cells, ``[n, cells]``."""
+    each = max(1, _FRAMES // len(readings))
+    pieces = [(i, slice(None, None, max(1, len(recording) // each))) for i, recording in enumerate(readings.given)]
+    return np.concatenate([readings.piece(i, frames, cells) for i, frames in pieces])
+
+
+def _learned(readings: RecordingBlocks, layout: SensorLayout) -> Rest:
+    """Return the direction of load of the array, see the module."""
+    low, high = readings.extremes()
+    moved = np.flatnonzero(layout.present.ravel() & (high - low > _MOVES * layout.full_scale))
+    moved = moved[:: max(1, len(moved) // _CELLS)]
+    if not len(moved):
+        return "low"
+    low, high, sample = low[moved], high[moved], _sample(readings, moved)
+    rest = np.nanmedian(sample, axis=0)
+    up = float(np.median((high - rest) / (high - low)))
+    quiet = float(np.median((np.abs(sample - rest) <= _QUIET * layout.full_scale).mean(axis=0)))
+    # Where a load is held most of the time, it differs between cells more than the readings without it do.
+    if up >= 1 - _ONE_WAY or quiet < _OFTEN or _spread(rest) > _spread(low):
+        return "low"
+    return "high" if up <= _ONE_WAY else "middle" if abs(up - 0.5) <= _BOTH_WAYS else "low"
+
+
+def _spread(values: Floats) -> float:
+    return float(np.subtract(*np.quantile(values, (0.75, 0.25))))

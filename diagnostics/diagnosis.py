@@ -64,6 +64,7 @@ class SelfDiagnosis:
     def __init__(self, layout: SensorLayout, *, false_discovery_rate: float = 0.006) -> None:
         self.layout = layout
         self.load_ = LoadDirection.declared(layout)
+        self._planes, self._order = axis_planes(layout)
         self.false_discovery_rate = false_discovery_rate
 
     def fit(self, recordings: ArrayLike | Sequence[ArrayLike]) -> SelfDiagnosis:
@@ -76,7 +77,10 @@ class SelfDiagnosis:
             ValueError: recordings that do not fit the layout, or hold no frame with a reading.
         """
         healthy = _recordings(recordings, self.layout).valid(self.layout.full_scale).whole(self.layout.present.ravel())
-        self.load_, layout = LoadDirection.fit(healthy, self.layout), self.layout
+        layout = self._planes
+        if self._order is not None:
+            healthy = RecordingBlocks([given[:, self._order] for given in healthy.given])
+        self.load_ = LoadDirection.fit(healthy, layout)
         if self.load_ is not None:
             healthy, layout = RecordingBlocks([self.load_.loads(r) for r in healthy]), replace(layout, rest="low")
         # Fractions of full scale refer to the range that was seen: a stated one may be too high.
@@ -137,7 +141,7 @@ class SelfDiagnosis:
             if fitted.load is not None:
                 fitted.load.check(fitted.layout)
             if fitted.reference is not None:
-                fitted.reference.check(fitted.layout)
+                fitted.reference.check(diagnoser._planes)
         except KeyError as error:
             raise ValueError(f"the stored diagnosis is damaged: {error} is missing") from None
         except (TypeError, ValueError, AttributeError) as error:
@@ -146,9 +150,9 @@ class SelfDiagnosis:
 
     def stream(self, needed: NDArray[np.bool_] | None = None) -> StreamState:
         """Return the state before any frame. Only tiles with a ``needed`` cell (bool ``[D]``; None: all) are scored."""
-        reference = self.reference_ or Reference.unknown(self.layout)
+        reference = self.reference_ or Reference.unknown(self._planes)
         exclusion = self.calibrator_.exclusion if reference.model else Exclusion(_SUSPICIOUS_COLD)
-        return StreamState(self.layout, reference, exclusion, needed, self.load_)
+        return StreamState(self._planes, reference, exclusion, needed, self.load_, self._order)
 
     def evaluate(self, stream: StreamState, *, n_recordings: int = 1) -> Diagnosis:
         """Return the diagnosis of the log behind ``stream``.
@@ -188,6 +192,8 @@ class SelfDiagnosis:
             weight[group] = np.maximum(weight[group], of_group[group])
         found = replace(found, weight=weight)
         yield
+        every = np.arange(self.layout.n_cells) if self._order is None else np.argsort(self._order)
+        found = found.of(every)
         causes = root_causes(found, aliased, self.layout)
         probability, inferred = found.probability.copy(), np.zeros(self.layout.n_cells, bool)
         for fault in causes:
@@ -195,17 +201,20 @@ class SelfDiagnosis:
             probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
             inferred[cells] = True
         scale, intermittency = stream.scale, stream.intermittency
-        working = found.alive & ~inferred
+        working = np.empty_like(inferred)
+        working[every] = found.alive & ~inferred
         return Diagnosis(
             layout=self.layout,
             faults=causes,
             probability=probability,
-            tested=(found.alive & stream.touched) | inferred,  # noise alone is no test
+            tested=(found.alive & stream.touched[every]) | inferred,  # noise alone is no test
             transport=stream.transport.faults(scale.baseline + scale.near, working, self.layout.rate),
             evidence={
-                "spatial": spatial.evidence + spatial.offset + spatial.gain,
-                "temporal": np.where(spatial.scored, stream.temporal(), intermittency.blinking + intermittency.noisy),
-                "events": spatial.events.astype(np.float64),
+                "spatial": (spatial.evidence + spatial.offset + spatial.gain)[every],
+                "temporal": np.where(spatial.scored, stream.temporal(), intermittency.blinking + intermittency.noisy)[
+                    every
+                ],
+                "events": spatial.events.astype(np.float64)[every],
             },
             n_frames=stream.transport.seen,
             n_recordings=n_recordings,
@@ -295,13 +304,35 @@ class SelfDiagnosis:
             return []
         consistent = found.rests & ~found.known & ~explained
         contradicting = found.alive | ~(found.rests | found.silent) & stream.present
-        return candidate_groups(consistent, contradicting, weight, self.layout)
+        if self._order is None:
+            return candidate_groups(consistent, contradicting, weight, self.layout)
+        every = np.argsort(self._order)
+        groups = candidate_groups(consistent[every], contradicting[every], weight[every], self.layout)
+        return [every[group] for group in groups]
+
+
+def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp] | None]:
+    """Return the array in which each axis of a pad is a pad of its own, and which cell each of its cells is.
+
+    The neighbours of a cell are then cells of the same axis. With one axis: the layout itself, and None.
+    """
+    if layout.axes == 1:
+        return layout, None
+    cells = np.arange(layout.n_cells).reshape(layout.pads, layout.rows, layout.cols, layout.axes)
+    order = np.moveaxis(cells, 3, 1).ravel()
+    planes = SensorLayout(
+        layout.pads * layout.axes, layout.rows, layout.cols, full_scale=layout.full_scale, unit=layout.unit,
+        rate=layout.rate, present=layout.present.ravel()[order], wiring="bus",
+        rest="middle" if layout.rest == "learn" else layout.rest,
+    )  # fmt: skip
+    return planes, order
 
 
 def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> RecordingBlocks:
     """Return the recordings as blocks, each ``[T, D]`` with T >= 1."""
     given: Any = recordings
-    single = isinstance(given, np.ndarray) and (given.shape[1:] == layout.shape or given.ndim <= 2)
+    shapes = (layout.shape, (layout.pads, layout.rows, layout.cols, layout.axes))
+    single = isinstance(given, np.ndarray) and (given.shape[1:] in shapes or given.ndim <= 2)
     checked = [_checked(r, f"recording {i}", layout) for i, r in enumerate([given] if single else given)]
     checked = [r for r in checked if len(r)]
     if not checked:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.wiring import members, nested
 
-LineKind = Literal["row", "column", "row_address", "column_address", "converter", "bus", "group"]
+LineKind = Literal["row", "column", "row_address", "column_address", "converter", "position", "bus", "group"]
 Wiring = Literal["matrix", "bus"]
 Rest = Literal["low", "high", "middle", "learn"]
 
@@ -26,8 +26,8 @@ class Line:
     """One wire of a pad, or a group of cells that share a fate.
 
     ``kind`` is ``"row"`` or ``"column"`` (``index`` counts the wires), ``"row_address"`` or ``"column_address"``
-    (``index`` is the bit, 0 the least significant), ``"converter"`` (``index`` 0: each pad has one channel), ``"bus"``
-    (``index`` 0: the pad is one bus) or ``"group"`` (``index`` counts the groups of the layout, ``name`` is that of the
+    (``index`` is the bit, 0 the least significant), ``"converter"`` (``index`` 0: each pad has one channel),
+    ``"position"`` (all axes of one position, counted row by row), ``"bus"`` (``index`` 0: the pad is one bus) or ``"group"`` (``index`` counts the groups of the layout, ``name`` is that of the
     group, and ``pad`` the pad of its first cell).
     """
 
@@ -50,6 +50,8 @@ class Line:
                 return f"pad {self.pad}, column address bit {self.index}"
             case "converter":
                 return f"pad {self.pad}, converter channel"
+            case "position":
+                return f"pad {self.pad}, position {self.index}"
             case "bus":
                 return f"pad {self.pad}, bus"
             case "group":
@@ -76,6 +78,9 @@ class SensorLayout:
         groups: cells that share a fate, as a chip, triangle, patch, board or connector: lists of cells or of the names
             of other groups, by name. Two groups are disjoint, or one contains the other. With groups, causes are
             groups and cells, and no rows or columns, whatever ``wiring`` says.
+        axes: readings of one position, as 3 of a magnetic taxel. Each axis is a cell of its own; D is ``pads * rows *
+            cols * axes``, and the axis runs last. A dead axis is a faulty cell, a dead position is one cause with all
+            its axes. There are no rows and columns of wires then, and ``rest="learn"`` means ``"middle"``.
         rest: what a cell reads without load: ``"low"``: its lower end, and load raises it; ``"high"``: its upper end,
             and load lowers it; ``"middle"``: in between, and load moves it either way; ``"learn"``: whichever the
             healthy recordings show, ``"low"`` without any.
@@ -94,10 +99,11 @@ class SensorLayout:
     present: NDArray[np.bool_] = field(default=None, kw_only=True, repr=False)  # type: ignore[arg-type]
     wiring: Wiring = field(default="matrix", kw_only=True)
     groups: Mapping[str, Sequence[int | str]] | None = field(default=None, kw_only=True, repr=False)
+    axes: int = field(default=1, kw_only=True)
     rest: Rest = field(default="learn", kw_only=True)
 
     def __post_init__(self) -> None:
-        for name in ("pads", "rows", "cols"):
+        for name in ("pads", "rows", "cols", "axes"):
             size = getattr(self, name)
             if not isinstance(size, int | np.integer) or isinstance(size, bool) or size < 1:
                 raise ValueError(f"a layout needs {name} >= 1, a whole number; got {size!r}")
@@ -112,6 +118,8 @@ class SensorLayout:
         if not isinstance(self.unit, str):
             raise ValueError(f"a layout needs the name of a unit; got {self.unit!r}")
         present = np.ones(self.shape, bool) if self.present is None else np.array(self.present, bool)
+        if self.axes > 1 and present.size * self.axes == self.n_cells:
+            present = np.repeat(present.ravel(), self.axes)
         if present.size != self.n_cells:
             raise ValueError(
                 f"present has shape {present.shape}, the layout {self.shape}: give one bool for each position"
@@ -137,26 +145,27 @@ class SensorLayout:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """``(pads, rows, cols)``."""
-        return self.pads, self.rows, self.cols
+        """``(pads, rows, cols * axes)``: how cells are laid out as a grid."""
+        return self.pads, self.rows, self.cols * self.axes
 
     @property
     def n_cells(self) -> int:
-        """D, the number of positions: ``pads * rows * cols``."""
-        return self.pads * self.rows * self.cols
+        """D, the number of positions times axes: ``pads * rows * cols * axes``."""
+        return self.pads * self.rows * self.cols * self.axes
 
-    def cell(self, pad: int, row: int, col: int) -> int:
+    def cell(self, pad: int, row: int, col: int, axis: int = 0) -> int:
         """Return the index of the cell at a position; IndexError names what is out of range."""
-        for name, value, size in zip(("pad", "row", "col"), (pad, row, col), self.shape, strict=True):
+        sizes = self.pads, self.rows, self.cols, self.axes
+        for name, value, size in zip(("pad", "row", "col", "axis"), (pad, row, col, axis), sizes, strict=True):
             if not 0 <= value < size:
                 raise IndexError(f"{name} {value} is outside this layout: use 0 to {size - 1}")
-        return int((pad * self.rows + row) * self.cols + col)
+        return int(((pad * self.rows + row) * self.cols + col) * self.axes + axis)
 
     def position(self, cell: int) -> tuple[int, int, int]:
         """Return ``(pad, row, col)`` of a cell; IndexError if the layout has no such cell."""
         if not 0 <= cell < self.n_cells:
             raise IndexError(f"cell {cell} is outside this layout: it has {self.n_cells} cells, numbered from 0")
-        pad, rest = divmod(int(cell), self.rows * self.cols)
+        pad, rest = divmod(int(cell) // self.axes, self.rows * self.cols)
         return (pad, *divmod(rest, self.cols))
 
     @cached_property
@@ -179,13 +188,17 @@ class SensorLayout:
     @property
     def is_matrix(self) -> bool:
         """Whether the cells are read through rows and columns."""
-        return self.wiring == "matrix" and self.groups is None
+        return self.wiring == "matrix" and self.groups is None and self.axes == 1
 
     @cached_property
     def _wires(self) -> dict[Line, NDArray[np.intp]]:
         """The cells of each bus and group, by line, an inner one before those that contain it."""
-        size = self.rows * self.cols
+        size = self.rows * self.cols * self.axes
         served = {}
+        if self.axes > 1:
+            for cell in range(0, self.n_cells, self.axes):
+                line = Line(cell // size, "position", cell % size // self.axes)
+                served[line] = np.arange(cell, cell + self.axes)
         if self.wiring == "bus":
             served = {Line(pad, "bus", 0): np.arange(pad * size, (pad + 1) * size) for pad in range(self.pads)}
         if self.groups is not None:
@@ -198,10 +211,15 @@ class SensorLayout:
         return {cell: line for line in reversed(self._wires) for cell in self._wires[line].tolist()}
 
     def place(self, cell: int) -> str:
-        """Return where a cell is, in words: "pad 0, row 4, column 5", or "triangle 7, cell 72" with declared wiring."""
+        """Return where a cell is, in words: "pad 0, row 4, column 5", or "triangle 7, cell 72" with declared wiring.
+
+        With several axes: "pad 0, position 24, axis 2 (cell 74)".
+        """
         pad, row, col = self.position(cell)
         if self.is_matrix:
             return f"pad {pad}, row {row}, column {col}"
+        if self.axes > 1:
+            return f"pad {pad}, position {row * self.cols + col}, axis {cell % self.axes} (cell {cell})"
         line = self._innermost.get(cell)
         return f"{line if line and line.kind == 'group' else f'pad {pad}'}, cell {cell}"
 
@@ -289,7 +307,7 @@ class SensorLayout:
             frames = np.asarray(recording, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{name}: expected numbers [T, {self.n_cells}] ({error})") from None
-        if frames.ndim == 4 and frames.shape[1:] == self.shape:
+        if frames.shape[1:] in (self.shape, (self.pads, self.rows, self.cols, self.axes)):
             frames = frames.reshape(len(frames), -1)
         if frames.ndim != 2 or frames.shape[1] != self.n_cells:
             grid = f"{self.pads}, {self.rows}, {self.cols}"
@@ -341,7 +359,8 @@ class SensorLayout:
 
     def __str__(self) -> str:
         masked = self.n_cells - int(self.present.sum())
-        text = f"{self.pads} x {self.rows} x {self.cols} cells, 0..{self.full_scale:g} {self.unit}, {self.rate:g} Hz"
+        axes = f" x {self.axes} axes" if self.axes > 1 else ""
+        text = f"{self.pads} x {self.rows} x {self.cols} cells{axes}, 0..{self.full_scale:g} {self.unit}, {self.rate:g} Hz"
         return f"{text}, {masked} position{'s' if masked > 1 else ''} masked" if masked else text
 
     def _key(self) -> tuple[Any, ...]:
@@ -350,7 +369,7 @@ class SensorLayout:
         return (*self.shape, self.full_scale, self.unit, self.rate, self.present.tobytes(), groups, *declared)
 
 
-_DEFAULTS = {"wiring": "matrix", "rest": "learn"}
+_DEFAULTS = {"wiring": "matrix", "axes": 1, "rest": "learn"}
 
 
 def address_bits(wires: int) -> int:

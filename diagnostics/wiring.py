@@ -14,7 +14,9 @@ if TYPE_CHECKING:
 
 Cells = NDArray[np.intp]
 
+_OUTSIDE = {"position": 0, "bus": 2}
 _ACTIONS = {
+    "position": "check the chip and the solder joints of {}",
     "connector": "reseat {}",
     "bus": "check the cable and the connectors of {}",
     "board": "check the supply and the connector of {}",
@@ -69,8 +71,9 @@ def nested(served: Mapping[Line, Cells]) -> dict[Line, Cells]:
     Raises:
         ValueError: two lines overlap, and neither contains the other.
     """
-    # Of two lines with the same cells a group is within a bus, and the earlier group is the inner one.
-    order = sorted(served, key=lambda line: (len(served[line]), line.kind == "bus", line.index))
+    # Of two lines with the same cells a group is within a bus, a position within a group, and the earlier group is the
+    # inner one.
+    order = sorted(served, key=lambda line: (len(served[line]), _OUTSIDE.get(line.kind, 1), line.index))
     inner: dict[int, Line] = {}
     for line in reversed(order):
         outer = {inner.get(cell) for cell in served[line].tolist()}
@@ -84,7 +87,7 @@ def nested(served: Mapping[Line, Cells]) -> dict[Line, Cells]:
 
 def action(line: Line) -> str:
     """Return what to do about a dead bus or group: "reseat connector J3"."""
-    return _ACTIONS.get("bus" if line.kind == "bus" else _word(line).lower(), "check the wiring of {}").format(line)
+    return _ACTIONS.get(_word(line).lower(), "check the wiring of {}").format(line)
 
 
 def counted(parts: Sequence[Line]) -> str:
@@ -95,5 +98,5 @@ def counted(parts: Sequence[Line]) -> str:
 
 
 def _word(line: Line) -> str:
-    match = re.match(r"[^\W\d_]+", "bus" if line.kind == "bus" else line.name)
+    match = re.match(r"[^\W\d_]+", line.name or line.kind)
     return match.group() if match else ""

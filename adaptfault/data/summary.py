@@ -122,7 +122,7 @@ class Summary:
 
         layout = self.layout
         figure, axes = pads_figure(layout, n_rows=2)
-        size = layout.rows * layout.cols
+        size = layout.rows * layout.shape[2]
         for (name, values), row in zip({"mean": self.mean, "peak": self.highest}.items(), axes, strict=True):
             shown = np.where(layout.present.ravel(), values, np.nan)
             top = _most(shown) or layout.full_scale

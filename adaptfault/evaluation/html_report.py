@@ -84,7 +84,7 @@ def _draw_maps(result: DemoResult) -> Figure:
     for (name, values), row in zip(masked.items(), axes, strict=True):
         dead = marks.get(name, result.diagnosis.fault_set)
         for pad, ax in enumerate(row):
-            size = layout.rows * layout.cols
+            size = layout.rows * layout.shape[2]
             on_pad = [c - pad * size for c in dead if c // size == pad]
             image = draw_forces(ax, layout.grid(values)[pad], layout, on_pad, vmin=0, vmax=top, cmap="viridis")
             ax.set_title(f"{name}, pad {pad}", fontsize=9)

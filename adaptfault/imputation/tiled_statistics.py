@@ -115,7 +115,7 @@ class TiledStatistics:
         The biased autocorrelation, which is positive semidefinite, by the Wiener-Khinchin theorem.
         """
         layout = self.layout
-        size = layout.rows + _REACH, layout.cols + _REACH
+        size = layout.rows + _REACH, layout.shape[2] + _REACH
         power = np.zeros((size[0], size[1] // 2 + 1))
         which = evenly(len(self.frames), _POOLED_FRAMES)
         for index in which:
@@ -127,7 +127,7 @@ class TiledStatistics:
 
     def prior(self, cells: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the pooled covariance ``[n, n]`` of cells of one tile."""
-        row, col = cells // self.layout.cols % self.layout.rows, cells % self.layout.cols
+        row, col = cells // self.layout.shape[2] % self.layout.rows, cells % self.layout.shape[2]
         centre = _REACH - 1
         return np.asarray(self.pooled[row[:, None] - row + centre, col[:, None] - col + centre])
 
@@ -250,7 +250,7 @@ def _averages(fault_set: FaultSet, layout: SensorLayout) -> Floats:
     """Return ``[D-k, pads]``, the map from healthy cells to the mean of each pad; 0 columns unless pads are few."""
     if not 2 <= layout.pads <= _MOST_PADS or not len(fault_set.healthy):
         return np.zeros((layout.n_cells - len(fault_set), 0), np.float32)
-    pad = fault_set.healthy // (layout.rows * layout.cols)
+    pad = fault_set.healthy // (layout.rows * layout.shape[2])
     of_pad = (pad[:, None] == np.arange(layout.pads)).astype(np.float32)
     averages: Floats = of_pad / np.maximum(of_pad.sum(axis=0), 1)
     return averages

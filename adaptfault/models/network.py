@@ -121,14 +121,14 @@ class TactileTransformer(nn.Module):
         if init not in ("torch", "glorot"):
             raise ValueError(f"unknown init {init!r}: use 'torch' or 'glorot'")
         lost = 0 if padding == "same" else 2 * len(FILTERS)  # each unpadded 3 x 3 takes one cell from every edge
-        if min(layout.rows, layout.cols) <= lost:
+        if min(layout.shape[1:]) <= lost:
             raise ValueError(
-                f"padding 'valid' needs pads of 5 x 5, these have {layout.rows} x {layout.cols}: use 'same'"
+                f"padding 'valid' needs pads of 5 x 5, these have {layout.rows} x {layout.shape[2]}: use 'same'"
             )
         self.layout, self.n_classes, self.length = layout, n_classes, length
         self.padding, self.init, self.p_dropout, self.seed = padding, init, dropout, seed
         self.register_buffer("present", torch.from_numpy(layout.present.ravel().copy()), persistent=False)
-        d = FILTERS[-1] * (layout.rows - lost) * (layout.cols - lost)
+        d = FILTERS[-1] * (layout.rows - lost) * (layout.shape[2] - lost)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
             self.conv1 = nn.Conv2d(layout.pads, FILTERS[0], 3, padding=padding)

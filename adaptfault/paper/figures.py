@@ -151,7 +151,7 @@ def force_maps(
         maps[f"{len(cells)} {name}"] = normal.copy()
         maps[f"{len(cells)} {name}"][cells] = value
     figure, axes = pads_figure(layout, n_rows=len(maps))
-    size = layout.rows * layout.cols
+    size = layout.rows * layout.shape[2]
     # One scale from the healthy map; shorts exceed it.
     top = float(normal[present].max()) or layout.full_scale
     for i, (name, values) in enumerate(maps.items()):

@@ -36,7 +36,7 @@ def draw(layout: SensorLayout, verdicts: NDArray[np.intp], letters: Mapping[int,
         ax.set_title(f"pad {pad}")
         _ticks(ax, layout)
     for cell, letter in letters.items():
-        pad, row, col = layout.position(cell)
+        pad, row, col = np.unravel_index(cell, layout.shape)
         axes[0, pad].text(col, row, letter, ha="center", va="center", color="white", fontsize=8)
     legend = {"alive": _ALIVE, "faulty": _FAULTY, "untested": _UNTESTED}
     figure.legend(
@@ -52,7 +52,7 @@ def draw_forces(ax: Axes, values: ArrayLike, layout: SensorLayout, dead: Iterabl
     """
     image = ax.imshow(np.asarray(values), **imshow)
     for position in dead:
-        row, col = divmod(position, layout.cols)
+        row, col = divmod(position, layout.shape[2])
         ax.plot(col, row, "x", color="#e74c3c", markersize=6, markeredgewidth=1.6)
     _ticks(ax, layout)
     return image
@@ -63,12 +63,12 @@ def pads_figure(layout: SensorLayout, *, n_rows: int) -> tuple[Figure, Any]:
     from matplotlib.figure import Figure
 
     height = float(np.clip(layout.rows * 0.28, 1.8, 8.0))
-    width = float(np.clip(layout.cols * 0.28, 1.8, 8.0))
+    width = float(np.clip(layout.shape[2] * 0.28, 1.8, 8.0))
     figure = Figure(figsize=(layout.pads * (width + 0.5) + 1.2, n_rows * (height + 0.5) + 0.6), layout="constrained")
     return figure, figure.subplots(n_rows, layout.pads, squeeze=False)
 
 
 def _ticks(ax: Axes, layout: SensorLayout) -> None:
-    ax.set_xticks(range(0, layout.cols, max(1, layout.cols // 8)))
+    ax.set_xticks(range(0, layout.shape[2], max(1, layout.shape[2] // 8)))
     ax.set_yticks(range(0, layout.rows, max(1, layout.rows // 8)))
     ax.tick_params(length=0, labelsize=7)

@@ -111,7 +111,7 @@ class Diagnosis:
         for fault in self.faults:
             signs[list(fault.cells)] = LETTERS[fault.kind]
         grid = self.layout.grid(np.where(self.layout.present.ravel(), signs, " "))
-        width = max(2 * self.layout.cols - 1, len(f"pad {self.layout.pads - 1}"))
+        width = max(2 * self.layout.shape[2] - 1, len(f"pad {self.layout.pads - 1}"))
         lines = ["   ".join(["    ", *(f"pad {p}".ljust(width) for p in range(self.layout.pads))]).rstrip()]
         for row in range(self.layout.rows):
             cells = [" ".join(grid[pad, row]).ljust(width) for pad in range(self.layout.pads)]

@@ -72,6 +72,10 @@ class CellFindings:
     known: Mask
     zero: Mask | None = None
 
+    def of(self, cells: NDArray[np.intp]) -> CellFindings:
+        """Return the findings in the order of ``cells``."""
+        return CellFindings(**{name: None if of is None else of[cells] for name, of in vars(self).items()})
+
 
 def root_causes(found: CellFindings, aliasings: Sequence[Aliasing], layout: SensorLayout) -> tuple[Fault, ...]:
     """Return the root causes of the faulty cells, one fault each, the one with most cells first."""
@@ -239,7 +243,7 @@ def _reason(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayou
         return f"{layout.place(fault.cells[0])} is {fault.kind}: it {does}{since}{whatever}{already}; check {check}"
     inferred = len(cause.cells) - len(cause.seen)
     are = "is" if inferred == 1 else "are"
-    if fault.line.kind in ("bus", "group"):
+    if fault.line.kind in ("position", "bus", "group"):
         silent = "are silent" if found.silent[fault.cells[0]] else f"are {fault.kind}: each cell {does}"
         also = f"; {inferred} of the cells, not tested, {are} inferred" if inferred else ""
         return f"{action(fault.line)}: {_behind(fault, layout)} {silent}{since}{already}{also}"
@@ -256,7 +260,9 @@ def _behind(fault: Fault, layout: SensorLayout) -> str:
     if len(fault.cells) < cells:
         return f"{len(fault.cells)} of {cells} cells on it"
     parts = layout.parts(fault.line)
-    return f"all {counted(parts)} behind it" if len(parts) > 1 else f"all {cells} cells on it"
+    if len(parts) > 1:
+        return f"all {counted(parts)} behind it"
+    return f"all {cells} {'axes' if fault.line.kind == 'position' else 'cells'} on it"
 
 
 def _span(fault: Fault, layout: SensorLayout) -> str:

@@ -69,6 +69,7 @@ class StreamState:
         exclusion: when a cell is excluded from the predictors.
         needed: bool ``[D]``, the cells to be scored; None: all. Tiles without such a cell are skipped.
         load: how readings become loads; None: they are.
+        order: int ``[D]``, which reading of a frame each cell is; None: they are in order.
 
     Attributes:
         transport: lost and repeated frames.
@@ -89,6 +90,7 @@ class StreamState:
         exclusion: Exclusion,
         needed: Mask | None = None,
         load: LoadDirection | None = None,
+        order: Cells | None = None,
     ) -> None:
         model = reference.model
         every = tiles(layout) if model is None else tuple(Tile(r.inputs, r.outputs) for r in model.local_regressions)
@@ -96,7 +98,7 @@ class StreamState:
         self.tiled = len(every) > 1
         self.exclusion = exclusion._replace(threshold=_EXCLUDED) if self.tiled else exclusion
         self.present = layout.present.ravel()
-        self.load, self.below = load, np.zeros(layout.n_cells, bool)
+        self.order, self.load, self.below = order, load, np.zeros(layout.n_cells, bool)
         self.transport = TransportState()
         self.runs = ConstantRuns.begin(layout.n_cells)
         self.local = TiledEvents.begin(every if self.tiled else tiles(layout), needed)
@@ -120,6 +122,8 @@ class StreamState:
 
     def extend(self, frames: NDArray[np.float64]) -> bool:
         """Take in frames ``[t, D]`` of readings; return whether a segment was completed."""
+        if self.order is not None:
+            frames = frames[:, self.order]
         if self.load is not None:
             side = np.where(np.isnan(frames), self.below, frames < self.load.rest)
             self.below = side[-1].astype(bool) if len(side) else self.below

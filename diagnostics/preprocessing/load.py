@@ -52,10 +52,11 @@ class LoadDirection:
     @classmethod
     def declared(cls, layout: SensorLayout) -> LoadDirection | None:
         """Return the direction without any recording: cells that rest in the middle rest at half of full scale."""
-        if layout.rest not in ("high", "middle"):
+        direction = "middle" if layout.axes > 1 and layout.rest == "learn" else layout.rest
+        if direction not in ("high", "middle"):
             return None
-        share = 1.0 if layout.rest == "high" else 0.5
-        return cls(layout.rest, np.full(layout.n_cells, share * layout.full_scale), layout.full_scale)
+        share = 1.0 if direction == "high" else 0.5
+        return cls(direction, np.full(layout.n_cells, share * layout.full_scale), layout.full_scale)
 
     @classmethod
     def fit(cls, recordings: Sequence[NDArray[Any]], layout: SensorLayout) -> LoadDirection | None:
@@ -63,7 +64,8 @@ class LoadDirection:
         if layout.rest in ("low", "high"):
             return cls.declared(layout)
         readings = RecordingBlocks.of(recordings)
-        direction = layout.rest if layout.rest == "middle" else _learned(readings, layout)
+        both_ways = layout.rest == "middle" or layout.axes > 1
+        direction = "middle" if both_ways else _learned(readings, layout)
         if direction != "middle":
             return cls.declared(replace(layout, rest=direction))
         cells, rest = np.arange(layout.n_cells), np.full(layout.n_cells, 0.5 * layout.full_scale)

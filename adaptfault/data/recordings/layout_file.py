@@ -82,6 +82,7 @@ def read_layout(path: str | PathLike[str]) -> SensorLayout:
         ("pads", int),
         ("rows", int),
         ("cols", int),
+        ("axes", int),
         ("full_scale", float),
         ("rate", float),
         ("unit", str),
@@ -90,8 +91,8 @@ def read_layout(path: str | PathLike[str]) -> SensorLayout:
             kind_name = {int: "a whole number", float: "a number", str: "text"}[kind]
             what = f"field {name!r}: expected {kind_name}, got {shown(str(document[name]))}; correct it"
             raise InputError.at(path, what)
-    sizes = [document.get(name, 1) for name in ("pads", "rows", "cols")]
-    if sizes[0] * sizes[1] * sizes[2] > MOST_CELLS:
+    sizes = [document.get(name, 1) for name in ("pads", "rows", "cols", "axes")]
+    if sizes[0] * sizes[1] * sizes[2] * sizes[3] > MOST_CELLS:
         raise InputError.at(path, f"fields 'pads', 'rows', 'cols': more than {MOST_CELLS} cells; check the sizes")
     if "present" in document and not (_are_bools(document["present"]) and _is_regular(document["present"])):
         raise InputError.at(path, "field 'present': expected lists [pads][rows][cols] of true and false; correct it")

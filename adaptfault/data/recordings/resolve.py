@@ -19,7 +19,7 @@ from diagnostics import SensorLayout
 if TYPE_CHECKING:
     from adaptfault.data.calibration import Calibration
 
-_KEPT = "present", "wiring", "groups", "rest"
+_KEPT = "present", "wiring", "groups", "axes", "rest"
 """What a layout states besides the shape and what the options override."""
 
 _SAME_RATE = 0.05
@@ -98,7 +98,8 @@ def resolve_layout(
     try:
         usual = "N" if tables is not None else default_unit(float(stated["full_scale"]), shape, contents)
         stated["unit"] = stated["unit"] or usual
-        layout = SensorLayout(*shape, **{name: value for name, value in stated.items() if value is not None})
+        sizes = (array.pads, array.rows, array.cols) if isinstance(array, SensorLayout) else shape
+        layout = SensorLayout(*sizes, **{name: value for name, value in stated.items() if value is not None})
     except (TypeError, ValueError) as error:
         raise InputError(f"layout: {error}; correct the option") from None
     measured = next((c.rate_reason for c in contents if c.rate_reason and c.rate == stated["rate"]), "")

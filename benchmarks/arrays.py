@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import gestures
@@ -72,6 +72,30 @@ def grasps(layout: SensorLayout) -> Callable[[int, int], Recordings]:
     return lambda count, seed: simulate(-(-count // 7), layout, n_frames=60, seed=seed)
 
 
+def triangles(rows: int, cols: int) -> SensorLayout:
+    """Return a skin of triangles of 10 cells, 4 of them behind a connector, as of ``rows`` x ``cols`` blocks."""
+    wide, groups = 5 * cols, {}
+    for r in range(rows):
+        for c in range(cols):
+            cells = [(2 * r + i) * wide + 5 * c + j for i in range(2) for j in range(5)]
+            groups[f"triangle {cols * r + c}"] = cells
+    names = list(groups)
+    groups |= {f"connector J{i}": names[4 * i : 4 * i + 4] for i in range(len(names) // 4)}
+    return SensorLayout(1, 2 * rows, wide, groups=groups)
+
+
+def on_buses(split: int, repeat: int, logs: int) -> Bench:
+    """Return the fingertips with their true wiring."""
+    recordings = load(DATA / FINGERTIPS).recordings
+    return Bench(replace(recordings, layout=replace(recordings.layout, wiring="bus")), split, logs, repeat)
+
+
+def wired(layout: SensorLayout) -> Callable[[int, int], Recordings]:
+    """Return simulated grasps of an array with declared wiring."""
+    plain = grasps(replace(layout, groups=None))
+    return lambda count, seed: replace(plain(count, seed), layout=layout)
+
+
 ARRAYS = [
     Array("hand", EVERY, real(HAND), 50, 2, 40, (*MAIN, "lines", "calibration", "cold"), HAND),
     Array(
@@ -79,6 +103,7 @@ ARRAYS = [
         (*MAIN, "many", "cold", "reference_faults", "holds", "untouched", "calibration", "rewired", "transport"),
         real(FINGERTIPS), 60, 2, 40, (*MAIN, "cold"), FINGERTIPS,
     ),
+    Array("fingertips, buses", (*MAIN, "groups"), on_buses, 60, 1, 40, (*MAIN, "groups"), FINGERTIPS),
     Array(
         "soles",
         (

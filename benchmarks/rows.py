@@ -257,6 +257,36 @@ def lines(bench: Bench) -> Iterator[Count]:
     yield Count("  lines invented in a log", invented, bench.count, higher=False)
 
 
+def groups(bench: Bench) -> Iterator[Count]:
+    """Two dead buses or groups, inner or outer ones, and single cells: are they named, and nothing else?"""
+    layout, named, asked, invented, healthy = bench.layout, 0, 0, 0, 0
+    sets = {line: set(layout.cells_on(line).tolist()) for line in layout.lines}
+    for seed, log, rng in bench.logs():
+        healthy += sum(fault.line is not None for fault in bench.fitted.diagnose(log).faults)
+        first = layout.lines[rng.integers(len(layout.lines))]
+        choice = [line for line in layout.lines if sets[line].isdisjoint(sets[first])]
+        dead = [first, choice[rng.integers(len(choice))]]
+        behind = sets[dead[0]] | sets[dead[1]]
+        whole = {line for line in layout.lines if sets[line] <= behind}
+        faults = [fault for fault in draw_faults(layout, 0.04, STUCK_KINDS, rng) if behind.isdisjoint(fault.cells)]
+        seen = list(broken(log, faults, layout, 0.0, 0.0, seed))
+        for line in dead:
+            silent = rng.random() < 0.5
+            value = np.nan if silent else layout.full_scale * rng.integers(2)
+            for frames in seen:
+                frames[:, layout.cells_on(line)] = value
+        touched = differs(np.concatenate(log), np.concatenate(seen), layout).sum(axis=0) >= TESTABLE
+        found = {fault.line for fault in bench.fitted.diagnose(seen).faults if fault.line is not None}
+        for line in dead:
+            unread = np.isnan(seen[0][:, layout.cells_on(line)]).all()
+            if unread or touched[layout.cells_on(line)].sum() >= 3:
+                asked, named = asked + 1, named + (line in found)
+        invented += len(found - whole)
+    yield Count("2 dead groups + 4 % of the cells: named", named, asked)
+    yield Count("  other groups named in a log", invented, bench.count, higher=False)
+    yield Count("  groups named in a healthy log", healthy, bench.count, higher=False)
+
+
 def cut(bench: Bench) -> Iterator[Count]:
     layout, exact, asked = bench.layout, 0, 0
     for seed, log, rng in bench.logs():

@@ -76,10 +76,7 @@ class Fault:
 
     def describe(self, layout: SensorLayout) -> str:
         """Return place and kind in a few words: "pad 0, row 4, column 5: stuck at 2.5 N"."""
-        if self.line is not None:
-            where = str(self.line)
-        else:
-            where = "; ".join(layout.place(cell) for cell in self.cells)
+        where = str(self.line) if self.line is not None else "; ".join(layout.place(cell) for cell in self.cells)
         at = "" if self.value is None or self.kind is FaultKind.ALIAS else f" at {self.value:.4g} {layout.unit}"
         return f"{where}: {self.kind}{at}"
 

@@ -27,8 +27,9 @@ class Line:
 
     ``kind`` is ``"row"`` or ``"column"`` (``index`` counts the wires), ``"row_address"`` or ``"column_address"``
     (``index`` is the bit, 0 the least significant), ``"converter"`` (``index`` 0: each pad has one channel),
-    ``"position"`` (all axes of one position, counted row by row), ``"bus"`` (``index`` 0: the pad is one bus) or ``"group"`` (``index`` counts the groups of the layout, ``name`` is that of the
-    group, and ``pad`` the pad of its first cell).
+    ``"position"`` (all axes of one position, counted row by row), ``"bus"`` (``index`` 0: the pad is one bus)
+    or ``"group"`` (``index`` counts the groups of the layout, ``name`` is that of the group, and ``pad`` the pad of its
+    first cell).
     """
 
     pad: int
@@ -74,7 +75,8 @@ class SensorLayout:
         unit: name of the unit of recordings.
         rate: frames per second.
         present: bool ``[pads, rows, cols]`` (or flat ``[D]``); None means every position is a cell.
-        wiring: ``"matrix"``: each pad has row and column wires; ``"bus"``: each pad is one bus without rows and columns.
+        wiring: ``"matrix"``: each pad has row and column wires; ``"bus"``: each pad is one bus, without rows and
+            columns.
         groups: cells that share a fate, as a chip, triangle, patch, board or connector: lists of cells or of the names
             of other groups, by name. Two groups are disjoint, or one contains the other. With groups, causes are
             groups and cells, and no rows or columns, whatever ``wiring`` says.
@@ -135,7 +137,11 @@ class SensorLayout:
                 raise ValueError(f"{name} is one of {', '.join(choices)}; got {getattr(self, name)!r}{also}")
         if self.groups is not None:
             members_of = members(self.groups, self.n_cells)
-            object.__setattr__(self, "groups", {name: tuple(x if isinstance(x, str) else int(x) for x in self.groups[name]) for name in members_of})
+            object.__setattr__(
+                self,
+                "groups",
+                {name: tuple(x if isinstance(x, str) else int(x) for x in self.groups[name]) for name in members_of},
+            )
         _ = self._wires  # raises ValueError for groups that overlap
 
     @classmethod
@@ -226,7 +232,7 @@ class SensorLayout:
     def parts(self, line: Line) -> tuple[Line, ...]:
         """Return the groups directly within a bus or group that together hold all its cells; none if there are none."""
         own = set(self.cells_on(line).tolist())
-        within = []
+        within: list[Line] = []
         for other in self.lines[: self.lines.index(line)][::-1]:
             cells = set(self.cells_on(other).tolist())
             if cells and cells < own and not any(cells <= set(self.cells_on(w).tolist()) for w in within):
@@ -360,7 +366,9 @@ class SensorLayout:
     def __str__(self) -> str:
         masked = self.n_cells - int(self.present.sum())
         axes = f" x {self.axes} axes" if self.axes > 1 else ""
-        text = f"{self.pads} x {self.rows} x {self.cols} cells{axes}, 0..{self.full_scale:g} {self.unit}, {self.rate:g} Hz"
+        text = (
+            f"{self.pads} x {self.rows} x {self.cols} cells{axes}, 0..{self.full_scale:g} {self.unit}, {self.rate:g} Hz"
+        )
         return f"{text}, {masked} position{'s' if masked > 1 else ''} masked" if masked else text
 
     def _key(self) -> tuple[Any, ...]:

@@ -34,7 +34,8 @@ def members(groups: Any, n_cells: int) -> dict[str, Cells]:
         n_cells: number of cells of the array.
 
     Raises:
-        ValueError: not such a mapping, an empty group, a group that contains itself, a cell or a name that is not there.
+        ValueError: not such a mapping, an empty group, a group that contains itself, a cell or a name that is not
+            there.
     """
     if not isinstance(groups, Mapping) or not all(isinstance(name, str) and name for name in groups):
         raise ValueError(f"groups are lists of cells or of names of groups, by name; got {str(groups)[:60]}")

@@ -26,7 +26,7 @@ _GROUPS = {
     "addresses": ("row_address", "column_address"),
     "converter": ("converter",),
 }
-_DECLARED = {"groups": ("bus", "group")}
+_DECLARED: dict[str, tuple[str, ...]] = {"groups": ("position", "bus", "group")}
 
 
 class Level(IntEnum):
@@ -44,9 +44,9 @@ def diagnostic_array(
     """Return a DiagnosticArray: one status for each pad, each group of its wires, and the stream of frames.
 
     The names depend on the layout only: "tactile: pad 0", "tactile: pad 0 rows" (``columns``, ``addresses``,
-    ``converter``; with declared wiring ``groups``), ..., "tactile: stream". Single faulty cells of a pad are a WARN; a tenth of its cells, or a wire, is
-    an ERROR, also of the wire's group. Lost or frozen frames are a WARN of the stream. Untested cells are counted in
-    the values and do not change the level.
+    ``converter``; with declared wiring ``groups``), ..., "tactile: stream". Single faulty cells of
+    a pad are a WARN; a tenth of its cells, or a wire, is an ERROR, also of the wire's group. Lost or frozen frames are
+    a WARN of the stream. Untested cells are counted in the values and do not change the level.
 
     Args:
         diagnosis: to convert.
@@ -75,7 +75,11 @@ def stale_array(
     hardware_id: str = "tactile",
 ) -> dict[str, Any]:
     """Return the same statuses, all STALE with this message, for a sensor that sends no frames."""
-    names = [one for pad in range(layout.pads) for one in (f"pad {pad}", *(f"pad {pad} {group}" for group in _groups(layout)))]
+    names = [
+        one
+        for pad in range(layout.pads)
+        for one in (f"pad {pad}", *(f"pad {pad} {group}" for group in _groups(layout)))
+    ]
     statuses = [_status(one, Level.STALE, message, {}) for one in (*names, "stream")]
     return _array(statuses, stamp, name, hardware_id)
 
@@ -110,7 +114,9 @@ def _groups(layout: SensorLayout) -> dict[str, tuple[str, ...]]:
 
 def _pad(diagnosis: Diagnosis, pad: int, faults: list[Fault]) -> dict[str, Any]:
     layout = diagnosis.layout
-    cells = np.flatnonzero(layout.present.ravel() & (np.arange(layout.n_cells) // (layout.rows * layout.shape[2]) == pad))
+    cells = np.flatnonzero(
+        layout.present.ravel() & (np.arange(layout.n_cells) // (layout.rows * layout.shape[2]) == pad)
+    )
     faulty = [cell for cell in diagnosis.fault_set if cell in set(cells.tolist())]
     untested = np.intersect1d(diagnosis.coverage.untested, cells).size
     tested = 1 - untested / max(1, cells.size)

@@ -77,7 +77,9 @@ def device(args: argparse.Namespace) -> str:
 def add_array(parser: argparse.ArgumentParser, *, calibration: bool = True) -> argparse._ArgumentGroup:
     """Add the options that describe the array; returns their group."""
     group = parser.add_argument_group("how recordings are read" if calibration else "the array")
-    group.add_argument("--layout", metavar="FILE", help="layout of the array, its wiring and direction of load: a JSON or TOML file")
+    group.add_argument(
+        "--layout", metavar="FILE", help="layout of the array, its wiring and direction of load: a JSON or TOML file"
+    )
     group.add_argument("--shape", metavar="PxRxC", help="shape: pads x rows x columns, as 2x13x6; 10x10 is one pad")
     group.add_argument("--full-scale", type=float, metavar="X", help="largest value a cell can report")
     group.add_argument("--unit", metavar="U", help="unit of the recordings, as N or count")

@@ -84,7 +84,9 @@ def _advice_by_group(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple
     cells: dict[str, list[int]] = {}
     for cell in np.flatnonzero(untested).tolist():
         cells.setdefault(layout.place(cell).rpartition(", ")[0], []).append(cell)
-    named = {where: ", ".join(map(str, some[:_NAMED])) + ", ..." * (len(some) > _NAMED) for where, some in cells.items()}
+    named = {
+        where: ", ".join(map(str, some[:_NAMED])) + ", ..." * (len(some) > _NAMED) for where, some in cells.items()
+    }
     return tuple(
         f"press {where}, {'cell' if len(cells[where]) == 1 else 'cells'} {named[where]} ({len(cells[where])} untested)"
         for where in sorted(cells, key=lambda where: -len(cells[where]))

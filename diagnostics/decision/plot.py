@@ -36,7 +36,7 @@ def draw(layout: SensorLayout, verdicts: NDArray[np.intp], letters: Mapping[int,
         ax.set_title(f"pad {pad}")
         _ticks(ax, layout)
     for cell, letter in letters.items():
-        pad, row, col = np.unravel_index(cell, layout.shape)
+        pad, row, col = (int(i) for i in np.unravel_index(cell, layout.shape))
         axes[0, pad].text(col, row, letter, ha="center", va="center", color="white", fontsize=8)
     legend = {"alive": _ALIVE, "faulty": _FAULTY, "untested": _UNTESTED}
     figure.legend(

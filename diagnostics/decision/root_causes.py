@@ -74,7 +74,7 @@ class CellFindings:
 
     def of(self, cells: NDArray[np.intp]) -> CellFindings:
         """Return the findings in the order of ``cells``."""
-        return CellFindings(**{name: None if of is None else of[cells] for name, of in vars(self).items()})
+        return replace(self, **{name: values[cells] for name, values in vars(self).items() if values is not None})
 
 
 def root_causes(found: CellFindings, aliasings: Sequence[Aliasing], layout: SensorLayout) -> tuple[Fault, ...]:

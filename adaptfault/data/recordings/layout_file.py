@@ -74,7 +74,8 @@ def read_layout(path: str | PathLike[str]) -> SensorLayout:
     A name that ends in ``.toml`` is TOML, any other JSON.
 
     Raises:
-        InputError: the file cannot be read, is no JSON or TOML, or a field is missing, unknown or of a wrong kind; named.
+        InputError: the file cannot be read, is no JSON or TOML, or a field is missing, unknown or of a wrong
+            kind; named.
     """
     path = Path(path)
     document = _read_toml(path) if path.suffix.lower() == ".toml" else read_json_object(path)

@@ -103,7 +103,8 @@ class SelfDiagnosis:
     def rewiring(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Rewiring | None:
         """Return the rows, columns or pads that answer in each other's place, None where the data show none.
 
-        ``Rewiring.undo`` puts the readings back; diagnose and predict with those. Without :meth:`fit` always None.
+        ``Rewiring.undo`` puts the readings back; diagnose and predict with those. Without :meth:`fit`, with
+        several axes and where cells rest in the middle always None.
 
         Args:
             recordings: a log, as for :meth:`diagnose`.
@@ -112,7 +113,13 @@ class SelfDiagnosis:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
         log = _recordings(recordings, self.layout).valid(self.layout.full_scale)
-        return None if self.reference_ is None else find_rewiring(log, self.reference_, self.layout)
+        if self.reference_ is None or self._order is not None:
+            return None
+        if self.load_ is not None:
+            if self.load_.direction == "middle":
+                return None
+            log = RecordingBlocks([self.load_.loads(recording) for recording in log])
+        return find_rewiring(log, self.reference_, self.layout)
 
     def state(self) -> tuple[dict[str, Any], Arrays]:
         """Return the fitted state: a JSON-safe dict and arrays by name, as :meth:`from_state` reads them."""

@@ -1,5 +1,7 @@
 """Swapped, mirrored and shifted wiring, on simulated grasps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -85,3 +87,19 @@ def test_what_the_data_cannot_tell_is_not_reported(fitted, small_grasps):
     assert fitted.rewiring(idle) is None
     assert fitted.rewiring(log(small_grasps, 0)[:1]) is None
     assert SelfDiagnosis(LAYOUT).rewiring(log(small_grasps, 0)) is None
+
+
+def test_where_there_are_no_rows_none_are_exchanged(fitted, small_grasps):
+    wired = exchanged_rows(0, 1, 4)
+    buses = SelfDiagnosis(replace(LAYOUT, wiring="bus"))
+    buses.reference_ = fitted.reference_
+    assert buses.rewiring([frames[:, wired] for frames in log(small_grasps, 0)]) is None
+
+
+def test_exchanged_rows_of_a_sensor_that_rests_high_are_named(fitted, small_grasps):
+    wired = exchanged_rows(0, 1, 4)
+    high = SelfDiagnosis(replace(LAYOUT, rest="high"))
+    high.reference_ = fitted.reference_
+    found = high.rewiring([5.0 - frames[:, wired] for frames in log(small_grasps, 0)])
+    assert found is not None
+    assert found.steps == ("rows 1 and 4 of pad 0 are exchanged",)

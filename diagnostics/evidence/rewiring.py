@@ -193,13 +193,13 @@ def _events(recordings: Sequence[NDArray[np.float64]], scale: Scale) -> list[_Ev
 
 
 def _candidates(layout: SensorLayout, surplus: Floats, source: Cells) -> Iterator[_Candidate]:
-    """Yield the permutations that are tried, each on top of ``source``."""
+    """Yield the permutations that are tried, each on top of ``source``; with declared wiring only exchanged pads."""
     grid, score = layout.grid(np.arange(layout.n_cells)), layout.grid(surplus)
 
     def on_top(changed: NDArray[np.intp], text: str) -> _Candidate:
         return _Candidate(source[changed.ravel()], text)
 
-    for pad in range(layout.pads):
+    for pad in range(layout.pads) if layout.is_matrix else ():
         for axis, kind in enumerate(("row", "column")):
             size = grid.shape[axis + 1]
             of_line = score[pad].sum(axis=1 - axis)

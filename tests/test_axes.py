@@ -27,7 +27,7 @@ def recordings(count: int, seed: int) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    return SelfDiagnosis(TAXELS).fit(recordings(60, 0))
+    return SelfDiagnosis(TAXELS).fit(recordings(40, 0))
 
 
 def test_the_axis_runs_last_and_each_position_is_a_wire():

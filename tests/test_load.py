@@ -107,6 +107,7 @@ def test_readings_that_no_converter_gives_are_missing_in_any_direction(high, log
     assert (fault.kind, fault.frames) == ("invalid", 2)
 
 
+@pytest.mark.slow
 def test_cells_that_rest_in_the_middle_are_diagnosed_and_named_by_what_they_read(low, healthy, log, small_grasps):
     layout = replace(small_grasps.layout, rest="middle")
     fitted = SelfDiagnosis(layout).fit(middled(healthy))

@@ -190,7 +190,7 @@ def test_two_rows_that_read_the_same_are_no_bridge_where_there_are_no_rows(grasp
         frames[:, 60:72] = frames[:, 72:84]
     found = {}
     for name, layout in (("matrix", replace(WIRED, groups=None)), ("bus", replace(WIRED, groups=None, wiring="bus"))):
-        found[name] = SelfDiagnosis(layout).fit(grasps[::2]).diagnose(log).faults
+        found[name] = SelfDiagnosis(layout).diagnose(log).faults
     assert any(fault.kind is FaultKind.ALIAS for fault in found["matrix"])
     assert all(fault.kind is not FaultKind.ALIAS for fault in found["bus"])
 
@@ -205,6 +205,7 @@ def test_the_monitor_names_the_group_and_the_wiring_is_stored(fitted: SelfDiagno
     assert monitor.diagnosis().faults == again.diagnose(log).faults
 
 
+@pytest.mark.slow
 def test_a_dead_bus_is_one_fault(grasps: list[np.ndarray]):
     layout = SensorLayout(3, 4, 12, wiring="bus")
     fitted = SelfDiagnosis(layout).fit(grasps[::2])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,7 @@ class Fitted:
     false_discovery_rate: float
     calibrator: Calibrator
     reference: Reference | None
-    load: LoadDirection | None = None
+    load: LoadDirection | None = field(default=None, metadata={"newer": True})
 
 
 class SelfDiagnosis:

@@ -1,8 +1,7 @@
 """Writes any dataclass of numbers and arrays as JSON and named arrays, and reads it back bit for bit. No pickle.
 
 The types of the fields say how each value is read: numbers, booleans, arrays, other dataclasses and named tuples,
-tuples of these, and ``| None``. A field with the default None may be absent, as in files of
-earlier versions. A :class:`~diagnostics.layout.SensorLayout` is written by its own ``to_dict``.
+tuples of these, and ``| None``. A :class:`~diagnostics.layout.SensorLayout` is written by its own ``to_dict``.
 """
 
 from __future__ import annotations

@@ -41,6 +41,7 @@ SLOW = {  # more than 7 s of CPU time
     "fleet_scaling.py",
     "kill_maintenance.py",
     "picture.py",
+    "relay.py",
     "repair.py",
     "scale_curves.py",
     "wrong_fault_set.py",

@@ -11,8 +11,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from adaptfault.acquisition import FrameRepair
 from adaptfault.acquisition.ros import Level, diagnostic_array, stale_array, write_diagnostics
-from diagnostics import Fault, FaultKind, Line, SelfDiagnosis, SensorLayout, inject, line_fault, lose_frames
+from adaptfault.imputation.restorer import Restorer
+from diagnostics import Fault, FaultKind, FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault, lose_frames
 
 LAYOUT = SensorLayout.paper()
 
@@ -200,3 +202,30 @@ def test_the_node_goes_stale_without_frames_and_comes_back(node, log):
     assert stale["status"][0]["message"] == "no frame for 5 s"
     watch.take(log[40])
     assert set(levels(watch.diagnostics()).values()) == {Level.OK}
+
+
+def test_the_node_restores_known_faults_and_those_that_its_monitor_finds(node, fitted, grasps, log):
+    repair = FrameRepair(Restorer(LAYOUT).fit(grasps.frames[::7]), FaultSet((115,), LAYOUT.n_cells))
+    watch = node.Watch(fitted, clock=lambda: 1000.0, repair=repair)
+    row = line_fault(LAYOUT, Line(1, "row", 5), FaultKind.SHORT)
+    broken = inject(log, [row], LAYOUT)
+    first = watch.restore(broken[0])
+    assert np.flatnonzero(first != broken[0]).tolist() in ([], [115])
+    assert first[row.cells[0]] == broken[0, row.cells[0]]
+    for frame in broken:
+        watch.take(frame)
+    whole = np.array([watch.restore(frame) for frame in broken])
+    cells, others = list(row.cells), np.setdiff1d(np.arange(LAYOUT.n_cells), [*repair.fault_set])
+    assert set(cells) <= set(repair.fault_set)
+    np.testing.assert_array_equal(whole[:, others], broken[:, others])
+    assert ((whole - log)[:, cells] ** 2).mean() < 0.1 * ((broken - log)[:, cells] ** 2).mean()
+
+
+def test_the_node_restores_nothing_without_a_bundle_or_a_frame_of_its_sensor(node, made_bundle):
+    assert node.repair_of({**node.DEFAULTS, "layout": "2x6x5"}) is None
+    assert node.repair_of({**node.DEFAULTS, "bundle": str(made_bundle), "restored": ""}) is None
+    assert node.Watch(SelfDiagnosis(LAYOUT)).restore(np.zeros(220)) is None
+    repair = node.repair_of({**node.DEFAULTS, "bundle": str(made_bundle)})
+    watch = node.Watch(node.diagnoser_of({**node.DEFAULTS, "bundle": str(made_bundle)}), repair=repair)
+    assert watch.restore(np.zeros(7)) is None
+    assert len(watch.restore(np.full(60, 1e30))) == 60

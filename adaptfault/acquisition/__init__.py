@@ -4,6 +4,7 @@ from adaptfault.acquisition.ordering import Arrivals, Frame, Ordering
 from adaptfault.acquisition.packet import Packet, PacketError, format_packet, parse_packet
 from adaptfault.acquisition.receiver import Counters, Receiver
 from adaptfault.acquisition.recorder import Recorded, Recorder
+from adaptfault.acquisition.relay import FrameRepair, Relay, Relayed
 from adaptfault.acquisition.session import Event, Session
 from adaptfault.acquisition.station import Station
 from adaptfault.acquisition.switch import Contact, Daily, Switch, parse_when
@@ -15,12 +16,15 @@ __all__ = [
     "Daily",
     "Event",
     "Frame",
+    "FrameRepair",
     "Ordering",
     "Packet",
     "PacketError",
     "Receiver",
     "Recorded",
     "Recorder",
+    "Relay",
+    "Relayed",
     "Session",
     "Station",
     "Switch",

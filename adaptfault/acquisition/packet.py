@@ -32,11 +32,13 @@ class Packet:
         device: name of the sender.
         time: seconds of the sender's clock.
         values: float64 ``[D]`` in the sender's unit; NaN = missing reading.
+        restored: cells whose value was written with a plus sign: ``adaptfault listen --relay`` restored them.
     """
 
     device: str
     time: float
     values: NDArray[np.float64]
+    restored: tuple[int, ...] = ()
 
 
 def longest_packet(n_cells: int) -> int:
@@ -74,11 +76,28 @@ def parse_packet(data: bytes, n_cells: int, *, ticks: float = TICKS) -> Packet:
     frame = np.array([_number(value) if value else math.nan for value in values])
     if (np.abs(frame) > _LARGEST).any():
         raise PacketError("a value is infinite or too large")
-    return Packet(device, time / ticks, frame)
+    restored = tuple(i for i, value in enumerate(values) if value.startswith("+")) if "+" in text else ()
+    return Packet(device, time / ticks, frame, restored)
 
 
-def format_packet(device: str, time: float, values: ArrayLike, *, ticks: float = TICKS) -> bytes:
-    """Write the packet that :func:`parse_packet` reads; values keep 6 digits, the time stamp is a whole number.
+def format_packet(
+    device: str,
+    time: float,
+    values: ArrayLike,
+    *,
+    ticks: float = TICKS,
+    restored: ArrayLike | None = None,
+    digits: int = 6,
+) -> bytes:
+    """Write the packet that :func:`parse_packet` reads; the time stamp is a whole number of ticks.
+
+    Args:
+        device: name of the sender.
+        time: seconds.
+        values: ``[D]``; NaN = missing reading.
+        ticks: ticks of the time stamp in a second.
+        restored: bool ``[D]``, values that are written with a plus sign, which readers of numbers ignore.
+        digits: significant digits of a value that is not restored; restored ones have 6.
 
     Raises:
         ValueError: :func:`parse_packet` would reject the device name.
@@ -86,7 +105,10 @@ def format_packet(device: str, time: float, values: ArrayLike, *, ticks: float =
     if DEVICE.fullmatch(device) is None:
         raise ValueError(f"device {device!r}; expected letters, digits and . _ : - (64 at most)")
     numbers = np.asarray(values, dtype=np.float64).ravel().tolist()
-    cells = ",".join("" if value != value else f"{value:.6g}" for value in numbers)
+    written = ["" if value != value else f"{value:.{digits}g}" for value in numbers]
+    for i in () if restored is None else np.flatnonzero(restored).tolist():
+        written[i] = f"{numbers[i]:+.6g}"
+    cells = ",".join(written)
     return f"{device},{round(time * ticks)},{cells}".encode()
 
 

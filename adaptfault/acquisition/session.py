@@ -106,6 +106,12 @@ class Session:
         before = round(_BEFORE * recorder.layout.rate) if recorder and isinstance(rule, Contact) else 0
         self._before: deque[Frame] = deque(maxlen=before)
 
+    @property
+    def fault_set(self) -> FaultSet:
+        """The cells that the monitor finds faulty now."""
+        assert self._faulty is not None  # after the first frame
+        return FaultSet(tuple(np.flatnonzero(self._faulty).tolist()), self._faulty.size)
+
     def take(self, frame: Frame, now: float) -> list[Event]:
         """Process a frame that arrived at ``now`` (seconds of the receiver's clock); return its events."""
         self._time, self._arrived = frame.time, now

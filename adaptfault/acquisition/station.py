@@ -18,6 +18,7 @@ from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.packet import TICKS
 from adaptfault.acquisition.receiver import Receiver
 from adaptfault.acquisition.recorder import Recorder
+from adaptfault.acquisition.relay import Relay, parse_address
 from adaptfault.acquisition.session import Event, Session, StreamingPredictor
 from adaptfault.acquisition.switch import Rule, parse_when
 from adaptfault.robot.converter_range import within_range
@@ -46,6 +47,7 @@ class Station:
         port, host, devices, ticks: as for :class:`Receiver`.
         bundle: folder of a bundle; None: monitor only.
         record: folder for recordings; None: no recording.
+        relay: ``HOST:PORT`` to which repaired packets are sent, see :class:`Relay`; needs a bundle.
         when: when to record, see :func:`parse_when`.
         seconds, frames: when to end; None: never.
         calibration: converts received values into the layout's unit.
@@ -54,7 +56,8 @@ class Station:
         quiet: no output on stderr.
 
     Raises:
-        ValueError: neither layout nor bundle, an unknown rule, or a calibration of another layout.
+        ValueError: neither layout nor bundle, an unknown rule, a calibration of another layout, or a relay that has no
+            bundle or sends to the port it listens on.
     """
 
     def __init__(
@@ -67,6 +70,7 @@ class Station:
         devices: Collection[str] | None = None,
         ticks: float = TICKS,
         record: str | os.PathLike[str] | None = None,
+        relay: str | None = None,
         when: str = "contact",
         seconds: float | None = None,
         frames: int | None = None,
@@ -92,6 +96,7 @@ class Station:
         if record is not None:
             with Recorder(record, layout):  # a folder that cannot be used raises now
                 pass
+        self._relay = None if relay is None else self._make_relay(relay, host, port, ticks)
         if not self._ready:
             self._ready.append(self._monitor())  # takes a second, so before the first frame
         queue = max(64, _WAITING // (8 * layout.n_cells))
@@ -124,6 +129,8 @@ class Station:
         finally:
             for session in self._sessions.values():
                 self._emit(session.close())
+            if self._relay is not None:
+                self._relay.close()
         self._end()
 
     async def _take_all(self) -> None:
@@ -145,6 +152,7 @@ class Station:
         session = self._sessions.get(frame.device)
         if session is None:
             session = self._sessions[frame.device] = self._begin(frame.device)
+        received = frame.values
         if self.calibration is not None:
             newtons = self.calibration.apply(frame.values)[0].astype(float)
             frame = replace(frame, values=newtons)
@@ -152,7 +160,12 @@ class Station:
         if outside:
             self._outside += outside
             frame = replace(frame, values=values)
-        self._emit(session.take(frame, time.monotonic()))
+        if self._relay is not None:  # first: monitoring and classifying take longer
+            self._relay.send(frame.device, frame.time, received, frame.values)
+        events = session.take(frame, time.monotonic())
+        self._emit(events)
+        if self._relay is not None and any(event.kind in ("fault", "gone") for event in events):
+            self._relay.found(frame.device, session.fault_set)
 
     def _begin(self, device: str) -> Session:
         watcher = self._ready.pop() if self._ready else self._monitor() if self.bundle is None else self._predictor()
@@ -172,6 +185,20 @@ class Station:
             return Predictor.load(self.bundle)
         except ImportError as error:
             raise ValueError(f"{self.bundle}: classifying needs {error.name}; install it, or give no bundle") from None
+
+    def _make_relay(self, address: str, host: str, port: int, ticks: float) -> Relay:
+        if self.bundle is None:
+            raise ValueError("--relay needs a bundle: cells are restored with its healthy windows")
+        if parse_address(address) == (host, port):
+            raise ValueError(f"--relay {address}: this address is listened on; give the consumer another port")
+        from adaptfault.robot.bundle import Bundle
+
+        bundle = Bundle.open(self.bundle)
+        known = bundle.known_faults().fault_set
+        self._say(
+            f"relay to {address}: fitting on the healthy windows of {self.bundle}; {len(known)} faulty cells known"
+        )
+        return Relay(address, bundle.restorer(), known, calibration=self.calibration, ticks=ticks)
 
     def _handle_command(self, line: str) -> None:
         word = line.strip().lower()
@@ -206,8 +233,13 @@ class Station:
             "counters": counters.to_dict(),
             "readings_outside_range": self._outside,
         }
-        outside = f", {self._outside} readings outside the range" if self._outside else ""
-        print(json.dumps(result, allow_nan=False) if self.as_json else f"end: {counters}{outside}", flush=True)
+        text = f"end: {counters}"
+        if self._outside:
+            text += f", {self._outside} readings outside the range"
+        if self._relay is not None:
+            result["relay"] = self._relay.to_dict()
+            text += f", {self._relay}"
+        print(json.dumps(result, allow_nan=False) if self.as_json else text, flush=True)
 
 
 def _read_commands(loop: asyncio.AbstractEventLoop, handle: Callable[[str], None]) -> None:

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 _EXAMPLE = """  adaptfault listen robot.bundle --port 5005 --record today/ --when contact
       packets: device_id,timestamp,one value a cell; without a bundle cells are monitored, nothing is classified
+  adaptfault listen robot.bundle --port 5005 --relay 127.0.0.1:5006
+      a consumer on port 5006 reads whole frames in the same format: faulty cells are restored from the healthy ones
       on stdin: record, stop, auto (as --when states), quit"""
 
 _WHEN = (
@@ -31,6 +33,9 @@ def add(commands: Commands) -> None:
         "--ticks", type=float, default=1000.0, help="time stamps count so many a second (default 1000: milliseconds)"
     )
     parser.add_argument("--record", metavar="FOLDER", help="record into this folder, CSV")
+    parser.add_argument(
+        "--relay", metavar="HOST:PORT", help="send repaired packets on; restored values have a plus sign; needs BUNDLE"
+    )
     parser.add_argument("--when", metavar="WHEN", help=_WHEN)
     parser.add_argument("--seconds", type=float, metavar="S", help="end after so long")
     parser.add_argument("--frames", type=int, metavar="N", help="end after so many frames")
@@ -71,6 +76,7 @@ def _station(args: argparse.Namespace) -> Station:
         devices=args.device,
         ticks=args.ticks,
         record=args.record,
+        relay=args.relay,
         when=args.when or "contact",
         seconds=args.seconds,
         frames=args.frames,

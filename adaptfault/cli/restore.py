@@ -36,7 +36,6 @@ def run(args: argparse.Namespace) -> int:
 
     from adaptfault.cli.options import fault_set
     from adaptfault.data.recordings import Recordings, save_npz
-    from adaptfault.imputation.restorer import Restorer
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.new_recordings import load_new_recordings
 
@@ -47,10 +46,7 @@ def run(args: argparse.Namespace) -> int:
     for problem in incoming.problems:
         print(problem, file=sys.stderr)
     say(args, f"{len(faults)} of {faults.n_cells} cells are faulty; restoring {len(incoming.frames)} recordings")
-    windows = bundle.parts.adapter().train
-    numbers = np.unique(windows.recording)
-    healthy = [windows.x[windows.recording == n].reshape(-1, layout.n_cells) * layout.full_scale for n in numbers]
-    restorer = Restorer(layout).fit(healthy)
+    restorer = bundle.restorer()
     restored = [restorer.transform(frames, faults).astype(np.float32) for frames in incoming.frames]
     missing = sum(int(np.isnan(frames[:, faults.healthy]).sum()) for frames in incoming.frames)
     deviation = restorer.deviation(faults)

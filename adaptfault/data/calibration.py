@@ -125,6 +125,14 @@ class Calibration:
             newtons[start : start + _BLOCK] = forces.T
         return newtons.reshape(counts.shape), OutOfRange(below, above)
 
+    def invert(self, newtons: ArrayLike) -> NDArray[np.float64]:
+        """Return counts at which :meth:`apply` gives these newtons ``[D]``; of several, any. 0 without a table."""
+        forces = np.asarray(newtons, dtype=np.float64)
+        counts = np.zeros(self.n_cells)
+        for cell, raw, force in self._tables:
+            counts[cell] = np.interp(forces[cell], force, raw)
+        return counts
+
     @cached_property
     def _tables(self) -> list[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
         """The calibrated cells and their points without the padding."""

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.data.calibration import Calibration
     from adaptfault.data.windows import Windows
+    from adaptfault.imputation.restorer import Restorer
     from adaptfault.models.any_model import AnyModel
     from adaptfault.models.network import TactileTransformer
 
@@ -262,6 +263,17 @@ class Bundle:
     def diagnoser(self) -> SelfDiagnosis:
         """Return the fitted self-diagnosis; raises Damaged. Needs no torch."""
         return self.parts.diagnoser()
+
+    def restorer(self) -> Restorer:
+        """Return a restorer that is fitted on the healthy windows; raises Damaged. Loads torch."""
+        import numpy as np
+
+        from adaptfault.imputation.restorer import Restorer
+
+        windows, layout = self.parts.adapter().train, self.layout
+        numbers = np.unique(windows.recording)
+        healthy = [windows.x[windows.recording == n].reshape(-1, layout.n_cells) * layout.full_scale for n in numbers]
+        return Restorer(layout).fit(healthy)
 
     # History.
 

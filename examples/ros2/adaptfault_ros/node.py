@@ -1,4 +1,4 @@
-"""A ROS 2 node that monitors tactile frames and publishes their faults on /diagnostics, once a second.
+"""A ROS 2 node that monitors tactile frames, publishes their faults on /diagnostics, and whole frames on a topic.
 
     ros2 run adaptfault_ros node --ros-args -p topic:=/tactile -p bundle:=/home/robot/robot.bundle
 
@@ -8,6 +8,8 @@ simulated sensor.
 Parameters:
     topic: of the frames (default /tactile).
     bundle: folder of ``adaptfault train --out X.bundle``: its layout and its healthy model.
+    restored: topic of the repaired frames, each as soon as it comes; "" = none. Needs a bundle. /diagnostics names the
+        faulty cells, which are the restored ones.
     layout: without a bundle: a layout file, or a shape as 2x11x10. Cells are then compared with their neighbours.
     full_scale, unit, rate: override the layout; 0 and "" keep it.
 """
@@ -21,15 +23,25 @@ from typing import Any
 
 import numpy as np
 
+from adaptfault.acquisition import FrameRepair
 from adaptfault.acquisition.ros import diagnostic_array, stale_array
 from adaptfault.data.recordings import parse_shape, read_layout
 from adaptfault.data.recordings.layout_file import looks_like_shape
-from diagnostics import Monitor, SelfDiagnosis, SensorLayout
+from adaptfault.robot.converter_range import within_range
+from diagnostics import FaultSet, Monitor, SelfDiagnosis, SensorLayout
 
 SILENCE = 2.0  # seconds without a frame, after which everything is STALE
 PERIOD = 10.0  # seconds between two diagnoses of all cells; the last one is published every second
 
-DEFAULTS = {"topic": "/tactile", "bundle": "", "layout": "", "full_scale": 0.0, "unit": "", "rate": 0.0}
+DEFAULTS = {
+    "topic": "/tactile",
+    "bundle": "",
+    "restored": "/tactile/restored",
+    "layout": "",
+    "full_scale": 0.0,
+    "unit": "",
+    "rate": 0.0,
+}
 
 
 def diagnoser_of(parameters: Mapping[str, Any]) -> SelfDiagnosis:
@@ -50,14 +62,37 @@ def diagnoser_of(parameters: Mapping[str, Any]) -> SelfDiagnosis:
     return SelfDiagnosis(replace(layout, **stated))
 
 
+def repair_of(parameters: Mapping[str, Any]) -> FrameRepair | None:
+    """Return what restores frames with the healthy windows of the bundle; None without a bundle or a topic."""
+    if not (parameters["bundle"] and parameters["restored"]):
+        return None
+    from adaptfault import Bundle
+
+    bundle = Bundle.open(parameters["bundle"])
+    return FrameRepair(bundle.restorer(), bundle.known_faults().fault_set)
+
+
 class Watch:
     """The work of the node, without ROS."""
 
-    def __init__(self, diagnoser: SelfDiagnosis, clock: Callable[[], float] = time.time):
+    def __init__(
+        self,
+        diagnoser: SelfDiagnosis,
+        clock: Callable[[], float] = time.time,
+        repair: FrameRepair | None = None,
+    ):
+        self.repair, self.faulty = repair, np.zeros(diagnoser.layout.n_cells, bool)
         self.monitor, self.layout, self.clock = Monitor(diagnoser), diagnoser.layout, clock
         self.last = self.diagnosed = -np.inf
         self.changed = False
         self.array = stale_array(self.layout, "no frame yet")
+
+    def restore(self, values) -> list[float] | None:
+        """Return the frame with its faulty cells and missing readings restored; None where nothing restores it."""
+        if self.repair is None or len(values) != self.layout.n_cells:
+            return None
+        readings = within_range(np.asarray(values, dtype=float), self.layout)[0]
+        return self.repair(readings)[0].tolist()
 
     def take(self, values) -> tuple:
         """Take in one frame; return the faults that are new, changed or gone.
@@ -70,6 +105,10 @@ class Watch:
         self.last = self.clock()
         faults = self.monitor.update(np.asarray(values, dtype=float))
         self.changed |= bool(faults)
+        for fault in faults:
+            self.faulty[list(fault.cells)] = fault.probability != 0
+        if faults and self.repair is not None:
+            self.repair.found(FaultSet(tuple(np.flatnonzero(self.faulty).tolist()), self.faulty.size))
         return faults
 
     def diagnostics(self) -> dict:
@@ -124,12 +163,18 @@ def main() -> None:
         def __init__(self):
             super().__init__("tactile_diagnostics")
             parameters = {name: self.declare_parameter(name, value).value for name, value in DEFAULTS.items()}
-            self.watch = Watch(diagnoser_of(parameters))
+            self.watch = Watch(diagnoser_of(parameters), repair=repair_of(parameters))
+            self.whole = None
+            if self.watch.repair is not None:
+                self.whole = self.create_publisher(Float32MultiArray, parameters["restored"], 10)
             self.publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
             self.create_subscription(Float32MultiArray, parameters["topic"], self.take, 10)
             self.create_timer(1.0, self.publish)
 
         def take(self, message):
+            # Published first: monitoring takes longer.
+            if self.whole is not None and (values := self.watch.restore(message.data)) is not None:
+                self.whole.publish(Float32MultiArray(layout=message.layout, data=values))
             try:
                 faults = self.watch.take(message.data)
             except ValueError as error:

@@ -337,10 +337,7 @@ def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp] | 
 
 def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> RecordingBlocks:
     """Return the recordings as blocks, each ``[T, D]`` with T >= 1."""
-    given: Any = recordings
-    shapes = (layout.shape, (layout.pads, layout.rows, layout.cols, layout.axes))
-    single = isinstance(given, np.ndarray) and (given.shape[1:] in shapes or given.ndim <= 2)
-    checked = [_checked(r, f"recording {i}", layout) for i, r in enumerate([given] if single else given)]
+    checked = [_checked(r, f"recording {i}", layout) for i, r in enumerate(layout.recordings(recordings))]
     checked = [r for r in checked if len(r)]
     if not checked:
         raise ValueError("no frames: expected recordings [T, D] with T >= 1")

@@ -303,8 +303,39 @@ class SensorLayout:
         values = np.asarray(values)
         return values.reshape(*values.shape[:-1], *self.shape)
 
+    @property
+    def _grids(self) -> tuple[tuple[int, ...], ...]:
+        """The shapes of a frame that is not flat."""
+        every = [self.shape] if self.axes == 1 else [self.shape, (self.pads, self.rows, self.cols, self.axes)]
+        return (*every, *(grid[1:] for grid in every)) if self.pads == 1 else tuple(every)
+
+    def recordings(self, given: Any) -> list[Any]:
+        """Return one or several recordings as a list; nothing is checked or converted.
+
+        Args:
+            given: one array ``[T, D]``, ``[T, pads, rows, cols]`` or, of a layout with one pad, ``[T, rows, cols]``; or
+                a sequence of such arrays; or recordings of one length in an array with one axis more,
+                ``[n, T, ...]``.
+        """
+        one = isinstance(given, np.ndarray) and (given.ndim <= 2 or given.shape[1:] in self._grids)
+        return [given] if one else list(given)
+
+    def check_frame(self, frame: ArrayLike) -> NDArray[np.float64]:
+        """Return one frame as float64 ``[D]``; ``[pads, rows, cols]`` and, of one pad, ``[rows, cols]`` are flattened.
+
+        Raises:
+            ValueError: another shape.
+        """
+        values = np.asarray(frame, dtype=np.float64)
+        if values.shape not in ((self.n_cells,), *self._grids):
+            grid = list(self._grids[-1])
+            raise ValueError(f"expected a frame [{self.n_cells}] or {grid}, got {list(values.shape)}")
+        return values.reshape(-1)
+
     def check_recording(self, recording: ArrayLike, name: str = "recording") -> NDArray[np.float64]:
-        """Return a recording as float64 ``[T, D]``; ``[T, pads, rows, cols]`` is flattened.
+        """Return a recording as float64 ``[T, D]``.
+
+        ``[T, pads, rows, cols]`` is flattened, for a layout of one pad ``[T, rows, cols]`` as well.
 
         Raises:
             ValueError: not numbers, or the shape does not fit this layout.
@@ -313,10 +344,10 @@ class SensorLayout:
             frames = np.asarray(recording, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{name}: expected numbers [T, {self.n_cells}] ({error})") from None
-        if frames.shape[1:] in (self.shape, (self.pads, self.rows, self.cols, self.axes)):
+        if frames.shape[1:] in self._grids:
             frames = frames.reshape(len(frames), -1)
         if frames.ndim != 2 or frames.shape[1] != self.n_cells:
-            grid = f"{self.pads}, {self.rows}, {self.cols}"
+            grid = ", ".join(map(str, self._grids[-1]))
             raise ValueError(
                 f"{name}: expected [T, {self.n_cells}] or [T, {grid}], got {list(frames.shape)};"
                 " check the layout, and that masked positions are kept in the columns"

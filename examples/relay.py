@@ -1,10 +1,10 @@
-"""A consumer that only reads frames, behind ``adaptfault listen --relay``: are frames lost, and how much later do they come?
+"""A consumer that only reads frames, behind ``adaptfault listen --relay``: frames lost, and added latency.
 
     python examples/relay.py [robot.bundle] [--seconds 5] [--rate 100]
 
-Without a bundle, one is made from simulated grasps (a minute). A sensor with a broken row sends to the relay, and at the
-same time to this consumer: the difference of both arrivals is the added latency. It ends with exit code 1 where a frame
-is lost, comes twice, or out of order.
+Without a bundle, one is made from simulated grasps (a minute). A sensor with a broken row sends to the relay, and at
+the same time to this consumer: the difference of both arrivals is the added latency. It ends with exit code 1 where a
+frame is lost, comes twice, or out of order.
 """
 
 import argparse

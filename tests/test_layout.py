@@ -101,3 +101,25 @@ def test_the_cells_beside_one_lie_on_its_pad_and_exist():
     assert layout.beside[9].tolist() == [-1, -1, -1, -1, 10, -1, 12, 13]
     for cell in (0, 4, 8, 13):
         assert all(cell in layout.beside[other] for other in layout.beside[cell] if other >= 0)
+
+
+ONE_PAD = SensorLayout(1, 3, 4)
+
+
+@pytest.mark.parametrize("shape", [(12,), (3, 4), (1, 3, 4)])
+def test_recordings_of_one_pad_may_have_its_rows_and_columns_alone(shape):
+    flat = np.arange(2 * 5 * 12.0).reshape(2, 5, 12)
+    several, one = flat.reshape(2, 5, *shape), flat[0].reshape(5, *shape)
+    np.testing.assert_array_equal(ONE_PAD.check_recording(one), flat[0])
+    np.testing.assert_array_equal(ONE_PAD.check_frame(one[2]), flat[0, 2])
+    for given, wanted in ((one, flat[:1]), (several, flat), (list(several), flat), (tuple(several), flat)):
+        np.testing.assert_array_equal([ONE_PAD.check_recording(r) for r in ONE_PAD.recordings(given)], wanted)
+
+
+def test_rows_and_columns_alone_are_no_frame_of_several_pads():
+    with pytest.raises(ValueError, match=r"expected \[T, 24\] or \[T, 2, 3, 4\], got \[5, 3, 4\]"):
+        SensorLayout(2, 3, 4).check_recording(np.zeros((5, 3, 4)))
+    with pytest.raises(ValueError, match=r"expected a frame \[24\] or \[2, 3, 4\], got \[3, 4\]"):
+        SensorLayout(2, 3, 4).check_frame(np.zeros((3, 4)))
+    with pytest.raises(ValueError, match=r"or \[T, 3, 4\], got \[5, 4, 3\]"):
+        ONE_PAD.check_recording(np.zeros((5, 4, 3)))

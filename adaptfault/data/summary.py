@@ -156,7 +156,8 @@ def summarise(
     total, finite, lengths = np.zeros(width), np.zeros(width, np.int64), []
     lowest, highest = np.full(width, np.inf), np.full(width, -np.inf)
     sample: list[NDArray[np.float64]] = []
-    for i, recording in enumerate(recordings):
+    given = layout.recordings(recordings) if isinstance(recordings, np.ndarray) else recordings  # or read one by one
+    for i, recording in enumerate(given):
         frames = layout.check_recording(recording, f"recording {i}")
         known = np.isfinite(frames)
         lengths.append(len(frames))

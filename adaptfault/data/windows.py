@@ -96,7 +96,7 @@ def make_windows(
     the last whole window are dropped; a recording shorter than one window gives none.
 
     Args:
-        recordings: arrays ``[T, D]`` or ``[T, pads, rows, cols]`` in the layout's unit; lengths may differ.
+        recordings: in the layout's unit, as :meth:`SensorLayout.recordings` takes them; lengths may differ.
         labels: int ``[n]``, one class a recording; None gives y = -1.
         layout: the array they come from.
         length: frames in a window, 10 in Section VI-C.
@@ -105,6 +105,7 @@ def make_windows(
     Raises:
         ValueError: a recording that does not fit the layout, another number of labels, no window at all.
     """
+    recordings = layout.recordings(recordings)
     stride = length if stride is None else stride
     if length < 1 or stride < 1:
         raise ValueError(f"windows need length >= 1 and stride >= 1, got {length} and {stride}")

@@ -61,10 +61,9 @@ class Restorer:
         Raises:
             ValueError: fewer than 4 frames, or recordings that do not fit the layout.
         """
-        given = [recordings] if isinstance(recordings, np.ndarray) and recordings.ndim == 2 else list(recordings)
         frames = [
             hold_missing(scale(self.layout.check_recording(recording, f"recording {i}"), self.layout))
-            for i, recording in enumerate(given)
+            for i, recording in enumerate(self.layout.recordings(recordings))
         ]
         total = sum(map(len, frames))
         if total < 4:
@@ -122,9 +121,7 @@ class Restorer:
         The first frame with a new set of missing cells takes the time of a linear solve; the next ones take one
         matrix-vector product.
         """
-        x = np.array(frame, dtype=np.float64)
-        if x.shape != (self.layout.n_cells,):
-            raise ValueError(f"expected a frame [{self.layout.n_cells}], got {list(x.shape)}")
+        x = self.layout.check_frame(frame).copy()
         mask = self._missing(x, fault_set)
         if mask.any():
             known = x.astype(np.float32)

@@ -180,11 +180,8 @@ class _InputRecording:
 def _checked(
     recordings: ArrayLike | Sequence[ArrayLike], names: Sequence[str], bundle: Bundle
 ) -> list[_InputRecording]:
-    given: Any = recordings
-    if isinstance(given, np.ndarray) and (given.ndim <= 2 or given.shape[1:] == bundle.layout.shape):
-        given = [given]
     incoming = []
-    for i, recording in enumerate(given):
+    for i, recording in enumerate(bundle.layout.recordings(recordings)):
         name = names[i] if i < len(names) else f"recording {i}"
         raw = np.ascontiguousarray(recording, dtype=np.float64)
         digest = hashlib.sha256(repr(raw.shape).encode() + raw.tobytes()).hexdigest()

@@ -148,14 +148,10 @@ class Predictor:
         Raises:
             ValueError: the frame has another shape, or the time is not finite.
         """
-        given = np.asarray(frame, dtype=np.float64)
-        if given.shape not in ((self.layout.n_cells,), self.layout.shape):
-            raise ValueError(
-                f"expected a frame [{self.layout.n_cells}] or {list(self.layout.shape)}, got {list(given.shape)}"
-            )
+        given = self.layout.check_frame(frame)
         if time is not None and not np.isfinite(time):
             raise ValueError(f"time {time}: expected seconds, or None where it is unknown")
-        given = given.reshape(-1)[self._running.source]
+        given = given[self._running.source]
         reading, outside = within_range(given, self.layout)
         if outside and not self.outside:
             _log.warning("%d readings outside the range of %s count as missing", outside, self.layout)

@@ -31,6 +31,7 @@ _CERTAIN = 0.999  # P(faulty) of silent, intermittent, noisy and drifting cells,
 _SUSPICIOUS_COLD = 3.0  # raw log ratio from which on a cell is no predictor, in a cold start
 _KNOWN = 9.0  # log likelihood ratio of a cell that was dead in the reference already
 _GROUP_SHARE = 0.5  # share of the evidence added with a group excluded, see _weight_of_groups
+_BEFORE_MODEL, _BEFORE_CALIBRATION = 0.02, 0.15  # share of the time of a fit that is over; for the progress only
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
 
 
@@ -67,11 +68,20 @@ class SelfDiagnosis:
         self._planes, self._order = axis_planes(layout)
         self.false_discovery_rate = false_discovery_rate
 
-    def fit(self, recordings: ArrayLike | Sequence[ArrayLike]) -> SelfDiagnosis:
+    def fit(
+        self,
+        recordings: ArrayLike | Sequence[ArrayLike],
+        *,
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> SelfDiagnosis:
         """Fit to fault-free recordings, ``[T, D]`` or a list of them.
 
         Cells that are dead in them are found first and excluded; they are reported in every log in which they do not
         move.
+
+        Args:
+            recordings: as :meth:`SensorLayout.recordings` takes them.
+            progress: receives the share of the work that is done, 0 to 1, again and again.
 
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame with a reading.
@@ -86,8 +96,15 @@ class SelfDiagnosis:
         # Fractions of full scale refer to the range that was seen: a stated one may be too high.
         layout = replace(layout, full_scale=min(layout.full_scale, highest_reading(healthy, layout)))
         dead = find_reference_faults(healthy, layout, tolerance_of(healthy, layout), self._diagnosed_cold)
+        progress(_BEFORE_MODEL)
         self.reference_ = Reference.fit(healthy, layout, dead)
-        self.calibrator_ = Calibrator.fit(healthy, living(layout, dead))
+        progress(_BEFORE_CALIBRATION)
+        self.calibrator_ = Calibrator.fit(
+            healthy,
+            living(layout, dead),
+            progress=lambda share: progress(_BEFORE_CALIBRATION + (1 - _BEFORE_CALIBRATION) * share),
+        )
+        progress(1.0)
         return self
 
     def diagnose(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Diagnosis:

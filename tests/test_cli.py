@@ -1,6 +1,7 @@
 """The routines end to end, through the command line."""
 
 import json
+import logging
 import re
 import shutil
 import subprocess
@@ -11,9 +12,13 @@ import numpy as np
 import pytest
 
 from adaptfault.cli import COMMANDS, main
+from adaptfault.cli.options import LogAboveBars
 from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.data.simulated_grasps import simulate
-from diagnostics import Diagnosis, Line, SensorLayout, inject, line_fault
+from adaptfault.data.windows import make_windows
+from adaptfault.models.network import TactileTransformer
+from adaptfault.models.training import train
+from diagnostics import Diagnosis, Line, SelfDiagnosis, SensorLayout, inject, line_fault
 
 SMALL = SensorLayout(2, 6, 5)
 
@@ -240,3 +245,49 @@ def test_help_comes_without_loading_torch_or_scikit_learn():
         "sys.exit(any(m in sys.modules for m in ('torch', 'sklearn', 'numpy')))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).returncode == 0
+
+
+def test_diagnose_and_maintain_have_one_meaning_of_the_exit_code(bundle, later_grasps, broken_row, tmp_path, capsys):
+    frames = tuple(inject(r, [broken_row], SMALL) for r in later_grasps)
+    save_npz(tmp_path / "log.npz", Recordings(frames, SMALL))
+    log, reference = str(tmp_path / "log.npz"), ["--reference", str(bundle.path), "--quiet"]
+    assert main(["diagnose", log, *reference]) == 2  # nothing handles the row yet
+    assert "handled" not in capsys.readouterr().out
+    handled = main(["maintain", str(bundle.path), log, "--quiet"])
+    capsys.readouterr()
+    assert main(["diagnose", log, *reference]) == handled
+    says = capsys.readouterr().out.splitlines()[-1]
+    assert (f"handled: version 2 of {bundle.path} runs without these cells" == says) == (handled == 1)
+    assert main(["rollback", str(bundle.path)]) == 0
+    assert main(["diagnose", log, *reference]) == main(["maintain", str(bundle.path), log, "--quiet"]) == 2
+
+
+def test_a_log_that_tests_nothing_exits_with_the_code_that_is_set(made_bundle, tmp_path, capsys):
+    save_npz(tmp_path / "still.npz", Recordings(tuple(np.zeros((60, 60)) for _ in range(6)), SMALL))
+    for command in (
+        ["diagnose", str(tmp_path / "still.npz"), "--reference", str(made_bundle)],
+        ["maintain", str(made_bundle), str(tmp_path / "still.npz"), "--dry-run"],
+    ):
+        assert main([*command, "--quiet"]) == 1
+        assert "only 0% of the cells" in capsys.readouterr().out
+        assert [main([*command, "--quiet", "--untested-code", str(code)]) for code in (0, 2, 3)] == [0, 2, 3]
+
+
+def test_the_fit_reports_shares_that_rise_to_all_of_it(small):
+    shares = []
+    SelfDiagnosis(SMALL).fit(small.frames[:9], progress=shares.append)
+    assert len(shares) > 100
+    assert shares == sorted(shares)
+    assert (shares[0] < 0.1, shares[-1]) == (True, 1.0)
+
+
+def test_training_shows_batches_with_an_end_and_warnings_stand_on_lines_of_their_own(small, capsys):
+    windows = make_windows(small.frames, small.labels, SMALL)
+    model = TactileTransformer(SMALL, 3)
+    train(model, windows.select(slice(0, 100)), windows.select(slice(100, 140)), epochs=2, progress=True)
+    shown = capsys.readouterr().err
+    assert "epoch 2 of 2: 100%" in shown
+    assert "8/8" in shown  # 2 epochs of 4 batches
+    handler = LogAboveBars()
+    handler.emit(logging.LogRecord("adaptfault", logging.WARNING, "", 0, "the disk is full", None, None))
+    assert capsys.readouterr().err == "the disk is full\n"

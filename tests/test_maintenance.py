@@ -9,6 +9,7 @@ from adaptfault.robot.deployment_test import Judgement
 from adaptfault.robot.lock import Busy
 from adaptfault.robot.maintenance import maintain
 from adaptfault.robot.predictor import Predictor
+from adaptfault.robot.sensor_state import SensorState, weak_base
 from diagnostics import FaultKind, Line, SensorLayout, inject, line_fault
 
 LAYOUT = SensorLayout(2, 6, 5)
@@ -78,8 +79,32 @@ def test_after_a_rollback_the_same_faults_deploy_nothing(bundle, later_grasps, b
     maintain(bundle, broken(later_grasps[:12], broken_row))
     bundle.rollback()
     report = maintain(bundle, broken(later_grasps[12:], broken_row))
-    assert (report.decision, report.version) == ("kept", 1)
+    assert (report.decision, report.version, report.exit_code) == ("kept", 1, 2)
     assert "rolled back" in report.reason
+    assert "version 1 runs, which uses 5 of the 5 faulty cells" in report.reason
+    again = maintain(bundle, broken(later_grasps[12:], broken_row))
+    assert (again.decision, again.exit_code) == ("unchanged", 2)
+
+
+def test_the_state_of_a_sensor_names_the_faults_that_the_running_version_does_not_handle(
+    bundle, later_grasps, broken_row
+):
+    assert SensorState.of(bundle).exit_code == 0
+    report = maintain(bundle, broken(later_grasps[:12], broken_row))
+    state = SensorState.of(bundle)
+    assert (state.exit_code, state.unhandled, state.accuracy) == (report.exit_code, (), report.accuracy)
+    bundle.rollback()
+    state = SensorState.of(bundle)
+    assert state.exit_code == 2
+    assert [fault.line for fault in state.unhandled] == [broken_row.line]
+    assert state.accuracy == report.judgement.running
+    assert not state.reason
+
+
+def test_a_repair_that_exceeds_the_healthy_accuracy_shows_a_weak_base_model():
+    assert weak_base(0.75, 0.71)
+    assert not weak_base(0.715, 0.71)
+    assert not weak_base(None, 0.71)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
@@ -19,6 +20,7 @@ from adaptfault.cli import (
     info,
     listen,
     maintain,
+    predict,
     report,
     reproduce,
     restore,
@@ -26,7 +28,7 @@ from adaptfault.cli import (
     simulate,
     train,
 )
-from adaptfault.cli.options import refuse_missing
+from adaptfault.cli.options import LogAboveBars, refuse_missing
 
 COMMANDS = (
     info,
@@ -35,6 +37,7 @@ COMMANDS = (
     diagnose,
     train,
     evaluate,
+    predict,
     adapt,
     restore,
     demo,
@@ -73,6 +76,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.command is None:
         parser.print_help()
         return 0
+    log, handler = logging.getLogger("adaptfault"), LogAboveBars()
+    log.addHandler(handler)
     try:
         refuse_missing(args)
         return int(args.run(args))
@@ -82,3 +87,5 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"adaptfault {args.command}: interrupted", file=sys.stderr)
         return 130
+    finally:
+        log.removeHandler(handler)

@@ -11,24 +11,28 @@ from typing import TYPE_CHECKING
 from adaptfault.cli.options import (
     Commands,
     add_recordings,
+    add_untested_code,
     command,
     emit,
+    fit_diagnoser,
     load_recordings,
     progress,
     report_inferred,
-    say,
     stream_recordings,
 )
 
 if TYPE_CHECKING:
     from adaptfault.data.recordings import Recordings
     from adaptfault.data.recordings.blocks import Stream
+    from adaptfault.robot.bundle import Bundle
     from diagnostics import Diagnosis, SelfDiagnosis
 
 _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.json --html diagnosis.html
       without --reference each cell is compared with the cells around it
   adaptfault diagnose today/ --reference robot.bundle
-      the healthy model of the bundle"""
+      the healthy model of the bundle
+      exit code: 0 nothing to do, 1 watch (a few single cells; faults that the bundle's version excludes; nothing tested),
+      2 a person is needed (a wire, or a tenth of the cells), 3 unusable input"""
 
 _ROWS = 24  # of a map, which is followed by the summary if it has more: the first line has left the screen
 
@@ -43,15 +47,17 @@ def add(commands: Commands) -> None:
     parser.add_argument("--out", metavar="FILE", help="write the diagnosis as JSON")
     parser.add_argument("--picture", metavar="FILE", help="write the verdict map as PNG")
     parser.add_argument("--html", metavar="FILE", help="write the technician's page")
+    add_untested_code(parser)
     parser.set_defaults(run=run, writes=("out", "picture", "html"))
 
 
 def run(args: argparse.Namespace) -> int:
-    """Diagnose; the exit code gives the severity."""
+    """Diagnose; the exit code says who has to act, as that of maintain."""
     from adaptfault.data.recordings.blocks import is_large
     from diagnostics import SelfDiagnosis
 
-    diagnoser = _fitted(args) if args.reference else None
+    bundle = _bundle(args.reference or [])
+    diagnoser = None if not args.reference else _fitted(args) if bundle is None else bundle.diagnoser()
     layout = None if diagnoser is None else diagnoser.layout
     log: Recordings | Stream
     if args.frames is None and is_large(args.recordings):
@@ -68,21 +74,38 @@ def run(args: argparse.Namespace) -> int:
         from adaptfault.evaluation.html_diagnosis import write_diagnosis
 
         write_diagnosis(args.html, diagnosis, name=", ".join(args.recordings), reference=bool(args.reference))
-    emit(args, diagnosis.to_dict(), text_of(diagnosis))
-    return diagnosis.exit_code
+    code, why = _severity(diagnosis, bundle, args.untested_code)
+    emit(args, diagnosis.to_dict(), text_of(diagnosis) + why)
+    return code
+
+
+def _bundle(reference: list[str]) -> Bundle | None:
+    """Return the bundle that is given as reference; None for recordings, and without a reference."""
+    if len(reference) != 1 or not (Path(reference[0]) / "bundle.json").is_file():
+        return None
+    from adaptfault.robot.bundle import Bundle
+
+    return Bundle.open(reference[0])
+
+
+def _severity(diagnosis: Diagnosis, bundle: Bundle | None, untested_code: int) -> tuple[int, str]:
+    """Return the exit code, and a line where it is another one than that of the faults."""
+    from adaptfault.robot.sensor_state import UNTESTED, SensorState, unhandled_cells
+
+    code, share = diagnosis.exit_code, diagnosis.coverage.test_coverage
+    if code == 0 and share < UNTESTED:
+        return untested_code, f"\nonly {share:.0%} of the cells were tested, so faults may be hidden"
+    if code == 2 and bundle is not None:
+        version = bundle.active()
+        if not unhandled_cells(bundle, diagnosis.fault_set, version) and SensorState.of(bundle).exit_code < 2:
+            return 1, f"\nhandled: version {version.number} of {bundle.path} runs without these cells"
+    return code, ""
 
 
 def _fitted(args: argparse.Namespace) -> SelfDiagnosis:
-    """Return the healthy model of a bundle, or one that is fitted on the reference recordings."""
-    from diagnostics import SelfDiagnosis
-
-    if len(args.reference) == 1 and (Path(args.reference[0]) / "bundle.json").is_file():
-        from adaptfault.robot.bundle import Bundle
-
-        return Bundle.open(args.reference[0]).diagnoser()
+    """Return the healthy model that is fitted on the reference recordings."""
     reference = load_recordings(args, args.reference)
-    say(args, f"fitting the healthy model on {len(reference)} recordings")
-    return SelfDiagnosis(reference.layout).fit(reference.frames)
+    return fit_diagnoser(args, reference)
 
 
 def text_of(diagnosis: Diagnosis) -> str:

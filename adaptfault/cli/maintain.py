@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from adaptfault.cli.options import Commands, command, emit, say
+from adaptfault.cli.options import Commands, add_untested_code, command, emit, say
 
 _EXAMPLE = """  adaptfault maintain robot.bundle today/
-      recordings seen before are skipped; exit code 0 fine, 1 degraded but handled, 2 needs a technician, 3 unusable
+      recordings seen before are skipped
+      exit code: 0 nothing to do, 1 faults that are handled, or a warning, 2 a person is needed, 3 unusable input
   adaptfault maintain robot.bundle today/ --dry-run --report report.html"""
 
 
@@ -18,6 +19,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("recordings", nargs="+", metavar="RECORDINGS", help="file or folder of recordings")
     parser.add_argument("--dry-run", action="store_true", help="report only, change nothing")
     parser.add_argument("--budget", type=float, metavar="S", help="seconds that an adaptation may take")
+    add_untested_code(parser)
     parser.add_argument("--report", metavar="FILE", help="write the technician's report (HTML)")
     parser.set_defaults(run=run, writes=("report",))
 
@@ -40,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
         names=incoming.names,
         dry_run=args.dry_run,
         budget=args.budget,
+        untested_code=args.untested_code,
         say=lambda text: say(args, text),
     )
     if args.report:

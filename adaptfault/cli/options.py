@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from adaptfault.data.recordings import Loaded, Recordings
     from adaptfault.data.recordings.blocks import Stream
-    from diagnostics import FaultSet, SensorLayout
+    from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
 Commands = Any  # argparse's private type of subparsers
 
@@ -49,6 +50,18 @@ def add_recordings(
         "--field", metavar="PATH", help="array in its messages that holds them, as data or sensors.values"
     )
     group.add_argument("--frames", type=int, metavar="T", help="refuse recordings of another length")
+
+
+def add_untested_code(parser: argparse.ArgumentParser) -> None:
+    """Add the exit code of a log that tests nothing."""
+    parser.add_argument(
+        "--untested-code",
+        type=int,
+        default=1,
+        choices=range(4),
+        metavar="CODE",
+        help="exit code where no fault is found and less than 5 %% of the cells are tested (default 1)",
+    )
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
@@ -274,15 +287,43 @@ def progress(args: argparse.Namespace) -> bool | None:
     return False if args.quiet else None
 
 
+def fit_diagnoser(args: argparse.Namespace, recordings: Recordings) -> SelfDiagnosis:
+    """Return the healthy model of recordings, with a bar while it is fitted."""
+    from tqdm import tqdm
+
+    from diagnostics import SelfDiagnosis
+
+    form = "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]"
+    say(args, f"fitting the healthy model of the diagnosis on {len(recordings)} recordings")
+    hide = None if (shown := progress(args)) is None else not shown
+    with tqdm(total=1.0, desc="fitting", bar_format=form, disable=hide, leave=False) as bar:
+        return SelfDiagnosis(recordings.layout).fit(
+            recordings.frames, progress=lambda share: bar.update(share - bar.n) and None
+        )
+
+
 def say(args: argparse.Namespace, text: str) -> None:
     """Print a step on stderr, above a progress bar if one is shown."""
     if not args.quiet:
-        if "tqdm" in sys.modules:
-            from tqdm import tqdm
+        above_bars(text)
 
-            tqdm.write(text, file=sys.stderr)
-        else:
-            print(text, file=sys.stderr, flush=True)
+
+def above_bars(text: str) -> None:
+    """Print on stderr, above a progress bar if one is shown."""
+    if "tqdm" in sys.modules:
+        from tqdm import tqdm
+
+        tqdm.write(text, file=sys.stderr)
+    else:
+        print(text, file=sys.stderr, flush=True)
+
+
+class LogAboveBars(logging.Handler):
+    """Prints warnings of the library as :func:`say` prints steps: a line of its own, above a progress bar."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a message."""
+        above_bars(self.format(record))
 
 
 def emit(args: argparse.Namespace, result: dict[str, Any], text: str) -> None:

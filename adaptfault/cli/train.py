@@ -15,6 +15,7 @@ from adaptfault.cli.options import (
     command,
     device,
     emit,
+    fit_diagnoser,
     load_recordings,
     progress,
     say,
@@ -100,7 +101,6 @@ def run(args: argparse.Namespace) -> int:
     scores = evaluate(model.cpu(), parts[2])
     extra = {"split_seed": args.seed, "test_scores": scores.to_dict(), "history": history.to_dict()}
     if bundled:
-        say(args, "fitting the healthy model of the diagnosis")
         _bundle(args, out, recordings, model, parts)
         shutil.rmtree(folder)
     else:
@@ -147,15 +147,13 @@ def _bundle(
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.data.calibration import Calibration
     from adaptfault.robot.bundle import Bundle
-    from diagnostics import SelfDiagnosis
 
     training, validation, test = parts
-    healthy = [recordings.frames[i] for i in np.unique(training.recording)]
     Bundle.create(
         out,
         model,
         Adapter(model, training, validation),
-        SelfDiagnosis(recordings.layout).fit(healthy),
+        fit_diagnoser(args, recordings.select(np.unique(training.recording))),
         check=test,
         class_names=recordings.class_names,
         calibration=Calibration.read(args.calibration) if args.calibration else None,

@@ -93,7 +93,8 @@ def train(
         checkpoint: file written after each epoch. If it exists, training continues from it, with the same result as
             without the interruption; ``epochs``, ``patience`` and ``budget`` may differ from the earlier run's.
         on_epoch: called with the history after each epoch, once the checkpoint is on disk.
-        progress: True or False shows or hides the bar on stderr; None shows it on a terminal.
+        progress: True or False shows or hides the bar on stderr: batches of all epochs, and the time that remains if no
+            epoch is left out; None shows it on a terminal.
 
     Raises:
         ValueError: windows that are empty or not finite, or labels beyond the outputs of the model; a checkpoint of
@@ -128,12 +129,13 @@ def train(
     hide = None if progress is None else not progress
     try:
         _begin(run, validation, clock, evaluate_start)
-        with tqdm(total=epochs, initial=run.history.epochs, unit="epoch", disable=hide) as bar:
+        batches = -(-len(source.y) // batch_size)
+        with tqdm(total=epochs * batches, initial=run.history.epochs * batches, unit="batch", disable=hide) as bar:
             while (stopped := _stop(run.history, epochs, patience, clock, len(source.y))) is None:
-                history = _epoch(run, source, validation, batch_size, seed, augment, clock)
+                bar.set_description(f"epoch {run.history.epochs + 1} of {epochs}", refresh=False)
+                history = _epoch(run, source, validation, batch_size, seed, augment, clock, bar.update)
                 if history is None:
                     continue
-                bar.update()
                 last, accuracy = history.train_loss[-1], history.validation_accuracy[-1]
                 bar.set_postfix(loss=f"{last:.4f}", accuracy=f"{accuracy:.4f}", best=history.best_epoch)
                 if on_epoch is not None:
@@ -163,13 +165,14 @@ def _epoch(
     seed: int,
     augment: Augment | None,
     clock: Clock,
+    on_batch: Callable[[], object],
 ) -> History | None:
     """Train for an epoch, validate and record; None if time ran out within a later epoch."""
     began, n, device = time.perf_counter(), len(source.y), next(run.model.parameters()).device
     run.model.train()
     with seeded(seed, run.history.epochs, device) as generator:
         order = torch.split(torch.randperm(n, generator=generator), batch_size)
-        loss, seen = _pass(run, source, order, augment, generator, clock)
+        loss, seen = _pass(run, source, order, augment, generator, clock, on_batch)
     if seen < n and run.history.epochs:
         return None
     with clock.closing():
@@ -187,6 +190,7 @@ def _pass(
     augment: Augment | None,
     generator: torch.Generator,
     clock: Clock,
+    on_batch: Callable[[], object],
 ) -> tuple[float, int]:
     """Train on batches until they or the time run out; return the mean loss and the number of windows used."""
     device, total, seen, began = next(run.model.parameters()).device, 0.0, 0, time.perf_counter()
@@ -205,6 +209,7 @@ def _pass(
         if not math.isfinite(total):
             raise ValueError(f"the loss became {loss.item()} in epoch {run.history.epochs + 1}: lower learning_rate")
         clock.pace = (time.perf_counter() - began) / seen
+        on_batch()
     return total / seen, seen
 
 

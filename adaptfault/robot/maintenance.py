@@ -19,6 +19,7 @@ from adaptfault.robot.deployment_test import Judgement, compare_candidate, with_
 from adaptfault.robot.known_faults import KnownFaults
 from adaptfault.robot.plausibility import contradiction, implausible
 from adaptfault.robot.pointer import Pointer
+from adaptfault.robot.sensor_state import TECHNICIAN_BELOW, UNTESTED, judged_before, unhandled_cells, weak_base
 from adaptfault.robot.versions import Version
 from diagnostics import Diagnosis, Fault, FaultSet
 from diagnostics.evidence.sensor_change import SensorChange, sensor_change
@@ -33,10 +34,8 @@ if TYPE_CHECKING:
 SCHEMA = "adaptfault.maintenance/1"
 Decision = Literal["unchanged", "deployed", "kept", "refused"]
 
-_TECHNICIAN_BELOW = 0.9  # share of the fault-free accuracy below which the sensor needs a technician
 _CONTRADICTORY = 1.0  # residual variance ratio at which other cells predict no better than the mean
 _UNKNOWN = 3
-_TESTED = 0.05  # test coverage below which recordings test nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +46,7 @@ class MaintenanceReport:
         decision: "unchanged": no new fault, or the running version already excludes all faulty cells. "deployed": a new
             version runs, on probation. "kept": no candidate is better than the running version. "refused": the
             recordings do not fit this sensor, or no working model is left.
-        exit_code: 0 no fault known; 1 degraded but handled; 2 needs a technician; 3 unusable recordings.
+        exit_code: 0 no fault known; 1 faults that are handled, or a warning; 2 a person is needed; 3 unusable recordings.
         reason: why, in one sentence.
         fault_set: F, as known now.
         version: number of the version that runs after this run.
@@ -94,6 +93,9 @@ class MaintenanceReport:
         would = " (dry run: nothing was changed)" if self.dry_run else ""
         lines = [f"ADAPTFAULT {status} - {self.decision}: {self.reason}{would} | {' '.join(measured)}"]
         lines.append(f"version {self.version} runs; {len(self.fault_set)} of {n} cells are faulty")
+        if weak_base(self.accuracy, self.fault_free_accuracy):
+            measured = f"{self.accuracy:.3f} repaired, {self.fault_free_accuracy:.3f} healthy"
+            lines.append(f"  weak base model: accuracy {measured}; train it longer or on more recordings")
         if self.diagnosis is not None:
             lines += [f"  {fault.reason}" for fault in self.diagnosis.faults]
             lines += [f"  {fault.reason}" for fault in self.diagnosis.transport]
@@ -267,7 +269,7 @@ class _Maintenance:
     def _with_coverage(self, report: MaintenanceReport) -> MaintenanceReport:
         """Return the report with the exit code of recordings that test nothing."""
         diagnosis = report.diagnosis
-        if diagnosis is None or report.exit_code != 0 or diagnosis.coverage.test_coverage >= _TESTED:
+        if diagnosis is None or report.exit_code != 0 or diagnosis.coverage.test_coverage >= UNTESTED:
             return report
         share = diagnosis.coverage.test_coverage
         reason = f"the recordings test only {share:.0%} of the cells, so faults may be hidden; {report.reason}"
@@ -303,7 +305,7 @@ class _Maintenance:
             changed = (load.readings(loads, readings < load.rest) / layout.full_scale).astype(np.float32)
         after = float((model.predict(changed) == windows.y).mean())
         effect = f"{change.reason}; accuracy of version {report.version} {before:.3f} -> {after:.3f} with this change"
-        code = max(report.exit_code, 2 if after < _TECHNICIAN_BELOW * before else 1)
+        code = max(report.exit_code, 2 if after < TECHNICIAN_BELOW * before else 1)
         return replace(report, change=change, exit_code=code, reason=f"{effect}; {report.reason}")
 
     def _decide(
@@ -328,12 +330,16 @@ class _Maintenance:
         if faulty == self.version.fault_set:
             reason = f"version {self.version.number} excludes these cells already" if faulty else "no faulty cell"
             return self._report("unchanged", self._code(faulty), reason, known, **found)
-        if (judged := self._judged_before(faulty)) is not None:
+        if (judged := judged_before(self.bundle, faulty, self.version.number)) is not None:
             self.judged = judged
             return self._report("kept", judged["exit_code"], f"compared before: {judged['reason']}", known, **found)
         if faulty.cells in Pointer.read(self.bundle.path).rejected:
-            reason = "a version for these faults was rolled back before"
-            return self._report("kept", max(1, self._code(faulty)), reason, known, **found)
+            used = len(faulty - self.version.fault_set)
+            reason = (
+                f"a version for these faults was rolled back before, so version {self.version.number} runs,"
+                f" which uses {used} of the {len(faulty)} faulty cells"
+            )
+            return self._report("kept", self._code(faulty), reason, known, **found)
         return self._adapt(adapter, known, found)
 
     def _adapt(self, adapter: Adapter, known: KnownFaults, found: dict[str, Any]) -> MaintenanceReport:
@@ -412,13 +418,6 @@ class _Maintenance:
         reason = f"{recovered} cells recovered; version {earlier.number} uses them again ({accuracies})"
         return self._report("deployed", code, reason, known, accuracy=judgement.candidate, number=number, **found)
 
-    def _judged_before(self, faulty: FaultSet) -> dict[str, Any] | None:
-        """Return the last comparison if it was for these faults and this version; None otherwise."""
-        judged = self.bundle.journal.last("judged")
-        if judged is None or (tuple(judged["fault_set"]), judged["version"]) != (faulty.cells, self.version.number):
-            return None
-        return dict(judged)
-
     def _deploy(self, adaptation: Adaptation, known: KnownFaults, judgement: Judgement, free: float) -> int:
         about = {
             "reason": f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}",
@@ -472,11 +471,13 @@ class _Maintenance:
         )
 
     def _code(self, faulty: FaultSet, accuracy: float | None = None, free: float | None = None) -> int:
-        """Return 0: no known fault; 1: handled; 2: accuracy below 90 % of the fault-free one."""
+        """Return 0: no known fault; 1: handled; 2: not handled, or accuracy below 90 % of the fault-free one."""
         if accuracy is None or free is None:
+            if unhandled_cells(self.bundle, faulty, self.version):
+                return 2
             about = self.version.about
             accuracy, free = about.get("accuracy"), about.get("fault_free_accuracy")
-        if accuracy is not None and free is not None and accuracy < _TECHNICIAN_BELOW * free:
+        if accuracy is not None and free is not None and accuracy < TECHNICIAN_BELOW * free:
             return 2
         return 1 if len(faulty) else 0
 

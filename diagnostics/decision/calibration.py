@@ -14,7 +14,7 @@ calibrated as well as these only by assumption.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -42,6 +42,7 @@ _FEWEST_CELLS = 10  # broken, and healthy, cells of a kind: with fewer it keeps 
 _ENOUGH = 100  # recordings that are held out in all, over the splits
 _FEW = 32  # recordings: fewer are cut into pieces, so that one long recording can be split
 _PIECE = 100  # frames of a piece, at least
+_REFERENCE_TIME = 50  # of fitting a reference, in diagnoses of a simulated log; for the progress only
 _MOST_FRAMES = 600  # of a recording in one simulated log: a size
 _TRAINING_SHARE = 0.75  # of the recordings; the others make the simulated logs
 _MOST_TEMPORAL = 1.0  # upper limit of d: a jump alone proves no fault
@@ -88,8 +89,18 @@ class Calibrator:
     gains: float = 1.0
 
     @classmethod
-    def fit(cls, recordings: Sequence[Floats], layout: SensorLayout, *, seed: int = 0) -> Calibrator:
-        """Fit to fault-free recordings, ``[T, D]`` each; fewer than 8 give the defaults."""
+    def fit(
+        cls,
+        recordings: Sequence[Floats],
+        layout: SensorLayout,
+        *,
+        seed: int = 0,
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> Calibrator:
+        """Fit to fault-free recordings, ``[T, D]`` each; fewer than 8 give the defaults.
+
+        ``progress`` receives the share of the work that is done, 0 to 1.
+        """
         rng = np.random.default_rng(seed)
         n_logs = _LOGS if layout.present.sum() <= MOST_CELLS else _LOGS_OF_LARGE
         recordings, layout = calibration_subset(recordings, layout)
@@ -108,7 +119,12 @@ class Calibrator:
         # Repeated splits, more with fewer recordings: so unusual events are held out at least once.
         turns = max(2, min(len(order), _ENOUGH) // held_out)
         parts = [np.split(np.roll(order, k * held_out), [n_training]) for k in range(turns)]
-        references = [Reference.fit([recordings[i] for i in those], layout) for those, _ in parts]
+        stages = (n_logs // 3, n_logs)
+        n_steps = _REFERENCE_TIME * turns + sum(stages)
+        references = []
+        for k, (those, _) in enumerate(parts, 1):
+            references.append(Reference.fit([recordings[i] for i in those], layout))
+            progress(_REFERENCE_TIME * k / n_steps)
         logs = []
         for i in range(n_logs):
             turn = (i + i // len(_LOG_SIZES)) % turns
@@ -120,8 +136,14 @@ class Calibrator:
             logs.append((log, _random_faults(layout, share, onset, rng), layout, references[turn]))
         # Evidence depends on the exclusion threshold and that on the calibration: fit roughly, then with all logs.
         weights = default = cls()
-        for n in (n_logs // 3, n_logs):
-            weights = cls._of([_trial(*log, weights.exclusion._replace(gains=1.0)) for log in logs[:n]])
+        done = _REFERENCE_TIME * turns
+        for n in stages:
+            trials = []
+            for log in logs[:n]:
+                trials.append(_trial(*log, weights.exclusion._replace(gains=1.0)))
+                done += 1
+                progress(done / n_steps)
+            weights = cls._of(trials)
         # Few held-out recordings contain few unusual events; repeated splits are correlated and count for less.
         counts = 1 - _MAX_DISCOUNT / (1 + turns * (held_out / _HALF_DISCOUNT) ** 2)
         measured = np.array(weights.slope) != default.slope

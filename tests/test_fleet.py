@@ -121,7 +121,7 @@ def test_a_fleet_is_maintained_through_the_command_line(made_bundle, later_grasp
     assert "used before" in document["outcomes"][0]["reason"]
     assert document["ages"][0]["robots"] == 1
     assert json.loads((tmp_path / "f.fleet" / "report.json").read_text()) == document
-    assert "The fleet's skins" in (tmp_path / "f.fleet" / "report.html").read_text()
+    assert "need" in (tmp_path / "f.fleet" / "report.html").read_text()
     (tmp_path / "f.toml").write_text("")
     assert main(arguments) == 3
     assert "it lists no robot" in capsys.readouterr().err
@@ -368,3 +368,23 @@ def test_a_list_that_is_wrong_says_where(tmp_path, text, reason):
     with pytest.raises(ValueError, match=reason) as error:
         listed(tmp_path, text)
     assert "fleet.toml" in str(error.value)
+
+
+def test_the_page_names_the_robots_that_need_somebody_worst_first(tmp_path):
+    def named(name, **facts):
+        return outcome(Robot(name, f"/{name}.bundle", ("/log",)), **facts)
+
+    fleet = report(
+        named("fine"),
+        named("unknown", exit_code=3),
+        named("half", exit_code=2, faulty=5, accuracy=0.4, fault_free_accuracy=0.8),
+        named("blind", exit_code=2, faulty=60, accuracy=0.1, fault_free_accuracy=0.8),
+        named("weak", exit_code=1, faulty=5, accuracy=0.9, fault_free_accuracy=0.8),
+    )
+    assert [o.robot.name for o in fleet.needy] == ["blind", "half", "unknown"]
+    text = fleet.write_page(tmp_path / "page.html").read_text()
+    assert "3 of 5 robots need somebody: blind, half, unknown</h1>" in text
+    assert text.index("<td>blind") < text.index("<td>half") < text.index("<td>unknown")
+    assert [o.robot.name for o in fleet.weak] == ["weak"]
+    assert "weak base models, better repaired than healthy:\n  weak" in str(fleet)
+    assert "No robot needs anybody</h1>" in report(named("fine")).write_page(tmp_path / "page.html").read_text()

@@ -10,6 +10,7 @@ import pytest
 
 from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
+from adaptfault.robot.technician_report import robot_name, write_report
 from diagnostics import SensorLayout, inject
 
 LAYOUT = SensorLayout(2, 6, 5)
@@ -114,3 +115,57 @@ def test_a_bundle_of_raw_counts_reads_raw_recordings(small_grasps, later_grasps,
     capsys.readouterr()
     code, text = told(capsys, "maintain", out, tmp_path / "log.npz", "--quiet")
     assert (code, "unchanged: no faulty cell" in text) == (0, True), text
+
+
+def heading(page: Path) -> str:
+    return re.search(r"<h1[^>]*>(.*?)</h1>", page.read_text(), re.DOTALL)[1]
+
+
+def test_the_page_begins_with_the_verdict_the_robot_and_the_date(bundle, log, capsys, tmp_path):
+    page = tmp_path / "page.html"
+    told(capsys, "report", bundle.path, "--out", page)
+    assert heading(page) == "Nothing to do"
+    code, _ = told(capsys, "maintain", bundle.path, log, "--quiet", "--report", page)
+    wanted = {1: "Watch: the faults are handled", 2: "Call a technician"}[code]
+    assert heading(page) == wanted
+    told(capsys, "report", bundle.path, "--out", page, "--name", "arm <7>")
+    text = page.read_text()
+    assert heading(page) == wanted
+    assert "<b>arm &lt;7&gt;</b>; 20" in text
+    order = [text.index(part) for part in ("<h1", "arm &lt;7&gt;</b>", "What to check, in this order", "History")]
+    assert order == sorted(order)
+    assert "not handled" not in text
+
+
+def test_after_a_rollback_the_page_and_the_command_name_the_faults_that_are_not_handled(bundle, log, capsys, tmp_path):
+    page = tmp_path / "page.html"
+    told(capsys, "maintain", bundle.path, log, "--quiet")
+    assert "not handled now: pad 1, row 2 is short" in told(capsys, "rollback", bundle.path)[1]
+    told(capsys, "report", bundle.path, "--out", page)
+    assert heading(page) == "Call a technician"
+    assert "1 known fault is <b>not handled</b>: version 1 runs" in page.read_text()
+    code, _ = told(capsys, "maintain", bundle.path, log, "--quiet", "--report", page)
+    assert (code, heading(page)) == (2, "Call a technician")
+    assert "not handled</b>" in page.read_text()
+
+
+def test_the_page_of_a_dry_run_shows_what_the_run_found(bundle, log, capsys, tmp_path):
+    page = tmp_path / "page.html"
+    told(capsys, "maintain", bundle.path, log, "--quiet", "--dry-run", "--report", page)
+    assert heading(page) in ("Watch: the faults are handled", "Call a technician")
+    text = page.read_text()
+    assert "a dry run, nothing was changed" in text
+    assert "pad 1, row 2 is short" in text
+
+
+def test_a_model_that_repairs_to_more_than_the_healthy_accuracy_is_shown_as_weak(bundle, broken_row, tmp_path):
+    measured = {"accuracy": 0.8, "fault_free_accuracy": 0.7, "exit_code": 1, "reason": "as good", "version": 1}
+    bundle.journal.add("2026-01-01T00:00:00+00:00", "kept", measured)
+    assert "Weak base model" in write_report(tmp_path / "page.html", bundle).read_text()
+    bundle.journal.add("2026-01-02T00:00:00+00:00", "kept", {**measured, "accuracy": 0.69})
+    assert "Weak base model" not in write_report(tmp_path / "page.html", bundle).read_text()
+
+
+@pytest.mark.parametrize(("path", "name"), [("r7/robot.bundle", "r7"), ("arm-3.bundle", "arm-3")])
+def test_a_robot_is_called_as_its_bundle_or_the_folder_of_it(path, name, tmp_path):
+    assert robot_name(tmp_path / path) == name

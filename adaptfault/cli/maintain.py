@@ -48,6 +48,6 @@ def run(args: argparse.Namespace) -> int:
     if args.report:
         from adaptfault.robot.technician_report import write_report
 
-        write_report(args.report, bundle, report.diagnosis)
+        write_report(args.report, bundle, run=report)
     emit(args, report.to_dict(), str(report))
     return report.exit_code

@@ -13,6 +13,7 @@ def add(commands: Commands) -> None:
     parser = command(commands, "report", "write the technician's report: what is broken, what to check", example)
     parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
     parser.add_argument("--out", default="report.html", metavar="FILE", help="default report.html")
+    parser.add_argument("--name", metavar="NAME", help="of the robot (default: of the bundle or its folder)")
     parser.set_defaults(run=run)  # the folder of the page is made
 
 
@@ -21,6 +22,6 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.technician_report import write_report
 
-    path = write_report(args.out, Bundle.open(args.bundle))
+    path = write_report(args.out, Bundle.open(args.bundle), name=args.name)
     emit(args, {"schema": "adaptfault.report/1", "report": str(path)}, f"report: {path}")
     return 0

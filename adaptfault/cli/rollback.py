@@ -17,10 +17,13 @@ def add(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Roll back."""
     from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.sensor_state import SensorState
 
     bundle = Bundle.open(args.bundle)
     left = bundle.active().number
     version = bundle.rollback()
-    result = {"schema": "adaptfault.rollback/1", "left": left, "version": version.number}
-    emit(args, result, f"{version} runs; version {left} is not deployed for the same faults again")
+    unhandled = [fault.reason for fault in SensorState.of(bundle).unhandled]
+    result = {"schema": "adaptfault.rollback/1", "left": left, "version": version.number, "not_handled": unhandled}
+    lines = [f"{version} runs; version {left} is not deployed for the same faults again"]
+    emit(args, result, "\n".join([*lines, *(f"not handled now: {reason}" for reason in unhandled)]))
     return 0

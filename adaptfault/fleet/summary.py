@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from adaptfault.fleet.outcome import Outcome
+from adaptfault.robot.sensor_state import weak_base
 
 SCHEMA = "adaptfault.fleet/1"
 STATES = ("ok", "degraded", "technician", "unknown")
@@ -112,6 +113,16 @@ class FleetReport:
         """Robots in an unknown state: an error, or unusable recordings."""
         return tuple(o for o in self.outcomes if o.exit_code == 3)
 
+    @property
+    def needy(self) -> tuple[Outcome, ...]:
+        """Robots that need somebody, worst first: those for a technician, then those in an unknown state."""
+        return (*self.technician, *self.errors)
+
+    @property
+    def weak(self) -> tuple[Outcome, ...]:
+        """Robots whose repaired model is better than their healthy one: its base model is weak."""
+        return tuple(o for o in self.outcomes if weak_base(o.accuracy, o.fault_free_accuracy))
+
     @cached_property
     def wires(self) -> tuple[WireCount, ...]:
         """Faulty wires, the most frequent first; single cells are one entry per kind."""
@@ -156,6 +167,7 @@ class FleetReport:
         would = " (dry run: nothing was changed)" if self.dry_run else ""
         lines = [f"ADAPTFAULT FLEET {status} - {len(self.outcomes)} robots: {counts}{would} | {measured}"]
         lines += _listed("need a technician, the most urgent first", [_needy(o) for o in self.technician])
+        lines += _listed("weak base models, better repaired than healthy", [o.robot.name for o in self.weak])
         lines += _listed("most frequent faults", [str(wire) for wire in self.wires])
         lines += _listed("by age", [str(group) for group in self.ages])
         lines += _listed("unknown state", [f"{o.robot.name}: {o.reason}" for o in self.errors])
@@ -172,6 +184,7 @@ class FleetReport:
             "exit_code": self.exit_code,
             "counts": self.counts,
             "technician": [o.robot.name for o in self.technician],
+            "weak_base_models": [o.robot.name for o in self.weak],
             "errors": {o.robot.name: o.reason for o in self.errors},
             "wires": [asdict(wire) for wire in self.wires],
             "families": self.families,

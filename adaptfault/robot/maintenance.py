@@ -46,7 +46,8 @@ class MaintenanceReport:
         decision: "unchanged": no new fault, or the running version already excludes all faulty cells. "deployed": a new
             version runs, on probation. "kept": no candidate is better than the running version. "refused": the
             recordings do not fit this sensor, or no working model is left.
-        exit_code: 0 no fault known; 1 faults that are handled, or a warning; 2 a person is needed; 3 unusable recordings.
+        exit_code: 0 no fault known; 1 faults that are handled, or a warning; 2 a person is needed; 3 unusable
+            recordings.
         reason: why, in one sentence.
         fault_set: F, as known now.
         version: number of the version that runs after this run.

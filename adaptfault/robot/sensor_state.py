@@ -1,7 +1,7 @@
 """The state of a robot's sensor as its bundle knows it: which known faults the running version handles.
 
-Exit codes mean the same in every command: 0 nothing to do; 1 watch: faults that are handled, or a warning; 2 a person is
-needed; 3 unknown, because the input or the usage is wrong.
+Exit codes mean the same in every command: 0 nothing to do; 1 watch: faults that are handled, or a warning; 2 a person
+is needed; 3 unknown, because the input or the usage is wrong.
 """
 
 from __future__ import annotations

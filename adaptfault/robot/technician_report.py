@@ -3,48 +3,111 @@
 from __future__ import annotations
 
 import platform
+from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from adaptfault.evaluation.html_page import embedded, render, version_of
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.pointer import Pointer
+from adaptfault.robot.sensor_state import SensorState, unhandled_cells
 from diagnostics import Diagnosis
 
+if TYPE_CHECKING:
+    from adaptfault.robot.maintenance import MaintenanceReport
 
-def write_report(path: str | Path, bundle: Bundle, diagnosis: Diagnosis | None = None) -> Path:
+
+_HEADLINES = (
+    "Nothing to do",
+    "Watch: the faults are handled",
+    "Call a technician",
+    "Unknown: the recordings cannot be used",
+)
+
+
+def write_report(
+    path: str | Path,
+    bundle: Bundle,
+    diagnosis: Diagnosis | None = None,
+    *,
+    run: MaintenanceReport | None = None,
+    name: str | None = None,
+) -> Path:
     """Write the page and return its path.
 
     Args:
         path: of the HTML file.
         bundle: of the robot.
-        diagnosis: to show; None: the last one in the journal.
+        diagnosis: to show; None: that of ``run``, or the last one in the journal.
+        run: a maintenance run that the page is about, also a dry one; None: what the bundle knows.
+        name: of the robot; None: of the bundle, or of its folder where that is called robot.bundle.
 
     Raises:
         OSError: the file cannot be written.
     """
     runs = bundle.journal.runs()
+    if diagnosis is None and run is not None:
+        diagnosis = run.diagnosis
     if diagnosis is None:
-        diagnosed = [run["diagnosis"] for run in runs if run.get("diagnosis")]
+        diagnosed = [one["diagnosis"] for one in runs if one.get("diagnosis")]
         diagnosis = Diagnosis.from_dict(diagnosed[-1]) if diagnosed else None
-    active = bundle.active()
-    compared = [run for run in runs if run.get("accuracy") is not None and run["version"] == active.number]
+    state, problems = SensorState.of(bundle), bundle.problems(repair=False)
+    if run is not None:
+        state = _state_after(run, bundle, state)
+    headline = _HEADLINES[state.exit_code]
+    if state.exit_code == 1 and not state.known.faults:
+        headline = "Watch: no fault is known, but see the reason"
+    if state.exit_code == 0 and problems:
+        headline = "Watch: files of the bundle are damaged"
     return render(
         path,
         "technician.html",
+        name=name or robot_name(bundle.path),
+        headline=headline,
+        bad=state.exit_code >= 2,
         bundle=bundle,
-        name=bundle.path.name,
         layout=bundle.layout,
-        active=active,
+        active=state.version,
         pointer=Pointer.read(bundle.path),
-        knowledge=bundle.known_faults(),
+        state=state,
+        ordered=sorted(
+            state.known.faults,
+            key=lambda fault: (fault not in state.unhandled, fault.line is None, -len(fault.cells)),
+        ),
         diagnosis=diagnosis,
         verdicts=None if diagnosis is None else embedded(diagnosis.plot()),
-        last=compared[-1] if compared else None,
-        runs=[_shown(run) for run in reversed(runs)],
-        problems=bundle.problems(repair=False),
+        dry_run=run is not None and run.dry_run,
+        runs=[_shown(one) for one in reversed(runs)],
+        problems=problems,
+        date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         versions=f"adaptfault {version_of('adaptfault')}",
         python=platform.python_version(),
+    )
+
+
+def robot_name(bundle: Path) -> str:
+    """Return the name of a bundle, or of the folder that holds it where the bundle is called robot.bundle."""
+    path = bundle.resolve()
+    return path.parent.name if path.stem == "robot" and path.parent.name else path.stem
+
+
+def _state_after(run: MaintenanceReport, bundle: Bundle, state: SensorState) -> SensorState:
+    """Return the state as a run reports it; a dry run changed nothing in the bundle."""
+    unhandled = state.unhandled
+    if run.dry_run:
+        cells = unhandled_cells(bundle, run.fault_set, state.version)
+        handled = run.decision == "deployed" or run.exit_code < 2
+        unhandled = () if handled else tuple(fault for fault in run.faults if cells & set(fault.cells))
+    measured = run.accuracy is not None
+    return replace(
+        state,
+        exit_code=run.exit_code,
+        known=replace(state.known, faults=run.faults),
+        unhandled=unhandled,
+        accuracy=run.accuracy if measured else state.accuracy,
+        fault_free_accuracy=run.fault_free_accuracy if measured else state.fault_free_accuracy,
+        reason=run.reason,
     )
 
 

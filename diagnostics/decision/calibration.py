@@ -139,8 +139,8 @@ class Calibrator:
         done = _REFERENCE_TIME * turns
         for n in stages:
             trials = []
-            for log in logs[:n]:
-                trials.append(_trial(*log, weights.exclusion._replace(gains=1.0)))
+            for simulated in logs[:n]:
+                trials.append(_trial(*simulated, weights.exclusion._replace(gains=1.0)))
                 done += 1
                 progress(done / n_steps)
             weights = cls._of(trials)

@@ -90,6 +90,17 @@ def test_restored_values_come_in_the_unit_of_the_sender(restorer, healthy, consu
     np.testing.assert_allclose(packet.values[list(DEAD)], healthy[0, list(DEAD)] * 65535 / 4000, atol=350)
 
 
+def test_exchanged_cells_are_put_back_before_cells_are_restored(restorer, healthy, consumer):
+    source = np.array([3, 1, 2, 0, *range(4, 12)])
+    relay = Relay(address(consumer), restorer, DEAD)
+    received = np.where(DEAD.mask, 0, healthy[5])[source]  # 0 and 3 exchanged
+    relay.send("a", 0.0, received, received, source)
+    packet = parse_packet(consumer.recv(1 << 16), 12)
+    relay.close()
+    np.testing.assert_array_equal(packet.values[DEAD.healthy], healthy[5, DEAD.healthy])
+    assert np.abs(packet.values - healthy[5]).max() < 20
+
+
 def test_a_calibration_is_inverted_where_its_tables_rise():
     calibration = Calibration(np.array([[0.0, 10, 20], [5, 6, np.nan]]), np.array([[0.0, 1, 4], [0, 8, np.nan]]))
     counts = np.array([12.0, 5.25])

@@ -114,7 +114,14 @@ class Relay:
         self._whole: dict[str, bool] = {}  # devices that have sent whole numbers only
         restorer.deviation(known)  # before the first frame
 
-    def send(self, device: str, time: float, received: NDArray[np.float64], values: NDArray[np.float64]) -> None:
+    def send(
+        self,
+        device: str,
+        time: float,
+        received: NDArray[np.float64],
+        values: NDArray[np.float64],
+        source: NDArray[np.intp] | None = None,
+    ) -> None:
         """Send one frame on.
 
         Args:
@@ -122,14 +129,17 @@ class Relay:
             time: seconds.
             received: ``[D]`` as they came.
             values: ``[D]`` in the layout's unit; NaN = missing.
+            source: ``[D]``, the received cell that belongs at each place, where wires are exchanged; None: the same.
         """
+        source = np.arange(len(values)) if source is None else source
+        received, values = received[source], values[source]
         repair = self._repairs.setdefault(device, FrameRepair(self.restorer, self.known))
         frame, restored = repair(values)
         whole = self._whole.get(device, True) and not np.any(received[~restored] % 1)
         self._whole[device] = whole
         if restored.any():
             self.relayed.restored += 1
-            back = frame if self.calibration is None else self.calibration.invert(frame)
+            back = frame if self.calibration is None else self._counts(frame, source)
             received = np.where(restored, np.rint(back) if whole else back, received)
         data = format_packet(device, time, received, ticks=self.ticks, restored=restored, digits=_DIGITS)
         try:
@@ -137,6 +147,14 @@ class Relay:
             self.relayed.sent += 1
         except OSError:
             self.relayed.failed += 1
+
+    def _counts(self, frame: NDArray[np.float64], source: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Return the counts that the received cells would have sent."""
+        assert self.calibration is not None
+        as_received = np.zeros(len(frame))
+        as_received[source] = frame
+        counts: NDArray[np.float64] = self.calibration.invert(as_received)[source]
+        return counts
 
     def found(self, device: str, faulty: FaultSet) -> None:
         """Restore these cells of a device too, from its next frame on."""

@@ -161,7 +161,8 @@ class Station:
             self._outside += outside
             frame = replace(frame, values=values)
         if self._relay is not None:  # first: monitoring and classifying take longer
-            self._relay.send(frame.device, frame.time, received, frame.values)
+            source = getattr(session.watcher, "source", None)
+            self._relay.send(frame.device, frame.time, received, frame.values, source)
         events = session.take(frame, time.monotonic())
         self._emit(events)
         if self._relay is not None and any(event.kind in ("fault", "gone") for event in events):

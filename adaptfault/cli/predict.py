@@ -28,6 +28,7 @@ def run(args: argparse.Namespace) -> int:
 
     from adaptfault.cli.trained_model import TrainedModel
     from adaptfault.data.windows import make_windows
+    from adaptfault.robot.bundle import Bundle
 
     trained = TrainedModel.open(args.model or args.bundle)
     if args.calibration is None and trained.calibration is not None:
@@ -36,7 +37,9 @@ def run(args: argparse.Namespace) -> int:
     windows = make_windows(recordings.frames, None, recordings.layout, length=trained.network.length)
     classifier = trained.adaptation or trained.network
     (trained.adaptation.model if trained.adaptation is not None else trained.network).to(device(args))
-    probabilities = classifier.predict_proba(windows.x)
+    # Exchanged wires are put back, as on the robot.
+    x = windows.x if args.bundle is None else windows.x[..., Bundle.open(args.bundle).active().source]
+    probabilities = classifier.predict_proba(x)
     names = trained.class_names or tuple(f"class {i}" for i in range(probabilities.shape[1]))
     results = []
     for i, name in enumerate(recordings.names):

@@ -47,8 +47,10 @@ def run(args: argparse.Namespace) -> int:
         print(problem, file=sys.stderr)
     say(args, f"{len(faults)} of {faults.n_cells} cells are faulty; restoring {len(incoming.frames)} recordings")
     restorer = bundle.restorer()
-    restored = [restorer.transform(frames, faults).astype(np.float32) for frames in incoming.frames]
-    missing = sum(int(np.isnan(frames[:, faults.healthy]).sum()) for frames in incoming.frames)
+    source = bundle.active().source  # exchanged wires are put back, as the running version does
+    given = [layout.check_recording(frames)[:, source] for frames in incoming.frames]
+    restored = [restorer.transform(frames, faults).astype(np.float32) for frames in given]
+    missing = sum(int(np.isnan(frames[:, faults.healthy]).sum()) for frames in given)
     deviation = restorer.deviation(faults)
     folder = Path(args.out)
     folder.mkdir(parents=True, exist_ok=True)

@@ -116,6 +116,11 @@ class Predictor:
         return self._running.model.fault_set
 
     @property
+    def source(self) -> NDArray[np.intp]:
+        """The received cell that belongs at each place ``[D]``: the running version puts exchanged wires back."""
+        return self._running.source
+
+    @property
     def version(self) -> int:
         """Number of the running version."""
         return self._running.version.number

@@ -102,6 +102,7 @@ class Relay:
     ) -> None:
         self.host, self.port = parse_address(address)
         self.restorer, self.known, self.calibration, self.ticks = restorer, known, calibration, ticks
+        self._to: Any  # host and port, of IPv6 with two numbers more
         try:
             family, kind, protocol, _, self._to = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_DGRAM)[0]
         except OSError as error:

@@ -8,6 +8,9 @@ from recording_files import PAPER, messages, newtons, refusal, rng, text, write
 
 from adaptfault.data.recordings import load
 from adaptfault.data.recordings.blocks import Stream
+from adaptfault.data.recordings.csv_folder import csv_pieces
+from adaptfault.data.recordings.errors import InputError
+from diagnostics import SensorLayout
 
 
 def test_a_csv_of_100_rows_and_220_columns_is_the_papers_sensor(tmp_path):
@@ -133,6 +136,20 @@ def test_a_bad_csv_is_refused_with_its_line_and_the_mend(tmp_path, content, expe
 def test_a_binary_csv_is_refused(tmp_path, content, expected):
     (tmp_path / "a.csv").write_bytes(content)
     assert expected in refusal(tmp_path / "a.csv")
+
+
+def test_a_csv_whose_pages_did_not_all_reach_the_disk_gives_the_lines_before_the_gap(tmp_path):
+    lines = [",".join(f"{i / 7 + cell + 0.5:.5g}" for cell in range(6)) for i in range(400)]
+    data = ("\n".join(lines) + "\n").encode()
+    (tmp_path / "a.csv").write_bytes(data[:4096] + bytes(4096) + data[8192:])
+    whole = data[:4096].count(b"\n")
+    result = load(tmp_path / "a.csv", layout=SensorLayout(1, 2, 3))
+    assert len(result.recordings.frames[0]) == whole
+    assert f"line {whole + 1}: cut off in this line" in str(result.problems[0])
+    assert sum(len(piece.lines) for piece in csv_pieces(tmp_path / "a.csv", 1000)) == whole
+    (tmp_path / "b.csv").write_bytes("1,2,3,4,5,6\n".encode("utf-16-le"))
+    with pytest.raises(InputError, match="zero bytes"):
+        load(tmp_path / "b.csv", layout=SensorLayout(1, 2, 3))
 
 
 def test_a_csv_that_was_cut_off_anywhere_gives_every_line_before_the_cut_and_says_so(tmp_path):

@@ -16,7 +16,7 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.data.atomic import atomic_write
+from adaptfault.data.atomic import atomic_write, make_folder, sync_folder
 from adaptfault.data.recordings.layout_file import read_layout
 from diagnostics import SensorLayout
 
@@ -71,7 +71,7 @@ class Recorder:
     ) -> None:
         self.folder, self.layout, self.device = Path(folder), layout, device
         self.longest, self.interval = longest, interval
-        self.folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self.folder)
         _write_layout(self.folder / "layout.json", layout)
         self._file: TextIO | None = None
         self._path = self.folder
@@ -152,7 +152,7 @@ class Recorder:
         self._path = self.folder / name
         self._first, self._last, self._frames = at, at, 0
         self._synced = time.monotonic()
-        self._syncing = self._disk.submit(_sync_folder, self.folder)
+        self._syncing = self._disk.submit(sync_folder, self.folder)
         return self._file
 
     def _sync(self, file: TextIO) -> None:
@@ -185,14 +185,3 @@ def _write_layout(path: Path, layout: SensorLayout) -> None:
             raise ValueError(f"{path.parent} holds recordings of {there}, not of {layout}; record into another folder")
         return
     atomic_write(path, json.dumps(layout.to_dict(), allow_nan=False).encode())
-
-
-def _sync_folder(folder: Path) -> None:
-    """Sync the directory entry of a new file."""
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -1,4 +1,4 @@
-"""Writes a file atomically: after a power failure it holds the old content or the new."""
+"""Writes that survive a power failure: a file holds its old content or the new, a new folder is there."""
 
 from __future__ import annotations
 
@@ -27,9 +27,29 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
         with contextlib.suppress(OSError):
             os.unlink(name)
         raise
-    if os.name == "posix":  # the rename is durable once the folder is synchronised
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+    sync_folder(path.parent)  # the rename is durable once the folder is synchronised
+
+
+def make_folder(path: str | os.PathLike[str]) -> None:
+    """Create a folder and the missing ones above it, so that they are there after a power cut.
+
+    Raises:
+        OSError: a folder cannot be created.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return
+    make_folder(path.parent)
+    path.mkdir(exist_ok=True)
+    sync_folder(path.parent)
+
+
+def sync_folder(path: str | os.PathLike[str]) -> None:
+    """Flush the entries of a folder to the disk."""
+    if os.name != "posix":
+        return
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

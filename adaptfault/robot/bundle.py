@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
+from adaptfault.data.atomic import make_folder
 from adaptfault.robot.checksummed_json import (
     Damaged,
     damage,
@@ -137,7 +138,7 @@ class Bundle:
             )
         if class_names and len(class_names) != model.n_classes:
             raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         new = path.with_name(f".{path.name}.unfinished")
         shutil.rmtree(new, ignore_errors=True)  # left by a crash
         Parts.write(new / _PARTS, adapter, diagnoser, check, calibration)

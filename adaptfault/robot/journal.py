@@ -116,8 +116,8 @@ class Journal:
     def _connection(self) -> Iterator[sqlite3.Connection]:
         with locked(self.bundle / _LOCK, wait=True):
             with closing(sqlite3.connect(self.path)) as connection:
+                connection.execute("PRAGMA synchronous=EXTRA")  # FULL may lose a committed run at a power cut
                 connection.executescript(_TABLES)
-                connection.execute("PRAGMA synchronous=FULL")
                 yield connection
             self._write_checksum()
 

@@ -153,5 +153,11 @@ class Versions:
         for unfinished in self.folder.glob(f"{_UNFINISHED}*"):
             shutil.rmtree(unfinished) if unfinished.is_dir() else unfinished.unlink()
         if keep is not None:
-            for number in set(self.numbers) - set(keep):
-                shutil.rmtree(self.path(number))
+            # Renamed first, so that a power cut during the removal leaves no version with missing files.
+            removed = [self.folder / f"{_UNFINISHED}{number:04d}" for number in sorted(set(self.numbers) - set(keep))]
+            for unfinished in removed:
+                os.replace(self.folder / unfinished.name.removeprefix(_UNFINISHED), unfinished)
+            if removed:
+                sync(self.folder)
+            for unfinished in removed:
+                shutil.rmtree(unfinished)

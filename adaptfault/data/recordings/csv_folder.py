@@ -31,8 +31,8 @@ def read_csv(path: Path) -> Content:
 
     A first column that the header names as a time (``time``, ``timestamp``, ``t``, with a unit as in ``time_ms``) is no
     reading; it gives the rate. An empty cell and ``nan`` are missing readings and become NaN. Blank lines are skipped.
-    A last line that a power failure cut off is left out with a warning, and so are the zero bytes that may follow it. A
-    cut inside the last number of a full line cannot be detected.
+    A last line that a power failure cut off is left out with a warning, and so is everything from zero bytes on, which
+    stand for data that did not reach the disk. A cut inside the last number of a full line cannot be detected.
 
     Raises:
         InputError: not text, no readings, lines of different lengths, a cell that is no number.
@@ -112,6 +112,8 @@ def csv_pieces(path: Path, size: int) -> Iterator[Piece]:
                         what = f"{_values(here)} where the lines before it have {width}; correct it"
                         raise InputError.at(path, what, f"line {parsed.lines[0]}")
                     yield parsed
+                    if b"\0" in piece:
+                        return  # cut off here
                     before = before.behind(piece, parsed)
                 if not data:
                     return
@@ -135,8 +137,9 @@ class _Before:
 
 
 def _parse(path: Path, data: bytes, before: _Before) -> Piece:
-    written = data.rstrip(b"\0") or data
-    written = written if written.isascii() else data  # then the file is binary
+    whole, zeros, _ = data.partition(b"\0")
+    is_text = data.isascii() and (b"\n" in whole or before.lines or not data.rstrip(b"\0").count(b"\0"))
+    written = whole if (whole or before.lines) and zeros and is_text else data  # else the file is binary
     text = decoded(path, written)
     rows, numbers = numbered_lines(text)
     problems: tuple[Problem, ...] = ()

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 Key = tuple[Line | None, int]
 
+_LONGEST_GAP = 86400.0  # seconds; after a longer one the clock was set
+
 
 class Monitor:
     """Monitors a running sensor and reports faults that are new, have changed, or are gone.
@@ -49,20 +51,23 @@ class Monitor:
 
         Args:
             frame: ``[D]`` or ``[pads, rows, cols]``, in the layout's unit; NaN = missing.
-            time: time of the frame in seconds; frames missing from the sequence of times are counted as lost.
+            time: time of the frame in seconds; frames missing from the sequence of times are counted as lost. A step
+                back, or forward by more than a day, is a clock that was set: no frame counts as lost.
 
         Returns:
             The faults; one that is gone has probability 0.
 
         Raises:
-            ValueError: a frame of another shape.
+            ValueError: a frame of another shape, or a time that is not finite; the frame is not processed.
         """
         layout = self._diagnoser.layout
         reading = np.asarray(frame, dtype=np.float64).reshape(-1)
         if reading.size != layout.n_cells:
             raise ValueError(f"expected a frame of {layout.n_cells} readings ({layout}), got {reading.size}")
         if time is not None:
-            if self._time is not None:
+            if not np.isfinite(time):
+                raise ValueError(f"time {time}: expected seconds, or None where it is unknown")
+            if self._time is not None and 0 < time - self._time <= _LONGEST_GAP:
                 self._stream.miss(round((time - self._time) * layout.rate) - 1)
             self._time = time
         due = self._stream.due

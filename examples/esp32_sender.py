@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from adaptfault.acquisition import PacketError, format_packet, parse_packet
+from adaptfault.acquisition import PacketError, format_packet, parse_packet, read_key
 
 
 @dataclass
@@ -38,6 +38,7 @@ def stream(
     garbage: float = 0.0,
     seed: int = 0,
     start: float = 0.0,
+    key: bytes | None = None,
 ) -> Iterator[tuple[str, bytes]]:
     """Yield ("good" | "garbage" | "duplicates" | "lost", datagram) for each frame of ``[T, D]``, with mischief between.
 
@@ -46,11 +47,12 @@ def stream(
         loss, duplicates, garbage: shares; ``reorder``: share of neighbours that change places.
         seed: of the mischief.
         start: see above.
+        key: authenticates the packets.
     """
     rng = np.random.default_rng(seed)
     waiting: bytes | None = None
     for i, frame in enumerate(frames):
-        packet = format_packet(device, start + i / rate, frame)
+        packet = format_packet(device, start + i / rate, frame, key=key)
         while rng.random() < garbage:
             yield "garbage", rubbish(packet, len(frame), rng)
         if rng.random() < loss:
@@ -135,10 +137,13 @@ def main() -> None:
     for name in ("loss", "reorder", "duplicates", "garbage"):
         parser.add_argument(f"--{name}", type=float, default=0.0, help="share of the packets")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--key", help="file with the key that authenticates the packets")
     args = parser.parse_args()
     frames, rate = recording(args.recording, args.frames)
     mischief = {name: getattr(args, name) for name in ("loss", "reorder", "duplicates", "garbage", "seed")}
-    sent = send(stream(frames, rate, args.device, **mischief), args.host, args.port, args.rate)
+    key = None if args.key is None else read_key(args.key)
+    start = 0.0 if key is None else time.time()  # never goes back, so that replays are refused
+    sent = send(stream(frames, rate, args.device, start=start, key=key, **mischief), args.host, args.port, args.rate)
     print(f"{args.host}:{args.port}:", ", ".join(f"{count} {name}" for name, count in asdict(sent).items()))
 
 

@@ -288,7 +288,9 @@ def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp
     watchdog.start()
     with child:
         port = int(re.search(r"port (\d+)", child.stderr.readline())[1])
-        send(port, [*packets(np.zeros((5, 6)), start=1000), *packets(np.zeros((2, 6)))])
+        send(port, packets(np.zeros((5, 6)), start=1000))
+        time.sleep(1.0)  # a device that restarts is silent for a while
+        send(port, packets(np.zeros((2, 6))))
         assert "restart: " in child.stdout.readline()  # so these have been dealt with
         child.stdin.write("record\n")
         assert child.stderr.readline() == "record: recording from now on\n"

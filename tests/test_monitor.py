@@ -197,3 +197,17 @@ def test_two_monitors_of_one_diagnoser_do_not_disturb_each_other(fitted, log, mi
         b.update(broken_frame)
     assert not a.diagnosis().faults
     assert b.diagnosis().fault_set == {middle[3]}
+
+
+def test_a_time_that_is_not_finite_is_refused_and_a_clock_that_is_set_loses_no_frames():
+    layout = SensorLayout(1, 2, 3)
+    monitor = Monitor(SelfDiagnosis(layout))
+    for time in (np.nan, np.inf, -np.inf):
+        with pytest.raises(ValueError, match="expected seconds"):
+            monitor.update(np.ones(6), time)
+    for time in (0.0, 0.1, -1e300, 1e300, 5.0, 4.0, 4.1, 4.3):
+        monitor.update(np.ones(6), time)
+    diagnosis = monitor.diagnosis()
+    assert diagnosis.n_frames == 8  # those that were refused are not among them
+    assert np.isfinite(diagnosis.probability).all()
+    assert monitor._stream.transport.lost == 1

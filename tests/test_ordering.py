@@ -74,11 +74,34 @@ def test_a_packet_that_comes_too_late_is_dropped_and_counted():
 
 def test_a_device_that_starts_anew_goes_on_and_time_keeps_rising():
     packets = [packet(i, start=500.0) for i in range(20)] + [packet(i) for i in range(20)]
-    ordering, frames = played(packets)
+    ordering, frames = Ordering("a", RATE), []
+    for i, one in enumerate(packets):
+        frames += ordering.push(one, i / RATE + (1.0 if i >= 20 else 0.0))  # it takes a second to start
     assert numbers(frames) == [*range(20), *range(20)]
     assert [frame.restarted for frame in frames].index(True) == 20
     assert ordering.arrivals.restarts == 1
     assert (np.diff([frame.time for frame in frames]) > 0).all()
+
+
+def test_replayed_packets_of_a_device_that_still_sends_are_no_restart_and_are_dropped():
+    packets = [packet(i, start=500.0) for i in range(200)]
+    ordering, frames = Ordering("a", RATE), []
+    for i, one in enumerate(packets):
+        frames += ordering.push(one, i / RATE)
+        if i > 100:
+            for old in packets[i - 100 : i - 95]:  # a burst of old packets after each
+                frames += ordering.push(old, i / RATE + 0.01)
+    assert numbers(frames) == list(range(200))
+    arrivals = ordering.arrivals
+    assert (arrivals.restarts, arrivals.strays + arrivals.duplicates, arrivals.lost) == (0, 99 * 5, 0)
+
+
+def test_where_clocks_never_go_back_old_packets_are_dropped_however_long_the_device_is_silent():
+    ordering = Ordering("a", RATE, restarts=False)
+    for i in range(20):
+        ordering.push(packet(i, start=500.0), i / RATE)
+    assert not [frame for i in range(10) for frame in ordering.push(packet(i), 1000.0 + i)]
+    assert numbers(ordering.push(packet(20, start=500.0), 2000.0)) == [20]
 
 
 def test_after_a_restart_the_time_that_it_took_is_counted():

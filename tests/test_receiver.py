@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adaptfault.acquisition import Counters, Receiver, format_packet
+from adaptfault.acquisition import Counters, Receiver, Station, format_packet, read_key
 from diagnostics import SensorLayout
 
 SMALL = SensorLayout(1, 2, 3, rate=1000.0)
@@ -127,6 +127,93 @@ def test_a_device_is_bound_to_its_address_until_it_is_silent():
     counters, frames = asyncio.run(run())
     assert (counters.kept, counters.refused) == (4, 3)
     assert all((frame.values == 1).all() for frame in frames)
+
+
+def offered(arrivals, **options):
+    """Hand (device, time stamp, address, arrival) to a receiver; return it and the frames."""
+
+    async def run():
+        receiver = Receiver(SensorLayout(1, 2, 3, rate=10.0), **options)
+        for device, stamp, address, now in arrivals:
+            receiver.take(format_packet(device, stamp, np.ones(6), key=options.get("key")), now, address)
+        receiver.close()
+        return receiver, [frame async for frame in receiver]
+
+    return asyncio.run(run())
+
+
+def test_invented_names_do_not_lock_a_device_out():
+    invented = [(f"invented{i}", 0.0, "10.0.0.66", 0.0) for i in range(16)]
+    robot = [("robot", i / 10, "10.0.0.1", i / 10) for i in range(100)]
+    receiver, frames = offered(invented + robot)
+    counters = receiver.counters
+    assert sum(frame.device == "robot" for frame in frames) == 80  # from 2 s on
+    assert (counters.received, counters.kept, counters.refused, counters.devices) == (116, 96, 20, 16)
+
+
+def test_a_device_that_sends_is_not_evicted():
+    arrivals = [("robot", i / 10, "10.0.0.1", i / 10) for i in range(600)]
+    arrivals += [(f"invented{i}", 0.0, "10.0.0.66", i / 10 + 0.05) for i in range(600)]
+    receiver, frames = offered(sorted(arrivals, key=lambda one: one[3]))
+    assert sum(frame.device == "robot" for frame in frames) == 600
+    assert receiver.counters.received == 1200 == receiver.counters.kept + receiver.counters.refused
+
+
+def test_a_device_with_a_configured_address_may_send_from_there_only():
+    arrivals = [("robot", i / 10, f"10.0.0.{1 + i % 2}", i / 10) for i in range(10)]
+    arrivals += [("hand", 0.0, "10.0.0.9", 0.0), ("other", 0.0, "10.0.0.2", 0.0)]
+    receiver, frames = offered(arrivals, devices=["robot@10.0.0.2", "hand"])
+    assert [frame.device for frame in frames].count("robot") == 5
+    assert {frame.device for frame in frames} == {"robot", "hand"}
+    assert receiver.counters.refused == 6
+    with pytest.raises(ValueError, match="no IP address; expected NAME or NAME@ADDRESS"):
+        Receiver(SMALL, devices=["robot@here"])
+
+
+def test_with_a_key_only_packets_that_are_signed_with_it_arrive_and_none_twice():
+    key, other = b"0123456789abcdef", b"0123456789abcdeF"
+    good = [format_packet("a", i / 10, np.ones(6), key=key) for i in range(20)]
+    forged = [
+        format_packet("a", 2.0, np.ones(6)),
+        format_packet("a", 2.0, np.ones(6), key=other),
+        good[3].replace(b",1,", b",2,", 1),
+        good[3][:-1],
+        good[3].split(b"*")[0] + b"*",
+    ]
+
+    async def run():
+        receiver = Receiver(SensorLayout(1, 2, 3, rate=10.0), key=key)
+        for i, data in enumerate(good):
+            receiver.take(data, i / 10)
+        for i, data in enumerate(forged + good):  # replayed long after
+            receiver.take(data, 1000.0 + i)
+        receiver.close()
+        return receiver.counters, [frame async for frame in receiver]
+
+    counters, frames = asyncio.run(run())
+    assert (len(frames), counters.kept, counters.forged, counters.restarts) == (20, 20, 5, 0)
+    assert counters.received == 45 == 20 + 5 + counters.duplicates + counters.late + counters.strays
+
+
+def test_a_key_is_read_from_a_file_and_a_short_one_refused(tmp_path):
+    (tmp_path / "key").write_text("0123456789abcdef0123\n")
+    assert read_key(tmp_path / "key") == b"0123456789abcdef0123"
+    (tmp_path / "key").write_text("secret")
+    with pytest.raises(ValueError, match="a key of 6 bytes, expected 16 or more"):
+        read_key(tmp_path / "key")
+
+
+def test_a_station_that_is_told_to_quit_drops_what_it_has_no_time_for(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("adaptfault.acquisition.station.time.monotonic", lambda: now[0])
+    station = Station(SMALL, on_event=lambda event: None, quiet=True)
+    monkeypatch.setattr(station, "_take", lambda frame: now.__setitem__(0, now[0] + 0.1))  # as a slow classifier
+    for i, data in enumerate(packets(1000)):
+        station.receiver.take(data, i / SMALL.rate)
+    station.receiver.close()
+    asyncio.run(station._take_all())
+    assert now[0] < 1
+    assert station.receiver.counters.dropped > 980
 
 
 def test_when_nobody_fetches_the_oldest_frames_go_and_are_counted():

@@ -1,7 +1,7 @@
 """Acquisition: receives frames from sensors, orders and records them."""
 
 from adaptfault.acquisition.ordering import Arrivals, Frame, Ordering
-from adaptfault.acquisition.packet import Packet, PacketError, format_packet, parse_packet
+from adaptfault.acquisition.packet import NotAuthentic, Packet, PacketError, format_packet, parse_packet, read_key
 from adaptfault.acquisition.receiver import Counters, Receiver
 from adaptfault.acquisition.recorder import Recorded, Recorder
 from adaptfault.acquisition.relay import FrameRepair, Relay, Relayed
@@ -17,6 +17,7 @@ __all__ = [
     "Event",
     "Frame",
     "FrameRepair",
+    "NotAuthentic",
     "Ordering",
     "Packet",
     "PacketError",
@@ -31,4 +32,5 @@ __all__ = [
     "format_packet",
     "parse_packet",
     "parse_when",
+    "read_key",
 ]

@@ -17,6 +17,7 @@ WINDOW = 3
 _LATE = 1.0  # seconds by which a packet may be older than the last frame; an older time stamp is a restart
 _FAR = 10.0  # seconds; a larger jump of the time stamp needs a second packet that agrees
 _PATIENCE = 0.25  # seconds for which a packet is held at least, because networks delay packets
+_QUIET = 0.5  # seconds; a device that sent within that has not restarted: no boot is so short
 _REMEMBERED = 64  # time stamps in which duplicates are recognised
 
 
@@ -78,16 +79,18 @@ class Ordering:
 
     A packet that follows the last frame is passed on at once. A packet after a gap is held back until the gap is
     filled, ``window`` packets are held, or the time of so many packets has passed. A jump of the time stamp needs a
-    second packet that agrees: backwards the device restarted, forwards it was silent.
+    second packet that agrees: backwards the device restarted, forwards it was silent. A device whose packets still
+    arrive has not restarted, so older time stamps are then replays, which are dropped as strays.
 
     Args:
         device: name of the device.
         rate: packets per second.
         window: most packets held back.
+        restarts: the device's clock may restart; False: older time stamps are always dropped.
     """
 
-    def __init__(self, device: str, rate: float, *, window: int = WINDOW) -> None:
-        self.device, self.rate, self.window = device, rate, window
+    def __init__(self, device: str, rate: float, *, window: int = WINDOW, restarts: bool = True) -> None:
+        self.device, self.rate, self.window, self.restarts = device, rate, window, restarts
         self._last: float | None = None  # time stamp of the last frame passed on
         self._arrived = 0.0  # its arrival by the receiver's clock
         self._offset = 0.0  # from the device's clock to a clock that never goes back
@@ -144,6 +147,10 @@ class Ordering:
 
     def _handle_jump(self, one: _Waiting) -> list[Frame]:
         """Handle a time stamp far from the last: wait for a second packet that agrees."""
+        quiet = max(_QUIET, 3 / self.rate)
+        if one.time < (self._last or 0.0) and (not self.restarts or one.arrived - self._arrived < quiet):
+            self._strays += 1
+            return []
         other, self._stray = self._stray, one
         if other is None:
             return []

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import hmac
 import math
+import os
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,8 +24,16 @@ _LATEST = 1e19  # ticks; nanoseconds since 1970 fit
 _VALUE_BYTES = 32  # a double written in full, and its comma
 
 
+_TAG = 16  # bytes of the HMAC, written as twice as many hexadecimal digits
+_SHORTEST_KEY = 16  # bytes
+
+
 class PacketError(ValueError):
     """A datagram that is not a packet of this array. One line: what came, what was expected."""
+
+
+class NotAuthentic(PacketError):
+    """A packet without an authentication code, or with a wrong one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,22 +55,42 @@ class Packet:
 
 def longest_packet(n_cells: int) -> int:
     """Return the largest size of a packet of ``n_cells`` values, in bytes."""
-    return 128 + _VALUE_BYTES * n_cells
+    return 128 + _VALUE_BYTES * n_cells + 1 + 2 * _TAG
 
 
-def parse_packet(data: bytes, n_cells: int, *, ticks: float = TICKS) -> Packet:
+def read_key(path: str | os.PathLike[str]) -> bytes:
+    """Return the key in a file, without white space at its ends.
+
+    Raises:
+        ValueError: it is shorter than 16 bytes.
+        OSError: the file cannot be read.
+    """
+    key = Path(path).read_bytes().strip()
+    if len(key) < _SHORTEST_KEY:
+        raise ValueError(f"{path}: a key of {len(key)} bytes, expected {_SHORTEST_KEY} or more; openssl rand -hex 32")
+    return key
+
+
+def parse_packet(data: bytes, n_cells: int, *, ticks: float = TICKS, key: bytes | None = None) -> Packet:
     """Parse a packet. An empty value and ``nan`` are missing readings; a line end or a trailing comma is ignored.
 
     Args:
         data: the datagram.
         n_cells: D, number of values.
         ticks: ticks of the time stamp in a second.
+        key: the packet must end with ``*`` and the HMAC-SHA256 of all before, its first 16 bytes as 32 hexadecimal
+            digits. None: packets have no such code.
 
     Raises:
         PacketError: the datagram is not such a packet.
+        NotAuthentic: the code is missing or wrong.
     """
     if len(data) > longest_packet(n_cells):
         raise PacketError(f"{len(data)} bytes; {n_cells} values take {longest_packet(n_cells)} at most")
+    if key is not None:
+        data, _, code = data.rstrip(b"\r\n\0 ").rpartition(b"*")
+        if not hmac.compare_digest(code.lower(), _code(data, key)):
+            raise NotAuthentic("no authentication code, or a wrong one; the sender needs the same key")
     try:
         text = data.decode("ascii").rstrip("\r\n\0 ")
     except UnicodeDecodeError:
@@ -88,6 +120,7 @@ def format_packet(
     ticks: float = TICKS,
     restored: ArrayLike | None = None,
     digits: int = 6,
+    key: bytes | None = None,
 ) -> bytes:
     """Write the packet that :func:`parse_packet` reads; the time stamp is a whole number of ticks.
 
@@ -98,6 +131,7 @@ def format_packet(
         ticks: ticks of the time stamp in a second.
         restored: bool ``[D]``, values that are written with a plus sign, which readers of numbers ignore.
         digits: significant digits of a value that is not restored; restored ones have 6.
+        key: of the authentication code that the packet ends with; None: no code.
 
     Raises:
         ValueError: :func:`parse_packet` would reject the device name.
@@ -108,8 +142,12 @@ def format_packet(
     written = ["" if value != value else f"{value:.{digits}g}" for value in numbers]
     for i in () if restored is None else np.flatnonzero(restored).tolist():
         written[i] = f"{numbers[i]:+.6g}"
-    cells = ",".join(written)
-    return f"{device},{round(time * ticks)},{cells}".encode()
+    data = f"{device},{round(time * ticks)},{','.join(written)}".encode()
+    return data if key is None else data + b"*" + _code(data, key)
+
+
+def _code(data: bytes, key: bytes) -> bytes:
+    return hmac.new(key, data, hashlib.sha256).digest()[:_TAG].hex().encode()
 
 
 def _number(text: str) -> float:

@@ -7,11 +7,13 @@ import socket
 import time
 from collections import deque
 from collections.abc import Collection, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, fields
+from ipaddress import ip_address
 from types import TracebackType
 
 from adaptfault.acquisition.ordering import WINDOW, Arrivals, Frame, Ordering
-from adaptfault.acquisition.packet import TICKS, PacketError, longest_packet, parse_packet
+from adaptfault.acquisition.packet import TICKS, NotAuthentic, PacketError, longest_packet, parse_packet
 from diagnostics import SensorLayout
 
 MOST_DEVICES = 16
@@ -19,6 +21,7 @@ QUEUE = 1024
 _KERNEL_BUFFER = 4 << 20  # bytes requested, for datagrams that arrive while this process does not run
 _TURNS = 8  # of the event loop for each frame fetched; each turn reads one datagram
 _BOUND = 10.0  # seconds of silence after which a device may send from another address
+_IDLE = 2.0  # seconds of silence after which a device may give its place to another one
 _TICK = 0.05  # seconds between checks for held packets
 
 
@@ -26,15 +29,16 @@ _TICK = 0.05  # seconds between checks for held packets
 class Counters:
     """Counts of all datagrams.
 
-    ``received`` is the sum of ``kept``, ``malformed``, ``oversized``, ``refused``, ``duplicates``, ``late``, ``strays``
-    and ``held``.
+    ``received`` is the sum of ``kept``, ``malformed``, ``oversized``, ``forged``, ``refused``, ``duplicates``, ``late``,
+    ``strays`` and ``held``.
 
     Attributes:
         received: datagrams.
         kept: frames, in order.
         dropped: kept frames that were not fetched in time.
         malformed, oversized: not packets of this array.
-        refused: from devices that are not listed, beyond the limit of devices, or from a second address.
+        forged: without the right authentication code, where a key is given.
+        refused: from devices that are not listed, beyond the limit of devices, or from another address.
         devices: number of devices.
         duplicates, late, strays, held, lost, restarts: as in :class:`Arrivals`, all devices together.
     """
@@ -44,6 +48,7 @@ class Counters:
     dropped: int = 0
     malformed: int = 0
     oversized: int = 0
+    forged: int = 0
     refused: int = 0
     devices: int = 0
     duplicates: int = 0
@@ -67,17 +72,24 @@ class Receiver(asyncio.DatagramProtocol):
     """Frames of one kind of array from the network: ``async with Receiver(layout, port) as r: async for frame in r:``.
 
     No content of a datagram stops the receiver or grows its memory: invalid datagrams are counted and discarded; the
-    numbers of devices and of waiting frames are limited. A full queue discards its oldest frame.
+    numbers of devices and of waiting frames are limited. A full queue discards its oldest frame. At the limit of devices
+    a new one takes the place of the one that has been silent longest, 2 s at least.
 
     Args:
         layout: the array; its rate determines which packets are missing.
         port: to listen on; 0 chooses a free one.
         host: address to listen on; the default receives from this machine only, "0.0.0.0" from the whole network.
         ticks: ticks of the time stamps in a second.
-        devices: names of the accepted devices; None: any.
+        devices: names of the accepted devices, each with its address where it has a fixed one, as "hand@10.0.0.7"; None:
+            any.
         most_devices: limit of devices; packets of further ones are refused.
         queue: frames that may wait to be fetched.
         window: packets of a device held back for a late one.
+        key: packets without the right authentication code are refused (see :func:`parse_packet`). Time stamps must then
+            never go back, not even when the device restarts: that excludes replays.
+
+    Raises:
+        ValueError: an address in ``devices`` is none.
     """
 
     def __init__(
@@ -91,14 +103,17 @@ class Receiver(asyncio.DatagramProtocol):
         most_devices: int = MOST_DEVICES,
         queue: int = QUEUE,
         window: int = WINDOW,
+        key: bytes | None = None,
     ) -> None:
         self.layout, self.port, self.host, self.ticks = layout, port, host, ticks
-        self.devices, self.most_devices, self.window = devices, most_devices, window
+        self.devices = None if devices is None else dict(map(_device, devices))
+        self.most_devices, self.window, self.key = most_devices, window, key
         self._queue: deque[Frame] = deque(maxlen=queue)
         self._longest = longest_packet(layout.n_cells)
         self._streams: dict[str, Ordering] = {}
         self._senders: dict[str, tuple[str, float]] = {}  # address of each device, and when it sent last
-        self._received = self._dropped = self._malformed = self._oversized = self._refused = 0
+        self._evicted = dict.fromkeys((f.name for f in fields(Arrivals)), 0)  # counts of devices that are forgotten
+        self._received = self._dropped = self._malformed = self._oversized = self._forged = self._refused = 0
         self._transport: asyncio.BaseTransport | None = None
         self._news = asyncio.Event()
         self._closed = False
@@ -108,12 +123,17 @@ class Receiver(asyncio.DatagramProtocol):
     def counters(self) -> Counters:
         """Counts of all datagrams so far."""
         each = [stream.arrivals for stream in self._streams.values()]
-        total = {f.name: sum(getattr(one, f.name) for one in each) for f in fields(Arrivals) if f.name != "received"}
+        total = {
+            f.name: self._evicted[f.name] + sum(getattr(one, f.name) for one in each)
+            for f in fields(Arrivals)
+            if f.name != "received"
+        }
         return Counters(
             received=self._received,
             dropped=self._dropped,
             malformed=self._malformed,
             oversized=self._oversized,
+            forged=self._forged,
             refused=self._refused,
             devices=len(each),
             **total,
@@ -135,23 +155,52 @@ class Receiver(asyncio.DatagramProtocol):
             self._oversized += 1
             return
         try:
-            packet = parse_packet(data, self.layout.n_cells, ticks=self.ticks)
+            packet = parse_packet(data, self.layout.n_cells, ticks=self.ticks, key=self.key)
+        except NotAuthentic:
+            self._forged += 1
+            return
         except PacketError:
             self._malformed += 1
             return
+        if self.devices is not None and self.devices.get(packet.device, "none") not in (None, sender):
+            self._refused += 1
+            return
         stream = self._streams.get(packet.device)
         if stream is None:
-            unwanted = self.devices is not None and packet.device not in self.devices
-            if unwanted or len(self._streams) >= self.most_devices:
+            if len(self._streams) >= self.most_devices and not self._evict(now):
                 self._refused += 1
                 return
-            stream = self._streams[packet.device] = Ordering(packet.device, self.layout.rate, window=self.window)
+            stream = self._streams[packet.device] = Ordering(
+                packet.device, self.layout.rate, window=self.window, restarts=self.key is None
+            )
         bound, last = self._senders.get(packet.device, (sender, now))
         if sender != bound and now - last < _BOUND:
             self._refused += 1
             return
         self._senders[packet.device] = (sender, now)
         self._put(stream.push(packet, now))
+
+    def _evict(self, now: float) -> bool:
+        """Forget the device that has been silent longest; return whether there was one."""
+        name = min(self._senders, key=lambda one: self._senders[one][1])
+        if now - self._senders[name][1] < _IDLE:
+            return False
+        stream = self._streams.pop(name)
+        del self._senders[name]
+        self._put(stream.flush())
+        for count in self._evicted:
+            self._evicted[count] += getattr(stream.arrivals, count)
+        return True
+
+    def discard(self) -> None:
+        """Drop the frames that wait to be fetched."""
+        self._dropped += len(self._queue)
+        self._queue.clear()
+
+    @property
+    def closed(self) -> bool:
+        """Whether it no longer listens."""
+        return self._closed
 
     def poll(self, now: float) -> None:
         """Release packets whose waiting time for an earlier one is over."""
@@ -223,3 +272,13 @@ class Receiver(asyncio.DatagramProtocol):
             self._dropped += len(self._queue) == self._queue.maxlen
             self._queue.append(frame)
             self._news.set()
+
+
+def _device(text: str) -> tuple[str, str | None]:
+    """Return the name and the address, if any, of a device "name" or "name@address"."""
+    name, _, address = text.partition("@")
+    if not address:
+        return name, None
+    with suppress(ValueError):
+        return name, str(ip_address(address))
+    raise ValueError(f"device {text!r}: {address!r} is no IP address; expected NAME or NAME@ADDRESS")

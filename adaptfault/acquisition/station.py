@@ -31,6 +31,7 @@ SCHEMA = "adaptfault.listen/1"
 
 _COMMANDS = {"record": True, "stop": False, "auto": None}
 _ANSWERS = {True: "recording from now on", False: "not recording", None: "recording as the rule says"}
+_DRAIN = 0.5  # seconds for the frames that still wait at the end
 _CHECK = 0.5  # seconds between checks for silent devices
 _WAITING = 16_000_000  # bytes of frames that may wait, for bursts
 _LINE = 1000  # bytes; longest command
@@ -44,7 +45,7 @@ class Station:
 
     Args:
         layout: the array; None: the bundle's.
-        port, host, devices, ticks: as for :class:`Receiver`.
+        port, host, devices, ticks, key: as for :class:`Receiver`.
         bundle: folder of a bundle; None: monitor only.
         record: folder for recordings; None: no recording.
         relay: ``HOST:PORT`` to which repaired packets are sent, see :class:`Relay`; needs a bundle.
@@ -69,6 +70,7 @@ class Station:
         host: str = "127.0.0.1",
         devices: Collection[str] | None = None,
         ticks: float = TICKS,
+        key: bytes | None = None,
         record: str | os.PathLike[str] | None = None,
         relay: str | None = None,
         when: str = "contact",
@@ -100,7 +102,7 @@ class Station:
         if not self._ready:
             self._ready.append(self._monitor())  # takes a second, so before the first frame
         queue = max(64, _WAITING // (8 * layout.n_cells))
-        self.receiver = Receiver(layout, port, host=host, devices=devices, ticks=ticks, queue=queue)
+        self.receiver = Receiver(layout, port, host=host, devices=devices, ticks=ticks, queue=queue, key=key)
         self._sessions: dict[str, Session] = {}
         self._outside = 0  # readings outside the layout's range
         self._command: bool | None = None  # the last command, also for devices that come later
@@ -135,11 +137,16 @@ class Station:
 
     async def _take_all(self) -> None:
         taken = 0
+        ending: float | None = None
         async for frame in self.receiver:
             self._take(frame)
             taken += 1
             if self.frames is not None and taken >= self.frames:
                 return
+            if self.receiver.closed:
+                ending = time.monotonic() if ending is None else ending
+                if time.monotonic() - ending > _DRAIN:
+                    self.receiver.discard()
 
     async def _check_silence(self) -> None:
         while True:
@@ -151,6 +158,8 @@ class Station:
     def _take(self, frame: Frame) -> None:
         session = self._sessions.get(frame.device)
         if session is None:
+            for gone in self._sessions.keys() - self.receiver.arrivals.keys():  # the receiver has forgotten them
+                self._emit(self._sessions.pop(gone).close())
             session = self._sessions[frame.device] = self._begin(frame.device)
         received = frame.values
         if self.calibration is not None:

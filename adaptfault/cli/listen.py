@@ -20,6 +20,7 @@ _WHEN = (
     "always | command (on stdin) | contact or contact:X (cells above X in the array's unit, default 5 %% of full scale)"
     " | HH:MM-HH:MM (local time); default contact"
 )
+_DEVICE = "listen to this one only, ID or ID@ADDRESS; may be repeated"
 
 
 def add(commands: Commands) -> None:
@@ -28,7 +29,8 @@ def add(commands: Commands) -> None:
     parser.add_argument("bundle", nargs="?", metavar="BUNDLE", help="the robot's bundle, to classify as well")
     parser.add_argument("--port", type=int, required=True, help="UDP port; 0 takes a free one and prints it")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this machine only)")
-    parser.add_argument("--device", action="append", metavar="ID", help="listen to this one only; may be repeated")
+    parser.add_argument("--device", action="append", metavar="ID", help=_DEVICE)
+    parser.add_argument("--key", metavar="FILE", help="accept only packets that are authenticated with this key")
     parser.add_argument(
         "--ticks", type=float, default=1000.0, help="time stamps count so many a second (default 1000: milliseconds)"
     )
@@ -52,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _station(args: argparse.Namespace) -> Station:
-    from adaptfault.acquisition import Station
+    from adaptfault.acquisition import Station, read_key
     from adaptfault.data.calibration import Calibration
 
     if args.when and not args.record:
@@ -75,6 +77,7 @@ def _station(args: argparse.Namespace) -> Station:
         host=args.host,
         devices=args.device,
         ticks=args.ticks,
+        key=None if args.key is None else read_key(args.key),
         record=args.record,
         relay=args.relay,
         when=args.when or "contact",

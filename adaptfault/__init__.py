@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.maintenance import MaintenanceReport, maintain
     from adaptfault.robot.predictor import Predictor, Reading
+    from adaptfault.robot.signature import sign_bundle
 
 __version__ = "0.1.0"
 
@@ -90,6 +91,7 @@ __all__ = [
     "save_model",
     "save_npz",
     "sensitivity",
+    "sign_bundle",
     "simulate",
     "split",
     "summarise",
@@ -138,6 +140,7 @@ _HOMES = {
     "load_adapter": "adaptation.adapter_files",
     "load_model": "models.store",
     "maintain": "robot.maintenance",
+    "sign_bundle": "robot.signature",
     "maintain_fleet": "fleet.run",
     "make_windows": "data.windows",
     "save": "data.recordings",

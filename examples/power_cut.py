@@ -255,8 +255,6 @@ class Trace:
                         yield tree, complete
 
 
-
-
 def _writes(args: tuple[Any, ...], options: dict[str, Any]) -> bool:
     mode = options.get("mode", options.get("flags", args[1] if len(args) > 1 else "r"))
     return bool(mode & (os.O_WRONLY | os.O_RDWR) if isinstance(mode, int) else set(mode) & set("wxa+"))

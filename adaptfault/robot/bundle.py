@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager, suppress
 from datetime import datetime, timezone
 from functools import partial
@@ -76,13 +76,19 @@ class Bundle:
 
     Args:
         path: an existing bundle.
+        keys: PEM files of public ed25519 keys. The bundle must be signed by one of them
+            (:func:`adaptfault.sign_bundle`), and only signed versions run. None: signatures are not checked.
+        least_serial: smallest serial number of the signature that is accepted.
 
     Raises:
         FileNotFoundError: the folder holds no bundle.
         Damaged: both ``bundle.json`` and its copy fail their checksum.
+        Untrusted: no given key signed the bundle, or it is older than ``least_serial``.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(
+        self, path: str | Path, *, keys: Sequence[str | os.PathLike[str]] | None = None, least_serial: int = 0
+    ) -> None:
         self.path = Path(path)
         if not (self.path / _ABOUT).is_file():
             raise FileNotFoundError(
@@ -95,11 +101,18 @@ class Bundle:
             self.parts = Parts(self.path / _PARTS, dict(self.about["parts"]))
         self.versions = Versions(self.path / "versions")
         self.journal = Journal(self.path)
+        self._signed: Collection[int] | None = None  # versions that may run; None: all
+        if keys is not None:
+            from adaptfault.robot.signature import verify_bundle
+
+            self._signed = verify_bundle(self, keys, least_serial)
 
     @classmethod
-    def open(cls, path: str | Path) -> Bundle:
+    def open(
+        cls, path: str | Path, *, keys: Sequence[str | os.PathLike[str]] | None = None, least_serial: int = 0
+    ) -> Bundle:
         """Open a bundle; see the class."""
-        return cls(path)
+        return cls(path, keys=keys, least_serial=least_serial)
 
     @classmethod
     def create(
@@ -175,6 +188,9 @@ class Bundle:
         before = [n for n in reversed(self.versions.numbers) if n < pointer.active]
         problems = []
         for number in dict.fromkeys((pointer.active, *pointer.fallbacks, *before)):
+            if self._signed is not None and number not in self._signed:
+                problems.append(f"version {number} is not signed")
+                continue
             try:
                 return self.versions[number]
             except (FileNotFoundError, Damaged) as error:

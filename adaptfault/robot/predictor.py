@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -99,16 +99,22 @@ class Predictor:
         self.reset()
 
     @classmethod
-    def load(cls, path: str | Path) -> Predictor:
+    def load(
+        cls, path: str | Path, *, keys: Sequence[str | os.PathLike[str]] | None = None, least_serial: int = 0
+    ) -> Predictor:
         """Open the bundle in a folder and start its active version.
+
+        Args:
+            path: of the bundle.
+            keys, least_serial: whose signature is needed, see :class:`Bundle`.
 
         Raises:
             FileNotFoundError: the folder holds no bundle, or a file is missing.
-            ValueError: the active version and all earlier ones are damaged.
+            ValueError: the active version and all earlier ones are damaged, or not signed by one of the keys.
         """
         from adaptfault.robot.bundle import Bundle
 
-        return cls(lambda: Bundle.open(path))
+        return cls(lambda: Bundle.open(path, keys=keys, least_serial=least_serial))
 
     @property
     def fault_set(self) -> FaultSet:

@@ -450,7 +450,8 @@ def check(operation: Operation, tree: Tree, complete: bool, home: Path, expected
     build(tree, home)
     path = home / NAME
     if not path.exists():
-        assert operation.name == "save" and not complete, "there is no bundle"
+        assert operation.name == "save", "there is no bundle"
+        assert not complete, "there is no bundle, the operation was done"
         return
     before = Pointer.read(path)
     if complete:
@@ -540,7 +541,7 @@ def run(*, sample: int | None, home: Path, say: Callable[[str], None] = print) -
         states = failed = 0
         for tree, complete in trace.states(sample=sample):
             states += 1
-            with tempfile.TemporaryDirectory(dir=home) as place, mock.patch.object(os, "fsync", lambda _: None):
+            with tempfile.TemporaryDirectory(dir=home) as place, mock.patch.object(os, "fsync", return_value=None):
                 try:
                     call(tree, complete, Path(place))
                 except Exception as error:

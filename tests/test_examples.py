@@ -28,6 +28,7 @@ ON_RECORDINGS = {
     "wrong_fault_set.py": ["--draws", "1"],
 }
 LESS = {  # they take minutes
+    "attack.py": ["--small"],
     "any_model.py": ["--small"],
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
 }
@@ -39,8 +40,10 @@ SLOW = {  # more than 7 s of CPU time
     "core_speed.py",
     "deploy_speed.py",
     "fleet_scaling.py",
+    "attack.py",
     "kill_maintenance.py",
     "picture.py",
+    "power_cut.py",
     "relay.py",
     "repair.py",
     "scale_curves.py",

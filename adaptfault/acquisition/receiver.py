@@ -29,8 +29,8 @@ _TICK = 0.05  # seconds between checks for held packets
 class Counters:
     """Counts of all datagrams.
 
-    ``received`` is the sum of ``kept``, ``malformed``, ``oversized``, ``forged``, ``refused``, ``duplicates``, ``late``,
-    ``strays`` and ``held``.
+    ``received`` is the sum of ``kept``, ``malformed``, ``oversized``, ``forged``, ``refused``, ``duplicates``,
+    ``late``, ``strays`` and ``held``.
 
     Attributes:
         received: datagrams.
@@ -72,16 +72,16 @@ class Receiver(asyncio.DatagramProtocol):
     """Frames of one kind of array from the network: ``async with Receiver(layout, port) as r: async for frame in r:``.
 
     No content of a datagram stops the receiver or grows its memory: invalid datagrams are counted and discarded; the
-    numbers of devices and of waiting frames are limited. A full queue discards its oldest frame. At the limit of devices
-    a new one takes the place of the one that has been silent longest, 2 s at least.
+    numbers of devices and of waiting frames are limited. A full queue discards its oldest frame. At the limit of
+    devices a new one takes the place of the one that has been silent longest, 2 s at least.
 
     Args:
         layout: the array; its rate determines which packets are missing.
         port: to listen on; 0 chooses a free one.
         host: address to listen on; the default receives from this machine only, "0.0.0.0" from the whole network.
         ticks: ticks of the time stamps in a second.
-        devices: names of the accepted devices, each with its address where it has a fixed one, as "hand@10.0.0.7"; None:
-            any.
+        devices: names of the accepted devices, each with its address where it has a fixed one, as "hand@10.0.0.7";
+            None: any.
         most_devices: limit of devices; packets of further ones are refused.
         queue: frames that may wait to be fetched.
         window: packets of a device held back for a late one.

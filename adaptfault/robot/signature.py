@@ -1,4 +1,4 @@
-"""Signed bundles: an ed25519 signature over the manifest and the versions. Needs ``cryptography``, the extra ``sign``."""
+"""Signed bundles: an ed25519 signature over the manifest and the versions. Needs the extra ``sign`` (cryptography)."""
 
 from __future__ import annotations
 

@@ -1,13 +1,14 @@
 """Attacks a bundle, the readers of recordings and the receiver, and prints what held: attack.py [--small]
 
-One table: the attack, how often it was tried, how often it held. A damaged bundle holds when it predicts as before or is
-refused with one line; a malformed recording when it is read or refused; packets when every valid one arrives.
+One table: the attack, how often it was tried, how often it held. A damaged bundle holds when it predicts as before or
+is refused with one line; a malformed recording when it is read or refused; packets when every valid one arrives.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import io
 import logging
 import os
 import shutil
@@ -16,6 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
 from pathlib import Path
 from unittest import mock
 
@@ -134,7 +136,9 @@ def storms(count: int, home: Path, rng: np.random.Generator) -> Outcome:
         return took
 
     for _ in range(count):
-        yield asyncio.run(one()) < 1
+        with redirect_stdout(io.StringIO()):
+            took = asyncio.run(one())
+        yield took < 1
 
 
 def kills(count: int, home: Path, rng: np.random.Generator) -> Outcome:

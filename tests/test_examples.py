@@ -29,6 +29,7 @@ ON_RECORDINGS = {
 }
 LESS = {  # they take minutes
     "attack.py": ["--small"],
+    "soak.py": ["--hours", "12", "--frames", "500"],
     "any_model.py": ["--small"],
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
 }
@@ -47,6 +48,7 @@ SLOW = {  # more than 7 s of CPU time
     "relay.py",
     "repair.py",
     "scale_curves.py",
+    "soak.py",
     "wrong_fault_set.py",
 }
 SLOW_ON_RECORDINGS = {

@@ -1,0 +1,81 @@
+"""A robot's day in simulated time: 10 frames a second, faults that come and go, restarts: soak.py [--hours 24]
+
+Each hour the robot's frames are classified and monitored, its last grasps are recorded, and maintenance runs. Prints the
+state after each hour; ends with an error where F is wrong, or where memory or the number of files grows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import tempfile
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import power_cut
+import psutil
+
+import adaptfault as af
+from diagnostics import inject
+
+LAYOUT, ROW = power_cut.LAYOUT, power_cut.ROW
+HOUR = 36_000  # frames
+LOGS_TO_RECOVER = 3  # logs that have to show a cell alive
+PERIOD = 8  # hours: the row is broken in the first three of them, from the second on
+
+
+def broken(hour: int) -> bool:
+    return hour % PERIOD in (1, 2, 3)
+
+
+def expected(hour: int) -> bool:
+    """Return whether the row is in F after maintenance in that hour."""
+    return any(broken(before) for before in range(max(0, hour - LOGS_TO_RECOVER + 1), hour + 1))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--hours", type=int, default=2, help="default 2; 24 takes minutes")
+    parser.add_argument("--frames", type=int, default=HOUR, help="frames that an hour has (default 36000: 10 Hz)")
+    args = parser.parse_args()
+    logging.getLogger("adaptfault").setLevel(logging.ERROR)
+    memory, files = [], []
+    with (
+        tempfile.TemporaryDirectory() as home,
+        power_cut.small_versions(),
+        mock.patch.object(os, "fsync", return_value=None),  # the disk is not what is measured
+    ):
+        bundle = power_cut.make(Path(home))
+        predictor = af.Predictor.load(bundle.path)
+        clock = 0.0
+        for hour in range(args.hours):
+            grasps = af.simulate(6, LAYOUT, n_frames=40, seed=1000 + hour, classes=power_cut.CLASSES[1:])
+            log = [inject(f, [ROW], LAYOUT) if broken(hour) else f for f in grasps.frames]
+            frames = np.concatenate(log)
+            for i in range(args.frames):
+                reading = predictor.stream(frames[i % len(frames)], clock)
+                assert reading.probabilities is None or np.isfinite(reading.probabilities).all()
+                clock += 1 / LAYOUT.rate
+            report = af.maintain(af.Bundle.open(bundle.path), log)
+            if hour % 6 == 5 or report.decision == "deployed":  # a restart
+                predictor = af.Predictor.load(bundle.path)
+            assert predictor.confirm()
+            faulty = set(ROW.cells) if expected(hour) else set()
+            assert report.fault_set == faulty, f"hour {hour}: F is {report.fault_set}, expected {faulty}"
+            memory.append(psutil.Process().memory_info().rss / 1e6)
+            files.append(sum(path.is_file() for path in bundle.path.rglob("*")))
+            print(
+                f"hour {hour + 1}: {report.decision}, version {predictor.version}, {len(faulty)} cells in F,"
+                f" {memory[-1]:.0f} MB, {files[-1]} files",
+                flush=True,
+            )
+    settled = len(memory) // 3
+    assert memory[-1] < 1.1 * memory[settled] + 20, "memory grows"
+    assert max(files) < 60, "files pile up"
+    print(f"{args.hours} hours, {args.hours * args.frames} frames: F right after each, memory and files flat")
+
+
+if __name__ == "__main__":
+    main()

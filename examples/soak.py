@@ -1,7 +1,7 @@
 """A robot's day in simulated time: 10 frames a second, faults that come and go, restarts: soak.py [--hours 24]
 
-Each hour the robot's frames are classified and monitored, its last grasps are recorded, and maintenance runs. Prints the
-state after each hour; ends with an error where F is wrong, or where memory or the number of files grows.
+Each hour the robot's frames are classified and monitored, and maintenance runs on its last grasps. Prints the state
+after each hour; ends with an error where F is wrong, or where memory or the number of files grows.
 """
 
 from __future__ import annotations

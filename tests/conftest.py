@@ -241,6 +241,15 @@ def bundle(made_bundle: Path, tmp_path: Path) -> Iterator[Bundle]:
 
 
 @pytest.fixture(scope="session")
+def linear_bundle(made_once) -> Iterator[Path]:
+    """The folder of a bundle of one linear layer, of which every step is cheap; not to be changed."""
+    import power_cut
+
+    with power_cut.small_versions():
+        yield made_once("linear", power_cut.make) / power_cut.NAME
+
+
+@pytest.fixture(scope="session")
 def later_grasps() -> list[np.ndarray]:
     """24 grasps of the same small sensor, healthy, on a later day."""
     grasps = simulate(12, SIMULATED, n_frames=60, seed=99, classes=SMALL_CLASSES)

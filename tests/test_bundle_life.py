@@ -39,7 +39,7 @@ class Life(RuleBasedStateMachine):
 
     @initialize()
     def begin(self):
-        self.place = Path(tempfile.mkdtemp(dir=self.home))
+        self.place = Path(tempfile.mkdtemp())
         shutil.copytree(self.home / power_cut.NAME, self.place / power_cut.NAME)
         self.path = self.place / power_cut.NAME
         self.broken, self.ever, self.seed = set(), set(), 100
@@ -136,17 +136,15 @@ class Life(RuleBasedStateMachine):
 
 def life(home: Path, examples: int, steps: int) -> None:
     Life.home = home
-    with power_cut.small_versions():
-        power_cut.make(home)
-        run_state_machine_as_test(
-            Life, settings=settings(max_examples=examples, stateful_step_count=steps, deadline=None, derandomize=True)
-        )
+    run_state_machine_as_test(
+        Life, settings=settings(max_examples=examples, stateful_step_count=steps, deadline=None, derandomize=True)
+    )
 
 
-def test_whatever_happens_in_its_life_a_bundle_opens_and_predicts(tmp_path):
-    life(tmp_path, 3, 8)
+def test_whatever_happens_in_its_life_a_bundle_opens_and_predicts(linear_bundle):
+    life(linear_bundle.parent, 3, 8)
 
 
 @pytest.mark.slow
-def test_whatever_happens_in_its_long_life_a_bundle_opens_and_predicts(tmp_path):
-    life(tmp_path, 60, 40)
+def test_whatever_happens_in_its_long_life_a_bundle_opens_and_predicts(linear_bundle):
+    life(linear_bundle.parent, 60, 40)

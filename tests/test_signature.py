@@ -27,6 +27,13 @@ def write_keys(folder, name):
 
 
 @pytest.fixture
+def bundle(linear_bundle, tmp_path):
+    """A copy of it, to be changed."""
+    shutil.copytree(linear_bundle, tmp_path / "robot.bundle")
+    return Bundle.open(tmp_path / "robot.bundle")
+
+
+@pytest.fixture
 def keys(tmp_path):
     return write_keys(tmp_path, "factory")
 

@@ -262,6 +262,22 @@ def test_diagnose_and_maintain_have_one_meaning_of_the_exit_code(bundle, later_g
     assert main(["diagnose", log, *reference]) == main(["maintain", str(bundle.path), log, "--quiet"]) == 2
 
 
+def test_exchanged_rows_are_told_and_the_log_is_diagnosed_with_them_put_back(
+    bundle, later_grasps, broken_row, tmp_path, capsys
+):
+    grid = SMALL.grid(np.arange(SMALL.n_cells))
+    grid[0, [1, 4]] = grid[0, [4, 1]]
+    broken = [inject(r, [broken_row], SMALL) for r in later_grasps]
+    save_npz(tmp_path / "log.npz", Recordings(tuple(r[:, grid.ravel()] for r in broken), SMALL))
+    command = ["diagnose", str(tmp_path / "log.npz"), "--reference", str(bundle.path), "--quiet"]
+    assert main([*command, "--json"]) == 2
+    told = json.loads(capsys.readouterr().out)
+    assert told["rewiring"] == ["rows 1 and 4 of pad 0 are exchanged"]
+    assert set(Diagnosis.from_dict(told).fault_set) == set(broken_row.cells)
+    assert main(command) == 2
+    assert "wiring changed: rows 1 and 4 of pad 0 are exchanged" in capsys.readouterr().out
+
+
 def test_a_log_that_tests_nothing_exits_with_the_code_that_is_set(made_bundle, tmp_path, capsys):
     save_npz(tmp_path / "still.npz", Recordings(tuple(np.zeros((60, 60)) for _ in range(6)), SMALL))
     for command in (

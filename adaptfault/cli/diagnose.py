@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,13 +27,14 @@ if TYPE_CHECKING:
     from adaptfault.data.recordings.blocks import Stream
     from adaptfault.robot.bundle import Bundle
     from diagnostics import Diagnosis, SelfDiagnosis
+    from diagnostics.evidence.rewiring import Rewiring
 
 _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.json --html diagnosis.html
       without --reference each cell is compared with the cells around it
   adaptfault diagnose today/ --reference robot.bundle
       the healthy model of the bundle
       exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version excludes, or nothing tested;
-      2 a person is needed: a wire, or a tenth of the cells; 3 unusable input"""
+      2 a person is needed: a wire, exchanged wires, or a tenth of the cells; 3 unusable input"""
 
 _ROWS = 24  # of a map, which is followed by the summary if it has more: the first line has left the screen
 
@@ -65,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
         report_inferred(args, log.inferred)
     else:
         log = load_recordings(args, args.recordings, layout=layout)
+    log, rewiring = _rewired(log, diagnoser, bundle)
     diagnosis = _diagnosed(args, diagnoser or SelfDiagnosis(log.layout), log)
     if args.out:
         Path(args.out).write_text(json.dumps(diagnosis.to_dict(), allow_nan=False))
@@ -75,8 +78,28 @@ def run(args: argparse.Namespace) -> int:
 
         write_diagnosis(args.html, diagnosis, name=", ".join(args.recordings), reference=bool(args.reference))
     code, why = _severity(diagnosis, bundle, args.untested_code)
-    emit(args, diagnosis.to_dict(), text_of(diagnosis) + why)
+    if rewiring is not None:
+        code, why = max(code, 2), f"{why}\n{rewiring.reason}; the verdicts are those with the readings put back"
+    found = {**diagnosis.to_dict(), "rewiring": [] if rewiring is None else list(rewiring.steps)}
+    emit(args, found, text_of(diagnosis) + why)
     return code
+
+
+def _rewired(
+    log: Recordings | Stream, diagnoser: SelfDiagnosis | None, bundle: Bundle | None
+) -> tuple[Recordings | Stream, Rewiring | None]:
+    """Return the log with the readings of exchanged wires put back, and the change that no version undoes yet."""
+    from adaptfault.data.recordings import Recordings
+
+    if diagnoser is None or not isinstance(log, Recordings):  # too large to be searched
+        return log, None
+    if bundle is not None:
+        source = bundle.active().source
+        log = replace(log, frames=tuple(frames[:, source] for frames in log.frames))
+    rewiring = diagnoser.rewiring(log.frames)
+    if rewiring is not None:
+        log = replace(log, frames=tuple(rewiring.undo(frames) for frames in log.frames))
+    return log, rewiring
 
 
 def _bundle(reference: list[str]) -> Bundle | None:

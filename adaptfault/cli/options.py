@@ -297,9 +297,11 @@ def fit_diagnoser(args: argparse.Namespace, recordings: Recordings) -> SelfDiagn
     say(args, f"fitting the healthy model of the diagnosis on {len(recordings)} recordings")
     hide = None if (shown := progress(args)) is None else not shown
     with tqdm(total=1.0, desc="fitting", bar_format=form, disable=hide, leave=False) as bar:
-        return SelfDiagnosis(recordings.layout).fit(
-            recordings.frames, progress=lambda share: bar.update(share - bar.n) and None
-        )
+
+        def advance(share: float) -> None:
+            bar.update(share - bar.n)
+
+        return SelfDiagnosis(recordings.layout).fit(recordings.frames, progress=advance)
 
 
 def say(args: argparse.Namespace, text: str) -> None:

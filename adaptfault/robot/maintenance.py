@@ -95,8 +95,8 @@ class MaintenanceReport:
         lines = [f"ADAPTFAULT {status} - {self.decision}: {self.reason}{would} | {' '.join(measured)}"]
         lines.append(f"version {self.version} runs; {len(self.fault_set)} of {n} cells are faulty")
         if weak_base(self.accuracy, self.fault_free_accuracy):
-            measured = f"{self.accuracy:.3f} repaired, {self.fault_free_accuracy:.3f} healthy"
-            lines.append(f"  weak base model: accuracy {measured}; train it longer or on more recordings")
+            both = f"{self.accuracy:.3f} repaired, {self.fault_free_accuracy:.3f} healthy"
+            lines.append(f"  weak base model: accuracy {both}; train it longer or on more recordings")
         if self.diagnosis is not None:
             lines += [f"  {fault.reason}" for fault in self.diagnosis.faults]
             lines += [f"  {fault.reason}" for fault in self.diagnosis.transport]
@@ -335,10 +335,10 @@ class _Maintenance:
             self.judged = judged
             return self._report("kept", judged["exit_code"], f"compared before: {judged['reason']}", known, **found)
         if faulty.cells in Pointer.read(self.bundle.path).rejected:
-            used = len(faulty - self.version.fault_set)
+            unhandled = len(faulty - self.version.fault_set)
             reason = (
                 f"a version for these faults was rolled back before, so version {self.version.number} runs,"
-                f" which uses {used} of the {len(faulty)} faulty cells"
+                f" which uses {unhandled} of the {len(faulty)} faulty cells"
             )
             return self._report("kept", self._code(faulty), reason, known, **found)
         return self._adapt(adapter, known, found)

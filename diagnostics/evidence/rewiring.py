@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +69,7 @@ class Rewiring:
         """One sentence."""
         return f"wiring changed: {', then '.join(self.steps)}; check the connectors"
 
-    def undo(self, frames: NDArray[np.float64]) -> NDArray[np.float64]:
+    def undo(self, frames: NDArray[Any]) -> NDArray[Any]:
         """Return frames ``[..., D]`` with each reading at the index of the cell that gave it."""
         return frames[..., self.source]
 

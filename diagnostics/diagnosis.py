@@ -299,7 +299,6 @@ class SelfDiagnosis:
             probability=probability,
             # A cell at rest supports a broken line by the events alone, without the prior of its value.
             weight=np.where(known, _KNOWN, self.calibrator_.calibrate(spatial.surprisal, temporal, kind)),
-            doubt=np.ones(len(stuck)),
             events=np.where(intermittent, intermittency.blinks, spatial.events),
             known=known,
         )

@@ -83,8 +83,9 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
 
     def made_once(name: str, make: Callable[[Path], object]) -> Path:
         if "PYTEST_XDIST_WORKER" not in os.environ:
-            (home / name).mkdir()
-            make(home / name)
+            if not (home / name).exists():
+                (home / name).mkdir()
+                make(home / name)
             return home / name
         from filelock import FileLock
 
@@ -240,7 +241,7 @@ def bundle(made_bundle: Path, tmp_path: Path) -> Iterator[Bundle]:
         yield Bundle.open(tmp_path / "robot.bundle")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture
 def linear_bundle(made_once) -> Iterator[Path]:
     """The folder of a bundle of one linear layer, of which every step is cheap; not to be changed."""
     import power_cut

@@ -6,7 +6,6 @@ from diagnostics.decision.line_cover import Cause, candidate_groups, cheapest_of
 
 LAYOUT = SensorLayout(2, 11, 10)
 SURE, WEAK, NOTHING = 8.0, 5.0, 0.0
-DOUBT = np.ones(220)
 
 
 def mask(*cells: np.ndarray | list[int]) -> np.ndarray:
@@ -26,7 +25,6 @@ def explained(
         consistent | faulty,
         contradicting,
         np.where(faulty, SURE, NOTHING) if weight is None else weight,
-        DOUBT,
         LAYOUT,
     )
 
@@ -123,7 +121,7 @@ def test_a_long_line_of_weak_suspects_is_the_edge_of_a_contact_and_no_wire():
     layout = SensorLayout(1, 64, 32)
     consistent = np.isin(np.arange(2048), layout.cells_on(Line(0, "row", 5)))
     none = np.zeros(2048, bool)
-    assert solve(none, consistent, ~consistent, np.where(consistent, 2.6, NOTHING), np.ones(2048), layout) == ()
+    assert solve(none, consistent, ~consistent, np.where(consistent, 2.6, NOTHING), layout) == ()
 
 
 @pytest.mark.parametrize(("weight", "reported"), [(2.65, False), (4.0, True)])
@@ -132,16 +130,17 @@ def test_correlated_evidence_along_one_wire_is_discounted(weight: float, reporte
     consistent = np.isin(np.arange(40), layout.cells_on(Line(0, "column", 5)))
     none = np.zeros(40, bool)
     # 10.6 from one cell alone would suffice.
-    causes = solve(none, consistent, ~consistent, np.where(consistent, weight, NOTHING), np.ones(40), layout)
+    causes = solve(none, consistent, ~consistent, np.where(consistent, weight, NOTHING), layout)
     assert bool(causes) == reported
 
 
-@pytest.mark.parametrize(("doubt", "reported"), [(1.0, False), (0.8, False), (0.1, True), (0.0, True)])
-def test_one_almost_certain_cell_lowers_the_cost_of_its_wire(doubt: float, reported: bool):
+@pytest.mark.parametrize("certain", [False, True])
+def test_one_certain_cell_lowers_the_cost_of_its_wire(certain: bool):
     row = LAYOUT.cells_on(Line(0, "row", 3))
     consistent = mask(row[:3])
-    leading = np.where(mask(row[:1]), doubt, 1.0)
-    assert bool(solve(mask(), consistent, mask(), np.where(consistent, 4.6, NOTHING), leading, LAYOUT)) == reported
+    faulty = mask(row[:1]) if certain else mask()
+    (cause,) = solve(faulty, consistent, mask(), np.where(consistent, 4.6, NOTHING), LAYOUT) or (None,)
+    assert (cause is not None and cause.line is not None) == certain
 
 
 def test_candidate_groups_are_the_cells_that_one_wire_would_explain():
@@ -234,7 +233,7 @@ def test_positions_without_a_cell_have_no_cause():
     row = layout.cells_on(Line(0, "row", 3))
     faulty = mask(row)
     contradicting = ~faulty & present.ravel()
-    (cause,) = solve(faulty, faulty, contradicting, np.where(faulty, SURE, NOTHING), DOUBT, layout)
+    (cause,) = solve(faulty, faulty, contradicting, np.where(faulty, SURE, NOTHING), layout)
     assert (cause.line, cause.cells) == (Line(0, "row", 3), tuple(row))
 
 
@@ -252,7 +251,7 @@ def test_where_single_faults_are_common_two_neighbours_at_the_end_of_a_line_are_
     row = LAYOUT.cells_on(Line(1, "row", 4))
     faulty = mask(row[8:])
     for common, cut in ((0.0, True), (0.1, False)):
-        causes = solve(faulty, faulty, ~faulty, np.where(faulty, SURE, NOTHING), DOUBT, LAYOUT, common)
+        causes = solve(faulty, faulty, ~faulty, np.where(faulty, SURE, NOTHING), LAYOUT, common)
         assert any(cause.line is not None for cause in causes) == cut
 
 

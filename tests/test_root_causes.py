@@ -15,7 +15,7 @@ ZERO = np.zeros(CELLS)
 HEALTHY = CellFindings(
     faulty=NONE, alive=~NONE, silent=NONE, rests=NONE, full=NONE, intermittent=NONE, noisy=NONE, drifting=NONE,
     gain=np.full(CELLS, np.nan), value=np.full(CELLS, np.nan), since=np.zeros(CELLS, np.intp), probability=ZERO,
-    weight=ZERO, doubt=np.ones(CELLS), events=np.zeros(CELLS, np.intp), known=NONE,
+    weight=ZERO, events=np.zeros(CELLS, np.intp), known=NONE,
 )  # fmt: skip
 
 
@@ -36,7 +36,6 @@ def dead(found: CellFindings, cells: object, value: float = 0.0, onset: int = 0)
         since=np.where(which, onset, found.since),
         probability=np.where(which, 0.99, found.probability),
         weight=np.where(which, 9.0, found.weight),
-        doubt=np.where(which, 0.0, found.doubt),
         events=np.where(which, 3, found.events),
     )
 

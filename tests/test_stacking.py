@@ -119,13 +119,11 @@ def test_it_uses_the_rings_where_the_regressions_are_uninformative():
     assert (never > 0.5)[~loaded_around].mean() > 0.95
 
 
-@pytest.mark.parametrize("events", [1, 500])
-def test_it_learns_an_interaction_of_two_rings_from_many_events_only(events: int):
+def test_it_learns_an_interaction_of_two_rings():
     rng = np.random.default_rng(2)
     samples = rng.normal(size=(20_000, N_FEATURES))
     samples[:, :2] = 0
     one_of_two = (samples[:, 10] > 0) ^ (samples[:, 14] > 0)
-    never, always = Stacking.fit(samples, ~one_of_two, one_of_two, events).predict(samples.T.astype(np.float32))
+    never, always = Stacking.fit(samples, ~one_of_two, one_of_two, 500).predict(samples.T.astype(np.float32))
     for outputs in (1 - never, always):
-        sure = (outputs > 0.8)[one_of_two].mean()
-        assert sure > 0.7 if events > 1 else sure < 0.01
+        assert (outputs > 0.8)[one_of_two].mean() > 0.7

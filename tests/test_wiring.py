@@ -19,7 +19,7 @@ SKIN = SensorLayout(1, 8, 10, groups=TRIANGLES | CONNECTORS | {"board A": ["conn
 def explained(dead: object, untested: object = (), layout: SensorLayout = SKIN) -> tuple[Cause, ...]:
     every = np.arange(layout.n_cells)
     faulty, consistent = np.isin(every, dead), np.isin(every, np.r_[dead, untested].astype(int))
-    return solve(faulty, consistent, ~consistent, 8.0 * faulty, np.ones(len(every)), layout)
+    return solve(faulty, consistent, ~consistent, 8.0 * faulty, layout)
 
 
 def test_with_groups_the_wires_are_the_groups_from_the_inside_out():

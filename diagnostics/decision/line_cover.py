@@ -86,7 +86,6 @@ def solve(
     consistent: NDArray[np.bool_],
     contradicting: NDArray[np.bool_],
     weight: NDArray[np.float64],
-    doubt: NDArray[np.float64],
     layout: SensorLayout,
     common: float = 0.0,
 ) -> tuple[Cause, ...]:
@@ -97,7 +96,6 @@ def solve(
         consistent: bool ``[D]``, cells that could have this fault; includes ``faulty``.
         contradicting: bool ``[D]``, cells that contradict a broken wire. Cells that are neither may be inferred faulty.
         weight: float ``[D]``, log likelihood ratio faulty : healthy of each consistent cell.
-        doubt: float ``[D]``, 0: certainly faulty, 1: uncertain; the smallest on a wire counts for the wire.
         layout: the array.
         common: lower limit of the prevalence of single faults of one kind.
     """
@@ -105,13 +103,13 @@ def solve(
         return tuple(Cause(None, (cell,), (cell,), 1.0) for cell in np.flatnonzero(faulty).tolist())
     causes: list[Cause] = []
     if not layout.is_matrix:  # a group may extend over several pads
-        return tuple(_explain_pad(faulty, consistent, contradicting, weight, doubt, layout, common))
+        return tuple(_explain_pad(faulty, consistent, contradicting, weight, layout, common))
     pads = layout.grid(consistent).any(axis=(1, 2))
     for pad in np.flatnonzero(pads).tolist():
         own = _one_pad(layout.rows, layout.cols, layout.present[pad].tobytes())
         first = pad * own.n_cells
         on = slice(first, first + own.n_cells)
-        of_pad = _explain_pad(faulty[on], consistent[on], contradicting[on], weight[on], doubt[on], own, common)
+        of_pad = _explain_pad(faulty[on], consistent[on], contradicting[on], weight[on], own, common)
         causes += [_moved(cause, pad, first) for cause in of_pad]
     return tuple(causes)
 
@@ -179,19 +177,17 @@ def _explain_pad(
     consistent: NDArray[np.bool_],
     contradicting: NDArray[np.bool_],
     weight: NDArray[np.float64],
-    doubt: NDArray[np.float64],
     layout: SensorLayout,
     common: float,
 ) -> list[Cause]:
     weight = np.where(consistent, np.maximum(weight, _MIN_RATIO), 0.0)
     supporting = consistent & (faulty | (weight >= _SUPPORTING))
     tested_cells = consistent & (faulty | (weight > _TESTED))
-    doubt = np.where(faulty, 0.0, np.where(consistent, doubt, 1.0))
     candidates = []
     lines = layout.lines if supporting.sum() >= 2 else ()
     for line in lines:
         if line.kind in _WIRES:
-            candidates += _candidates(line, layout.cells_on(line), contradicting, supporting, tested_cells, doubt)
+            candidates += _candidates(line, layout.cells_on(line), contradicting, supporting, tested_cells, faulty)
     if not layout.is_matrix:  # of groups that explain the same cells, the innermost: it comes first
         candidates = list({tuple(c.cells[supporting[c.cells]].tolist()): c for c in candidates[::-1]}.values())
     present = layout.present.ravel()
@@ -230,7 +226,7 @@ def _candidates(
     contradicting: NDArray[np.bool_],
     supporting: NDArray[np.bool_],
     tested_cells: NDArray[np.bool_],
-    doubt: NDArray[np.float64],
+    faulty: NDArray[np.bool_],
 ) -> list[_Candidate]:
     """Return the wire broken as a whole, and in its middle with either end working, where enough cells support it."""
 
@@ -238,7 +234,7 @@ def _candidates(
         return bool(supporting[behind].sum() >= max(_MIN_SUPPORT, _SUPPORT_SHARE * float(tested_cells[behind].sum())))
 
     def cost(behind: NDArray[np.intp]) -> float:
-        return float(_LINE_COST + _UNCERTAIN_COST * doubt[behind].min())
+        return float(_LINE_COST + (0.0 if faulty[behind].any() else _UNCERTAIN_COST))
 
     contradictions = int(contradicting[cells].sum())
     found = []

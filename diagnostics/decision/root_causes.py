@@ -49,7 +49,6 @@ class CellFindings:
         since: int, number of the first frame of the fault.
         probability: float, P(faulty).
         weight: float, log likelihood ratio faulty : healthy.
-        doubt: float, 0: certain, 1: uncertain, see ``solve``.
         events: int, number of events that tested the cell, or number of its blinks.
         known: cells that were dead in the reference already.
     """
@@ -67,7 +66,6 @@ class CellFindings:
     since: NDArray[np.intp]
     probability: Floats
     weight: Floats
-    doubt: Floats
     events: NDArray[np.intp]
     known: Mask
     zero: Mask | None = None
@@ -124,7 +122,7 @@ def _explained(
     known = found.known & faulty
 
     def of(faulty: Mask, consistent: Mask, contradicting: Mask) -> tuple[Cause, ...]:
-        return solve(faulty, consistent, contradicting, found.weight, found.doubt, layout, common)
+        return solve(faulty, consistent, contradicting, found.weight, layout, common)
 
     causes = of(faulty & ~known, consistent & ~known, contradicting & ~known)
     known[[cell for cause in causes for cell in cause.cells]] = False

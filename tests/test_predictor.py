@@ -327,7 +327,7 @@ def test_between_two_looks_the_disk_is_left_alone(carried, monkeypatch):
 
 
 def test_load_opens_the_bundle_at_a_path_and_prints_what_runs(carried, monkeypatch):
-    monkeypatch.setattr(Bundle, "open", lambda path: carried if path == "robot.bundle" else pytest.fail(path))
+    monkeypatch.setattr(Bundle, "open", lambda path, **signed: carried if path == "robot.bundle" else pytest.fail(path))
     predictor = Predictor.load("robot.bundle")
     assert (predictor.version, predictor.runtime, predictor.class_names) == (1, "onnx", ("a", "b", "c"))
     assert str(predictor).startswith("version 1: 3 classes from 5 frames of 2 x 3 x 3 cells")

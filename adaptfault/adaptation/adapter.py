@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from functools import cached_property
 from typing import get_args
 
 import torch
@@ -12,7 +13,6 @@ from adaptfault.adaptation.forecast import Forecast
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.adaptation.stages import Method, Run
 from adaptfault.models.any_model import AnyModel, not_resettable
-from adaptfault.models.network import logits_of
 from diagnostics import FaultSet
 
 
@@ -55,8 +55,9 @@ class Adapter(FaultFreeModel):
                 head is fitted in closed form to the features of the network and the healthy cells. "finetune": in
                 addition, all parameters are trained, front end included, in rounds that each end with a new head.
                 "scratch": a new network is trained on the healthy cells, the paper's protocol. "auto": fill; head,
-                if the fill keeps less than 99 % of the fault-free validation accuracy; finetune, if the head does and
-                a budget is given.
+                if it improves validation beyond the noise; finetune, if a budget is given and the head keeps less than
+                99 % of the healthy accuracy. With F empty, "fill" is the fault-free model, bit for bit, and "auto" is
+                the model for a healthy sensor, as good a head as a repair gets.
             budget: seconds for the stages after the fill; a stage that does not fit is left out. None: until
                 validation stops improving.
             seed: of training.
@@ -67,7 +68,26 @@ class Adapter(FaultFreeModel):
                 healthy cell left.
         """
         self.check(fault_set, method)
-        return Run(self, fault_set, budget, seed, progress).execute(method)
+        return Run(self, fault_set, budget, seed, progress, lambda: self.fault_free_accuracy).execute(method)
+
+    @cached_property
+    def _healthy(self) -> Run:
+        run = Run(self, FaultSet((), self.layout.n_cells), None, 0, False)
+        run.execute("auto")
+        return run
+
+    @property
+    def healthy(self) -> Adaptation:
+        """The model for a sensor without faults: the fault-free model, with a new head where that helps validation.
+
+        Repairs are compared with it, so that a sensor does not get better by a fault.
+        """
+        return self._healthy.done()
+
+    @property
+    def fault_free_accuracy(self) -> float:
+        """Validation accuracy (R2 of a regression) of :attr:`healthy`, its head fitted without the scored windows."""
+        return self._healthy.accuracy()
 
     def forecast(self, fault_set: FaultSet) -> Forecast:
         """Return the accuracy (R2 of a regression) to expect of each stage, from validation windows without F.
@@ -79,7 +99,7 @@ class Adapter(FaultFreeModel):
         """
         self.check(fault_set)
         windows = self.validation
-        outputs = {"fault-free": logits_of(self.compact or self.model, windows.x)}
+        outputs = {"fault-free": self._healthy.held_out()}
         if len(fault_set):
             run = Run(self, fault_set, None, 0, False)
             outputs["fill"] = run.held_out()

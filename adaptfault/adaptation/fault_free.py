@@ -84,11 +84,6 @@ class FaultFreeModel:
         """The source of front ends: ``statistics``, or tiles on a large array."""
         return TiledStatistics.fit(self.train, self.layout) if self.layout.n_cells > LARGE else self.statistics
 
-    @cached_property
-    def fault_free_accuracy(self) -> float:
-        """Accuracy (R2 of a regression) of the fault-free model on the fault-free validation windows."""
-        return self.score(logits_of(self.compact or self.model, self.validation.x))
-
     def score(self, outputs: Tensor) -> float:
         """Return accuracy or R2 of outputs ``[N, n]`` for the validation windows."""
         if self.task == "regression":

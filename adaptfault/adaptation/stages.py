@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -27,7 +28,8 @@ from diagnostics import FaultSet
 
 Method = Literal["auto", "fill", "head", "finetune", "scratch"]
 
-_ENOUGH = 0.99  # auto stops at the first stage that keeps this share of the fault-free validation accuracy
+_ENOUGH = 0.99  # auto does not fine-tune a repair that keeps this share of the healthy validation accuracy
+_NOISE = 1.0  # standard errors of its gain on validation that a stage of auto has to exceed
 _ROUND_EPOCHS, _ROUNDS, _ROUND_PATIENCE = 2, 6, 1  # of fine-tuning
 _FOLDS = 5  # of validation recordings, each held out of a head in turn
 _BATCH, _PILOT = 256, 500  # windows run at once; windows of a trial fit that measures the time of a head
@@ -47,9 +49,11 @@ class Run:
         budget: float | None,
         seed: int,
         progress: bool | None,
+        healthy: Callable[[], float] = lambda: 1.0,
     ) -> None:
         self.fault_free, self.fault_set, self.seed, self.progress = fault_free, fault_set, seed, progress
         self.budget, self.device = budget, device_of(fault_free.model)
+        self.healthy, self.noise = healthy, 0.0  # accuracy without faults; standard errors that a gain has to exceed
         self.training = reduce_windows(fault_free.train, fault_set)
         self.validation = reduce_windows(fault_free.validation, fault_set)
         self.logits: Tensor | None = None
@@ -63,8 +67,8 @@ class Run:
 
     def execute(self, method: Method) -> Adaptation:
         """Run the stages of a method and return the adaptation."""
-        if not len(self.fault_set) and method != "scratch":
-            return self.done()  # nothing to repair: the fault-free model, bit for bit
+        if not len(self.fault_set) and method == "fill":
+            return self.done()  # nothing to impute: the fault-free model, bit for bit
         if method not in ("fill", "scratch"):
             self.quick = self.fault_free.compact  # computed once, not a cost of this F
         self.began = time.perf_counter()
@@ -75,16 +79,14 @@ class Run:
                 self.head()
             case "finetune":
                 self.head()
-                self.finetune()
+                if len(self.fault_set):
+                    self.finetune()
             case "auto":
-                if not self._enough():
-                    self.head()
-                    if self.budget is not None and not self._enough():
-                        self.finetune()
+                self.noise = _NOISE
+                self.head()
+                if self.budget is not None and len(self.fault_set) and self.accuracy() < _ENOUGH * self.healthy():
+                    self.finetune()
         return self.done()
-
-    def _enough(self) -> bool:
-        return self.accuracy() >= _ENOUGH * self.fault_free.fault_free_accuracy
 
     def head(self) -> None:
         """Fit a new head in closed form; keep it if validation improves. A model without features keeps its own."""
@@ -181,12 +183,34 @@ class Run:
         head, logits = fitted
         self.head_seconds = time.perf_counter() - start
         reached = self._quality(logits)
-        better = reached > before
+        better = reached > before and self._exceeds_noise(logits)
         if better:
             reduced.head = head
             self.reduced, self.logits = reduced, logits
-        self.stages.append(Stage(name, time.perf_counter() - began, max(before, reached)[0]))
+        kept = reached if better else before
+        self.stages.append(Stage(name, time.perf_counter() - began, kept[0]))
         return better
+
+    def _exceeds_noise(self, outputs: Tensor) -> bool:
+        """Return whether the gain of new validation outputs exceeds its standard error ``noise`` times.
+
+        The gain is that of the logarithm of the probability of the true class, or of the negative squared error. Its
+        standard error is that of a mean of clusters, one for each recording.
+        """
+        if not self.noise:
+            return True
+        gain = self._merit(outputs) - self._merit(self.held_out())
+        _, inverse = np.unique(self.validation.recording, return_inverse=True)
+        deviation = np.bincount(inverse, weights=gain - gain.mean())
+        return bool(gain.mean() > self.noise * np.sqrt((deviation**2).sum()) / len(gain))
+
+    def _merit(self, outputs: Tensor) -> NDArray[np.float64]:
+        """Return for each validation window the log probability of its class, or its negative squared error."""
+        if self.fault_free.task == "regression":
+            return -((outputs.numpy() - self.validation.y) ** 2).astype(np.float64).mean(axis=1)
+        scale, _ = calibrate(outputs, self.validation.y)
+        likely = torch.log_softmax(scale * outputs.double(), 1)
+        return likely.numpy()[np.arange(len(likely)), self.validation.y]
 
     def _head(self, reduced: ReducedModel) -> tuple[Blend | None, Tensor] | None:
         """Return a head, and the outputs for validation windows of heads fitted without them; None if time is short.

@@ -22,6 +22,7 @@ from adaptfault.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from adaptfault.adaptation.adapter import Adapter
     from adaptfault.data.recordings import Recordings
     from adaptfault.data.windows import Windows
     from adaptfault.models.any_model import AnyModel
@@ -47,6 +48,13 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="remove random cells while training: imputation alone then repairs more; needs about twice the epochs",
     )
+    parser.add_argument(
+        "--head",
+        default="auto",
+        choices=("auto", "linear"),
+        help="auto: after training, a head in closed form where it improves validation (default);"
+        " linear: the network alone, as in the paper",
+    )
     parser.add_argument("--strict", action="store_true", help="exit code 1 if the training shows a sign of failure")
     parser.add_argument(
         "--model",
@@ -67,12 +75,14 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"{out} exists: choose another name, or remove it")
     recordings, where = load_recordings(args, args.recordings, labelled=True), device(args)
 
+    from adaptfault.adaptation.adapter import Adapter
     from adaptfault.data.windows import make_windows, split
     from adaptfault.evaluation.scores import evaluate
     from adaptfault.evaluation.training_check import plot_training, training_problems
     from adaptfault.models.network import TactileTransformer
     from adaptfault.models.store import save_model
     from adaptfault.models.training import train
+    from diagnostics import FaultSet
 
     windows = make_windows(recordings.frames, recordings.labels, recordings.layout, length=args.length)
     parts = split(windows, seed=args.seed)
@@ -98,13 +108,15 @@ def run(args: argparse.Namespace) -> int:
         checkpoint=checkpoint,
         progress=progress(args),
     )
-    scores = evaluate(model.cpu(), parts[2])
+    adapter = Adapter(model.cpu(), parts[0], parts[1])
+    healthy = adapter.healthy if args.head == "auto" else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
+    scores = evaluate(healthy, parts[2])
     extra = {"split_seed": args.seed, "test_scores": scores.to_dict(), "history": history.to_dict()}
     if bundled:
-        _bundle(args, out, recordings, model, parts)
+        _bundle(args, out, recordings, adapter, parts)
         shutil.rmtree(folder)
     else:
-        save_model(out, model, class_names=recordings.class_names, extra=extra)
+        save_model(out, model, class_names=recordings.class_names, extra=extra, head=healthy.model.head)
         checkpoint.unlink()  # the run is complete: nothing is left to resume
     kind = "bundle" if bundled else "model"
     picture = out.with_name(f"{out.stem}.training.png") if bundled else out / "training.png"
@@ -138,23 +150,23 @@ def _bundle(
     args: argparse.Namespace,
     out: Path,
     recordings: Recordings,
-    model: TactileTransformer | AnyModel,
+    adapter: Adapter,
     parts: tuple[Windows, Windows, Windows],
 ) -> None:
     """Make the bundle; new versions are tested on the windows of the test recordings."""
     import numpy as np
 
-    from adaptfault.adaptation.adapter import Adapter
     from adaptfault.data.calibration import Calibration
     from adaptfault.robot.bundle import Bundle
 
-    training, validation, test = parts
+    training, _, test = parts
     Bundle.create(
         out,
-        model,
-        Adapter(model, training, validation),
+        adapter.model,
+        adapter,
         fit_diagnoser(args, recordings.select(np.unique(training.recording))),
         check=test,
         class_names=recordings.class_names,
         calibration=Calibration.read(args.calibration) if args.calibration else None,
+        head=args.head,
     )

@@ -15,7 +15,7 @@ from adaptfault.adaptation.result import Adaptation
 from adaptfault.cli.options import load_recordings
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, make_windows, split
-from adaptfault.models.store import SCHEMA, load_model, read_manifest
+from adaptfault.models.store import SCHEMA, load_healthy, read_manifest
 
 if TYPE_CHECKING:
     from adaptfault.robot.bundle import Bundle
@@ -29,14 +29,15 @@ class TrainedModel:
         network: the fault-free model, with its layout and window length.
         class_names: one name a class, or none.
         split_seed: of the split into training, validation and test recordings; None where it is not stored.
-        adaptation: the version that a bundle runs; None for a model.
+        adaptation: the version that a bundle runs; of a model, its form for the healthy sensor, with the head in closed
+            form if it has one.
         calibration: the bundle's table from raw counts to the layout's unit.
     """
 
     network: Network
     class_names: tuple[str, ...]
     split_seed: int | None
-    adaptation: Adaptation | None = None
+    adaptation: Adaptation
     calibration: Path | None = None
 
     @classmethod
@@ -50,7 +51,8 @@ class TrainedModel:
         if bundle is None:
             manifest = read_manifest(folder, SCHEMA)
             seed = int(manifest["extra"].get("split_seed", 0))
-            return cls(load_model(folder), tuple(manifest["class_names"]), seed)
+            healthy = load_healthy(folder)
+            return cls(healthy.model.network, tuple(manifest["class_names"]), seed, healthy)
         active = Adaptation.load(bundle.active().folder)
         return cls(active.model.network, bundle.class_names, None, active, bundle.parts.calibration)
 

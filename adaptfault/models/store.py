@@ -16,12 +16,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
+    from adaptfault.adaptation.heads import Blend
+    from adaptfault.adaptation.result import Adaptation
     from adaptfault.models.any_model import AnyModel
     from adaptfault.models.network import TactileTransformer
 
 SCHEMA = "adaptfault.model/1"
 ADAPTATION = "adaptfault.adaptation/1"  # schema of an adapted model
 MANIFEST = "manifest.json"
+_HEAD = "closed form head."  # begins the names of its tensors; no module's name holds a space
 
 
 def save_tensors(folder: str | Path, schema: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
@@ -169,6 +172,7 @@ def save_model(
     *,
     class_names: Sequence[str] = (),
     extra: Mapping[str, Any] | None = None,
+    head: Blend | None = None,
 ) -> None:
     """Write a model into a folder; an earlier model there is replaced in one step.
 
@@ -177,6 +181,7 @@ def save_model(
         model: saved as weights and :attr:`~adaptfault.models.network.TactileTransformer.config`.
         class_names: one name a class, or none.
         extra: JSON-safe values to store beside the model.
+        head: fitted in closed form to the healthy model, for :func:`load_healthy`; None: the model has its own alone.
 
     Raises:
         ValueError: another number of class names than classes, a module without builder, or ``extra`` does not fit into
@@ -190,25 +195,51 @@ def save_model(
             " build_model('package.module:function', layout, n_classes)"
         )
     about = {"config": model.config, "class_names": list(class_names), "extra": dict(extra or {})}
-    save_tensors(folder, SCHEMA, about, model.state_dict())
+    tensors = dict(model.state_dict())
+    if head is not None:
+        about["head"] = head.about
+        tensors |= {_HEAD + name: tensor for name, tensor in head.state_dict().items()}
+    save_tensors(folder, SCHEMA, about, tensors)
 
 
 def load_model(folder: str | Path) -> TactileTransformer | AnyModel:
-    """Read the model that :func:`save_model` wrote, in eval mode.
+    """Read the model that :func:`save_model` wrote, in eval mode, without the head in closed form.
 
     Raises:
         FileNotFoundError: a file is missing.
         ValueError: a file is damaged, the weights do not fit the network, or its builder is not allowed.
     """
+    return _load_model(folder)[0]
+
+
+def load_healthy(folder: str | Path) -> Adaptation:
+    """Read the model that :func:`save_model` wrote, with its head in closed form if it has one.
+
+    The result is an adaptation to the empty fault set, without scores. Raises the errors of :func:`load_model`.
+    """
+    from adaptfault.adaptation.reduced_model import ReducedModel
+    from adaptfault.adaptation.result import Adaptation
+    from diagnostics import FaultSet
+
+    model, head = _load_model(folder)
+    none = FaultSet((), model.layout.n_cells)
+    return Adaptation(ReducedModel(model, none, None, head).eval(), none, ())
+
+
+def _load_model(folder: str | Path) -> tuple[TactileTransformer | AnyModel, Blend | None]:
+    from adaptfault.adaptation.heads import Blend
     from adaptfault.models.any_model import network_from_config
     from adaptfault.models.builders import ModelNotAllowed
 
     manifest, tensors = load_tensors(folder, SCHEMA)
     try:
-        model = network_from_config(manifest["config"])
-        model.load_state_dict(tensors)
+        model, head = network_from_config(manifest["config"]), None
+        if (about := manifest.get("head")) is not None:
+            head = Blend.empty(about, model.n_classes)
+            head.load_state_dict({k.removeprefix(_HEAD): v for k, v in tensors.items() if k.startswith(_HEAD)})
+        model.load_state_dict({k: v for k, v in tensors.items() if not k.startswith(_HEAD)})
     except ModelNotAllowed:
         raise
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"the model in {folder} is damaged: {str(error).splitlines()[0]}") from None
-    return model.eval()
+    return model.eval(), head

@@ -18,6 +18,7 @@ from adaptfault.adaptation.baselines.fault_aware import train_fault_aware
 from adaptfault.adaptation.baselines.random_faults import FaultPattern, RandomFaults
 from adaptfault.adaptation.reduced_model import ReducedModel, phi, reduce_windows
 from adaptfault.adaptation.result import Adaptation
+from adaptfault.adaptation.stages import Method
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, evenly, make_windows, split
 from adaptfault.models.network import TactileTransformer, logits_of
@@ -213,7 +214,8 @@ class Bench:
     def _adapted(self, faults: FaultSet, x: Floats | None = None) -> Classes:
         """Predict by the base network adapted to F; the cells in F read NaN unless ``x`` is given."""
         if faults not in self._adaptations:
-            self._adaptations[faults] = self.adapter.adapt(faults, seed=self.seed, progress=False)
+            method: Method = "auto" if len(faults) else "fill"  # without faults the paper's network alone
+            self._adaptations[faults] = self.adapter.adapt(faults, method=method, seed=self.seed, progress=False)
         if x is None:
             x = self.test.x.copy()
             x[..., list(faults)] = np.nan

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, suppress
 from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
 
 from adaptfault.data.atomic import make_folder
@@ -29,12 +29,12 @@ from adaptfault.robot.checksummed_json import (
 from adaptfault.robot.journal import Journal
 from adaptfault.robot.known_faults import KnownFaults
 from adaptfault.robot.lock import locked
-from adaptfault.robot.parts import Parts
+from adaptfault.robot.parts import Parts, split_validation
 from adaptfault.robot.pointer import NAME as POINTER
 from adaptfault.robot.pointer import SCHEMA as POINTER_SCHEMA
 from adaptfault.robot.pointer import STARTS, Pointer
 from adaptfault.robot.versions import Version, Versions
-from diagnostics import SelfDiagnosis, SensorLayout
+from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
@@ -125,24 +125,29 @@ class Bundle:
         check: Windows | None = None,
         class_names: Sequence[str] = (),
         calibration: Calibration | None = None,
+        head: Literal["auto", "linear"] = "auto",
     ) -> Bundle:
         """Write a new bundle from a fault-free model, its adapter and a fitted diagnoser.
 
         Args:
             path: folder to create; must not exist.
-            model: the fault-free model, which becomes version 1.
+            model: the fault-free model; version 1 is this model, see ``head``.
             adapter: of the same model; its windows are stored, at most 20 MB of them.
             diagnoser: fitted on fault-free recordings.
             check: held-out fault-free labelled windows, as the test windows of ``split``, on which new versions are
                 compared with the running one. None takes half of the adapter's validation windows.
             class_names: one name a class, or none.
             calibration: from raw counts to the layout's unit, if recordings are raw counts.
+            head: of version 1. "auto": fitted in closed form where it improves validation, as for a repair
+                (:attr:`~adaptfault.adaptation.adapter.Adapter.healthy`). "linear": the model's own.
 
         Raises:
             FileExistsError: ``path`` exists.
-            ValueError: the parts have different array shapes, or the diagnoser is not fitted.
+            ValueError: the parts have different array shapes, the diagnoser is not fitted, or ``head`` is unknown.
         """
         path = Path(path)
+        if head not in ("auto", "linear"):
+            raise ValueError(f"unknown head {head!r}: use 'auto' or 'linear'")
         if path.exists():
             raise FileExistsError(f"{path} exists: choose another name, or remove it")
         if not diagnoser.layout.shape == adapter.model.layout.shape == model.layout.shape:
@@ -154,6 +159,8 @@ class Bundle:
         make_folder(path.parent)
         new = path.with_name(f".{path.name}.unfinished")
         shutil.rmtree(new, ignore_errors=True)  # left by a crash
+        if check is None:
+            adapter, check = split_validation(adapter)
         Parts.write(new / _PARTS, adapter, diagnoser, check, calibration)
         about: dict[str, Any] = {
             "schema": SCHEMA,
@@ -165,7 +172,8 @@ class Bundle:
         write_with_copy(new / _ABOUT, about)
         bundle = cls(new)
         Pointer(active=1).write(new)
-        bundle.write_version(_fault_free(model, adapter.validation), {"reason": "the fault-free model"})
+        first = adapter.healthy if head == "auto" else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
+        bundle.write_version(first, {"reason": "the fault-free model"})
         sync_tree(new)
         os.replace(new, path)
         sync(path.parent)
@@ -338,13 +346,3 @@ def _save(adaptation: Adaptation, folder: Path) -> None:
         add_onnx(folder)
     except (ImportError, ExportError) as error:
         _log.warning("no ONNX export, this version runs on torch: %s", error)
-
-
-def _fault_free(model: TactileTransformer | AnyModel, validation: Windows) -> Adaptation:
-    """Return the model as an adaptation to the empty fault set, with identical logits."""
-    from adaptfault.adaptation.reduced_model import ReducedModel
-    from adaptfault.adaptation.result import Adaptation
-    from diagnostics import FaultSet
-
-    none = FaultSet((), model.layout.n_cells)
-    return Adaptation(ReducedModel(model, none, None).eval(), none, (), _validation=validation)

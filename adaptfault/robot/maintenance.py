@@ -353,7 +353,7 @@ class _Maintenance:
             return self._return_to(earlier, windows, known, found)
         broken = with_faults(windows, known.faults, self.bundle.layout)
         running = Adaptation.load(self.version.folder)
-        free = float((adapter.model.predict(windows.x) == windows.y).mean())
+        free = self._fault_free_accuracy(windows)
         self.say(f"{len(faulty)} of {faulty.n_cells} cells are faulty; adapting")
         for method in ("auto", "fill"):
             adaptation = adapter.adapt(faulty, method=method, budget=self.budget, progress=False)
@@ -382,6 +382,16 @@ class _Maintenance:
         number = self.version.number if self.dry_run else self._deploy(adaptation, known, judgement, free)
         return self._report("deployed", code, reason, known, accuracy=judgement.candidate, number=number, **found)
 
+    def _fault_free_accuracy(self, windows: Windows) -> float:
+        """Return the accuracy of version 1, the model of the healthy sensor, on windows without faults."""
+        from adaptfault.adaptation.result import Adaptation
+
+        try:
+            model = Adaptation.load(self.bundle.versions[1].folder)
+        except (Damaged, FileNotFoundError):
+            return float((self.bundle.parts.adapter().model.predict(windows.x) == windows.y).mean())
+        return float((model.predict(windows.x) == windows.y).mean())
+
     def _version_for(self, faulty: FaultSet) -> Version | None:
         """Return the latest version for exactly this F, where the running one also excludes recovered cells."""
         if not set(faulty) < set(self.version.fault_set):
@@ -402,7 +412,7 @@ class _Maintenance:
         broken = with_faults(windows, known.faults, self.bundle.layout)
         running, candidate = Adaptation.load(self.version.folder), Adaptation.load(earlier.folder)
         judgement = compare_candidate(running.predict, candidate.predict, broken)
-        free = float((self.bundle.parts.adapter().model.predict(windows.x) == windows.y).mean())
+        free = self._fault_free_accuracy(windows)
         found |= {"judgement": judgement, "fault_free_accuracy": free}
         recovered = len(self.version.fault_set) - len(known.fault_set)
         accuracies = f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}"

@@ -39,20 +39,18 @@ class Parts:
         folder: Path,
         adapter: Adapter,
         diagnoser: SelfDiagnosis,
-        check: Windows | None,
+        check: Windows,
         calibration: Calibration | None,
     ) -> None:
-        """Write the parts into a new folder; without ``check``, half of the validation windows become the check.
+        """Write the parts into a new folder.
 
         Raises:
-            ValueError: the diagnoser is not fitted, or there are too few windows.
+            ValueError: the diagnoser is not fitted.
         """
         from adaptfault.adaptation.adapter_files import save_adapter, save_windows
 
         if diagnoser.reference_ is None:
             raise ValueError("a bundle needs a diagnoser that is fitted on fault-free recordings: call fit first")
-        if check is None:
-            adapter, check = _split_validation(adapter)
         folder.mkdir(parents=True)
         save_adapter(folder / _ADAPTER, adapter)
         save_windows(folder / _CHECK, check)
@@ -126,7 +124,7 @@ def _diagnoser(path: Path) -> SelfDiagnosis:
         return SelfDiagnosis.from_state(about["diagnosis"], arrays)
 
 
-def _split_validation(adapter: Adapter) -> tuple[Adapter, Windows]:
+def split_validation(adapter: Adapter) -> tuple[Adapter, Windows]:
     """Return an adapter with every second validation recording of each class, and the windows of the others."""
     import numpy as np
 

@@ -137,3 +137,18 @@ def test_an_atomic_write_replaces_all_or_nothing(tmp_path: Path, monkeypatch: py
     assert list(tmp_path.iterdir()) == [path]
     atomic_write(path, b"new")
     assert path.read_bytes() == b"new"
+
+
+def test_a_model_comes_back_with_its_head_in_closed_form_and_without(tmp_path, versions):
+    from adaptfault.adaptation.result import Adaptation
+    from adaptfault.models.store import load_healthy
+
+    head = Adaptation.load(versions["head"]).model.head
+    network = Adaptation.load(versions["whole"]).model.network
+    save_model(tmp_path, network, head=head)
+    plain, healthy = load_model(tmp_path), load_healthy(tmp_path)
+    assert all(torch.equal(tensor, network.state_dict()[name]) for name, tensor in plain.state_dict().items())
+    assert not len(healthy.fault_set)
+    assert all(torch.equal(tensor, head.state_dict()[name]) for name, tensor in healthy.model.head.state_dict().items())
+    save_model(tmp_path, network)
+    assert load_healthy(tmp_path).model.head is None

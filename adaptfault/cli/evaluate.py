@@ -17,6 +17,12 @@ def add(commands: Commands) -> None:
     parser.add_argument("model", metavar="MODEL", help="folder written by adaptfault train, or a bundle")
     add_recordings(parser)
     parser.add_argument("--adapted", metavar="FOLDER", help="score this adaptation of the model instead")
+    parser.add_argument(
+        "--head",
+        default="auto",
+        choices=("auto", "linear"),
+        help="auto: the head that the model was stored with (default); linear: the head of its network, as in the paper",
+    )
     parser.add_argument("--inject", action="append", default=[], metavar="FAULT", help=INJECT_HELP)
     parser.add_argument("--seed", type=int, default=0, help="random seed of random faults (default 0)")
     parser.add_argument("--all", action="store_true", help="score on all recordings, not only on the test share")
@@ -30,14 +36,16 @@ def run(args: argparse.Namespace) -> int:
 
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.cli.trained_model import TrainedModel
-    from adaptfault.evaluation.scores import Scores, accuracy_interval
+    from adaptfault.evaluation.scores import Scores, accuracy_interval, recording_scores
     from diagnostics import inject
 
     trained = TrainedModel.open(args.model)
     model, recordings = trained.network, trained.recordings(args, args.recordings)
-    classifier = Adaptation.load(args.adapted) if args.adapted else trained.adaptation or model
-    (classifier.model if isinstance(classifier, Adaptation) else model).to(device(args))
-    if isinstance(classifier, Adaptation) and classifier.fault_set.n_cells != model.layout.n_cells:
+    classifier = Adaptation.load(args.adapted) if args.adapted else trained.adaptation
+    if args.head == "linear":
+        classifier.model.head = None
+    classifier.model.to(device(args))
+    if classifier.fault_set.n_cells != model.layout.n_cells:
         raise ValueError(f"{args.adapted}: an adaptation over {classifier.fault_set.n_cells} cells, not of this model")
     whole = args.all or trained.split_seed is None
     if whole and not args.all:
@@ -55,16 +63,24 @@ def run(args: argparse.Namespace) -> int:
 
         every = make_windows(broken, recordings.labels, recordings.layout, length=model.length)
         windows = every.select(np.isin(every.recording, which))
-    predicted = classifier.predict(windows.x)
+    probabilities = classifier.predict_proba(windows.x)
+    predicted = probabilities.argmax(axis=1)
     scores = Scores.of(windows.y, predicted, n_classes=model.n_classes)
+    whole_recordings = recording_scores(probabilities, windows)
     interval = accuracy_interval(predicted == windows.y, windows.recording)
     cells = sorted({c for fault in faults for c in fault.cells})
     result = {
         "schema": "adaptfault.evaluate/1",
         "scores": scores.to_dict(),
         "accuracy_interval": list(interval),
+        "recordings": {"accuracy": whole_recordings.accuracy, "n": whole_recordings.n},
         "injected": [fault.to_dict() for fault in faults],
     }
-    clustered = f"95 % interval of the accuracy, clustered by recording: {interval[0]:.3f} to {interval[1]:.3f}"
-    emit(args, result, f"{len(cells)} cells faulty: {scores}\n{clustered}" if cells else f"{scores}\n{clustered}")
+    lines = (
+        f"{len(cells)} cells faulty: {scores}" if cells else str(scores),
+        f"95 % interval of the accuracy, clustered by recording: {interval[0]:.3f} to {interval[1]:.3f}",
+        f"whole recordings, all windows of one together: accuracy {whole_recordings.accuracy:.3f}"
+        f" on {whole_recordings.n} recordings",
+    )
+    emit(args, result, "\n".join(lines))
     return 0

@@ -163,6 +163,27 @@ def r2(true: ArrayLike, predicted: ArrayLike) -> float:
     return float((1 - ((t - p) ** 2).sum(axis=0)[varies] / total[varies]).mean()) if varies.any() else 0.0
 
 
+def recording_scores(probabilities: ArrayLike, windows: Windows) -> Scores:
+    """Score one decision for each recording: the class with the largest product of its windows' probabilities.
+
+    Args:
+        probabilities: ``[N, n_classes]`` of the windows.
+        windows: labelled; all windows of a recording have one class.
+
+    Returns:
+        Scores whose ``n`` counts recordings.
+
+    Raises:
+        ValueError: as :meth:`Scores.of`.
+    """
+    p = np.asarray(probabilities, dtype=np.float64)
+    logs = np.log(np.maximum(p, np.finfo(np.float32).tiny))
+    _, first, inverse = np.unique(windows.recording, return_index=True, return_inverse=True)
+    summed = np.zeros((len(first), p.shape[1]))
+    np.add.at(summed, inverse, logs)
+    return Scores.of(windows.y[first], summed.argmax(axis=1), n_classes=p.shape[1])
+
+
 def mean_interval(values: ArrayLike, recording: ArrayLike, *, level: float = 0.95) -> tuple[float, float]:
     """Return the cluster-robust t interval of the mean of ``values [N]``, clustered by recording ``[N]``.
 

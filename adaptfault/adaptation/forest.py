@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-_TREES = 100
+TREES = 100
 
 
 class Forest(nn.Module):
@@ -33,25 +33,33 @@ class Forest(nn.Module):
         self.register_buffer("thresholds", thresholds)
 
     @classmethod
-    def fit(cls, x: Tensor, y: NDArray[np.int64], n_classes: int, *, seed: int = 0) -> Forest:
+    def fit(cls, x: Tensor, y: NDArray[np.int64], n_classes: int, *, trees: int = TREES, seed: int = 0) -> Forest:
         """Fit trees to ``x [M, p]`` and classes ``y [M]``, with as many threads as torch, on the device of x."""
         from sklearn.ensemble import ExtraTreesClassifier
 
         # The number of threads does not change the trees: each has a seed of its own.
-        grown = ExtraTreesClassifier(_TREES, random_state=seed, n_jobs=torch.get_num_threads()).fit(x.cpu().numpy(), y)
-        trees = [estimator.tree_ for estimator in grown.estimators_]
-        most = max(tree.node_count for tree in trees)
-        nodes, thresholds = np.zeros((_TREES, most, 3), np.int64), np.full((_TREES, most), np.inf, np.float32)
-        for i, tree in enumerate(trees):
+        grown = ExtraTreesClassifier(trees, random_state=seed, n_jobs=torch.get_num_threads()).fit(x.cpu().numpy(), y)
+        of_each = [estimator.tree_ for estimator in grown.estimators_]
+        most = max(tree.node_count for tree in of_each)
+        nodes, thresholds = np.zeros((trees, most, 3), np.int64), np.full((trees, most), np.inf, np.float32)
+        for i, tree in enumerate(of_each):
             n, leaf = tree.node_count, tree.children_left < 0
             itself, classes = np.arange(n), grown.classes_[tree.value[:, 0].argmax(axis=1)]
             nodes[i, :n, 0] = np.where(leaf, classes, tree.feature)
             nodes[i, :n, 1] = np.where(leaf, itself, tree.children_left)
             nodes[i, :n, 2] = np.where(leaf, itself, tree.children_right)
             thresholds[i, :n] = np.where(leaf, np.inf, _as_float32(tree.threshold))
-        depth = max(tree.max_depth for tree in trees)
+        depth = max(tree.max_depth for tree in of_each)
         forest = cls(torch.from_numpy(nodes), torch.from_numpy(thresholds), depth, n_classes)
         return forest.to(x.device)
+
+    def __add__(self, other: Forest) -> Forest:
+        """Return the forest with the trees of both."""
+        most = max(self.thresholds.shape[1], other.thresholds.shape[1])
+        pad = [most - forest.thresholds.shape[1] for forest in (self, other)]
+        nodes = [nn.functional.pad(f.nodes, (0, 0, 0, n)) for f, n in zip((self, other), pad, strict=True)]
+        thresholds = [nn.functional.pad(f.thresholds, (0, n), value=np.inf) for f, n in zip((self, other), pad, strict=True)]
+        return Forest(torch.cat(nodes), torch.cat(thresholds), max(self.depth, other.depth), self.n_classes)
 
     @classmethod
     def empty(cls, about: dict[str, Any]) -> Forest:

@@ -9,6 +9,7 @@ may be averaged with a forest of randomised trees, where held-out windows favour
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,9 +18,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.adaptation.forest import Forest
+from adaptfault.adaptation.forest import TREES, Forest
+from adaptfault.data.windows import evenly
 
 _WIDTH = 0.7  # of the Gaussian kernel, in units of the median squared distance
+_SAMPLE = 1_000  # windows on which bandwidths and shares of the views are chosen
 _RIDGE = 0.05  # added to the kernel's diagonal, which is 1
 _LINEAR_C = 0.3  # inverse strength of the linear head's ridge penalty
 _VIEW_SHARES = ((0.5, 0.5), (1.0, 0.0), (0.0, 1.0))  # of features and healthy cells in the kernel
@@ -156,8 +159,21 @@ class KernelFit:
     ) -> None:
         self.views, self.targets, self.folds, self.values = views, targets, folds, values
         distances = [_squared_distance(view, view) for view in views]
-        self.widths = [_WIDTH * (float(d.median()) or 1.0) for d in distances]
+        sample = evenly(len(views[0]), _SAMPLE)
+        self.widths = [_WIDTH * (float(d[sample][:, sample].median()) or 1.0) for d in distances]
         self.kernels = [d.div_(-width).exp_() for d, width in zip(distances, self.widths, strict=True)]
+
+    def thinned(self, most: int) -> KernelFit:
+        """Return the same with at most so many of the windows that are never held out, for quick comparisons."""
+        n = len(self.folds)
+        m = len(self.targets) - n
+        if m <= most:
+            return self
+        kept = np.concatenate([evenly(m, most), np.arange(m, m + n)])
+        few = copy.copy(self)
+        few.views, few.targets = [view[kept] for view in self.views], self.targets[kept]
+        few.kernels = [kernel[kept][:, kept] for kernel in self.kernels]
+        return few
 
     def fit(self, shares: Sequence[float], ridge: float = _RIDGE) -> tuple[KernelHead, Tensor]:
         """Fit a head on all windows.
@@ -219,24 +235,26 @@ def fit_head(
     both = [torch.cat(pair) for pair in zip(training, held, strict=True)]
     classes, y = training_targets.argmax(axis=1), held_targets.argmax(axis=1)
     fit = KernelFit(both, np.concatenate([training_targets, held_targets]), folds)
-    fitted = [fit.fit(shares) for shares in _VIEW_SHARES]
-    scales = [calibrate(logits, y) for _, logits in fitted]
-    best = int(np.argmin([loss for _, loss in scales]))
-    kernel, logits = fitted[best][0].scaled(scales[best][0]), scales[best][0] * fitted[best][1]
+    few = fit.thinned(_SAMPLE)
+    tried = [calibrate(few.fit(shares)[1], y)[1] for shares in _VIEW_SHARES]
+    head, logits = fit.fit(_VIEW_SHARES[int(np.argmin(tried))])
+    scale, _ = calibrate(logits, y)
+    kernel, logits = head.scaled(scale), scale * logits
 
     n_classes = logits.shape[1]
     voted = torch.empty_like(logits)
+    halves = []
     for half in (0, 1):  # held out in turn
         known, out = folds % 2 != half, folds % 2 == half
-        grown = Forest.fit(torch.cat([training[1], held[1][known]]), np.concatenate([classes, y[known]]), n_classes)
-        voted[out] = grown(held[1][out]).cpu()
+        x, labels = torch.cat([training[1], held[1][known]]), np.concatenate([classes, y[known]])
+        halves.append(Forest.fit(x, labels, n_classes, trees=TREES // 2, seed=half))
+        voted[out] = halves[-1](held[1][out]).cpu()
     scale, _ = calibrate(voted, y)
     losses = [calibrate(blend(logits, scale * voted, share), y)[1] for share in _KERNEL_SHARES]
     share = _KERNEL_SHARES[int(np.argmin(losses))]
     if share == 1.0:
         return Blend(kernel), logits
-    forest = Forest.fit(both[1], np.concatenate([classes, y]), n_classes)
-    return Blend(kernel, forest, share, scale), blend(logits, scale * voted, share)
+    return Blend(kernel, halves[0] + halves[1], share, scale), blend(logits, scale * voted, share)
 
 
 def fit_value_head(
@@ -263,9 +281,10 @@ def fit_value_head(
     mean, deviation = values.mean(axis=0), values.std(axis=0)
     deviation[deviation == 0] = 1.0
     fit = KernelFit(both, ((values - mean) / deviation).astype(np.float32), folds, values=True)
-    fitted = [fit.fit(shares, ridge) for shares in _VIEW_SHARES for ridge in _RIDGES]
+    few, choices = fit.thinned(_SAMPLE), [(shares, ridge) for shares in _VIEW_SHARES for ridge in _RIDGES]
     truth = torch.from_numpy(((held_values - mean) / deviation).astype(np.float32))
-    head, found = fitted[int(np.argmin([float((out - truth).square().mean()) for _, out in fitted]))]
+    tried = [float((few.fit(*choice)[1] - truth).square().mean()) for choice in choices]
+    head, found = fit.fit(*choices[int(np.argmin(tried))])
     scale, offset = (torch.as_tensor(v, dtype=torch.float32) for v in (deviation, mean))
     on = head.weights.device
     weights, bias = head.weights * scale.to(on), head.bias * scale.to(on) + offset.to(on)

@@ -19,6 +19,7 @@ from adaptfault.models.network import BLOCKS, HEAD_DIM, HEADS, HIDDEN, EncoderBl
 
 _UPDATES = BLOCKS * (HEADS * HEAD_DIM + HIDDEN + 2)  # numbers that the blocks add to those of a frame's cells
 _MOST = 20_000_000  # values in a basis; a larger decomposition costs more time than it saves
+_ROWS = 128  # of a triangular matrix, multiplied at once
 _DEPENDENT = 1e-5  # relative Cholesky diagonal below which the columns count as linearly dependent
 _WORTH = 2000  # windows from which on the decomposition saves time: about twice its break-even
 
@@ -37,20 +38,33 @@ class _Wide:
         """Return the map from y and the inputs of ``layer`` to the new y of ``norm(x + layer(inputs))``."""
         rows = torch.cat([self.basis, layer.weight.T, (self.offset + layer.bias)[None]])
         directions, lengths = _orthonormal((rows - rows.mean(1, keepdim=True)).T)  # (d, k'), (k', rows)
-        folded = CompactNorm(_linear(lengths[:, :-1], lengths[:, -1]), rows.shape[1], norm.eps)
+        folded = CompactNorm(lengths[:, :-1], lengths[:, -1], rows.shape[1], norm.eps)
         return folded, _Wide(directions.T * norm.weight, norm.bias)
 
 
 class CompactNorm(nn.Module):
-    """Residual sum and LayerNorm of ``width`` values, computed on coordinates."""
+    """Residual sum and LayerNorm of ``width`` values, computed on coordinates.
 
-    def __init__(self, sum_: nn.Linear, width: int, eps: float) -> None:
+    The matrix of the sum is upper triangular: blocks of its rows leave out the zeros below the diagonal.
+
+    Args:
+        matrix: ``[k', k + u]``, upper triangular.
+        offset: ``[k']``.
+        width: of the LayerNorm.
+        eps: of the LayerNorm.
+    """
+
+    def __init__(self, matrix: Tensor, offset: Tensor, width: int, eps: float) -> None:
         super().__init__()
-        self.sum, self.width, self.eps = sum_, width, eps
+        self.width, self.eps = width, eps
+        self.rows = nn.ModuleList(
+            _linear(matrix[i : i + _ROWS, i:], offset[i : i + _ROWS]) for i in range(0, len(matrix), _ROWS)
+        )
 
     def forward(self, y: Tensor, update: Tensor) -> Tensor:
         """Map ``[N, T, k]`` and an update ``[N, T, u]`` to ``[N, T, k']``."""
-        y = self.sum(torch.cat([y, update], dim=-1))
+        y = torch.cat([y, update], dim=-1)
+        y = torch.cat([rows(y[..., i * _ROWS :]) for i, rows in enumerate(self.rows)], dim=-1)
         return y * torch.rsqrt(y.square().sum(-1, keepdim=True) / self.width + self.eps)
 
 

@@ -108,3 +108,12 @@ def test_without_an_error_the_interval_is_the_exact_binomial_one_over_recordings
     assert (low, high) == pytest.approx((0.025 ** (1 / 10), 1.0))
     low, high = accuracy_interval(np.zeros(100), recording)
     assert (low, high) == pytest.approx((0.0, 1 - 0.025 ** (1 / 10)))
+
+
+def test_a_recording_is_decided_by_all_its_windows():
+    from adaptfault.evaluation.scores import recording_scores
+
+    likely = np.array([[0.6, 0.4], [0.1, 0.9], [0.6, 0.4], [0.9, 0.1]])
+    windows = Windows(np.zeros((4, 1, 1), np.float32), np.array([1, 1, 1, 0]), np.array([7, 7, 7, 3]))
+    scores = recording_scores(likely, windows)
+    assert (scores.accuracy, scores.n) == (1.0, 2)

@@ -358,3 +358,20 @@ assert "torch" not in sys.modules
 
 def test_a_robot_streams_without_torch(versions):
     subprocess.run([sys.executable, "-c", WITHOUT_TORCH, str(versions["head"])], check=True)
+
+
+def test_a_predictor_accumulates_over_a_contact_only_where_it_is_asked_to(carried):
+    frames = presses(3, 60)
+    plain, accumulating = running(carried), Predictor(lambda: carried, accumulate=True)
+    alone, together = [plain.stream(f) for f in frames], [accumulating.stream(f) for f in frames]
+    assert all(reading.contact is None for reading in alone)
+    full = [reading for reading in together if reading.probabilities is not None]
+    inside = [reading.contact is not None for reading in full]
+    assert any(inside)
+    assert not all(inside)
+    first = full[inside.index(True)]
+    np.testing.assert_allclose(first.contact, first.probabilities, atol=1e-6)
+    for one, other in zip(alone, together, strict=True):
+        assert one.label == other.label
+    accumulating.reset()
+    assert accumulating.stream(np.zeros(D)).contact is None

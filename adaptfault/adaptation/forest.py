@@ -58,7 +58,9 @@ class Forest(nn.Module):
         most = max(self.thresholds.shape[1], other.thresholds.shape[1])
         pad = [most - forest.thresholds.shape[1] for forest in (self, other)]
         nodes = [nn.functional.pad(f.nodes, (0, 0, 0, n)) for f, n in zip((self, other), pad, strict=True)]
-        thresholds = [nn.functional.pad(f.thresholds, (0, n), value=np.inf) for f, n in zip((self, other), pad, strict=True)]
+        thresholds = [
+            nn.functional.pad(f.thresholds, (0, n), value=np.inf) for f, n in zip((self, other), pad, strict=True)
+        ]
         return Forest(torch.cat(nodes), torch.cat(thresholds), max(self.depth, other.depth), self.n_classes)
 
     @classmethod

@@ -14,9 +14,10 @@ from torch import Tensor, nn
 from adaptfault.adaptation.heads import Blend
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
 from adaptfault.data.windows import Windows
-from adaptfault.evaluation.scores import Scores, ValueScores, evaluate
+from adaptfault.evaluation.scores import Scores, ValueScores
 from adaptfault.imputation.linear import AffineFill, NearestFill
 from adaptfault.imputation.tiled import TiledFill
+from adaptfault.models.accumulation import ContactStatistics
 from adaptfault.models.any_model import network_from_config
 from adaptfault.models.builders import ModelNotAllowed
 from adaptfault.models.network import logits_of
@@ -59,8 +60,9 @@ class Adaptation:
     stages: tuple[Stage, ...]
     task: Literal["classification", "regression"] = "classification"
     _validation: Windows | None = field(default=None, repr=False)
-    _held_out: NDArray[Any] | None = field(default=None, repr=False)
+    _held_out: Tensor | None = field(default=None, repr=False)
     _scores: Scores | ValueScores | None = field(default=None, repr=False)
+    _contact: ContactStatistics | None = field(default=None, repr=False)
 
     def predict(self, x: NDArray[Any] | Tensor) -> NDArray[Any]:
         """Return the class of each window ``[N, T, D]``, int64 ``[N]``, or its values, float32 ``[N, k]``.
@@ -96,13 +98,26 @@ class Adaptation:
             return self._scores
         if self._validation is None:
             raise ValueError("this adaptation was loaded without scores")
+        outputs = self._outputs(self._validation)
         if self.task == "regression":
-            values = self.predict(self._validation.x) if self._held_out is None else self._held_out
-            return ValueScores.of(self._validation.y, values)
+            return ValueScores.of(self._validation.y, outputs.numpy())
+        return Scores.of(self._validation.y, outputs.argmax(1).numpy(), n_classes=self.model.network.n_classes)
+
+    def _outputs(self, validation: Windows) -> Tensor:
+        """Return the outputs for the validation windows, computed once."""
         if self._held_out is None:
-            scores: Scores = evaluate(self, self._validation)
-            return scores
-        return Scores.of(self._validation.y, self._held_out, n_classes=self.model.network.n_classes)
+            object.__setattr__(self, "_held_out", self._logits(validation.x))
+        assert self._held_out is not None
+        return self._held_out
+
+    @property
+    def contact(self) -> ContactStatistics | None:
+        """What accumulating probabilities over a contact needs; None for a regression, or where it is not stored."""
+        if self._contact is not None or self._validation is None or self.task == "regression":
+            return self._contact
+        windows = self._validation
+        likely = self._outputs(windows).softmax(1).numpy()
+        return ContactStatistics.fit(windows.x, likely, windows.y, windows.recording)
 
     def save(self, path: str | Path) -> None:
         """Write to a folder: weights as safetensors, the rest as JSON, no pickle."""
@@ -116,6 +131,7 @@ class Adaptation:
             "head": None if model.head is None else model.head.about,
             "stages": [vars(stage) for stage in self.stages],
             "scores": self.scores.to_dict(),
+            "contact": None if (contact := self.contact) is None else contact.to_dict(),
         }
         save_tensors(path, ADAPTATION, about, model.state_dict())
 
@@ -144,11 +160,13 @@ class Adaptation:
             stages = tuple(Stage(**stage) for stage in about["stages"])
             task = about.get("task", "classification")
             scores = (ValueScores if task == "regression" else Scores).from_dict(about["scores"])
+            stored = about.get("contact")
+            contact = None if stored is None else ContactStatistics.from_dict(stored)
         except ModelNotAllowed:
             raise
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise ValueError(f"the adaptation in {path} is damaged: {str(error).splitlines()[0]}") from None
-        return cls(model.eval(), fault_set, stages, task, _scores=scores)
+        return cls(model.eval(), fault_set, stages, task, _scores=scores, _contact=contact)
 
 
 def _empty_front(about: dict[str, Any], fault_set: FaultSet) -> nn.Module:

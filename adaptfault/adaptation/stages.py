@@ -165,11 +165,8 @@ class Run:
             tuple(self.stages),
             task=self.fault_free.task,
             _validation=self.fault_free.validation,
-            _held_out=None if self.logits is None else self._answers(self.logits),
+            _held_out=self.logits,
         )
-
-    def _answers(self, outputs: Tensor) -> NDArray[np.int64] | NDArray[np.float32]:
-        return outputs.numpy() if self.fault_free.task == "regression" else outputs.argmax(1).numpy()
 
     def _keep_better(self, name: str, reduced: ReducedModel, began: float | None = None) -> bool:
         """Give ``reduced`` a new head and keep it if validation improves; False if it does not, or time is short."""

@@ -109,7 +109,9 @@ def run(args: argparse.Namespace) -> int:
         progress=progress(args),
     )
     adapter = Adapter(model.cpu(), parts[0], parts[1])
-    healthy = adapter.healthy if args.head == "auto" else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
+    healthy = (
+        adapter.healthy if args.head == "auto" else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
+    )
     scores = evaluate(healthy, parts[2])
     extra = {"split_seed": args.seed, "test_scores": scores.to_dict(), "history": history.to_dict()}
     if bundled:

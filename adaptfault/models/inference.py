@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.models.accumulation import ContactStatistics
 from adaptfault.models.store import ADAPTATION, read_attached, read_manifest
 from diagnostics import FaultSet, SensorLayout
 
@@ -31,6 +32,7 @@ class Inference:
         n_classes: number of classes.
         fault_set: F; the readings of its cells cannot reach the output, not even NaN or infinity.
         runtime: "onnx" or "torch".
+        contact: for decisions about whole contacts.
     """
 
     def __init__(
@@ -41,7 +43,9 @@ class Inference:
         fault_set: FaultSet,
         length: int,
         n_classes: int,
+        contact: ContactStatistics | None = None,
     ) -> None:
+        self.contact = ContactStatistics.unknown(layout.n_cells) if contact is None else contact
         self._run, self.runtime = run, runtime
         self.layout, self.fault_set, self.length, self.n_classes = layout, fault_set, length, n_classes
 
@@ -67,6 +71,8 @@ class Inference:
             layout = SensorLayout.from_dict(network["layout"])
             fault_set = FaultSet(tuple(manifest["fault_set"]), layout.n_cells)
             length, n_classes = int(network["length"]), int(network["n_classes"])
+            stored = manifest.get("contact")
+            contact = None if stored is None else ContactStatistics.from_dict(stored)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueError(f"the adaptation in {folder} is damaged: {error}") from None
         exported = "onnx" in manifest
@@ -75,7 +81,7 @@ class Inference:
         if runtime == "onnx" and not exported:
             raise ValueError(f"{folder} has no ONNX file: add one with add_onnx, or run it on torch")
         run = _on_onnx(folder, manifest) if runtime == "onnx" else _on_torch(folder)
-        return cls(run, runtime, layout, fault_set, length, n_classes)
+        return cls(run, runtime, layout, fault_set, length, n_classes, contact)
 
     def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
         """Return the probability of each class for windows ``[N, T, D]`` on the 0..1 scale, ``[N, n_classes]``.

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptfault.data.windows import hold_missing, scale
+from adaptfault.models.accumulation import ContactDecision
 from adaptfault.models.inference import Inference
 from adaptfault.robot.bundle import PROCESS
 from adaptfault.robot.checksummed_json import Damaged, decoding
@@ -42,6 +43,8 @@ class Reading:
         fault_set: F, the cells that were not used.
         events: faults that are new, changed, or gone (probability 0).
         version: number of the version that computed the label.
+        contact: float32 ``[n_classes]``, probabilities accumulated over the windows of the present contact; None without
+            contact, or where the predictor does not accumulate.
     """
 
     label: int | None
@@ -49,6 +52,7 @@ class Reading:
     fault_set: FaultSet
     events: tuple[Fault, ...]
     version: int
+    contact: NDArray[np.float32] | None = None
 
     def __str__(self) -> str:
         confidence = "" if self.probabilities is None else f" ({self.probabilities.max():.2f})"
@@ -75,13 +79,15 @@ class Predictor:
 
     Args:
         open_bundle: opens the bundle as it is now on disk; see :meth:`load`.
+        accumulate: :meth:`stream` also accumulates the probabilities of the windows of one contact, calibrated on
+            validation recordings, and begins anew at its release (:mod:`adaptfault.models.accumulation`).
 
     Raises:
         FileNotFoundError, ValueError: no version of the bundle can be loaded.
     """
 
-    def __init__(self, open_bundle: Callable[[], Bundle]) -> None:
-        self._open = open_bundle
+    def __init__(self, open_bundle: Callable[[], Bundle], *, accumulate: bool = False) -> None:
+        self._open, self._accumulate = open_bundle, accumulate
         bundle = open_bundle()
         self._pointer = bundle.pointer
         self._stamp = _stamp(self._pointer)
@@ -96,13 +102,19 @@ class Predictor:
         self.outside = 0  # readings outside the range so far
         self._last: NDArray[np.float32]  # last reading of each cell that is not missing
         self._frames: NDArray[np.float32]  # last frames, scaled
+        self._decision = self._new_decision()
         self.reset()
 
     @classmethod
     def load(
-        cls, path: str | Path, *, keys: Sequence[str | os.PathLike[str]] | None = None, least_serial: int = 0
+        cls,
+        path: str | Path,
+        *,
+        keys: Sequence[str | os.PathLike[str]] | None = None,
+        least_serial: int = 0,
+        accumulate: bool = False,
     ) -> Predictor:
-        """Open the bundle in a folder and start its active version.
+        """Open the bundle in a folder and start its active version; ``accumulate`` as in the class.
 
         Args:
             path: of the bundle.
@@ -114,7 +126,7 @@ class Predictor:
         """
         from adaptfault.robot.bundle import Bundle
 
-        return cls(lambda: Bundle.open(path, keys=keys, least_serial=least_serial))
+        return cls(lambda: Bundle.open(path, keys=keys, least_serial=least_serial), accumulate=accumulate)
 
     @property
     def fault_set(self) -> FaultSet:
@@ -178,12 +190,23 @@ class Predictor:
         if len(self._frames) == model.length:
             probabilities = model.predict_proba(self._frames[None])[0]
             label = int(probabilities.argmax())
-        return Reading(label, probabilities, model.fault_set, events, self.version)
+        contact = None if self._decision is None else self._decision.update(self._last, probabilities)
+        return Reading(label, probabilities, model.fault_set, events, self.version, contact)
+
+    def _new_decision(self) -> ContactDecision | None:
+        """Return a decision for the running version, without contact; None where the predictor does not accumulate."""
+        if not self._accumulate:
+            return None
+        model = self._running.model
+        healthy = self.layout.present.ravel() & ~model.fault_set.mask
+        return ContactDecision(model.contact, healthy, model.length)
 
     def reset(self) -> None:
         """Begin a new recording: no window spans it. The monitor keeps its state."""
         self._frames = np.zeros((0, self.layout.n_cells), np.float32)
         self._last = np.zeros(self.layout.n_cells, np.float32)
+        if self._decision is not None:
+            self._decision.reset()
 
     def confirm(self) -> bool:
         """End the probation of the running version.
@@ -221,6 +244,7 @@ class Predictor:
                 if not np.array_equal(before.source, self._running.source):  # the frames so far are of another order
                     self._monitor = Monitor(_reference(self._running.bundle))
                     self.reset()
+                self._decision = self._new_decision()
                 _log.info("version %d runs now", self.version)
         now = monotonic()
         if now < self._next_look:

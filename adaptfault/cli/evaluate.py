@@ -21,7 +21,7 @@ def add(commands: Commands) -> None:
         "--head",
         default="auto",
         choices=("auto", "linear"),
-        help="auto: the head that the model was stored with (default); linear: the head of its network, as in the paper",
+        help="auto: the head that the model was stored with (default); linear: that of its network, as in the paper",
     )
     parser.add_argument("--inject", action="append", default=[], metavar="FAULT", help=INJECT_HELP)
     parser.add_argument("--seed", type=int, default=0, help="random seed of random faults (default 0)")

@@ -73,9 +73,9 @@ class ContactStatistics:
 class ContactDecision:
     """Accumulates the probabilities of windows that end within one contact.
 
-    A contact begins where the load rises by ``begins`` over its lowest value since the last release, and ends where 30 %
-    of its load is left. It does not see that one object is exchanged for another without a release, and a cell that is
-    stuck at a high reading and not in F may hide a release.
+    A contact begins where the load rises by ``begins`` over its lowest value since the last release, and ends where
+    30 % of its load is left. It does not see that one object is exchanged for another without a release, and a cell
+    that is stuck at a high reading and not in F may hide a release.
 
     Args:
         statistics: of the model.

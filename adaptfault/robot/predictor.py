@@ -43,8 +43,8 @@ class Reading:
         fault_set: F, the cells that were not used.
         events: faults that are new, changed, or gone (probability 0).
         version: number of the version that computed the label.
-        contact: float32 ``[n_classes]``, probabilities accumulated over the windows of the present contact; None without
-            contact, or where the predictor does not accumulate.
+        contact: float32 ``[n_classes]``, probabilities accumulated over the windows of the present contact; None
+            without contact, or where the predictor does not accumulate.
     """
 
     label: int | None

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from adaptfault.adaptation.forecast import Forecast
     from adaptfault.adaptation.reduced_model import ReducedModel
     from adaptfault.adaptation.result import Adaptation
+    from adaptfault.adaptation.worst import WorstFaults, worst_faults
     from adaptfault.data.calibration import Calibration
     from adaptfault.data.recordings import Recordings, load, save, save_npz
     from adaptfault.data.simulated_grasps import simulate
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from adaptfault.models.history import History
     from adaptfault.models.inference import Inference
     from adaptfault.models.network import TactileTransformer
-    from adaptfault.models.store import load_model, save_model
+    from adaptfault.models.store import load_healthy, load_model, save_model
     from adaptfault.models.training import train
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.maintenance import MaintenanceReport, maintain
@@ -73,6 +74,7 @@ __all__ = [
     "TactileTransformer",
     "ValueScores",
     "Windows",
+    "WorstFaults",
     "add_onnx",
     "allow_model",
     "analyse",
@@ -82,6 +84,7 @@ __all__ = [
     "evaluate",
     "load",
     "load_adapter",
+    "load_healthy",
     "load_model",
     "maintain",
     "maintain_fleet",
@@ -97,6 +100,7 @@ __all__ = [
     "summarise",
     "train",
     "train_fault_aware",
+    "worst_faults",
     "write_diagnostics",
 ]
 
@@ -129,6 +133,7 @@ _HOMES = {
     "TactileTransformer": "models.network",
     "ValueScores": "evaluation.scores",
     "Windows": "data.windows",
+    "WorstFaults": "adaptation.worst",
     "add_onnx": "models.export",
     "allow_model": "models.builders",
     "analyse": "evaluation.sensitivity",
@@ -138,6 +143,7 @@ _HOMES = {
     "evaluate": "evaluation.scores",
     "load": "data.recordings",
     "load_adapter": "adaptation.adapter_files",
+    "load_healthy": "models.store",
     "load_model": "models.store",
     "maintain": "robot.maintenance",
     "maintain_fleet": "fleet.run",
@@ -153,6 +159,7 @@ _HOMES = {
     "summarise": "data.summary",
     "train": "models.training",
     "train_fault_aware": "adaptation.baselines.fault_aware",
+    "worst_faults": "adaptation.worst",
     "write_diagnostics": "acquisition.ros",
 }
 

@@ -280,6 +280,24 @@ def test_with_f_empty_the_forecast_is_the_fault_free_accuracy_alone(adapter):
     assert forecast.worst_class is None
 
 
+def test_the_worst_wires_and_pads_are_listed_and_mapped(adapter, tmp_path):
+    from adaptfault.adaptation.worst import worst_faults
+
+    few = Adapter(adapter.model, adapter.train.select(slice(0, 60)), adapter.validation.select(slice(0, 60)))
+    worst = worst_faults(few, among=2)
+    assert [len(part) for part in (worst.wires, worst.pairs, worst.pads)] == [16, 1, 2]
+    for part in (worst.wires, worst.pairs, worst.pads):
+        reached = [loss.expected.accuracy for loss in part]
+        assert reached == sorted(reached)
+    first, second = worst.wires[:2]
+    assert worst.pairs[0].fault_set == first.fault_set | second.fault_set
+    stages = few.forecast(first.fault_set).stages
+    assert first.expected.accuracy == max(stages[name].accuracy for name in ("fill", "head"))
+    assert f"  {first.expected}  {first.what}" in str(worst)
+    json.dumps(worst.to_dict(), allow_nan=False)
+    worst.plot().savefig(tmp_path / "worst.png")
+
+
 # On disk
 
 

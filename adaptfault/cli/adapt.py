@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError("nothing to do: give --faults F with --out or --forecast, or --keep FOLDER")
     if (args.faults is None) != (args.out is None and not args.forecast):
         raise ValueError("--faults F needs --out FOLDER or --forecast, and either of them needs --faults F")
-    adapter = _adapter(args)
+    adapter = open_adapter(args)
     result: dict[str, Any] = {"schema": "adaptfault.adapt/1"}
     lines: list[str] = []
     if args.keep is not None:
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _adapter(args: argparse.Namespace) -> Adapter:
+def open_adapter(args: argparse.Namespace) -> Adapter:
     """Return a kept adapter, a bundle's, or a new one for the model and its recordings."""
     from adaptfault.adaptation.adapter_files import SCHEMA, load_adapter
     from adaptfault.cli.trained_model import TrainedModel, open_bundle

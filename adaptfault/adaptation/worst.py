@@ -1,0 +1,131 @@
+"""The faults that would cost most: the expected accuracy after repair without each wire, each pad, and pairs of wires.
+
+Each fault set is removed from the validation windows and forecast (:mod:`adaptfault.adaptation.forecast`). What counts
+is the accuracy after the repair, because a repair takes seconds. All single wires and pads are forecast. Pairs are
+forecast among the worst single wires alone, so the worst of all pairs may be missed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from adaptfault.adaptation.forecast import Expected
+from diagnostics import FaultSet, SensorLayout
+
+if TYPE_CHECKING:
+    from adaptfault.adaptation.adapter import Adapter
+
+SCHEMA = "adaptfault.worst/1"
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A fault and its accuracy after repair.
+
+    Attributes:
+        what: the wire, the two wires or the pad.
+        fault_set: its cells.
+        expected: accuracy (R2 of a regression) after the best measured stage of the repair.
+    """
+
+    what: str
+    fault_set: FaultSet
+    expected: Expected
+
+
+@dataclass(frozen=True, eq=False)
+class WorstFaults:
+    """Faults in the order of the accuracy after repair, lowest first.
+
+    Attributes:
+        layout: the array.
+        fault_free: accuracy without faults.
+        wires, pairs, pads: the faults of each kind; a pad is left out where it is the only one.
+    """
+
+    layout: SensorLayout
+    fault_free: Expected
+    wires: tuple[Loss, ...]
+    pairs: tuple[Loss, ...]
+    pads: tuple[Loss, ...]
+
+    def __str__(self) -> str:
+        return self.text()
+
+    def text(self, most: int = 5) -> str:
+        """Return the list as text, at most so many faults of each kind."""
+        lines = [f"expected accuracy without faults: {self.fault_free}"]
+        for name, losses in (("wire", self.wires), ("two wires", self.pairs), ("pad", self.pads)):
+            if losses:
+                lines.append(f"worst {name} to lose, accuracy after repair:")
+                lines += [f"  {loss.expected}  {loss.what}" for loss in losses[:most]]
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict."""
+        kinds = {
+            name: [
+                {"what": loss.what, "cells": list(loss.fault_set), "expected": asdict(loss.expected)}
+                for loss in getattr(self, name)
+            ]
+            for name in ("wires", "pairs", "pads")
+        }
+        return {"schema": SCHEMA, "layout": self.layout.to_dict(), "fault_free": asdict(self.fault_free), **kinds}
+
+    def plot(self) -> Any:
+        """Draw for each cell the accuracy lost with the worse of its two wires; return the matplotlib figure."""
+        from diagnostics.decision.plot import draw_forces, pads_figure
+
+        lost = np.full(self.layout.n_cells, np.nan)
+        for loss in self.wires:
+            cells = list(loss.fault_set)
+            lost[cells] = np.fmax(lost[cells], max(0.0, self.fault_free.accuracy - loss.expected.accuracy))
+        figure, axes = pads_figure(self.layout, n_rows=1)
+        top = max(float(np.nanmax(lost)), 1e-3)
+        for pad, ax in enumerate(axes[0]):
+            image = draw_forces(ax, self.layout.grid(lost)[pad], self.layout, vmin=0, vmax=top, cmap="Reds")
+            ax.set_title(f"pad {pad}", fontsize=9)
+        figure.colorbar(image, ax=axes[0].tolist(), label="accuracy lost after repair, worse wire")
+        return figure
+
+
+def worst_faults(adapter: Adapter, *, among: int = 5, say: Callable[[str], None] = lambda text: None) -> WorstFaults:
+    """Forecast the loss of each row and column wire, of each pad, and of the pairs among the ``among`` worst wires.
+
+    It takes one head in closed form for each fault set: seconds each.
+
+    Args:
+        adapter: of the model.
+        among: number of the worst wires of which all pairs are forecast; below 2: no pairs.
+        say: receives a line of progress before each part.
+    """
+    layout = adapter.layout
+    index = np.flatnonzero(layout.present).tolist()
+    wires = {
+        str(line): [int(c) for c in layout.cells_on(line) if layout.present.flat[c]]
+        for line in layout.lines
+        if line.kind in ("row", "column")
+    }
+    pads = {f"pad {pad}": [c for c in index if layout.position(c)[0] == pad] for pad in range(layout.pads)}
+
+    def ranked(sets: Iterable[tuple[str, Iterable[int]]]) -> tuple[Loss, ...]:
+        losses = []
+        for what, cells in sets:
+            faults = FaultSet(tuple(sorted(set(cells))), layout.n_cells)
+            if 0 < len(faults) < len(index):
+                stages = adapter.forecast(faults).stages
+                losses.append(Loss(what, faults, max(stages["fill"], stages["head"], key=lambda e: e.accuracy)))
+        return tuple(sorted(losses, key=lambda loss: loss.expected.accuracy))
+
+    say(f"forecasting {len(wires)} wires")
+    alone = ranked(wires.items())
+    pairs = list(combinations(alone[: max(among, 0)], 2))
+    say(f"forecasting {len(pairs)} pairs of wires and {len(pads)} pads")
+    together = ranked((f"{a.what} and {b.what}", a.fault_set | b.fault_set) for a, b in pairs)
+    fault_free = adapter.forecast(FaultSet((), layout.n_cells)).stages["fault-free"]
+    return WorstFaults(layout, fault_free, alone, together, ranked(pads.items()))

@@ -1,0 +1,53 @@
+"""adaptfault forecast: the accuracy to expect after a repair, for a fault set or for the worst faults of the array."""
+
+from __future__ import annotations
+
+import argparse
+
+from adaptfault.cli.adapt import open_adapter
+from adaptfault.cli.options import Commands, add_device, add_recordings, command, device, emit, fault_set, say
+
+_EXAMPLE = """  adaptfault forecast robot.bundle --worst --picture worst.png
+      which wire, which two wires and which pad would cost most accuracy after a repair
+  adaptfault forecast model grasps/ --faults diagnosis.json"""
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    parser = command(commands, "forecast", "forecast the accuracy after a repair, before anything breaks", _EXAMPLE)
+    parser.add_argument(
+        "model", metavar="MODEL", help="folder written by adaptfault train or adapt --keep, or a bundle"
+    )
+    add_recordings(parser, least=0)
+    parser.add_argument("--faults", metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200")
+    parser.add_argument(
+        "--worst",
+        action="store_true",
+        help="forecast each wire, each pad and pairs of the worst wires; lists the worst",
+    )
+    parser.add_argument(
+        "--among", type=int, default=5, metavar="N", help="forecast all pairs of the N worst wires (default 5)"
+    )
+    parser.add_argument("--picture", metavar="PNG", help="with --worst: a map of the accuracy lost")
+    add_device(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Forecast."""
+    if (args.faults is None) == (not args.worst):
+        raise ValueError("give --faults F, or --worst")
+    if args.picture is not None and not args.worst:
+        raise ValueError("--picture needs --worst: it is a map of all wires")
+    adapter = open_adapter(args).to(device(args))
+    if not args.worst:
+        forecast = adapter.forecast(fault_set(args.faults, adapter.layout))
+        emit(args, forecast.to_dict(), str(forecast))
+        return 0
+    from adaptfault.adaptation.worst import worst_faults
+
+    worst = worst_faults(adapter, among=args.among, say=lambda text: say(args, text))
+    if args.picture is not None:
+        worst.plot().savefig(args.picture, dpi=120)
+    emit(args, worst.to_dict(), str(worst))
+    return 0

@@ -142,12 +142,14 @@ def run_demo(
     with clock("training"):
         history = train(model, training, validation, epochs=epochs, learning_rate=learning_rate, **options)
     say(f"training     {history}")
-    fault_free = _score(model, test)
+    adapter = Adapter(model, training, validation)
+    deployed = adapter.healthy
+    fault_free = _score(deployed, test)
     say(f"fault-free   {fault_free[0]}")
 
     injected = tuple(default_faults(healthy, layout, rng) if faults is None else faults)
     broken, broken_windows = _broken(recordings, np.unique(test.recording), injected, seed)
-    collapsed = _score(model, broken_windows)
+    collapsed = _score(deployed, broken_windows)
     say(f"broken       {len({c for fault in injected for c in fault.cells})} cells; {collapsed[0]}")
     _list(say, [fault.describe(layout) for fault in injected])
 
@@ -157,7 +159,7 @@ def run_demo(
     _list(say, [fault.reason for fault in diagnosis.faults])
 
     with clock("adaptation"):
-        adaptation = Adapter(model, training, validation).adapt(diagnosis.fault_set, seed=seed, progress=progress)
+        adaptation = adapter.adapt(diagnosis.fault_set, seed=seed, progress=progress)
     for stage in adaptation.stages:
         say(f"adaptation   {stage}")
     repaired = _score(adaptation, broken_windows)

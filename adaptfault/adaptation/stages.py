@@ -204,10 +204,10 @@ class Run:
     def _merit(self, outputs: Tensor) -> NDArray[np.float64]:
         """Return for each validation window the log probability of its class, or its negative squared error."""
         if self.fault_free.task == "regression":
-            return -((outputs.numpy() - self.validation.y) ** 2).astype(np.float64).mean(axis=1)
+            return np.asarray(-((outputs.numpy() - self.validation.y) ** 2).mean(axis=1, dtype=np.float64))
         scale, _ = calibrate(outputs, self.validation.y)
         likely = torch.log_softmax(scale * outputs.double(), 1)
-        return likely.numpy()[np.arange(len(likely)), self.validation.y]
+        return np.asarray(likely.numpy()[np.arange(len(likely)), self.validation.y])
 
     def _head(self, reduced: ReducedModel) -> tuple[Blend | None, Tensor] | None:
         """Return a head, and the outputs for validation windows of heads fitted without them; None if time is short.

@@ -62,3 +62,12 @@ def test_the_dependence_of_the_windows_is_estimated(copies, low, high):
     found = ContactStatistics.fit(x, p.reshape(-1, k), np.repeat(y, t), np.repeat(np.arange(n), t))
     assert low <= found.dependence <= high
     assert ContactStatistics.from_dict(found.to_dict()) == found
+
+
+def test_what_a_missing_position_holds_does_not_matter():
+    x = np.random.default_rng(0).random((20, 5, 4)).astype(np.float32)
+    given = (np.full((20, 2), 0.5), np.zeros(20, np.int64), np.arange(20) // 2)
+    x[..., 3] = 0
+    usual = ContactStatistics.fit(x, *given)
+    x[..., 3] = np.nan
+    assert ContactStatistics.fit(x, *given) == usual

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from adaptfault.adaptation.adapter import Adapter
 from adaptfault.adaptation.result import Adaptation
@@ -248,3 +249,19 @@ assert not Predictor.load(sys.argv[1]).confirm()
 def test_a_version_on_probation_starts_on_a_full_disk(bundle):
     bundle.deploy(1)
     subprocess.run([sys.executable, "-c", FULL_DISK, str(bundle.path)], check=True)
+
+
+@pytest.mark.parametrize(("head", "fitted"), [("auto", True), ("linear", False)])
+def test_version_1_has_the_head_that_is_asked_for(bundle, tmp_path, head, fitted):
+    adapter, check = bundle.parts.adapter(), bundle.parts.check_windows()
+    with torch.no_grad():  # a head in closed form is better than one that was never trained
+        adapter.model.head.weight.copy_(torch.randn(3, 128, generator=torch.Generator().manual_seed(0)))
+    parts = (adapter.model, adapter, bundle.diagnoser())
+    made = Bundle.create(tmp_path / "made", *parts, check=check, head=head)
+    first = Adaptation.load(made.versions[1].folder)
+    assert (first.model.head is not None) == fitted
+    same = np.array_equal(first.predict_proba(check.x), adapter.model.predict_proba(check.x))
+    assert same != fitted
+    assert first.contact is not None
+    with pytest.raises(ValueError, match="unknown head 'paper'"):
+        Bundle.create(tmp_path / "other", *parts, check=check, head="paper")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from adaptfault.data.windows import make_windows, scale
+from adaptfault.adaptation.result import Adaptation
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.deployment_test import Judgement
 from adaptfault.robot.lock import Busy
@@ -30,6 +31,8 @@ def test_a_broken_row_is_found_repaired_and_deployed_on_probation(bundle, later_
     assert report.judgement.better
     assert report.judgement.candidate > report.judgement.running + 0.1
     assert report.exit_code == (1 if report.accuracy >= 0.9 * report.fault_free_accuracy else 2)
+    healthy, windows = Adaptation.load(bundle.versions[1].folder), bundle.parts.check_windows()
+    assert report.fault_free_accuracy == (healthy.predict(windows.x) == windows.y).mean()
     assert str(report).startswith(f"ADAPTFAULT {('WARNING', 'CRITICAL')[report.exit_code - 1]} - deployed: accuracy")
     assert bundle.active().fault_set == report.fault_set
     assert [bundle.begin(f"start {i}").number for i in range(3)] == [2, 2, 1]

@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
 
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.data.windows import make_windows, split
-    from adaptfault.evaluation.scores import evaluate
+    from adaptfault.evaluation.scores import Scores
     from adaptfault.evaluation.training_check import plot_training, training_problems
     from adaptfault.models.network import TactileTransformer
     from adaptfault.models.store import save_model
@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
     healthy = (
         adapter.healthy if args.head == "auto" else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
     )
-    scores = evaluate(healthy, parts[2])
+    scores = Scores.of(parts[2].y, healthy.predict(parts[2].x), n_classes=n_classes)
     extra = {"split_seed": args.seed, "test_scores": scores.to_dict(), "history": history.to_dict()}
     if bundled:
         _bundle(args, out, recordings, adapter, parts)

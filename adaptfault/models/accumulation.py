@@ -50,6 +50,7 @@ class ContactStatistics:
             y: class of each window ``[N]``.
             recording: of each window ``[N]``; its windows are in the order of time.
         """
+        x = np.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0)  # positions without a cell may hold anything
         rest = np.quantile(x.reshape(-1, x.shape[2]), _REST, axis=0).astype(np.float32)
         load = np.maximum(x - rest, 0.0).mean(axis=2).max(axis=1)
         peaks = [load[recording == number].max() for number in np.unique(recording)]

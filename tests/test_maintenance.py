@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from adaptfault.data.windows import make_windows, scale
 from adaptfault.adaptation.result import Adaptation
+from adaptfault.data.windows import make_windows, scale
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.deployment_test import Judgement
 from adaptfault.robot.lock import Busy

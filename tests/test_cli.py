@@ -184,6 +184,12 @@ def test_a_label_table_that_names_a_missing_file_is_told_and_the_rest_is_used(tm
         (["adapt", "{home}/model", "{home}/grasps.npz", "--faults", "1"], "needs --out FOLDER or --forecast"),
         (["adapt", "{home}/model", "{home}/grasps.npz", "--forecast"], "nothing to do"),
         (["adapt", "{home}/model", "--faults", "1", "--forecast"], "give the fault-free recordings"),
+        (["forecast", "{home}/model", "{home}/grasps.npz"], "give --faults F, or --worst"),
+        (["forecast", "{home}/model", "{home}/grasps.npz", "--faults", "1", "--worst"], "give --faults F, or --worst"),
+        (
+            ["forecast", "{home}/model", "{home}/grasps.npz", "--faults", "1", "--picture", "a"],
+            "--picture needs --worst",
+        ),
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--adapted", "{home}/gone"], "gone"),
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--device", "abacus"], "--device abacus"),
         (
@@ -203,6 +209,17 @@ def test_f_empty_leaves_the_model_as_it_was(home, capsys):
     assert main([*empty, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["scores"]["accuracy"] == result["fault_free_accuracy"]
+
+
+def test_a_model_is_evaluated_with_and_without_its_head_and_by_whole_recordings(home, capsys):
+    model, grasps = str(home / "model"), str(home / "grasps.npz")
+    for head in ("auto", "linear"):
+        assert main(["evaluate", model, grasps, "--head", head, "--json", "--quiet"]) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert result["scores"]["n"] == 6 * result["recordings"]["n"]  # 60 frames in a recording, 10 in a window
+        assert 0 <= result["recordings"]["accuracy"] <= 1
+    assert main(["forecast", model, grasps, "--faults", "3", "--json", "--quiet"]) == 0
+    assert json.loads(capsys.readouterr().out)["schema"] == "adaptfault.forecast/1"
 
 
 def test_a_robot_forecasts_and_adapts_without_the_recordings(home, capsys):

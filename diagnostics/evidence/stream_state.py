@@ -27,6 +27,7 @@ from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, group_excluded_evidence, held_load_evidence
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
+from diagnostics.preprocessing.baseline import LIGHT
 from diagnostics.preprocessing.offset import OffsetTracker
 from diagnostics.preprocessing.readings import held
 from diagnostics.preprocessing.transport import TransportState, invalid
@@ -201,14 +202,21 @@ class StreamState:
         """Return the healthy model of tile i; without a reference, a model of its ``events``."""
         known = self.reference.model
         if not self.tiled:
-            return known or NearestNeighbours.of(events.kept, self.layout)
+            return known or NearestNeighbours.of(events.kept, self.layout, self.scale.root_near)
         if i in self._models:
             return self._models[i]
         own = self.local.tiles[i].rectangle(self.layout)
         if known is None:
-            log = NearestNeighbours.of(events.kept, own.layout).log
-            return _Rectangular(NearestNeighbours(own.on(log), own.layout), own)
+            model = NearestNeighbours.of(events.kept, own.layout, self.scale.root_near)
+            return _Rectangular(replace(model, log=own.on(model.log)), own)
         return self._models.setdefault(i, _Rectangular(known.of_tile(i, own.cells, own.layout), own))
+
+    @property
+    def _highest_rest(self) -> float:
+        """The highest load at which a working cell may rest: the lowest so far, of cells that moved."""
+        lowest = self._offsets.lowest[self.runs.moved & self.present]
+        at_rest = lowest <= LIGHT * self.scale.full_scale  # the others were loaded throughout
+        return float(lowest.max(initial=0.0, where=at_rest))
 
     def views(self, onset: int) -> Iterator[tuple[Array, Cells, Cells, Model]]:
         """Yield, for each tile, its events since frame ``onset`` as features ``[n, 4, k]``.
@@ -295,7 +303,9 @@ class StreamState:
         frames, numbers = self._buffer[: self._filled], self._numbers[: self._filled]
         self._filled = 0
         self._offsets = self._offsets.extend(frames, self.reference.scale, self.present, self.reference.offset)
-        self.scale = scale = self._offsets.on(self.reference.scale)
+        self.scale = scale = plain = self._offsets.on(self.reference.scale)
+        if self.reference.model is None:  # a reading at which a working cell may rest is no load
+            self.scale = scale = replace(plain, near=max(plain.near, self._highest_rest))
         start, known = self.runs.start, _known(frames, self.runs.last)
         self.runs = runs = self.runs.extend(frames, numbers, self.reference.tolerance, scale.baseline)
         # Evidence belongs to a constant run, and ends with it.
@@ -309,8 +319,8 @@ class StreamState:
             self._skin = skin.split(KEPT_EVENTS)[1].without_loads()
             # On long lines some cell is always dead: cells that never moved are no difference between two lines.
             frames = np.where(runs.moved, frames, np.nan)
-        self.intermittency = self.intermittency.extend(known, root, numbers, scale, self.reference.usual, still)
-        self.duplicates = self.duplicates.extend(frames, numbers, informative(frames, still, scale), scale.near)
+        self.intermittency = self.intermittency.extend(known, root, numbers, plain, self.reference.usual, still)
+        self.duplicates = self.duplicates.extend(frames, numbers, informative(frames, still, plain), plain.near)
 
     @property
     def _crowded(self) -> bool:

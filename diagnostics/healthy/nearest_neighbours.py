@@ -7,7 +7,8 @@ over pairs of opposite neighbours of the smaller load), for highest and mean roo
     P(never loaded) = (count of never loaded neighbours + prior) / (k + 1)
 
 Equals scikit-learn's ``KNeighborsClassifier`` and ``KNeighborsRegressor`` (Cover and Hart 1967) with one pseudo-count.
-It interpolates and never extrapolates: it predicts nothing for cells that no two opposite predictors enclose.
+It interpolates and never extrapolates: of cells that no two opposite predictors enclose it predicts held loads alone,
+from the means.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 _NEIGHBOURS = 20  # k
 _PRIOR_WEIGHT = 1.0  # pseudo-count of the share over all samples
 _MOST_SAMPLES = 20_000  # in the search tree: a size
+_MEANS = [0, 1, 3, 4]  # of the surroundings: the means, without the enclosure
 _MIN_SPREAD = 0.05  # of the root load: no reading is predicted more exactly
 
 
@@ -39,41 +41,68 @@ class NearestNeighbours:
     Attributes:
         log: features ``[n, 4, D]`` of the events of the log (see ``Summary.features``).
         layout: the array.
+        rest: highest root load at which a working cell may rest.
     """
 
     log: Array
     layout: SensorLayout
+    rest: float = 0.0
 
     @classmethod
-    def of(cls, events: Sequence[ContactEvent], layout: SensorLayout) -> NearestNeighbours:
+    def of(cls, events: Sequence[ContactEvent], layout: SensorLayout, rest: float = 0.0) -> NearestNeighbours:
         """Build the model from the events of a log and from each of their parts."""
-        return cls(
-            np.stack([part.features() for event in events for part in (*event.parts, event.suffixes()[0])]), layout
-        )
+        parts = [part.features() for event in events for part in (*event.parts, event.suffixes()[0])]
+        return cls(np.stack(parts), layout, rest)
 
     def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
-        """See ``HealthyModel.predict``. Probabilities are 1 for a cell that no two opposite predictors enclose."""
-        from scipy.spatial import cKDTree
+        """See ``HealthyModel.predict``. P(never loaded) is 1 for a cell that no two opposite predictors enclose."""
 
         shape = (len(features), features.shape[2])
         never, always, mean = np.ones(shape), np.ones(shape), np.zeros(shape)
         spread = np.full(shape[1], np.nan)
         present = self.layout.present.ravel()
-        known = _describe(self.log, predictors, self.layout)
-        usable = np.flatnonzero(predictors & present & np.isfinite(known).all(axis=(0, 2)))
-        if not len(usable):
-            return Prediction(never, always, mean, spread, own=False)
+        known, scored = (_describe(of, predictors, self.layout) for of in (self.log, features))
+        enclosed = np.isfinite(scored).all(axis=(0, 2)) & present
+        # A held load beside unloaded cells is unlikely anywhere; an unloaded cell at the border tells nothing.
+        border = np.isfinite(scored[..., _MEANS]).all(axis=(0, 2)) & present & ~enclosed
+        border &= (features[:, 1] > self.rest).all(axis=0)
+        for cells, described in ((enclosed, slice(None)), (border, _MEANS)):
+            found = self._predict(known[..., described], scored[..., described], predictors & present, cells)
+            if found is None:
+                continue
+            if cells is enclosed:
+                never[:, cells] = found.never
+            always[:, cells], mean[:, cells], spread[cells] = found.always, found.mean, found.spread
+        return Prediction(never, always, mean, spread, own=False)
+
+    def _predict(
+        self,
+        known: NDArray[np.float64],
+        scored: NDArray[np.float64],
+        predictors: NDArray[np.bool_],
+        cells: NDArray[np.bool_],
+    ) -> Prediction | None:
+        """Return the prediction of some ``cells`` (bool ``[D]``); None without any to learn from.
+
+        Args:
+            known, scored: surroundings in the log and in the excerpts, ``[n, D, k]``.
+            predictors: bool ``[D]``, the cells whose readings may be used.
+            cells: the cells whose loads are predicted.
+        """
+        from scipy.spatial import cKDTree
+
+        usable = np.flatnonzero(predictors & np.isfinite(known).all(axis=(0, 2)))
+        if not len(usable) or not cells.any():
+            return None
         samples = known[:, usable].reshape(-1, known.shape[2])
         targets = np.moveaxis(self.log[:, :, usable], 1, -1).reshape(-1, self.log.shape[1])
         kept = np.linspace(0, len(samples) - 1, min(len(samples), _MOST_SAMPLES)).astype(int)
         tree, targets = cKDTree(samples[kept]), targets[kept]
-        scored = _describe(features, predictors, self.layout)
-        predicted = np.flatnonzero(np.isfinite(scored).all(axis=(0, 2)) & present)
         neighbours = min(_NEIGHBOURS, len(targets))
         # Most cells lie far from any load and have the same surroundings, which are searched for once, as the first.
-        neighbourhood = scored[:, predicted].reshape(-1, scored.shape[2])
+        neighbourhood = scored[:, cells].reshape(-1, scored.shape[2])
         loaded = neighbourhood.any(axis=1)
-        which = np.where(loaded, np.cumsum(loaded), 0).reshape(len(features), len(predicted))
+        which = np.where(loaded, np.cumsum(loaded), 0).reshape(len(scored), -1)
         unloaded = np.zeros((1, scored.shape[2]))
         _, nearest = tree.query(np.concatenate([unloaded, neighbourhood[loaded]]), k=neighbours)
         near = targets[nearest.reshape(-1, neighbours)]  # (m, K, 4)
@@ -83,11 +112,14 @@ class NearestNeighbours:
             result: NDArray[np.float64] = (of.sum(axis=1) + prior * _PRIOR_WEIGHT) / (neighbours + _PRIOR_WEIGHT)
             return result[which]
 
-        never[:, predicted] = share(near[..., 2] == 0, targets[:, 2] == 0)
-        always[:, predicted] = share(near[..., 3] == 1, targets[:, 3] == 1)
-        mean[:, predicted] = near[..., 1].mean(axis=1)[which]
-        spread[predicted] = max(float(near[..., 1].std(axis=1)[which].mean()), _MIN_SPREAD)
-        return Prediction(never, always, mean, spread, own=False)
+        spread = max(float(near[..., 1].std(axis=1)[which].mean()), _MIN_SPREAD)
+        return Prediction(
+            never=share(near[..., 2] == 0, targets[:, 2] == 0),
+            always=share(near[..., 3] == 1, targets[:, 3] == 1),
+            mean=near[..., 1].mean(axis=1)[which],
+            spread=np.full(np.count_nonzero(cells), spread),
+            own=False,
+        )
 
 
 def _describe(features: Array, predictors: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.float64]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _LOW = 0.05  # quantile of all readings of a cell
 _UNLOADED = 0.03  # quantile of the readings in one recording: its baseline there, unless loaded throughout
-_LIGHT = 0.05  # of full scale: a cell that stays further above its baseline was loaded throughout
+LIGHT = 0.05  # of full scale: a cell that stays further above its baseline was loaded throughout
 _CALM = 0.25  # quantile of the noise over cells and recordings: loaded cells have more
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
 _RARE = 0.001  # share of cells and recordings that is ignored
@@ -77,7 +77,7 @@ class LowerLimit:
         # Where most cells rest at 0, a cell that always reads more is loaded.
         if len(peaks) >= FEWEST and np.median(low[present]) > tolerance:
             peak = peaks - low
-            unloaded = peak < _LIGHT * full_scale
+            unloaded = peak < LIGHT * full_scale
             often = np.count_nonzero(unloaded, axis=0) >= _OFTEN * len(peaks)
             peak_values = peak[unloaded & present]
             rare = float(np.quantile(peak_values, _RARE, method="lower"))
@@ -159,7 +159,7 @@ def baseline(
     if not offsets:
         return low, LowerLimit.unknown(len(low))
     offset = np.concatenate(offsets)
-    light = offset[offset < _LIGHT * full_scale]
+    light = offset[offset < LIGHT * full_scale]
     noise = float(np.quantile(np.concatenate(curvatures), _CALM)) / (0.6745 * np.sqrt(6))
     most = low + max(0.0, _highest(light) + _NOISE * noise - tolerance)
     if noise > tolerance:

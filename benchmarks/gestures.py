@@ -28,6 +28,7 @@ class Skin:
         rest: of untouched cells, 0.3 to 1.7 times that.
         wander: of each cell's rest from one recording to the next, standard deviation; half as much within one.
         crosstalk: of the mean load of a line that its other cells read.
+        decades: standard deviation of log10 of the gains, beside 0.7 to 1.3; dull: share of cells that hardly react.
     """
 
     side: int = 10
@@ -35,6 +36,8 @@ class Skin:
     rest: float = 0.02
     wander: float = 0.002
     crosstalk: float = 0.05
+    decades: float = 0.0
+    dull: float = 0.0
 
     rate, seconds = 54.0, 8.0
 
@@ -43,6 +46,12 @@ class Skin:
         rng, own = np.random.default_rng(seed), np.random.default_rng(99)
         shape = self.side, self.side
         gain, rest = own.uniform(0.7, 1.3, shape), self.rest * own.uniform(0.3, 1.7, shape)
+        if self.decades or self.dull:
+            gain = (
+                gain
+                * 10 ** (self.decades * own.standard_normal(shape))
+                * np.where(own.random(shape) < self.dull, 0.02, 1)
+            )
         frames = int(self.seconds * self.rate)
         labels = rng.integers(len(GESTURES), size=count)
         read = []
@@ -65,6 +74,8 @@ SKINS = {
     "rest wanders by 1 %": Skin(rest=0.05, wander=0.01),
     "rests at 0": Skin(rest=0.0, wander=0.0),
     "16 x 16": Skin(16),
+    "gains over a decade": Skin(16, crosstalk=0.01, decades=0.4),
+    "a third hardly reacts": Skin(16, crosstalk=0.01, dull=0.33),
 }
 
 

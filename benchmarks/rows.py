@@ -537,6 +537,6 @@ ROWS: dict[str, Callable[[Bench], Iterator[Count]]] = {
     row.__name__: row
     for row in (
         cells, onset, dither, missing, many, cold, reference_faults, lines, cut, address, healthy, holds, untouched,
-        kind, calibration, changing, gain, rewired, transport, speed,
+        kind, calibration, changing, gain, rewired, groups, transport, speed,
     )
 }  # fmt: skip

@@ -28,16 +28,18 @@ run() { # WANTED COMMAND...: run a command whose exit code has to be among those
     esac
 }
 
-first_hour() { # NAME RAW LATER FAULT CAUSE: one array, the recordings kept back, the fault, the words of its cause
-    name=$1 raw=$2 later=$3 fault=$4 cause=$5
+first_hour() { # one array: $name $raw, the recordings kept back, the fault, the words of its cause, options
+    echo "first_hour: $name"
     home=$out/$name
     mkdir -p "$home"
     run 0 info "$raw" --picture "$home/raw.png"
     # The robot records these later: no model is trained on them.
-    run 0 convert "$raw" --leave "$later" --out "$home/healthy.npz"
-    run 0 convert "$raw" --take "$later" --out "$home/later.npz"
+    # shellcheck disable=SC2086 # options are several words
+    run 0 convert "$raw" $scale --leave "$later" --out "$home/healthy.npz"
+    run 0 convert "$raw" $scale --take "$later" --out "$home/later.npz"
     run "0 1" diagnose "$home/later.npz" --reference "$home/healthy.npz" --html "$home/later.html"
-    run 0 train "$home/healthy.npz" --epochs "$epochs" --out "$home/robot.bundle"
+    # shellcheck disable=SC2086
+    run 0 train "$home/healthy.npz" --epochs "$epochs" $training --out "$home/robot.bundle"
     run 0 evaluate "$home/robot.bundle" "$home/later.npz"
     # The sensor breaks.
     run 0 convert "$home/later.npz" --inject "$fault" --out "$home/broken.npz"
@@ -55,26 +57,36 @@ first_hour() { # NAME RAW LATER FAULT CAUSE: one array, the recordings kept back
 
 [ $# -gt 0 ] || set -- skin icub insole sdh
 mkdir -p "$out"
-for array in "$@"; do
-    case $array in
+for name in "$@"; do
+    raw='' scale='' training=''
+    case $name in
     skin)
         # CSV files of one folder a class and a layout.json, as a user's own recordings would lie there.
-        [ -d "$out/skin-csv" ] || run 0 simulate --shape 10x10 --full-scale 3.3 --unit V --rate 20 \
-            --grasps "${GRASPS:-24}" --frames 60 --classes nothing normal softer harder --out "$out/skin-csv"
-        first_hour skin "$out/skin-csv" ::6 row:0:4=short "row 4 is short"
+        raw=$out/skin-csv later=::6 fault=row:0:4=short cause="row 4 is short"
+        [ -d "$raw" ] || run 0 simulate --shape 10x10 --full-scale 3.3 --unit V --rate 20 \
+            --grasps "${GRASPS:-24}" --frames 60 --classes nothing normal softer harder --out "$raw"
         ;;
-    icub) file=icub5x1x12_grasps11 later=::6 fault=row:1:0=short cause="pad 1" ;;
-    insole) file=insole2x33x15 later=::8 fault=row:0:12=open cause="row 12 is open" ;;
-    sdh) file=sdh2x13x6_grasps36 later=::6 fault=row:0:9=short cause="row 9 is short" ;;
+    icub)
+        # The shortest recordings, a class of their own, have 4 frames.
+        raw=$data/icub5x1x12_grasps11.npz later=::6 fault=row:1:0=short cause="pad 1, row 0 is short"
+        scale="--full-scale 255 --unit count" training="--length 4"
+        ;;
+    insole)
+        raw=$data/insole2x33x15.npz later=::8 fault=row:0:12=open cause="row 12 is open"
+        scale="--full-scale 4095 --unit count"
+        ;;
+    sdh)
+        raw=$data/sdh2x13x6_grasps36.npz later=::6 fault=row:0:9=short cause="row 9 is short"
+        scale="--full-scale 4095 --unit count"
+        ;;
     *)
-        echo "first_hour: no array $array: skin, icub, insole, sdh" >&2
+        echo "first_hour: no array $name: skin, icub, insole, sdh" >&2
         exit 3
         ;;
     esac
-    [ "$array" = skin ] && continue
-    if [ -f "$data/$file.npz" ]; then
-        first_hour "$array" "$data/$file.npz" "$later" "$fault" "$cause"
+    if [ -e "$raw" ]; then
+        first_hour
     else
-        echo "first_hour: $array: $data/$file.npz is not there; left out"
+        echo "first_hour: $name: $raw is not there; left out"
     fi
 done

@@ -75,6 +75,16 @@ def test_the_papers_layout_fits_into_20_mb_with_many_windows(tmp_path):
     assert abs(close) < 0.02
 
 
+def test_the_network_of_a_large_array_raises_the_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr("adaptfault.adaptation.adapter_files.LIMIT", 100_000)
+    first = adapter()
+    save_adapter(tmp_path, first)
+    weights = sum(value.numel() for value in first.model.state_dict().values())
+    assert weights > 100_000
+    assert size(tmp_path) < 3 * weights
+    assert load_adapter(tmp_path).model.n_classes == first.model.n_classes
+
+
 def test_a_tight_limit_thins_windows_evenly_and_too_tight_a_one_is_refused(tmp_path):
     first = adapter()
     weights = sum(p.numel() for p in first.model.parameters())

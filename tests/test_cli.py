@@ -102,6 +102,13 @@ def test_training_again_gives_the_same_model(home, tmp_path):
     assert weights[0] == weights[1]  # named by their hash
 
 
+def test_recordings_shorter_than_a_window_are_told(home, small, tmp_path, capsys):
+    frames = (small.frames[0][:5], small.frames[1][:9], *small.frames[2:])
+    save_npz(tmp_path / "log.npz", Recordings(frames, SMALL, small.labels, small.class_names))
+    assert main(["evaluate", str(home / "model"), str(tmp_path / "log.npz"), "--all"]) == 0
+    assert "2 of 16 recordings are shorter than a window of 10 frames: not used" in capsys.readouterr().err
+
+
 # Bad input: one line that names what is wrong, exit code 3, never a traceback
 
 

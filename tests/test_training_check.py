@@ -27,6 +27,7 @@ def test_a_training_that_learned_has_no_problem():
     ("confusion", "history", "expected"),
     [
         ([[12, 12, 12], [11, 13, 12], [13, 10, 12]], GOOD, "test accuracy 0.346 is near chance (0.336)"),
+        ([[30, 3, 0], [4, 28, 0], [0, 0, 0]], GOOD, "class without a window: pen: its recordings are shorter"),
         ([[30, 3, 0], [4, 28, 0], [1, 34, 0]], GOOD, "class never predicted: pen"),
         (
             [[30, 3, 3], [4, 28, 2], [1, 4, 31]],

@@ -20,7 +20,7 @@ from adaptfault.models.store import load_tensors, save_tensors
 
 SCHEMA = "adaptfault.adapter/1"
 WINDOWS_SCHEMA = "adaptfault.windows/1"
-LIMIT = 20_000_000  # bytes of an adapter
+LIMIT = 20_000_000  # bytes of an adapter, unless its network alone is larger
 
 _SHARE = 0.5  # of the limit: the most that windows take
 _FINEST = 1 / 4095  # step for readings without visible converter steps: a 12-bit converter
@@ -28,8 +28,11 @@ _MOST_STEPS = 65_535
 _OVERHEAD = 100_000  # bytes for names, labels and JSON
 
 
-def save_adapter(path: str | Path, adapter: Adapter, *, limit: int = LIMIT) -> None:
+def save_adapter(path: str | Path, adapter: Adapter, *, limit: int | None = None) -> None:
     """Write everything an adaptation needs into a folder of at most ``limit`` bytes.
+
+    Without a limit these are 20,000,000 bytes, or what a network of a large array needs with 8-bit weights and as many
+    bytes of windows.
 
     Readings that are whole converter steps are stored exactly, others with 12 bits. Windows that need more than half of
     the limit are thinned evenly. The weights use the first format that fits the rest: 32-bit floats, 16-bit floats, or
@@ -51,6 +54,9 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int = LIMIT) -> N
         "statistics.mean": torch.from_numpy(statistics.mean),
         "statistics.covariance": torch.from_numpy(statistics.covariance[upper].astype(np.float32)),
     }
+    if limit is None:
+        weights_only = _bytes(_eighth(adapter.model.state_dict()))
+        limit = max(LIMIT, _OVERHEAD + _bytes(tensors) + int(weights_only / (1 - _SHARE)) + 1)
     room = limit - _OVERHEAD - _bytes(tensors)
     about: dict[str, Any] = {"network": adapter.model.config}
     parts = {"train": (adapter.train, adapter.targets), "validation": (adapter.validation, adapter.validation_targets)}

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from adaptfault.adaptation.result import Adaptation
-    from adaptfault.cli.trained_model import TrainedModel
+    from adaptfault.cli.trained_model import TrainedModel, say_short
     from adaptfault.evaluation.scores import Scores, accuracy_interval, recording_scores
     from diagnostics import inject
 
@@ -50,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
     whole = args.all or trained.split_seed is None
     if whole and not args.all:
         say(args, f"{args.model} does not store the split of its training: scored on all recordings given")
+    say_short(args, recordings, model.length)
     windows = trained.windows(recordings) if whole else trained.parts(recordings)[2]
     rng = np.random.default_rng(args.seed)
     faults = parse_faults(args.inject, recordings.layout, rng)

@@ -76,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
     recordings, where = load_recordings(args, args.recordings, labelled=True), device(args)
 
     from adaptfault.adaptation.adapter import Adapter
+    from adaptfault.cli.trained_model import say_short
     from adaptfault.data.windows import make_windows, split
     from adaptfault.evaluation.scores import Scores
     from adaptfault.evaluation.training_check import plot_training, training_problems
@@ -87,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
     windows = make_windows(recordings.frames, recordings.labels, recordings.layout, length=args.length)
     parts = split(windows, seed=args.seed)
     say(args, f"{recordings.layout}; {windows}")
+    say_short(args, recordings, args.length)
     n_classes = len(recordings.class_names)
     model: TactileTransformer | AnyModel
     if args.builder:

@@ -12,7 +12,7 @@ import numpy as np
 
 from adaptfault.adaptation.fault_free import Network
 from adaptfault.adaptation.result import Adaptation
-from adaptfault.cli.options import load_recordings
+from adaptfault.cli.options import load_recordings, say
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, make_windows, split
 from adaptfault.models.store import SCHEMA, load_healthy, read_manifest
@@ -87,6 +87,13 @@ class TrainedModel:
     def parts(self, recordings: Recordings) -> tuple[Windows, Windows, Windows]:
         """Return training, validation and test windows, the same as in training."""
         return split(self.windows(recordings), seed=self.split_seed or 0)
+
+
+def say_short(args: argparse.Namespace, recordings: Recordings, length: int) -> None:
+    """Say on stderr how many recordings are shorter than a window of ``length`` frames, if any is."""
+    if short := sum(len(frames) < length for frames in recordings.frames):
+        many = "is" if short == 1 else "are"
+        say(args, f"{short} of {len(recordings)} recordings {many} shorter than a window of {length} frames: not used")
 
 
 def open_bundle(folder: str) -> Bundle | None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptfault.evaluation.scores import Scores
 from adaptfault.models.history import History
@@ -20,7 +21,8 @@ _FALL = 0.02
 def training_problems(scores: Scores, history: History, class_names: Sequence[str]) -> tuple[str, ...]:
     """Return one sentence for each sign of a failed training, with likely causes; empty if there is none.
 
-    The signs are a test accuracy near chance, a class that is never predicted, and a training loss that did not fall.
+    The signs are a test accuracy near chance, a class without a window, a class that is never predicted, and a training
+    loss that did not fall.
     Chance is the share m of the most frequent class. An accuracy is near it if it is below
     m + 2 sqrt(m (1 - m) / n), two standard errors of n test windows. A run on unbalanced classes may be useful below
     that limit; the sentence names both numbers.
@@ -39,13 +41,14 @@ def training_problems(scores: Scores, history: History, class_names: Sequence[st
             f"test accuracy {scores.accuracy:.3f} is near chance ({chance:.3f}): train longer (--epochs), and check the"
             " labels, the full scale (adaptfault info) and that the classes differ in contact"
         )
+    absent = np.flatnonzero(counts == 0)
+    if absent.size:
+        causes = "its recordings are shorter than a window (--length), or too few"
+        problems.append(f"{_classes(absent, 'without a window', class_names)}: {causes}")
     never = np.flatnonzero((scores.confusion.sum(axis=0) == 0) & (counts > 0))
     if never.size:
-        names = ", ".join(class_names[i] if len(class_names) else str(i) for i in never[:5])
-        more = f" and {never.size - 5} more" if never.size > 5 else ""
-        classes = "class" if never.size == 1 else "classes"
         causes = "too few recordings, labels that are mixed up, or too few epochs"
-        problems.append(f"{classes} never predicted: {names}{more}: {causes}")
+        problems.append(f"{_classes(never, 'never predicted', class_names)}: {causes}")
     losses = history.train_loss
     if len(losses) > 1 and min(losses[1:]) > (1 - _FALL) * losses[0]:
         problems.append(
@@ -53,6 +56,12 @@ def training_problems(scores: Scores, history: History, class_names: Sequence[st
             " (adaptfault info) and the labels"
         )
     return tuple(problems)
+
+
+def _classes(which: NDArray[np.intp], what: str, class_names: Sequence[str]) -> str:
+    names = ", ".join(class_names[i] if len(class_names) else str(i) for i in which[:5])
+    more = f" and {which.size - 5} more" if which.size > 5 else ""
+    return f"{'class' if which.size == 1 else 'classes'} {what}: {names}{more}"
 
 
 def plot_training(scores: Scores, history: History, class_names: Sequence[str]) -> Figure:

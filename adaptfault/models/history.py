@@ -42,8 +42,9 @@ class History:
         return self.start[1] if self.start else math.nan
 
     def __str__(self) -> str:
+        epochs = "1 epoch" if self.epochs == 1 else f"{self.epochs} epochs"
         return (
-            f"{self.epochs} epochs in {sum(self.seconds):.1f} s, stopped by {self.stopped}; "
+            f"{epochs} in {sum(self.seconds):.1f} s, stopped by {self.stopped}; "
             f"best is epoch {self.best_epoch}, validation accuracy {self.best_accuracy:.3f}"
         )
 

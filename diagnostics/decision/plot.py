@@ -14,33 +14,50 @@ if TYPE_CHECKING:
 
     from diagnostics.layout import SensorLayout
 
+_PAGE = 10.0
+"""Width of the verdict map, in inches; pads that do not fit go below."""
+
 _ALIVE, _FAULTY, _UNTESTED, _ABSENT = "#8fbf8f", "#c0392b", "#d9d9d9", "#ffffff"
 
 
-def draw(layout: SensorLayout, verdicts: NDArray[np.intp], letters: Mapping[int, str]) -> Figure:
-    """Draw each pad: green alive, red faulty, grey untested.
+def draw(
+    layout: SensorLayout, verdicts: NDArray[np.intp], letters: Mapping[int, str], kinds: Mapping[str, str]
+) -> Figure:
+    """Draw each pad: green alive, red faulty, grey untested; the legend explains the letters that are on the map.
 
     Args:
         layout: the array.
         verdicts: int ``[D]``, 0 alive, 1 faulty, 2 untested, as :class:`~diagnostics.Verdict` counts.
         letters: letter of the fault kind, by cell.
+        kinds: name of the fault kind, by letter.
     """
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    figure, axes = pads_figure(layout, n_rows=1)
+    figure, axes = _map_figure(layout)
     colours = np.where(layout.present.ravel(), verdicts, 3)
     palette = ListedColormap([_ALIVE, _FAULTY, _UNTESTED, _ABSENT])
-    for pad, ax in enumerate(axes[0]):
+    cell_points = 72 * _cell(layout)
+    for pad, ax in enumerate(axes):
         ax.imshow(layout.grid(colours)[pad], cmap=palette, vmin=-0.5, vmax=3.5)
         ax.set_title(f"pad {pad}")
         _ticks(ax, layout)
+        ax.set_xticks(np.arange(0.5, layout.shape[2] - 1), minor=True)
+        ax.set_yticks(np.arange(0.5, layout.rows - 1), minor=True)
+        ax.grid(which="minor", color="white", linewidth=min(1.5, 0.1 * cell_points))
+        ax.tick_params(which="minor", length=0)
+        ax.spines[:].set_visible(False)
     for cell, letter in letters.items():
         pad, row, col = (int(i) for i in np.unravel_index(cell, layout.shape))
-        axes[0, pad].text(col, row, letter, ha="center", va="center", color="white", fontsize=8)
-    legend = {"alive": _ALIVE, "faulty": _FAULTY, "untested": _UNTESTED}
+        size = min(8.0, 0.6 * cell_points)
+        axes[pad].text(col, row, letter, ha="center", va="center", color="white", fontsize=size)
+    shown = ", ".join(f"{letter} {name}" for letter, name in kinds.items() if letter in letters.values())
+    legend = {"alive": _ALIVE, f"faulty: {shown}" if shown else "faulty": _FAULTY, "untested": _UNTESTED}
     figure.legend(
-        handles=[Patch(color=c, label=name) for name, c in legend.items()], loc="outside lower center", ncols=3
+        handles=[Patch(color=colour, label=name) for name, colour in legend.items()],
+        loc="outside lower center",
+        ncols=3 if figure.get_figwidth() > 5 else 1,
+        fontsize=8,
     )
     return figure
 
@@ -62,10 +79,33 @@ def pads_figure(layout: SensorLayout, *, n_rows: int) -> tuple[Figure, Any]:
     """Return a figure with ``n_rows`` rows of axes, one for each pad, sized to the pads' shape."""
     from matplotlib.figure import Figure
 
-    height = float(np.clip(layout.rows * 0.28, 1.8, 8.0))
-    width = float(np.clip(layout.shape[2] * 0.28, 1.8, 8.0))
+    height, width = _extent(layout.rows), _extent(layout.shape[2])
     figure = Figure(figsize=(layout.pads * (width + 0.5) + 1.2, n_rows * (height + 0.5) + 0.6), layout="constrained")
     return figure, figure.subplots(n_rows, layout.pads, squeeze=False)
+
+
+def _map_figure(layout: SensorLayout) -> tuple[Figure, list[Axes]]:
+    """Return a figure with one axes for each pad, in as many rows as the width of a page needs."""
+    from matplotlib.figure import Figure
+
+    height, width = layout.rows * _cell(layout) + 0.6, max(layout.shape[2] * _cell(layout), 1.2) + 0.5
+    columns = max(1, min(layout.pads, int(_PAGE // width)))
+    rows = -(-layout.pads // columns)
+    figure = Figure(figsize=(max(columns * width, 3.0), rows * height + 0.6), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax in axes[layout.pads :]:
+        ax.set_visible(False)
+    return figure, list(axes[: layout.pads])
+
+
+def _cell(layout: SensorLayout) -> float:
+    """Return the size of a cell on the verdict map, in inches: less where the pad would not fit a page."""
+    return min(0.28, 8.0 / max(layout.rows, layout.shape[2]))
+
+
+def _extent(n_cells: int) -> float:
+    """Return the length of ``n_cells`` cells in a row, in inches."""
+    return float(np.clip(n_cells * 0.28, 1.8, 8.0))
 
 
 def _ticks(ax: Axes, layout: SensorLayout) -> None:

@@ -132,7 +132,8 @@ class Diagnosis:
         from diagnostics.decision.plot import draw
 
         letters = {cell: LETTERS[fault.kind] for fault in self.faults for cell in fault.cells}
-        return draw(self.layout, self.verdicts.astype(np.intp), letters)
+        kinds = {letter: kind.value for kind, letter in LETTERS.items()}
+        return draw(self.layout, self.verdicts.astype(np.intp), letters, kinds)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict (no NaN) that :meth:`from_dict` reads."""

@@ -106,7 +106,18 @@ def test_recordings_shorter_than_a_window_are_told(home, small, tmp_path, capsys
     frames = (small.frames[0][:5], small.frames[1][:9], *small.frames[2:])
     save_npz(tmp_path / "log.npz", Recordings(frames, SMALL, small.labels, small.class_names))
     assert main(["evaluate", str(home / "model"), str(tmp_path / "log.npz"), "--all"]) == 0
-    assert "2 of 16 recordings are shorter than a window of 10 frames: not used" in capsys.readouterr().err
+    assert "2 of 48 recordings are shorter than a window of 10 frames: not used" in capsys.readouterr().err
+
+
+def test_a_crash_of_a_command_is_no_verdict(home, capsys, monkeypatch):
+    def crash(args):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr("adaptfault.cli.info.run", crash)
+    assert main(["info", str(home / "grasps.npz")]) == 3  # 1 would be "degraded but handled"
+    said = capsys.readouterr().err
+    assert "RuntimeError: a bug" in said
+    assert said.splitlines()[-1].startswith("adaptfault info: internal error")
 
 
 # Bad input: one line that names what is wrong, exit code 3, never a traceback

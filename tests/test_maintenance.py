@@ -8,10 +8,10 @@ from adaptfault.data.windows import make_windows, scale
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.deployment_test import Judgement
 from adaptfault.robot.lock import Busy
-from adaptfault.robot.maintenance import maintain
+from adaptfault.robot.maintenance import MaintenanceReport, maintain
 from adaptfault.robot.predictor import Predictor
 from adaptfault.robot.sensor_state import SensorState, weak_base
-from diagnostics import FaultKind, Line, SensorLayout, inject, line_fault
+from diagnostics import FaultKind, FaultSet, Line, SensorLayout, inject, line_fault
 
 LAYOUT = SensorLayout(2, 6, 5)
 
@@ -294,3 +294,9 @@ def test_a_dry_run_tells_of_exchanged_rows_and_changes_nothing(bundle, later_gra
     assert (report.decision, report.version, report.exit_code) == ("deployed", 1, 1)
     assert "a new version would undo it" in report.reason
     assert files(bundle) == before
+
+
+def test_a_report_counts_the_cells_that_exist():
+    report = MaintenanceReport("kept", 1, "as good", FaultSet((3,), 10), version=1, n_cells=8)
+    assert "| faulty=1;;;0;8" in str(report)
+    assert "version 1 runs; 1 of 8 cells is faulty" in str(report)

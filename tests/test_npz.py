@@ -146,6 +146,11 @@ def test_an_archive_without_its_json_names_what_it_lost(tmp_path):
     assert load(file).inferred == ()
 
 
+def test_an_archive_that_states_numbers_as_class_names_lost_nothing(tmp_path):
+    save_npz(tmp_path / "kept.npz", Recordings((newtons(), newtons()), PAPER, np.array([0, 1]), ("0", "1")))
+    assert load(tmp_path / "kept.npz").inferred == ()
+
+
 def test_readings_that_look_scaled_already_are_questioned(tmp_path):
     file = write(tmp_path / "a.csv", newtons() / 5)
     assert "if they are scaled to 0..1 already" in messages(load(file), "warning")[0]

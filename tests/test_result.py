@@ -16,6 +16,16 @@ def diagnosed(*faults: Fault, layout: SensorLayout = LAYOUT, **more: object) -> 
     return Diagnosis(layout, faults, np.full(40, 0.01), tested, n_frames=100, n_recordings=2, **more)
 
 
+def test_the_map_wraps_wide_pads_and_its_legend_explains_the_letters():
+    layout = SensorLayout(5, 1, 12)
+    short = Fault("short", tuple(range(12, 24)))
+    figure = Diagnosis(layout, (short,), np.zeros(60), np.ones(60, bool), n_frames=9, n_recordings=1).plot()
+    assert figure.get_figwidth() <= 10
+    assert [ax.get_title() for ax in figure.axes if ax.get_visible()] == [f"pad {pad}" for pad in range(5)]
+    assert [text.get_text() for text in figure.axes[1].texts] == ["S"] * 12
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["alive", "faulty: S short", "untested"]
+
+
 def test_the_fault_set_holds_the_cells_of_all_faults():
     assert diagnosed(ROW, CELL).fault_set == {5, 6, 7, 8, 9, 30}
     assert len(diagnosed().fault_set) == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+import traceback
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -89,5 +90,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"adaptfault {args.command}: interrupted", file=sys.stderr)
         return 130
+    except Exception:  # Python's own exit code for a traceback, 1, would read as "degraded but handled"
+        traceback.print_exc()
+        print(f"adaptfault {args.command}: internal error; please report the lines above", file=sys.stderr)
+        return BAD_INPUT
     finally:
         log.removeHandler(handler)

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
         faults = fault_set(args.faults, adapter.model.layout)
         adapter = adapter.to(device(args))
         if args.forecast:
-            say(args, f"{len(faults)} of {faults.n_cells} cells are faulty; forecasting")
+            say(args, f"{len(faults)} of {adapter.model.layout.present.sum()} cells are faulty; forecasting")
             forecast = adapter.forecast(faults)
             result["forecast"] = forecast.to_dict()
             lines.append(str(forecast))
@@ -109,7 +109,7 @@ def open_adapter(args: argparse.Namespace) -> Adapter:
 def _adapt(
     args: argparse.Namespace, adapter: Adapter, faults: FaultSet, result: dict[str, Any], lines: list[str]
 ) -> None:
-    say(args, f"{len(faults)} of {faults.n_cells} cells are faulty; adapting")
+    say(args, f"{len(faults)} of {adapter.model.layout.present.sum()} cells are faulty; adapting")
     adaptation = adapter.adapt(faults, method=args.method, budget=args.budget, seed=args.seed, progress=progress(args))
     adaptation.save(args.out)
     result |= {

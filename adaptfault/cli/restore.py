@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     incoming = load_new_recordings(bundle, args.recordings)
     for problem in incoming.problems:
         print(problem, file=sys.stderr)
-    say(args, f"{len(faults)} of {faults.n_cells} cells are faulty; restoring {len(incoming.frames)} recordings")
+    say(args, f"{len(faults)} of {layout.present.sum()} cells are faulty; restoring {len(incoming.frames)} recordings")
     restorer = bundle.restorer()
     source = bundle.active().source  # exchanged wires are put back, as the running version does
     given = [layout.check_recording(frames)[:, source] for frames in incoming.frames]

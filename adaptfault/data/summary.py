@@ -131,7 +131,8 @@ class Summary:
                 image = draw_forces(ax, layout.grid(shown)[pad], layout, silent, vmin=0, vmax=top, cmap="viridis")
                 ax.set_title(f"{name}, pad {pad}", fontsize=9)
             figure.colorbar(image, ax=row.tolist(), label=layout.unit)
-        figure.supxlabel("x: the reading of the cell never changes", fontsize=8)
+        if self.silent.size:
+            figure.supxlabel("x: the reading of the cell never changes", fontsize=8)
         return figure
 
 

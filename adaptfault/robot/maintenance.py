@@ -64,6 +64,7 @@ class MaintenanceReport:
         warnings: damage found in the bundle.
         dry_run: nothing was changed.
         seconds: wall clock.
+        n_cells: cells of the array, without masked positions; 0 where that is not known.
     """
 
     decision: Decision
@@ -84,16 +85,17 @@ class MaintenanceReport:
     warnings: tuple[str, ...] = ()
     dry_run: bool = False
     seconds: float = 0.0
+    n_cells: int = 0
 
     def __str__(self) -> str:
         status = ("OK", "WARNING", "CRITICAL", "UNKNOWN")[self.exit_code]
-        n = self.fault_set.n_cells
-        measured = [f"faulty={len(self.fault_set)};;;0;{n}"]
+        n, faulty = self.n_cells or self.fault_set.n_cells, len(self.fault_set)
+        measured = [f"faulty={faulty};;;0;{n}"]
         if self.accuracy is not None:
             measured.append(f"accuracy={self.accuracy:.4f};;;0;1")
         would = " (dry run: nothing was changed)" if self.dry_run else ""
         lines = [f"ADAPTFAULT {status} - {self.decision}: {self.reason}{would} | {' '.join(measured)}"]
-        lines.append(f"version {self.version} runs; {len(self.fault_set)} of {n} cells are faulty")
+        lines.append(f"version {self.version} runs; {faulty} of {n} cells {'is' if faulty == 1 else 'are'} faulty")
         if weak_base(self.accuracy, self.fault_free_accuracy):
             both = f"{self.accuracy:.3f} repaired, {self.fault_free_accuracy:.3f} healthy"
             lines.append(f"  weak base model: accuracy {both}; train it longer or on more recordings")
@@ -354,7 +356,7 @@ class _Maintenance:
         broken = with_faults(windows, known.faults, self.bundle.layout)
         running = Adaptation.load(self.version.folder)
         free = self._fault_free_accuracy(windows)
-        self.say(f"{len(faulty)} of {faulty.n_cells} cells are faulty; adapting")
+        self.say(f"{len(faulty)} of {self.bundle.layout.present.sum()} cells are faulty; adapting")
         for method in ("auto", "fill"):
             adaptation = adapter.adapt(faulty, method=method, budget=self.budget, progress=False)
             judgement = compare_candidate(running.predict, adaptation.predict, broken)
@@ -478,6 +480,7 @@ class _Maintenance:
             left_out=self.left_out,
             warnings=self.warnings,
             dry_run=self.dry_run,
+            n_cells=int(self.bundle.layout.present.sum()),
             **found,
         )
 

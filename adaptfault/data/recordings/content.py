@@ -27,6 +27,7 @@ class Content:
         lines: int ``[T]``, the line of each frame in a text file that holds one recording.
         labels: the class name of each recording.
         class_names: the order of the classes, if the file gives one.
+        numbered: the class names are the numbers of the labels, because the file gives no names.
         names: a name for each recording, if the file gives them.
         shape: ``(pads, rows, cols)``.
         present: bool ``[pads, rows, cols]``, False = no sensing element.
@@ -42,6 +43,7 @@ class Content:
     lines: NDArray[np.intp] | None = None
     labels: tuple[str, ...] | None = None
     class_names: tuple[str, ...] = ()
+    numbered: bool = False
     names: tuple[str, ...] | None = None
     shape: Shape | None = None
     present: NDArray[np.bool_] | None = None

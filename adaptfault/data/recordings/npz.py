@@ -62,7 +62,8 @@ def read_npz(path: Path) -> Content:
     if len(set(class_names)) < len(class_names):
         raise InputError.at(path, "a class name occurs twice; give each class a name of its own")
     labels = _labels(path, arrays, class_names, len(frames))
-    if labels is not None and not class_names and arrays["labels"].dtype.kind in "iu":
+    numbered = labels is not None and not class_names and arrays["labels"].dtype.kind in "iu"
+    if numbered:
         class_names = tuple(str(i) for i in range(int(arrays["labels"].max()) + 1))
     names = _texts(path, arrays, "names")
     if names and len(names) != len(frames):
@@ -74,6 +75,7 @@ def read_npz(path: Path) -> Content:
         counts=arrays["frames"].dtype.kind in "iu",
         labels=labels,
         class_names=class_names,
+        numbered=numbered,
         names=names or None,
         shape=shape,
         present=present,

@@ -114,7 +114,7 @@ def resolve_layout(
 def _lost(contents: Sequence[Content], missing: Sequence[str]) -> list[str]:
     """Return a sentence on archives without the JSON file that may state what they do not."""
     bare = [c for c in contents if c.path.suffix.lower() == ".npz" and not c.path.with_suffix(".json").is_file()]
-    numbered = [c for c in bare if c.labels is not None and c.class_names == tuple(map(str, range(len(c.class_names))))]
+    numbered = [c for c in bare if c.numbered]
     if not bare or not (numbered or missing):
         return []
     what = ["class names (the numbers of the labels are used)"] * bool(numbered)

@@ -36,6 +36,13 @@ def test_advice_names_each_region_of_untested_cells_the_largest_first():
     )
 
 
+def test_100_percent_are_tested_only_if_no_cell_is_left():
+    layout = SensorLayout(1, 20, 20)
+    untested, nothing = np.arange(400) == 7, np.zeros(400)
+    assert str(coverage(untested, nothing > 0, nothing, layout)).startswith("99% of the cells tested")
+    assert str(coverage(nothing > 0, nothing > 0, nothing, layout)).startswith("100% of the cells tested")
+
+
 def test_positions_without_a_cell_do_not_count():
     present = np.ones((2, 4, 5), bool)
     present[0] = False

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from adaptfault.evaluation.html_diagnosis import write_diagnosis
 from diagnostics import Diagnosis, Fault, FaultKind, Line, SensorLayout, TransportFault, Verdict
 
 LAYOUT = SensorLayout(2, 4, 5)
@@ -24,6 +25,12 @@ def test_the_map_wraps_wide_pads_and_its_legend_explains_the_letters():
     assert [ax.get_title() for ax in figure.axes if ax.get_visible()] == [f"pad {pad}" for pad in range(5)]
     assert [text.get_text() for text in figure.axes[1].texts] == ["S"] * 12
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["alive", "faulty: S short", "untested"]
+
+
+def test_a_page_without_a_fault_says_how_many_cells_were_not_tested(tmp_path):
+    page = write_diagnosis(tmp_path / "page.html", diagnosed(), name="log", reference=True).read_text()
+    assert "No faulty cell was found. 6 cells were not tested: a fault there would not be found." in page
+    assert "<b>85 %</b><span>of the cells tested" in page
 
 
 def test_the_fault_set_holds_the_cells_of_all_faults():

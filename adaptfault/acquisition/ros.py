@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from diagnostics import Diagnosis, Fault, Line, SensorLayout
+from diagnostics.decision.coverage import percent
 
 TOPIC = "/diagnostics"
 
@@ -124,7 +125,7 @@ def _pad(diagnosis: Diagnosis, pad: int, faults: list[Fault]) -> dict[str, Any]:
         grave = any(f.line is not None for f in faults) or len(faulty) >= _SHARE * cells.size
         level, message = (Level.ERROR if grave else Level.WARN), f"{len(faulty)} of {cells.size} cells faulty"
     else:
-        level, message = Level.OK, f"no fault found, {tested:.0%} of the cells tested"
+        level, message = Level.OK, f"no fault found, {percent(tested)}% of the cells tested"
     values: dict[str, Any] = {"cells": cells.size, "faulty": len(faulty), "untested": untested}
     values |= {"test coverage": f"{tested:.3f}", "faulty cells": _places(layout, faulty)}
     values |= {f"cause {i}": fault.reason for i, fault in enumerate(faults, 1)}

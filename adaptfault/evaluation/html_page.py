@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.data.atomic import atomic_write
+from diagnostics.decision.coverage import percent
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,6 +24,7 @@ def render(path: str | Path, template: str, **values: Any) -> Path:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(loader=PackageLoader("adaptfault.evaluation"), autoescape=True, undefined=StrictUndefined)
+    environment.filters["percent"] = percent
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(path, environment.get_template(template).render(values).encode())

@@ -40,7 +40,8 @@ class WireCount:
     cells: int
 
     def __str__(self) -> str:
-        return f"{self.wire} {self.kind}: {self.robots} robots ({100 * self.share:.1f} %), {self.cells} cells"
+        robots = f"{self.robots} robot{'' if self.robots == 1 else 's'}"
+        return f"{self.wire} {self.kind}: {robots} ({100 * self.share:.1f} %), {self.cells} cells"
 
 
 @dataclass(frozen=True)

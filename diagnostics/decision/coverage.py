@@ -34,9 +34,13 @@ class Coverage:
     advice: tuple[str, ...]
 
     def __str__(self) -> str:
-        return (
-            f"{self.test_coverage:.0%} of the cells tested, an estimated {self.fault_coverage:.0%} of the faults found"
-        )
+        tested, found = percent(self.test_coverage), percent(self.fault_coverage)
+        return f"{tested}% of the cells tested, an estimated {found}% of the faults found"
+
+
+def percent(share: float) -> int:
+    """Return a share from 0 to 1 as whole percent; 100 only where nothing is missing."""
+    return min(round(100 * share), 100 if share >= 1 else 99)
 
 
 def coverage(

@@ -4,7 +4,8 @@
 #   examples/first_hour.sh OUT [ARRAY...]        ARRAY: skin (simulated), icub, insole, sdh; default: all that are there
 #
 # The real arrays are read from DATA (default ../shared/data), and left out where it is absent. EPOCHS (default 8) is the
-# length of the training. A line of another verdict than expected ends the script with exit code 1.
+# length of the training, SHAPE and GRASPS the size of the simulated skin. Another exit code or cause than expected ends
+# the script with exit code 1.
 set -eu
 
 out=${1:?give a folder for the results}
@@ -63,7 +64,7 @@ for name in "$@"; do
     skin)
         # CSV files of one folder a class and a layout.json, as a user's own recordings would lie there.
         raw=$out/skin-csv later=::6 fault=row:0:4=short cause="row 4 is short"
-        [ -d "$raw" ] || run 0 simulate --shape 10x10 --full-scale 3.3 --unit V --rate 20 \
+        [ -d "$raw" ] || run 0 simulate --shape "${SHAPE:-10x10}" --full-scale 3.3 --unit V --rate 20 \
             --grasps "${GRASPS:-24}" --frames 60 --classes nothing normal softer harder --out "$raw"
         ;;
     icub)

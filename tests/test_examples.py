@@ -3,6 +3,7 @@
 Those that are marked slow run there and in ``make test-all``, not in ``make test``.
 """
 
+import contextlib
 import importlib.util
 import os
 import subprocess
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 from _pytest.mark import ParameterSet
 
+from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
 
 HOME = Path(__file__).parents[1] / "examples"
@@ -94,6 +96,26 @@ def test_the_example_runs_on_recordings(name: str, small_grasps: Recordings, tmp
 def test_no_example_that_takes_recordings_is_left_out():
     takes = {path.name for path in EXAMPLES if 'argument("recording' in path.read_text() or "[REC" in path.read_text()}
     assert takes == set(ON_RECORDINGS)
+
+
+def test_the_first_hour_ends_with_the_right_verdict_on_a_small_skin(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Every command runs in this process, because importing torch for each takes longer than all of them."""
+    call, answer = tmp_path / "call", tmp_path / "answer"
+    os.mkfifo(call)
+    os.mkfifo(answer)
+    client = tmp_path / "client.sh"
+    client.write_text(f"printf '%s\\n' \"$@\" > {call}; read -r code < {answer}; exit $code\n")
+    environment = {"ADAPTFAULT": f"sh {client}", "EPOCHS": "1", "GRASPS": "6", "SHAPE": "6x6", "OUT": str(tmp_path)}
+    script = ["sh", "-c", f'sh {HOME / "first_hour.sh"} "$OUT" skin; code=$?; echo end > {call}; exit $code']
+    with subprocess.Popen(script, env={**os.environ, **environment}, stdout=subprocess.PIPE, text=True) as running:
+        while (arguments := call.read_text().splitlines()) != ["end"]:
+            code = 3
+            with contextlib.suppress(SystemExit):  # of an unknown option: the script waits for an answer
+                code = main([*arguments, "--quiet"])
+            answer.write_text(f"{code}\n")
+        said, _ = running.communicate()
+    assert running.returncode == 0, said[-2000:] + capsys.readouterr().err[-2000:]
+    assert "first_hour: skin: verdict right" in said
 
 
 @pytest.mark.slow

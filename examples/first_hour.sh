@@ -40,7 +40,7 @@ first_hour() { # one array: $name $raw, the recordings kept back, the fault, the
     run 0 convert "$raw" $scale --take "$later" --out "$home/later.npz"
     run "0 1" diagnose "$home/later.npz" --reference "$home/healthy.npz" --html "$home/later.html"
     # shellcheck disable=SC2086
-    run 0 train "$home/healthy.npz" --epochs "$epochs" $training --out "$home/robot.bundle"
+    run 0 train "$home/healthy.npz" $training --out "$home/robot.bundle"
     run 0 evaluate "$home/robot.bundle" "$home/later.npz"
     # The sensor breaks.
     run 0 convert "$home/later.npz" --inject "$fault" --out "$home/broken.npz"
@@ -59,7 +59,7 @@ first_hour() { # one array: $name $raw, the recordings kept back, the fault, the
 [ $# -gt 0 ] || set -- skin icub insole sdh
 mkdir -p "$out"
 for name in "$@"; do
-    raw='' scale='' training=''
+    raw='' scale='' training="--epochs $epochs"
     case $name in
     skin)
         # CSV files of one folder a class and a layout.json, as a user's own recordings would lie there.
@@ -68,9 +68,9 @@ for name in "$@"; do
             --grasps "${GRASPS:-24}" --frames 60 --classes nothing normal softer harder --out "$raw"
         ;;
     icub)
-        # The shortest recordings, a class of their own, have 4 frames.
+        # The shortest recordings, a class of their own, have 4 frames. They are few, so there are more epochs.
         raw=$data/icub5x1x12_grasps11.npz later=::6 fault=row:1:0=short cause="pad 1, row 0 is short"
-        scale="--full-scale 255 --unit count" training="--length 4"
+        scale="--full-scale 255 --unit count" training="--epochs $((4 * epochs)) --length 4"
         ;;
     insole)
         raw=$data/insole2x33x15.npz later=::8 fault=row:0:12=open cause="row 12 is open"

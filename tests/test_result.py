@@ -27,6 +27,24 @@ def test_the_map_wraps_wide_pads_and_its_legend_explains_the_letters():
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["alive", "faulty: S short", "untested"]
 
 
+@pytest.mark.parametrize(
+    "shape", [(1, 10, 10), (2, 13, 6), (5, 1, 12), (1, 2, 3), (2, 33, 15), (1, 64, 64), (1, 40, 4)]
+)
+def test_nothing_on_the_map_is_cut_off_or_covered(shape):
+    layout = SensorLayout(*shape)
+    cells = layout.n_cells
+    short = Fault("short", (1,))
+    figure = Diagnosis(layout, (short,), np.zeros(cells), np.ones(cells, bool), n_frames=9, n_recordings=1).plot()
+    figure.draw_without_rendering()
+    legend = figure.legends[0].get_window_extent()
+    for box in [legend, *(ax.get_tightbbox() for ax in figure.axes if ax.get_visible())]:
+        assert box.x0 >= -1
+        assert box.y0 >= -1
+        assert box.x1 <= figure.bbox.x1 + 1
+        assert box.y1 <= figure.bbox.y1 + 1
+        assert box is legend or box.y0 >= legend.y1 - 1
+
+
 def test_a_page_without_a_fault_says_how_many_cells_were_not_tested(tmp_path):
     page = write_diagnosis(tmp_path / "page.html", diagnosed(), name="log", reference=True).read_text()
     assert "No faulty cell was found. 6 cells were not tested: a fault there would not be found." in page

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 _PAGE = 10.0
 """Width of the verdict map, in inches; pads that do not fit go below."""
 
+_WIDE = 5.0
+"""Width of a map whose legend fits on one line, in inches."""
+
 _ALIVE, _FAULTY, _UNTESTED, _ABSENT = "#8fbf8f", "#c0392b", "#d9d9d9", "#ffffff"
 
 
@@ -40,7 +43,7 @@ def draw(
     cell_points = 72 * _cell(layout)
     for pad, ax in enumerate(axes):
         ax.imshow(layout.grid(colours)[pad], cmap=palette, vmin=-0.5, vmax=3.5)
-        ax.set_title(f"pad {pad}")
+        ax.set_title(f"pad {pad}", fontsize=10)
         _ticks(ax, layout)
         ax.set_xticks(np.arange(0.5, layout.shape[2] - 1), minor=True)
         ax.set_yticks(np.arange(0.5, layout.rows - 1), minor=True)
@@ -56,7 +59,7 @@ def draw(
     figure.legend(
         handles=[Patch(color=colour, label=name) for name, colour in legend.items()],
         loc="outside lower center",
-        ncols=3 if figure.get_figwidth() > 5 else 1,
+        ncols=3 if figure.get_figwidth() > _WIDE else 1,
         fontsize=8,
     )
     return figure
@@ -88,10 +91,12 @@ def _map_figure(layout: SensorLayout) -> tuple[Figure, list[Axes]]:
     """Return a figure with one axes for each pad, in as many rows as the width of a page needs."""
     from matplotlib.figure import Figure
 
-    height, width = layout.rows * _cell(layout) + 0.6, max(layout.shape[2] * _cell(layout), 1.2) + 0.5
+    height, width = layout.rows * _cell(layout) + 0.7, max(layout.shape[2] * _cell(layout), 1.2) + 0.5
     columns = max(1, min(layout.pads, int(_PAGE // width)))
     rows = -(-layout.pads // columns)
-    figure = Figure(figsize=(max(columns * width, 3.0), rows * height + 0.6), layout="constrained")
+    page = max(columns * width, 3.0)
+    legend = 0.5 if page > _WIDE else 0.9
+    figure = Figure(figsize=(page, rows * height + legend), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for ax in axes[layout.pads :]:
         ax.set_visible(False)

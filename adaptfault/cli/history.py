@@ -1,4 +1,4 @@
-"""adaptfault history: lists the maintenance runs and versions of a robot."""
+"""adaptfault history: lists the maintenance runs and versions of a robot, and what drifts over them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from adaptfault.cli.options import Commands, command, emit
 
 _EXAMPLE = """  adaptfault history robot.bundle --last 10
   adaptfault history robot.bundle --confirm
-      ends the probation of the version that runs"""
+      ends the probation of the version that runs
+  adaptfault history robot.bundle --trend --picture trend.png
+      cells and lines whose gain, offset, noise or blinks drift, and when they cross their limits"""
 
 
 def add(commands: Commands) -> None:
@@ -18,7 +20,9 @@ def add(commands: Commands) -> None:
     parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
     parser.add_argument("--last", type=int, metavar="N", help="only the last N entries")
     parser.add_argument("--confirm", action="store_true", help="end the probation of the version that runs")
-    parser.set_defaults(run=run)
+    parser.add_argument("--trend", action="store_true", help="what drifts from run to run, in place of the runs")
+    parser.add_argument("--picture", metavar="FILE", help="with --trend: write the drifting series as PNG")
+    parser.set_defaults(run=run, writes=("picture",))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -27,8 +31,18 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.robot.pointer import Pointer
 
     bundle = Bundle.open(args.bundle)
+    if args.picture and not args.trend:
+        raise ValueError("--picture shows trends: give --trend, too")
     if args.confirm:
         bundle.confirm()
+    if args.trend:
+        from adaptfault.robot.ageing import AgeingTable
+
+        report = AgeingTable.of(bundle).report()
+        if args.picture:
+            report.write_picture(args.picture)
+        emit(args, report.to_dict(), str(report))
+        return 0
     pointer = Pointer.read(bundle.path)
     runs = bundle.journal.runs(args.last)
     problems = bundle.problems(repair=False)

@@ -21,6 +21,7 @@ _TABLES = """
     CREATE TABLE IF NOT EXISTS runs (id INTEGER PRIMARY KEY, time TEXT NOT NULL, what TEXT NOT NULL,
                                      document TEXT NOT NULL);
     CREATE TABLE IF NOT EXISTS recordings (digest TEXT PRIMARY KEY, name TEXT NOT NULL, run INTEGER NOT NULL);
+    CREATE TABLE IF NOT EXISTS conditions (run INTEGER PRIMARY KEY, cells BLOB NOT NULL);
 """
 
 
@@ -63,8 +64,21 @@ class Journal:
                 checksum.unlink(missing_ok=True)
             return [f"{self.path} is damaged: it is renamed to {_ASIDE} and a new journal is started"]
 
-    def add(self, time: str, what: str, document: Mapping[str, Any], recordings: Sequence[tuple[str, str]] = ()) -> int:
-        """Add a run and the recordings ``(digest, name)`` that it used, in one transaction; return its number."""
+    def add(
+        self,
+        time: str,
+        what: str,
+        document: Mapping[str, Any],
+        recordings: Sequence[tuple[str, str]] = (),
+        condition: bytes | None = None,
+    ) -> int:
+        """Add a run in one transaction and return its number.
+
+        Args:
+            time, what, document: of the run.
+            recordings: ``(digest, name)`` of those that it used.
+            condition: of the cells, as :mod:`adaptfault.robot.ageing` encodes it; None: no row.
+        """
         with self._connection() as connection, connection:
             cursor = connection.execute(
                 "INSERT INTO runs (time, what, document) VALUES (?, ?, ?)",
@@ -72,6 +86,8 @@ class Journal:
             )
             rows = [(digest, name, cursor.lastrowid) for digest, name in recordings]
             connection.executemany("INSERT OR IGNORE INTO recordings VALUES (?, ?, ?)", rows)
+            if condition is not None:
+                connection.execute("INSERT INTO conditions VALUES (?, ?)", (cursor.lastrowid, condition))
             return int(cursor.lastrowid or 0)
 
     def seen(self, digests: Sequence[str]) -> set[str]:
@@ -90,6 +106,16 @@ class Journal:
             query = "SELECT id, time, what, document FROM runs ORDER BY id DESC LIMIT ?"
             rows = connection.execute(query, (-1 if last is None else last,)).fetchall()
         return [{**json.loads(text), "id": i, "time": time, "what": what} for i, time, what, text in reversed(rows)]
+
+    def conditions(self) -> list[tuple[int, str, bytes]]:
+        """Return number, time and condition of the cells of each run that has one, oldest first."""
+        if not self.path.exists():
+            return []
+        with self._reading() as connection:
+            if not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'conditions'").fetchone():
+                return []  # an earlier version wrote the journal
+            query = "SELECT run, time, cells FROM conditions JOIN runs ON runs.id = run ORDER BY run"
+            return list(connection.execute(query))
 
     def last(self, key: str) -> Any:
         """Return the value of ``key`` in the last run that has it; None if no run has it."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from adaptfault.robot.ageing import encode
 from adaptfault.robot.bundle import Bundle, now
 from adaptfault.robot.checksummed_json import Damaged
 from adaptfault.robot.converter_range import within_range
@@ -22,6 +23,7 @@ from adaptfault.robot.pointer import Pointer
 from adaptfault.robot.sensor_state import TECHNICIAN_BELOW, UNTESTED, judged_before, unhandled_cells, weak_base
 from adaptfault.robot.versions import Version
 from diagnostics import Diagnosis, Fault, FaultSet
+from diagnostics.evidence.ageing import cell_condition
 from diagnostics.evidence.sensor_change import SensorChange, sensor_change
 
 if TYPE_CHECKING:
@@ -213,6 +215,7 @@ class _Maintenance:
     say: Callable[[str], None]
     warnings: tuple[str, ...] = field(default=(), init=False)
     judged: dict[str, Any] | None = field(default=None, init=False)
+    condition: bytes | None = field(default=None, init=False)
 
     def run(self, incoming: Sequence[_InputRecording]) -> MaintenanceReport:
         """Diagnose recordings that no earlier run used, decide, and journal the run unless it is a dry run."""
@@ -279,23 +282,22 @@ class _Maintenance:
         return replace(report, exit_code=self.untested_code, reason=reason)
 
     def _with_change(self, report: MaintenanceReport, frames: list[NDArray[np.float64]]) -> MaintenanceReport:
-        """Return the report with a change of the whole sensor, and its effect on the accuracy."""
+        """Return the report with a change of the whole sensor, and its effect on the accuracy; measure the cells."""
         from adaptfault.adaptation.result import Adaptation
 
         layout = self.bundle.layout
-        healthy = np.flatnonzero(layout.present.ravel() & ~report.fault_set.mask)
-        if not len(healthy):
-            return report
         train = self.bundle.parts.adapter().train
-        reference = (
+        reference = [
             train.x[train.recording == number].reshape(-1, layout.n_cells) * layout.full_scale
             for number in np.unique(train.recording)
-        )
+        ]
         load = self.bundle.diagnoser().load_
-        if load is None:
-            change = sensor_change(frames, reference, layout, healthy)
-        else:
-            change = sensor_change(map(load.loads, frames), map(load.loads, reference), layout, healthy)
+        if load is not None:
+            frames, reference = [*map(load.loads, frames)], [*map(load.loads, reference)]
+        if report.diagnosis is not None and report.used:
+            self.condition = encode(cell_condition(frames, reference, layout), report.diagnosis.verdicts)
+        healthy = np.flatnonzero(layout.present.ravel() & ~report.fault_set.mask)
+        change = sensor_change(frames, reference, layout, healthy) if len(healthy) else None
         if change is None:
             return report
         windows = with_faults(self.bundle.parts.check_windows(), report.faults, layout)
@@ -450,6 +452,7 @@ class _Maintenance:
             report.decision,
             {**report.to_dict(), "knowledge": self.known.to_dict(), "judged": self._judgement_of(report)},
             [(r.digest, r.name) for r in usable] if report.used else [],  # refused ones are diagnosed again
+            self.condition,
         )
 
     def _judgement_of(self, report: MaintenanceReport) -> dict[str, Any] | None:

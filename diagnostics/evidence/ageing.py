@@ -1,0 +1,172 @@
+"""Ageing: the condition of each cell in the recordings of one run, from which trends over many runs are estimated.
+
+Statistics, per cell, with the load l(t) = r(t) - b and the contact limit c = 5 % of full scale:
+
+    baseline   b = lower quartile, over recordings, of the 5 % quantile of r(t)
+    peak       median, over contacts, of the highest load in each; a contact is a run of frames with l(t) > c
+    gain       peak : peak in the reference
+    offset     (b - b in the reference) / full scale
+    noise      1.4826 / sqrt(6) * median |second difference| of the unloaded frames / full scale; median over recordings
+    blinks     number of losses of a load for at most 6 frames, per loaded frame
+
+The noise equals the median absolute deviation of white noise (Rousseeuw and Croux 1993); a second difference is free of
+slow loads. A statistic is NaN where the recordings do not tell: fewer than 5 contacts of the cell, here or in the
+reference, 20 loaded frames or 8 unloaded ones.
+
+Not detected: what the contacts do not test. Other objects or tasks than in the reference change the gains of all cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.layout import SensorLayout
+
+_CONTACT = 0.05  # of full scale: a load above it is a contact
+_LOW = 0.05  # quantile of the readings of a cell in one recording: its baseline there
+_QUARTILE = 0.25  # over recordings: three in four may load the cell throughout
+_CONTACTS, _LOADED, _UNLOADED = 5, 20, 8  # contacts and frames without which a statistic is NaN
+_LONGEST_BLINK = 6  # frames
+_SAME = 0.3  # of a load: largest difference before and after a blink
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class CellCondition:
+    """Condition of each cell, float ``[D]`` each; NaN: the recordings do not tell.
+
+    Attributes:
+        gain: ratio of the loads to those of the reference.
+        offset: shift of the baseline since the reference, as a share of full scale.
+        noise: standard deviation of the unloaded readings, as a share of full scale.
+        blinks: short losses of a load, per loaded frame.
+    """
+
+    gain: Floats
+    offset: Floats
+    noise: Floats
+    blinks: Floats
+
+    @property
+    def values(self) -> Floats:
+        """The four statistics, ``[4, D]``, in the order of :data:`STATISTICS`."""
+        return np.stack([getattr(self, name) for name in STATISTICS])
+
+
+STATISTICS = tuple(field.name for field in fields(CellCondition))
+"""Names of the statistics of a cell."""
+
+
+def cell_condition(
+    recordings: Iterable[NDArray[Any]], reference: Iterable[NDArray[Any]], layout: SensorLayout
+) -> CellCondition:
+    """Return the condition of the cells in recordings, compared with healthy ones.
+
+    Args:
+        recordings: loads ``[T, D]`` each, in the layout's unit; NaN = missing.
+        reference: healthy recordings, likewise.
+        layout: the array.
+    """
+    new, old = (_Measured.of([np.asarray(r, np.float64) for r in given], layout) for given in (recordings, reference))
+    absent = ~layout.present.ravel()
+    return CellCondition(
+        *(
+            np.where(absent, np.nan, statistic)
+            for statistic in (
+                new.peak / old.peak,
+                (new.baseline - old.baseline) / layout.full_scale,
+                new.noise / layout.full_scale,
+                new.blinks,
+            )
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """Peak, baseline and noise in the layout's unit, and blinks per loaded frame, ``[D]`` each."""
+
+    peak: Floats
+    baseline: Floats
+    noise: Floats
+    blinks: Floats
+
+    @classmethod
+    def of(cls, recordings: Sequence[Floats], layout: SensorLayout) -> _Measured:
+        limit, d = _CONTACT * layout.full_scale, layout.n_cells
+        recordings = [frames for frames in recordings if len(frames)]
+        if not recordings:
+            return cls(*(np.full(d, np.nan) for _ in range(4)))
+        baseline = _quantile(np.stack([_quantile(frames, _LOW) for frames in recordings]), _QUARTILE)
+        cells, peaks, noise = [], [], []
+        blinks, loaded = np.zeros(d), np.zeros(d)
+        for frames in recordings:
+            load = frames - baseline
+            of, peak, lost = _contacts(load, limit)
+            cells.append(of)
+            peaks.append(peak)
+            blinks += np.bincount(lost, minlength=d)
+            loaded += (load > limit).sum(axis=0)
+            noise.append(_noise(load, limit))
+        enough = np.where(loaded >= _LOADED, loaded, np.nan)
+        medians = _medians(np.concatenate(cells), np.concatenate(peaks), d)
+        return cls(medians, baseline, _quantile(np.stack(noise), 0.5), blinks / enough)
+
+
+def _quantile(values: Floats, share: float) -> Floats:
+    """Return a quantile over the first axis without the missing values, rounded down; NaN where all are missing."""
+    n = np.count_nonzero(~np.isnan(values), axis=0)
+    which = np.floor(share * np.maximum(n - 1, 0)).astype(np.intp)
+    found: Floats = np.take_along_axis(np.sort(values, axis=0), which[None], axis=0)[0]
+    return found
+
+
+def _contacts(load: Floats, limit: float) -> tuple[NDArray[np.intp], Floats, NDArray[np.intp]]:
+    """Return the cell and the peak of each contact, and the cell of each blink."""
+    n, d = load.shape
+    padded = np.zeros((d, n + 1))  # one unloaded frame ends the contacts of each cell
+    padded[:, :n] = np.nan_to_num(load.T)
+    x = padded.ravel()
+    edges = np.flatnonzero(np.diff((x > limit).astype(np.int8), prepend=0))
+    starts, ends = edges[::2], edges[1::2]
+    cells = starts // (n + 1)
+    if not len(starts):
+        return cells, np.zeros(0), cells
+    before, after = x[ends[:-1] - 1], x[starts[1:]]
+    blink = (cells[1:] == cells[:-1]) & (starts[1:] - ends[:-1] <= _LONGEST_BLINK)
+    # In one step each way, and to about the same load: no contact does that.
+    blink &= (before > 2 * limit) & (x[ends[:-1]] <= limit / 2) & (np.abs(after - before) <= _SAME * before)
+    return cells, np.maximum.reduceat(x, starts), cells[1:][blink]
+
+
+def _medians(cells: NDArray[np.intp], values: Floats, d: int) -> Floats:
+    """Return the median of the values of each cell; NaN for fewer than 5."""
+    found = np.full(d, np.nan)
+    order = np.argsort(cells, kind="stable")
+    for cell, group in zip(*_groups(cells[order], values[order]), strict=True):
+        if len(group) >= _CONTACTS:
+            found[cell] = np.median(group)
+    return found
+
+
+def _groups(cells: NDArray[np.intp], values: Floats) -> tuple[NDArray[np.intp], list[Floats]]:
+    """Return the distinct cells of sorted ones, and the values of each."""
+    distinct, first = np.unique(cells, return_index=True)
+    return distinct, np.split(values, first[1:]) if len(distinct) else []
+
+
+def _noise(load: Floats, limit: float) -> Floats:
+    """Return the noise of each cell in the frames without load; NaN for fewer than 8."""
+    if len(load) < 3:
+        return np.full(load.shape[1], np.nan)
+    quiet = np.abs(load) <= limit
+    calm = quiet[:-2] & quiet[1:-1] & quiet[2:]
+    curvature = np.where(calm, np.abs(np.diff(load, 2, axis=0)), np.nan)
+    noise = 1.4826 / np.sqrt(6) * _quantile(curvature, 0.5)
+    return np.where(calm.sum(axis=0) >= _UNLOADED, noise, np.nan)

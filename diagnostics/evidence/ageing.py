@@ -2,7 +2,7 @@
 
 Statistics, per cell, with the load l(t) = r(t) - b and the contact limit c = 5 % of full scale:
 
-    baseline   b = lower quartile, over recordings, of the 5 % quantile of r(t)
+    baseline   b = 5 % quantile of all r(t), if the 25 % quantile is within 2 % of full scale: the cell rests
     peak       median, over contacts, of the highest load in each; a contact is a run of frames with l(t) > c
     gain       peak : peak in the reference
     offset     (b - b in the reference) / full scale
@@ -11,7 +11,7 @@ Statistics, per cell, with the load l(t) = r(t) - b and the contact limit c = 5 
 
 The noise equals the median absolute deviation of white noise (Rousseeuw and Croux 1993); a second difference is free of
 slow loads. A statistic is NaN where the recordings do not tell: fewer than 5 contacts of the cell, here or in the
-reference, 20 loaded frames or 8 unloaded ones.
+reference, 20 loaded frames, or a cell that does not rest. Its gain then refers to the baseline of the reference.
 
 Not detected: what the contacts do not test. Other objects or tasks than in the reference change the gains of all cells.
 """
@@ -28,11 +28,12 @@ from numpy.typing import NDArray
 from diagnostics.layout import SensorLayout
 
 _CONTACT = 0.05  # of full scale: a load above it is a contact
-_LOW = 0.05  # quantile of the readings of a cell in one recording: its baseline there
-_QUARTILE = 0.25  # over recordings: three in four may load the cell throughout
+_LOW, _QUARTER = 0.05, 0.25  # quantiles of the readings of a cell that agree where it rests
+_QUIET = 0.02  # of full scale: so far they agree
 _CONTACTS, _LOADED, _UNLOADED = 5, 20, 8  # contacts and frames without which a statistic is NaN
 _LONGEST_BLINK = 6  # frames
 _SAME = 0.3  # of a load: largest difference before and after a blink
+_BLOCK = 512  # cells processed together: a size
 
 Floats = NDArray[np.float64]
 
@@ -73,14 +74,15 @@ def cell_condition(
         reference: healthy recordings, likewise.
         layout: the array.
     """
-    new, old = (_Measured.of([np.asarray(r, np.float64) for r in given], layout) for given in (recordings, reference))
+    old = _Measured.of([np.asarray(r, np.float64) for r in reference], layout)
+    new = _Measured.of([np.asarray(r, np.float64) for r in recordings], layout, old.baseline)
     absent = ~layout.present.ravel()
     return CellCondition(
         *(
             np.where(absent, np.nan, statistic)
             for statistic in (
                 new.peak / old.peak,
-                (new.baseline - old.baseline) / layout.full_scale,
+                np.where(new.rests & old.rests, new.baseline - old.baseline, np.nan) / layout.full_scale,
                 new.noise / layout.full_scale,
                 new.blinks,
             )
@@ -90,20 +92,26 @@ def cell_condition(
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """Peak, baseline and noise in the layout's unit, and blinks per loaded frame, ``[D]`` each."""
+    """Peak, baseline and noise in the layout's unit, blinks per loaded frame, and whether it rests, ``[D]`` each."""
 
     peak: Floats
     baseline: Floats
     noise: Floats
     blinks: Floats
+    rests: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, recordings: Sequence[Floats], layout: SensorLayout) -> _Measured:
+    def of(cls, recordings: Sequence[Floats], layout: SensorLayout, otherwise: Floats | None = None) -> _Measured:
+        """Measure; ``otherwise`` is the baseline of cells that do not rest."""
         limit, d = _CONTACT * layout.full_scale, layout.n_cells
         recordings = [frames for frames in recordings if len(frames)]
         if not recordings:
-            return cls(*(np.full(d, np.nan) for _ in range(4)))
-        baseline = _quantile(np.stack([_quantile(frames, _LOW) for frames in recordings]), _QUARTILE)
+            return cls(*(np.full(d, np.nan) for _ in range(4)), np.zeros(d, bool))
+        blocks = [slice(first, first + _BLOCK) for first in range(0, d, _BLOCK)]
+        pooled = (np.concatenate([frames[:, block] for frames in recordings]) for block in blocks)
+        low, quarter = np.hstack([[_quantile(readings, share) for share in (_LOW, _QUARTER)] for readings in pooled])
+        rests = quarter - low <= _QUIET * layout.full_scale
+        baseline = low if otherwise is None else np.where(rests, low, otherwise)
         cells, peaks, noise = [], [], []
         blinks, loaded = np.zeros(d), np.zeros(d)
         for frames in recordings:
@@ -116,7 +124,8 @@ class _Measured:
             noise.append(_noise(load, limit))
         enough = np.where(loaded >= _LOADED, loaded, np.nan)
         medians = _medians(np.concatenate(cells), np.concatenate(peaks), d)
-        return cls(medians, baseline, _quantile(np.stack(noise), 0.5), blinks / enough)
+        calm = np.where(rests, _quantile(np.stack(noise), 0.5), np.nan)
+        return cls(medians, baseline, calm, blinks / enough, rests)
 
 
 def _quantile(values: Floats, share: float) -> Floats:

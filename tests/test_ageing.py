@@ -139,12 +139,13 @@ def test_runs_of_a_robot_show_the_cell_that_weakens_and_when_it_will_be_too_weak
     assert main(command) == 0
     assert "no run has measured" in capsys.readouterr().out
     today = datetime(2026, 1, 1, tzinfo=timezone.utc)
+    grasps = af.simulate(8, layout, n_frames=40, seed=100, classes=power_cut.CLASSES[1:])
     for week in range(13):
-        grasps = af.simulate(20, layout, n_frames=40, seed=100 + week, classes=power_cut.CLASSES[1:])
-        frames = [np.concatenate([f, np.zeros_like(f)]).astype(np.float32) for f in grasps.frames]
+        rng = np.random.default_rng(week)
+        frames = [np.abs(np.concatenate([f, 0 * f]) + rng.normal(0, 0.01, (80, layout.n_cells))) for f in grasps.frames]
         for f in frames:
             f[:, weak] *= np.exp(-0.05 * week)
-        save_npz(tmp_path / f"{week}.npz", Recordings(tuple(frames), layout))
+        save_npz(tmp_path / f"{week}.npz", Recordings(tuple(f.astype(np.float32) for f in frames), layout))
         day = (today + timedelta(days=7 * week)).isoformat()
         monkeypatch.setattr("adaptfault.robot.maintenance.now", lambda day=day: day)
         assert main(["maintain", str(path), str(tmp_path / f"{week}.npz"), "--quiet"]) in (0, 1, 2)
@@ -159,8 +160,9 @@ def test_runs_of_a_robot_show_the_cell_that_weakens_and_when_it_will_be_too_weak
     assert (tmp_path / "trend.png").stat().st_size > 1000
     assert main([*command, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    (drift,) = told["drifts"]
-    assert (drift["statistic"], drift["cell"], told["unit"]) == ("gain", weak, "day")
+    assert {d["cell"] for d in told["drifts"]} == {weak}
+    drift = next(d for d in told["drifts"] if d["statistic"] == "gain")
+    assert told["unit"] == "day"
     assert drift["rate_low"] <= -0.05 / 7 <= drift["rate_high"]
     assert main(["history", str(path), "--picture", "x.png"]) == 3
 

@@ -33,6 +33,7 @@ ACCURACY = 0.9
 _DAY = 86400.0  # seconds
 _SHOWN = 10  # entries of a list, in the text
 _OF_LINE, _OF_SENSOR = 0.5, 0.1  # share of the cells of a line, and of all cells, that must be known
+_ROBUST = 3  # cells of a line that must be known: the median of fewer follows a single cell
 _PLOTTED = 8  # series in the picture
 
 Floats = NDArray[np.float64]
@@ -124,7 +125,7 @@ class AgeingTable:
             of = [(Series(statistic), sensor)]
             for line in self.layout.lines:
                 on = self.layout.cells_on(line)
-                if "address" not in line.kind and 1 < len(on) < present.sum():
+                if "address" not in line.kind and _ROBUST <= len(on) < present.sum():
                     of.append((Series(statistic, line=line), _median(cells[:, on], _OF_LINE)))
             of += [(Series(statistic, cell=int(cell)), cells[:, cell]) for cell in np.flatnonzero(present)]
             names += [name for name, _ in of]
@@ -305,4 +306,5 @@ def _median(values: Floats, share: float) -> Floats:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a run in which none is known
         median = np.nanmedian(values, axis=1)
-    return np.where((~np.isnan(values)).mean(axis=1) >= share, median, np.nan)
+    known = np.count_nonzero(~np.isnan(values), axis=1)
+    return np.where(known >= max(_ROBUST, share * values.shape[1]), median, np.nan)

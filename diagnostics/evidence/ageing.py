@@ -1,9 +1,11 @@
 """Ageing: the condition of each cell in the recordings of one run, from which trends over many runs are estimated.
 
-Statistics, per cell, with the load l(t) = r(t) - b and the contact limit c = 5 % of full scale:
+Statistics, per cell, with the load l(t) = r(t) - b and the contact limit c = 5 % of the largest load in
+the reference:
 
     baseline   b = 5 % quantile of all r(t), if the 25 % quantile is within 2 % of full scale: the cell rests
-    peak       median, over contacts, of the highest load in each; a contact is a run of frames with l(t) > c
+    peak       median, over contacts, of the highest load in each; a contact is a run of frames with l(t) > c that
+               reaches 2 c
     gain       peak : peak in the reference
     offset     (b - b in the reference) / full scale
     noise      1.4826 / sqrt(6) * median |second difference| of the unloaded frames / full scale; median over recordings
@@ -27,7 +29,7 @@ from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
 
-_CONTACT = 0.05  # of full scale: a load above it is a contact
+_CONTACT = 0.05  # of the largest load in the reference: a load above it is a contact
 _LOW, _QUARTER = 0.05, 0.25  # quantiles of the readings of a cell that agree where it rests
 _QUIET = 0.02  # of full scale: so far they agree
 _CONTACTS, _LOADED, _UNLOADED = 5, 20, 8  # contacts and frames without which a statistic is NaN
@@ -75,7 +77,7 @@ def cell_condition(
         layout: the array.
     """
     old = _Measured.of([np.asarray(r, np.float64) for r in reference], layout)
-    new = _Measured.of([np.asarray(r, np.float64) for r in recordings], layout, old.baseline)
+    new = _Measured.of([np.asarray(r, np.float64) for r in recordings], layout, old)
     absent = ~layout.present.ravel()
     return CellCondition(
         *(
@@ -92,26 +94,32 @@ def cell_condition(
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """Peak, baseline and noise in the layout's unit, blinks per loaded frame, and whether it rests, ``[D]`` each."""
+    """Peak, baseline and noise in the layout's unit, blinks per loaded frame, whether it rests, ``[D]``; limit c."""
 
     peak: Floats
     baseline: Floats
     noise: Floats
     blinks: Floats
     rests: NDArray[np.bool_]
+    limit: float
 
     @classmethod
-    def of(cls, recordings: Sequence[Floats], layout: SensorLayout, otherwise: Floats | None = None) -> _Measured:
-        """Measure; ``otherwise`` is the baseline of cells that do not rest."""
-        limit, d = _CONTACT * layout.full_scale, layout.n_cells
+    def of(cls, recordings: Sequence[Floats], layout: SensorLayout, reference: _Measured | None = None) -> _Measured:
+        """Measure; the reference gives the limit of contacts, and the baseline of cells that do not rest."""
+        d = layout.n_cells
         recordings = [frames for frames in recordings if len(frames)]
         if not recordings:
-            return cls(*(np.full(d, np.nan) for _ in range(4)), np.zeros(d, bool))
+            return cls(*(np.full(d, np.nan) for _ in range(4)), np.zeros(d, bool), _CONTACT * layout.full_scale)
         blocks = [slice(first, first + _BLOCK) for first in range(0, d, _BLOCK)]
         pooled = (np.concatenate([frames[:, block] for frames in recordings]) for block in blocks)
         low, quarter = np.hstack([[_quantile(readings, share) for share in (_LOW, _QUARTER)] for readings in pooled])
         rests = quarter - low <= _QUIET * layout.full_scale
-        baseline = low if otherwise is None else np.where(rests, low, otherwise)
+        if reference is None:
+            largest = max((float(np.fmax.reduce(frames - low, axis=None)) for frames in recordings), default=np.nan)
+            usable = np.isfinite(largest) and largest > 0
+            baseline, limit = low, _CONTACT * min(largest if usable else layout.full_scale, layout.full_scale)
+        else:
+            baseline, limit = np.where(rests, low, reference.baseline), reference.limit
         cells, peaks, noise = [], [], []
         blinks, loaded = np.zeros(d), np.zeros(d)
         for frames in recordings:
@@ -125,7 +133,7 @@ class _Measured:
         enough = np.where(loaded >= _LOADED, loaded, np.nan)
         medians = _medians(np.concatenate(cells), np.concatenate(peaks), d)
         calm = np.where(rests, _quantile(np.stack(noise), 0.5), np.nan)
-        return cls(medians, baseline, calm, blinks / enough, rests)
+        return cls(medians, baseline, calm, blinks / enough, rests, limit)
 
 
 def _quantile(values: Floats, share: float) -> Floats:
@@ -151,7 +159,9 @@ def _contacts(load: Floats, limit: float) -> tuple[NDArray[np.intp], Floats, NDA
     blink = (cells[1:] == cells[:-1]) & (starts[1:] - ends[:-1] <= _LONGEST_BLINK)
     # In one step each way, and to about the same load: no contact does that.
     blink &= (before > 2 * limit) & (x[ends[:-1]] <= limit / 2) & (np.abs(after - before) <= _SAME * before)
-    return cells, np.maximum.reduceat(x, starts), cells[1:][blink]
+    peaks = np.maximum.reduceat(x, starts)
+    contact = peaks > 2 * limit  # noise divides a load near the limit into many contacts that end below
+    return cells[contact], peaks[contact], cells[1:][blink]
 
 
 def _medians(cells: NDArray[np.intp], values: Floats, d: int) -> Floats:

@@ -144,7 +144,7 @@ def test_runs_of_a_robot_show_the_cell_that_weakens_and_when_it_will_be_too_weak
         rng = np.random.default_rng(week)
         frames = [np.abs(np.concatenate([f, 0 * f]) + rng.normal(0, 0.01, (80, layout.n_cells))) for f in grasps.frames]
         for f in frames:
-            f[:, weak] *= np.exp(-0.05 * week)
+            f[:, weak] *= np.exp(-0.03 * week)
         save_npz(tmp_path / f"{week}.npz", Recordings(tuple(f.astype(np.float32) for f in frames), layout))
         day = (today + timedelta(days=7 * week)).isoformat()
         monkeypatch.setattr("adaptfault.robot.maintenance.now", lambda day=day: day)
@@ -163,7 +163,7 @@ def test_runs_of_a_robot_show_the_cell_that_weakens_and_when_it_will_be_too_weak
     assert {d["cell"] for d in told["drifts"]} == {weak}
     drift = next(d for d in told["drifts"] if d["statistic"] == "gain")
     assert told["unit"] == "day"
-    assert drift["rate_low"] <= -0.05 / 7 <= drift["rate_high"]
+    assert drift["rate_low"] <= -0.03 / 7 <= drift["rate_high"]
     assert main(["history", str(path), "--picture", "x.png"]) == 3
 
 

@@ -1,4 +1,4 @@
-"""adaptfault fleet maintain: maintains many robots in parallel and reports what the fleet needs."""
+"""adaptfault fleet: maintains many robots in parallel, reports what the fleet needs and how its sensors age."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ _EXAMPLE = """  adaptfault fleet maintain FLEET.toml --jobs 8
       or as bundles = "robots/*/robot.bundle" and recordings = "{bundle_dir}/recordings";
       after a crash the same command continues"""
 
+_SURVIVAL = """  adaptfault fleet survival FLEET.toml --picture survival.png
+      from the journals of the bundles: how long wires and cells last, and whom to service in the next 30 days"""
+
 
 def add(commands: Commands) -> None:
     """Add the command."""
@@ -18,7 +21,7 @@ def add(commands: Commands) -> None:
         "fleet",
         help="maintain many robots",
         description="Maintain many robots.",
-        epilog=f"example:\n{_EXAMPLE}",
+        epilog=f"example:\n{_EXAMPLE}\n{_SURVIVAL}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     inner = group.add_subparsers(dest="fleet_command", required=True, metavar="COMMAND")
@@ -38,6 +41,11 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("--out", metavar="FOLDER", help="of ledger and reports (default: FLEET.fleet)")
     parser.set_defaults(run=run)
+    parser = command(inner, "survival", "how long wires and cells last, and whom to service next", _SURVIVAL)
+    parser.add_argument("fleet", metavar="FLEET.toml", help="list of the robots")
+    parser.add_argument("--days", type=float, default=30.0, metavar="N", help="time ahead (default 30)")
+    parser.add_argument("--picture", metavar="FILE", help="write the survival curves as PNG")
+    parser.set_defaults(run=survival, writes=("picture",))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -66,3 +74,15 @@ def run(args: argparse.Namespace) -> int:
     say(args, f"report: {page}")
     emit(args, report.to_dict(), str(report))
     return report.exit_code
+
+
+def survival(args: argparse.Namespace) -> int:
+    """Tell how the sensors of a fleet age."""
+    from adaptfault.fleet.ageing import FleetSurvival
+    from adaptfault.fleet.listing import Fleet
+
+    found = FleetSurvival.of(Fleet.read(args.fleet), args.days)
+    if args.picture:
+        found.plot().savefig(args.picture, dpi=150)
+    emit(args, found.to_dict(), str(found))
+    return 0

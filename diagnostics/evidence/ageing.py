@@ -15,7 +15,8 @@ The noise equals the median absolute deviation of white noise (Rousseeuw and Cro
 slow loads. A statistic is NaN where the recordings do not tell: fewer than 5 contacts of the cell, here or in the
 reference, 20 loaded frames, or a cell that does not rest. Its gain then refers to the baseline of the reference.
 
-Not detected: what the contacts do not test. Other objects or tasks than in the reference change the gains of all cells.
+Not detected: what the contacts do not test. Loads that have become too weak to be contacts drop out, so that the gain of a
+cell of weak loads is too large. Other objects or tasks than in the reference change the gains of all cells.
 """
 
 from __future__ import annotations

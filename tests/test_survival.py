@@ -92,7 +92,7 @@ def test_the_command_line_reads_lifetimes_from_journals_and_names_whom_to_servic
     assert main([*arguments, "--json", "--picture", str(tmp_path / "s.png")]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (tmp_path / "s.png").stat().st_size > 1000
-    assert [robot["robot"] for robot in told["service"]][0] in "ab"
+    assert told["service"][0]["robot"] in "ab"
     assert {robot["robot"]: robot["known"] for robot in told["service"]} == {"a": 2, "b": 0}
     wires, cells = told["units"]["wires"], told["units"]["cells"]
     assert (wires["faults"], cells["faults"]) == (1, 1)

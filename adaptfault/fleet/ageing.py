@@ -105,7 +105,10 @@ class FleetSurvival:
             numbers = np.array(survival.next_faults(days))
             ahead[:, : numbers.shape[1]] += numbers
         watched = {int(r) for survival in units.values() for r in survival.lifetimes.robot}
-        service = [Service(fleet.robots[i].name, *map(float, ahead[:, i]), known[i]) for i in sorted(watched)]
+        service = [
+            Service(fleet.robots[i].name, float(ahead[0, i]), float(ahead[1, i]), float(ahead[2, i]), known[i])
+            for i in sorted(watched)
+        ]
         return cls(units, tuple(sorted(service, key=lambda s: (-s.faults, s.robot))), days, tuple(left_out))
 
     def __str__(self) -> str:
@@ -146,7 +149,9 @@ class FleetSurvival:
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(4 * len(self.units), 3), layout="constrained")
-        for axes, (kind, of) in zip(figure.subplots(1, len(self.units), squeeze=False)[0], self.units.items(), strict=True):
+        for axes, (kind, of) in zip(
+            figure.subplots(1, len(self.units), squeeze=False)[0], self.units.items(), strict=True
+        ):
             ages = np.linspace(0, of.lifetimes.end.max(), 200)
             axes.plot(ages, np.exp(-of.hazard(ages)), color="#c0392b", label="Weibull")
             if len(of.ages):
@@ -181,12 +186,16 @@ def _lifetimes(bundle: Bundle, commissioned: str | None, number: int) -> tuple[d
         half = (before + last) / 2
         faults = [Fault.from_dict(fault) for fault in run["faults"]]
         known = len(faults)
-        failed = {
+        failed: dict[str, set[Any]] = {
             "wires": {fault.line for fault in faults if fault.line is not None},
             "cells": {cell for fault in faults if fault.line is None for cell in fault.cells},
         }
-        behind = {cell for fault in faults if fault.line is not None for cell in fault.cells}
-        ends = [("wires", failed["wires"], True), ("cells", failed["cells"], True), ("cells", behind, False)]
+        behind: set[Any] = {cell for fault in faults if fault.line is not None for cell in fault.cells}
+        ends: list[tuple[str, set[Any], bool]] = [
+            ("wires", failed["wires"], True),
+            ("cells", failed["cells"], True),
+            ("cells", behind, False),
+        ]
         for kind, units, fault in ends:
             if half > entry and (gone := len(units & alive[kind])):
                 found[kind].append((entry, half, fault, number, gone))

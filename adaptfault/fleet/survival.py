@@ -114,8 +114,20 @@ class Survival:
         few = chi2.ppf((1 - COVERAGE) / 2, 2 * n / over) / 2 if n else 0.0
         many = chi2.ppf((1 + COVERAGE) / 2, 2 * n / over + 2) / 2
         rates = 1000 * over * np.array([few, many]) / exposure
-        bounds = (shape / margin, shape * margin)
-        return cls(lifetimes, ages, survival, low, high, shape, *bounds, scale, *map(float, rates), 1 / a)
+        return cls(
+            lifetimes=lifetimes,
+            ages=ages,
+            survival=survival,
+            low=low,
+            high=high,
+            shape=shape,
+            shape_low=float(shape / margin),
+            shape_high=float(shape * margin),
+            scale=scale,
+            rate_low=float(rates[0]),
+            rate_high=float(rates[1]),
+            spread=1 / a,
+        )
 
     def hazard(self, age: Floats | float) -> Floats:
         """Return the cumulative hazard H of a unit of the average robot at an age in days."""
@@ -137,7 +149,9 @@ class Survival:
         coming = life.units * (self.hazard(life.end + days) - self.hazard(life.end))
         ahead = np.bincount(life.robot[left], coming[left], len(expected))
         of = gamma(a + faults, scale=1 / (a + expected))
-        return ahead * of.mean(), ahead * of.ppf((1 - COVERAGE) / 2), ahead * of.ppf((1 + COVERAGE) / 2)
+        factors = (of.mean(), of.ppf((1 - COVERAGE) / 2), of.ppf((1 + COVERAGE) / 2))
+        mean, low, high = (np.asarray(ahead * factor, np.float64) for factor in factors)
+        return mean, low, high
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
@@ -170,7 +184,7 @@ def _weibull(life: Lifetimes) -> tuple[float, float, float]:
 
     def loss(log_shape: float) -> float:
         shape = float(np.exp(log_shape))
-        return -(n * np.log(shape) - n * np.log(total(shape)) + (shape - 1) * logs)
+        return float(-(n * np.log(shape) - n * np.log(total(shape)) + (shape - 1) * logs))
 
     if n < _FEWEST:
         return 1.0, longest * total(1.0) / n, 0.0
@@ -186,7 +200,8 @@ def _by_robot(life: Lifetimes, shape: float, scale: float) -> tuple[Floats, Floa
     """Return the expected and the observed number of faults of each robot, ``[robots]`` each."""
     expected = life.units * ((life.end / scale) ** shape - (life.entry / scale) ** shape)
     robots = int(life.robot.max()) + 1
-    return np.bincount(life.robot, expected, robots), np.bincount(life.robot, life.units * life.failed, robots)
+    of, faults = (np.bincount(life.robot, number, robots) for number in (expected, life.units * life.failed))
+    return of.astype(np.float64), faults.astype(np.float64)
 
 
 def _gamma_shape(expected: Floats, faults: Floats) -> float:

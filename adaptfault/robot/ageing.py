@@ -77,7 +77,9 @@ class AgeingTable:
         values, verdicts = np.full((len(rows), 4, d), np.nan), np.full((len(rows), d), Verdict.UNTESTED, np.int8)
         for i, (run, _, cells) in enumerate(rows):
             if len(cells) != 9 * d:
-                raise Damaged(f"{bundle.journal.path} is damaged: the condition of {d} cells in run {run} has a wrong size")
+                raise Damaged(
+                    f"{bundle.journal.path} is damaged: the condition of {d} cells in run {run} has a wrong size"
+                )
             values[i] = np.frombuffer(cells, "<f2", 4 * d).reshape(4, d)
             verdicts[i] = np.frombuffer(cells, np.int8, offset=8 * d)
         accuracy = {
@@ -218,13 +220,14 @@ class AgeingReport:
 
     def _told(self, trend: Trend) -> str:
         series, layout = self._of(trend), self.table.layout
-        low, high = sorted((trend.rate_low, trend.rate_high))
         span, every = (30, "30 days") if self.unit == "day" else (1, "run")
+        rates = [span * rate for rate in (trend.rate, trend.rate_low, trend.rate_high)]
         if series.statistic == "gain":
-            rate, low, high = (f"{100 * np.expm1(span * r):+.2g} %" for r in (trend.rate, low, high))
+            rate, low, high = (f"{100 * np.expm1(r):+.2g} %" for r in rates)
+        elif series.statistic in ("offset", "noise"):
+            rate, low, high = (f"{100 * r:+.2g} % of full scale" for r in rates)
         else:
-            unit = 100 if series.statistic in ("offset", "noise") else 1
-            rate, low, high = (f"{unit * span * r:+.2g}{' % of full scale' * (unit > 1)}" for r in (trend.rate, low, high))
+            rate, low, high = (f"{r:+.2g}" for r in rates)
         now = series.value(trend.now)
         text = f"{series.place(layout)}: {series.statistic} {now:.3g}, {rate} per {every} ({low} to {high})"
         if trend.limit is None or trend.crossing is None:
@@ -275,7 +278,7 @@ class AgeingReport:
         from matplotlib.figure import Figure
 
         drifts = {trend.series: trend for trend in self.shown[:_PLOTTED]}
-        chosen = list(drifts) or [i for i, s in enumerate(self.series) if s.line is s.cell is None][:4]
+        chosen = list(drifts) or [i for i, s in enumerate(self.series) if s.line is None and s.cell is None][:4]
         figure = Figure(figsize=(8, 1.9 * ((len(chosen) + 1) // 2) + 0.4), layout="constrained")
         grid = figure.subplots((len(chosen) + 1) // 2, 2, squeeze=False).ravel()
         for axes, index in zip(grid, chosen, strict=False):

@@ -15,8 +15,8 @@ The noise equals the median absolute deviation of white noise (Rousseeuw and Cro
 slow loads. A statistic is NaN where the recordings do not tell: fewer than 5 contacts of the cell, here or in the
 reference, 20 loaded frames, or a cell that does not rest. Its gain then refers to the baseline of the reference.
 
-Not detected: what the contacts do not test. Loads that have become too weak to be contacts drop out, so that the gain of a
-cell of weak loads is too large. Other objects or tasks than in the reference change the gains of all cells.
+Not detected: what the contacts do not test. Loads that have become too weak to be contacts drop out, so that the gain
+of a cell of weak loads is too large. Other objects or tasks than in the reference change the gains of all cells.
 """
 
 from __future__ import annotations
@@ -110,7 +110,9 @@ class _Measured:
         d = layout.n_cells
         recordings = [frames for frames in recordings if len(frames)]
         if not recordings:
-            return cls(*(np.full(d, np.nan) for _ in range(4)), np.zeros(d, bool), _CONTACT * layout.full_scale)
+            unknown = np.full(d, np.nan)
+            none = np.zeros(d, bool)
+            return cls(unknown, unknown, unknown, unknown, none, _CONTACT * layout.full_scale)
         blocks = [slice(first, first + _BLOCK) for first in range(0, d, _BLOCK)]
         pooled = (np.concatenate([frames[:, block] for frames in recordings]) for block in blocks)
         low, quarter = np.hstack([[_quantile(readings, share) for share in (_LOW, _QUARTER)] for readings in pooled])

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 import adaptfault as af
 from adaptfault.adaptation.reduced_model import phi
+from adaptfault.robot.trend import trends
 from diagnostics import (
     Diagnosis,
     Fault,
@@ -314,9 +315,29 @@ def forecast() -> Figure:
     return figure
 
 
+def ageing() -> Figure:
+    """Draw the gains of a weakening and of a stable cell over weekly runs, with what is reported of them."""
+    rng = np.random.default_rng(0)
+    when = 7.0 * np.arange(14)
+    gains = rng.normal(0, 0.05, (14, 40))
+    gains[:, 0] += np.log(0.97) * when / 7
+    found = {t.series: t for t in trends(when, gains, np.full(40, np.log(0.5)), np.full(40, np.log(2))).found}
+    figure, axes = panels(1, 1)
+    for cell, place in enumerate(axes):
+        place.plot(when, np.exp(gains[:, cell]), ".", color=BLUE)
+        place.axhline(0.5, color=GREY, linestyle=":")
+        place.set(xlabel="days", ylabel="gain", ylim=(0.3, 1.3), xlim=(-3, 200), title="no drift beyond chance")
+        if (trend := found.get(cell)) is not None and trend.crossing is not None:
+            days = np.linspace(when[0], when[-1] + trend.crossing)
+            place.plot(days, np.exp(trend.now + trend.rate * (days - when[-1])), color=RED)
+            place.set_title(f"crosses its limit in {trend.crossing:.0f} days")
+    return figure
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     "diagnosis": diagnosis,
     "events": events,
+    "ageing": ageing,
     "healthy-model": healthy_model,
     "evidence": evidence,
     "calibration": calibration,

@@ -105,7 +105,7 @@ def test_options_that_the_pages_name_exist(capsys):
     known = {module.__name__.rpartition(".")[2] for module in COMMANDS}
     for page in PAGES:
         for code in re.findall(r"`+([^`]*)`+", page.read_text()):
-            for command, rest in re.findall(r"^adaptfault (\w+(?: maintain)?)(.*)$", code, re.MULTILINE):
+            for command, rest in re.findall(r"^adaptfault (\w+(?: maintain| survival)?)(.*)$", code, re.MULTILINE):
                 assert command.split()[0] in known, f"{page.name}: {code}"
                 with pytest.raises(SystemExit):
                     main([*command.split(), "--help"])

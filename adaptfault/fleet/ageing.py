@@ -120,9 +120,8 @@ class FleetSurvival:
             )
             if of.shape_low < of.shape_high:
                 trend = "rises" if of.shape_low > 1 else "falls" if of.shape_high < 1 else "may be constant"
-                lines.append(
-                    f"  hazard {trend} with age: Weibull shape {of.shape:.2f} ({of.shape_low:.2f} to {of.shape_high:.2f})"
-                )
+                interval = f"{of.shape_low:.2f} to {of.shape_high:.2f}"
+                lines.append(f"  hazard {trend} with age: Weibull shape {of.shape:.2f} ({interval})")
             for age in _YEARS:
                 if age <= of.lifetimes.end.max() and len(of.ages):
                     share, low, high = of.at(age)

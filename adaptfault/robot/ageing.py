@@ -214,7 +214,7 @@ class AgeingReport:
             lines.append("no drift beyond chance")
             fewest = self.trends.fewest_runs
             if self.trends.tested and n < fewest:
-                lines.append(f"a steady drift of one cell alone can be told from {fewest} runs on")
+                lines.append(f"a steady drift of one cell alone needs {fewest} runs")
         lines += self._unproven()
         return "\n".join(lines)
 

@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 _EVENTS = 32  # contact events that are scored: a size
 _FRAMES = 64  # of an event, evenly spread: a size
 _FEWEST = 4  # events; fewer prove nothing
-_LINES = 16  # lines of one kind on a pad, the least expected ones, whose exchange is tried: a size
+_LINES, _FEW_LINES = 16, 4  # of one kind on a pad, the least expected, whose exchange is tried; on large arrays: sizes
+_WORK = 6400  # lines times cells, about: a size
 _LIMIT = 24.0  # log likelihood gained, all events together
 _WITHOUT = 2  # events without which there must be a gain too: one odd contact proves nothing
 _MOST_STEPS = 4  # permutations that are combined
@@ -195,6 +196,7 @@ def _events(recordings: Sequence[NDArray[np.float64]], scale: Scale) -> list[_Ev
 def _candidates(layout: SensorLayout, surplus: Floats, source: Cells) -> Iterator[_Candidate]:
     """Yield the permutations that are tried, each on top of ``source``; with declared wiring only exchanged pads."""
     grid, score = layout.grid(np.arange(layout.n_cells)), layout.grid(surplus)
+    most = int(np.clip(_WORK // layout.n_cells, _FEW_LINES, _LINES))  # fewer on large arrays, where each costs more
 
     def on_top(changed: NDArray[np.intp], text: str) -> _Candidate:
         return _Candidate(source[changed.ravel()], text)
@@ -203,7 +205,7 @@ def _candidates(layout: SensorLayout, surplus: Floats, source: Cells) -> Iterato
         for axis, kind in enumerate(("row", "column")):
             size = grid.shape[axis + 1]
             of_line = score[pad].sum(axis=1 - axis)
-            worst = np.sort(np.argsort(of_line)[:_LINES]).tolist()
+            worst = np.sort(np.argsort(of_line)[:most]).tolist()
             for a, b in combinations(worst, 2):
                 order = np.arange(size)
                 order[[a, b]] = b, a

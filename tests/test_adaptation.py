@@ -84,9 +84,10 @@ def test_phi_drops_exactly_the_faulty_cells():
         phi(x[..., :-1], F)
 
 
-def test_with_f_empty_the_logits_are_bit_identical(adapter):
+@pytest.mark.parametrize("method", ["auto", "fill"])
+def test_with_f_empty_the_logits_are_bit_identical(adapter, method):
     x = torch.from_numpy(adapter.validation.x)
-    adapted = adapter.adapt(FaultSet((), D), method="fill")
+    adapted = adapter.adapt(FaultSet((), D), method=method)
     with torch.no_grad():
         assert torch.equal(adapted.model(x), adapter.model(x))
 

@@ -254,6 +254,7 @@ def build(layout: SensorLayout, n_classes: int, length: int) -> nn.Module:
     return Recurrent(n_classes)
 
 
+@pytest.mark.slow
 def test_a_bundle_of_a_built_model_is_maintained_and_opens_only_where_its_builder_is_allowed(
     training, validation, tmp_path, monkeypatch
 ):

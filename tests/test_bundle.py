@@ -47,6 +47,7 @@ def test_what_new_versions_are_judged_on_was_never_learned_from(bundle):
     assert not learned & set(check.recording)
 
 
+@pytest.mark.slow
 def test_without_windows_to_judge_on_the_adapter_gives_up_half_of_its_validation(small_grasps, tmp_path):
     windows = make_windows(small_grasps.frames[::3], small_grasps.labels[::3], small_grasps.layout)
     validation = windows.select(windows.recording % 2 == 0)

@@ -77,6 +77,7 @@ def test_a_broken_row_is_diagnosed_adapted_to_and_the_repair_measured(home, smal
     assert accuracy["repaired"] > accuracy["healthy"] - 0.1
 
 
+@pytest.mark.slow
 def test_the_demo_runs_on_the_users_recordings_and_writes_a_report_that_needs_nothing_else(home, capsys):
     out = home / "demo"
     run = ["demo", "--recordings", str(home / "grasps.npz"), "--epochs", "3", "--out", str(out), "--quiet"]

@@ -27,7 +27,10 @@ PAGES = [*GUIDES, *sorted((HOME / "examples" / "compare").glob("*.md"))]
 WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text()]
 NOT_RUN = {"reproduce": "test_paper.py runs it, small"}
 # make test-all runs these, by the language of their blocks.
-SLOW = {"": ("README.md", "maintenance.md"), "python": ("robot-software.md",)}
+SLOW = {
+    "": ("README.md", "maintenance.md", "sensor.md"),
+    "python": ("robot-software.md", "diagnosis.md", "test-bench.md"),
+}
 QUICK = {
     "train": ["--epochs", "1"],
     "demo": ["--epochs", "1"],

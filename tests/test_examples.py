@@ -54,6 +54,7 @@ SLOW = {  # more than 7 s of CPU time
     "wrong_fault_set.py",
 }
 SLOW_ON_RECORDINGS = {
+    "any_model.py",
     "adaptation_figures.py",
     "compare_classification.py",
     "compare_keras.py",
@@ -98,6 +99,7 @@ def test_no_example_that_takes_recordings_is_left_out():
     assert takes == set(ON_RECORDINGS)
 
 
+@pytest.mark.slow
 def test_the_first_hour_ends_with_the_right_verdict_on_a_small_skin(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Every command runs in this process, because importing torch for each takes longer than all of them."""
     call, answer = tmp_path / "call", tmp_path / "answer"

@@ -9,7 +9,7 @@ from adaptfault.data.recordings import Recordings
 from diagnostics import Fault, SelfDiagnosis, inject
 
 
-@pytest.mark.parametrize("factor", [2.5, 10.0])
+@pytest.mark.parametrize("factor", [pytest.param(2.5, marks=pytest.mark.slow), 10.0])
 def test_verdicts_are_the_same_with_a_full_scale_stated_too_high(factor: float, small_grasps: Recordings):
     frames = [np.asarray(f, dtype=float) for f in small_grasps.frames]
     dead = [Fault("stuck", (cell,), value=1.3) for cell in (7, 40)] + [Fault("open", (cell,)) for cell in (18, 22, 52)]

@@ -122,7 +122,7 @@ def test_on_simulated_grasps_the_main_rows_hold(grasps: Recordings, fitted: Self
     check(GRASPS, bench)
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == "hand" else pytest.mark.slow) for n in REAL])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) for n in REAL])
 def test_on_real_arrays_the_main_rows_hold(name: str):
     if not REAL[name].available:
         pytest.skip("the real recordings are not here")

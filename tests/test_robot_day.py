@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from adaptfault.acquisition import format_packet
 from adaptfault.cli import main
@@ -48,6 +49,7 @@ def broken(recordings, *faults):
     return [inject(r, faults, LAYOUT) for r in recordings]
 
 
+@pytest.mark.slow
 def test_a_day_of_a_robots_life(bundle, later_grasps, broken_row, tmp_path, capsys):
     def here(*args: object) -> tuple[int, str]:
         """The same command within this process: starting another one, and its export, take longer."""

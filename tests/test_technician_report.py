@@ -102,6 +102,7 @@ def test_a_page_of_a_bundle_that_was_never_maintained(bundle, tmp_path, capsys):
     assert "No faulty cell is known" in text
 
 
+@pytest.mark.slow
 def test_a_bundle_of_raw_counts_reads_raw_recordings(small_grasps, later_grasps, tmp_path, capsys):
     table = tmp_path / "table.csv"
     table.write_text("cell,raw,force\n" + "".join(f"{c},0,0\n{c},4095,5\n" for c in range(60)))

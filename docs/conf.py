@@ -89,7 +89,10 @@ def public_name(app: Sphinx, env: BuildEnvironment, node: pending_xref, content:
 
 
 def described_elsewhere(app: Sphinx, what: str, name: str, thing: Any, skip: bool, options: Any) -> bool | None:
-    """Skip public names on the pages of modules: they have pages of their own."""
+    """Skip public names on the pages of modules, which have pages of their own, and what other packages describe."""
+    module = getattr(thing, "__module__", None)
+    if callable(thing) and module and not module.startswith(PUBLIC):
+        return True
     if what == "module" and any(thing is public for public in public_things()):
         return True
     return None

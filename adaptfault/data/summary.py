@@ -33,7 +33,7 @@ class Summary:
         step: the least difference between two readings that are not equal; None where no cell changes.
         missing: int ``[D]``, missing readings.
         classes: recordings of each class; empty without labels.
-        inferred: see :class:`adaptfault.data.recordings.Loaded`.
+        inferred: see :class:`~adaptfault.data.recordings.load.Loaded`.
     """
 
     layout: SensorLayout

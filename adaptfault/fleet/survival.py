@@ -5,11 +5,11 @@ last run (left truncation, right censoring). Three estimates:
 
     curve     Kaplan and Meier (1958), ``statsmodels.SurvfuncRight``, with log(-log) intervals
     Weibull   H(t) = (t / scale)^shape, maximum likelihood; with fewer than 5 faults shape = 1, a constant hazard
-    robot     multiplier ~ Gamma(a + k, a + E):  k faults, E expected by H; the spread 1 / a between robots by maximum
-              likelihood (negative binomial), so that robots with few data stay near the fleet
+    robot     multiplier ~ Gamma(a + k, a + E), with k faults where H expects E
 
-Faults of one robot are not independent where robots differ: all variances are multiplied by
-1 + sum E^2 / (a sum E), which equals the overdispersion of the negative binomial.
+The spread 1 / a between robots is the maximum likelihood estimate of a negative binomial, so that robots with few data
+stay near the fleet. Faults of one robot are not independent where robots differ: all variances are multiplied
+by 1 + sum E^2 / (a sum E), which equals the overdispersion of the negative binomial.
 
 Not detected: what no run has tested, effects of use where age does not measure it, second faults of a repaired unit.
 """

@@ -11,7 +11,7 @@ correlation rho of the n uncertain cells on the wire (design effect, Kish 1965):
 together. Minimum weight set cover, solved by enumeration or by ``scipy.optimize.milp``; q is re-estimated from the
 solution until it no longer changes. Wires with fewer than two tested cells are not found.
 
-With declared wiring the wires are buses and nested groups (:attr:`~diagnostics.layout.SensorLayout.groups`), which are
+With declared wiring the wires are buses and nested groups (``SensorLayout.groups``), which are
 broken as a whole. Of those that explain the same cells the innermost is named.
 """
 

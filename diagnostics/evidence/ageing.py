@@ -1,11 +1,9 @@
 """Ageing: the condition of each cell in the recordings of one run, from which trends over many runs are estimated.
 
-Statistics, per cell, with the load l(t) = r(t) - b and the contact limit c = 5 % of the largest load in
-the reference:
+Statistics, per cell, with the load l(t) = r(t) - b and the contact limit c = 5 % of the largest load in the reference:
 
     baseline   b = 5 % quantile of all r(t), if the 25 % quantile is within 2 % of full scale: the cell rests
-    peak       median, over contacts, of the highest load in each; a contact is a run of frames with l(t) > c that
-               reaches 2 c
+    peak       median, over contacts (runs of frames with l(t) > c that reach 2 c), of the highest load in each
     gain       peak : peak in the reference
     offset     (b - b in the reference) / full scale
     noise      1.4826 / sqrt(6) * median |second difference| of the unloaded frames / full scale; median over recordings

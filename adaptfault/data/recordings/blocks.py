@@ -69,7 +69,7 @@ class Stream:
 
     Attributes:
         layout: the array.
-        inferred: as in :class:`adaptfault.data.recordings.Loaded`.
+        inferred: as in :class:`~adaptfault.data.recordings.load.Loaded`.
         problems: errors and warnings; complete after an iteration.
 
     Raises:

@@ -50,7 +50,10 @@ def test_a_layout_file_is_read_and_its_scale_goes_before_the_archives(tmp_path):
     ],
 )
 def test_a_bad_layout_file_is_refused_with_the_field(tmp_path, content, expected):
-    path = write(tmp_path / "layout.json", content)
+    assert_refused(write(tmp_path / "layout.json", content), expected)
+
+
+def assert_refused(path, expected):
     with pytest.raises(InputError) as caught:
         read_layout(path)
     assert str(caught.value).startswith(str(path))
@@ -129,9 +132,4 @@ def test_recordings_keep_the_wiring_of_the_layout_file_beside_or_given(tmp_path)
     ],
 )
 def test_a_bad_toml_layout_is_refused_in_one_line(tmp_path, content, expected):
-    path = write(tmp_path / "layout.toml", content)
-    with pytest.raises(InputError) as caught:
-        read_layout(path)
-    assert str(caught.value).startswith(str(path))
-    assert expected in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert_refused(write(tmp_path / "layout.toml", content), expected)

@@ -28,18 +28,16 @@ def run(args: argparse.Namespace) -> int:
 
     from adaptfault.cli.trained_model import TrainedModel
     from adaptfault.data.windows import make_windows
-    from adaptfault.robot.bundle import Bundle
 
     trained = TrainedModel.open(args.model or args.bundle)
     if args.calibration is None and trained.calibration is not None:
         args.calibration = str(trained.calibration)
     recordings = load_recordings(args, args.recordings, layout=trained.network.layout)
     windows = make_windows(recordings.frames, None, recordings.layout, length=trained.network.length)
-    classifier = trained.adaptation or trained.network
-    (trained.adaptation.model if trained.adaptation is not None else trained.network).to(device(args))
+    trained.adaptation.model.to(device(args))
     # Exchanged wires are put back, as on the robot.
-    x = windows.x if args.bundle is None else windows.x[..., Bundle.open(args.bundle).active().source]
-    probabilities = classifier.predict_proba(x)
+    x = windows.x if trained.source is None else windows.x[..., trained.source]
+    probabilities = trained.adaptation.predict_proba(x)
     names = trained.class_names or tuple(f"class {i}" for i in range(probabilities.shape[1]))
     results = []
     for i, name in enumerate(recordings.names):
@@ -55,12 +53,11 @@ def run(args: argparse.Namespace) -> int:
                 "label": None if recordings.labels is None else recordings.class_names[recordings.labels[i]],
             }
         )
-    fault_set = [] if trained.adaptation is None else list(trained.adaptation.fault_set)
     result = {
         "schema": "adaptfault.predict/1",
         "layout": recordings.layout.to_dict(),
         "class_names": list(names),
-        "fault_set": fault_set,
+        "fault_set": list(trained.adaptation.fault_set),
         "predictions": results,
     }
     emit(args, result, _table(results))

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptfault.adaptation.fault_free import Network
 from adaptfault.adaptation.result import Adaptation
@@ -32,6 +33,7 @@ class TrainedModel:
         adaptation: the version that a bundle runs; of a model, its form for the healthy sensor, with the head in closed
             form if it has one.
         calibration: the bundle's table from raw counts to the layout's unit.
+        source: see ``Version.source``; None of a model.
     """
 
     network: Network
@@ -39,6 +41,7 @@ class TrainedModel:
     split_seed: int | None
     adaptation: Adaptation
     calibration: Path | None = None
+    source: NDArray[np.intp] | None = None
 
     @classmethod
     def open(cls, folder: str) -> TrainedModel:
@@ -53,8 +56,9 @@ class TrainedModel:
             seed = int(manifest["extra"].get("split_seed", 0))
             healthy = load_healthy(folder)
             return cls(healthy.model.network, tuple(manifest["class_names"]), seed, healthy)
-        active = Adaptation.load(bundle.active().folder)
-        return cls(active.model.network, bundle.class_names, None, active, bundle.parts.calibration)
+        version = bundle.active()
+        active = Adaptation.load(version.folder)
+        return cls(active.model.network, bundle.class_names, None, active, bundle.parts.calibration, version.source)
 
     def recordings(self, args: argparse.Namespace, paths: Sequence[str]) -> Recordings:
         """Read labelled recordings in the layout of the model.

@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ class Version:
     fault_set: FaultSet
     about: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
-    @property
+    @cached_property
     def source(self) -> NDArray[np.intp]:
         """int ``[D]``: cell i of the array answers at index ``source[i]``; its own index unless the wiring changed."""
         every = np.arange(self.layout.n_cells)

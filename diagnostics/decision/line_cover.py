@@ -39,14 +39,8 @@ _MIN_RATIO = -1.0  # log ratio that one uncertain cell can bring against its wir
 _UNCERTAIN_COST = np.log(10.0)  # more, where no cell on the wire is certain: at the edge of a contact errors are common
 _PROVEN = np.log(9.0)  # log odds from which on a wire is reported: single cells are the safer answer
 _ROUNDS = 5  # of re-estimating q, at most: a size
-_WIRES = (
-    "row",
-    "column",
-    "converter",
-    "position",
-    "bus",
-    "group",
-)  # that may be broken; address wires: see ``address_aliasing``
+# Wires that may be broken; address wires: see ``address_aliasing``.
+_WIRES = "row", "column", "converter", "position", "bus", "group"
 _IN_MIDDLE = "row", "column"  # wires that may be broken in their middle
 _FEW = 8  # wires up to which all sets are enumerated: a size
 

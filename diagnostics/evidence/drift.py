@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from diagnostics.healthy.prediction import log_student_t
+
 if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
     from diagnostics.preprocessing.scale import Array
@@ -101,8 +103,7 @@ def gain_evidence(
 
     def log_likelihood(gain: float) -> Array:
         """Return the log likelihood of a gain from each event on, ``[n, k]``."""
-        u = 1 + ((root - np.float32(np.sqrt(gain)) * mean) / (2 * spread)) ** 2
-        of_event = np.log((1 - _OUTLIERS) / (u * u * np.sqrt(u)) + _OUTLIERS)  # Student's t, 4 degrees of freedom
+        of_event = log_student_t((root - np.float32(np.sqrt(gain)) * mean) / spread, _OUTLIERS)
         return np.where(informative, counts * of_event, 0.0)[::-1].cumsum(axis=0)[::-1]
 
     chance = np.full(n, (1 - _FROM_START) / max(n - 1, 1))

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from diagnostics.events.contact_events import Summary, count_repeats
 from diagnostics.healthy.model import contact_events
+from diagnostics.healthy.prediction import log_student_t
 from diagnostics.preprocessing.readings import held
 
 if TYPE_CHECKING:
@@ -112,7 +113,8 @@ def find_rewiring(
     now = test.score(source)
     for _ in range(_MOST_STEPS):
         candidates = list(_candidates(layout, now.surplus, source))
-        gains = np.array([test.score(candidate.source).by_event - now.by_event for candidate in candidates])
+        scores = [test.score(candidate.source) for candidate in candidates]
+        gains = np.array([score.by_event - now.by_event for score in scores])
         sums = gains.sum(axis=1)
         best = int(sums.argmax())
         rivals = np.delete(sums, best)
@@ -120,9 +122,11 @@ def find_rewiring(
             break
         source, total = candidates[best].source, total + float(sums[best])
         steps.append(candidates[best].text)
-        now = test.score(source)
+        now = scores[best]
+    if not steps:
+        return None
     at_random = test.score(np.random.default_rng(0).permutation(layout.n_cells))
-    if not steps or now.surplus.sum() < _UNEXPLAINED * at_random.surplus.sum():
+    if now.surplus.sum() < _UNEXPLAINED * at_random.surplus.sum():
         return None
     return Rewiring(source, tuple(steps), total, len(events))
 
@@ -174,7 +178,7 @@ def _log_likelihood(expected: Prediction, features: Array) -> tuple[Floats, Floa
     logs = np.log(p)
     state = np.take_along_axis(logs, did[None], axis=0)[0]
     error = np.nan_to_num((features[:, 1] - expected.mean) / expected.spread, nan=np.inf)  # never loaded
-    load = np.where(did > 0, np.log((1 - _OUTLIERS) / (1 + error**2 / 4) ** 2.5 + _OUTLIERS), 0.0)
+    load = np.where(did > 0, log_student_t(error, _OUTLIERS), 0.0)
     return state + load, (p * logs).sum(axis=0)
 
 

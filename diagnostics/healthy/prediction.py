@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,16 @@ class Prediction:
         likely = _student_t((high - mean) / spread) - _student_t((low - mean) / spread)
         p = (1 - _OUTLIERS) * likely + _OUTLIERS * (np.minimum(high, 1.0) - low)
         return np.where(np.isnan(spread), 1.0, p)
+
+
+def log_student_t(error: NDArray[Any], outliers: float) -> NDArray[Any]:
+    """Return the log density of standardised errors, contaminated by a share of ``outliers``; up to a constant.
+
+    ``log((1 - outliers) t_4(error) / t_4(0) + outliers)``, as ``scipy.stats.t(4).pdf``; the dtype of ``error`` is kept.
+    """
+    u = 1 + (error / 2) ** 2
+    log_density: NDArray[Any] = np.log((1 - outliers) / (u * u * np.sqrt(u)) + outliers)
+    return log_density
 
 
 def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:

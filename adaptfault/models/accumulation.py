@@ -1,4 +1,4 @@
-"""One decision for a whole contact: class probabilities accumulated over its windows, reset at its release. Numpy only.
+"""One decision for a whole contact: class probabilities accumulated over its windows, reset at its release.
 
 The windows of one contact are dependent. With n windows of independent frames so far, the accumulated probabilities are
 
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
 _REST = 0.1  # quantile of a cell's readings that is its reading without contact
 _BEGINS = 0.1  # load at which a contact begins, as a share of the median peak load of a recording
@@ -120,7 +121,7 @@ class ContactDecision:
         self._count += 1
         n = 1 + (self._count - 1) / self.length
         effective = n / (1 + (n - 1) * self.statistics.dependence)
-        return _softmax(effective * self._sum / self._count).astype(np.float32)
+        return softmax(effective * self._sum / self._count).astype(np.float32)
 
     def _follow(self, load: float) -> None:
         """Decide whether there is a contact; forget the last one at its release."""
@@ -147,12 +148,7 @@ def _dependence(probabilities: NDArray[Any], y: NDArray[np.int64], recording: ND
         means[of_it] = logs[of_it].cumsum(axis=0) / n[of_it, None]
 
     def loss(rho: float) -> float:
-        likely = _softmax((n / (1 + (n - 1) * rho))[:, None] * means)
+        likely = softmax((n / (1 + (n - 1) * rho))[:, None] * means, axis=1)
         return float(-np.log(np.maximum(likely[np.arange(len(y)), y], _LEAST)).mean())
 
     return float(minimize_scalar(loss, bounds=(0.0, 1.0), method="bounded").x) if n.max() > 1 else 1.0
-
-
-def _softmax(logits: NDArray[np.float64]) -> NDArray[np.float64]:
-    raised = np.exp(logits - logits.max(axis=-1, keepdims=True))
-    return np.asarray(raised / raised.sum(axis=-1, keepdims=True))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.robot.checksummed_json import Damaged
+from adaptfault.robot.sensor_state import TECHNICIAN_BELOW
 from adaptfault.robot.trend import COVERAGE, FALSE, Trend, Trends, trends
 from diagnostics.decision.result import Verdict
 from diagnostics.evidence.ageing import STATISTICS, CellCondition
@@ -26,9 +27,6 @@ SCHEMA = "adaptfault.trend/1"
 
 LIMITS = {"gain": (0.5, 2.0), "offset": (-0.05, 0.05), "noise": (-np.inf, 0.05), "blinks": (-np.inf, 0.05)}
 """Limits of a cell: the wrong gain, offset, noise and rate of blinks that the diagnosis takes for a fault."""
-
-ACCURACY = 0.9
-"""Limit of the accuracy, as a share of the fault-free one, from which on a person is needed."""
 
 _DAY = 86400.0  # seconds
 _SHOWN = 10  # entries of a list, in the text
@@ -135,7 +133,7 @@ class AgeingTable:
             limits += [(low, high)] * len(of)
         names.append(Series("accuracy"))
         columns.append(self.accuracy)
-        limits.append((ACCURACY, np.inf))
+        limits.append((TECHNICIAN_BELOW, np.inf))
         return names, np.stack(columns, axis=1), *np.array(limits).T
 
 

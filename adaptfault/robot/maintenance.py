@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -22,7 +23,7 @@ from adaptfault.robot.plausibility import contradiction, implausible
 from adaptfault.robot.pointer import Pointer
 from adaptfault.robot.sensor_state import TECHNICIAN_BELOW, UNTESTED, judged_before, unhandled_cells, weak_base
 from adaptfault.robot.versions import Version
-from diagnostics import Diagnosis, Fault, FaultSet
+from diagnostics import Diagnosis, Fault, FaultSet, SelfDiagnosis
 from diagnostics.evidence.ageing import cell_condition
 from diagnostics.evidence.sensor_change import SensorChange, sensor_change
 
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.data.windows import Windows
-    from adaptfault.robot.versions import Version
     from diagnostics.evidence.rewiring import Rewiring
 
 SCHEMA = "adaptfault.maintenance/1"
@@ -241,13 +241,17 @@ class _Maintenance:
             return self._report("refused", _UNKNOWN, "no recording is usable", self.before)
         self.say(f"diagnosing {len(usable)} new recordings")
         frames = [r.frames[:, self.version.source] for r in usable if r.frames is not None]
-        rewiring = bundle.diagnoser().rewiring(frames)
+        rewiring = self.diagnoser.rewiring(frames)
         if rewiring is not None:
             frames = [rewiring.undo(recording) for recording in frames]
             if not self.dry_run:
                 self.version = self._undone(rewiring)
-        report = self._decide(bundle.diagnoser().diagnose(frames), frames, tuple(r.name for r in usable))
-        report = self._with_change(self._with_coverage(report), frames)
+        diagnosis = self.diagnoser.diagnose(frames)
+        report = self._decide(diagnosis, frames, tuple(r.name for r in usable))
+        loads, healthy = self._loads(frames)
+        report = self._with_change(self._with_coverage(report), loads, healthy)
+        if report.used:
+            self.condition = encode(cell_condition(loads, healthy, bundle.layout), diagnosis.verdicts)
         if rewiring is not None:
             undone = "a new version would undo it" if self.dry_run else f"version {self.version.number} undoes it"
             report = replace(
@@ -260,6 +264,25 @@ class _Maintenance:
         if not self.dry_run:
             self._write(report, usable)
         return report
+
+    @cached_property
+    def diagnoser(self) -> SelfDiagnosis:
+        """The fitted diagnosis of the bundle."""
+        return self.bundle.diagnoser()
+
+    @cached_property
+    def adapter(self) -> Adapter:
+        """The adapter of the bundle, with the fault-free model and windows."""
+        return self.bundle.parts.adapter()
+
+    def _loads(self, frames: list[NDArray[np.float64]]) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
+        """Return new recordings, and the healthy ones of the bundle, as loads, ``[T, D]`` each."""
+        layout, train, load = self.bundle.layout, self.adapter.train, self.diagnoser.load_
+        healthy = [
+            train.x[train.recording == number].reshape(-1, layout.n_cells) * layout.full_scale
+            for number in np.unique(train.recording)
+        ]
+        return (frames, healthy) if load is None else ([*map(load.loads, frames)], [*map(load.loads, healthy)])
 
     def _undone(self, rewiring: Rewiring) -> Version:
         """Deploy the running model as a version that puts the readings back."""
@@ -281,23 +304,15 @@ class _Maintenance:
         reason = f"the recordings test only {share:.0%} of the cells, so faults may be hidden; {report.reason}"
         return replace(report, exit_code=self.untested_code, reason=reason)
 
-    def _with_change(self, report: MaintenanceReport, frames: list[NDArray[np.float64]]) -> MaintenanceReport:
-        """Return the report with a change of the whole sensor, and its effect on the accuracy; measure the cells."""
+    def _with_change(
+        self, report: MaintenanceReport, loads: list[NDArray[Any]], reference: list[NDArray[Any]]
+    ) -> MaintenanceReport:
+        """Return the report with a change of the whole sensor, and its effect on the accuracy; see :meth:`_loads`."""
         from adaptfault.adaptation.result import Adaptation
 
-        layout = self.bundle.layout
-        train = self.bundle.parts.adapter().train
-        reference = [
-            train.x[train.recording == number].reshape(-1, layout.n_cells) * layout.full_scale
-            for number in np.unique(train.recording)
-        ]
-        load = self.bundle.diagnoser().load_
-        if load is not None:
-            frames, reference = [*map(load.loads, frames)], [*map(load.loads, reference)]
-        if report.diagnosis is not None and report.used:
-            self.condition = encode(cell_condition(frames, reference, layout), report.diagnosis.verdicts)
+        layout, load = self.bundle.layout, self.diagnoser.load_
         healthy = np.flatnonzero(layout.present.ravel() & ~report.fault_set.mask)
-        change = sensor_change(frames, reference, layout, healthy) if len(healthy) else None
+        change = sensor_change(loads, reference, layout, healthy) if len(healthy) else None
         if change is None:
             return report
         windows = with_faults(self.bundle.parts.check_windows(), report.faults, layout)
@@ -306,8 +321,8 @@ class _Maintenance:
         changed = (windows.x * change.gain + change.offset / layout.full_scale).astype(np.float32)
         if load is not None:
             readings = windows.x.astype(np.float64) * layout.full_scale
-            loads = load.loads(readings) * change.gain + change.offset
-            changed = (load.readings(loads, readings < load.rest) / layout.full_scale).astype(np.float32)
+            changed_loads = load.loads(readings) * change.gain + change.offset
+            changed = (load.readings(changed_loads, readings < load.rest) / layout.full_scale).astype(np.float32)
         after = float((model.predict(changed) == windows.y).mean())
         effect = f"{change.reason}; accuracy of version {report.version} {before:.3f} -> {after:.3f} with this change"
         code = max(report.exit_code, 2 if after < TECHNICIAN_BELOW * before else 1)
@@ -320,7 +335,7 @@ class _Maintenance:
         known = self.before.merged(diagnosis)
         faulty = known.fault_set
         found: dict[str, Any] = {"diagnosis": diagnosis, "used": used}
-        adapter = self.bundle.parts.adapter()
+        adapter = self.adapter
         present = FaultSet(tuple(np.flatnonzero(self.bundle.layout.present).tolist()), faulty.n_cells)
         if not present - faulty:
             reason = "no healthy cell is left to predict from: replace the sensor"
@@ -393,7 +408,7 @@ class _Maintenance:
         try:
             model = Adaptation.load(self.bundle.versions[1].folder)
         except (Damaged, FileNotFoundError):
-            return float((self.bundle.parts.adapter().model.predict(windows.x) == windows.y).mean())
+            return float((self.adapter.model.predict(windows.x) == windows.y).mean())
         return float((model.predict(windows.x) == windows.y).mean())
 
     def _version_for(self, faulty: FaultSet) -> Version | None:

@@ -22,6 +22,7 @@ from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference import Reference, highest_reading, living, tolerance_of
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
+from diagnostics.preprocessing.baseline import CERTAIN_RATIO
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
 
@@ -29,9 +30,7 @@ SCHEMA = "adaptfault.diagnoser/10"
 
 _CERTAIN = 0.999  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
 _SUSPICIOUS_COLD = 3.0  # raw log ratio from which on a cell is no predictor, in a cold start
-_KNOWN = 9.0  # log likelihood ratio of a cell that was dead in the reference already
 _GROUP_SHARE = 0.5  # share of the evidence added with a group excluded, see _weight_of_groups
-_BEFORE_MODEL, _BEFORE_CALIBRATION = 0.02, 0.15  # share of the time of a fit that is over; for the progress only
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
 
 
@@ -96,14 +95,8 @@ class SelfDiagnosis:
         # Fractions of full scale refer to the range that was seen: a stated one may be too high.
         layout = replace(layout, full_scale=min(layout.full_scale, highest_reading(healthy, layout)))
         dead = find_reference_faults(healthy, layout, tolerance_of(healthy, layout), self._diagnosed_cold)
-        progress(_BEFORE_MODEL)
         self.reference_ = Reference.fit(healthy, layout, dead)
-        progress(_BEFORE_CALIBRATION)
-        self.calibrator_ = Calibrator.fit(
-            healthy,
-            living(layout, dead),
-            progress=lambda share: progress(_BEFORE_CALIBRATION + (1 - _BEFORE_CALIBRATION) * share),
-        )
+        self.calibrator_ = Calibrator.fit(healthy, living(layout, dead), progress=progress)
         progress(1.0)
         return self
 
@@ -298,7 +291,7 @@ class SelfDiagnosis:
             ),
             probability=probability,
             # A cell at rest supports a broken line by the events alone, without the prior of its value.
-            weight=np.where(known, _KNOWN, self.calibrator_.calibrate(spatial.surprisal, temporal, kind)),
+            weight=np.where(known, CERTAIN_RATIO, self.calibrator_.calibrate(spatial.surprisal, temporal, kind)),
             events=np.where(intermittent, intermittency.blinks, spatial.events),
             known=known,
         )

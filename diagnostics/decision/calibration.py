@@ -29,6 +29,7 @@ from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.calibration_subset import calibration_subset
 from diagnostics.healthy.reference import Reference
+from diagnostics.preprocessing.baseline import FEWEST
 from diagnostics.simulation.injection import inject
 
 if TYPE_CHECKING:
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 _LOGS, _LOGS_OF_LARGE = 192, 32  # simulated logs: sizes; large arrays have more cells in each
 _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
 _DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
-_FEWEST_RECORDINGS = 8  # below that the reference cannot be split
 _FEWEST_CELLS = 10  # broken, and healthy, cells of a kind: with fewer it keeps the defaults
 _ENOUGH = 100  # recordings that are held out in all, over the splits
 _FEW = 32  # recordings: fewer are cut into pieces, so that one long recording can be split
@@ -46,7 +46,6 @@ _REFERENCE_TIME = 50  # of fitting a reference, in diagnoses of a simulated log;
 _MOST_FRAMES = 600  # of a recording in one simulated log: a size
 _TRAINING_SHARE = 0.75  # of the recordings; the others make the simulated logs
 _MOST_TEMPORAL = 1.0  # upper limit of d: a jump alone proves no fault
-_KINDS = 3
 _SUSPICIOUS = 2.8  # calibrated log ratio from which on a cell is excluded from the predictors
 _SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw log ratio at that point
 _MAX_DISCOUNT, _HALF_DISCOUNT = 0.5, 22.0  # of the slopes; recordings held out that halve it (one split)
@@ -111,7 +110,7 @@ class Calibrator:
             for i in rng.permutation(len(recordings)).tolist()
             for piece in np.array_split(recordings[i], np.clip(len(recordings[i]) // _PIECE, 1, cuts))
         ]
-        if len(recordings) < _FEWEST_RECORDINGS:
+        if len(recordings) < FEWEST:
             return cls()
         order = np.arange(len(recordings))
         n_training = round(_TRAINING_SHARE * len(order))
@@ -158,7 +157,7 @@ class Calibrator:
         evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
         default = cls()
         found = list(zip(default.offset, default.slope, default.temporal, strict=True))
-        for k in range(_KINDS):
+        for k in range(len(found)):
             of, same_origin = kind == k, (kind > 0) == (k > 0)
             if min(dead[of].sum(), (~dead[of]).sum()) >= _FEWEST_CELLS:
                 base = float(logit(dead[same_origin].mean()))

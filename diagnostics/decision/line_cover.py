@@ -32,7 +32,7 @@ _CONTRADICTION_COST = np.log(1000.0)  # one working cell in 1000 is wrongly call
 _MOST_CONTRADICTIONS = 1  # working cells on a wire that can still be broken
 _RAREST, _MOST_COMMON = 0.005, 0.5  # bounds on the prevalence q, which few cells cannot estimate
 _MIN_SUPPORT, _SUPPORT_SHARE = 2, 1 / 3  # supporting cells of a broken wire, and share of its tested cells
-_SUPPORTING = 2.5  # log ratio of a supporting cell
+SUPPORTING = 2.5  # log ratio of a supporting cell
 _TESTED = 0.3  # log ratio of a tested cell
 _CORRELATION, _MAX_CORRELATION = 0.0125, 0.3  # rho per cell on the line (long lines run along edges), and at most
 _MIN_RATIO = -1.0  # log ratio that one uncertain cell can bring against its wire
@@ -120,7 +120,7 @@ def candidate_groups(
         weight: float ``[D]``, an upper estimate of the log likelihood ratio.
         layout: the array.
     """
-    supporting, groups = consistent & (weight >= _SUPPORTING), []
+    supporting, groups = consistent & (weight >= SUPPORTING), []
     pads = set(np.flatnonzero(layout.grid(supporting).sum(axis=(1, 2)) >= _MIN_SUPPORT).tolist())
     enough = bool(pads) if layout.is_matrix else supporting.sum() >= _MIN_SUPPORT
     for line in layout.lines if enough else ():
@@ -175,7 +175,7 @@ def _explain_pad(
     common: float,
 ) -> list[Cause]:
     weight = np.where(consistent, np.maximum(weight, _MIN_RATIO), 0.0)
-    supporting = consistent & (faulty | (weight >= _SUPPORTING))
+    supporting = consistent & (faulty | (weight >= SUPPORTING))
     tested_cells = consistent & (faulty | (weight > _TESTED))
     candidates = []
     lines = layout.lines if supporting.sum() >= 2 else ()

@@ -16,17 +16,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.decision.line_cover import Cause, solve
+from diagnostics.decision.line_cover import SUPPORTING, Cause, solve
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, LineKind, SensorLayout
+from diagnostics.preprocessing.scale import SLIGHT
 from diagnostics.wiring import action, counted
 
 if TYPE_CHECKING:
     from diagnostics.decision.address_aliasing import Aliasing
 
-_SAME_VALUE = 0.02  # of full scale: stuck cells whose values differ by less may share a cause
 _SAME_KIND = 1 / 3  # share of the single faults that are of one kind: open, short or stuck
-_LEADING = 2.5  # log ratio of cells that date the break of a wire, where no cell is certainly faulty
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -102,7 +101,7 @@ def _causes(
         contradicting = found.alive | (found.faulty & ~consistent) | aliased
         if kind in (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK):
             # A cell that became constant before the wire broke does not contradict it.
-            leading = faulty if faulty.any() else consistent & (found.weight >= _LEADING)
+            leading = faulty if faulty.any() else consistent & (found.weight >= SUPPORTING)
             begun = int(np.median(found.since[leading])) if leading.any() else 0
             contradicting &= ~(consistent & ~faulty & (found.since <= begun) & (begun > 0))
             contradicting |= ~consistent & ~found.silent
@@ -148,7 +147,7 @@ def _groups(found: CellFindings, full_scale: float) -> list[tuple[FaultKind, Mas
     at_an_end = found.full if found.zero is None else found.full | found.zero
     intermediate = np.flatnonzero(constant & ~found.rests & ~at_an_end)
     intermediate = intermediate[np.argsort(value[intermediate])]
-    for cells in np.split(intermediate, np.flatnonzero(np.diff(value[intermediate]) > _SAME_VALUE * full_scale) + 1):
+    for cells in np.split(intermediate, np.flatnonzero(np.diff(value[intermediate]) > SLIGHT * full_scale) + 1):
         if len(cells):
             mask = np.zeros(len(faulty), bool)
             mask[cells] = True
@@ -161,7 +160,7 @@ def _fault(kind: FaultKind, value: float | None, cause: Cause, found: CellFindin
     if kind in (FaultKind.STUCK, FaultKind.OPEN, FaultKind.INTERMITTENT) and not found.silent[seen[0]]:
         value = float(np.median(found.value[seen]))
         if found.zero is not None and kind is FaultKind.OPEN:  # at rest, which is not the lower end
-            low, high = _SAME_VALUE * layout.full_scale, (1 - _SAME_VALUE) * layout.full_scale
+            low, high = SLIGHT * layout.full_scale, (1 - SLIGHT) * layout.full_scale
             kind = FaultKind.SHORT if value >= high else FaultKind.OPEN if value <= low else FaultKind.STUCK
     start = int(np.median(found.since[seen]))
     fault = Fault(

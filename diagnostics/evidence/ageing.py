@@ -26,15 +26,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.evidence.intermittency import ALIKE, LONGEST_BLINK
 from diagnostics.layout import SensorLayout
+from diagnostics.preprocessing.readings import CELLS
+from diagnostics.preprocessing.scale import LIGHT, SLIGHT
 
-_CONTACT = 0.05  # of the largest load in the reference: a load above it is a contact
 _LOW, _QUARTER = 0.05, 0.25  # quantiles of the readings of a cell that agree where it rests
-_QUIET = 0.02  # of full scale: so far they agree
 _CONTACTS, _LOADED, _UNLOADED = 5, 20, 8  # contacts and frames without which a statistic is NaN
-_LONGEST_BLINK = 6  # frames
-_SAME = 0.3  # of a load: largest difference before and after a blink
-_BLOCK = 512  # cells processed together: a size
 
 Floats = NDArray[np.float64]
 
@@ -110,15 +108,15 @@ class _Measured:
         if not recordings:
             unknown = np.full(d, np.nan)
             none = np.zeros(d, bool)
-            return cls(unknown, unknown, unknown, unknown, none, _CONTACT * layout.full_scale)
-        blocks = [slice(first, first + _BLOCK) for first in range(0, d, _BLOCK)]
+            return cls(unknown, unknown, unknown, unknown, none, LIGHT * layout.full_scale)
+        blocks = [slice(first, first + CELLS) for first in range(0, d, CELLS)]
         pooled = (np.concatenate([frames[:, block] for frames in recordings]) for block in blocks)
         low, quarter = np.hstack([[_quantile(readings, share) for share in (_LOW, _QUARTER)] for readings in pooled])
-        rests = quarter - low <= _QUIET * layout.full_scale
+        rests = quarter - low <= SLIGHT * layout.full_scale
         if reference is None:
             largest = max((float(np.fmax.reduce(frames - low, axis=None)) for frames in recordings), default=np.nan)
             usable = np.isfinite(largest) and largest > 0
-            baseline, limit = low, _CONTACT * min(largest if usable else layout.full_scale, layout.full_scale)
+            baseline, limit = low, LIGHT * min(largest if usable else layout.full_scale, layout.full_scale)
         else:
             baseline, limit = np.where(rests, low, reference.baseline), reference.limit
         cells, peaks, noise = [], [], []
@@ -157,9 +155,9 @@ def _contacts(load: Floats, limit: float) -> tuple[NDArray[np.intp], Floats, NDA
     if not len(starts):
         return cells, np.zeros(0), cells
     before, after = x[ends[:-1] - 1], x[starts[1:]]
-    blink = (cells[1:] == cells[:-1]) & (starts[1:] - ends[:-1] <= _LONGEST_BLINK)
+    blink = (cells[1:] == cells[:-1]) & (starts[1:] - ends[:-1] <= LONGEST_BLINK)
     # In one step each way, and to about the same load: no contact does that.
-    blink &= (before > 2 * limit) & (x[ends[:-1]] <= limit / 2) & (np.abs(after - before) <= _SAME * before)
+    blink &= (before > 2 * limit) & (x[ends[:-1]] <= limit / 2) & (np.abs(after - before) <= ALIKE * before)
     peaks = np.maximum.reduceat(x, starts)
     contact = peaks > 2 * limit  # noise divides a load near the limit into many contacts that end below
     return cells[contact], peaks[contact], cells[1:][blink]

@@ -23,6 +23,7 @@ from scipy.special import expit, logit, softmax
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, count_repeats
+from diagnostics.healthy.prediction import MEDIAN_ERROR
 from diagnostics.preprocessing.scale import Array, Scale
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ P_MIN = 1e-4  # lower limit of P in one event: models err
 SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
 _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 _FIT_WEIGHT = 0.5  # factor on the log likelihood of the moving cells: neighbours err together
-_MEDIAN_ERROR = 0.741  # median of |t| with 4 degrees of freedom
 _PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit of the inflation
 _REPEATS, _THE_SAME = 0.15, 0.95  # correlation of events that load the same cells, and cosine of their mean loads
 
@@ -193,10 +193,10 @@ def _inflation(expected: Prediction, features: Array, working: Mask) -> Floats:
     known = working & np.isfinite(expected.spread)
     loaded = features[:, 2, known] > 0
     error = np.abs(features[:, 1, known] - expected.mean[:, known]) / expected.spread[known]
-    error = np.column_stack([np.where(loaded, error, np.inf), np.full((len(features), _PRIOR_CELLS), _MEDIAN_ERROR)])
+    error = np.column_stack([np.where(loaded, error, np.inf), np.full((len(features), _PRIOR_CELLS), MEDIAN_ERROR)])
     middle = (loaded.sum(axis=1) + _PRIOR_CELLS) // 2
     half: Floats = np.sort(error, axis=1)[np.arange(len(features)), middle]
-    return np.clip(half / _MEDIAN_ERROR, 1.0, _MAX_INFLATION)
+    return np.clip(half / MEDIAN_ERROR, 1.0, _MAX_INFLATION)
 
 
 def _tempered(never: Floats, unloaded: NDArray[np.bool_], working: NDArray[np.bool_]) -> Floats:

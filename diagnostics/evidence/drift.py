@@ -3,12 +3,12 @@
 The evidence of an offset is the sum of -log P(loaded throughout | other cells) over the last events, as far as the cell
 is loaded throughout each. That of a gain g is the log likelihood ratio
 
-    log sum_{g, s} P(g) P(s) L_s(g) / max_{0.75 <= h <= 1.33} L_s(h),    L_s(g) = prod_{e >= s} t_4(y_e; sqrt(g) m_e)
+    log sum_{g, s} P(g) P(s) L_s(g) / max_{1/1.3 <= h <= 1.3} L_s(h),    L_s(g) = prod_{e >= s} t_4(y_e; sqrt(g) m_e)
 
 over gains g and change points s, for root loads y and predicted means m, with a contaminated Student t: Bayesian change
 point detection (Barry and Hartigan 1993) for one change of scale. Both need several events, because objects have edges
 and a reading may hold a residue of the last load. Offsets below 2 % of full scale and gains
-between 0.75 and 1.33 are not detected.
+between 1/1.3 and 1.3 are not detected.
 """
 
 from __future__ import annotations
@@ -19,25 +19,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from diagnostics.healthy.prediction import log_student_t
+from diagnostics.healthy.prediction import MEDIAN_ERROR, OUTLIERS, log_student_t
+from diagnostics.preprocessing.baseline import MARGIN
+from diagnostics.preprocessing.scale import SLIGHT
 
 if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
     from diagnostics.preprocessing.scale import Array
 
-_OFFSET = 9.5  # log evidence from which on a cell has an offset: four events
-_MIN_OFFSET = 0.02  # of full scale, of the mean load: a smaller offset does no harm
-_MAX_PER_EVENT = 3.0  # log evidence of an offset that one event can bring
-_GAIN = 7.0  # log evidence from which on a cell has another gain: three events
 _FEWEST = 3  # events; fewer prove no gain
-_MARGIN = 1.5  # times the largest evidence that any healthy cell reached
 _OUTLIERS = 0.05  # share of events that are independent of the gain: none brings more than log 20
+_CERTAIN = 7.0  # log evidence from which on a cell drifts: a prior of one in a thousand
 _GAINS = np.array([0.1, 0.2, 0.35, 0.5, 2.0, 3.0])  # faulty gains: a grid
-_AS_GOOD = np.array([0.75, 1.0, 1.33])  # gains that are no fault: the mean may err by as much
+GAIN = 1.3  # up or down: a smaller change is no fault, the mean may err by as much
 _LOADED = 2.0  # times the lowest root load that counts as loaded: expected in an event that tests the gain
 _FROM_START = 0.5  # prior that a wrong gain is wrong from the start of the log
-
-_MEDIAN = 0.741  # median of |t| with 4 degrees of freedom
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -51,9 +47,9 @@ def offset_evidence(whole: Array, always: Floats, moving: Mask) -> Floats:
         always: ``[n, D]``, P(loaded throughout) of a healthy cell.
         moving: bool ``[D]``, cells that move.
     """
-    loaded = (whole[:, 3] == 1) & (whole[:, 1] ** 2 >= _MIN_OFFSET)
+    loaded = (whole[:, 3] == 1) & (whole[:, 1] ** 2 >= SLIGHT)
     lasting = np.logical_and.accumulate(loaded[::-1])[::-1]  # unbroken up to the end
-    surprisal = -np.log(np.maximum(always, np.exp(-_MAX_PER_EVENT)))
+    surprisal = -np.log(np.maximum(always, OUTLIERS))
     return np.where(moving, np.where(lasting, surprisal, 0.0).sum(axis=0), 0.0)
 
 
@@ -99,7 +95,7 @@ def gain_evidence(
     informative, root = informative[:, cells], whole[:, 1, cells]
     mean, spread = (of.astype(np.float32) for of in (expected.mean[:, cells], expected.spread[cells]))
     # The error of the predictions in this log is estimated from all cells.
-    spread *= max(1.0, float(np.median(np.abs((root - mean) / spread)[informative])) / _MEDIAN)
+    spread *= max(1.0, float(np.median(np.abs((root - mean) / spread)[informative])) / MEDIAN_ERROR)
 
     def log_likelihood(gain: float) -> Array:
         """Return the log likelihood of a gain from each event on, ``[n, k]``."""
@@ -109,7 +105,7 @@ def gain_evidence(
     chance = np.full(n, (1 - _FROM_START) / max(n - 1, 1))
     chance[0] = _FROM_START
     wrong = np.stack([log_likelihood(gain) for gain in _GAINS]) - np.max(
-        [log_likelihood(gain) for gain in _AS_GOOD], axis=0
+        [log_likelihood(gain) for gain in (1 / GAIN, 1.0, GAIN)], axis=0
     )
     wrong += np.log(chance / len(_GAINS)).astype(np.float32)[:, None]  # (gains, n, k)
     likeliest = wrong.max(axis=1).argmax(axis=0)
@@ -125,12 +121,12 @@ def gains_count(reached: float) -> float:
 
     Events may be correlated, or contacts so small that the neighbours do not determine the load of a cell.
     """
-    return _GAIN / max(_GAIN, _MARGIN * reached)
+    return _CERTAIN / max(_CERTAIN, MARGIN * reached)
 
 
 def drifting(offset: Floats, gain: Floats | float = 0.0) -> Mask:
     """Return the cells whose evidence of an offset or a gain, ``[D]`` each, exceeds the threshold, bool ``[D]``."""
-    certain: Mask = (offset >= _OFFSET) | (gain >= _GAIN)
+    certain: Mask = (offset >= _CERTAIN) | (gain >= _CERTAIN)
     return certain
 
 

@@ -23,33 +23,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.constant_runs import segments
+from diagnostics.events.constant_runs import SHORTEST_RUN, segments
 from diagnostics.events.contact_events import SEGMENT
 from diagnostics.layout import SensorLayout
+from diagnostics.preprocessing.baseline import MARGIN
+from diagnostics.preprocessing.scale import LIGHT
 
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Array, Scale
 
 Floats = NDArray[np.float64]
 
-_LOADED = 0.05  # of full scale: smaller loads are not tested for blinks
 _CLEAR = 1.5  # times the lowest load of all cells
 _BLINK_RATE = 0.05  # blinks per loaded frame of a loose contact
-_LONGEST_BLINK = 6  # frames
+LONGEST_BLINK = 6  # frames
 _ON_ROW, _ON_COLUMN = [3, 4], [1, 6]  # neighbours on the same row and column, see SensorLayout.beside
-_SHORTEST = 8  # frames of a segment from which noise is estimated
-_SHARED = 0.3  # of the change of a cell: a neighbour that changes as much shares it, as where a finger slides
-_ALIKE = 0.3  # of a load: largest change during a blink
-_RAREST = 2e-4  # lower limit of the healthy blinks per loaded frame
-_UNKNOWN_BLINKS, _UNKNOWN_NOISE = 2e-3, 0.05  # per loaded frame, and of full scale, in a cold start
+ALIKE = 0.3  # of a load: largest change during a blink; and of its change: a neighbour that changes as much shares it
+_RARE = 0.002  # healthy blinks per loaded frame, in a cold start; share of healthy segments above the limit of noise
 _NOISY_SHARE = 0.8  # share of the segments of a noisy cell above the limit
-_NOISIER = 0.002  # share of healthy segments above the limit
 _LEVELS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8])  # of the mean root load, bin edges: noise grows with load
 _ALONE = 0.3  # share of the loaded cells that may be noisy together: with more the contact moves
 _CROWD = 0.2  # the same, of all cells
 _THRESHOLD = 14.0  # of the CUSUM: a prior of one in a thousand, and P(faulty) = 0.999
 _MAX = 40.0  # upper limit of the CUSUM, so that a repaired cell is cleared soon
-_MARGIN, _HEALTHY = 1.5, 0.99  # times the largest CUSUM in the reference, of this quantile of the cells
+_HEALTHY = 0.99  # quantile of the cells, of the largest CUSUM in the reference
 
 
 @dataclass(frozen=True)
@@ -94,17 +91,17 @@ class HealthyRates:
                 )
                 blinks += float((low + high).sum())
                 loaded += float(under_load.sum())
-                if len(frames) >= _SHORTEST:
+                if len(frames) >= SHORTEST_RUN:
                     for k in range(len(_LEVELS)):
                         noise[k].append(noise_level[level == k])
         limit = np.zeros(len(_LEVELS))
         for k, of_level in enumerate(noise):
             # One pseudo-sample with the noise of a cold start: rare noise is not seen in few samples.
-            limit[k] = np.quantile(np.concatenate([*of_level, [_UNKNOWN_NOISE]]), 1 - _NOISIER)
+            limit[k] = np.quantile(np.concatenate([*of_level, [LIGHT]]), 1 - _RARE)
         # Readings within +- tolerance (near / 2) have second differences up to 2 near.
         limit = np.maximum.accumulate(np.maximum(limit, 2 * scale.near / scale.full_scale))
         # One pseudo-blink, in as many frames as it takes at the rate of a cold start.
-        usual = cls(max(_RAREST, (blinks + 1) / (loaded + 1 / _UNKNOWN_BLINKS)), limit, alone=alone, lowest=lowest)
+        usual = cls(max(0.1 * _RARE, (blinks + 1) / (loaded + 1 / _RARE)), limit, alone=alone, lowest=lowest)
         intermittency = Intermittency.begin(layout)
         reached = np.stack([intermittency.blinking, intermittency.noisy])
         for recording in recordings:
@@ -114,13 +111,13 @@ class HealthyRates:
                     frames, scale.root_load(frames), numbers, scale, usual, constant, np.inf
                 )
                 reached = np.maximum(reached, [intermittency.blinking, intermittency.noisy])
-        counts = _THRESHOLD / np.maximum(_THRESHOLD, _MARGIN * np.quantile(reached, _HEALTHY, axis=1))
+        counts = _THRESHOLD / np.maximum(_THRESHOLD, MARGIN * np.quantile(reached, _HEALTHY, axis=1))
         return replace(usual, blinks_count=float(counts[0]), noise_counts=float(counts[1]))
 
     @classmethod
     def unknown(cls, scale: Scale) -> HealthyRates:
         """Return the rates of a cold start, at which only gross faults count."""
-        return cls(_UNKNOWN_BLINKS, np.full(len(_LEVELS), _UNKNOWN_NOISE))
+        return cls(_RARE, np.full(len(_LEVELS), LIGHT))
 
 
 @dataclass(frozen=True)
@@ -172,7 +169,7 @@ class Intermittency:
             constant: bool ``[D]``, cells that do not move in these frames, and do not count.
             full: upper limit of the sums.
         """
-        if len(frames) < _SHORTEST or constant.all():
+        if len(frames) < SHORTEST_RUN or constant.all():
             return self
         moving = np.flatnonzero(~constant)
         lowest = min(
@@ -195,9 +192,9 @@ class Intermittency:
             noisier[which] = ~_shared(neighbours, every[neighbours], noise_level[which])
         if noisier.sum() > max(crowd, _CROWD * len(constant)):
             noisier[:] = False
-        gain = np.where(noisier, np.log(_NOISY_SHARE / _NOISIER), 0.0)
+        gain = np.where(noisier, np.log(_NOISY_SHARE / _RARE), 0.0)
         gain[events > 1] = 0.0  # blinks are noise as well: count them once
-        noisy = self.noisy + usual.noise_counts * np.log((1 - _NOISY_SHARE) / (1 - _NOISIER))
+        noisy = self.noisy + usual.noise_counts * np.log((1 - _NOISY_SHARE) / (1 - _RARE))
         noisy[moving] = np.where(noisier, self.noisy[moving] + usual.noise_counts * gain, noisy[moving])
         noisy = np.clip(noisy, 0.0, full)
         blinks, to_full = np.zeros(len(constant), np.intp), np.zeros(len(constant), np.intp)
@@ -239,7 +236,7 @@ def _measure(
     if np.isnan(x).any():
         x = np.nan_to_num(x)
     near, top = scale.near, scale.full_scale - scale.near
-    loaded = x > max(_LOADED * scale.full_scale, _CLEAR * lowest)
+    loaded = x > max(LIGHT * scale.full_scale, _CLEAR * lowest)
     rests, full = x <= near, frames >= top
     moderate = loaded & ~full
 
@@ -254,9 +251,9 @@ def _measure(
             return count
         loaded_before, absent, of = initial[:, some], away[:, some], x[:, some]
         missing = absent
-        for gap in range(1, min(_LONGEST_BLINK, len(x) - 2) + 1):
+        for gap in range(1, min(LONGEST_BLINK, len(x) - 2) + 1):
             before, after = of[: -gap - 1], of[gap + 1 :]
-            same_load = np.abs(after - before) <= _ALIKE * before
+            same_load = np.abs(after - before) <= ALIKE * before
             when, which = np.nonzero(loaded_before[: -gap - 1] & missing[1:-1] & loaded_before[gap + 1 :] & same_load)
             which = some[which]
             if alone and len(which):
@@ -272,7 +269,7 @@ def _measure(
     noise_level = _median(curvature) / scale.full_scale
     level = np.searchsorted(_LEVELS, root.sum(axis=0) / np.float32(len(root)), side="right") - 1
     # A load near full scale may reach it without a fault.
-    far = moderate & ((1 + _ALIKE) * x < np.float32(top))
+    far = moderate & ((1 + ALIKE) * x < np.float32(top))
     low, high = blinks(moderate, rests), blinks(far, full)
     return low, high, loaded.sum(axis=0, dtype=np.float64), noise_level, np.maximum(level, 0)
 
@@ -293,7 +290,7 @@ def _shared(neighbours: NDArray[np.intp], change: Floats, own: Floats | Array) -
         change: ``[n, 8]``, change of each neighbour; NaN: unknown.
         own: ``[n]``, change of the cell.
     """
-    much = (neighbours >= 0) & (change >= _SHARED * own[:, None])
+    much = (neighbours >= 0) & (change >= ALIKE * own[:, None])
     of_wire = [much[:, on].all(axis=1) & (much.sum(axis=1) == 2) for on in (_ON_ROW, _ON_COLUMN)]
     return np.asarray(much.any(axis=1) & ~of_wire[0] & ~of_wire[1])
 

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import ConstantRuns, same_for
-from diagnostics.preprocessing.baseline import FEWEST, untouched_evidence
+from diagnostics.preprocessing.baseline import FEWEST, MAJORITY, MARGIN, untouched_evidence
 from diagnostics.preprocessing.readings import RecordingBlocks, held
 
 _CALM = 0.25  # of a recording: a cell with a longer identical run has no noise
-_NOISY, _QUIET = 0.5, 0.02  # share of cells with noise, at least; share without noise off the rails, at most
-_LONGER, _RECORDINGS = 2.0, 1.5  # times the longest run, and times a recording: baselines change in between
+_QUIET = 0.02  # share of cells without noise off the rails, at most
+_LONGER = 2.0  # times the longest run
 
 Floats = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class NoiseLoss:
         recording = float(np.median([len(r) for r in recordings]))
         has_noise = longest <= _CALM * recording
         quiet = ~has_noise & (value > lowest) & (value < highest)
-        few = len(recordings) < FEWEST or has_noise[present].mean() < _NOISY or quiet[present].mean() > _QUIET
+        few = len(recordings) < FEWEST or has_noise[present].mean() < MAJORITY or quiet[present].mean() > _QUIET
         return cls.unknown(len(present)) if few else cls(np.where(has_noise, longest, np.inf), recording)
 
     @classmethod
@@ -78,7 +78,7 @@ class NoiseLoss:
             present: bool ``[D]``.
             sunk: all cells at rest read less than ever in the reference; at the low rail they have no noise.
         """
-        too_long = np.maximum(_LONGER * self.longest, _RECORDINGS * self.recording)
+        too_long = np.maximum(_LONGER * self.longest, MARGIN * self.recording)
         calm = present & (np.minimum(runs.same, runs.length) >= too_long)  # missing readings are not identical ones
         as_ever = present & rests & (runs.length >= too_long) & (runs.same <= self.longest)
         return untouched_evidence(calm, calm & ~(rests & sunk), as_ever, present)

@@ -24,8 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.contact_events import Summary, count_repeats
-from diagnostics.healthy.model import contact_events
-from diagnostics.healthy.prediction import log_student_t
+from diagnostics.healthy.model import MIN_P_FLOOR, contact_events
+from diagnostics.healthy.prediction import OUTLIERS, log_student_t
+from diagnostics.preprocessing.baseline import CERTAIN_RATIO
 from diagnostics.preprocessing.readings import held
 
 if TYPE_CHECKING:
@@ -39,12 +40,10 @@ _FRAMES = 64  # of an event, evenly spread: a size
 _FEWEST = 4  # events; fewer prove nothing
 _LINES, _FEW_LINES = 16, 4  # of one kind on a pad, the least expected, whose exchange is tried; on large arrays: sizes
 _WORK = 6400  # lines times cells, about: a size
-_LIMIT = 24.0  # log likelihood gained, all events together
+_LIMIT = 2 * CERTAIN_RATIO  # log likelihood gained, all events together
 _WITHOUT = 2  # events without which there must be a gain too: one odd contact proves nothing
 _MOST_STEPS = 4  # permutations that are combined
-_OUTLIERS = 0.1  # share of loads that the model does not predict
 _UNEXPLAINED = 0.5  # of what a random order leaves: with more it is another sensor
-_LEAST_P = 1e-3  # lower limit of a probability: models err
 
 Floats = NDArray[np.float64]
 Cells = NDArray[np.intp]
@@ -161,7 +160,7 @@ class _Test:
         expected = self._model.predict(features, predictors)
         likely, usual = _log_likelihood(expected, features)
         # The same readings count for each permutation; a load where no cell is, is as good as impossible.
-        likely = np.where(self._present, likely, np.where(features[:, 2] > 0, np.log(_LEAST_P), 0.0))
+        likely = np.where(self._present, likely, np.where(features[:, 2] > 0, np.log(MIN_P_FLOOR), 0.0))
         likely, usual = (np.where(self._moved[source], of, 0.0) for of in (likely, usual * self._present))
         return _Score(self.weight * likely.sum(axis=1), (self.weight[:, None] * (likely - usual)).sum(axis=0))
 
@@ -173,12 +172,12 @@ class _Test:
 def _log_likelihood(expected: Prediction, features: Array) -> tuple[Floats, Floats]:
     """Return the log likelihood ``[n, D]`` of what each cell did, and its expectation under the model."""
     never, always = expected.never, expected.always
-    p = np.clip(np.stack([never, always, 1 - never - always]), _LEAST_P, 1.0)
+    p = np.clip(np.stack([never, always, 1 - never - always]), MIN_P_FLOOR, 1.0)
     did = np.where(features[:, 2] == 0, 0, np.where(features[:, 3] == 1, 1, 2))
     logs = np.log(p)
     state = np.take_along_axis(logs, did[None], axis=0)[0]
     error = np.nan_to_num((features[:, 1] - expected.mean) / expected.spread, nan=np.inf)  # never loaded
-    load = np.where(did > 0, log_student_t(error, _OUTLIERS), 0.0)
+    load = np.where(did > 0, log_student_t(error, OUTLIERS), 0.0)
     return state + load, (p * logs).sum(axis=0)
 
 

@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import median_abs_deviation
 
+from diagnostics.evidence.drift import GAIN
 from diagnostics.layout import SensorLayout
+from diagnostics.preprocessing.scale import LIGHT
 
 _LEAST = 5  # recordings, new and reference, for a standard error that can be trusted
-_GAIN = 1.3  # smallest change of the gain that is reported, up or down
-_SHARE = 0.05  # of full scale: smallest offset that is reported, and smallest load of a contact
 _ERRORS = 4.0  # standard errors
 _LOW, _HIGH = 0.05, 0.99  # quantiles: baseline of a cell, load of a recording
 
@@ -62,12 +62,12 @@ def sensor_change(
     """
     new, old = (_statistics(given, healthy) for given in (recordings, reference))
     offset, error = _shift(new[:, 0], old[:, 0])
-    if abs(offset) < max(_SHARE * layout.full_scale, _ERRORS * error):
+    if abs(offset) < max(LIGHT * layout.full_scale, _ERRORS * error):
         offset = 0.0
-    contact = _SHARE * layout.full_scale
+    contact = LIGHT * layout.full_scale
     loads = [np.log(given[given[:, 1] > contact, 1]) for given in (new, old)]
     change, error = _shift(*loads)
-    gain = float(np.exp(change)) if abs(change) >= max(np.log(_GAIN), _ERRORS * error) else 1.0
+    gain = float(np.exp(change)) if abs(change) >= max(np.log(GAIN), _ERRORS * error) else 1.0
     if gain == 1.0 and offset == 0.0:
         return None
     parts = []

@@ -27,9 +27,9 @@ from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, group_excluded_evidence, held_load_evidence
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
-from diagnostics.preprocessing.baseline import LIGHT
 from diagnostics.preprocessing.offset import OffsetTracker
 from diagnostics.preprocessing.readings import held
+from diagnostics.preprocessing.scale import LIGHT
 from diagnostics.preprocessing.transport import TransportState, invalid
 
 if TYPE_CHECKING:

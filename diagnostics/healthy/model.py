@@ -22,22 +22,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from diagnostics.events.constant_runs import segments
+from diagnostics.events.constant_runs import SHORTEST_RUN, segments
 from diagnostics.events.contact_events import SEGMENT, ContactEvent, EventLog, Summary, count_repeats
 from diagnostics.healthy.cross_fitting import FOLDS, CrossFitting, RegressionFit
 from diagnostics.healthy.local_regression import LocalRegression, predict_regressions
 from diagnostics.healthy.prediction import Prediction
 from diagnostics.healthy.stacking import RegressionOutput, Stacking, neighbourhood
 from diagnostics.layout import SensorLayout
+from diagnostics.preprocessing.baseline import FEWEST
 
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Array, Scale
 
 _SAMPLES = 3000  # excerpts of events to fit on, about
 _MOST_DRAWS = 8  # excerpts of one event: more of them are nearly the same
-_SHORTEST = 6  # frames of an excerpt
-_MIN_P_FLOOR = 0.002  # lower limit of the probabilities, however many events there are: models err
-_MIN_RECORDINGS = 12  # with fewer recordings each event is a source of its own
+MIN_P_FLOOR = 0.002  # lower limit of the probabilities, however many events there are: models err
 _BATCH = 6144  # cells times excerpts in one batch: bounds memory
 
 
@@ -65,7 +64,7 @@ class HealthyModel:
         every = np.flatnonzero(layout.present)
 
         def regressions(training: Array) -> RegressionFit:
-            return partial(predict_regressions, (LocalRegression.fit(training, every, every, _MIN_P_FLOOR),))
+            return partial(predict_regressions, (LocalRegression.fit(training, every, every, MIN_P_FLOOR),))
 
         stacking = None
         if n_events >= FOLDS:
@@ -153,7 +152,7 @@ def count_events(seen: Sequence[ReferenceEvent]) -> int:
 
 def _few_recordings(seen: Sequence[ReferenceEvent]) -> bool:
     """Return whether there are too few recordings for cross-fitting by recording."""
-    return len({event.recording for event in seen}) < _MIN_RECORDINGS
+    return len({event.recording for event in seen}) < FEWEST
 
 
 def excerpts(
@@ -198,7 +197,7 @@ def drawn(
         root = scale.root_load(read(i, slice(first, first + n)))
         n = len(root)
         for draw in range(draws):
-            length = int(rng.integers(min(_SHORTEST, n), n + 1)) if draw else n
+            length = int(rng.integers(min(SHORTEST_RUN, n), n + 1)) if draw else n
             at = int(rng.integers(0, n - length + 1))
             features.append(Summary.of(root[at : at + length], first + at, scale.root_near).features())
     sources = range(len(seen)) if _few_recordings(seen) else [event.recording for event in seen]
@@ -207,7 +206,7 @@ def drawn(
 
 def p_floor_of(n_events: int) -> float:
     """Return the probability of what never happened in n events: 1 / (n + 2), Laplace's rule of succession."""
-    return max(_MIN_P_FLOOR, 1 / (n_events + 2))
+    return max(MIN_P_FLOOR, 1 / (n_events + 2))
 
 
 def contact_events(recording: NDArray[np.float64], scale: Scale) -> tuple[ContactEvent, ...]:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_OUTLIERS = 0.1  # share of events in which any load is equally likely (contamination)
+OUTLIERS = 0.1  # share of events in which any load is equally likely (contamination)
+MEDIAN_ERROR = 0.741  # median of |t| with 4 degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Prediction:
         """
         mean, spread = self.mean[:, cells], self.spread[cells] * np.reshape(inflation, (-1, 1))
         likely = _student_t((high - mean) / spread) - _student_t((low - mean) / spread)
-        p = (1 - _OUTLIERS) * likely + _OUTLIERS * (np.minimum(high, 1.0) - low)
+        p = (1 - OUTLIERS) * likely + OUTLIERS * (np.minimum(high, 1.0) - low)
         return np.where(np.isnan(spread), 1.0, p)
 
 

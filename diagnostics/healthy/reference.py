@@ -18,7 +18,7 @@ from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.baseline import LowerLimit, baseline
 from diagnostics.preprocessing.offset import ReferenceOffset
-from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.preprocessing.readings import RecordingBlocks, spread
 from diagnostics.preprocessing.scale import Scale
 from diagnostics.preprocessing.transport import longest_repetition
 
@@ -29,8 +29,6 @@ _TOLERANCE = 0.005  # of full scale: half the range of a stuck cell's reading, t
 _STEPS = 1.5  # and at least so many converter steps
 _DUPLICATES = 5  # coincidences that two healthy lines may have, in a cold start
 _MANY = 250  # recordings after which the largest count seen is the limit; one more for each halving
-_SAMPLED = 2000  # cells, about, from which the step of the converter is estimated: a size
-_PATIENCE = 32  # repetitions of one frame, and twice as many as ever in the reference
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ class Reference:
         rest[dead > 0] = np.median(rest[present])  # the baseline of a dead cell is unknown
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
         jumps_seen = JumpHistogram.fit(recordings, tolerance, layout.full_scale, rest)
-        patience = max(_PATIENCE, 2 * max(longest_repetition(r) for r in recordings))
+        patience = max(SEGMENT, 2 * max(longest_repetition(r) for r in recordings))
         model = fit_healthy_model(recordings, layout, scale)
         return cls(
             tolerance,
@@ -118,7 +116,7 @@ class Reference:
             LowerLimit.unknown(layout.n_cells),
             NoiseLoss.unknown(layout.n_cells),
             ReferenceOffset(0.0, tolerance),
-            2 * _PATIENCE,
+            2 * SEGMENT,
             HealthyRates.unknown(scale),
             _DUPLICATES,
             None,
@@ -140,8 +138,8 @@ def highest_reading(recordings: Sequence[NDArray[np.float64]], layout: SensorLay
 
 def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
     """Return the half range of a constant reading: 1.5 converter steps, within 0.5 to 1 % of full scale."""
-    cells = slice(None, None, max(1, layout.n_cells // _SAMPLED))
-    sample = np.concatenate([r[:: max(1, len(r) // 20), cells].ravel() for r in recordings])
+    readings = RecordingBlocks.of(recordings)
+    sample = readings.thinned(spread(np.flatnonzero(layout.present)))
     steps = np.diff(np.unique(sample[np.isfinite(sample)]))
     steps = steps[steps > 1e-6 * layout.full_scale]  # smaller differences are rounding
     step = float(steps.min()) if len(steps) else 0.0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from diagnostics.healthy.stacking import enclosed
-from diagnostics.preprocessing.baseline import baseline
+from diagnostics.preprocessing.baseline import MAJORITY, baseline
 from diagnostics.preprocessing.readings import RecordingBlocks
 
 if TYPE_CHECKING:
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 _PIECES, _FRAMES = 60, 200  # pieces that are diagnosed, evenly spread, and frames of each: sizes
 _CERTAIN = 0.99  # P(faulty) from which on a cell counts as dead in every later log
-_ADJACENT = np.array([np.zeros((3, 3)), np.ones((3, 3)), np.zeros((3, 3))])  # 8 neighbours on one pad
-_MOST = 0.5  # share of the cells: if more never moved, the reference holds too little contact
 
 
 def find_reference_faults(
@@ -46,7 +44,7 @@ def find_reference_faults(
     present = layout.present.ravel()
     never_moved = present & _constant(recordings, 2 * tolerance)
     candidates = _enclosed_groups(never_moved, layout)
-    if not candidates.any() or never_moved[present].mean() > _MOST:
+    if not candidates.any() or never_moved[present].mean() > MAJORITY:
         return np.zeros(layout.n_cells)
     rest, _ = baseline(recordings, present & ~never_moved, tolerance, layout.full_scale)
     typical = rest[present & ~never_moved]
@@ -66,7 +64,8 @@ def _constant(recordings: RecordingBlocks, most: float) -> NDArray[np.bool_]:
 def _enclosed_groups(never_moved: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.bool_]:
     """Return the groups of ``never_moved`` cells in which one is enclosed by cells that moved, bool ``[D]``."""
     moved = layout.grid(~never_moved & layout.present.ravel())
-    groups, _ = label(layout.grid(never_moved), _ADJACENT)
+    beside = np.pad(np.ones((1, 3, 3)), [(1, 1), (0, 0), (0, 0)])  # 8 neighbours on one pad
+    groups, _ = label(layout.grid(never_moved), beside)
     candidates: NDArray[np.bool_] = np.isin(groups, groups[enclosed(moved[..., None])[..., 0] & (groups > 0)]).ravel()
     return candidates
 

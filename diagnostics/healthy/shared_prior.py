@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.special import expit
 
+from diagnostics.healthy.local_regression import FEATURES
 from diagnostics.preprocessing.scale import Array
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
 REACH = 3  # rows and columns
-_FEATURES = 4  # see Summary.features
 _MOST, _UNLOADED = 20_000, 0.2  # samples; share of them without any load around, which are all equal
 _RIDGE = 1e-3  # per sample: keeps the Hessian regular
 _STEPS = 12  # of Newton's method: converged
@@ -47,7 +47,7 @@ class Samples:
         """Draw at most ``most`` loaded samples from excerpts of a tile, features ``[n, 4, inputs]``."""
         alone = tile.rectangle(layout)
         rows, cols = alone.layout.rows, alone.layout.cols
-        grid = np.zeros((len(features), _FEATURES, rows + 2 * REACH, cols + 2 * REACH), np.float32)
+        grid = np.zeros((len(features), FEATURES, rows + 2 * REACH, cols + 2 * REACH), np.float32)
         r, c = alone.cells // cols, alone.cells % cols
         grid[:, :, r + REACH, c + REACH] = features
         windows = np.lib.stride_tricks.sliding_window_view(grid, (2 * REACH + 1,) * 2, axis=(2, 3))
@@ -92,14 +92,14 @@ class SharedPrior:
                 hessian = (x * variance[:, None]).T @ x / len(x) + _RIDGE * np.eye(len(w))
                 w[:, q] -= linalg.solve(hessian, gradient, assume_a="pos")
         side = 2 * REACH + 1
-        return cls(w[:-1].T.reshape(2, _FEATURES, side, side), w[-1])
+        return cls(w[:-1].T.reshape(2, FEATURES, side, side), w[-1])
 
     def on(self, tile: Tile, layout: SensorLayout) -> NDArray[np.float64]:
         """Return the weights for a tile, ``[4, inputs, 2, outputs]``."""
         rows, cols = tile.inputs // layout.cols % layout.rows, tile.inputs % layout.cols
         down, across = (of[:, None] - of[tile.place] for of in (rows, cols))  # (inputs, outputs)
         near = (np.abs(down) <= REACH) & (np.abs(across) <= REACH)
-        found = np.zeros((_FEATURES, len(tile.inputs), 2, len(tile.outputs)))
+        found = np.zeros((FEATURES, len(tile.inputs), 2, len(tile.outputs)))
         i, j = np.nonzero(near)
         found[:, i, :, j] = self.weight[:, :, down[i, j] + REACH, across[i, j] + REACH].transpose(2, 1, 0)
         return found

@@ -19,24 +19,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.contact_events import SEGMENT
-from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.preprocessing.readings import CELLS, RecordingBlocks
+from diagnostics.preprocessing.scale import LIGHT
 
 if TYPE_CHECKING:
     from diagnostics.events.constant_runs import ConstantRuns
 
 _LOW = 0.05  # quantile of all readings of a cell
 _UNLOADED = 0.03  # quantile of the readings in one recording: its baseline there, unless loaded throughout
-LIGHT = 0.05  # of full scale: a cell that stays further above its baseline was loaded throughout
 _CALM = 0.25  # quantile of the noise over cells and recordings: loaded cells have more
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
 _RARE = 0.001  # share of cells and recordings that is ignored
-FEWEST = 8  # recordings from which the change of baselines between recordings can be estimated
-_OFTEN = 0.5  # share of the recordings: a reading in so many of them is the baseline, not a load
-_BEYOND = 1.5  # times the largest deviation of healthy cells: no healthy cell reads less
-_BELOW = 12.0  # log likelihood ratio of a reading below the lower limit
+FEWEST = 8  # recordings from which differences between recordings can be estimated
+MAJORITY = 0.5  # of recordings, frames or cells: what most do is usual
+MARGIN = 1.5  # times the most that healthy cells showed: what no healthy cell shows
+CERTAIN_RATIO = 12.0  # log likelihood ratio fault : healthy of what only a fault explains
 _AS_EVER = -2.0  # log likelihood ratio of a usual reading that an open cell does not give
-_CROWD = 0.5  # share of the cells: when so many deviate, the whole array has changed
-_BLOCK = 4096  # cells processed together: a size
 
 Floats = NDArray[np.float64]
 
@@ -78,10 +76,10 @@ class LowerLimit:
         if len(peaks) >= FEWEST and np.median(low[present]) > tolerance:
             peak = peaks - low
             unloaded = peak < LIGHT * full_scale
-            often = np.count_nonzero(unloaded, axis=0) >= _OFTEN * len(peaks)
+            often = np.count_nonzero(unloaded, axis=0) >= MAJORITY * len(peaks)
             peak_values = peak[unloaded & present]
             rare = float(np.quantile(peak_values, _RARE, method="lower"))
-            margin = max((_BEYOND - 1) * (float(np.median(peak_values)) - rare), tolerance)
+            margin = max((MARGIN - 1) * (float(np.median(peak_values)) - rare), tolerance)
             reading = np.where(often, np.maximum(reading, low + rare - margin), reading)
         above = (np.median((row - reading)[rests]) for row in last if (rests := present & (row <= most)).any())
         return cls(reading, float(min(above, default=-np.inf)))
@@ -127,9 +125,9 @@ def untouched_evidence(
         as_ever: bool ``[D]``, cells that behave as ever, unlike broken ones: -2.
         present: bool ``[D]``.
     """
-    if unusual.sum() > _CROWD * present.sum():
+    if unusual.sum() > MAJORITY * present.sum():
         return np.zeros(len(present))
-    return np.where(broken, _BELOW, np.where(as_ever, _AS_EVER, 0.0))
+    return np.where(broken, CERTAIN_RATIO, np.where(as_ever, _AS_EVER, 0.0))
 
 
 def baseline(
@@ -186,8 +184,8 @@ def _low(recordings: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
     """
     readings, n_cells = RecordingBlocks.of(recordings), recordings[0].shape[1]
     low, (last, peaks) = np.zeros(n_cells), np.full((2, len(readings), n_cells), np.nan)
-    for first in range(0, n_cells, _BLOCK):
-        cells = np.arange(first, min(first + _BLOCK, n_cells))
+    for first in range(0, n_cells, CELLS):
+        cells = np.arange(first, min(first + CELLS, n_cells))
         pieces = [readings.piece(i, slice(None), cells) for i in range(len(readings))]
         for i, frames in enumerate(pieces):
             last[i, cells], peaks[i, cells] = frames[-1], _lowest_peak(frames)

@@ -19,18 +19,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.preprocessing.baseline import MAJORITY
+from diagnostics.preprocessing.readings import CELLS, RecordingBlocks, spread
+from diagnostics.preprocessing.scale import SLIGHT
 from diagnostics.preprocessing.transport import invalid
 
 if TYPE_CHECKING:
     from diagnostics.layout import Rest, SensorLayout
 
-_QUIET = 0.02  # of full scale: readings so near the rest of a cell are quiet
-_OFTEN = 0.5  # share of its frames in which a cell is quiet, at the median over cells
 _MOVES = 0.1  # of full scale: range of a cell that was loaded
 _ONE_WAY = 0.1  # share of the range on the other side of the rest, at most, where load moves all cells one way
 _BOTH_WAYS = 0.15  # from half of the range, at most, where load moves cells either way: offsets drift less than that
-_FRAMES, _CELLS, _BLOCK = 2000, 1000, 1000  # frames and cells that are looked at, about: sizes
 
 Floats = NDArray[np.float64]
 
@@ -69,8 +68,8 @@ class LoadDirection:
         if direction != "middle":
             return cls.declared(replace(layout, rest=direction))
         cells, rest = np.arange(layout.n_cells), np.full(layout.n_cells, 0.5 * layout.full_scale)
-        for some in np.split(cells, range(_BLOCK, len(cells), _BLOCK)):
-            sample = _sample(readings, some)
+        for some in np.split(cells, range(CELLS, len(cells), CELLS)):
+            sample = readings.thinned(some)
             received = ~np.isnan(sample).all(axis=0)
             rest[some[received]] = np.nanmedian(sample[:, received], axis=0)
         return cls(direction, rest, layout.full_scale)
@@ -94,26 +93,18 @@ class LoadDirection:
         return np.clip(np.where(down, self.rest - loads, self.rest + loads), 0.0, self.full_scale)
 
 
-def _sample(readings: RecordingBlocks, cells: NDArray[np.intp]) -> Floats:
-    """Return evenly spread readings of some cells, ``[n, cells]``."""
-    each = max(1, _FRAMES // len(readings))
-    pieces = [(i, slice(None, None, max(1, len(recording) // each))) for i, recording in enumerate(readings.given)]
-    return np.concatenate([readings.piece(i, frames, cells) for i, frames in pieces])
-
-
 def _learned(readings: RecordingBlocks, layout: SensorLayout) -> Rest:
     """Return the direction of load of the array, see the module."""
     low, high = readings.extremes()
-    moved = np.flatnonzero(layout.present.ravel() & (high - low > _MOVES * layout.full_scale))
-    moved = moved[:: max(1, len(moved) // _CELLS)]
+    moved = spread(np.flatnonzero(layout.present.ravel() & (high - low > _MOVES * layout.full_scale)))
     if not len(moved):
         return "low"
-    low, high, sample = low[moved], high[moved], _sample(readings, moved)
+    low, high, sample = low[moved], high[moved], readings.thinned(moved)
     rest = np.nanmedian(sample, axis=0)
     up = float(np.median((high - rest) / (high - low)))
-    quiet = float(np.median((np.abs(sample - rest) <= _QUIET * layout.full_scale).mean(axis=0)))
+    quiet = float(np.median((np.abs(sample - rest) <= SLIGHT * layout.full_scale).mean(axis=0)))
     # Where a load is held most of the time, it differs between cells more than the readings without it do.
-    if up >= 1 - _ONE_WAY or quiet < _OFTEN or _spread(rest) > _spread(low):
+    if up >= 1 - _ONE_WAY or quiet < MAJORITY or _spread(rest) > _spread(low):
         return "low"
     return "high" if up <= _ONE_WAY else "middle" if abs(up - 0.5) <= _BOTH_WAYS else "low"
 

@@ -19,15 +19,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.preprocessing.readings import RecordingBlocks, spread
+from diagnostics.preprocessing.scale import LIGHT, SLIGHT
 
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Scale
 
 _LEAST_LOADED = 0.25  # quantile over the cells: more are unloaded than this, and fewer are open
-_COMMON, _OWN = 0.05, 0.02  # of full scale: largest common offset, and largest own offset
 _USUAL = 0.95  # quantile of the common offsets in the reference
-_FRAMES = 20  # of each recording, about: a size
 
 Floats = NDArray[np.float64]
 
@@ -46,13 +45,9 @@ class ReferenceOffset(NamedTuple):
     @classmethod
     def fit(cls, recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_]) -> ReferenceOffset:
         """Fit to fault-free recordings, ``[T, D]`` each."""
-        cells, some = RecordingBlocks.of(recordings).sample(present)
-        common: list[float] = []
-        for frames in some:
-            if len(frames):
-                above = frames - scale.baseline[cells]
-                common += [_least_loaded(frame) for frame in above[:: max(1, len(above) // _FRAMES)]]
-        common = common or [0.0]
+        cells = spread(np.flatnonzero(present))
+        above = RecordingBlocks.of(recordings).thinned(cells) - scale.baseline[cells]
+        common = [_least_loaded(frame) for frame in above]
         mostly = min(0.0, float(np.median(common)))
         return cls(mostly, max(mostly + scale.near / 2, float(np.quantile(common, _USUAL))))
 
@@ -94,15 +89,15 @@ class OffsetTracker:
         own = np.zeros(len(lowest))
         if (lowest > scale.near / 2).any():
             shared = usual.excess(_least_loaded(lowest[present]))
-            beyond = lowest - np.where(shared < _COMMON * scale.full_scale, shared, 0.0)
-            own = np.where((beyond > scale.near / 2) & (beyond < _OWN * scale.full_scale), beyond, 0.0)
+            beyond = lowest - np.where(shared < LIGHT * scale.full_scale, shared, 0.0)
+            own = np.where((beyond > scale.near / 2) & (beyond < SLIGHT * scale.full_scale), beyond, 0.0)
         # Usually there is no common offset: enough cells stay at their baseline throughout.
         calm = present & (np.fmax.reduce(frames) - scale.baseline - own <= usual.most)
         if np.count_nonzero(calm) > _LEAST_LOADED * np.count_nonzero(present):
             return OffsetTracker(lowest, own, np.zeros(len(frames)))
         common = usual.excess([_least_loaded(frame) for frame in (frames - scale.baseline - own)[:, present]])
         last = self.common[-1]
-        for t in np.flatnonzero(common >= _COMMON * scale.full_scale):  # nearly all cells are loaded: keep the last one
+        for t in np.flatnonzero(common >= LIGHT * scale.full_scale):  # nearly all cells are loaded: keep the last one
             common[t] = common[t - 1] if t else last
         return OffsetTracker(lowest, own, common)
 

@@ -13,7 +13,7 @@ from diagnostics.preprocessing.transport import invalid
 Recording = NDArray[np.float64]
 
 _MOST_VALUES = 1 << 23  # in a block of frames: a size
-_RECORDINGS, _CELLS = 200, 2000  # in a sample, about: sizes
+_RECORDINGS, CELLS, _FRAMES = 200, 2000, 20  # in a sample, about, and frames of each recording: sizes
 
 
 class RecordingBlocks(Sequence[Recording]):
@@ -56,10 +56,18 @@ class RecordingBlocks(Sequence[Recording]):
 
     def sample(self, present: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Iterator[Recording]]:
         """Return evenly spread indices of ``present`` cells (bool ``[D]``), and recordings of these cells."""
-        cells = np.flatnonzero(present)
-        cells = cells[:: max(1, len(cells) // _CELLS)]
-        which = range(0, len(self), max(1, len(self) // _RECORDINGS))
-        return cells, (self.piece(i, slice(None), cells) for i in which)
+        cells = spread(np.flatnonzero(present))
+        return cells, (self.piece(i, slice(None), cells) for i in self._some)
+
+    def thinned(self, cells: NDArray[np.intp]) -> Recording:
+        """Return evenly spread readings of some cells, ``[n, cells]``."""
+        steps = ((i, max(1, len(self._given[i]) // _FRAMES)) for i in self._some)
+        return np.concatenate([self.piece(i, slice(None, None, step), cells) for i, step in steps])
+
+    @property
+    def _some(self) -> range:
+        """Evenly spread recordings."""
+        return range(0, len(self), max(1, len(self) // _RECORDINGS))
 
     def extremes(self) -> tuple[Recording, Recording]:
         """Return the lowest and the highest reading of each cell, ``[D]``; NaN for a cell without any reading."""
@@ -94,6 +102,11 @@ class RecordingBlocks(Sequence[Recording]):
     def of(cls, recordings: Sequence[NDArray[Any]]) -> RecordingBlocks:
         """Return ``recordings`` as blocks."""
         return recordings if isinstance(recordings, RecordingBlocks) else cls(recordings)
+
+
+def spread(cells: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return about 2000 of the cells, evenly spread."""
+    return cells[:: max(1, len(cells) // CELLS)]
 
 
 def held(frames: NDArray[Any], last: NDArray[Any]) -> NDArray[Any]:

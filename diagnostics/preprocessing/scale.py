@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 
+LIGHT = 0.05  # of full scale: a lighter load may be drift of the baseline
+SLIGHT = 0.02  # of full scale: readings that differ by less agree
+
 
 @dataclass(frozen=True)
 class Scale:

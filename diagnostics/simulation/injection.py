@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, SensorLayout
+from diagnostics.preprocessing.scale import LIGHT
 
 # Defaults of ``Fault.value`` and thresholds, as shares of full scale.
 _NOISE = 0.05  # NOISY: standard deviation of the added noise
 _DRIFT = 0.01  # DRIFT: offset gained per second
-_LOADED = 0.05  # INTERMITTENT: a loose contact blinks while its cell carries more than this
 # INTERMITTENT: probability per frame that a closed contact opens, and that an open one closes.
 _OPENS, _CLOSES = 0.2, 0.4
 
@@ -103,7 +103,7 @@ def _faulty_readings(
         case FaultKind.INTERMITTENT:
             # One contact serves all the cells of the fault: they blink together, each only while it is loaded.
             closed = _blinking(len(own), rng)[:, None]
-            return np.where(closed | ~(own > _LOADED * full_scale), own, fault.value or 0.0)
+            return np.where(closed | ~(own > LIGHT * full_scale), own, fault.value or 0.0)
         case FaultKind.NOISY:
             sigma = _NOISE * full_scale if fault.value is None else fault.value
             return own + rng.normal(0.0, sigma, own.shape)

@@ -211,7 +211,7 @@ class SelfDiagnosis:
         yield
         every = np.arange(self.layout.n_cells) if self._order is None else np.argsort(self._order)
         found = found.of(every)
-        causes = root_causes(found, aliased, self.layout)
+        causes, possible = root_causes(found, aliased, self.layout)
         probability, inferred = found.probability.copy(), np.zeros(self.layout.n_cells, bool)
         for fault in causes:
             cells = list(fault.cells)
@@ -235,6 +235,7 @@ class SelfDiagnosis:
             },
             n_frames=stream.transport.seen,
             n_recordings=n_recordings,
+            possible=possible,
         )
 
     def _diagnosed(self, log: RecordingBlocks, needed: NDArray[np.bool_] | None = None) -> Diagnosis:

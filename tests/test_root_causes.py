@@ -58,7 +58,7 @@ def untested(found: CellFindings, cells: object) -> CellFindings:
 
 
 def causes(found: CellFindings, *aliasings: Aliasing) -> tuple[Fault, ...]:
-    return root_causes(found, aliasings, LAYOUT)
+    return root_causes(found, aliasings, LAYOUT)[0]
 
 
 def row(pad: int, index: int) -> np.ndarray:

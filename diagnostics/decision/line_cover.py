@@ -9,7 +9,8 @@ supports its wire with
 the log ratio of "broken wire" against "single fault or none", where w is its log likelihood ratio and c discounts the
 correlation rho of the n uncertain cells on the wire (design effect, Kish 1965): neighbours at the edge of a contact err
 together. Minimum weight set cover, solved by enumeration or by ``scipy.optimize.milp``; q is re-estimated from the
-solution until it no longer changes. Wires with fewer than two tested cells are not found.
+solution until it no longer changes. Wires with fewer than two tested cells are not found. Wires that are more likely
+broken than not, at odds below 9, are returned as possible: one more contact tells.
 
 With declared wiring the wires are buses and nested groups (``SensorLayout.groups``), which are
 broken as a whole. Of those that explain the same cells the innermost is named.
@@ -23,6 +24,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from diagnostics.layout import Line, SensorLayout
 
@@ -57,6 +59,7 @@ class Cause:
         seen: those of them with evidence of their own; the others are inferred.
         probability: P(the wire is broken rather than all of ``seen`` by chance); 1 for single cells.
         whole: False where the wire is broken in its middle.
+        proven: False for a wire that is only possible; its cells are single faults too, or work.
     """
 
     line: Line | None
@@ -64,6 +67,7 @@ class Cause:
     seen: tuple[int, ...]
     probability: float
     whole: bool = True
+    proven: bool = True
 
 
 @dataclass(frozen=True)
@@ -203,15 +207,19 @@ def _explain_pad(
             break
     causes: list[Cause] = []
     explained = np.zeros(layout.n_cells, bool)
-    for c in chosen_wires:
+
+    def cause(c: _Candidate, gain: float, proven: bool) -> Cause:
         cells = c.cells[~contradicting[c.cells]]
-        gain = _gain(c, faulty, support, cell_cost)
         seen = cells[supporting[cells]]
-        probability = float(1 / (1 + np.exp(-gain)))
-        causes.append(Cause(c.line, tuple(cells.tolist()), tuple(seen.tolist()), probability, c.whole))
-        explained[cells] = True
+        return Cause(c.line, tuple(cells.tolist()), tuple(seen.tolist()), float(expit(gain)), c.whole, proven)
+
+    for c in chosen_wires:
+        causes.append(cause(c, _gain(c, faulty, support, cell_cost), True))
+        explained[list(causes[-1].cells)] = True
     causes += [Cause(None, (cell,), (cell,), 1.0) for cell in found.tolist() if not explained[cell]]
-    return causes
+    left, support = faulty & ~explained, np.where(explained, 0.0, support)
+    more = _cheapest(candidates, np.flatnonzero(left & present), left, support, cell_cost, 0.0)
+    return causes + [cause(c, _gain(c, left, support, cell_cost), False) for c in more]
 
 
 def _candidates(
@@ -264,10 +272,11 @@ def _cheapest(
     faulty: NDArray[np.bool_],
     support: NDArray[np.float64],
     cell_cost: float,
+    least: float = _PROVEN,
 ) -> list[_Candidate]:
-    """Return the wires of the cover of least cost."""
+    """Return the wires of the cover of least cost, with log odds above ``least``."""
     # A wire that costs more than it can save is in no optimal cover.
-    candidates = [c for c in candidates if _gain(c, faulty, np.maximum(support, 0), cell_cost) > _PROVEN]
+    candidates = [c for c in candidates if _gain(c, faulty, np.maximum(support, 0), cell_cost) > least]
     if candidates:
         on_any = np.concatenate([c.cells for c in candidates])
         uncertain = np.unique(on_any[~faulty[on_any]])
@@ -278,7 +287,7 @@ def _cheapest(
         cheapest = cheapest_of_few if len(candidates) <= _FEW else cheapest_of_many
         chosen = cheapest(np.array([c.cost for c in candidates]), covers, saves)
         candidates = [c for c, is_chosen in zip(candidates, chosen, strict=True) if is_chosen]
-    return [c for c in candidates if _gain(c, faulty, support, cell_cost) > _PROVEN]
+    return [c for c in candidates if _gain(c, faulty, support, cell_cost) > least]
 
 
 def cheapest_of_few(cost: NDArray[np.float64], covers: NDArray[np.bool_], saves: NDArray[np.float64]) -> Mask:

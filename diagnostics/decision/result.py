@@ -54,6 +54,8 @@ class Diagnosis:
         tested: bool ``[D]``, the log tested whether the cell works.
         n_frames: number of frames in the log.
         n_recordings: number of recordings in the log.
+        possible: wires that are more likely broken than not, but not proven. Their cells are in F only as faults of
+            their own.
         transport: lost frames, frozen streams and invalid readings: faults of the link, not of cells.
         evidence: float ``[D]`` each: ``"spatial"`` and ``"temporal"``, log likelihood ratios faulty : healthy (0: no
             evidence), and ``"events"``, number of events that tested the cell. Evidence of wires is in ``faults``.
@@ -67,6 +69,7 @@ class Diagnosis:
     n_recordings: int
     transport: tuple[TransportFault, ...] = ()
     evidence: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    possible: tuple[Fault, ...] = ()
 
     @cached_property
     def fault_set(self) -> FaultSet:
@@ -121,7 +124,7 @@ class Diagnosis:
     def __str__(self) -> str:
         found = f"{len(self.fault_set)} faulty cells" if len(self.fault_set) != 1 else "1 faulty cell"
         reasons = [line for fault in self.faults for line in (fault.reason, *(f"  or {a}" for a in fault.alternatives))]
-        reasons += [fault.reason for fault in self.transport]
+        reasons += [fault.reason for fault in (*self.possible, *self.transport)]
         recordings = "1 recording" if self.n_recordings == 1 else f"{self.n_recordings} recordings"
         frames = "1 frame" if self.n_frames == 1 else f"{self.n_frames} frames"
         head = f"{found} in {recordings} ({frames}); {self.coverage}"
@@ -142,6 +145,7 @@ class Diagnosis:
             "layout": self.layout.to_dict(),
             "fault_set": list(self.fault_set),
             "faults": [fault.to_dict() for fault in self.faults],
+            "possible": [fault.to_dict() for fault in self.possible],
             "verdicts": [v.name for v in self.verdicts],
             "probability": self.probability.tolist(),
             "evidence": {kind: values.tolist() for kind, values in self.evidence.items()},
@@ -199,4 +203,5 @@ class Diagnosis:
             n_recordings=d["n_recordings"],
             evidence={kind: np.asarray(values, dtype=np.float64) for kind, values in d.get("evidence", {}).items()},
             transport=tuple(TransportFault.from_dict(f) for f in d.get("transport", ())),
+            possible=tuple(Fault.from_dict(f) for f in d.get("possible", ())),
         )

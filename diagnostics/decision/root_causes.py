@@ -74,21 +74,24 @@ class CellFindings:
         return replace(self, **{name: values[cells] for name, values in vars(self).items() if values is not None})
 
 
-def root_causes(found: CellFindings, aliasings: Sequence[Aliasing], layout: SensorLayout) -> tuple[Fault, ...]:
-    """Return the root causes of the faulty cells, one fault each, the one with most cells first."""
+def root_causes(
+    found: CellFindings, aliasings: Sequence[Aliasing], layout: SensorLayout
+) -> tuple[tuple[Fault, ...], tuple[Fault, ...]]:
+    """Return the root causes of the faulty cells, one fault each, the one with most cells first; and possible wires."""
     aliased = np.zeros(layout.n_cells, bool)
     for aliasing in aliasings:
         aliased[list(aliasing.cells)] = True
     faults = [_aliased(aliasing, layout) for aliasing in aliasings]
     causes = _causes(found, aliased, layout, 0.0)
     singles = sum(cause.line is None for _, _, cause in causes)
-    if 0 < singles < len(causes):
+    if 0 < singles < sum(cause.proven for _, _, cause in causes):
         # With many single faults, some are neighbours on a wire by chance: solve again with a higher prevalence.
         common = _SAME_KIND * singles / int((found.alive | found.faulty).sum())
         causes = _causes(found, aliased, layout, common)
-    faults += [_fault(kind, value, cause, found, layout) for kind, value, cause in causes]
+    faults += [_fault(kind, value, cause, found, layout) for kind, value, cause in causes if cause.proven]
     faults = _addresses_of_dead_rows(faults, found, layout)
-    return tuple(sorted(faults, key=lambda fault: (-len(fault.cells), fault.cells)))
+    possible = [_fault(kind, value, cause, found, layout) for kind, value, cause in causes if not cause.proven]
+    return tuple(sorted(faults, key=lambda fault: (-len(fault.cells), fault.cells))), tuple(possible)
 
 
 def _causes(
@@ -124,7 +127,7 @@ def _explained(
         return solve(faulty, consistent, contradicting, found.weight, layout, common)
 
     causes = of(faulty & ~known, consistent & ~known, contradicting & ~known)
-    known[[cell for cause in causes for cell in cause.cells]] = False
+    known[[cell for cause in causes if cause.proven for cell in cause.cells]] = False
     return causes + of(known, known, ~known)
 
 
@@ -173,7 +176,7 @@ def _fault(kind: FaultKind, value: float | None, cause: Cause, found: CellFindin
         evidence=int(found.events[seen].sum()),
     )
     fault = replace(fault, reason=_reason(fault, cause, found, layout))
-    if cause.line is not None and cause.line.kind in ("row", "column"):
+    if cause.proven and cause.line is not None and cause.line.kind in ("row", "column"):
         fault = replace(fault, alternatives=_alternatives(fault, cause, found, layout))
     return fault
 
@@ -232,6 +235,12 @@ def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
 def _reason(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayout) -> str:
     """Return one sentence: what was observed, and what to check."""
     does = _does(fault, found, layout)
+    if not cause.proven:
+        few = f"{len(cause.seen)} cells on it" if len(cause.seen) > 1 else "1 cell on it"
+        return (
+            f"{fault.line} may be {fault.kind}{_where(fault, cause, layout)} (P = {fault.probability:.2f}), or only "
+            f"{few}, each of which {does}: one more contact along it will tell"
+        )
     already = ", and did so in the reference already" if found.known[list(cause.seen)].all() else ""
     since = "" if fault.onset is None else f" from frame {fault.onset} on ({fault.onset / layout.rate:.1f} s)"
     if fault.line is None:
@@ -245,7 +254,7 @@ def _reason(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayou
         also = f"; {inferred} of the cells, not tested, {are} inferred" if inferred else ""
         return f"{action(fault.line)}: {_behind(fault, layout)} {silent}{since}{already}{also}"
     also = f"; {inferred} more, not tested, {are} inferred from the wire" if inferred else ""
-    where = "" if cause.whole else _span(fault, layout)
+    where = _where(fault, cause, layout)
     seen = f"each of {len(cause.seen)} cells on it {does}{since}{already}{also}"
     return f"{fault.line} is {fault.kind}{where}: {seen}; check {_wire(fault.line)}"
 
@@ -262,9 +271,10 @@ def _behind(fault: Fault, layout: SensorLayout) -> str:
     return f"all {cells} {'axes' if fault.line.kind == 'position' else 'cells'} on it"
 
 
-def _span(fault: Fault, layout: SensorLayout) -> str:
-    """Return the part of its line that a fault affects, as " from column 5 on" or " up to column 4"."""
-    assert fault.line is not None
+def _where(fault: Fault, cause: Cause, layout: SensorLayout) -> str:
+    """Return the part of its line that a fault affects, as " from column 5 on" or " up to column 4"; "": all of it."""
+    if cause.whole or fault.line is None:
+        return ""
     across, name = (2, "column") if fault.line.kind == "row" else (1, "row")
     dead = [layout.position(cell)[across] for cell in fault.cells]
     on_line = [layout.position(cell)[across] for cell in layout.cells_on(fault.line).tolist()]

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from diagnostics import Line, SensorLayout
-from diagnostics.decision.line_cover import Cause, candidate_groups, cheapest_of_few, cheapest_of_many, solve
+from diagnostics.decision import line_cover
+from diagnostics.decision.line_cover import Cause, candidate_groups, cheapest_of_few, cheapest_of_many
 
 LAYOUT = SensorLayout(2, 11, 10)
 SURE, WEAK, NOTHING = 8.0, 5.0, 0.0
@@ -10,6 +11,11 @@ SURE, WEAK, NOTHING = 8.0, 5.0, 0.0
 
 def mask(*cells: np.ndarray | list[int]) -> np.ndarray:
     return np.isin(np.arange(220), np.concatenate([np.asarray(c, int) for c in cells] or [np.zeros(0, int)]))
+
+
+def solve(*given: object) -> tuple[Cause, ...]:
+    """Return the causes that are more than possible."""
+    return tuple(cause for cause in line_cover.solve(*given) if cause.proven)
 
 
 def explained(
@@ -253,6 +259,30 @@ def test_where_single_faults_are_common_two_neighbours_at_the_end_of_a_line_are_
     for common, cut in ((0.0, True), (0.1, False)):
         causes = solve(faulty, faulty, ~faulty, np.where(faulty, SURE, NOTHING), LAYOUT, common)
         assert any(cause.line is not None for cause in causes) == cut
+
+
+def test_a_wire_of_some_suspects_is_possible_and_its_probability_between_a_half_and_what_proves_it():
+    row = LAYOUT.cells_on(Line(1, "row", 4))
+    suspects = mask(row[6:])
+    seen = []
+    for strength in (2.6, 2.8, 3.0, 4.0):
+        weight = np.where(suspects, strength, NOTHING)
+        causes = line_cover.solve(mask(), suspects, ~suspects, weight, LAYOUT)
+        seen.append([(cause.line, cause.proven) for cause in causes])
+        for cause in causes:
+            assert cause.cells == tuple(row[6:])
+            assert (cause.probability > 0.9) == cause.proven
+            assert cause.probability > 0.5
+    assert seen == [[], [], [(Line(1, "row", 4), False)], [(Line(1, "row", 4), True)]]
+
+
+def test_cells_of_a_possible_wire_stay_faults_of_their_own():
+    row = LAYOUT.cells_on(Line(1, "row", 4))
+    faulty, suspect = mask(row[9:]), mask(row[8:9])
+    weight = np.where(faulty, SURE, np.where(suspect, 2.8, NOTHING))
+    causes = line_cover.solve(faulty, faulty | suspect, ~(faulty | suspect), weight, LAYOUT)
+    assert [(cause.line, cause.proven) for cause in causes] == [(None, True), (Line(1, "row", 4), False)]
+    assert causes[0].cells == (row[9],)
 
 
 def test_suspects_alone_need_more_than_a_certain_cell_does():

@@ -90,11 +90,12 @@ def test_the_exit_code_distinguishes_no_fault_single_cells_and_faults_of_wires()
 
 @pytest.mark.parametrize("faults", [(), (ROW,), (CELL, ROW)])
 def test_a_diagnosis_survives_json_with_transport_faults_and_alternatives(faults):
-    diagnosis = diagnosed(*faults, transport=(LOST, TransportFault("frozen", 50, 40, "it froze")))
+    diagnosis = diagnosed(*faults, transport=(LOST, TransportFault("frozen", 50, 40, "it froze")), possible=(ROW,))
     d = json.loads(json.dumps(diagnosis.to_dict(), allow_nan=False))
     again = Diagnosis.from_dict(d)
     assert again.faults == faults
     assert again.transport == diagnosis.transport
+    assert again.possible == (ROW,)
     assert again.layout == LAYOUT
     assert (again.n_frames, again.n_recordings) == (100, 2)
     assert (again.verdicts == diagnosis.verdicts).all()

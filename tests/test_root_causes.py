@@ -118,6 +118,19 @@ def test_cells_stuck_at_different_values_share_no_cause():
     assert [fault.line for fault in causes(found)] == [None] * 6
 
 
+def test_a_wire_that_the_log_does_not_prove_is_possible_and_says_what_will_tell():
+    cells = row(0, 3)[2:]
+    found = untested(HEALTHY, cells)
+    found = replace(found, weight=np.where(at(cells), 3.3, found.weight))
+    certain, (possible,) = root_causes(found, (), LAYOUT)
+    assert certain == ()
+    assert (possible.line, possible.kind, possible.cells) == (Line(0, "row", 3), FaultKind.OPEN, tuple(cells))
+    assert "may be open" in possible.reason
+    assert f"P = {possible.probability:.2f}" in possible.reason
+    assert f"{len(cells)} cells on it" in possible.reason
+    assert "one more contact along it will tell" in possible.reason
+
+
 def test_a_cell_with_another_fault_is_not_attributed_to_the_wire():
     found = dead(dead(HEALTHY, row(0, 2)), [row(0, 2)[5]], 5.0)
     found = replace(found, rests=found.rests & ~at([row(0, 2)[5]]))

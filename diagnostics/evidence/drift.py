@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from diagnostics.healthy.prediction import MEDIAN_ERROR, OUTLIERS, log_student_t
+from diagnostics.healthy.prediction import MEDIAN_ERROR, log_student_t
 from diagnostics.preprocessing.baseline import MARGIN
 from diagnostics.preprocessing.scale import SLIGHT
 
@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Array
 
 _FEWEST = 3  # events; fewer prove no gain
-_OUTLIERS = 0.05  # share of events that are independent of the gain: none brings more than log 20
-_CERTAIN = 7.0  # log evidence from which on a cell drifts: a prior of one in a thousand
+_OUTLIERS = 0.05  # share of events that are independent of gain and offset: none brings more than log 20
+_GAIN = 7.0  # log evidence from which on a cell has another gain: three events
+_OFFSET = 9.5  # the same, of an offset: four events, as a reading may hold a residue of the last load
 _GAINS = np.array([0.1, 0.2, 0.35, 0.5, 2.0, 3.0])  # faulty gains: a grid
 GAIN = 1.3  # up or down: a smaller change is no fault, the mean may err by as much
 _LOADED = 2.0  # times the lowest root load that counts as loaded: expected in an event that tests the gain
@@ -49,7 +50,7 @@ def offset_evidence(whole: Array, always: Floats, moving: Mask) -> Floats:
     """
     loaded = (whole[:, 3] == 1) & (whole[:, 1] ** 2 >= SLIGHT)
     lasting = np.logical_and.accumulate(loaded[::-1])[::-1]  # unbroken up to the end
-    surprisal = -np.log(np.maximum(always, OUTLIERS))
+    surprisal = -np.log(np.maximum(always, _OUTLIERS))
     return np.where(moving, np.where(lasting, surprisal, 0.0).sum(axis=0), 0.0)
 
 
@@ -121,12 +122,12 @@ def gains_count(reached: float) -> float:
 
     Events may be correlated, or contacts so small that the neighbours do not determine the load of a cell.
     """
-    return _CERTAIN / max(_CERTAIN, MARGIN * reached)
+    return _GAIN / max(_GAIN, MARGIN * reached)
 
 
 def drifting(offset: Floats, gain: Floats | float = 0.0) -> Mask:
     """Return the cells whose evidence of an offset or a gain, ``[D]`` each, exceeds the threshold, bool ``[D]``."""
-    certain: Mask = (offset >= _CERTAIN) | (gain >= _CERTAIN)
+    certain: Mask = (offset >= _OFFSET) | (gain >= _GAIN)
     return certain
 
 

@@ -100,7 +100,7 @@ def counted(array: str, bench: Bench) -> list[dict]:
 
 def rows(counts: list[dict]) -> Iterator[Row]:
     for count in counts:
-        if "onset, mean" not in count["row"]:  # it is 0, or nearly
+        if "onset, mean" not in count["row"] and "possible" not in count["row"]:  # they are 0, or nearly
             value, noise = value_and_noise({(0, 0): count})
             yield count["row"].strip(), value, noise, count["higher"]
 

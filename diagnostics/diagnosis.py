@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from diagnostics.decision import earlier_versions
 from diagnostics.decision.address_aliasing import find_aliasing
 from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
+from diagnostics.decision.line_cover import candidate_groups
 from diagnostics.decision.result import Diagnosis
 from diagnostics.decision.root_causes import CellFindings, root_causes
 from diagnostics.decision.serialization import Arrays, from_state, to_state
@@ -29,6 +30,7 @@ SCHEMA = "adaptfault.diagnoser/10"
 
 _CERTAIN = 0.999  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
 _SUSPICIOUS_COLD = 3.0  # raw log ratio from which on a cell is no predictor, in a cold start
+_GROUP_SHARE = 0.5  # share of the evidence added with a group excluded, see _weight_of_groups
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
 
 
@@ -199,6 +201,13 @@ class SelfDiagnosis:
         spatial = test.result
         yield
         found = self._found(stream, spatial, explained)
+        weight = found.weight.copy()
+        weight_of = self._weight_of_groups(found, stream)
+        for group in self._groups(found, stream, weight_of(spatial.initial), explained):
+            yield
+            of_group = weight_of(stream.group_excluded(spatial, explained, group))
+            weight[group] = np.maximum(weight[group], of_group[group])
+        found = replace(found, weight=weight)
         yield
         every = np.arange(self.layout.n_cells) if self._order is None else np.argsort(self._order)
         found = found.of(every)
@@ -287,6 +296,36 @@ class SelfDiagnosis:
             events=np.where(intermittent, intermittency.blinks, spatial.events),
             known=known,
         )
+
+    def _weight_of_groups(
+        self, found: CellFindings, stream: StreamState
+    ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+        """Return the function from a summed surprisal with a group excluded to the weights ``[D]`` for the line cover.
+
+        By the chain rule of probability each cell of a group is conditioned on those before it: on half of them, about
+        the mean of conditioning on all and on none.
+        """
+        temporal, kind = stream.temporal(), kinds(stream)
+
+        def weight_of(surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
+            more = self.calibrator_.calibrate(surprisal, temporal, kind) - found.weight
+            return found.weight + _GROUP_SHARE * np.maximum(more, 0.0)
+
+        return weight_of
+
+    def _groups(
+        self, found: CellFindings, stream: StreamState, weight: NDArray[np.float64], explained: NDArray[np.bool_]
+    ) -> list[NDArray[np.intp]]:
+        """Return the groups of cells at rest that one broken line would explain."""
+        if stream.reference.model is None:
+            return []
+        consistent = found.rests & ~found.known & ~explained
+        contradicting = found.alive | ~(found.rests | found.silent) & stream.present
+        if self._order is None:
+            return candidate_groups(consistent, contradicting, weight, self.layout)
+        every = np.argsort(self._order)
+        groups = candidate_groups(consistent[every], contradicting[every], weight[every], self.layout)
+        return [every[group] for group in groups]
 
 
 def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp] | None]:

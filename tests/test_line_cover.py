@@ -3,7 +3,7 @@ import pytest
 
 from diagnostics import Line, SensorLayout
 from diagnostics.decision import line_cover
-from diagnostics.decision.line_cover import Cause, cheapest_of_few, cheapest_of_many
+from diagnostics.decision.line_cover import Cause, candidate_groups, cheapest_of_few, cheapest_of_many
 
 LAYOUT = SensorLayout(2, 11, 10)
 SURE, WEAK, NOTHING = 8.0, 5.0, 0.0
@@ -147,6 +147,39 @@ def test_one_certain_cell_lowers_the_cost_of_its_wire(certain: bool):
     faulty = mask(row[:1]) if certain else mask()
     (cause,) = solve(faulty, consistent, mask(), np.where(consistent, 4.6, NOTHING), LAYOUT) or (None,)
     assert (cause is not None and cause.line is not None) == certain
+
+
+def test_candidate_groups_are_the_cells_that_one_wire_would_explain():
+    row, column = LAYOUT.cells_on(Line(0, "row", 3)), LAYOUT.cells_on(Line(1, "column", 2))
+    consistent = mask(row, column[4:])
+    weight = np.where(mask(row[[0, 5]], column[[6, 9]]), 3.0, NOTHING)
+    groups = candidate_groups(consistent, ~consistent, weight, LAYOUT)
+    assert [group.tolist() for group in groups] == [row.tolist(), column[4:].tolist()]
+    assert candidate_groups(consistent, ~consistent, np.where(mask(row[:1], column[-1:]), 3.0, NOTHING), LAYOUT) == []
+
+
+def test_lines_that_a_stuck_address_would_move_are_one_group_if_none_works():
+    moved, _ = LAYOUT.misaddressed(Line(0, "row_address", 3), 0)
+    consistent = mask(moved)
+    weight = np.where(mask(moved[[0, 15]]), 3.0, NOTHING)  # one cell each of two rows: no row is a group
+    (group,) = candidate_groups(consistent, ~consistent, weight, LAYOUT)
+    assert group.tolist() == moved.tolist()
+    contradicting = ~consistent | mask(moved[-1:])
+    assert all(len(g) < len(moved) for g in candidate_groups(consistent, contradicting, weight, LAYOUT))
+
+
+def test_cells_of_a_pad_with_a_working_one_are_no_group():
+    consistent = mask(np.arange(110))  # a converter has no middle to be broken in
+    weight = np.where(consistent, 3.0, NOTHING)
+    pad = np.arange(110).tolist()
+    assert pad in [group.tolist() for group in candidate_groups(consistent, mask(), weight, LAYOUT)]
+    consistent[60] = False
+    groups = [group.tolist() for group in candidate_groups(consistent, mask([60]), weight, LAYOUT)]
+    assert pad[:60] not in groups
+    assert pad[61:] not in groups
+    addresses = [line for line in LAYOUT.lines if line.kind.endswith("address")]
+    moved = [LAYOUT.misaddressed(line, level)[0].tolist() for line in addresses for level in (0, 1)]
+    assert max(len(group) for group in groups if group not in moved) == 11  # no more than a column
 
 
 def test_a_few_uncertain_cells_do_not_prove_a_broken_wire():

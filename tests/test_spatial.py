@@ -4,7 +4,7 @@ import pytest
 from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, Summary
 from diagnostics.evidence.conditional_test import CellState, Model
-from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest
+from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, group_excluded_evidence
 from diagnostics.healthy.prediction import Prediction
 from diagnostics.preprocessing.scale import Array, Scale
 
@@ -133,6 +133,19 @@ def test_cells_that_move_are_not_scored_and_have_no_evidence():
     assert (spatial.evidence[~spatial.scored] == 0).all()
     assert spatial.events[3] == 4
     assert spatial.events[~spatial.scored].sum() == 0
+
+
+def test_cells_that_broke_together_do_not_vouch_for_each_other():
+    log = pressed(1)
+    log[:, 5:] = 0
+    assert (result_of(log, model=Row()).surprisal[5:] < 0.1).all()
+    runs, events = seen(log)
+    zero, predictors = np.zeros(CELLS), np.ones(CELLS, bool)
+    cells = CellState(runs, zero, zero, zero, predictors, NONE)
+    groups = [np.array([5, 6, 7]), np.array([6])]
+    together, alone = group_excluded_evidence(events, cells, Row(), SCALE, 0.025, predictors, groups)
+    assert (together[5:] > 1).all()
+    assert alone[6] < 0.1  # the others of its row are predictors
 
 
 def test_only_what_came_after_the_onset_speaks_against_a_cell():

@@ -53,6 +53,18 @@ def test_each_cell_is_an_output_of_one_tile_with_all_cells_near_it_on_its_pad_as
             assert set(np.flatnonzero(block & present).tolist()) <= near
 
 
+def test_a_row_across_several_tiles_is_excluded_from_the_predictors_as_a_group(fitted):
+    row = SKIN.cells_on(Line(0, "row", 11))
+    stream = fitted.stream()
+    stream.extend(inject(log(SKIN, 100, 40), [line_fault(SKIN, Line(0, "row", 11), FaultKind.OPEN)], SKIN))
+    stream = stream.complete()
+    spatial, none = stream.spatial().finish(), np.zeros(SKIN.n_cells, bool)
+    of_row, of_one = (stream.group_excluded(spatial, none, group) for group in (row, row[:1]))
+    assert len({i for i, tile in enumerate(tiles(SKIN)) if np.isin(row, tile.outputs).any()}) > 1
+    assert of_row[row].sum() > spatial.surprisal[row].sum() + 3
+    assert of_one[row[0]] == pytest.approx(spatial.surprisal[row[0]], abs=0.5)
+
+
 def test_an_array_of_a_few_hundred_cells_is_one_tile():
     assert len(tiles(SensorLayout.paper())) == 1
     assert len(tiles(SensorLayout(2, 13, 6))) == 1

@@ -112,6 +112,40 @@ def solve(
     return tuple(causes)
 
 
+def candidate_groups(
+    consistent: NDArray[np.bool_], contradicting: NDArray[np.bool_], weight: NDArray[np.float64], layout: SensorLayout
+) -> list[NDArray[np.intp]]:
+    """Return the groups of cells that one fault would explain, where enough of them support it.
+
+    The fault is a wire broken as a whole or at one end, or a stuck address wire, which may select unloaded lines.
+
+    Args:
+        consistent, contradicting: as for :func:`solve`.
+        weight: float ``[D]``, an upper estimate of the log likelihood ratio.
+        layout: the array.
+    """
+    supporting, groups = consistent & (weight >= SUPPORTING), []
+    pads = set(np.flatnonzero(layout.grid(supporting).sum(axis=(1, 2)) >= _MIN_SUPPORT).tolist())
+    enough = bool(pads) if layout.is_matrix else supporting.sum() >= _MIN_SUPPORT
+    for line in layout.lines if enough else ():
+        if line.pad in pads or not layout.is_matrix:
+            groups += [
+                cells[consistent[cells]]
+                for cells in _silenced(line, contradicting, layout)
+                if supporting[cells].sum() >= _MIN_SUPPORT
+            ]
+    return groups
+
+
+def _silenced(line: Line, contradicting: Mask, layout: SensorLayout) -> Sequence[NDArray[np.intp]]:
+    """Return the cells that each possible fault of a wire would make dead, where none of them is alive."""
+    if line.kind in _WIRES:
+        cells = layout.cells_on(line)
+        return _ends(line, cells, contradicting) if contradicting[cells].any() else (cells,)
+    moved = [layout.misaddressed(line, level)[0] for level in (0, 1)]
+    return [cells for cells in moved if not contradicting[cells].any()]
+
+
 def _ends(line: Line, cells: NDArray[np.intp], contradicting: Mask) -> tuple[NDArray[np.intp], ...]:
     """Return the cells beyond the last working one, seen from either end of a wire; none if none works.
 

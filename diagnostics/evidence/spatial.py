@@ -11,7 +11,8 @@ cells that no event loads and that no event leaves unloaded among loaded neighbo
 
 Which cells may serve as predictors depends on which cells are faulty, so the test is iterated: cells that moved are
 the first predictors; then constant cells whose value is plausible join them, and cells that look stuck leave, until
-nothing changes.
+nothing changes. Cells that failed together corroborate each other as predictors, so groups that one broken line would
+explain are scored once more with the whole group excluded (:func:`group_excluded_evidence`).
 """
 
 from __future__ import annotations
@@ -66,6 +67,7 @@ class Spatial:
     Attributes:
         evidence: float ``[D]``, log likelihood ratio stuck : healthy; 0 for cells that are not constant.
         surprisal: float ``[D]``, the part of it that the events add.
+        initial: float ``[D]``, the same in the first round, when only cells that moved were predictors.
         scored: bool ``[D]``, the cells that are constant now.
         events: int ``[D]``, number of events that carry evidence about each cell.
         offset: float ``[D]``, log likelihood ratio that a moving cell never returns to its baseline; 0 elsewhere.
@@ -76,6 +78,7 @@ class Spatial:
 
     evidence: Floats
     surprisal: Floats
+    initial: Floats
     scored: Mask
     events: NDArray[np.intp]
     offset: Floats
@@ -94,7 +97,7 @@ class Spatial:
         scored, d = cells.scored, len(cells.scored)
         accumulated, nothing, none = np.where(scored, cells.accumulated, 0.0), np.zeros(d), np.zeros(d, np.intp)
         unknown = np.full(d, np.nan)
-        return cls(accumulated, accumulated, scored, none, nothing, nothing, unknown, none)
+        return cls(accumulated, accumulated, accumulated, scored, none, nothing, nothing, unknown, none)
 
 
 class SpatialTest:
@@ -137,6 +140,7 @@ class SpatialTest:
         plausible = test.values.rests | (fresh & (cells.temporal < SUDDEN_JUMP))
         self._predictors: Mask = test.eligible & runs.moved & plausible
         self._drifts = np.zeros(len(plausible), bool)
+        self._initial: Floats | None = None
         self._rounds = self._exclusions = 0
         self._agreed: tuple[Prediction, Floats, Floats, Floats] | None = None  # scores with the final predictors
 
@@ -151,6 +155,8 @@ class SpatialTest:
         expected, surprisal = test.score(predictors)
         summed = test.summed(surprisal)
         evidence = np.where(test.scored, test.values.prior + summed, 0.0)
+        if self._initial is None:
+            self._initial = summed
         self._rounds += 1
         self._predictors = test.eligible & (evidence + self._cells.temporal < self._exclusion.threshold)
         if self._rounds == _MOST_ROUNDS or (self._predictors == predictors).all():
@@ -173,9 +179,11 @@ class SpatialTest:
         counts = self._exclusion.gains * test.novelty[test.begins]
         gain = gain_evidence(whole, on_whole, moved, self._scale.root_near, counts)
         of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
+        assert self._initial is not None
         self.result = Spatial(
             evidence,
             summed,
+            self._initial,
             test.scored,
             np.where(of_gain, gain.events, (surprisal > _TESTED).sum(axis=0)),
             offset,
@@ -191,6 +199,32 @@ class SpatialTest:
         self._test = replace(test, eligible=test.eligible & ~more)
         self._rounds, self._agreed = 0, None
         return False
+
+
+def group_excluded_evidence(
+    events: Sequence[ContactEvent],
+    cells: CellState,
+    model: Model,
+    scale: Scale,
+    tolerance: float,
+    predictors: Mask,
+    groups: Sequence[NDArray[np.intp]],
+) -> Floats:
+    """Return the summed surprisal with each group of cells excluded from the predictors, ``[groups, D]``.
+
+    Args:
+        events, cells, model, scale, tolerance: as for :class:`SpatialTest`.
+        predictors: bool ``[D]``, the final predictors.
+        groups: cell indices of each group that one fault would explain.
+    """
+    test = ConditionalTest.of(events, cells, model, scale, tolerance)
+    summed = np.zeros((len(groups), len(predictors)))
+    for i, group in enumerate(groups):
+        others = predictors & test.eligible
+        others[group] = False
+        _, surprisal = test.score(others)
+        summed[i] = test.summed(surprisal)
+    return summed
 
 
 def held_load_evidence(

@@ -25,7 +25,7 @@ from diagnostics.events.tiles import Rectangle, Tile, tiles
 from diagnostics.evidence.conditional_test import SUDDEN_JUMP, CellState, Model
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
-from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, held_load_evidence
+from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, group_excluded_evidence, held_load_evidence
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
 from diagnostics.preprocessing.offset import OffsetTracker
 from diagnostics.preprocessing.readings import held
@@ -233,6 +233,28 @@ class StreamState:
         """Return the spatial test of all constant cells; cells already ``explained`` (bool ``[D]``) are left out."""
         cells = self.cells(explained)
         return self._test(self._with_held_loads(cells) if self.tiled else cells, self.local, passes=2)
+
+    def group_excluded(self, spatial: Spatial, explained: Mask, group: Cells) -> NDArray[np.float64]:
+        """Return the summed surprisal ``[D]`` with a group of cells excluded from the predictors.
+
+        Args:
+            spatial: the result of the test with all cells that are not suspected as predictors.
+            explained: bool ``[D]``, cells already explained.
+            group: cells that one fault would explain.
+        """
+        every, predictors = self.cells(explained), ~self.suspected(spatial)
+        total, among = self.accumulated.copy(), np.zeros(len(predictors), bool)
+        among[group] = True
+        for i, events in self.local.kept():
+            tile = self.local.tiles[i]
+            if among[tile.outputs].any():
+                cells = tile.inputs
+                (summed,) = group_excluded_evidence(
+                    events.kept, every.of(cells), self.model_of(i, events), self.scale.of(cells),
+                    self.reference.tolerance, predictors[cells], [np.flatnonzero(among[cells])],
+                )  # fmt: skip
+                total[tile.outputs] = summed[tile.place]
+        return total
 
     def suspected(self, spatial: Spatial) -> Mask:
         """Return the cells that are no predictors after a test, bool ``[D]``."""

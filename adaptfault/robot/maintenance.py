@@ -103,7 +103,8 @@ class MaintenanceReport:
             lines.append(f"  weak base model: accuracy {both}; train it longer or on more recordings")
         if self.diagnosis is not None:
             lines += [f"  {fault.reason}" for fault in self.diagnosis.faults]
-            lines += [f"  {fault.reason}" for fault in (*self.diagnosis.possible, *self.diagnosis.transport)]
+            lines += [f"  {wire.reason}" for wire in self.diagnosis.possible]
+            lines += [f"  {fault.reason}" for fault in self.diagnosis.transport]
             lines.append(f"  {self.diagnosis.coverage}")
             lines += [f"  to test more: {touch}" for touch in self.diagnosis.coverage.advice[:3]]
         lines += [f"  {stage}" for stage in self.stages]

@@ -124,7 +124,7 @@ class Diagnosis:
     def __str__(self) -> str:
         found = f"{len(self.fault_set)} faulty cells" if len(self.fault_set) != 1 else "1 faulty cell"
         reasons = [line for fault in self.faults for line in (fault.reason, *(f"  or {a}" for a in fault.alternatives))]
-        reasons += [fault.reason for fault in (*self.possible, *self.transport)]
+        reasons += [wire.reason for wire in self.possible] + [fault.reason for fault in self.transport]
         recordings = "1 recording" if self.n_recordings == 1 else f"{self.n_recordings} recordings"
         frames = "1 frame" if self.n_frames == 1 else f"{self.n_frames} frames"
         head = f"{found} in {recordings} ({frames}); {self.coverage}"

@@ -82,7 +82,7 @@ def test_lines_that_have_read_alike_since_some_frame_are_dated():
     assert (pair.pad, pair.kind, pair.first, pair.second) == (1, "row", 2, 3)
     assert 190 <= pair.since <= 230
     assert pair.since <= pair.seen_by
-    assert pair.witnesses > 5
+    assert pair.coincidences > 5
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -145,7 +145,7 @@ def test_cells_that_hold_still_or_are_saturated_or_unloaded_are_not_informative(
 def test_the_most_coincidences_of_any_pair_are_kept():
     assert DuplicateLines.begin(LAYOUT).most == 0
     log = inject(pressed(1), [bridge(LAYOUT, Line(1, "row", 2))], LAYOUT, until=500)
-    assert state_after(log).duplicates.most >= duplicate_pairs(log[:500])[0].witnesses
+    assert state_after(log).duplicates.most >= duplicate_pairs(log[:500])[0].coincidences
 
 
 # What joins them

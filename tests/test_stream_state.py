@@ -47,7 +47,7 @@ def same(a: StreamState, b: StreamState) -> None:
     np.testing.assert_array_equal(a.accumulated, b.accumulated)
     np.testing.assert_array_equal(a.received, b.received)
     for kind, of_a in a.duplicates.of.items():
-        for name in ("since", "seen_by", "witnesses", "sums"):
+        for name in ("since", "seen_by", "coincidences", "sums"):
             np.testing.assert_array_equal(getattr(of_a, name), getattr(b.duplicates.of[kind], name), err_msg=name)
     assert [(r.onset, r.frames) for r in a.transport.repetitions] == [
         (r.onset, r.frames) for r in b.transport.repetitions

@@ -33,7 +33,7 @@ class Aliasing:
         value: the level of the bit, or the index of the other line.
         cells: indices of the cells that are misread.
         onset: number of the first frame; 0: from the start.
-        witnesses: number of moving loads on which the lines agreed.
+        coincidences: number of moving loads on which the lines agreed.
         copies: pairs (line, line that is read instead; -1: none is connected).
         alternatives: other causes that the data permit.
         doubtful: indices of the cells that may be the misread ones instead.
@@ -43,7 +43,7 @@ class Aliasing:
     value: int
     cells: tuple[int, ...]
     onset: int
-    witnesses: int
+    coincidences: int
     copies: tuple[tuple[int, int], ...]
     alternatives: tuple[str, ...]
     doubtful: tuple[int, ...] = ()
@@ -83,7 +83,13 @@ def _on_pad(pairs: list[DuplicatePair], stream: StreamState) -> list[Aliasing]:
         also = (f"{line} reads {other}, or the other way round: an address fault of this one line",)
         found.append(
             Aliasing(
-                line, pair.second, tuple(cells.tolist()), pair.since, pair.witnesses, ((pair.first, pair.second),), also
+                line,
+                pair.second,
+                tuple(cells.tolist()),
+                pair.since,
+                pair.coincidences,
+                ((pair.first, pair.second),),
+                also,
             )
         )
     return found
@@ -112,7 +118,7 @@ def _stuck_bit(line: Line, pairs: list[DuplicatePair], onset: int, stream: Strea
         level,
         tuple(cells.tolist()),
         onset,
-        sum(pair.witnesses for pair in pairs),
+        sum(pair.coincidences for pair in pairs),
         tuple(sorted(copies.items())),
         () if clear else (f"{line} is stuck at {1 - level}",),
         () if clear else tuple(layout.misaddressed(line, 1 - level)[0].tolist()),

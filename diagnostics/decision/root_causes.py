@@ -192,16 +192,16 @@ def _aliased(a: Aliasing, layout: SensorLayout) -> Fault:
         text = f"{a.line} is stuck at {a.value}: {copies}"
         check = f"the {across} multiplexer and its address wires"
     since = "" if a.onset == 0 else f" from frame {a.onset} on ({a.onset / layout.rate:.1f} s)"
-    reason = f"{text}{since}; they agreed on {a.witnesses} moving loads; check {check}"
+    reason = f"{text}{since}; they agreed on {a.coincidences} moving loads; check {check}"
     return Fault(
         FaultKind.ALIAS,
         a.cells,
         line=a.line,
         value=a.value,
         onset=a.onset or None,
-        probability=1.0 - 0.5 ** min(a.witnesses, 30),
+        probability=1.0 - 0.5 ** min(a.coincidences, 30),
         reason=reason,
-        evidence=a.witnesses,
+        evidence=a.coincidences,
         alternatives=a.alternatives,
     )
 

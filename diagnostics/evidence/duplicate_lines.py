@@ -47,7 +47,7 @@ class DuplicatePair:
         first, second: indices of the lines, ascending.
         since: number of the first frame from which on they did not differ.
         seen_by: number of the frame of the first coincidence.
-        witnesses: number of coincidences since.
+        coincidences: number of coincidences since.
     """
 
     pad: int
@@ -56,7 +56,7 @@ class DuplicatePair:
     second: int
     since: int
     seen_by: int
-    witnesses: int
+    coincidences: int
 
 
 @cache
@@ -74,7 +74,7 @@ class _Pairs:
     Attributes:
         first, second: int ``[pairs]``, indices of the lines.
         there: bool ``[pads, pairs, positions]``, where both lines have a cell.
-        since, seen_by, witnesses: int ``[pads, pairs]``, see :class:`DuplicatePair`.
+        since, seen_by, coincidences: int ``[pads, pairs]``, see :class:`DuplicatePair`.
         sums: float ``[4, pads, pairs, positions]``, sums over informative frames of the difference, its square, its
             product with the one before, and of 1; the squares are above 0 where there were coincidences.
     """
@@ -84,7 +84,7 @@ class _Pairs:
     there: Mask
     since: NDArray[np.intp]
     seen_by: NDArray[np.intp]
-    witnesses: NDArray[np.intp]
+    coincidences: NDArray[np.intp]
     sums: NDArray[np.float32]
 
     @classmethod
@@ -110,13 +110,13 @@ class _Pairs:
         since = np.where(ever, numbers[last] + 1, self.since)
         both: Mask = np.take(informative, self.first, axis=1)  # [pads, pairs, positions]
         both &= np.take(informative, self.second, axis=1)
-        seen_by, witnesses, sums = self.seen_by, self.witnesses, self.sums
+        seen_by, coincidences, sums = self.seen_by, self.coincidences, self.sums
         agree = both.any(axis=2) & ~ever
-        if agree.any() or (ever & (witnesses > 0)).any():
-            witnesses = np.where(ever, 0, witnesses + np.minimum(both.sum(axis=2), _MOST_AT_ONCE))
-            seen_by = np.where(agree & (self.witnesses == 0), numbers[-1], seen_by)
+        if agree.any() or (ever & (coincidences > 0)).any():
+            coincidences = np.where(ever, 0, coincidences + np.minimum(both.sum(axis=2), _MOST_AT_ONCE))
+            seen_by = np.where(agree & (self.coincidences == 0), numbers[-1], seen_by)
             sums = self._summed(lines, both & ~ever[..., None], ever, tolerance)
-        return _Pairs(self.first, self.second, self.there, since, seen_by, witnesses, sums)
+        return _Pairs(self.first, self.second, self.there, since, seen_by, coincidences, sums)
 
     def _summed(self, lines: NDArray[np.float32], both: Mask, anew: Mask, tolerance: float) -> NDArray[np.float32]:
         """Return the sums with the informative cells (``both``) added; sums of pairs that differ begin ``anew``."""
@@ -132,7 +132,7 @@ class _Pairs:
 
     def matching(self, needed: int) -> list[tuple[int, int]]:
         """Return (pad, pair) of the pairs with at least ``needed`` coincidences that differ by noise only."""
-        return [(pad, i) for pad, i in np.argwhere(self.witnesses >= needed).tolist() if not self._steady(pad, i)]
+        return [(pad, i) for pad, i in np.argwhere(self.coincidences >= needed).tolist() if not self._steady(pad, i)]
 
     def _steady(self, pad: int, pair: int) -> bool:
         """Return whether the difference of two lines is constant or slow rather than noise, see the module."""
@@ -185,7 +185,7 @@ class DuplicateLines:
             "row": self.of["row"].extend(grid, numbers[some], loaded, tolerance),
             "column": self.of["column"].extend(grid.swapaxes(2, 3), numbers[some], loaded.swapaxes(1, 2), tolerance),
         }
-        more = [int(each.witnesses[place]) for each in of.values() for place in each.matching(self.most + 1)]
+        more = [int(each.coincidences[place]) for each in of.values() for place in each.matching(self.most + 1)]
         return DuplicateLines(self.layout, of, max([self.most, *more]))
 
     def duplicate_pairs(self, usual: int) -> list[DuplicatePair]:
@@ -194,7 +194,7 @@ class DuplicateLines:
         return [
             DuplicatePair(
                 pad, kind, int(each.first[i]), int(each.second[i]),
-                *(int(values[pad, i]) for values in (each.since, each.seen_by, each.witnesses)),
+                *(int(values[pad, i]) for values in (each.since, each.seen_by, each.coincidences)),
             )
             for kind, each in self.of.items()
             for pad, i in each.matching(needed)

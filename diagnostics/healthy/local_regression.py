@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.special import expit, logit
 
+from diagnostics.healthy.dual_ridge import covariance_and_precision
+from diagnostics.healthy.dual_ridge import logistic as dual_logistic
 from diagnostics.healthy.stacking import RegressionOutput
 from diagnostics.preprocessing.scale import Array
 
@@ -100,6 +102,8 @@ class LocalRegression:
             p_floor: lower limit of the probabilities.
             start: the shared prior of a tile of a large array, which has fewer samples than inputs.
         """
+        from sklearn.covariance import LedoitWolf
+
         x = features[:, :, inputs]
         mean, scale = x.mean(axis=0), x.std(axis=0)
         if start is None:
@@ -110,16 +114,24 @@ class LocalRegression:
         place = np.searchsorted(inputs, outputs)
         targets = np.concatenate([x[:, 2, place] == 0, x[:, 3, place] == 1], axis=1).astype(np.float32)
         own = np.arange(FEATURES) * len(inputs) + np.tile(place, 2)[:, None]
-        flat, z1 = z.reshape(len(z), -1), z[:, 1].astype(np.float64)
+        flat = z.reshape(len(z), -1)
         if start is None:
-            weight, bias = _logistic(flat, targets, own, RIDGE)
+            weight, bias = _logistic(flat, targets, own)
+            estimate = LedoitWolf().fit(z[:, 1].astype(np.float64))
+            covariance, precision = estimate.covariance_, estimate.precision_
         else:
             shared = start.weight.reshape(flat.shape[1], -1).astype(np.float32)
-            shared_bias = np.repeat(start.bias, len(outputs)).astype(np.float32)
-            weight, bias = _logistic(flat, targets, own, start.ridge, x.reshape(len(z), -1) @ shared + shared_bias)
+            shared_odds = x.reshape(len(z), -1) @ shared + np.repeat(start.bias, len(outputs)).astype(np.float32)
+            y = targets.reshape(len(z), 2, -1)
+            of_samples, own_bias = dual_logistic(flat, y, z[:, :, place], start.ridge, shared_odds.reshape(y.shape))
+            weight, bias = flat.T @ of_samples.reshape(len(z), -1), own_bias.ravel()
+            weight[own, np.arange(len(own))[:, None]] = 0
             weight += shared * scale.reshape(-1, 1)
-            bias += mean.reshape(-1) @ shared + shared_bias
-        covariance, precision = _covariance_and_precision(z1, None if start is None else start.taper)
+            bias += mean.reshape(-1) @ shared + np.repeat(start.bias, len(outputs)).astype(np.float32)
+            covariance, precision = covariance_and_precision(z[:, 1].astype(np.float64), start.taper)
+        if not z[:, 1].any():  # no event in this tile: cells count as independent
+            covariance = precision = np.eye(len(inputs))
+        z1 = z[:, 1].astype(np.float64)
         error = (z1 @ precision / np.diag(precision))[:, place] * np.where(np.isfinite(scale[1]), scale[1], 0)[place]
         # An unloaded cell is predicted almost exactly: only excerpts in which the cell is loaded count.
         loaded = x[:, 2, place] > 0
@@ -176,28 +188,7 @@ def predict_regressions(
     return regressed
 
 
-def _covariance_and_precision(
-    z: NDArray[np.float64], taper: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the covariance of samples ``[n, inputs]`` and its inverse; without any load cells count as independent.
-
-    Shrunk (Ledoit and Wolf 2004) and multiplied by ``taper`` (``[inputs, inputs]``, falling with distance): few
-    samples produce spurious correlations at a distance (Houtekamer and Mitchell 2001).
-    """
-    from sklearn.covariance import LedoitWolf
-
-    if not z.any():
-        return np.eye(z.shape[1]), np.eye(z.shape[1])
-    estimate = LedoitWolf().fit(z)
-    if taper is None:
-        return estimate.covariance_, estimate.precision_
-    covariance = estimate.covariance_ * taper
-    return covariance, linalg.pinvh(covariance)
-
-
-def _logistic(
-    x: Array, y: Array, own: NDArray[np.intp], ridge: float, usual: Array | None = None
-) -> tuple[Array, Array]:
+def _logistic(x: Array, y: Array, own: NDArray[np.intp]) -> tuple[Array, Array]:
     """Fit one ridge logistic regression for each column of ``y``, in which some weights are fixed at 0.
 
     Minimises a quadratic upper bound of the loss with one curvature for all columns (Boehning 1992), accelerated
@@ -207,28 +198,23 @@ def _logistic(
         x: ``[n, d]``.
         y: ``[n, k]``, 0 or 1.
         own: int ``[k, f]``, the inputs whose weight is 0, for each column.
-        ridge: per sample.
-        usual: log odds ``[n, k]`` to which the regressions are added; their bias is then shrunk as well.
 
     Returns:
         Weights ``[d, k]`` and biases ``[k]``.
     """
     n, d = x.shape
     x = np.concatenate([x, np.ones((n, 1), np.float32)], axis=1)
-    penalty = np.full((d + 1, 1), ridge, np.float32)
-    if usual is None:
-        penalty[d] = _BIAS_RIDGE
+    penalty = np.full((d + 1, 1), RIDGE, np.float32)
+    penalty[d] = _BIAS_RIDGE
     inverse = np.linalg.inv((x.T @ x).astype(np.float64) / (4 * n) + np.diag(penalty[:, 0])).astype(np.float32)
     # Project each step onto the subspace in which the fixed weights do not change (Lagrange multipliers).
     block = np.linalg.inv(inverse[own[:, :, None], own[:, None, :]].astype(np.float64)).astype(np.float32)  # (k, f, f)
     projection = np.einsum("dkf,kfg->kdg", inverse[:, own], block)
     weight = np.zeros((d + 1, y.shape[1]), np.float32)
-    if usual is None:
-        weight[d] = logit((y.sum(axis=0) + 1) / (n + 2))  # Laplace smoothing keeps it finite
-        usual = np.zeros((1, y.shape[1]), np.float32)
+    weight[d] = logit((y.sum(axis=0) + 1) / (n + 2))  # Laplace smoothing keeps it finite
     ahead, column = weight, np.arange(len(own))[:, None]
     for step in range(_STEPS):
-        change = inverse @ (x.T @ ((expit(x @ ahead + usual) - y) / np.float32(n)) + penalty * ahead)
+        change = inverse @ (x.T @ ((expit(x @ ahead) - y) / np.float32(n)) + penalty * ahead)
         change -= np.matmul(projection, change[own, column][:, :, None])[:, :, 0].T
         change[own, column] = 0
         following = ahead - change

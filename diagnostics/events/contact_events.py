@@ -217,16 +217,10 @@ class EventLog:
             elif ongoing:
                 lowest = np.minimum(lowest, kept[-1].lowest)
                 highest = np.maximum(highest, kept[-1].highest)
-            (floor, lowest_of_all), (peak, highest_of_all) = (lowest @ weights).T, (highest @ weights).T
-            now, moving = (ahead @ weights)[:, 0], peak - floor
             # Loads that are constant since the event began would have to be released.
             held = constant & (start >= (kept[-1].since if ongoing else numbers[begin]))
             weakest = max(_WEAKEST * largest, _MIN_AMPLITUDE, _SLIGHT * float(ahead[0] @ held))
-            enough = np.maximum(_MOVING * (highest_of_all - lowest_of_all), weakest)
-            # A relaxing load is also lowest at its end, but most of it remains.
-            gone = peak - now >= _MOVING * peak
-            released = (now - floor <= _RELEASED * moving) & (moving > enough) & gone
-            end = int(released.argmax()) if released.any() else len(ahead)
+            end = _release(ahead @ weights, lowest @ weights, highest @ weights, weakest)
             if end:
                 part = Summary.of(ahead[:end], int(numbers[begin]), root_near)
                 low, high = lowest[end - 1], highest[end - 1]
@@ -296,6 +290,23 @@ def count_repeats(
     sizes = np.linalg.norm(means, axis=1)
     similar = means @ means.T >= least * np.maximum(sizes[:, None] * sizes, _MIN_AMPLITUDE**2)
     return np.asarray(np.tril(similar, -1).sum(axis=1))
+
+
+def _release(load: Array, lowest: Array, highest: Array, weakest: float) -> int:
+    """Return the first frame in which the load of an event is released; the number of frames, if in none.
+
+    Args:
+        load: root load, summed over the moving and over the working cells, ``[t, 2]``.
+        lowest, highest: the same of the extremes of each cell so far, ``[t, 2]``.
+        weakest: smaller changes are no release.
+    """
+    (floor, lowest_of_all), (peak, highest_of_all) = lowest.T, highest.T
+    now, moving = load[:, 0], peak - floor
+    enough = np.maximum(_MOVING * (highest_of_all - lowest_of_all), weakest)
+    # A relaxing load is also lowest at its end, but most of it remains.
+    gone = peak - now >= _MOVING * peak
+    released = (now - floor <= _RELEASED * moving) & (moving > enough) & gone
+    return int(released.argmax()) if released.any() else len(load)
 
 
 def _releasing_frames(root: Array, last: Array | None) -> int:

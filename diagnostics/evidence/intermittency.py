@@ -184,16 +184,10 @@ class Intermittency:
         gain = events * np.log(_BLINK_RATE / usual.blinks) - loaded * (_BLINK_RATE - usual.blinks)
         blinking = self.blinking.copy()
         blinking[moving] = np.clip(blinking[moving] + usual.blinks_count * gain, 0.0, full)
-        noisier = noise_level > usual.noise[level]
-        if usual.alone and noisier.any():
-            every, which = np.zeros(len(constant)), np.flatnonzero(noisier)
-            every[moving] = noise_level
-            neighbours = self.layout.beside[moving[which]]
-            noisier[which] = ~_shared(neighbours, every[neighbours], noise_level[which])
+        noisier = self._noisier(noise_level, usual.noise[level], moving, usual.alone)
         if noisier.sum() > max(crowd, _CROWD * len(constant)):
             noisier[:] = False
-        gain = np.where(noisier, np.log(_NOISY_SHARE / _RARE), 0.0)
-        gain[events > 1] = 0.0  # blinks are noise as well: count them once
+        gain = np.where(events > 1, 0.0, np.log(_NOISY_SHARE / _RARE))  # blinks are noise as well: count them once
         noisy = self.noisy + usual.noise_counts * np.log((1 - _NOISY_SHARE) / (1 - _RARE))
         noisy[moving] = np.where(noisier, self.noisy[moving] + usual.noise_counts * gain, noisy[moving])
         noisy = np.clip(noisy, 0.0, full)
@@ -210,6 +204,16 @@ class Intermittency:
             np.where(quiet, numbers[0], self.noisy_since),
             lowest,
         )
+
+    def _noisier(self, noise: Floats, limit: Floats, moving: NDArray[np.intp], alone: bool) -> NDArray[np.bool_]:
+        """Return which of the ``moving`` cells have more noise than the limit, bool ``[n]``; ``alone``: unshared."""
+        noisier = noise > limit
+        if alone and noisier.any():
+            every, which = np.zeros(self.layout.n_cells), np.flatnonzero(noisier)
+            every[moving] = noise
+            neighbours = self.layout.beside[moving[which]]
+            noisier[which] = ~_shared(neighbours, every[neighbours], noise[which])
+        return noisier
 
     @property
     def intermittent(self) -> NDArray[np.bool_]:

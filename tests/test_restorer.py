@@ -128,5 +128,11 @@ def test_bad_input_is_refused_in_one_line(small):
 
 
 def test_a_restorer_needs_no_torch():
-    code = "import sys; from adaptfault import Restorer; assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
+    code = (
+        "import sys\nimport numpy as np\n"
+        "from adaptfault import Restorer\nfrom diagnostics import FaultSet, SensorLayout\n"
+        "restorer = Restorer(SensorLayout(1, 2, 3)).fit(np.random.default_rng(0).uniform(0, 5, (50, 6)))\n"
+        "restored = restorer.update(np.full(6, np.nan), FaultSet((1,), 6))\n"
+        "sys.exit('torch' in sys.modules or not np.isfinite(restored).all())"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

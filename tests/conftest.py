@@ -225,7 +225,7 @@ def without_export() -> Iterator[None]:
 
 @contextmanager
 def without_calibration() -> Iterator[None]:
-    """Let a fit keep the calibration of a cold start: its simulated logs take most of the time, and have their tests."""
+    """Let a fit keep the calibration of a cold start: its simulated logs take most of the time and have tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Calibrator, "fit", lambda recordings, layout, *, progress: Calibrator())
         yield

@@ -19,7 +19,8 @@ from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.data.simulated_grasps import simulate
 from adaptfault.robot.bundle import Bundle
-from diagnostics import Fault, FaultSet, Line, SelfDiagnosis, SensorLayout, line_fault
+from diagnostics import Fault, FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault
+from diagnostics.decision.calibration import Calibrator
 
 
 def without_torch(path: Path) -> bool:
@@ -57,17 +58,19 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("few")
 
 
+@pytest.hookimpl(trylast=True)  # after the choice of tests
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put what needs a costly fixture together, so that the processes of ``pytest -n 2`` do not wait for each other.
 
-    The first process begins with the fitted diagnosis; the bundle comes last, and is made while the other one is busy.
+    Each process gets one half: the first begins with the fitted diagnosis, the second with the bundle.
     """
-
-    def costly(item: pytest.Item) -> int:
+    parts: dict[str, list[pytest.Item]] = {"fitted": [], "made_bundle": [], "versions": [], "": []}
+    for item in items:
         names = getattr(item, "fixturenames", ())
-        return 0 if "fitted" in names else 3 if "made_bundle" in names else 2 if "versions" in names else 1
-
-    items.sort(key=costly)
+        parts[next((costly for costly in parts if costly in names), "")].append(item)
+    fitted, bundle, versions, others = parts.values()
+    half = max(0, len(items) // 2 - len(fitted))
+    items[:] = [*fitted, *others[:half], *bundle, *versions, *others[half:]]
 
 
 @pytest.fixture(scope="session")
@@ -220,6 +223,20 @@ def without_export() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def without_calibration() -> Iterator[None]:
+    """Let a fit keep the calibration of a cold start: its simulated logs take most of the time and have tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Calibrator, "fit", lambda recordings, layout, *, progress: Calibrator())
+        yield
+
+
+@pytest.fixture
+def uncalibrated() -> Iterator[None]:
+    with without_calibration():
+        yield
+
+
 @pytest.fixture(scope="session")
 def made_bundle(small_grasps: Recordings, made_once) -> Path:
     """A bundle made by the command line; not to be changed."""
@@ -238,6 +255,24 @@ def bundle(made_bundle: Path, tmp_path: Path) -> Iterator[Bundle]:
     """A copy of it, to be changed."""
     shutil.copytree(made_bundle, tmp_path / "robot.bundle")
     with without_export():
+        yield Bundle.open(tmp_path / "robot.bundle")
+
+
+@pytest.fixture
+def repaired(
+    made_bundle: Path, later_grasps: list[np.ndarray], broken_row: Fault, made_once, tmp_path: Path
+) -> Iterator[Bundle]:
+    """A copy of it after maintenance with the broken row in 12 of the later grasps: version 2 is on probation."""
+
+    def make(home: Path) -> None:
+        from adaptfault.robot.maintenance import maintain
+
+        shutil.copytree(made_bundle, home / "robot.bundle")
+        log = [inject(frames, [broken_row], SIMULATED) for frames in later_grasps[:12]]
+        assert maintain(Bundle.open(home / "robot.bundle"), log).decision == "deployed"
+
+    with without_export():
+        shutil.copytree(made_once("repaired", make) / "robot.bundle", tmp_path / "robot.bundle")
         yield Bundle.open(tmp_path / "robot.bundle")
 
 

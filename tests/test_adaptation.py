@@ -123,6 +123,7 @@ def test_each_stage_repairs_and_none_is_worse_than_the_one_before(adapter):
     assert reached == sorted(reached)
 
 
+@pytest.mark.slow
 def test_on_fewer_numbers_the_network_gives_the_same_features_and_as_good_a_head(adapter):
     assert adapter.compact is None  # so few windows are not worth it
     folded = Adapter(adapter.model, adapter.train, adapter.validation)

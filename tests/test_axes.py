@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from conftest import without_calibration
 
 from diagnostics import Diagnosis, FaultKind, Line, Monitor, SelfDiagnosis, SensorLayout
 
@@ -27,7 +28,8 @@ def recordings(count: int, seed: int) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    return SelfDiagnosis(TAXELS).fit(recordings(40, 0))
+    with without_calibration():
+        return SelfDiagnosis(TAXELS).fit(recordings(40, 0))
 
 
 def test_the_axis_runs_last_and_each_position_is_a_wire():

@@ -1,5 +1,8 @@
+from functools import cache
+
 import numpy as np
 import pytest
+from conftest import without_calibration
 
 from diagnostics import Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
 from diagnostics.events.constant_runs import ConstantRuns
@@ -138,9 +141,15 @@ def test_a_cell_that_is_always_loaded_has_no_rest_to_fall_short_of():
     assert least.reading[60] < 0.04 < held[0][:, 60].min()
 
 
+@cache
+def fitted_to(sigma: float, rest: float) -> SelfDiagnosis:
+    with without_calibration():
+        return SelfDiagnosis(LAYOUT).fit(noisy(events(0), sigma, rest))
+
+
 @pytest.mark.parametrize(("sigma", "rest"), [(0.0, 0.08), (0.01, 0.1)])
 def test_an_open_cell_is_found_without_contact_where_cells_rest_above_0(sigma, rest):
-    fitted = SelfDiagnosis(LAYOUT).fit(noisy(events(0), sigma, rest))
+    fitted = fitted_to(sigma, rest)
     log = noisy(events(1, 3), sigma, rest, seed=11)
     assert not fitted.diagnose(log).fault_set
     untouched = LAYOUT.cell(0, 7, 4)
@@ -151,13 +160,13 @@ def test_an_open_cell_is_found_without_contact_where_cells_rest_above_0(sigma, r
 
 
 def test_noise_alone_proves_no_cell_alive():
-    fitted = SelfDiagnosis(LAYOUT).fit(noisy(events(0), 0.01, 0.1))
+    fitted = fitted_to(0.01, 0.1)
     idle = noisy([np.zeros((200, CELLS))], 0.01, 0.1, seed=12)
     assert set(fitted.diagnose(idle).verdicts) == {Verdict.UNTESTED}
 
 
 def test_cells_that_only_have_noise_are_not_put_down_to_a_broken_wire():
-    fitted = SelfDiagnosis(LAYOUT).fit(noisy(events(0), 0.01, 0.1))
+    fitted = fitted_to(0.01, 0.1)
     dead = list(range(20))
     idle = noisy([np.zeros((200, CELLS))], 0.01, 0.1, seed=12)[0]
     idle[:, dead] = 0

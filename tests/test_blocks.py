@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def log(grasps):
-    values = np.concatenate(grasps.frames[::3]).astype(np.float32).copy()
+    values = np.concatenate(grasps.frames[::7]).astype(np.float32).copy()
     values.reshape(-1, 2, 11, 10)[:, 1, 5] = 5.0
     values[500:520, 7] = np.nan
     return values
@@ -30,8 +30,8 @@ def written(folder, log, kind):
     folder.mkdir(exist_ok=True)
     match kind:
         case "npy":
-            np.save(folder / "a.npy", log[:3000])
-            np.save(folder / "b.npy", log[3000:].reshape(-1, 2, 11, 10))
+            np.save(folder / "a.npy", log[:900])
+            np.save(folder / "b.npy", log[900:].reshape(-1, 2, 11, 10))
         case "counts":
             np.save(folder / "a.npy", np.nan_to_num(log * 819).astype(np.uint16))
         case "several":

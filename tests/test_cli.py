@@ -95,6 +95,7 @@ def test_the_demo_runs_on_the_users_recordings_and_writes_a_report_that_needs_no
     assert not (out / "training.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_training_again_gives_the_same_model(home, tmp_path):
     for name in ("first", "again"):
         command = ["train", str(home / "grasps.npz"), "--out", str(tmp_path / name), "--epochs", "2", "--quiet"]

@@ -136,6 +136,7 @@ def test_an_adapter_works_on_the_cpu_wherever_the_model_is(elsewhere):
     assert model.head.weight.device == AWAY
 
 
+@pytest.mark.slow
 def test_the_papers_networks_are_trained_there_and_answer_as_those_trained_here(elsewhere, tmp_path):
     grasps = simulate(6, SensorLayout(2, 6, 5), n_frames=30, seed=1, classes=("nothing", "softer", "harder"))
     data = make_windows(grasps.frames, grasps.labels, grasps.layout)

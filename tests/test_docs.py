@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from _pytest.mark import ParameterSet
-from conftest import without_export
+from conftest import without_calibration, without_export
 
 import adaptfault as af
 from adaptfault.cli import COMMANDS, main
@@ -78,7 +78,7 @@ def place(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
     shutil.copytree(prepared, place)
     monkeypatch.chdir(place)
     monkeypatch.setattr(af, "train", partial(af.train, epochs=1, progress=False))
-    with without_export():
+    with without_export(), without_calibration():
         yield place
 
 
@@ -87,7 +87,9 @@ def test_the_python_on_a_page_runs(page, place, later_grasps, capsys):
     diagnoser = Bundle.open("robot.bundle").diagnoser()
     frames = np.concatenate(later_grasps)
     given = {"af": af, "diagnoser": diagnoser, "frames": frames, "frame": frames[0], "recordings": later_grasps}
-    for code in blocks(page, "python"):
+    found = blocks(page, "python")
+    assert len(found) == page.read_text().count("```python") > 0
+    for code in found:
         exec(compile(code, page.name, "exec"), given)
 
 

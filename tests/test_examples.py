@@ -35,22 +35,27 @@ LESS = {  # they take minutes
     "any_model.py": ["--small"],
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
 }
-SLOW = {  # more than 7 s of CPU time
+SLOW = {  # they take long, or a test of the library proves the same
     "any_model.py",
     "adaptation_figures.py",
+    "circuit_vs_injector.py",
     "compare_classification.py",
     "compare_keras.py",
     "core_speed.py",
     "deploy_speed.py",
+    "esp32_sender.py",
     "fleet_scaling.py",
     "attack.py",
     "kill_maintenance.py",
+    "own_model.py",
     "picture.py",
     "power_cut.py",
     "relay.py",
     "repair.py",
     "scale_curves.py",
+    "simulated_vs_real.py",
     "soak.py",
+    "udp_soak.py",
     "wrong_fault_set.py",
 }
 SLOW_ON_RECORDINGS = {

@@ -2,12 +2,14 @@ import json
 import shutil
 import threading
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import without_export
 
 import adaptfault.fleet.run as running
 import adaptfault.fleet.work as working
@@ -49,9 +51,24 @@ def fleet(farm) -> Fleet:
     return Fleet.read(farm / "fleet.toml")
 
 
+@contextmanager
+def in_this_process() -> Iterator[None]:
+    """Work on robots here; workers in processes of their own have tests that are slow, and those of fleet_workers."""
+    with pytest.MonkeyPatch.context() as patch, without_export():
+        patch.setattr(running, "engine", lambda task, **where: nullcontext(partial(map, task.work)))
+        yield
+
+
+@pytest.fixture
+def here() -> Iterator[None]:
+    with in_this_process():
+        yield
+
+
 @pytest.fixture(scope="module")
 def sequential(fleet, tmp_path_factory) -> FleetReport:
-    return maintain_fleet(fleet, tmp_path_factory.mktemp("run"), jobs=1, dry_run=True, progress=False)
+    with in_this_process():
+        return maintain_fleet(fleet, tmp_path_factory.mktemp("run"), jobs=1, dry_run=True, progress=False)
 
 
 def told(report: FleetReport) -> dict:
@@ -106,6 +123,7 @@ def test_two_workers_of_a_dask_cluster_report_what_one_process_does(fleet, seque
     assert told(report) == told(sequential)
 
 
+@pytest.mark.usefixtures("here")
 def test_a_fleet_is_maintained_through_the_command_line(made_bundle, later_grasps, tmp_path, capsys):
     shutil.copytree(made_bundle, tmp_path / "r.bundle")
     save_npz(tmp_path / "log.npz", Recordings(tuple(r.astype(np.float32) for r in later_grasps), LAYOUT))

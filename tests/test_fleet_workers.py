@@ -74,7 +74,7 @@ def cluster() -> Iterator[str]:
         yield started.scheduler_address
 
 
-@pytest.fixture(params=["loky", "dask"])
+@pytest.fixture(params=["loky", pytest.param("dask", marks=pytest.mark.slow)])
 def where(request) -> dict:
     return {"jobs": 2} if request.param == "loky" else {"dask": request.getfixturevalue("cluster")}
 

@@ -118,7 +118,7 @@ def test_large_arrays_are_modelled_in_tiles_that_cover_every_cell():
     rng = np.random.default_rng(0)
     column = np.arange(520) % 260
     recordings = []
-    for _ in range(300):
+    for _ in range(150):
         force = 2 * np.sin(np.linspace(0, np.pi, 8))[:, None]
         recordings.append(np.maximum(0, force * (1 - ((column - rng.uniform(0, 260)) / 12) ** 2)))
     scale = Scale(np.zeros(520), 0.05, 5.0)

@@ -45,6 +45,7 @@ def test_many_impossible_readings_blame_no_other_cell(fitted: SelfDiagnosis, log
     assert set(fitted.diagnose(seen).fault_set) <= {57, 163}
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_a_reference_with_impossible_readings_is_fitted_as_one_with_missing_readings(small_grasps: Recordings):
     frames = [np.array(f, dtype=float) for f in small_grasps.frames[:12]]
     spoiled, missing = frames[3].copy(), frames[3].copy()

@@ -274,7 +274,7 @@ def wait_for(child, line, count):
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT, "quit"])
+@pytest.mark.parametrize("end", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow), "quit"])
 def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp_path, end):
     arguments = ["listen", "--port", "0", "--shape", "1x2x3", "--record", str(tmp_path), "--when", "command"]
     code = f"import sys; from adaptfault.cli import main; code = main({arguments!r})"

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import without_export
+from conftest import without_calibration, without_export
 
 from adaptfault.acquisition.switch import parse_when
 from adaptfault.cli import main
@@ -50,12 +50,14 @@ def log(later_grasps: list[np.ndarray], small_grasps: Recordings) -> list[np.nda
 
 @pytest.fixture(scope="module")
 def low(healthy: list[np.ndarray], small_grasps: Recordings) -> SelfDiagnosis:
-    return SelfDiagnosis(replace(small_grasps.layout, rest="low")).fit(healthy)
+    with without_calibration():
+        return SelfDiagnosis(replace(small_grasps.layout, rest="low")).fit(healthy)
 
 
 @pytest.fixture(scope="module")
 def high(healthy: list[np.ndarray], small_grasps: Recordings) -> SelfDiagnosis:
-    return SelfDiagnosis(replace(small_grasps.layout, rest="high")).fit(turned(healthy))
+    with without_calibration():
+        return SelfDiagnosis(replace(small_grasps.layout, rest="high")).fit(turned(healthy))
 
 
 def same(one: Diagnosis, other: Diagnosis) -> bool:

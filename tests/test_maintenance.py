@@ -39,14 +39,12 @@ def test_a_broken_row_is_found_repaired_and_deployed_on_probation(bundle, later_
     json.dumps(report.to_dict(), allow_nan=False)
 
 
-def test_the_same_recordings_twice_change_nothing(bundle, later_grasps, broken_row):
-    log = broken(later_grasps, broken_row)
-    maintain(bundle, log)
-    before = files(bundle)
-    report = maintain(bundle, log)
+def test_the_same_recordings_twice_change_nothing(repaired, later_grasps, broken_row):
+    before = files(repaired)
+    report = maintain(repaired, broken(later_grasps[:12], broken_row))
     assert (report.decision, report.version) == ("unchanged", 2)
     assert "used before" in report.reason
-    assert files(bundle) == before
+    assert files(repaired) == before
 
 
 def test_healthy_recordings_change_nothing_but_the_journal(bundle, later_grasps):
@@ -63,29 +61,26 @@ def test_a_dry_run_changes_no_file(bundle, later_grasps, broken_row):
     assert files(bundle) == before
 
 
-def test_known_faults_in_new_recordings_deploy_nothing_again(bundle, later_grasps, broken_row):
-    maintain(bundle, broken(later_grasps[:12], broken_row))
-    report = maintain(bundle, broken(later_grasps[12:], broken_row))
+def test_known_faults_in_new_recordings_deploy_nothing_again(repaired, later_grasps, broken_row):
+    report = maintain(repaired, broken(later_grasps[12:], broken_row))
     assert (report.decision, report.version) == ("unchanged", 2)
     assert "excludes these cells already" in report.reason
 
 
-def test_faults_add_up_over_runs(bundle, later_grasps, broken_row):
-    second = line_fault(bundle.layout, Line(0, "column", 1), FaultKind.SHORT)
-    maintain(bundle, broken(later_grasps[:12], broken_row))
-    report = maintain(bundle, broken(later_grasps[12:], broken_row, second))
+def test_faults_add_up_over_runs(repaired, later_grasps, broken_row):
+    second = line_fault(LAYOUT, Line(0, "column", 1), FaultKind.SHORT)
+    report = maintain(repaired, broken(later_grasps[12:], broken_row, second))
     assert report.fault_set == set(broken_row.cells) | set(second.cells)
     assert report.version == 3
 
 
-def test_after_a_rollback_the_same_faults_deploy_nothing(bundle, later_grasps, broken_row):
-    maintain(bundle, broken(later_grasps[:12], broken_row))
-    bundle.rollback()
-    report = maintain(bundle, broken(later_grasps[12:], broken_row))
+def test_after_a_rollback_the_same_faults_deploy_nothing(repaired, later_grasps, broken_row):
+    repaired.rollback()
+    report = maintain(repaired, broken(later_grasps[12:], broken_row))
     assert (report.decision, report.version, report.exit_code) == ("kept", 1, 2)
     assert "rolled back" in report.reason
     assert "version 1 runs, which uses 5 of the 5 faulty cells" in report.reason
-    again = maintain(bundle, broken(later_grasps[12:], broken_row))
+    again = maintain(repaired, broken(later_grasps[12:], broken_row))
     assert (again.decision, again.exit_code) == ("unchanged", 2)
 
 
@@ -216,11 +211,10 @@ def test_maintenance_is_refused_while_another_runs(bundle, later_grasps):
         maintain(bundle, later_grasps)
 
 
-def test_a_damaged_version_is_replaced_by_a_new_one(bundle, later_grasps, broken_row):
-    maintain(bundle, broken(later_grasps[:12], broken_row))
-    weights = next(bundle.versions.path(2).glob("*.safetensors"))
+def test_a_damaged_version_is_replaced_by_a_new_one(repaired, later_grasps, broken_row):
+    weights = next(repaired.versions.path(2).glob("*.safetensors"))
     weights.write_bytes(weights.read_bytes()[:-1])
-    report = maintain(bundle, broken(later_grasps[12:], broken_row))
+    report = maintain(repaired, broken(later_grasps[12:], broken_row))
     assert (report.decision, report.version) == ("deployed", 3)
     assert any("0002" in warning for warning in report.warnings)
 

@@ -60,8 +60,18 @@ def without_recordings(diagnosis) -> dict:
     return {key: value for key, value in diagnosis.to_dict().items() if key != "n_recordings"}
 
 
-@pytest.mark.parametrize("mix", mixes([0, 1, 2, 3, 4]))
-@pytest.mark.parametrize("cold", [False, True])
+EVERY = mixes([0, 1, 2, 3, 4])
+QUICK = ("none", "a row and a noisy cell")  # of the cold starts, which take longer
+
+
+@pytest.mark.parametrize(
+    ("cold", "mix"),
+    [
+        pytest.param(cold, mix, marks=pytest.mark.slow if cold and mix not in QUICK else ())
+        for cold in (False, True)
+        for mix in EVERY
+    ],
+)
 def test_frame_by_frame_it_gives_the_diagnosis_of_all_frames(fitted, log, middle, mix: str, cold: bool):
     diagnoser = COLD if cold else fitted
     frames = inject(log, mixes(middle)[mix], LAYOUT, seed=0, dither=0.004)[:970]

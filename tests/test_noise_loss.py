@@ -62,6 +62,7 @@ def test_missing_readings_are_not_identical_readings():
     assert not (noise_loss.evidence(runs_of(frames), PRESENT, PRESENT, sunk=False) > 0).any()
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_suspected_for_noise_loss():
     rng = np.random.default_rng(4)
     rests = np.linspace(0.004, 0.04, CELLS)
@@ -82,6 +83,7 @@ def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_suspected_for
     assert not (stream.temporal() > 10).any()
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_dead_cells_without_contact_are_found_by_noise_loss_in_the_monitor_too():
     fitted = SelfDiagnosis(LAYOUT).fit(noisy_presses(0))
     log = noisy_presses(1, 4)

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from conftest import without_calibration
 from test_baseline import events
 
 from adaptfault.data.simulated_grasps import simulate
@@ -15,7 +16,8 @@ SCALE = Scale(np.zeros(CELLS), 0.01, 1.0)
 
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
-    return SelfDiagnosis(LAYOUT).fit(events(0))
+    with without_calibration():
+        return SelfDiagnosis(LAYOUT).fit(events(0))
 
 
 def test_where_nothing_moved_the_scale_stays_as_it_is():
@@ -67,6 +69,7 @@ def test_a_large_offset_of_all_cells_is_not_taken_for_one_of_each():
     assert not tracker.own.any()
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_a_small_offset_of_one_cell_is_no_load_where_the_reference_held_light_loads_throughout():
     recordings = [np.asarray(r, dtype=np.float64) for r in simulate(10, SensorLayout(2, 8, 6), n_frames=60).frames]
     full_scale, cells = 5.0, 96

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from conftest import without_calibration
 
 from adaptfault import Recordings, Restorer, make_windows, summarise
 from diagnostics import Fault, Monitor, SelfDiagnosis, SensorLayout, inject
@@ -25,9 +26,16 @@ def given(request, flat):
     return flat.reshape(10, 40, *request.param)
 
 
-def test_a_diagnosis_is_the_same(flat, given):
+@pytest.fixture(scope="module")
+def flat_fit(flat):
+    with without_calibration():
+        return SelfDiagnosis(LAYOUT).fit(list(flat))
+
+
+@pytest.mark.usefixtures("uncalibrated")
+def test_a_diagnosis_is_the_same(flat_fit, given):
     broken = [inject(one, [Fault("short", (7,))], LAYOUT) for one in given]
-    wanted = SelfDiagnosis(LAYOUT).fit(list(flat)).diagnose(broken).to_dict()
+    wanted = flat_fit.diagnose(broken).to_dict()
     diagnoser = SelfDiagnosis(LAYOUT).fit(given)
     assert diagnoser.diagnose(np.reshape(broken, given.shape)).to_dict() == wanted
     alone = diagnoser.diagnose(broken[0].reshape(given.shape[1:]))

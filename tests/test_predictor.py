@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import DROPPED, SMALL, small_windows
+from conftest import DROPPED, SMALL, small_windows, without_calibration
 
 from adaptfault.data.atomic import atomic_write
 from adaptfault.data.windows import make_windows
@@ -71,7 +71,8 @@ def presses(seed: int, frames: int = 400) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def fitted_small() -> SelfDiagnosis:
-    return SelfDiagnosis(SMALL).fit([presses(seed, 100) for seed in range(12)])
+    with without_calibration():
+        return SelfDiagnosis(SMALL).fit([presses(seed, 100) for seed in range(12)])
 
 
 @pytest.fixture
@@ -321,9 +322,11 @@ def test_only_the_running_version_is_confirmed(carried):
 def test_between_two_looks_the_disk_is_left_alone(carried, monkeypatch):
     monkeypatch.setattr(module, "_POLL", 1000.0)
     predictor = running(carried)
-    monkeypatch.setattr(module, "_stamp", lambda path: pytest.fail("it looked"))
-    for frame in presses(59, 30):
-        predictor.stream(frame)
+    looked = []
+    monkeypatch.setattr(module, "_stamp", looked.append)
+    readings = [predictor.stream(frame) for frame in presses(59, 30)]
+    assert readings[-1].label is not None
+    assert looked == []
 
 
 def test_load_opens_the_bundle_at_a_path_and_prints_what_runs(carried, monkeypatch):
@@ -357,7 +360,8 @@ assert "torch" not in sys.modules
 
 
 def test_a_robot_streams_without_torch(versions):
-    subprocess.run([sys.executable, "-c", WITHOUT_TORCH, str(versions["head"])], check=True)
+    command = [sys.executable, "-c", WITHOUT_TORCH, str(versions["head"])]
+    assert subprocess.run(command, check=False).returncode == 0  # what it asserts
 
 
 def test_a_predictor_accumulates_over_a_contact_only_where_it_is_asked_to(carried):

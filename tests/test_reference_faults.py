@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from conftest import without_calibration
 
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Diagnosis, Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
@@ -34,7 +35,8 @@ def worn() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(worn: list[np.ndarray]) -> SelfDiagnosis:
-    return SelfDiagnosis(LAYOUT).fit(worn[::2])
+    with without_calibration():
+        return SelfDiagnosis(LAYOUT).fit(worn[::2])
 
 
 def test_cells_that_are_dead_throughout_are_found_and_no_other(worn):

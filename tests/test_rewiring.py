@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import without_calibration
 
 from diagnostics import SelfDiagnosis, SensorLayout
 
@@ -13,7 +14,8 @@ GRID = LAYOUT.grid(np.arange(LAYOUT.n_cells))
 
 @pytest.fixture(scope="module")
 def fitted(small_grasps):
-    return SelfDiagnosis(LAYOUT).fit(small_grasps.frames[:60])
+    with without_calibration():
+        return SelfDiagnosis(LAYOUT).fit(small_grasps.frames[:60])
 
 
 def log(small_grasps, seed):

@@ -102,6 +102,22 @@ def test_without_a_healthy_cell_nothing_is_predicted():
         FaultTolerantClassifier(LogisticRegression()).fit(x, y).set_faults(range(D))
 
 
-def test_scikit_learn_estimators_need_no_torch():
-    code = "import sys; from adaptfault import CellImputer, FaultTolerantClassifier; assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
+WITHOUT_TORCH = """
+import sys
+import numpy as np
+from sklearn.linear_model import LogisticRegression
+from adaptfault import CellImputer, FaultTolerantClassifier, Restorer
+from diagnostics import FaultSet, SensorLayout
+x = np.random.default_rng(0).uniform(0, 5, (60, 6))
+classifier = FaultTolerantClassifier(LogisticRegression()).fit(x, np.arange(60) % 2).set_faults([1])
+answers = [
+    classifier.predict(x),
+    CellImputer(FaultSet((1,), 6)).fit(x).transform(x),
+    Restorer(SensorLayout(1, 2, 3)).fit(x).transform(x, FaultSet((1,), 6)),
+]
+sys.exit("torch" in sys.modules or not all(np.isfinite(answer).all() for answer in answers))
+"""
+
+
+def test_scikit_learn_estimators_and_the_restorer_need_no_torch():
+    assert subprocess.run([sys.executable, "-c", WITHOUT_TORCH], check=False).returncode == 0

@@ -29,7 +29,7 @@ def windows(n: int, seed: int) -> Windows:
     return Windows(x.reshape(n, 10, -1).astype(np.float32), y, np.arange(n))
 
 
-@pytest.fixture(scope="module", params=["same", "valid"])
+@pytest.fixture(scope="module", params=["same", pytest.param("valid", marks=pytest.mark.slow)])
 def model(request) -> TactileTransformer:
     model = TactileTransformer(LAYOUT, 3, padding=request.param, init="glorot")
     train(model, windows(128, 0), windows(32, 1), epochs=2, learning_rate=1e-3, progress=False)

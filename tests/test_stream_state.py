@@ -80,8 +80,8 @@ def test_it_is_the_same_however_the_frames_come_in(size: int):
 def test_looking_at_it_in_between_changes_nothing():
     log = broken()[:1800]
     stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
-    for first in range(0, 1800, 13):
-        stream.extend(log[first : first + 13])
+    for first in range(0, 1800, 29):
+        stream.extend(log[first : first + 29])
         stream.complete().spatial().finish()
     same(stream.complete(), remembered(log))
 

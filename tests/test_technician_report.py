@@ -81,8 +81,8 @@ class Links(HTMLParser):
         self.outside += [v for k, v in attrs if k in ("src", "href") and not v.startswith("data:")]
 
 
-def test_the_page_needs_nothing_else_and_escapes_what_it_shows(bundle, log, capsys, tmp_path):
-    told(capsys, "maintain", bundle.path, log, "--quiet")
+def test_the_page_needs_nothing_else_and_escapes_what_it_shows(repaired, capsys, tmp_path):
+    bundle = repaired
     bundle.journal.add("2026-01-01T00:00:00+00:00", "kept", {"version": 2, "reason": "<script>alert(1)</script>"})
     code, out = told(capsys, "report", bundle.path, "--out", tmp_path / "sub" / "page.html")
     assert (code, out) == (0, f"report: {tmp_path / 'sub' / 'page.html'}\n")
@@ -138,9 +138,10 @@ def test_the_page_begins_with_the_verdict_the_robot_and_the_date(bundle, log, ca
     assert "not handled" not in text
 
 
-def test_after_a_rollback_the_page_and_the_command_name_the_faults_that_are_not_handled(bundle, log, capsys, tmp_path):
-    page = tmp_path / "page.html"
-    told(capsys, "maintain", bundle.path, log, "--quiet")
+def test_after_a_rollback_the_page_and_the_command_name_the_faults_that_are_not_handled(
+    repaired, log, capsys, tmp_path
+):
+    page, bundle = tmp_path / "page.html", repaired
     assert "not handled now: pad 1, row 2 is short" in told(capsys, "rollback", bundle.path)[1]
     told(capsys, "report", bundle.path, "--out", page)
     assert heading(page) == "Call a technician"

@@ -249,6 +249,7 @@ def test_resuming_keeps_the_best_weights_of_before_the_interruption(tmp_path: Pa
     assert same(weights(first), weights(resumed))
 
 
+@pytest.mark.slow
 def test_a_run_killed_with_kill_9_continues_as_if_nothing_had_happened(tmp_path: Path):
     script = textwrap.dedent(
         """

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import without_calibration
 
 from adaptfault.acquisition.ros import diagnostic_array, stale_array
 from adaptfault.data.simulated_grasps import simulate
@@ -145,7 +146,8 @@ def grasps() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def fitted(grasps: list[np.ndarray]) -> SelfDiagnosis:
-    return SelfDiagnosis(WIRED).fit(grasps[::2])
+    with without_calibration():
+        return SelfDiagnosis(WIRED).fit(grasps[::2])
 
 
 def silenced(log: list[np.ndarray], cells: object, value: float = np.nan) -> list[np.ndarray]:

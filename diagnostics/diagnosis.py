@@ -85,6 +85,7 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame with a reading.
         """
+        progress(0.0)
         healthy = _recordings(recordings, self.layout).valid(self.layout.full_scale).whole(self.layout.present.ravel())
         layout = self._planes
         if self._order is not None:

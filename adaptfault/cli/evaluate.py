@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from diagnostics import inject
 
     trained = TrainedModel.open(args.model)
-    model, recordings = trained.network, trained.recordings(args, args.recordings)
+    model, recordings = trained.network, trained.rewired(trained.recordings(args, args.recordings))
     classifier = Adaptation.load(args.adapted) if args.adapted else trained.adaptation
     if args.head == "linear":
         classifier.model.head = None

@@ -32,12 +32,10 @@ def run(args: argparse.Namespace) -> int:
     trained = TrainedModel.open(args.model or args.bundle)
     if args.calibration is None and trained.calibration is not None:
         args.calibration = str(trained.calibration)
-    recordings = load_recordings(args, args.recordings, layout=trained.network.layout)
+    recordings = trained.rewired(load_recordings(args, args.recordings, layout=trained.network.layout))
     windows = make_windows(recordings.frames, None, recordings.layout, length=trained.network.length)
     trained.adaptation.model.to(device(args))
-    # Exchanged wires are put back, as on the robot.
-    x = windows.x if trained.source is None else windows.x[..., trained.source]
-    probabilities = trained.adaptation.predict_proba(x)
+    probabilities = trained.adaptation.predict_proba(windows.x)
     names = trained.class_names or tuple(f"class {i}" for i in range(probabilities.shape[1]))
     results = []
     for i, name in enumerate(recordings.names):

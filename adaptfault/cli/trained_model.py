@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -72,6 +72,12 @@ class TrainedModel:
         if self.class_names and recordings.class_names != self.class_names:
             recordings = self._in_order(recordings)
         return recordings
+
+    def rewired(self, recordings: Recordings) -> Recordings:
+        """Return recordings with exchanged wires put back, as the version that a bundle runs does on the robot."""
+        if self.source is None:
+            return recordings
+        return replace(recordings, frames=tuple(frames[:, self.source] for frames in recordings.frames))
 
     def _in_order(self, recordings: Recordings) -> Recordings:
         """Return the recordings with the classes of the model, in the order of the model."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from adaptfault.cli.options import (
     Commands,
     add_recordings,
+    add_trust,
     add_untested_code,
     command,
     emit,
@@ -50,6 +51,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--picture", metavar="FILE", help="write the verdict map as PNG")
     parser.add_argument("--html", metavar="FILE", help="write the technician's page")
     add_untested_code(parser)
+    add_trust(parser)
     parser.set_defaults(run=run, writes=("out", "picture", "html"))
 
 
@@ -58,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.data.recordings.blocks import is_large
     from diagnostics import SelfDiagnosis
 
-    bundle = _bundle(args.reference or [])
+    bundle = _bundle(args)
     diagnoser = None if not args.reference else _fitted(args) if bundle is None else bundle.diagnoser()
     layout = None if diagnoser is None else diagnoser.layout
     log: Recordings | Stream
@@ -102,13 +104,15 @@ def _rewired(
     return log, rewiring
 
 
-def _bundle(reference: list[str]) -> Bundle | None:
+def _bundle(args: argparse.Namespace) -> Bundle | None:
     """Return the bundle that is given as reference; None for recordings, and without a reference."""
-    if len(reference) != 1 or not (Path(reference[0]) / "bundle.json").is_file():
-        return None
-    from adaptfault.robot.bundle import Bundle
+    from adaptfault.cli.trained_model import open_bundle
 
-    return Bundle.open(reference[0])
+    if len(args.reference or []) == 1:
+        return open_bundle(args, args.reference[0])
+    if args.trust:
+        raise ValueError("--trust needs a bundle: --reference BUNDLE")
+    return None
 
 
 def _severity(diagnosis: Diagnosis, bundle: Bundle | None, untested_code: int) -> tuple[int, str]:

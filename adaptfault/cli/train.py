@@ -12,6 +12,7 @@ from adaptfault.cli.options import (
     Commands,
     add_device,
     add_recordings,
+    add_sign,
     command,
     device,
     emit,
@@ -63,6 +64,7 @@ def add(commands: Commands) -> None:
         help="train the torch module that this function returns for (layout, n_classes, length)"
         " (default: the paper's network)",
     )
+    add_sign(parser, "X.bundle")
     add_device(parser)
     parser.set_defaults(run=run)
 
@@ -73,6 +75,12 @@ def run(args: argparse.Namespace) -> int:
     bundled = out.suffix == ".bundle"
     if bundled and out.exists():
         raise ValueError(f"{out} exists: choose another name, or remove it")
+    if args.sign is not None:
+        from adaptfault.robot.signature import read_private_key
+
+        if not bundled:
+            raise ValueError("--sign signs bundles: give --out X.bundle")
+        read_private_key(args.sign)  # before the training, not after it
     recordings, where = load_recordings(args, args.recordings, labelled=True), device(args)
 
     from adaptfault.adaptation.adapter import Adapter
@@ -162,9 +170,10 @@ def _bundle(
 
     from adaptfault.data.calibration import Calibration
     from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.signature import sign_bundle
 
     training, _, test = parts
-    Bundle.create(
+    bundle = Bundle.create(
         out,
         adapter.model,
         adapter,
@@ -174,3 +183,5 @@ def _bundle(
         calibration=Calibration.read(args.calibration) if args.calibration else None,
         head=args.head,
     )
+    if args.sign is not None:
+        sign_bundle(bundle, args.sign)

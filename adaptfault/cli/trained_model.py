@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adaptfault.adaptation.fault_free import Network
 from adaptfault.adaptation.result import Adaptation
-from adaptfault.cli.options import load_recordings, say
+from adaptfault.cli.options import load_recordings, say, trust
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, make_windows, split
 from adaptfault.models.store import SCHEMA, load_healthy, read_manifest
@@ -44,13 +44,17 @@ class TrainedModel:
     source: NDArray[np.intp] | None = None
 
     @classmethod
-    def open(cls, folder: str) -> TrainedModel:
+    def open(cls, args: argparse.Namespace, folder: str) -> TrainedModel:
         """Read a model or a bundle.
 
+        Args:
+            args: the options of ``add_trust``.
+            folder: of the model or the bundle.
+
         Raises:
-            FileNotFoundError, ValueError: neither, or damaged.
+            FileNotFoundError, ValueError: neither, damaged, or not signed by a trusted key.
         """
-        bundle = open_bundle(folder)
+        bundle = open_bundle(args, folder)
         if bundle is None:
             manifest = read_manifest(folder, SCHEMA)
             seed = int(manifest["extra"].get("split_seed", 0))
@@ -106,10 +110,21 @@ def say_short(args: argparse.Namespace, recordings: Recordings, length: int) -> 
         say(args, f"{short} of {len(recordings)} recordings {many} shorter than a window of {length} frames: not used")
 
 
-def open_bundle(folder: str) -> Bundle | None:
-    """Return the bundle in a folder; None if it holds something else."""
+def open_bundle(args: argparse.Namespace, folder: str) -> Bundle | None:
+    """Return the bundle in a folder; None if it holds something else.
+
+    Args:
+        args: the options of ``add_trust``.
+        folder: of the bundle, a model, or recordings.
+
+    Raises:
+        FileNotFoundError, ValueError: the bundle is damaged or not signed by a trusted key; or no bundle, with --trust.
+    """
+    trusted = trust(args)
     if not (Path(folder) / "bundle.json").is_file():
+        if trusted["keys"]:
+            raise ValueError(f"--trust: {folder} is no bundle, and only bundles are signed")
         return None
     from adaptfault.robot.bundle import Bundle
 
-    return Bundle.open(folder)
+    return Bundle.open(folder, **trusted)

@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from datetime import datetime, timezone
 from functools import partial
@@ -77,7 +77,8 @@ class Bundle:
     Args:
         path: an existing bundle.
         keys: PEM files of public ed25519 keys. The bundle must be signed by one of them
-            (:func:`adaptfault.sign_bundle`), and only signed versions run. None: signatures are not checked.
+            (:func:`adaptfault.sign_bundle`), and only signed versions run, and those that this object wrote. None:
+            signatures are not checked.
         least_serial: smallest serial number of the signature that is accepted.
 
     Raises:
@@ -101,11 +102,10 @@ class Bundle:
             self.parts = Parts(self.path / _PARTS, dict(self.about["parts"]))
         self.versions = Versions(self.path / "versions")
         self.journal = Journal(self.path)
-        self._signed: Collection[int] | None = None  # versions that may run; None: all
         if keys is not None:
             from adaptfault.robot.signature import verify_bundle
 
-            self._signed = verify_bundle(self, keys, least_serial)
+            self.versions.signed = verify_bundle(self, keys, least_serial)
 
     @classmethod
     def open(
@@ -196,9 +196,6 @@ class Bundle:
         before = [n for n in reversed(self.versions.numbers) if n < pointer.active]
         problems = []
         for number in dict.fromkeys((pointer.active, *pointer.fallbacks, *before)):
-            if self._signed is not None and number not in self._signed:
-                problems.append(f"version {number} is not signed")
-                continue
             try:
                 return self.versions[number]
             except (FileNotFoundError, Damaged) as error:

@@ -9,6 +9,7 @@ Parameters:
     topic: of the frames (default /tactile).
     bundle: folder of ``adaptfault train --out X.bundle``: its layout and its healthy model. Exchanged wires that its
         active version puts back are put back here too; restart the node after a maintenance run that deployed one.
+    trust: PEM file of the public key that must have signed the bundle; "" = signatures are not checked.
     restored: topic of the repaired frames, each as soon as it comes; "" = none. Needs a bundle. /diagnostics names the
         faulty cells, which are the restored ones.
     layout: without a bundle: a layout file, or a shape as 2x11x10. Cells are then compared with their neighbours.
@@ -37,12 +38,20 @@ PERIOD = 10.0  # seconds between two diagnoses of all cells; the last one is pub
 DEFAULTS = {
     "topic": "/tactile",
     "bundle": "",
+    "trust": "",
     "restored": "/tactile/restored",
     "layout": "",
     "full_scale": 0.0,
     "unit": "",
     "rate": 0.0,
 }
+
+
+def bundle_of(parameters: Mapping[str, Any]):
+    """Return the bundle; raises ValueError where the trusted key, if one is given, did not sign it."""
+    from adaptfault import Bundle
+
+    return Bundle.open(parameters["bundle"], keys=[parameters["trust"]] if parameters["trust"] else None)
 
 
 def diagnoser_of(parameters: Mapping[str, Any]) -> SelfDiagnosis:
@@ -54,9 +63,7 @@ def diagnoser_of(parameters: Mapping[str, Any]) -> SelfDiagnosis:
     if bool(parameters["bundle"]) == bool(parameters["layout"]):
         raise ValueError("give the parameter bundle, or the parameter layout (a layout file or a shape as 2x11x10)")
     if parameters["bundle"]:
-        from adaptfault import Bundle
-
-        return Bundle.open(parameters["bundle"]).diagnoser()
+        return bundle_of(parameters).diagnoser()
     text = parameters["layout"]
     layout = SensorLayout(*parse_shape(text)) if looks_like_shape(text) else read_layout(text)
     stated = {name: parameters[name] for name in ("full_scale", "unit", "rate") if parameters[name]}
@@ -67,9 +74,7 @@ def repair_of(parameters: Mapping[str, Any]) -> FrameRepair | None:
     """Return what restores frames with the healthy windows of the bundle; None without a bundle or a topic."""
     if not (parameters["bundle"] and parameters["restored"]):
         return None
-    from adaptfault import Bundle
-
-    bundle = Bundle.open(parameters["bundle"])
+    bundle = bundle_of(parameters)
     return FrameRepair(bundle.restorer(), bundle.known_faults().fault_set)
 
 
@@ -77,9 +82,7 @@ def source_of(parameters: Mapping[str, Any]) -> np.ndarray | None:
     """Return the received cell that belongs at each place ``[D]``, as the bundle's active version; None without one."""
     if not parameters["bundle"]:
         return None
-    from adaptfault import Bundle
-
-    return Bundle.open(parameters["bundle"]).active().source
+    return bundle_of(parameters).active().source
 
 
 class Watch:

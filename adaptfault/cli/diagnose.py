@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +23,9 @@ from adaptfault.cli.options import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from adaptfault.data.recordings import Recordings
     from adaptfault.data.recordings.blocks import Stream
     from adaptfault.robot.bundle import Bundle
@@ -69,8 +71,8 @@ def run(args: argparse.Namespace) -> int:
         report_inferred(args, log.inferred)
     else:
         log = load_recordings(args, args.recordings, layout=layout)
-    log, rewiring = _rewired(log, diagnoser, bundle)
-    diagnosis = _diagnosed(args, diagnoser or SelfDiagnosis(log.layout), log)
+    source, rewiring = _rewired(log, diagnoser, bundle)
+    diagnosis = _diagnosed(args, diagnoser or SelfDiagnosis(log.layout), log, source)
     if args.out:
         Path(args.out).write_text(json.dumps(diagnosis.to_dict(), allow_nan=False))
     if args.picture:
@@ -89,19 +91,19 @@ def run(args: argparse.Namespace) -> int:
 
 def _rewired(
     log: Recordings | Stream, diagnoser: SelfDiagnosis | None, bundle: Bundle | None
-) -> tuple[Recordings | Stream, Rewiring | None]:
-    """Return the log with the readings of exchanged wires put back, and the change that no version undoes yet."""
+) -> tuple[NDArray[np.intp] | slice, Rewiring | None]:
+    """Return the received cell that belongs at each place, and the change of the wiring that no version undoes yet."""
+    import numpy as np
+
     from adaptfault.data.recordings import Recordings
 
+    source = slice(None) if bundle is None else bundle.active().source
     if diagnoser is None or not isinstance(log, Recordings):  # too large to be searched
-        return log, None
-    if bundle is not None:
-        source = bundle.active().source
-        log = replace(log, frames=tuple(frames[:, source] for frames in log.frames))
-    rewiring = diagnoser.rewiring(log.frames)
-    if rewiring is not None:
-        log = replace(log, frames=tuple(rewiring.undo(frames) for frames in log.frames))
-    return log, rewiring
+        return source, None
+    rewiring = diagnoser.rewiring([frames[:, source] for frames in log.frames])
+    if rewiring is None:
+        return source, None
+    return rewiring.undo(np.arange(log.layout.n_cells)[source]), rewiring
 
 
 def _bundle(args: argparse.Namespace) -> Bundle | None:
@@ -148,7 +150,9 @@ def text_of(diagnosis: Diagnosis) -> str:
     return "\n".join(lines)
 
 
-def _diagnosed(args: argparse.Namespace, diagnoser: SelfDiagnosis, log: Recordings | Stream) -> Diagnosis:
+def _diagnosed(
+    args: argparse.Namespace, diagnoser: SelfDiagnosis, log: Recordings | Stream, source: NDArray[np.intp] | slice
+) -> Diagnosis:
     """Pass the log through the diagnosis recording by recording, or block by block, in constant memory."""
     import numpy as np
     from tqdm import tqdm
@@ -160,7 +164,7 @@ def _diagnosed(args: argparse.Namespace, diagnoser: SelfDiagnosis, log: Recordin
     total = len(log) if isinstance(log, Recordings) else None
     unit = "recording" if isinstance(log, Recordings) else "block"
     for frames in tqdm(log, total=total, unit=unit, desc="diagnosing", disable=hide, leave=False):
-        stream.extend(np.asarray(frames, dtype=np.float64))
+        stream.extend(np.asarray(frames, dtype=np.float64)[:, source])
     if not isinstance(log, Recordings):
         for problem in log.problems:
             print(problem, file=sys.stderr)

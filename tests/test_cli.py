@@ -328,6 +328,16 @@ def test_exchanged_rows_that_the_version_undoes_are_put_back_in_a_log_too_large_
     assert set(Diagnosis.from_dict(json.loads(capsys.readouterr().out)).fault_set) == set(broken_row.cells)
 
 
+def test_diagnose_tells_of_a_change_of_the_whole_sensor(made_bundle, small, later_grasps, tmp_path, capsys):
+    save_npz(tmp_path / "healthy.npz", small)
+    for reference, gain in ((made_bundle, 1.0), (made_bundle, 0.2), (tmp_path / "healthy.npz", 0.2)):
+        save_npz(tmp_path / "log.npz", Recordings(tuple(gain * r for r in later_grasps), SMALL))
+        code = main(["diagnose", str(tmp_path / "log.npz"), "--reference", str(reference), "--json", "--quiet"])
+        change = json.loads(capsys.readouterr().out)["change"]
+        assert (code > 0) == (change is not None) == (gain < 1)
+    assert change["gain"] < 0.5
+
+
 def test_a_log_that_tests_nothing_exits_with_the_code_that_is_set(made_bundle, tmp_path, capsys):
     save_npz(tmp_path / "still.npz", Recordings(tuple(np.zeros((60, 60)) for _ in range(6)), SMALL))
     for command in (

@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.options import (
     Commands,
@@ -31,12 +31,14 @@ if TYPE_CHECKING:
     from adaptfault.robot.bundle import Bundle
     from diagnostics import Diagnosis, SelfDiagnosis
     from diagnostics.evidence.rewiring import Rewiring
+    from diagnostics.evidence.sensor_change import SensorChange
 
 _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.json --html diagnosis.html
       without --reference each cell is compared with the cells around it
   adaptfault diagnose today/ --reference robot.bundle
       the healthy model of the bundle
-      exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version excludes, or nothing tested;
+      exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version excludes, nothing tested, or
+      another gain or offset of the whole sensor;
       2 a person is needed: a wire, exchanged wires, or a tenth of the cells; 3 unusable input"""
 
 _ROWS = 24  # of a map, which is followed by the summary if it has more: the first line has left the screen
@@ -59,11 +61,13 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Diagnose; the exit code says who has to act, as that of maintain."""
+    from adaptfault.data.recordings import Recordings
     from adaptfault.data.recordings.blocks import is_large
     from diagnostics import SelfDiagnosis
 
     bundle = _bundle(args)
-    diagnoser = None if not args.reference else _fitted(args) if bundle is None else bundle.diagnoser()
+    healthy = load_recordings(args, args.reference) if args.reference and bundle is None else None
+    diagnoser = bundle.diagnoser() if bundle is not None else None if healthy is None else fit_diagnoser(args, healthy)
     layout = None if diagnoser is None else diagnoser.layout
     log: Recordings | Stream
     if args.frames is None and is_large(args.recordings):
@@ -82,9 +86,19 @@ def run(args: argparse.Namespace) -> int:
 
         write_diagnosis(args.html, diagnosis, name=", ".join(args.recordings), reference=bool(args.reference))
     code, why = _severity(diagnosis, bundle, args.untested_code)
+    change = None
+    if diagnoser is not None and isinstance(log, Recordings):
+        frames = [frames[:, source] for frames in log.frames]
+        change = _change(diagnosis, diagnoser, frames, bundle if healthy is None else list(healthy))
+    if change is not None:
+        code, why = max(code, 1), f"{why}\n{change.reason}"
     if rewiring is not None:
         code, why = max(code, 2), f"{why}\n{rewiring.reason}; the verdicts are those with the readings put back"
-    found = {**diagnosis.to_dict(), "rewiring": [] if rewiring is None else list(rewiring.steps)}
+    found = {
+        **diagnosis.to_dict(),
+        "rewiring": [] if rewiring is None else list(rewiring.steps),
+        "change": None if change is None else vars(change),
+    }
     emit(args, found, text_of(diagnosis) + why)
     return code
 
@@ -131,10 +145,25 @@ def _severity(diagnosis: Diagnosis, bundle: Bundle | None, untested_code: int) -
     return code, ""
 
 
-def _fitted(args: argparse.Namespace) -> SelfDiagnosis:
-    """Return the healthy model that is fitted on the reference recordings."""
-    reference = load_recordings(args, args.reference)
-    return fit_diagnoser(args, reference)
+def _change(
+    diagnosis: Diagnosis,
+    diagnoser: SelfDiagnosis,
+    frames: list[NDArray[Any]],
+    reference: Bundle | list[NDArray[Any]] | None,
+) -> SensorChange | None:
+    """Return how all cells together differ from the healthy recordings; None where they do not."""
+    import numpy as np
+
+    from adaptfault.data.windows import recordings_of
+    from diagnostics.evidence.sensor_change import sensor_change
+
+    if not isinstance(reference, list):
+        assert reference is not None
+        reference = recordings_of(reference.parts.adapter().train, diagnosis.layout)
+    load = diagnoser.load_
+    new, old = (frames, reference) if load is None else ([*map(load.loads, frames)], [*map(load.loads, reference)])
+    cells = np.flatnonzero(diagnosis.layout.present.ravel() & ~diagnosis.fault_set.mask)
+    return sensor_change(new, old, diagnosis.layout, cells) if len(cells) else None
 
 
 def text_of(diagnosis: Diagnosis) -> str:

@@ -288,14 +288,10 @@ class Bundle:
 
     def restorer(self) -> Restorer:
         """Return a restorer that is fitted on the healthy windows; raises Damaged. Loads torch."""
-        import numpy as np
-
+        from adaptfault.data.windows import recordings_of
         from adaptfault.imputation.restorer import Restorer
 
-        windows, layout = self.parts.adapter().train, self.layout
-        numbers = np.unique(windows.recording)
-        healthy = [windows.x[windows.recording == n].reshape(-1, layout.n_cells) * layout.full_scale for n in numbers]
-        return Restorer(layout).fit(healthy)
+        return Restorer(self.layout).fit(recordings_of(self.parts.adapter().train, self.layout))
 
     # History.
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from adaptfault.data.windows import recordings_of
 from adaptfault.evaluation.scores import chance
 from adaptfault.robot.ageing import encode
 from adaptfault.robot.bundle import Bundle, now
@@ -278,11 +279,7 @@ class _Maintenance:
 
     def _loads(self, frames: list[NDArray[np.float64]]) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
         """Return new recordings, and the healthy ones of the bundle, as loads, ``[T, D]`` each."""
-        layout, train, load = self.bundle.layout, self.adapter.train, self.diagnoser.load_
-        healthy = [
-            train.x[train.recording == number].reshape(-1, layout.n_cells) * layout.full_scale
-            for number in np.unique(train.recording)
-        ]
+        load, healthy = self.diagnoser.load_, recordings_of(self.adapter.train, self.bundle.layout)
         return (frames, healthy) if load is None else ([*map(load.loads, frames)], [*map(load.loads, healthy)])
 
     def _undone(self, rewiring: Rewiring) -> Version:

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from conftest import write_keys
 
 from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
@@ -20,18 +21,6 @@ from adaptfault.robot.versions import Untrusted
 from diagnostics import FaultSet
 
 pytest.importorskip("cryptography")
-
-
-def write_keys(folder, name):
-    """Write a pair of keys; return the paths of the private and the public one."""
-    from cryptography.hazmat.primitives import serialization as to
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
-    key = Ed25519PrivateKey.generate()
-    private, public = folder / f"{name}.pem", folder / f"{name}.pub.pem"
-    private.write_bytes(key.private_bytes(to.Encoding.PEM, to.PrivateFormat.PKCS8, to.NoEncryption()))
-    public.write_bytes(key.public_key().public_bytes(to.Encoding.PEM, to.PublicFormat.SubjectPublicKeyInfo))
-    return private, public
 
 
 @pytest.fixture

@@ -77,14 +77,7 @@ def run(args: argparse.Namespace) -> int:
         log = load_recordings(args, args.recordings, layout=layout)
     source, rewiring = _rewired(log, diagnoser, bundle)
     diagnosis = _diagnosed(args, diagnoser or SelfDiagnosis(log.layout), log, source)
-    if args.out:
-        Path(args.out).write_text(json.dumps(diagnosis.to_dict(), allow_nan=False))
-    if args.picture:
-        diagnosis.plot().savefig(args.picture, dpi=150)
-    if args.html:
-        from adaptfault.evaluation.html_diagnosis import write_diagnosis
-
-        write_diagnosis(args.html, diagnosis, name=", ".join(args.recordings), reference=bool(args.reference))
+    _write(args, diagnosis)
     code, why = _severity(diagnosis, bundle, args.untested_code)
     change = None
     if diagnoser is not None and isinstance(log, Recordings):
@@ -101,6 +94,18 @@ def run(args: argparse.Namespace) -> int:
     }
     emit(args, found, text_of(diagnosis) + why)
     return code
+
+
+def _write(args: argparse.Namespace, diagnosis: Diagnosis) -> None:
+    """Write the files that the options ask for."""
+    if args.out:
+        Path(args.out).write_text(json.dumps(diagnosis.to_dict(), allow_nan=False))
+    if args.picture:
+        diagnosis.plot().savefig(args.picture, dpi=150)
+    if args.html:
+        from adaptfault.evaluation.html_diagnosis import write_diagnosis
+
+        write_diagnosis(args.html, diagnosis, name=", ".join(args.recordings), reference=bool(args.reference))
 
 
 def _rewired(

@@ -146,16 +146,7 @@ class Bundle:
             ValueError: the parts have different array shapes, the diagnoser is not fitted, or ``head`` is unknown.
         """
         path = Path(path)
-        if head not in ("auto", "linear"):
-            raise ValueError(f"unknown head {head!r}: use 'auto' or 'linear'")
-        if path.exists():
-            raise FileExistsError(f"{path} exists: choose another name, or remove it")
-        if not diagnoser.layout.shape == adapter.model.layout.shape == model.layout.shape:
-            raise ValueError(
-                f"model, adapter and diagnoser need one array shape; got {model.layout} and {diagnoser.layout}"
-            )
-        if class_names and len(class_names) != model.n_classes:
-            raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
+        _check_parts(path, model, adapter, diagnoser, class_names, head)
         make_folder(path.parent)
         new = path.with_name(f".{path.name}.unfinished")
         shutil.rmtree(new, ignore_errors=True)  # left by a crash
@@ -328,6 +319,27 @@ class Bundle:
 def now() -> str:
     """Return the current UTC time as ISO 8601."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def _check_parts(
+    path: Path,
+    model: TactileTransformer | AnyModel,
+    adapter: Adapter,
+    diagnoser: SelfDiagnosis,
+    class_names: Sequence[str],
+    head: str,
+) -> None:
+    """Refuse parts that make no bundle, before anything is written; the errors are those of :meth:`Bundle.create`."""
+    if head not in ("auto", "linear"):
+        raise ValueError(f"unknown head {head!r}: use 'auto' or 'linear'")
+    if path.exists():
+        raise FileExistsError(f"{path} exists: choose another name, or remove it")
+    if not diagnoser.layout.shape == adapter.model.layout.shape == model.layout.shape:
+        raise ValueError(
+            f"model, adapter and diagnoser need one array shape; got {model.layout} and {diagnoser.layout}"
+        )
+    if class_names and len(class_names) != model.n_classes:
+        raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
 
 
 def _save(adaptation: Adaptation, folder: Path) -> None:

@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from adaptfault.acquisition import Receiver, Recorder, Station
+    from adaptfault.acquisition import NotAuthentic, Receiver, Recorder, Station, read_key
     from adaptfault.acquisition.ros import diagnostic_array, write_diagnostics
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.adaptation.adapter_files import load_adapter, save_adapter
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from adaptfault.robot.maintenance import MaintenanceReport, maintain
     from adaptfault.robot.predictor import Predictor, Reading
     from adaptfault.robot.signature import sign_bundle
+    from adaptfault.robot.versions import Untrusted
 
 __version__ = "0.1.0"
 
@@ -60,6 +61,7 @@ __all__ = [
     "History",
     "Inference",
     "MaintenanceReport",
+    "NotAuthentic",
     "Predictor",
     "Reading",
     "Receiver",
@@ -72,6 +74,7 @@ __all__ = [
     "Station",
     "Summary",
     "TactileTransformer",
+    "Untrusted",
     "ValueScores",
     "Windows",
     "WorstFaults",
@@ -89,6 +92,7 @@ __all__ = [
     "maintain",
     "maintain_fleet",
     "make_windows",
+    "read_key",
     "save",
     "save_adapter",
     "save_model",
@@ -119,6 +123,7 @@ _HOMES = {
     "History": "models.history",
     "Inference": "models.inference",
     "MaintenanceReport": "robot.maintenance",
+    "NotAuthentic": "acquisition",
     "Predictor": "robot.predictor",
     "Reading": "robot.predictor",
     "Receiver": "acquisition",
@@ -131,6 +136,7 @@ _HOMES = {
     "Summary": "data.summary",
     "Sensitivity": "evaluation.sensitivity",
     "TactileTransformer": "models.network",
+    "Untrusted": "robot.versions",
     "ValueScores": "evaluation.scores",
     "Windows": "data.windows",
     "WorstFaults": "adaptation.worst",
@@ -148,6 +154,7 @@ _HOMES = {
     "maintain": "robot.maintenance",
     "maintain_fleet": "fleet.run",
     "make_windows": "data.windows",
+    "read_key": "acquisition",
     "save": "data.recordings",
     "save_adapter": "adaptation.adapter_files",
     "save_model": "models.store",

@@ -210,6 +210,18 @@ def small_grasps() -> Recordings:
     return simulate(30, SIMULATED, n_frames=60, seed=1, classes=SMALL_CLASSES)
 
 
+def write_keys(folder: Path, name: str) -> tuple[Path, Path]:
+    """Write a pair of ed25519 keys; return the paths of the private and the public one."""
+    from cryptography.hazmat.primitives import serialization as to
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+    key = Ed25519PrivateKey.generate()
+    private, public = folder / f"{name}.pem", folder / f"{name}.public.pem"
+    private.write_bytes(key.private_bytes(to.Encoding.PEM, to.PrivateFormat.PKCS8, to.NoEncryption()))
+    public.write_bytes(key.public_key().public_bytes(to.Encoding.PEM, to.PublicFormat.SubjectPublicKeyInfo))
+    return private, public
+
+
 @contextmanager
 def without_export() -> Iterator[None]:
     """As where the export's packages are missing: it takes seconds, and has tests of its own."""

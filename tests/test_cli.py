@@ -18,7 +18,7 @@ from adaptfault.data.simulated_grasps import simulate
 from adaptfault.data.windows import make_windows
 from adaptfault.models.network import TactileTransformer
 from adaptfault.models.training import train
-from diagnostics import Diagnosis, Line, SelfDiagnosis, SensorLayout, inject, line_fault
+from diagnostics import Diagnosis, FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault
 
 SMALL = SensorLayout(2, 6, 5)
 
@@ -313,6 +313,30 @@ def test_exchanged_rows_are_told_and_the_log_is_diagnosed_with_them_put_back(
     assert set(Diagnosis.from_dict(told).fault_set) == set(broken_row.cells)
     assert main(command) == 2
     assert "wiring changed: rows 1 and 4 of pad 0 are exchanged" in capsys.readouterr().out
+
+
+def test_exchanged_rows_that_the_version_undoes_are_put_back_in_a_log_too_large_for_the_memory(
+    bundle, later_grasps, broken_row, tmp_path, capsys, monkeypatch
+):
+    grid = SMALL.grid(np.arange(SMALL.n_cells))
+    grid[0, [1, 4]] = grid[0, [4, 1]]
+    healthy = bundle.parts.adapter().adapt(FaultSet((), SMALL.n_cells), method="fill")
+    bundle.deploy(bundle.write_version(healthy, {"source": grid.ravel().tolist()}).number)
+    broken = [inject(r, [broken_row], SMALL) for r in later_grasps]
+    save_npz(tmp_path / "log.npz", Recordings(tuple(r[:, grid.ravel()] for r in broken), SMALL))
+    monkeypatch.setattr("adaptfault.data.recordings.blocks.is_large", lambda paths: True)
+    assert main(["diagnose", str(tmp_path / "log.npz"), "--reference", str(bundle.path), "--json", "--quiet"]) == 2
+    assert set(Diagnosis.from_dict(json.loads(capsys.readouterr().out)).fault_set) == set(broken_row.cells)
+
+
+def test_diagnose_tells_of_a_change_of_the_whole_sensor(made_bundle, small, later_grasps, tmp_path, capsys):
+    save_npz(tmp_path / "healthy.npz", small)
+    for reference, gain in ((made_bundle, 1.0), (made_bundle, 0.2), (tmp_path / "healthy.npz", 0.2)):
+        save_npz(tmp_path / "log.npz", Recordings(tuple(gain * r for r in later_grasps), SMALL))
+        code = main(["diagnose", str(tmp_path / "log.npz"), "--reference", str(reference), "--json", "--quiet"])
+        change = json.loads(capsys.readouterr().out)["change"]
+        assert (code > 0) == (change is not None) == (gain < 1)
+    assert change["gain"] < 0.5
 
 
 def test_a_log_that_tests_nothing_exits_with_the_code_that_is_set(made_bundle, tmp_path, capsys):

@@ -12,6 +12,7 @@ from adaptfault import __version__
 from adaptfault.cli import main
 from adaptfault.data.recordings import load, save_npz
 from adaptfault.data.simulated_grasps import simulate
+from adaptfault.data.summary import summarise
 from diagnostics import SensorLayout
 
 SKIN = SensorLayout(1, 6, 5, full_scale=3.3, unit="V", rate=20)
@@ -50,6 +51,18 @@ def test_info_shows_the_content_as_text_as_json_and_as_a_picture(file, skin, tmp
     assert found["layout"] == SKIN.to_dict()
     assert found["highest"] == pytest.approx(max(frames.max() for frames in skin))
     assert (found["missing"], found["inferred"], found["recordings"]) == (0, [], 9)
+
+
+def test_the_pads_of_a_picture_that_do_not_fit_side_by_side_are_below_each_other():
+    layout = SensorLayout(5, 1, 12)
+    figure = summarise([np.random.default_rng(0).uniform(0, 5, (20, layout.n_cells))], layout).plot()
+    assert max(figure.get_size_inches()) < 12
+    maps = [ax for ax in figure.axes if "pad" in ax.get_title()]
+    assert [ax.get_title() for ax in maps] == [f"{what}, pad {pad}" for what in ("mean", "peak") for pad in range(5)]
+    figure.draw_without_rendering()
+    boxes = [ax.get_window_extent() for ax in maps]
+    assert len({round(box.x0) for box in boxes}) == 2
+    assert min(box.width for box in boxes) > 2 * figure.dpi
 
 
 def test_info_names_silent_cells_missing_readings_and_what_was_inferred(skin, tmp_path, capsys):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from _pytest.mark import ParameterSet
-from conftest import without_calibration, without_export
+from conftest import without_calibration, without_export, write_keys
 
 import adaptfault as af
 from adaptfault.cli import COMMANDS, main
@@ -28,7 +28,7 @@ WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text()]
 NOT_RUN = {"reproduce": "test_paper.py runs it, small"}
 # make test-all runs these, by the language of their blocks.
 SLOW = {
-    "": ("README.md", "maintenance.md", "sensor.md"),
+    "": ("README.md", "maintenance.md", "sensor.md", "signed-bundles.md"),
     "python": ("robot-software.md", "diagnosis.md", "test-bench.md"),
 }
 QUICK = {
@@ -95,6 +95,11 @@ def test_the_python_on_a_page_runs(page, place, later_grasps, capsys):
 
 @pytest.mark.parametrize("page", marked([page for page in PAGES if commands(page)], ""))
 def test_the_commands_on_a_page_run(page, place, capsys):
+    if page.name == "signed-bundles.md":
+        pytest.importorskip("cryptography")
+        private, public = write_keys(Path(), "key")
+        private.rename("private.pem")
+        public.rename("public.pem")
     for command, *arguments in commands(page):
         if command in NOT_RUN:
             continue

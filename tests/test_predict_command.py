@@ -1,6 +1,7 @@
 """adaptfault predict: one prediction a recording, with layout, scale and class names of the model."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.data.windows import make_windows
 from adaptfault.robot.predictor import Predictor
+from diagnostics import FaultSet
 
 
 def test_each_recording_has_the_class_of_its_mean_probability(made_bundle, small_grasps, tmp_path, capsys):
@@ -36,6 +38,32 @@ def test_the_table_names_recordings_classes_and_labels(made_bundle, small_grasps
     assert len(rows) == 9
     right = sum(row.split()[-1] == row.split()[-6] for row in rows)
     assert total == f"{right} of 9 recordings are predicted as labelled"
+
+
+def test_evaluate_and_predict_put_exchanged_wires_back_as_the_version_that_the_bundle_runs(
+    bundle, made_bundle, small_grasps, tmp_path, capsys
+):
+    some = small_grasps.select(range(0, 90, 6))
+    save_npz(tmp_path / "before.npz", some)
+    wired = np.random.default_rng(0).permutation(bundle.layout.n_cells)
+    save_npz(tmp_path / "after.npz", replace(some, frames=tuple(frames[:, wired] for frames in some.frames)))
+    healthy = bundle.parts.adapter().adapt(FaultSet((), wired.size), method="fill")
+    bundle.deploy(bundle.write_version(healthy, {"source": np.argsort(wired).tolist()}).number)
+
+    def told(*words) -> dict:
+        assert main([*map(str, words), "--json", "--quiet"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    before, after = tmp_path / "before.npz", tmp_path / "after.npz"
+    for inject in ([], ["--inject", "row:0:3=open"]):
+        scores = [
+            told("evaluate", which, path, "--all", "--head", "linear", *inject)["scores"]
+            for which, path in ((made_bundle, before), (bundle.path, after))
+        ]
+        assert scores[0] == scores[1]
+    assert told("evaluate", made_bundle, after, "--all", "--head", "linear")["scores"] != scores[0]
+    plain, rewired = (told("predict", before, "--bundle", made_bundle), told("predict", after, "--bundle", bundle.path))
+    assert [one["class"] for one in plain["predictions"]] == [one["class"] for one in rewired["predictions"]]
 
 
 def test_recordings_that_contradict_the_model_are_refused_in_one_line(made_bundle, tmp_path, capsys):

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scale_curves import FULL_SCALE, recording
 
 from adaptfault.imputation.restorer import Restorer
 from diagnostics import FaultSet, Line, SensorLayout
@@ -102,13 +103,27 @@ def test_a_lost_row_and_a_lost_pad_are_no_worse_than_the_mean(large):
         assert np.mean(error**2) <= 1.02 * np.mean((truth[:, lost] - large.mean_[lost]) ** 2)
 
 
+@pytest.mark.parametrize(("pads", "share"), [(3, 1.0), (5, 0.5)])  # the whole array at once, and tile by tile
+def test_lines_of_a_skin_with_few_contacts_are_restored_better_than_by_the_mean_in_every_pad(pads, share):
+    layout = SensorLayout(pads, 16, 16, full_scale=FULL_SCALE, rate=20.0)
+    rng = np.random.default_rng(0)
+    restorer = Restorer(layout).fit([recording(layout, rng) for _ in range(12)])
+    truth = np.concatenate([recording(layout, rng) for _ in range(40)]).astype(float)
+    grid = layout.grid(np.arange(layout.n_cells))
+    for lost in (grid[:, :, 4:6], grid[:, 7]):  # a bridge of two columns and a row, in each pad
+        whole = restorer.transform(truth, FaultSet(tuple(lost.ravel().tolist()), layout.n_cells))
+        for cells in lost.reshape(pads, -1):
+            error = np.mean((whole - truth)[:, cells] ** 2)
+            assert error < share * np.mean((truth[:, cells] - restorer.mean_[cells]) ** 2)
+
+
 def test_absent_positions_may_be_nan():
     present = np.ones(LAYOUT.shape, bool)
     present[0, 0, 0] = False
     layout = SensorLayout(2, 6, 5, full_scale=4095.0, present=present)
     recordings = pressed(layout, 40, 0)
-    for recording in recordings:
-        recording[:, 0] = np.nan
+    for frames in recordings:
+        frames[:, 0] = np.nan
     restorer = Restorer(layout).fit(recordings)
     assert np.isfinite(restorer.update(recordings[0][3])).all()
 

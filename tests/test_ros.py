@@ -229,3 +229,24 @@ def test_the_node_restores_nothing_without_a_bundle_or_a_frame_of_its_sensor(nod
     watch = node.Watch(node.diagnoser_of({**node.DEFAULTS, "bundle": str(made_bundle)}), repair=repair)
     assert watch.restore(np.zeros(7)) is None
     assert len(watch.restore(np.full(60, 1e30))) == 60
+
+
+def test_the_node_puts_exchanged_wires_back_as_the_version_that_the_bundle_runs(node, bundle, small_grasps):
+    rows = bundle.layout.grid(np.arange(bundle.layout.n_cells)).copy()
+    rows[0, [1, 4]] = rows[0, [4, 1]]
+    wired = rows.ravel()
+    healthy = bundle.parts.adapter().adapt(FaultSet((), wired.size), method="fill")
+    bundle.deploy(bundle.write_version(healthy, {"source": np.argsort(wired).tolist()}).number)
+    parameters = {**node.DEFAULTS, "bundle": str(bundle.path)}
+    source = node.source_of(parameters)
+    np.testing.assert_array_equal(source, np.argsort(wired))
+    row = line_fault(bundle.layout, Line(0, "row", 1), FaultKind.SHORT)
+    frames = inject(np.concatenate(small_grasps.frames[::3]).astype(float), [row], bundle.layout)
+    repair = node.repair_of(parameters)
+    watch = node.Watch(node.diagnoser_of(parameters), clock=lambda: 1000.0, repair=repair, source=source)
+    for frame in frames[:, wired]:
+        watch.take(frame)
+    assert np.flatnonzero(watch.faulty).tolist() == list(row.cells)
+    others = np.flatnonzero(~watch.faulty)
+    np.testing.assert_array_equal(np.array(watch.restore(frames[5][wired]))[others], frames[5][others])
+    assert node.source_of({**node.DEFAULTS, "layout": "2x6x5"}) is None

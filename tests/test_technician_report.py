@@ -2,14 +2,20 @@
 
 import json
 import re
+import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
+import power_cut
 import pytest
 
 from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
+from adaptfault.robot.bundle import Bundle
+from adaptfault.robot.maintenance import maintain
+from adaptfault.robot.parts import Parts
 from adaptfault.robot.technician_report import robot_name, write_report
 from diagnostics import SensorLayout, inject
 
@@ -166,6 +172,23 @@ def test_a_model_that_repairs_to_more_than_the_healthy_accuracy_is_shown_as_weak
     assert "Weak base model" in write_report(tmp_path / "page.html", bundle).read_text()
     bundle.journal.add("2026-01-02T00:00:00+00:00", "kept", {**measured, "accuracy": 0.69})
     assert "Weak base model" not in write_report(tmp_path / "page.html", bundle).read_text()
+
+
+def test_a_model_at_chance_that_no_repair_helps_needs_a_person(linear_bundle, tmp_path, monkeypatch):
+    shutil.copytree(linear_bundle, tmp_path / "robot.bundle")
+    bundle = Bundle.open(tmp_path / "robot.bundle")
+    windows = bundle.parts.check_windows()
+    wrong = replace(windows, y=(windows.y + 1) % 3)  # as a model that names the wrong class throughout
+    monkeypatch.setattr(Parts, "check_windows", lambda parts: wrong)
+    log = power_cut.broken_log()
+    report = maintain(bundle, log)
+    assert report.exit_code == 2
+    assert report.reason.startswith(f"the model is at chance: accuracy {report.accuracy:.3f}, where always naming")
+    page = tmp_path / "page.html"
+    write_report(page, bundle)
+    assert heading(page) == "Call a technician"
+    assert "The model is at chance" in page.read_text()
+    assert maintain(bundle, power_cut.broken_log(10)).exit_code == 2
 
 
 @pytest.mark.parametrize(("path", "name"), [("r7/robot.bundle", "r7"), ("arm-3.bundle", "arm-3")])

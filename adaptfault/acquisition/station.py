@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -47,6 +47,7 @@ class Station:
         layout: the array; None: the bundle's.
         port, host, devices, ticks, key: as for :class:`Receiver`.
         bundle: folder of a bundle; None: monitor only.
+        keys, least_serial: whose signature the bundle needs, see :class:`Bundle`.
         record: folder for recordings; None: no recording.
         relay: ``HOST:PORT`` to which repaired packets are sent, see :class:`Relay`; needs a bundle.
         when: when to record, see :func:`parse_when`.
@@ -67,6 +68,8 @@ class Station:
         port: int = 0,
         *,
         bundle: str | None = None,
+        keys: Sequence[str | os.PathLike[str]] | None = None,
+        least_serial: int = 0,
         host: str = "127.0.0.1",
         devices: Collection[str] | None = None,
         ticks: float = TICKS,
@@ -82,6 +85,7 @@ class Station:
         quiet: bool = False,
     ) -> None:
         self.bundle, self.record, self.calibration = bundle, record, calibration
+        self._keys, self._least_serial = keys, least_serial
         self.seconds, self.frames, self.as_json, self.quiet = seconds, frames, as_json, quiet
         self.on_event = self._print if on_event is None else on_event
         self._ready: list[StreamingPredictor | Monitor] = []
@@ -192,7 +196,7 @@ class Station:
 
         assert self.bundle is not None
         try:
-            return Predictor.load(self.bundle)
+            return Predictor.load(self.bundle, keys=self._keys, least_serial=self._least_serial)
         except ImportError as error:
             raise ValueError(f"{self.bundle}: classifying needs {error.name}; install it, or give no bundle") from None
 
@@ -203,7 +207,7 @@ class Station:
             raise ValueError(f"--relay {address}: this address is listened on; give the consumer another port")
         from adaptfault.robot.bundle import Bundle
 
-        bundle = Bundle.open(self.bundle)
+        bundle = Bundle.open(self.bundle, keys=self._keys, least_serial=self._least_serial)
         known = bundle.known_faults().fault_set
         self._say(
             f"relay to {address}: fitting on the healthy windows of {self.bundle}; {len(known)} faulty cells known"

@@ -9,6 +9,7 @@ from adaptfault.cli.options import (
     Commands,
     add_device,
     add_recordings,
+    add_trust,
     command,
     device,
     emit,
@@ -50,6 +51,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--budget", type=float, metavar="S", help="seconds of training allowed")
     parser.add_argument("--seed", type=int, default=0, help="random seed of training (default 0)")
     add_device(parser)
+    add_trust(parser)
     parser.set_defaults(run=run)
 
 
@@ -88,7 +90,7 @@ def open_adapter(args: argparse.Namespace) -> Adapter:
     from adaptfault.cli.trained_model import TrainedModel, open_bundle
     from adaptfault.models.store import schema_of
 
-    bundle = open_bundle(args.model)
+    bundle = open_bundle(args, args.model)
     if bundle is not None:
         if args.recordings:
             raise ValueError(f"{args.model} holds its own windows: leave the recordings out")
@@ -101,7 +103,7 @@ def open_adapter(args: argparse.Namespace) -> Adapter:
 
     if not args.recordings:
         raise ValueError(f"{args.model} is a model: give the fault-free recordings that it was trained on, too")
-    trained = TrainedModel.open(args.model)
+    trained = TrainedModel.open(args, args.model)
     train, validation, _ = trained.parts(trained.recordings(args, args.recordings))
     return Adapter(trained.network, train, validation)
 

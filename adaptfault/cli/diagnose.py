@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.options import (
     Commands,
     add_recordings,
+    add_trust,
     add_untested_code,
     command,
     emit,
@@ -23,17 +23,22 @@ from adaptfault.cli.options import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from adaptfault.data.recordings import Recordings
     from adaptfault.data.recordings.blocks import Stream
     from adaptfault.robot.bundle import Bundle
     from diagnostics import Diagnosis, SelfDiagnosis
     from diagnostics.evidence.rewiring import Rewiring
+    from diagnostics.evidence.sensor_change import SensorChange
 
 _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.json --html diagnosis.html
       without --reference each cell is compared with the cells around it
   adaptfault diagnose today/ --reference robot.bundle
       the healthy model of the bundle
-      exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version excludes, or nothing tested;
+      exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version excludes, nothing tested, or
+      another gain or offset of the whole sensor;
       2 a person is needed: a wire, exchanged wires, or a tenth of the cells; 3 unusable input"""
 
 _ROWS = 24  # of a map, which is followed by the summary if it has more: the first line has left the screen
@@ -50,16 +55,19 @@ def add(commands: Commands) -> None:
     parser.add_argument("--picture", metavar="FILE", help="write the verdict map as PNG")
     parser.add_argument("--html", metavar="FILE", help="write the technician's page")
     add_untested_code(parser)
+    add_trust(parser)
     parser.set_defaults(run=run, writes=("out", "picture", "html"))
 
 
 def run(args: argparse.Namespace) -> int:
     """Diagnose; the exit code says who has to act, as that of maintain."""
+    from adaptfault.data.recordings import Recordings
     from adaptfault.data.recordings.blocks import is_large
     from diagnostics import SelfDiagnosis
 
-    bundle = _bundle(args.reference or [])
-    diagnoser = None if not args.reference else _fitted(args) if bundle is None else bundle.diagnoser()
+    bundle = _bundle(args)
+    healthy = load_recordings(args, args.reference) if args.reference and bundle is None else None
+    diagnoser = bundle.diagnoser() if bundle is not None else None if healthy is None else fit_diagnoser(args, healthy)
     layout = None if diagnoser is None else diagnoser.layout
     log: Recordings | Stream
     if args.frames is None and is_large(args.recordings):
@@ -67,8 +75,29 @@ def run(args: argparse.Namespace) -> int:
         report_inferred(args, log.inferred)
     else:
         log = load_recordings(args, args.recordings, layout=layout)
-    log, rewiring = _rewired(log, diagnoser, bundle)
-    diagnosis = _diagnosed(args, diagnoser or SelfDiagnosis(log.layout), log)
+    source, rewiring = _rewired(log, diagnoser, bundle)
+    diagnosis = _diagnosed(args, diagnoser or SelfDiagnosis(log.layout), log, source)
+    _write(args, diagnosis)
+    code, why = _severity(diagnosis, bundle, args.untested_code)
+    change = None
+    if diagnoser is not None and isinstance(log, Recordings):
+        frames = [frames[:, source] for frames in log.frames]
+        change = _change(diagnosis, diagnoser, frames, bundle if healthy is None else list(healthy))
+    if change is not None:
+        code, why = max(code, 1), f"{why}\n{change.reason}"
+    if rewiring is not None:
+        code, why = max(code, 2), f"{why}\n{rewiring.reason}; the verdicts are those with the readings put back"
+    found = {
+        **diagnosis.to_dict(),
+        "rewiring": [] if rewiring is None else list(rewiring.steps),
+        "change": None if change is None else vars(change),
+    }
+    emit(args, found, text_of(diagnosis) + why)
+    return code
+
+
+def _write(args: argparse.Namespace, diagnosis: Diagnosis) -> None:
+    """Write the files that the options ask for."""
     if args.out:
         Path(args.out).write_text(json.dumps(diagnosis.to_dict(), allow_nan=False))
     if args.picture:
@@ -77,38 +106,34 @@ def run(args: argparse.Namespace) -> int:
         from adaptfault.evaluation.html_diagnosis import write_diagnosis
 
         write_diagnosis(args.html, diagnosis, name=", ".join(args.recordings), reference=bool(args.reference))
-    code, why = _severity(diagnosis, bundle, args.untested_code)
-    if rewiring is not None:
-        code, why = max(code, 2), f"{why}\n{rewiring.reason}; the verdicts are those with the readings put back"
-    found = {**diagnosis.to_dict(), "rewiring": [] if rewiring is None else list(rewiring.steps)}
-    emit(args, found, text_of(diagnosis) + why)
-    return code
 
 
 def _rewired(
     log: Recordings | Stream, diagnoser: SelfDiagnosis | None, bundle: Bundle | None
-) -> tuple[Recordings | Stream, Rewiring | None]:
-    """Return the log with the readings of exchanged wires put back, and the change that no version undoes yet."""
+) -> tuple[NDArray[np.intp] | slice, Rewiring | None]:
+    """Return the received cell that belongs at each place, and the change of the wiring that no version undoes yet."""
+    import numpy as np
+
     from adaptfault.data.recordings import Recordings
 
+    source = slice(None) if bundle is None else bundle.active().source
     if diagnoser is None or not isinstance(log, Recordings):  # too large to be searched
-        return log, None
-    if bundle is not None:
-        source = bundle.active().source
-        log = replace(log, frames=tuple(frames[:, source] for frames in log.frames))
-    rewiring = diagnoser.rewiring(log.frames)
-    if rewiring is not None:
-        log = replace(log, frames=tuple(rewiring.undo(frames) for frames in log.frames))
-    return log, rewiring
+        return source, None
+    rewiring = diagnoser.rewiring([frames[:, source] for frames in log.frames])
+    if rewiring is None:
+        return source, None
+    return rewiring.undo(np.arange(log.layout.n_cells)[source]), rewiring
 
 
-def _bundle(reference: list[str]) -> Bundle | None:
+def _bundle(args: argparse.Namespace) -> Bundle | None:
     """Return the bundle that is given as reference; None for recordings, and without a reference."""
-    if len(reference) != 1 or not (Path(reference[0]) / "bundle.json").is_file():
-        return None
-    from adaptfault.robot.bundle import Bundle
+    from adaptfault.cli.trained_model import open_bundle
 
-    return Bundle.open(reference[0])
+    if len(args.reference or []) == 1:
+        return open_bundle(args, args.reference[0])
+    if args.trust:
+        raise ValueError("--trust needs a bundle: --reference BUNDLE")
+    return None
 
 
 def _severity(diagnosis: Diagnosis, bundle: Bundle | None, untested_code: int) -> tuple[int, str]:
@@ -125,10 +150,25 @@ def _severity(diagnosis: Diagnosis, bundle: Bundle | None, untested_code: int) -
     return code, ""
 
 
-def _fitted(args: argparse.Namespace) -> SelfDiagnosis:
-    """Return the healthy model that is fitted on the reference recordings."""
-    reference = load_recordings(args, args.reference)
-    return fit_diagnoser(args, reference)
+def _change(
+    diagnosis: Diagnosis,
+    diagnoser: SelfDiagnosis,
+    frames: list[NDArray[Any]],
+    reference: Bundle | list[NDArray[Any]] | None,
+) -> SensorChange | None:
+    """Return how all cells together differ from the healthy recordings; None where they do not."""
+    import numpy as np
+
+    from adaptfault.data.windows import recordings_of
+    from diagnostics.evidence.sensor_change import sensor_change
+
+    if not isinstance(reference, list):
+        assert reference is not None
+        reference = recordings_of(reference.parts.adapter().train, diagnosis.layout)
+    load = diagnoser.load_
+    new, old = (frames, reference) if load is None else ([*map(load.loads, frames)], [*map(load.loads, reference)])
+    cells = np.flatnonzero(diagnosis.layout.present.ravel() & ~diagnosis.fault_set.mask)
+    return sensor_change(new, old, diagnosis.layout, cells) if len(cells) else None
 
 
 def text_of(diagnosis: Diagnosis) -> str:
@@ -144,7 +184,9 @@ def text_of(diagnosis: Diagnosis) -> str:
     return "\n".join(lines)
 
 
-def _diagnosed(args: argparse.Namespace, diagnoser: SelfDiagnosis, log: Recordings | Stream) -> Diagnosis:
+def _diagnosed(
+    args: argparse.Namespace, diagnoser: SelfDiagnosis, log: Recordings | Stream, source: NDArray[np.intp] | slice
+) -> Diagnosis:
     """Pass the log through the diagnosis recording by recording, or block by block, in constant memory."""
     import numpy as np
     from tqdm import tqdm
@@ -156,7 +198,7 @@ def _diagnosed(args: argparse.Namespace, diagnoser: SelfDiagnosis, log: Recordin
     total = len(log) if isinstance(log, Recordings) else None
     unit = "recording" if isinstance(log, Recordings) else "block"
     for frames in tqdm(log, total=total, unit=unit, desc="diagnosing", disable=hide, leave=False):
-        stream.extend(np.asarray(frames, dtype=np.float64))
+        stream.extend(np.asarray(frames, dtype=np.float64)[:, source])
     if not isinstance(log, Recordings):
         for problem in log.problems:
             print(problem, file=sys.stderr)

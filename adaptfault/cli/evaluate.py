@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from adaptfault.cli.inject_option import INJECT_HELP, parse_faults
-from adaptfault.cli.options import Commands, add_device, add_recordings, command, device, emit, say
+from adaptfault.cli.options import Commands, add_device, add_recordings, add_trust, command, device, emit, say
 
 _EXAMPLE = """  adaptfault evaluate model grasps/ --inject random:5=short
   adaptfault evaluate model grasps/ --inject row:0:3=open --adapted adapted"""
@@ -27,6 +27,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--seed", type=int, default=0, help="random seed of random faults (default 0)")
     parser.add_argument("--all", action="store_true", help="score on all recordings, not only on the test share")
     add_device(parser)
+    add_trust(parser)
     parser.set_defaults(run=run)
 
 
@@ -39,8 +40,8 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.evaluation.scores import Scores, accuracy_interval, recording_scores
     from diagnostics import inject
 
-    trained = TrainedModel.open(args.model)
-    model, recordings = trained.network, trained.recordings(args, args.recordings)
+    trained = TrainedModel.open(args, args.model)
+    model, recordings = trained.network, trained.rewired(trained.recordings(args, args.recordings))
     classifier = Adaptation.load(args.adapted) if args.adapted else trained.adaptation
     if args.head == "linear":
         classifier.model.head = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from adaptfault.cli.options import Commands, command, emit, progress, say
+from adaptfault.cli.options import Commands, add_sign, add_trust, command, emit, progress, say, trust
 
 _EXAMPLE = """  adaptfault fleet maintain FLEET.toml --jobs 8
       FLEET.toml lists robots as [[robots]] with name, bundle, recordings (and tags, commissioned = 2025-03-01),
@@ -40,6 +40,8 @@ def add(commands: Commands) -> None:
         help="seconds that one robot may take; past it, it is an error (default: none)",
     )
     parser.add_argument("--out", metavar="FOLDER", help="of ledger and reports (default: FLEET.fleet)")
+    add_trust(parser)
+    add_sign(parser, "each bundle after its run")
     parser.set_defaults(run=run)
     parser = command(inner, "survival", "how long wires and cells last, and whom to service next", _SURVIVAL)
     parser.add_argument("fleet", metavar="FLEET.toml", help="list of the robots")
@@ -67,6 +69,8 @@ def run(args: argparse.Namespace) -> int:
         dry_run=args.dry_run,
         budget=args.budget,
         limit=args.limit,
+        **trust(args),
+        sign=args.sign,
         progress=progress(args),
     )
     atomic_write(folder / "report.json", json.dumps(report.to_dict(), indent=1, allow_nan=False).encode())

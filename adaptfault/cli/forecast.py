@@ -5,7 +5,17 @@ from __future__ import annotations
 import argparse
 
 from adaptfault.cli.adapt import open_adapter
-from adaptfault.cli.options import Commands, add_device, add_recordings, command, device, emit, fault_set, say
+from adaptfault.cli.options import (
+    Commands,
+    add_device,
+    add_recordings,
+    add_trust,
+    command,
+    device,
+    emit,
+    fault_set,
+    say,
+)
 
 _EXAMPLE = """  adaptfault forecast robot.bundle --worst --picture worst.png
       which wire, which two wires and which pad would cost most accuracy after a repair
@@ -30,6 +40,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("--picture", metavar="PNG", help="with --worst: a map of the accuracy lost")
     add_device(parser)
+    add_trust(parser)
     parser.set_defaults(run=run)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from adaptfault.cli.options import Commands, command, emit
+from adaptfault.cli.options import Commands, add_trust, command, emit, trust
 
 _EXAMPLE = """  adaptfault history robot.bundle --last 10
   adaptfault history robot.bundle --confirm
@@ -22,6 +22,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--confirm", action="store_true", help="end the probation of the version that runs")
     parser.add_argument("--trend", action="store_true", help="what drifts from run to run, in place of the runs")
     parser.add_argument("--picture", metavar="FILE", help="with --trend: write the drifting series as PNG")
+    add_trust(parser)
     parser.set_defaults(run=run, writes=("picture",))
 
 
@@ -30,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.pointer import Pointer
 
-    bundle = Bundle.open(args.bundle)
+    bundle = Bundle.open(args.bundle, **trust(args))
     if args.picture and not args.trend:
         raise ValueError("--picture shows trends: give --trend, too")
     if args.confirm:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from adaptfault.cli.options import Commands, add_array, command, layout_of
+from adaptfault.cli.options import Commands, add_array, add_trust, command, layout_of, trust
 
 if TYPE_CHECKING:
     from adaptfault.acquisition import Station
@@ -42,6 +42,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--seconds", type=float, metavar="S", help="end after so long")
     parser.add_argument("--frames", type=int, metavar="N", help="end after so many frames")
     add_array(parser)
+    add_trust(parser)
     parser.set_defaults(run=run)
 
 
@@ -59,6 +60,8 @@ def _station(args: argparse.Namespace) -> Station:
 
     if args.when and not args.record:
         raise ValueError("--when needs --record FOLDER: it chooses when to record")
+    if args.trust and not args.bundle:
+        raise ValueError("--trust needs BUNDLE: its signature is checked")
     if not 0 <= args.port < 65536:
         raise ValueError(f"--port {args.port}: expected 0 to 65535")
     if not args.ticks > 0:
@@ -67,13 +70,14 @@ def _station(args: argparse.Namespace) -> Station:
     if args.bundle and not table:
         from adaptfault.robot.bundle import Bundle
 
-        table = Bundle.open(args.bundle).parts.calibration
+        table = Bundle.open(args.bundle, **trust(args)).parts.calibration
     tables = Calibration.read(table) if table else None
     layout = layout_of(args) if tables is None else layout_of(args, full_scale=tables.full_scale, unit="N")
     return Station(
         None if args.bundle else layout,
         args.port,
         bundle=args.bundle,
+        **trust(args),
         host=args.host,
         devices=args.device,
         ticks=args.ticks,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from adaptfault.cli.options import Commands, add_untested_code, command, emit, say
+from adaptfault.cli.options import Commands, add_sign, add_trust, add_untested_code, command, emit, say, trust
 
 _EXAMPLE = """  adaptfault maintain robot.bundle today/
       recordings seen before are skipped
@@ -21,6 +21,8 @@ def add(commands: Commands) -> None:
     parser.add_argument("--budget", type=float, metavar="S", help="seconds that an adaptation may take")
     add_untested_code(parser)
     parser.add_argument("--report", metavar="FILE", help="write the technician's report (HTML)")
+    add_trust(parser)
+    add_sign(parser, "the bundle after the run")
     parser.set_defaults(run=run, writes=("report",))
 
 
@@ -31,8 +33,9 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.new_recordings import load_new_recordings
+    from adaptfault.robot.signature import sign_bundle
 
-    bundle = Bundle.open(args.bundle)
+    bundle = Bundle.open(args.bundle, **trust(args))
     incoming = load_new_recordings(bundle, args.recordings)
     for problem in incoming.problems:
         print(problem, file=sys.stderr)
@@ -45,6 +48,11 @@ def run(args: argparse.Namespace) -> int:
         untested_code=args.untested_code,
         say=lambda text: say(args, text),
     )
+    if args.sign and not args.dry_run:
+        sign_bundle(bundle, args.sign)
+    elif args.trust and report.decision == "deployed" and not args.dry_run:
+        what = "runs only where no key is asked for; give maintain --sign KEY, or sign the bundle"
+        print(f"warning: version {report.version} is not signed and {what}", file=sys.stderr)
     if args.report:
         from adaptfault.robot.technician_report import write_report
 

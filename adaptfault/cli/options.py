@@ -64,6 +64,40 @@ def add_untested_code(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_trust(parser: argparse.ArgumentParser) -> None:
+    """Add whose signature a bundle needs."""
+    group = parser.add_argument_group("signed bundles")
+    group.add_argument(
+        "--trust",
+        action="append",
+        metavar="KEY",
+        help="PEM file of a public ed25519 key that must have signed the bundle; may be repeated",
+    )
+    group.add_argument(
+        "--least-serial", type=int, metavar="N", help="with --trust: smallest serial number of the signature"
+    )
+
+
+def add_sign(parser: argparse.ArgumentParser, when: str) -> None:
+    """Add the key that signs a bundle."""
+    parser.add_argument("--sign", metavar="KEY", help=f"sign {when} with this private ed25519 key (PEM)")
+
+
+def trust(args: argparse.Namespace) -> dict[str, Any]:
+    """Return whose signature a bundle needs, as ``Bundle.open`` takes it; the key that signs is trusted, too.
+
+    Raises:
+        ValueError: a serial number without a key.
+    """
+    keys = list(args.trust or [])
+    if args.least_serial is not None and not keys:
+        raise ValueError("--least-serial needs --trust KEY")
+    sign = getattr(args, "sign", None)
+    if sign is not None:
+        keys.append(sign)
+    return {"keys": keys or None, "least_serial": args.least_serial or 0}
+
+
 def add_device(parser: argparse.ArgumentParser) -> None:
     """Add the option of the device that trains networks."""
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default auto: cuda where there is one)")
@@ -237,8 +271,9 @@ def refuse_missing(args: argparse.Namespace) -> None:
 
     Checked are the inputs of every command, and the folders of the files that it writes.
     """
-    many = [*(getattr(args, "recordings", None) or []), *(getattr(args, "reference", None) or [])]
-    one = [getattr(args, name, None) for name in ("labels", "layout", "calibration", "adapted", "model", "fleet")]
+    many = [path for name in ("recordings", "reference", "trust") for path in getattr(args, name, None) or []]
+    names = ("labels", "layout", "calibration", "adapted", "model", "fleet", "sign")
+    one = [getattr(args, name, None) for name in names]
     for path in filter(None, [*many, *one]):
         if not os.path.lexists(path):
             raise ValueError(f"{path}: is not there; check the path")

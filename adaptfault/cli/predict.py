@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import argparse
 
-from adaptfault.cli.options import Commands, add_device, add_recordings, command, device, emit, load_recordings
+from adaptfault.cli.options import (
+    Commands,
+    add_device,
+    add_recordings,
+    add_trust,
+    command,
+    device,
+    emit,
+    load_recordings,
+)
 
 _EXAMPLE = """  adaptfault predict today/ --bundle robot.bundle
       the version that the robot runs: faulty cells are not used
@@ -19,6 +28,7 @@ def add(commands: Commands) -> None:
     which.add_argument("--model", metavar="MODEL", help="folder written by adaptfault train")
     which.add_argument("--bundle", metavar="BUNDLE", help="the robot's bundle")
     add_device(parser)
+    add_trust(parser)
     parser.set_defaults(run=run)
 
 
@@ -29,15 +39,13 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.cli.trained_model import TrainedModel
     from adaptfault.data.windows import make_windows
 
-    trained = TrainedModel.open(args.model or args.bundle)
+    trained = TrainedModel.open(args, args.model or args.bundle)
     if args.calibration is None and trained.calibration is not None:
         args.calibration = str(trained.calibration)
-    recordings = load_recordings(args, args.recordings, layout=trained.network.layout)
+    recordings = trained.rewired(load_recordings(args, args.recordings, layout=trained.network.layout))
     windows = make_windows(recordings.frames, None, recordings.layout, length=trained.network.length)
     trained.adaptation.model.to(device(args))
-    # Exchanged wires are put back, as on the robot.
-    x = windows.x if trained.source is None else windows.x[..., trained.source]
-    probabilities = trained.adaptation.predict_proba(x)
+    probabilities = trained.adaptation.predict_proba(windows.x)
     names = trained.class_names or tuple(f"class {i}" for i in range(probabilities.shape[1]))
     results = []
     for i, name in enumerate(recordings.names):

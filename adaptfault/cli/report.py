@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from adaptfault.cli.options import Commands, command, emit
+from adaptfault.cli.options import Commands, add_trust, command, emit, trust
 
 
 def add(commands: Commands) -> None:
@@ -14,6 +14,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
     parser.add_argument("--out", default="report.html", metavar="FILE", help="default report.html")
     parser.add_argument("--name", metavar="NAME", help="of the robot (default: of the bundle or its folder)")
+    add_trust(parser)
     parser.set_defaults(run=run)  # the folder of the page is made
 
 
@@ -22,6 +23,6 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.technician_report import write_report
 
-    path = write_report(args.out, Bundle.open(args.bundle), name=args.name)
+    path = write_report(args.out, Bundle.open(args.bundle, **trust(args)), name=args.name)
     emit(args, {"schema": "adaptfault.report/1", "report": str(path)}, f"report: {path}")
     return 0

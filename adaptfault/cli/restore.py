@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from adaptfault.cli.options import Commands, command, emit, say
+from adaptfault.cli.options import Commands, add_trust, command, emit, say, trust
 
 _EXAMPLE = """  adaptfault restore today/ --bundle robot.bundle --out restored/
       writes restored.npz, readable by every command, and restored.json with the deviation of each restored cell
@@ -27,6 +27,7 @@ def add(commands: Commands) -> None:
         metavar="F",
         help="a diagnosis (JSON), or cell indices as 3,17,200 (default: the faulty cells that the bundle lists)",
     )
+    add_trust(parser)
     parser.set_defaults(run=run)
 
 
@@ -39,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.new_recordings import load_new_recordings
 
-    bundle = Bundle.open(args.bundle)
+    bundle = Bundle.open(args.bundle, **trust(args))
     layout = bundle.layout
     faults = bundle.known_faults().fault_set if args.faults is None else fault_set(args.faults, layout)
     incoming = load_new_recordings(bundle, args.recordings)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 
-from adaptfault.cli.options import Commands, command, emit
+from adaptfault.cli.options import Commands, add_trust, command, emit, trust
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "rollback", "return to the previous version", "  adaptfault rollback robot.bundle")
     parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
+    add_trust(parser)
     parser.set_defaults(run=run)
 
 
@@ -19,7 +20,7 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.sensor_state import SensorState
 
-    bundle = Bundle.open(args.bundle)
+    bundle = Bundle.open(args.bundle, **trust(args))
     left = bundle.active().number
     version = bundle.rollback()
     unhandled = [fault.reason for fault in SensorState.of(bundle).unhandled]

@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.options import (
     Commands,
     add_device,
     add_recordings,
+    add_sign,
     command,
     device,
     emit,
@@ -25,9 +27,13 @@ if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.data.recordings import Recordings
     from adaptfault.data.windows import Windows
+    from adaptfault.evaluation.scores import Scores
     from adaptfault.models.any_model import AnyModel
+    from adaptfault.models.history import History
     from adaptfault.models.network import TactileTransformer
     from diagnostics import SensorLayout
+
+_CHECKPOINT = "training.safetensors"
 
 _EXAMPLE = """  adaptfault train grasps/ --out model --epochs 20
       grasps/<class>/<recording>.csv; after a crash the same command continues the training
@@ -63,6 +69,7 @@ def add(commands: Commands) -> None:
         help="train the torch module that this function returns for (layout, n_classes, length)"
         " (default: the paper's network)",
     )
+    add_sign(parser, "X.bundle")
     add_device(parser)
     parser.set_defaults(run=run)
 
@@ -71,18 +78,15 @@ def run(args: argparse.Namespace) -> int:
     """Train, evaluate on the test recordings, save."""
     out = Path(args.out)
     bundled = out.suffix == ".bundle"
-    if bundled and out.exists():
-        raise ValueError(f"{out} exists: choose another name, or remove it")
+    _check_options(args, out, bundled)
     recordings, where = load_recordings(args, args.recordings, labelled=True), device(args)
 
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.cli.trained_model import say_short
     from adaptfault.data.windows import make_windows, split
     from adaptfault.evaluation.scores import Scores
-    from adaptfault.evaluation.training_check import plot_training, training_problems
     from adaptfault.models.network import TactileTransformer
     from adaptfault.models.store import save_model
-    from adaptfault.models.training import train
     from diagnostics import FaultSet
 
     windows = make_windows(recordings.frames, recordings.labels, recordings.layout, length=args.length)
@@ -96,20 +100,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         model = TactileTransformer(recordings.layout, n_classes, length=args.length, seed=args.seed)
     folder = out.with_name(f".{out.name}.training") if bundled else out
-    folder.mkdir(parents=True, exist_ok=True)
-    checkpoint = folder / "training.safetensors"
-    if checkpoint.exists():
-        say(args, f"continuing from {checkpoint}")
-    history = train(
-        model.to(where),
-        parts[0],
-        parts[1],
-        epochs=args.epochs,
-        seed=args.seed,
-        repairable=args.repairable,
-        checkpoint=checkpoint,
-        progress=progress(args),
-    )
+    history = _trained(args, model.to(where), parts, folder)
     adapter = Adapter(model.cpu(), parts[0], parts[1])
     healthy = (
         adapter.healthy if args.head == "auto" else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
@@ -121,11 +112,64 @@ def run(args: argparse.Namespace) -> int:
         shutil.rmtree(folder)
     else:
         save_model(out, model, class_names=recordings.class_names, extra=extra, head=healthy.model.head)
-        checkpoint.unlink()  # the run is complete: nothing is left to resume
+        (folder / _CHECKPOINT).unlink()  # the run is complete: nothing is left to resume
+    problems = _told(args, out, bundled, scores, history, recordings.class_names, extra)
+    return int(args.strict and bool(problems))
+
+
+def _check_options(args: argparse.Namespace, out: Path, bundled: bool) -> None:
+    """Refuse what would fail after the training."""
+    if bundled and out.exists():
+        raise ValueError(f"{out} exists: choose another name, or remove it")
+    if args.sign is not None:
+        from adaptfault.robot.signature import read_private_key
+
+        if not bundled:
+            raise ValueError("--sign signs bundles: give --out X.bundle")
+        read_private_key(args.sign)
+
+
+def _trained(
+    args: argparse.Namespace,
+    model: TactileTransformer | AnyModel,
+    parts: tuple[Windows, Windows, Windows],
+    folder: Path,
+) -> History:
+    """Train in place; the checkpoint in the folder continues a training that was cut off."""
+    from adaptfault.models.training import train
+
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoint = folder / _CHECKPOINT
+    if checkpoint.exists():
+        say(args, f"continuing from {checkpoint}")
+    return train(
+        model,
+        parts[0],
+        parts[1],
+        epochs=args.epochs,
+        seed=args.seed,
+        repairable=args.repairable,
+        checkpoint=checkpoint,
+        progress=progress(args),
+    )
+
+
+def _told(
+    args: argparse.Namespace,
+    out: Path,
+    bundled: bool,
+    scores: Scores,
+    history: History,
+    class_names: Sequence[str],
+    extra: dict[str, Any],
+) -> tuple[str, ...]:
+    """Draw the training, print the result, and return the signs of a failed training."""
+    from adaptfault.evaluation.training_check import plot_training, training_problems
+
     kind = "bundle" if bundled else "model"
     picture = out.with_name(f"{out.stem}.training.png") if bundled else out / "training.png"
-    plot_training(scores, history, recordings.class_names).savefig(picture, dpi=120)
-    problems = training_problems(scores, history, recordings.class_names)
+    plot_training(scores, history, class_names).savefig(picture, dpi=120)
+    problems = training_problems(scores, history, class_names)
     for problem in problems:
         print(f"warning: {problem}", file=sys.stderr)
     emit(
@@ -133,7 +177,7 @@ def run(args: argparse.Namespace) -> int:
         {"schema": "adaptfault.train/1", kind: str(out), **extra, "picture": str(picture), "problems": list(problems)},
         f"test: {scores}\ntraining: {history}\n{kind}: {out}\npicture: {picture}",
     )
-    return int(args.strict and bool(problems))
+    return problems
 
 
 def _built(builder: str, windows: Windows, layout: SensorLayout, n_classes: int) -> TactileTransformer | AnyModel:
@@ -162,9 +206,10 @@ def _bundle(
 
     from adaptfault.data.calibration import Calibration
     from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.signature import sign_bundle
 
     training, _, test = parts
-    Bundle.create(
+    bundle = Bundle.create(
         out,
         adapter.model,
         adapter,
@@ -174,3 +219,5 @@ def _bundle(
         calibration=Calibration.read(args.calibration) if args.calibration else None,
         head=args.head,
     )
+    if args.sign is not None:
+        sign_bundle(bundle, args.sign)

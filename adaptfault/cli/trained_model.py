@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adaptfault.adaptation.fault_free import Network
 from adaptfault.adaptation.result import Adaptation
-from adaptfault.cli.options import load_recordings, say
+from adaptfault.cli.options import load_recordings, say, trust
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, make_windows, split
 from adaptfault.models.store import SCHEMA, load_healthy, read_manifest
@@ -44,13 +44,17 @@ class TrainedModel:
     source: NDArray[np.intp] | None = None
 
     @classmethod
-    def open(cls, folder: str) -> TrainedModel:
+    def open(cls, args: argparse.Namespace, folder: str) -> TrainedModel:
         """Read a model or a bundle.
 
+        Args:
+            args: the options of ``add_trust``.
+            folder: of the model or the bundle.
+
         Raises:
-            FileNotFoundError, ValueError: neither, or damaged.
+            FileNotFoundError, ValueError: neither, damaged, or not signed by a trusted key.
         """
-        bundle = open_bundle(folder)
+        bundle = open_bundle(args, folder)
         if bundle is None:
             manifest = read_manifest(folder, SCHEMA)
             seed = int(manifest["extra"].get("split_seed", 0))
@@ -72,6 +76,12 @@ class TrainedModel:
         if self.class_names and recordings.class_names != self.class_names:
             recordings = self._in_order(recordings)
         return recordings
+
+    def rewired(self, recordings: Recordings) -> Recordings:
+        """Return recordings with exchanged wires put back, as the version that a bundle runs does on the robot."""
+        if self.source is None:
+            return recordings
+        return replace(recordings, frames=tuple(frames[:, self.source] for frames in recordings.frames))
 
     def _in_order(self, recordings: Recordings) -> Recordings:
         """Return the recordings with the classes of the model, in the order of the model."""
@@ -100,10 +110,21 @@ def say_short(args: argparse.Namespace, recordings: Recordings, length: int) -> 
         say(args, f"{short} of {len(recordings)} recordings {many} shorter than a window of {length} frames: not used")
 
 
-def open_bundle(folder: str) -> Bundle | None:
-    """Return the bundle in a folder; None if it holds something else."""
+def open_bundle(args: argparse.Namespace, folder: str) -> Bundle | None:
+    """Return the bundle in a folder; None if it holds something else.
+
+    Args:
+        args: the options of ``add_trust``.
+        folder: of the bundle, a model, or recordings.
+
+    Raises:
+        FileNotFoundError, ValueError: the bundle is damaged or not signed by a trusted key; or no bundle, with --trust.
+    """
+    trusted = trust(args)
     if not (Path(folder) / "bundle.json").is_file():
+        if trusted["keys"]:
+            raise ValueError(f"--trust: {folder} is no bundle, and only bundles are signed")
         return None
     from adaptfault.robot.bundle import Bundle
 
-    return Bundle.open(folder)
+    return Bundle.open(folder, **trusted)

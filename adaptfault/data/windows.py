@@ -130,6 +130,14 @@ def make_windows(
     return Windows(x, np.repeat(classes, counts), np.repeat(np.arange(len(recordings)), counts))
 
 
+def recordings_of(windows: Windows, layout: SensorLayout) -> list[NDArray[np.float64]]:
+    """Return the frames of the windows of each recording, one after the other, ``[T, D]`` in the layout's unit."""
+    return [
+        windows.x[windows.recording == number].reshape(-1, layout.n_cells) * float(layout.full_scale)
+        for number in np.unique(windows.recording)
+    ]
+
+
 def split(
     windows: Windows, *, test: float = 0.2, validation: float = 0.2, seed: int = 0
 ) -> tuple[Windows, Windows, Windows]:

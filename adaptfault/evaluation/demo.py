@@ -137,6 +137,7 @@ def run_demo(
     healthy = [recordings.frames[i] for i in np.unique(training.recording)]
     say(f"recordings   {len(recordings)} of {layout}; {len(recordings.class_names)} classes, {len(windows)} windows")
 
+    # Train.
     model = TactileTransformer(layout, len(recordings.class_names), seed=seed, **(network or {}))
     options: dict[str, Any] = {"checkpoint": checkpoint, "progress": progress, "seed": seed}
     with clock("training"):
@@ -147,17 +148,18 @@ def run_demo(
     fault_free = _score(deployed, test)
     say(f"fault-free   {fault_free[0]}")
 
+    # Break.
     injected = tuple(default_faults(healthy, layout, rng) if faults is None else faults)
     broken, broken_windows = _broken(recordings, np.unique(test.recording), injected, seed)
     collapsed = _score(deployed, broken_windows)
     say(f"broken       {len({c for fault in injected for c in fault.cells})} cells; {collapsed[0]}")
     _list(say, [fault.describe(layout) for fault in injected])
 
+    # Diagnose and repair.
     log = [broken[i] for i in rng.permutation(len(broken))[:_LOG_RECORDINGS]]
     diagnosis = _diagnosed(layout, healthy, log, clock)
     say(_found(diagnosis, injected, len(log), clock.seconds["diagnosis"]))
     _list(say, [fault.reason for fault in diagnosis.faults])
-
     with clock("adaptation"):
         adaptation = adapter.adapt(diagnosis.fault_set, seed=seed, progress=progress)
     for stage in adaptation.stages:

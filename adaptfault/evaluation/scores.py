@@ -184,6 +184,16 @@ def recording_scores(probabilities: ArrayLike, windows: Windows) -> Scores:
     return Scores.of(windows.y[first], summed.argmax(axis=1), n_classes=p.shape[1])
 
 
+def chance(y: ArrayLike) -> tuple[float, float]:
+    """Return the accuracy m of always naming the most frequent class, and the least that exceeds it beyond chance.
+
+    The latter is m + 2 sqrt(m (1 - m) / n), two standard errors of n windows, classes ``y [n]``.
+    """
+    counts = np.unique(np.asarray(y), return_counts=True)[1]
+    share = float(counts.max() / counts.sum())
+    return share, share + 2 * float(np.sqrt(share * (1 - share) / counts.sum()))
+
+
 def mean_interval(values: ArrayLike, recording: ArrayLike, *, level: float = 0.95) -> tuple[float, float]:
     """Return the cluster-robust t interval of the mean of ``values [N]``, clustered by recording ``[N]``.
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.evaluation.scores import Scores
+from adaptfault.evaluation.scores import Scores, chance
 from adaptfault.models.history import History
 
 if TYPE_CHECKING:
@@ -23,9 +23,8 @@ def training_problems(scores: Scores, history: History, class_names: Sequence[st
 
     The signs are a test accuracy near chance, a class without a window, a class that is never predicted, and a training
     loss that did not fall.
-    Chance is the share m of the most frequent class. An accuracy is near it if it is below
-    m + 2 sqrt(m (1 - m) / n), two standard errors of n test windows. A run on unbalanced classes may be useful below
-    that limit; the sentence names both numbers.
+    An accuracy is near chance if it is below the limit of :func:`adaptfault.evaluation.scores.chance`. A run on
+    unbalanced classes may be useful below that limit; the sentence names both numbers.
 
     Args:
         scores: of the test windows.
@@ -34,11 +33,10 @@ def training_problems(scores: Scores, history: History, class_names: Sequence[st
     """
     counts = scores.confusion.sum(axis=1)
     problems = []
-    chance = counts.max() / counts.sum()
-    limit = chance + 2 * np.sqrt(chance * (1 - chance) / counts.sum())
+    share, limit = chance(np.repeat(np.arange(len(counts)), counts))
     if scores.accuracy < limit:
         problems.append(
-            f"test accuracy {scores.accuracy:.3f} is near chance ({chance:.3f}): train longer (--epochs), and check the"
+            f"test accuracy {scores.accuracy:.3f} is near chance ({share:.3f}): train longer (--epochs), and check the"
             " labels, the full scale (adaptfault info) and that the classes differ in contact"
         )
     absent = np.flatnonzero(counts == 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from functools import partial
@@ -38,6 +39,9 @@ def maintain_fleet(
     dry_run: bool = False,
     budget: float | None = None,
     limit: float | None = None,
+    keys: Sequence[str] | None = None,
+    least_serial: int = 0,
+    sign: str | None = None,
     progress: bool | None = None,
 ) -> FleetReport:
     """Run ``maintain`` over all robots; one that fails is an error in the report, and the others go on.
@@ -53,11 +57,14 @@ def maintain_fleet(
         dry_run: report only, change nothing.
         budget: seconds that one adaptation may take.
         limit: seconds per robot, after which its process is killed and the robot is an error. None: no limit.
+        keys, least_serial: whose signature each bundle needs, see :class:`Bundle`. The files must be there on every
+            worker.
+        sign: PEM file of the private key that signs each bundle after its run, with ``keys``; None: none is signed.
         progress: show or hide it on stderr; None shows it on a terminal.
 
     Raises:
-        ValueError: ``jobs`` is below 1 or given with ``dask``, ``limit`` is not above 0, Dask is not installed, or the
-            ledger has another schema.
+        ValueError: ``jobs`` is below 1 or given with ``dask``, ``limit`` is not above 0, Dask is not installed, the
+            ledger has another schema, or ``sign`` comes without ``keys``.
         Busy: another process maintains the fleet in this folder.
         OSError: the scheduler does not answer.
     """
@@ -67,11 +74,14 @@ def maintain_fleet(
         raise ValueError(f"jobs {jobs}: expected at least 1, and none with a Dask cluster, which has its own workers")
     if limit is not None and not limit > 0:
         raise ValueError(f"limit {limit}: expected seconds, more than 0")
+    if sign is not None and not keys:  # whatever lies in the bundle would be signed
+        raise ValueError("sign needs keys: only a bundle that a trusted key signed is signed again")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder / "run.lock", wait=False):
         lines = Lines(folder / LEDGER)
-        options: dict[str, Any] = {"dry_run": dry_run, "budget": budget}
+        options: dict[str, Any] = {"dry_run": dry_run, "budget": budget, "least_serial": least_serial, "sign": sign}
+        options["keys"] = None if keys is None else list(map(str, keys))
         began, done = _resumed(lines.read(), fleet, options)
         if not done:
             began = now()

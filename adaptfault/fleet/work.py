@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 
 from adaptfault.fleet.listing import Robot
 from adaptfault.fleet.outcome import Outcome
@@ -17,43 +18,65 @@ def ready() -> None:
     """Import what maintenance needs (the import of this module does it)."""
 
 
-def maintain_robot(robot: Robot, *, dry_run: bool = False, budget: float | None = None) -> Outcome:
+def maintain_robot(
+    robot: Robot,
+    *,
+    dry_run: bool = False,
+    budget: float | None = None,
+    keys: Sequence[str] | None = None,
+    least_serial: int = 0,
+    sign: str | None = None,
+) -> Outcome:
     """Maintain one robot; a failure becomes an outcome "error" with its reason.
 
     Args:
         robot: with paths that are valid on every worker.
         dry_run: report only.
         budget: seconds that an adaptation may take.
+        keys, least_serial: whose signature the bundle needs, see :class:`Bundle`.
+        sign: PEM file of the private key that signs the bundle after the run; None: it is not signed.
     """
+    work = partial(_maintained, robot, dry_run, budget, keys, least_serial, sign)
     began = time.perf_counter()
     try:
         with _one_thread():
-            return _patiently(robot, dry_run, budget, began)
+            return _patiently(work, began)
     except (ValueError, OSError) as error:
         return Outcome.error(robot, str(error), time.perf_counter() - began)
     except Exception as error:  # one robot must not stop the others
         return Outcome.error(robot, f"{type(error).__name__}: {error}", time.perf_counter() - began)
 
 
-def _patiently(robot: Robot, dry_run: bool, budget: float | None, began: float) -> Outcome:
+def _patiently(work: Callable[[float], Outcome], began: float) -> Outcome:
     """Wait for a locked robot: a Dask worker may still process it after its run was killed."""
     while True:
         try:
-            return _maintained(robot, dry_run, budget, began)
+            return work(began)
         except Busy:
             if time.perf_counter() - began > _PATIENCE:
                 raise
         time.sleep(_PAUSE)
 
 
-def _maintained(robot: Robot, dry_run: bool, budget: float | None, began: float) -> Outcome:
+def _maintained(
+    robot: Robot,
+    dry_run: bool,
+    budget: float | None,
+    keys: Sequence[str] | None,
+    least_serial: int,
+    sign: str | None,
+    began: float,
+) -> Outcome:
     from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.new_recordings import load_new_recordings
+    from adaptfault.robot.signature import sign_bundle
 
-    bundle = Bundle.open(robot.bundle)
+    bundle = Bundle.open(robot.bundle, keys=keys, least_serial=least_serial)
     incoming = load_new_recordings(bundle, robot.paths())
     report = maintain(bundle, incoming.frames, names=incoming.names, dry_run=dry_run, budget=budget)
+    if sign is not None and not dry_run:
+        sign_bundle(bundle, sign)
     notes = tuple(problem.message for problem in incoming.problems if problem.level == "error")
     return Outcome.of(robot, bundle, report, notes=notes, seconds=time.perf_counter() - began)
 

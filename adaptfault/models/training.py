@@ -111,18 +111,14 @@ def train(
     run = _Run(model, learning_rate, averaging, Path(checkpoint) if checkpoint is not None else None)
     run.loss = _default_loss(train) if loss is None else loss
     if run.path is not None:
-        run.settings = {
+        options: dict[str, Any] = {
             "learning_rate": learning_rate,
             "batch_size": batch_size,
             "seed": seed,
             "averaging": averaging,
             "evaluate_start": evaluate_start,
-            **({} if loss is None else {"loss": getattr(loss, "__qualname__", type(loss).__qualname__)}),
-            "augment": None if augment is None else getattr(augment, "__qualname__", type(augment).__qualname__),
-            "data": fingerprint_windows(train, validation),
-            "more": None if more is None else str(more),
-            "starting weights": fingerprint_weights(model),
         }
+        run.settings = options | _settings(model, train, validation, loss, augment, more)
         run.resume()
         clock.spent = sum(run.history.seconds)
     source = _Source(train, more)
@@ -144,6 +140,28 @@ def train(
         run.restore_best()
         model.eval()
     return replace(run.history, stopped=stopped)
+
+
+def _settings(
+    model: nn.Module,
+    train: Windows,
+    validation: Windows,
+    loss: Loss | None,
+    augment: Augment | None,
+    more: MoreWindows | None,
+) -> dict[str, Any]:
+    """Return what identifies a run beside its numbers: a checkpoint with other settings is of another run."""
+
+    def name(function: Callable[..., Any]) -> str:
+        return str(getattr(function, "__qualname__", type(function).__qualname__))
+
+    return {
+        **({} if loss is None else {"loss": name(loss)}),
+        "augment": None if augment is None else name(augment),
+        "data": fingerprint_windows(train, validation),
+        "more": None if more is None else str(more),
+        "starting weights": fingerprint_weights(model),
+    }
 
 
 def _begin(run: _Run, validation: Windows, clock: Clock, evaluate_start: bool) -> None:

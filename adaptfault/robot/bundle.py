@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from datetime import datetime, timezone
 from functools import partial
@@ -77,7 +77,8 @@ class Bundle:
     Args:
         path: an existing bundle.
         keys: PEM files of public ed25519 keys. The bundle must be signed by one of them
-            (:func:`adaptfault.sign_bundle`), and only signed versions run. None: signatures are not checked.
+            (:func:`adaptfault.sign_bundle`), and only signed versions run, and those that this object wrote. None:
+            signatures are not checked.
         least_serial: smallest serial number of the signature that is accepted.
 
     Raises:
@@ -101,11 +102,10 @@ class Bundle:
             self.parts = Parts(self.path / _PARTS, dict(self.about["parts"]))
         self.versions = Versions(self.path / "versions")
         self.journal = Journal(self.path)
-        self._signed: Collection[int] | None = None  # versions that may run; None: all
         if keys is not None:
             from adaptfault.robot.signature import verify_bundle
 
-            self._signed = verify_bundle(self, keys, least_serial)
+            self.versions.signed = verify_bundle(self, keys, least_serial)
 
     @classmethod
     def open(
@@ -146,16 +146,7 @@ class Bundle:
             ValueError: the parts have different array shapes, the diagnoser is not fitted, or ``head`` is unknown.
         """
         path = Path(path)
-        if head not in ("auto", "linear"):
-            raise ValueError(f"unknown head {head!r}: use 'auto' or 'linear'")
-        if path.exists():
-            raise FileExistsError(f"{path} exists: choose another name, or remove it")
-        if not diagnoser.layout.shape == adapter.model.layout.shape == model.layout.shape:
-            raise ValueError(
-                f"model, adapter and diagnoser need one array shape; got {model.layout} and {diagnoser.layout}"
-            )
-        if class_names and len(class_names) != model.n_classes:
-            raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
+        _check_parts(path, model, adapter, diagnoser, class_names, head)
         make_folder(path.parent)
         new = path.with_name(f".{path.name}.unfinished")
         shutil.rmtree(new, ignore_errors=True)  # left by a crash
@@ -196,9 +187,6 @@ class Bundle:
         before = [n for n in reversed(self.versions.numbers) if n < pointer.active]
         problems = []
         for number in dict.fromkeys((pointer.active, *pointer.fallbacks, *before)):
-            if self._signed is not None and number not in self._signed:
-                problems.append(f"version {number} is not signed")
-                continue
             try:
                 return self.versions[number]
             except (FileNotFoundError, Damaged) as error:
@@ -291,14 +279,10 @@ class Bundle:
 
     def restorer(self) -> Restorer:
         """Return a restorer that is fitted on the healthy windows; raises Damaged. Loads torch."""
-        import numpy as np
-
+        from adaptfault.data.windows import recordings_of
         from adaptfault.imputation.restorer import Restorer
 
-        windows, layout = self.parts.adapter().train, self.layout
-        numbers = np.unique(windows.recording)
-        healthy = [windows.x[windows.recording == n].reshape(-1, layout.n_cells) * layout.full_scale for n in numbers]
-        return Restorer(layout).fit(healthy)
+        return Restorer(self.layout).fit(recordings_of(self.parts.adapter().train, self.layout))
 
     # History.
 
@@ -335,6 +319,27 @@ class Bundle:
 def now() -> str:
     """Return the current UTC time as ISO 8601."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def _check_parts(
+    path: Path,
+    model: TactileTransformer | AnyModel,
+    adapter: Adapter,
+    diagnoser: SelfDiagnosis,
+    class_names: Sequence[str],
+    head: str,
+) -> None:
+    """Refuse parts that make no bundle, before anything is written; the errors are those of :meth:`Bundle.create`."""
+    if head not in ("auto", "linear"):
+        raise ValueError(f"unknown head {head!r}: use 'auto' or 'linear'")
+    if path.exists():
+        raise FileExistsError(f"{path} exists: choose another name, or remove it")
+    if not diagnoser.layout.shape == adapter.model.layout.shape == model.layout.shape:
+        raise ValueError(
+            f"model, adapter and diagnoser need one array shape; got {model.layout} and {diagnoser.layout}"
+        )
+    if class_names and len(class_names) != model.n_classes:
+        raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
 
 
 def _save(adaptation: Adaptation, folder: Path) -> None:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from adaptfault.data.windows import recordings_of
+from adaptfault.evaluation.scores import chance
 from adaptfault.robot.ageing import encode
 from adaptfault.robot.bundle import Bundle, now
 from adaptfault.robot.checksummed_json import Damaged
@@ -250,7 +252,7 @@ class _Maintenance:
         diagnosis = self.diagnoser.diagnose(frames)
         report = self._decide(diagnosis, frames, tuple(r.name for r in usable))
         loads, healthy = self._loads(frames)
-        report = self._with_change(self._with_coverage(report), loads, healthy)
+        report = self._with_chance(self._with_change(self._with_coverage(report), loads, healthy))
         if report.used:
             self.condition = encode(cell_condition(loads, healthy, bundle.layout), diagnosis.verdicts)
         if rewiring is not None:
@@ -278,11 +280,7 @@ class _Maintenance:
 
     def _loads(self, frames: list[NDArray[np.float64]]) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
         """Return new recordings, and the healthy ones of the bundle, as loads, ``[T, D]`` each."""
-        layout, train, load = self.bundle.layout, self.adapter.train, self.diagnoser.load_
-        healthy = [
-            train.x[train.recording == number].reshape(-1, layout.n_cells) * layout.full_scale
-            for number in np.unique(train.recording)
-        ]
+        load, healthy = self.diagnoser.load_, recordings_of(self.adapter.train, self.bundle.layout)
         return (frames, healthy) if load is None else ([*map(load.loads, frames)], [*map(load.loads, healthy)])
 
     def _undone(self, rewiring: Rewiring) -> Version:
@@ -304,6 +302,19 @@ class _Maintenance:
         share = diagnosis.coverage.test_coverage
         reason = f"the recordings test only {share:.0%} of the cells, so faults may be hidden; {report.reason}"
         return replace(report, exit_code=self.untested_code, reason=reason)
+
+    def _with_chance(self, report: MaintenanceReport) -> MaintenanceReport:
+        """Return the report with exit code 2 where the accuracy that was measured is that of guessing."""
+        if report.accuracy is None:
+            return report
+        share, limit = chance(self.bundle.parts.check_windows().y)
+        if report.accuracy >= limit:
+            return report
+        reason = (
+            f"the model is at chance: accuracy {report.accuracy:.3f}, where always naming the most frequent class gives"
+            f" {share:.3f}; {report.reason}"
+        )
+        return replace(report, exit_code=2, reason=reason)
 
     def _with_change(
         self, report: MaintenanceReport, loads: list[NDArray[Any]], reference: list[NDArray[Any]]
@@ -456,6 +467,7 @@ class _Maintenance:
             "source": self.version.source.tolist(),
             "accuracy": judgement.candidate,
             "fault_free_accuracy": free,
+            "chance": chance(self.bundle.parts.check_windows().y)[1],
         }
         version = self.bundle.write_version(adaptation, about)
         self.bundle.deploy(version.number)
@@ -504,12 +516,14 @@ class _Maintenance:
         )
 
     def _code(self, faulty: FaultSet, accuracy: float | None = None, free: float | None = None) -> int:
-        """Return 0: no known fault; 1: handled; 2: not handled, or accuracy below 90 % of the fault-free one."""
+        """Return 0: no known fault; 1: handled; 2: not handled, or too little accuracy."""
         if accuracy is None or free is None:
             if unhandled_cells(self.bundle, faulty, self.version):
                 return 2
             about = self.version.about
             accuracy, free = about.get("accuracy"), about.get("fault_free_accuracy")
+            if accuracy is not None and accuracy < about.get("chance", 0):
+                return 2
         if accuracy is not None and free is not None and accuracy < TECHNICIAN_BELOW * free:
             return 2
         return 1 if len(faulty) else 0

@@ -3,108 +3,142 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.data.atomic import atomic_write
-from adaptfault.robot.checksummed_json import hash_file
-from adaptfault.robot.versions import ABOUT
+from adaptfault.robot.checksummed_json import Damaged
+from adaptfault.robot.pointer import Pointer
+from adaptfault.robot.versions import Untrusted
 
 if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
     from adaptfault.robot.bundle import Bundle
 
 SCHEMA = "adaptfault.signature/1"
 NAME = "signature.json"
 
-
-class Untrusted(ValueError):
-    """A bundle or a version that no trusted key signed."""
+_MISSING = "signatures need cryptography; pip install 'adaptfault[sign]'"
 
 
-def sign_bundle(bundle: Bundle, private_key: str | PathLike[str], *, serial: int) -> None:
-    """Sign the manifest of a bundle and all its versions.
+def sign_bundle(bundle: Bundle, private_key: str | PathLike[str], *, serial: int | None = None) -> None:
+    """Sign the manifest of a bundle and the versions that may run: the active one, its fallbacks, and the fault-free.
 
     The manifest holds the hash of every part, and the description of a version that of each of its files.
 
     Args:
-        bundle: to sign; sign it again after a maintenance run that deployed a version.
+        bundle: to sign; sign it again after a maintenance run that deployed a version. Opened with ``keys``, only
+            versions are signed that were signed before or written by this object; otherwise, what is on the disk.
         private_key: PEM file of an ed25519 key: ``openssl genpkey -algorithm ed25519 -out private.pem``.
-        serial: number of this state of the bundle, larger than all before; a robot refuses smaller ones.
+        serial: number of this state of the bundle, larger than all before; a robot refuses smaller ones. None: one
+            more than the number that is signed.
 
     Raises:
-        ValueError: the key is no ed25519 key, or the serial number is not larger than the one that is signed.
+        ValueError: the key is no ed25519 key, cryptography is not installed, or the serial number is not larger than
+            the one that is signed.
+        Damaged: the pointer to the active version cannot be read.
     """
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-    from cryptography.hazmat.primitives.serialization import load_pem_private_key
-
-    key = load_pem_private_key(Path(private_key).read_bytes(), password=None)
-    if not isinstance(key, Ed25519PrivateKey):
-        raise ValueError(f"{private_key}: expected an ed25519 key; openssl genpkey -algorithm ed25519")
+    key = read_private_key(private_key)
     path = bundle.path / NAME
     before = json.loads(path.read_bytes())["signed"]["serial"] if path.exists() else 0
+    serial = before + 1 if serial is None else serial
     if serial <= before:
         raise ValueError(f"serial number {serial}: expected more than {before}, which is signed already")
-    signed = {
-        "schema": SCHEMA,
-        "serial": serial,
-        "manifest": bundle.about,
-        "versions": {str(number): _hash(bundle, number) for number in bundle.versions.numbers},
-    }
+    pointer = Pointer.read(bundle.path)
+    versions = {}
+    for number in sorted({1, pointer.active, *pointer.fallbacks}):
+        try:
+            versions[str(bundle.versions[number].number)] = bundle.versions.hash(number)
+        except (FileNotFoundError, Damaged):  # it does not run either
+            continue
+    signed = {"schema": SCHEMA, "serial": serial, "manifest": bundle.about, "versions": versions}
     document = {"signed": signed, "signature": key.sign(_canonical(signed)).hex()}
     atomic_write(path, json.dumps(document, indent=1, allow_nan=False).encode())
 
 
-def verify_bundle(bundle: Bundle, public_keys: Sequence[str | PathLike[str]], least_serial: int) -> Collection[int]:
-    """Return the numbers of the versions that a trusted key signed.
+def verify_bundle(bundle: Bundle, keys: Sequence[str | PathLike[str]], least_serial: int) -> dict[int, str]:
+    """Return number and hash of each version that a trusted key signed.
 
     Args:
         bundle: to verify.
-        public_keys: PEM files of the trusted keys: ``openssl pkey -in private.pem -pubout -out public.pem``.
+        keys: PEM files of the trusted keys: ``openssl pkey -in private.pem -pubout -out public.pem``. A private key
+            stands for its public one.
         least_serial: smallest serial number that is accepted.
 
     Raises:
         Untrusted: the bundle is not signed, not by one of these keys, was changed since, or is older than that.
+        ValueError: a file holds no ed25519 key, or cryptography is not installed.
     """
     path = bundle.path / NAME
+    trusted = [_read_public_key(key) for key in keys]
     try:
         document = json.loads(path.read_bytes())
         signed, signature = document["signed"], bytes.fromhex(document["signature"])
         data = _canonical(signed)
     except FileNotFoundError:
-        raise Untrusted(f"{bundle.path} is not signed; adaptfault.sign_bundle signs it") from None
+        raise Untrusted(
+            f"{bundle.path} is not signed; adaptfault train --sign or adaptfault.sign_bundle signs it"
+        ) from None
     except (ValueError, TypeError, KeyError):
         raise Untrusted(f"{path} holds no signature; sign the bundle again") from None
-    if not any(_verifies(key, signature, data) for key in public_keys):
-        raise Untrusted(f"{bundle.path} is not signed by one of the {len(public_keys)} trusted keys")
+    if not any(_verifies(key, signature, data) for key in trusted):
+        raise Untrusted(f"{bundle.path} is not signed by one of the {len(keys)} trusted keys")
     if signed["schema"] != SCHEMA:
         raise Untrusted(f"{path} has schema {signed['schema']!r}, expected {SCHEMA!r}")
     if signed["manifest"] != bundle.about:
         raise Untrusted(f"{bundle.path}: the manifest is not the signed one, from another bundle or changed")
     if signed["serial"] < least_serial:
         raise Untrusted(f"{bundle.path} has serial number {signed['serial']}, expected {least_serial} or more")
-    here = {n for n in bundle.versions.numbers if (bundle.versions.path(n) / ABOUT).is_file()}
-    return {n for n in here if signed["versions"].get(str(n)) == _hash(bundle, n)}
+    return {int(number): str(digest) for number, digest in signed["versions"].items()}
 
 
-def _verifies(public_key: str | PathLike[str], signature: bytes, data: bytes) -> bool:
-    from cryptography.exceptions import InvalidSignature
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
-    from cryptography.hazmat.primitives.serialization import load_pem_public_key
+def read_private_key(path: str | PathLike[str]) -> Ed25519PrivateKey:
+    """Return the ed25519 key in a PEM file; raises ValueError, also where cryptography is not installed."""
+    try:
+        from cryptography.exceptions import UnsupportedAlgorithm
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+        from cryptography.hazmat.primitives.serialization import load_pem_private_key
+    except ImportError:
+        raise ValueError(_MISSING) from None
+    try:
+        key = load_pem_private_key(Path(path).read_bytes(), password=None)
+    except (ValueError, TypeError, UnsupportedAlgorithm):  # TypeError: it has a password
+        key = None
+    if not isinstance(key, Ed25519PrivateKey):
+        raise ValueError(f"{path}: expected an ed25519 key without password; openssl genpkey -algorithm ed25519")
+    return key
 
-    key = load_pem_public_key(Path(public_key).read_bytes())
+
+def _read_public_key(path: str | PathLike[str]) -> Ed25519PublicKey:
+    try:
+        from cryptography.exceptions import UnsupportedAlgorithm
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+        from cryptography.hazmat.primitives.serialization import load_pem_public_key
+    except ImportError:
+        raise ValueError(_MISSING) from None
+    data = Path(path).read_bytes()
+    if b"PRIVATE KEY" in data:
+        return read_private_key(path).public_key()
+    try:
+        key = load_pem_public_key(data)
+    except (ValueError, UnsupportedAlgorithm):
+        key = None
     if not isinstance(key, Ed25519PublicKey):
-        raise ValueError(f"{public_key}: expected the public part of an ed25519 key")
+        raise ValueError(f"{path}: expected the public part of an ed25519 key; openssl pkey -in KEY -pubout")
+    return key
+
+
+def _verifies(key: Ed25519PublicKey, signature: bytes, data: bytes) -> bool:
+    from cryptography.exceptions import InvalidSignature
+
     try:
         key.verify(signature, data)
     except InvalidSignature:
         return False
     return True
-
-
-def _hash(bundle: Bundle, number: int) -> str:
-    return hash_file(bundle.versions.path(number) / ABOUT)
 
 
 def _canonical(signed: dict[str, Any]) -> bytes:

@@ -17,6 +17,7 @@ from adaptfault.robot.checksummed_json import (
     Damaged,
     check_files,
     decoding,
+    hash_file,
     hash_files,
     read_checksummed,
     sync,
@@ -29,6 +30,10 @@ SCHEMA = "adaptfault.version/1"
 ABOUT = "version.json"
 
 _UNFINISHED = ".unfinished-"
+
+
+class Untrusted(Damaged):
+    """A bundle or a version that no trusted key signed."""
 
 
 @dataclass(frozen=True)
@@ -93,14 +98,28 @@ class Version:
 
 
 class Versions:
-    """The versions of a bundle, each in a folder named by its number."""
+    """The versions of a bundle, each in a folder named by its number.
+
+    Attributes:
+        folder: of all versions.
+        signed: hash of the description of each version that a trusted key signed, or that was written here; None: every
+            version may be read.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.signed: dict[int, str] | None = None
 
     def __getitem__(self, number: int) -> Version:
-        """Read a version; raises FileNotFoundError or Damaged."""
-        return Version.read(self.path(number))
+        """Read a version; raises FileNotFoundError, Damaged or Untrusted."""
+        version = Version.read(self.path(number))
+        if self.signed is not None and self.signed.get(number) != self.hash(number):
+            raise Untrusted(f"version {number} is not signed")
+        return version
+
+    def hash(self, number: int) -> str:
+        """Return the hash of the description of a version, which holds the hash of each of its files."""
+        return hash_file(self.path(number) / ABOUT)
 
     def path(self, number: int) -> Path:
         """Return the folder of a version."""
@@ -147,6 +166,8 @@ class Versions:
         sync_tree(new)
         os.replace(new, self.path(number))
         sync(self.folder)
+        if self.signed is not None:
+            self.signed[number] = self.hash(number)
         return self[number]
 
     def sweep(self, keep: Collection[int] | None = None) -> None:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
 _PAGE = 10.0
-"""Width of the verdict map, in inches; pads that do not fit go below."""
+"""Width of the maps, in inches; pads that do not fit go below."""
 
 _WIDE = 5.0
 """Width of a map whose legend fits on one line, in inches."""
@@ -37,7 +37,7 @@ def draw(
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    figure, axes = _map_figure(layout)
+    figure, ((*axes,),) = pads_figure(layout, n_rows=1, scale=False)
     colours = np.where(layout.present.ravel(), verdicts, 3)
     palette = ListedColormap([_ALIVE, _FAULTY, _UNTESTED, _ABSENT])
     cell_points = 72 * _cell(layout)
@@ -78,39 +78,31 @@ def draw_forces(ax: Axes, values: ArrayLike, layout: SensorLayout, dead: Iterabl
     return image
 
 
-def pads_figure(layout: SensorLayout, *, n_rows: int) -> tuple[Figure, Any]:
-    """Return a figure with ``n_rows`` rows of axes, one for each pad, sized to the pads' shape."""
+def pads_figure(layout: SensorLayout, *, n_rows: int, scale: bool = True) -> tuple[Figure, Any]:
+    """Return a figure and its axes ``[n_rows, pads]``, sized to the pads; pads that do not fit a page go below.
+
+    Args:
+        layout: the array.
+        n_rows: number of maps of each pad.
+        scale: leave room for a colour scale beside the maps; otherwise for a legend below them.
+    """
     from matplotlib.figure import Figure
 
-    height, width = _extent(layout.rows), _extent(layout.shape[2])
-    figure = Figure(figsize=(layout.pads * (width + 0.5) + 1.2, n_rows * (height + 0.5) + 0.6), layout="constrained")
-    return figure, figure.subplots(n_rows, layout.pads, squeeze=False)
-
-
-def _map_figure(layout: SensorLayout) -> tuple[Figure, list[Axes]]:
-    """Return a figure with one axes for each pad, in as many rows as the width of a page needs."""
-    from matplotlib.figure import Figure
-
-    height, width = layout.rows * _cell(layout) + 0.7, max(layout.shape[2] * _cell(layout), 1.2) + 0.5
+    height, width = layout.rows * _cell(layout) + 0.7, max(layout.shape[2] * _cell(layout), 1.8) + 0.5
     columns = max(1, min(layout.pads, int(_PAGE // width)))
     rows = -(-layout.pads // columns)
-    page = max(columns * width, 3.0)
-    legend = 0.5 if page > _WIDE else 0.9
-    figure = Figure(figsize=(page, rows * height + legend), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax in axes[layout.pads :]:
+    page = max(columns * width, 3.0) + (1.2 if scale else 0)
+    below = 0.6 if scale else 0.5 if page > _WIDE else 0.9
+    figure = Figure(figsize=(page, n_rows * rows * height + below), layout="constrained")
+    axes = figure.subplots(n_rows * rows, columns, squeeze=False).reshape(n_rows, rows * columns)
+    for ax in axes[:, layout.pads :].ravel():
         ax.set_visible(False)
-    return figure, list(axes[: layout.pads])
+    return figure, axes[:, : layout.pads]
 
 
 def _cell(layout: SensorLayout) -> float:
     """Return the size of a cell on the verdict map, in inches: less where the pad would not fit a page."""
     return min(0.28, 8.0 / max(layout.rows, layout.shape[2]))
-
-
-def _extent(n_cells: int) -> float:
-    """Return the length of ``n_cells`` cells in a row, in inches."""
-    return float(np.clip(n_cells * 0.28, 1.8, 8.0))
 
 
 def _ticks(ax: Axes, layout: SensorLayout) -> None:

@@ -141,8 +141,8 @@ def _salvaged(
             if read > given:
                 yield message
     what = f"damaged or cut off: {read} messages of {extractor.topic.name}, {(last - first) / 1e9:.1f} s, could be read"
-    skipped = sum(part.skipped for part in parts)
-    lost = [f"{skipped} damaged chunks left out"] * bool(skipped) + [f"{bad} damaged messages left out"] * bool(bad)
+    counts = {"chunk": sum(part.skipped for part in parts), "message": bad}
+    lost = [f"{n} damaged {what}{'s' * (n != 1)} left out" for what, n in counts.items() if n]
     ends = [f"reading ended at {part.reason}" for part in parts if part.reason]
     problems.append(Problem("warning", located(path, "; ".join([what, *lost, *ends]))))
 

@@ -96,7 +96,10 @@ def _topic(channel: Any, schema: Any) -> Topic:
 
 
 def _checked(chunk: Any, breakup: Any) -> list[Any]:
-    """Return the records of a chunk; none if it is damaged: the next chunk may be whole."""
+    """Return the records of a chunk; none if it is damaged: the next chunk may be whole.
+
+    ``Salvage.skipped`` counts the chunks without a record, and the reader tells the user their number.
+    """
     if chunk.uncompressed_size > _MOST:
         return []
     try:
@@ -106,7 +109,7 @@ def _checked(chunk: Any, breakup: Any) -> list[Any]:
 
 
 def _rest(file: Any, place: int) -> list[Any]:
-    """Return the records of a chunk that the file ends in."""
+    """Return the records of a chunk that the file ends in; ``Salvage.reason`` says already where the file ends."""
     from mcap.stream_reader import StreamReader
 
     file.seek(place)

@@ -101,17 +101,7 @@ def load(
     tables = _calibration(calibration)
     aside = {Path(p).resolve() for p in (layout, labels, calibration) if isinstance(p, str | PathLike)}
     found, problems = find(given, (*READERS, *STORAGES), aside)
-
-    contents: list[tuple[Found, Content]] = []
-    for file in found:
-        try:
-            reader = READERS.get(file.path.suffix.lower()) if file.path.is_file() else None
-            content = reader(file.path) if reader else read_bag(file.path, topic=topic, field=field)
-        except InputError as error:
-            problems.append(Problem("error", str(error)))
-        else:
-            problems += content.problems
-            contents.append((file, content.read_as(shape) if shape else content))
+    contents = _read(found, shape, topic, field, problems)
     contents = label_files(contents, None if labels is None else Path(labels), problems)
     if not contents:
         raise nothing_left(problems)
@@ -123,6 +113,23 @@ def load(
         except ValueError as error:
             raise InputError(f"calibration: {error}") from None
     return _assemble(contents, resolved, frames, tables, problems, strict=strict)
+
+
+def _read(
+    found: Sequence[Found], shape: Shape | None, topic: str | None, field: str | None, problems: list[Problem]
+) -> list[tuple[Found, Content]]:
+    """Return the content of each file that can be read; what cannot is added to the problems."""
+    contents: list[tuple[Found, Content]] = []
+    for file in found:
+        try:
+            reader = READERS.get(file.path.suffix.lower()) if file.path.is_file() else None
+            content = reader(file.path) if reader else read_bag(file.path, topic=topic, field=field)
+        except InputError as error:
+            problems.append(Problem("error", str(error)))
+        else:
+            problems += content.problems
+            contents.append((file, content.read_as(shape) if shape else content))
+    return contents
 
 
 def _assemble(

@@ -7,7 +7,9 @@ simulated sensor.
 
 Parameters:
     topic: of the frames (default /tactile).
-    bundle: folder of ``adaptfault train --out X.bundle``: its layout and its healthy model.
+    bundle: folder of ``adaptfault train --out X.bundle``: its layout and its healthy model. Exchanged wires that its
+        active version puts back are put back here too; restart the node after a maintenance run that deployed one.
+    trust: PEM file of the public key that must have signed the bundle; "" = signatures are not checked.
     restored: topic of the repaired frames, each as soon as it comes; "" = none. Needs a bundle. /diagnostics names the
         faulty cells, which are the restored ones.
     layout: without a bundle: a layout file, or a shape as 2x11x10. Cells are then compared with their neighbours.
@@ -36,12 +38,20 @@ PERIOD = 10.0  # seconds between two diagnoses of all cells; the last one is pub
 DEFAULTS = {
     "topic": "/tactile",
     "bundle": "",
+    "trust": "",
     "restored": "/tactile/restored",
     "layout": "",
     "full_scale": 0.0,
     "unit": "",
     "rate": 0.0,
 }
+
+
+def bundle_of(parameters: Mapping[str, Any]):
+    """Return the bundle; raises ValueError where the trusted key, if one is given, did not sign it."""
+    from adaptfault import Bundle
+
+    return Bundle.open(parameters["bundle"], keys=[parameters["trust"]] if parameters["trust"] else None)
 
 
 def diagnoser_of(parameters: Mapping[str, Any]) -> SelfDiagnosis:
@@ -53,9 +63,7 @@ def diagnoser_of(parameters: Mapping[str, Any]) -> SelfDiagnosis:
     if bool(parameters["bundle"]) == bool(parameters["layout"]):
         raise ValueError("give the parameter bundle, or the parameter layout (a layout file or a shape as 2x11x10)")
     if parameters["bundle"]:
-        from adaptfault import Bundle
-
-        return Bundle.open(parameters["bundle"]).diagnoser()
+        return bundle_of(parameters).diagnoser()
     text = parameters["layout"]
     layout = SensorLayout(*parse_shape(text)) if looks_like_shape(text) else read_layout(text)
     stated = {name: parameters[name] for name in ("full_scale", "unit", "rate") if parameters[name]}
@@ -66,10 +74,15 @@ def repair_of(parameters: Mapping[str, Any]) -> FrameRepair | None:
     """Return what restores frames with the healthy windows of the bundle; None without a bundle or a topic."""
     if not (parameters["bundle"] and parameters["restored"]):
         return None
-    from adaptfault import Bundle
-
-    bundle = Bundle.open(parameters["bundle"])
+    bundle = bundle_of(parameters)
     return FrameRepair(bundle.restorer(), bundle.known_faults().fault_set)
+
+
+def source_of(parameters: Mapping[str, Any]) -> np.ndarray | None:
+    """Return the received cell that belongs at each place ``[D]``, as the bundle's active version; None without one."""
+    if not parameters["bundle"]:
+        return None
+    return bundle_of(parameters).active().source
 
 
 class Watch:
@@ -80,7 +93,9 @@ class Watch:
         diagnoser: SelfDiagnosis,
         clock: Callable[[], float] = time.time,
         repair: FrameRepair | None = None,
+        source: np.ndarray | None = None,
     ):
+        self.source = np.arange(diagnoser.layout.n_cells) if source is None else source
         self.repair, self.faulty = repair, np.zeros(diagnoser.layout.n_cells, bool)
         self.monitor, self.layout, self.clock = Monitor(diagnoser), diagnoser.layout, clock
         self.last = self.diagnosed = -np.inf
@@ -91,7 +106,7 @@ class Watch:
         """Return the frame with its faulty cells and missing readings restored; None where nothing restores it."""
         if self.repair is None or len(values) != self.layout.n_cells:
             return None
-        readings = within_range(np.asarray(values, dtype=float), self.layout)[0]
+        readings = within_range(np.asarray(values, dtype=float)[self.source], self.layout)[0]
         return self.repair(readings)[0].tolist()
 
     def take(self, values) -> tuple:
@@ -103,7 +118,7 @@ class Watch:
         if len(values) != self.layout.n_cells:
             raise ValueError(f"{len(values)} values, expected {self.layout.n_cells}")
         self.last = self.clock()
-        faults = self.monitor.update(np.asarray(values, dtype=float))
+        faults = self.monitor.update(np.asarray(values, dtype=float)[self.source])
         self.changed |= bool(faults)
         for fault in faults:
             self.faulty[list(fault.cells)] = fault.probability != 0
@@ -163,7 +178,7 @@ def main() -> None:
         def __init__(self):
             super().__init__("tactile_diagnostics")
             parameters = {name: self.declare_parameter(name, value).value for name, value in DEFAULTS.items()}
-            self.watch = Watch(diagnoser_of(parameters), repair=repair_of(parameters))
+            self.watch = Watch(diagnoser_of(parameters), repair=repair_of(parameters), source=source_of(parameters))
             self.whole = None
             if self.watch.repair is not None:
                 self.whole = self.create_publisher(Float32MultiArray, parameters["restored"], 10)
@@ -178,7 +193,7 @@ def main() -> None:
             try:
                 faults = self.watch.take(message.data)
             except ValueError as error:
-                self.get_logger().warning(str(error), throttle_duration_sec=5.0)
+                self.get_logger().warning(f"frame dropped: {error}", throttle_duration_sec=5.0)
                 return
             for fault in faults:
                 self.get_logger().warning(fault.reason)
@@ -188,14 +203,15 @@ def main() -> None:
 
     rclpy.init()
     try:
-        node = TactileDiagnostics()
+        try:
+            node = TactileDiagnostics()
+        except (ValueError, OSError) as error:  # parameters or bundle; later errors keep their traceback
+            print(f"tactile_diagnostics: {error}", file=sys.stderr)
+            sys.exit(3)
         rclpy.spin(node)
         node.destroy_node()
-    except KeyboardInterrupt:
+    except KeyboardInterrupt:  # Ctrl-C is how a node ends
         pass
-    except (ValueError, OSError) as error:
-        print(f"tactile_diagnostics: {error}", file=sys.stderr)
-        sys.exit(3)
     finally:
         rclpy.try_shutdown()
 

@@ -9,6 +9,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 PARAMETERS = {
     "topic": ("/tactile", str),
     "bundle": ("", str),
+    "trust": ("", str),
     "restored": ("/tactile/restored", str),
     "layout": ("", str),
     "full_scale": ("0.0", float),

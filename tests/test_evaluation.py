@@ -137,6 +137,7 @@ def test_the_prediction_interval_of_perfect_validation_still_has_a_width():
     low, high = prediction_interval(np.ones(100, bool), np.repeat(np.arange(10), 10))
     assert 0.5 < low < 0.9
     assert high == 1.0
+    assert prediction_interval(np.ones(60, bool), np.arange(60))[1] == 1.0  # not a rounding error less
     assert prediction_interval(np.ones(10, bool), np.zeros(10)) == (0.0, 1.0)
 
 

@@ -256,7 +256,8 @@ def prediction_interval(
     square = 1 + scale * (1 - share) ** 2
     half = p + scale * (1 - share) * (1 - 2 * share * p) / 2
     root = np.sqrt(max(0.0, half**2 - square * (p**2 - scale * share * p * (1 - share * p))))
-    return float(max(0.0, (half - root) / square)), float(min(1.0, (half + root) / square))
+    low, high = (half - root) / square, (half + root) / square
+    return float(np.clip(low, 0.0, p)), float(np.clip(high, p, 1.0))  # p itself solves it, but for rounding
 
 
 def _evaluate_values(model: Any, windows: Windows) -> ValueScores:

@@ -111,8 +111,9 @@ class Adapter(FaultFreeModel):
         outputs = {"fault-free": self._healthy.held_out()}
         if len(fault_set):
             run = Run(self, fault_set, None, 0, False)
+            run.quick = self.compact
             outputs["fill"] = run.held_out()
-            run.execute("head")
+            run.head()
             outputs["head"] = run.held_out()
         if self.task == "regression":
             values = {name: out.numpy() for name, out in outputs.items()}

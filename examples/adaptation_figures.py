@@ -27,7 +27,6 @@ from sklearn.svm import SVC
 
 import adaptfault as af
 from adaptfault.adaptation.reduced_model import ReducedModel, phi, reduce_windows
-from adaptfault.imputation.dropout import random_fault_set
 from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.models.network import logits_of
 from diagnostics import FaultSet, SensorLayout
@@ -187,29 +186,7 @@ def measure(args: argparse.Namespace) -> list[dict]:
                 with results.open("a") as file:
                     file.write(json.dumps(rows[-1]) + "\n")
                 print(f"seed {seed}, {name} ({len(faults)}), {method}: {accuracy:.3f} in {seconds:.2f} s", flush=True)
-        if args.forecasts:
-            coverage(repairs, args.forecasts)
     return rows
-
-
-def coverage(repairs: Repairs, n: int) -> None:
-    """Say how often the forecast's intervals hold what the test recordings then give, over random fault sets."""
-    rng, held, gaps = np.random.default_rng(1000 + repairs.seed), defaultdict(int), defaultdict(list)
-    for _ in range(n):
-        faults = random_fault_set(repairs.layout, rng)
-        while not len(faults):
-            faults = random_fault_set(repairs.layout, rng)
-        expected = repairs.adapter.forecast(faults).stages
-        for stage in ("fill", "head"):
-            reached = af.evaluate(repairs.adapter.adapt(faults, method=stage), repairs.test).accuracy
-            held[stage] += expected[stage].low <= reached <= expected[stage].high
-            gaps[stage].append(reached - expected[stage].accuracy)
-    for stage, count in held.items():
-        print(
-            f"forecast, seed {repairs.seed}, {stage}: {count} of {n} intervals hold the test accuracy, which is"
-            f" {np.mean(gaps[stage]):+.3f} +- {np.std(gaps[stage]):.3f} from the expected one",
-            flush=True,
-        )
 
 
 def table(rows: list[dict]) -> dict[tuple[str, str], tuple[float, float, float, int]]:
@@ -266,11 +243,10 @@ def main() -> None:
     parser.add_argument("--scratch-epochs", type=int, default=None, help="of training anew")
     parser.add_argument("--repairable", action="store_true", help="train a base that is made to be repaired")
     parser.add_argument("--only", nargs="+", help="methods")
-    parser.add_argument("--forecasts", type=int, default=0, help="random fault sets that the forecast is tried on")
     parser.add_argument("--cases", type=int, help="only the first fault sets")
     args = parser.parse_args()
     if quick := args.recordings is None and args.grasps is None:
-        args.grasps, args.cases, args.forecasts = 8, args.cases or 1, args.forecasts or 1
+        args.grasps, args.cases = 8, args.cases or 1
     args.epochs = args.epochs or (2 if quick else 20)
     args.scratch_epochs = args.scratch_epochs or args.epochs
     args.only = args.only or (["full scale", "fill", "head", "scratch", "ExtraTrees retrained"] if quick else None)

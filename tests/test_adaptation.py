@@ -266,6 +266,20 @@ def test_the_interval_covers_new_recordings(adapter, quick):
     assert covered >= 17  # of 20, at 95 % each
 
 
+def test_an_interval_for_more_recordings_is_narrower(adapter):
+    widths = []
+    for recordings in (30, None, 1000, np.inf):
+        forecast = adapter.forecast(F, recordings=recordings)
+        expected = forecast.stages["fill"]
+        widths.append(expected.high - expected.low)
+    assert widths == sorted(widths, reverse=True)
+    assert len(set(widths)) == 4
+    assert "many new recordings" in str(forecast)
+    assert json.loads(json.dumps(forecast.to_dict(), allow_nan=False))["n_new"] is None
+    with pytest.raises(ValueError, match="a positive number of new recordings, got 0"):
+        adapter.forecast(F, recordings=0)
+
+
 def test_the_forecast_names_the_class_that_loses_most():
     y = np.repeat([0, 1, 2], 20)
     lost = np.where((y == 1) & (np.arange(60) % 2 == 0), 2, y)

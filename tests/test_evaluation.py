@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from adaptfault.data.windows import Windows
-from adaptfault.evaluation.scores import Scores, accuracy_interval, evaluate
+from adaptfault.evaluation.scores import Scores, accuracy_interval, evaluate, prediction_interval
 
 TRUE, PREDICTED = [0, 0, 0, 1, 1, 2], [0, 0, 1, 1, 0, 0]
 
@@ -108,6 +108,37 @@ def test_without_an_error_the_interval_is_the_exact_binomial_one_over_recordings
     assert (low, high) == pytest.approx((0.025 ** (1 / 10), 1.0))
     low, high = accuracy_interval(np.zeros(100), recording)
     assert (low, high) == pytest.approx((0.0, 1 - 0.025 ** (1 / 10)))
+
+
+@pytest.mark.parametrize(("mean", "known", "new"), [(0.98, 45, 56), (0.6, 20, 200)])
+def test_the_prediction_interval_holds_the_accuracy_on_new_recordings(mean, known, new):
+    rng, held = np.random.default_rng(0), []
+    recording = np.repeat(np.arange(known), 10)
+    for _ in range(300):
+        chance = rng.beta(mean, 1 - mean, known + new)  # of a window to be right, correlated in a recording by 0.5
+        right = rng.random((known + new, 10)) < chance[:, None]
+        low, high = prediction_interval(right[:known].ravel(), recording, new=new)
+        held.append(low <= right[known:].mean() <= high)
+    assert 0.88 < np.mean(held) < 0.99  # of 0.95; its standard error is 0.013
+
+
+def test_of_infinitely_many_recordings_the_prediction_interval_is_wilsons():
+    from scipy.stats import t
+    from statsmodels.stats.proportion import proportion_confint
+
+    right = np.arange(50) % 10 > 1  # of one window each, so that the effective number is that of a sample
+    level = 2 * t.cdf(1.959963985, 49) - 1  # the quantile of t that is the normal one of 95 %
+    found = prediction_interval(right, np.arange(50), new=np.inf, level=level)
+    effective = 49  # the sample variance has n - 1 degrees of freedom
+    assert found == pytest.approx(proportion_confint(0.8 * effective, effective, method="wilson"), abs=1e-6)
+
+
+def test_the_prediction_interval_of_perfect_validation_still_has_a_width():
+    low, high = prediction_interval(np.ones(100, bool), np.repeat(np.arange(10), 10))
+    assert 0.5 < low < 0.9
+    assert high == 1.0
+    assert prediction_interval(np.ones(60, bool), np.arange(60))[1] == 1.0  # not a rounding error less
+    assert prediction_interval(np.ones(10, bool), np.zeros(10)) == (0.0, 1.0)
 
 
 def test_a_recording_is_decided_by_all_its_windows():

@@ -26,11 +26,14 @@ ON_RECORDINGS = {
     "compare_classification.py": ["--small", "--only", "adaptfault"],
     "compare_keras.py": ["--epochs", "1", "--windows", "32"],
     "esp32_sender.py": ["--frames", "20"],
+    "forecast_intervals.py": ["--small"],
     "simulated_vs_real.py": [],
     "wrong_fault_set.py": ["--draws", "1"],
 }
 LESS = {  # they take minutes
     "attack.py": ["--small"],
+    "design_study.py": ["--small"],
+    "forecast_intervals.py": ["--small"],
     "soak.py": ["--hours", "12", "--frames", "500"],
     "any_model.py": ["--small"],
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
@@ -44,7 +47,9 @@ SLOW = {  # they take long, or a test of the library proves the same
     "core_speed.py",
     "deploy_speed.py",
     "esp32_sender.py",
+    "design_study.py",
     "fleet_scaling.py",
+    "forecast_intervals.py",
     "attack.py",
     "kill_maintenance.py",
     "own_model.py",
@@ -63,6 +68,7 @@ SLOW_ON_RECORDINGS = {
     "adaptation_figures.py",
     "compare_classification.py",
     "compare_keras.py",
+    "forecast_intervals.py",
     "wrong_fault_set.py",
 }
 NEEDS = {"deploy_speed.py": "onnxruntime"}  # others do without, and say so

@@ -90,29 +90,36 @@ class Adapter(FaultFreeModel):
         """Validation accuracy (R2 of a regression) of :attr:`healthy`, its head fitted without the scored windows."""
         return self._healthy.accuracy()
 
-    def forecast(self, fault_set: FaultSet) -> Forecast:
+    def forecast(self, fault_set: FaultSet, *, recordings: float | None = None) -> Forecast:
         """Return the accuracy (R2 of a regression) to expect of each stage, from validation windows without F.
 
         It trains and deploys nothing and takes as long as ``method="head"``.
 
+        Args:
+            fault_set: F.
+            recordings: number of new recordings whose accuracy the intervals hold, at most ``math.inf``: then they are
+                intervals of the expected accuracy. None: as many as validation has.
+
         Raises:
-            ValueError: F over another number of cells, or no healthy cell left.
+            ValueError: F over another number of cells, no healthy cell left, or a number of recordings that is not
+                positive.
         """
         self.check(fault_set)
+        if recordings is not None and not recordings > 0:
+            raise ValueError(f"a forecast needs a positive number of new recordings, got {recordings}")
         windows = self.validation
         outputs = {"fault-free": self._healthy.held_out()}
         if len(fault_set):
             run = Run(self, fault_set, None, 0, False)
+            run.quick = self.compact
             outputs["fill"] = run.held_out()
-            if self.has_features:
-                run.head()
+            run.head()
             outputs["head"] = run.held_out()
         if self.task == "regression":
-            return Forecast.of_values(
-                fault_set, windows.y, windows.recording, {name: out.numpy() for name, out in outputs.items()}
-            )
+            values = {name: out.numpy() for name, out in outputs.items()}
+            return Forecast.of_values(fault_set, windows.y, windows.recording, values, recordings)
         predicted = {name: out.argmax(1).numpy() for name, out in outputs.items()}
-        return Forecast.of(fault_set, windows.y, windows.recording, predicted)
+        return Forecast.of(fault_set, windows.y, windows.recording, predicted, recordings)
 
     def to(self, device: str | torch.device) -> Adapter:
         """Return an adapter that works on a device, as "cuda"; this one stays. Its adaptations are on that device."""

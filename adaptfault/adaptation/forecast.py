@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.evaluation.scores import accuracy_interval, mean_interval
+from adaptfault.evaluation.scores import mean_interval, prediction_interval
 from diagnostics import FaultSet
 
 SCHEMA = "adaptfault.forecast/1"
@@ -21,8 +21,7 @@ class Expected:
 
     Attributes:
         accuracy: on the validation windows.
-        low, high: 95 % interval for as many *new* recordings as validation has. It is wider by the root of 2 than the
-            interval of the mean (clustered by recording), because the new recordings vary as much.
+        low, high: 95 % interval of the accuracy on new recordings, whose number is :attr:`Forecast.n_new`.
     """
 
     accuracy: float
@@ -31,6 +30,19 @@ class Expected:
 
     def __str__(self) -> str:
         return f"{self.accuracy:.3f} ({self.low:.3f} to {self.high:.3f})"
+
+    @classmethod
+    def of(cls, right: NDArray[np.bool_], recording: NDArray[np.int64], new: float | None = None) -> Expected:
+        """Return the accuracy to expect on ``new`` recordings (None: as many) from windows ``[N]`` that are right."""
+        return cls(float(right.mean()), *prediction_interval(right, recording, new=new))
+
+    @classmethod
+    def of_errors(cls, explained: NDArray[np.floating], recording: NDArray[np.int64], new: float | None) -> Expected:
+        """Return the R2 to expect from the share of the variance that is explained in each window ``[N]``."""
+        low, high = mean_interval(explained, recording)
+        known = len(np.unique(recording))
+        wider, r2 = np.sqrt(1 + known / (known if new is None else new)), float(explained.mean())
+        return cls(r2, r2 - wider * (r2 - low), min(1.0, r2 + wider * (high - r2)))
 
 
 @dataclass(frozen=True)
@@ -45,6 +57,7 @@ class Forecast:
         worst_class: the class that loses most recall at the best measured stage; None with F empty or a regression.
         worst_loss: loss of its recall, 0..1.
         n_recordings: number of validation recordings.
+        n_new: number of new recordings whose accuracy the intervals hold.
     """
 
     fault_set: FaultSet
@@ -52,6 +65,7 @@ class Forecast:
     worst_class: int | None
     worst_loss: float
     n_recordings: int
+    n_new: float
 
     @classmethod
     def of(
@@ -60,18 +74,20 @@ class Forecast:
         y: NDArray[np.int64],
         recording: NDArray[np.int64],
         predicted: Mapping[str, NDArray[np.int64]],
+        new: float | None = None,
     ) -> Forecast:
         """Build a forecast from the classes ``[N]`` that each measured stage predicted for validation windows."""
-        stages = {name: _expected(classes == y, recording) for name, classes in predicted.items()}
+        stages = {name: Expected.of(classes == y, recording, new) for name, classes in predicted.items()}
         count = len(np.unique(recording))
+        new = count if new is None else new
         if len(predicted) == 1:
-            return cls(fault_set, stages, None, 0.0, count)
+            return cls(fault_set, stages, None, 0.0, count, new)
         best = _add_trained(stages)
         last = predicted["fill" if best is stages["fill"] else "head"]
         classes = np.unique(y)
         lost = [((predicted["fault-free"] == y) * 1.0 - (last == y))[y == c].mean() for c in classes]
         worst = int(np.argmax(lost))
-        return cls(fault_set, stages, int(classes[worst]), float(lost[worst]), count)
+        return cls(fault_set, stages, int(classes[worst]), float(lost[worst]), count, new)
 
     @classmethod
     def of_values(
@@ -80,6 +96,7 @@ class Forecast:
         y: NDArray[np.float32],
         recording: NDArray[np.int64],
         predicted: Mapping[str, NDArray[np.float32]],
+        new: float | None = None,
     ) -> Forecast:
         """Build a forecast from the values ``[N, k]`` that each measured stage predicted for validation windows."""
         total = ((y - y.mean(axis=0)) ** 2).mean(axis=0)
@@ -87,16 +104,16 @@ class Forecast:
         stages = {}
         for name, values in predicted.items():
             explained = 1 - ((values - y) ** 2 / total).mean(axis=1)  # its mean is R2
-            low, high = mean_interval(explained, recording)
-            r2, wider = float(explained.mean()), np.sqrt(2)
-            stages[name] = Expected(r2, r2 - wider * (r2 - low), min(1.0, r2 + wider * (high - r2)))
+            stages[name] = Expected.of_errors(explained, recording, new)
         if len(predicted) > 1:
             _add_trained(stages)
-        return cls(fault_set, stages, None, 0.0, len(np.unique(recording)))
+        count = len(np.unique(recording))
+        return cls(fault_set, stages, None, 0.0, count, count if new is None else new)
 
     def __str__(self) -> str:
         k = len(self.fault_set)
-        lines = [f"expected accuracy without {k} cells, from {self.n_recordings} recordings (95 % of such samples):"]
+        many = "many new recordings" if np.isinf(self.n_new) else f"{self.n_new:g} new ones"
+        lines = [f"expected accuracy without {k} cells, from {self.n_recordings} recordings (95 % interval, {many}):"]
         lines += [f"  {name:10s} {expected}" for name, expected in self.stages.items()]
         if self.worst_class is not None:
             lines.append(f"  class {self.worst_class} suffers most: its recall falls by {self.worst_loss:.2f}")
@@ -111,6 +128,7 @@ class Forecast:
             "worst_class": self.worst_class,
             "worst_loss": self.worst_loss,
             "n_recordings": self.n_recordings,
+            "n_new": None if np.isinf(self.n_new) else self.n_new,
         }
 
 
@@ -120,12 +138,3 @@ def _add_trained(stages: dict[str, Expected]) -> Expected:
     trained = Expected(best.accuracy, best.low, max(best.high, stages["fault-free"].high))
     stages |= {"finetune": trained, "scratch": trained}
     return best
-
-
-def _expected(right: NDArray[np.bool_], recording: NDArray[np.int64]) -> Expected:
-    accuracy = float(right.mean())
-    low, high = accuracy_interval(right, recording)
-    wider = np.sqrt(2)
-    return Expected(
-        accuracy, max(0.0, accuracy - wider * (accuracy - low)), min(1.0, accuracy + wider * (high - accuracy))
-    )

@@ -31,6 +31,13 @@ def add(commands: Commands) -> None:
     add_recordings(parser, least=0)
     parser.add_argument("--faults", metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200")
     parser.add_argument(
+        "--new",
+        type=float,
+        metavar="N",
+        help="with --faults: number of new recordings that the intervals are for (default: as many as validation has;"
+        " inf: the expected accuracy itself)",
+    )
+    parser.add_argument(
         "--worst",
         action="store_true",
         help="forecast each wire, each pad and pairs of the worst wires; lists the worst",
@@ -50,9 +57,11 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError("give --faults F, or --worst")
     if args.picture is not None and not args.worst:
         raise ValueError("--picture needs --worst: it is a map of all wires")
+    if args.new is not None and args.worst:
+        raise ValueError("--new needs --faults")
     adapter = open_adapter(args).to(device(args))
     if not args.worst:
-        forecast = adapter.forecast(fault_set(args.faults, adapter.layout))
+        forecast = adapter.forecast(fault_set(args.faults, adapter.layout), recordings=args.new)
         emit(args, forecast.to_dict(), str(forecast))
         return 0
     from adaptfault.adaptation.worst import worst_faults

@@ -231,6 +231,45 @@ def accuracy_interval(right: ArrayLike, recording: ArrayLike, *, level: float = 
     return max(0.0, low), min(1.0, high)
 
 
+def prediction_interval(
+    right: ArrayLike, recording: ArrayLike, *, new: float | None = None, level: float = 0.95
+) -> tuple[float, float]:
+    """Return the interval of the accuracy on ``new`` recordings that are like the known ones.
+
+    The score prediction interval of Krishnamoorthy and Peng (2011), with t quantiles. The windows count as their
+    effective number, n_e = p (1 - p) / (cluster-robust variance of p) (Korn and Graubard 1998). With infinitely many
+    new recordings it is the score interval of Wilson (1927).
+
+    Args:
+        right: bool ``[N]``, whether each window was classified correctly.
+        recording: int ``[N]``, the recording of each window.
+        new: number of recordings to come, positive or infinite; None: as many as are known.
+        level: probability that the interval holds the accuracy on the new recordings.
+
+    Returns:
+        The lowest and the highest accuracy. From a single recording nothing can be said: 0 and 1.
+    """
+    from scipy import stats
+
+    right, recording = np.asarray(right, dtype=bool), np.asarray(recording)
+    known = len(np.unique(recording))
+    new = known if new is None else new
+    if known < 2:
+        return 0.0, 1.0
+    p, quantile = float(right.mean()), float(stats.t.ppf((1 + level) / 2, known - 1))
+    low, high = mean_interval(right, recording, level=level)
+    variance = ((high - low) / 2 / quantile) ** 2
+    # Where all windows are right, nothing shows how alike those of a recording are: a recording then counts as one.
+    effective = known if p in (0.0, 1.0) else min(len(right), p * (1 - p) / max(variance, np.finfo(float).tiny))
+    # All a with (p - a)^2 <= scale q (1 - q), where q = share p + (1 - share) a is the accuracy of both samples.
+    scale, share = quantile**2 / effective * (1 + known / new), known / (known + new)
+    square = 1 + scale * (1 - share) ** 2
+    half = p + scale * (1 - share) * (1 - 2 * share * p) / 2
+    root = np.sqrt(max(0.0, half**2 - square * (p**2 - scale * share * p * (1 - share * p))))
+    low, high = (half - root) / square, (half + root) / square
+    return float(np.clip(low, 0.0, p)), float(np.clip(high, p, 1.0))  # p itself solves it, but for rounding
+
+
 def _evaluate_values(model: Any, windows: Windows) -> ValueScores:
     from torch import nn
 

@@ -27,7 +27,7 @@ from adaptfault.robot.sensor_state import TECHNICIAN_BELOW, UNTESTED, judged_bef
 from adaptfault.robot.versions import Version
 from diagnostics import Diagnosis, Fault, FaultSet, SelfDiagnosis
 from diagnostics.evidence.ageing import cell_condition
-from diagnostics.evidence.sensor_change import SensorChange, sensor_change
+from diagnostics.evidence.sensor_change import SensorChange, pad_change, sensor_change
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
@@ -60,7 +60,7 @@ class MaintenanceReport:
         judgement: comparison of the last candidate with the running version; None without a candidate.
         accuracy: of the version that runs now, under the known faults, on the held-out windows; None if not measured.
         fault_free_accuracy: of version 1 on the same windows without faults; None if not measured.
-        change: of the whole sensor against the reference (gain, offset); None where none was found.
+        change: of a pad, or of the whole sensor, against the reference (gain, offset); None where none was found.
         rewiring: rows, columns or pads that answer in each other's place, as text; the deployed version undoes it.
         stages: cost and result of each adaptation stage, as text.
         used: names of the recordings whose diagnosis entered the known faults; empty where they were refused.
@@ -319,21 +319,23 @@ class _Maintenance:
     def _with_change(
         self, report: MaintenanceReport, loads: list[NDArray[Any]], reference: list[NDArray[Any]]
     ) -> MaintenanceReport:
-        """Return the report with a change of the whole sensor, and its effect on the accuracy; see :meth:`_loads`."""
+        """Return the report with a change of pad or sensor, and its effect on the accuracy; see :meth:`_loads`."""
         from adaptfault.adaptation.result import Adaptation
 
         layout, load = self.bundle.layout, self.diagnoser.load_
         healthy = np.flatnonzero(layout.present.ravel() & ~report.fault_set.mask)
-        change = sensor_change(loads, reference, layout, healthy) if len(healthy) else None
+        compared = loads, reference, layout, healthy
+        change = (pad_change(*compared) or sensor_change(*compared)) if len(healthy) else None
         if change is None:
             return report
+        gain, offset = change.of_cells(layout)
         windows = with_faults(self.bundle.parts.check_windows(), report.faults, layout)
         model = Adaptation.load(self.bundle.versions[report.version].folder)
         before = float((model.predict(windows.x) == windows.y).mean())
-        changed = (windows.x * change.gain + change.offset / layout.full_scale).astype(np.float32)
+        changed = (windows.x * gain + offset / layout.full_scale).astype(np.float32)
         if load is not None:
             readings = windows.x.astype(np.float64) * layout.full_scale
-            changed_loads = load.loads(readings) * change.gain + change.offset
+            changed_loads = load.loads(readings) * gain + offset
             changed = (load.readings(changed_loads, readings < load.rest) / layout.full_scale).astype(np.float32)
         after = float((model.predict(changed) == windows.y).mean())
         effect = f"{change.reason}; accuracy of version {report.version} {before:.3f} -> {after:.3f} with this change"

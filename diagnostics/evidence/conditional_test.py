@@ -4,7 +4,8 @@ Computes for event e and constant cell i the surprisal
 
     -w_e log P(cell i reads v_i throughout e | healthy, predictors)
 
-with weight w_e = 1 / (1 + 0.15 r_e), r_e earlier events that load the same cells (effective sample size, Kish 1965).
+with weight w_e = 1 / (1 + 0.15 r_e), r_e earlier events that load the same cells (effective sample size, Kish 1965);
+w_e = 1 / (1 + r_e) where the model knows the surroundings of a cell only (cold start).
 P is the predicted probability of staying unloaded for a cell at its baseline, and of staying loaded near v_i for one
 that holds a load. In unusual events the model errs about many cells at once. So the log odds are averaged over powers
 0.25 to 1 (tempered likelihoods), weighted by how well they fit the moving cells of the same event; the spread of loads
@@ -36,6 +37,7 @@ _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 _FIT_WEIGHT = 0.5  # factor on the log likelihood of the moving cells: neighbours err together
 _PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit of the inflation
 _REPEATS, _THE_SAME = 0.15, 0.95  # correlation of events that load the same cells, and cosine of their mean loads
+_REPEATS_COLD = 1.0  # without a reference the same surroundings are predicted with the same error
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -122,7 +124,7 @@ class ConditionalTest:
         scored: bool ``[D]``, cells to be tested.
         eligible: bool ``[D]``, cells that may be predictors.
         features, begins, counted: see :func:`_excerpts`.
-        novelty: float ``[n, 1]``, weight w_e of each excerpt.
+        repeats: int ``[n, 1]``, r_e of each excerpt.
     """
 
     cells: CellState
@@ -133,7 +135,7 @@ class ConditionalTest:
     features: Array
     begins: Mask
     counted: Mask
-    novelty: Floats
+    repeats: NDArray[np.intp]
 
     @classmethod
     def of(
@@ -147,10 +149,8 @@ class ConditionalTest:
         unsure = held & (cells.sudden >= SUDDEN_JUMP) & (cells.temporal < SUDDEN_JUMP)
         scored = constant & ~unsure
         features, begins, counted = _excerpts(events, runs, scored)
-        novelty = 1 / (
-            1 + _REPEATS * count_repeats(events, _THE_SAME, values.rests | ~constant)[begins.cumsum() - 1, None]
-        )
-        return cls(cells, model, values, scored, cells.eligible & ~unsure, features, begins, counted, novelty)
+        repeats = count_repeats(events, _THE_SAME, values.rests | ~constant)[begins.cumsum() - 1, None]
+        return cls(cells, model, values, scored, cells.eligible & ~unsure, features, begins, counted, repeats)
 
     def score(self, predictors: Mask) -> tuple[Prediction, Floats]:
         """Return the prediction of the ``predictors`` (bool ``[D]``), and the surprisal of each excerpt ``[n, D]``."""
@@ -160,7 +160,13 @@ class ConditionalTest:
         inflation = _inflation(expected, self.features, predictors)
         within = expected.within(self.values.low[held], self.values.high[held], held, inflation)
         likely[:, held] = expected.always[:, held] * within
-        return expected, np.where(self.counted, -self.novelty * np.log(np.maximum(likely, P_MIN)), 0.0)
+        surprisal = -self.novelty(expected.own) * np.log(np.maximum(likely, P_MIN))
+        return expected, np.where(self.counted, surprisal, 0.0)
+
+    def novelty(self, own: bool) -> Floats:
+        """Return the weight w_e of each excerpt, ``[n, 1]``; ``own``: whether predictions are specific to each cell."""
+        novelty: Floats = 1 / (1 + (_REPEATS if own else _REPEATS_COLD) * self.repeats)
+        return novelty
 
     def summed(self, surprisal: Floats) -> Floats:
         """Return the evidence ``[D]`` of all events, earlier ones included."""

@@ -1,4 +1,4 @@
-"""A change of the whole sensor: gain, or offset, of all cells at once. No single cell stands out, so no fault is found.
+"""A change of the whole sensor, or of a pad: gain, or offset, of all its cells. No single cell stands out as faulty.
 
 Statistic, per recording r over the healthy cells: the baseline b_r is the median over cells of each cell's 5 % quantile
 over time; the load l_r is the 99 % quantile of all readings above the baseline. With n new recordings and m reference
@@ -6,8 +6,14 @@ recordings, the gain is exp(median log l_new - median log l_ref) and the offset 
 is reported where it exceeds four standard errors, each from the median absolute deviation (Rousseeuw and Croux 1993),
 and a size that matters.
 
-Not detected: a change with fewer than five recordings of contact, a change below the limits, swapped cells, and a
-change of the gain of single cells. Other objects or tasks than in the reference look like a change of the gain.
+A pad is compared with the other pads of the same recordings: log l_r and b_r less their medians over the other pads.
+So another force or object, which all pads feel, is no change of a pad. A pad has changed where the rank-sum test of the
+new against the reference recordings has p < 1e-4 (``scipy.stats.mannwhitneyu``; Mann and Whitney 1947), and the size
+matters. Where two pads differ from each other, the one that differs more from itself has changed.
+
+Not detected: a change with fewer than five recordings of contact, a change below the limits, swapped cells, and gains
+of single cells, also of a replaced pad whose cells read as much on average. Other objects or tasks than in the
+reference look like a change of the gain; of a pad, where it takes another part in them.
 """
 
 from __future__ import annotations
@@ -18,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import median_abs_deviation
+from scipy.stats import mannwhitneyu, median_abs_deviation
 
 from diagnostics.evidence.drift import GAIN
 from diagnostics.layout import SensorLayout
@@ -26,24 +32,32 @@ from diagnostics.preprocessing.scale import LIGHT
 
 _LEAST = 5  # recordings, new and reference, for a standard error that can be trusted
 _ERRORS = 4.0  # standard errors
+_RARE = 1e-4  # p of a pad that has not changed
 _LOW, _HIGH = 0.05, 0.99  # quantiles: baseline of a cell, load of a recording
 
 
 @dataclass(frozen=True)
 class SensorChange:
-    """How the readings of all cells differ from the reference.
+    """How the readings of all cells, or of those of a pad, differ from the reference.
 
     Attributes:
         gain: ratio of the loads, new : reference; 1 where no change was found.
         offset: difference of the baselines in the layout's unit; 0 where no change was found.
         recordings: number of new recordings that were compared.
         reason: one sentence.
+        pad: index of the pad; None: the whole sensor.
     """
 
     gain: float
     offset: float
     recordings: int
     reason: str
+    pad: int | None = None
+
+    def of_cells(self, layout: SensorLayout) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return gain and offset of each cell, ``[D]`` each."""
+        has_changed = np.full(layout.n_cells, True) if self.pad is None else _pad_of(layout) == self.pad
+        return np.where(has_changed, self.gain, 1.0), np.where(has_changed, self.offset, 0.0)
 
 
 def sensor_change(
@@ -70,12 +84,76 @@ def sensor_change(
     gain = float(np.exp(change)) if abs(change) >= max(np.log(GAIN), _ERRORS * error) else 1.0
     if gain == 1.0 and offset == 0.0:
         return None
+    return SensorChange(gain, offset, len(new), f"sensor changed: {_told(gain, offset, layout)}")
+
+
+def pad_change(
+    recordings: Iterable[NDArray[Any]],
+    reference: Iterable[NDArray[Any]],
+    layout: SensorLayout,
+    healthy: NDArray[np.intp],
+) -> SensorChange | None:
+    """Compare the pads with each other; None where none of them has changed. Arguments as of :func:`sensor_change`.
+
+    Of several pads that have changed, the one whose readings changed most is returned.
+    """
+    pad_of = _pad_of(layout)[healthy]
+    pads = np.unique(pad_of)
+    if len(pads) < 2:
+        return None
+    new, old = (_by_pad(list(given), [healthy[pad_of == pad] for pad in pads]) for given in (recordings, reference))
+    contact, least = LIGHT * layout.full_scale, (np.log(GAIN), LIGHT * layout.full_scale)
+    found = []
+    for i in range(len(pads)):
+        own = [_beside(given, i, contact) for given in (new, old)]
+        gain, offset = (_change(*values, size) for *values, size in zip(*own, least, strict=True))
+        if gain or offset:
+            alone = [(np.log(given[i, given[i, :, 1] > contact, 1]), given[i, :, 0]) for given in (new, old)]
+            strength = sum(abs(_shift(*values)[0]) / size for *values, size in zip(*alone, least, strict=True))
+            found.append((strength, int(pads[i]), float(np.exp(gain)), offset))
+    if not found:
+        return None
+    _, pad, gain, offset = max(found)
+    reason = f"pad {pad} changed: {_told(gain, offset, layout)}, compared with the other pads"
+    advice = "if it was replaced, record healthy data with it and train anew"
+    return SensorChange(gain, offset, new.shape[1], f"{reason}; {advice}", pad)
+
+
+def _pad_of(layout: SensorLayout) -> NDArray[np.intp]:
+    """Return the pad of each cell, int ``[D]``."""
+    return np.arange(layout.n_cells) // (layout.n_cells // layout.pads)
+
+
+def _told(gain: float, offset: float, layout: SensorLayout) -> str:
     parts = []
     if gain != 1.0:
         parts.append(f"readings are about {gain:.2g}x of what they were")
     if offset != 0.0:
         parts.append(f"the readings of idle cells are shifted by {offset:+.2g} {layout.unit}")
-    return SensorChange(gain, offset, len(new), f"sensor changed: {' and '.join(parts)}")
+    return " and ".join(parts)
+
+
+def _by_pad(recordings: list[NDArray[Any]], cells: list[NDArray[np.intp]]) -> NDArray[np.float64]:
+    """Return baseline and load of each pad in each recording with a reading of all pads, ``[pads, n, 2]``."""
+    received = [r for r in recordings if all((~np.isnan(np.asarray(r)[:, pad])).any() for pad in cells)]
+    return np.stack([_statistics(received, pad) for pad in cells])
+
+
+def _beside(given: NDArray[np.float64], pad: int, contact: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return log load, of recordings with contact, and baseline of a pad, less the medians over the other pads."""
+    others = np.delete(given, pad, axis=0)
+    load = np.where(others[..., 1] > contact, others[..., 1], np.nan)
+    both = (given[pad, :, 1] > contact) & ~np.isnan(load).all(axis=0)
+    gain = np.log(given[pad, both, 1]) - np.log(np.nanmedian(load[:, both], axis=0))
+    return gain, given[pad, :, 0] - np.median(others[..., 0], axis=0)
+
+
+def _change(new: NDArray[np.float64], old: NDArray[np.float64], least: float) -> float:
+    """Return the difference of two medians, 0 where it is below ``least`` or may be chance."""
+    if min(len(new), len(old)) < _LEAST:
+        return 0.0
+    change = float(np.median(new) - np.median(old))
+    return change if abs(change) >= least and mannwhitneyu(new, old).pvalue < _RARE else 0.0
 
 
 def _statistics(recordings: Iterable[NDArray[Any]], healthy: NDArray[np.intp]) -> NDArray[np.float64]:

@@ -176,7 +176,7 @@ class SpatialTest:
         moved = cells.eligible & cells.runs.moved & (first[:, None] <= cells.runs.start)
         whole, on_whole = test.features[test.begins], expected.on(test.begins)
         offset = offset_evidence(whole, on_whole.always, moved[-1] & np.isfinite(on_whole.spread))
-        counts = self._exclusion.gains * test.novelty[test.begins]
+        counts = self._exclusion.gains * test.novelty(expected.own)[test.begins]
         gain = gain_evidence(whole, on_whole, moved, self._scale.root_near, counts)
         of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
         assert self._initial is not None

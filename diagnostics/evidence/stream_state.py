@@ -26,10 +26,11 @@ from diagnostics.evidence.conditional_test import SUDDEN_JUMP, CellState, Model
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, group_excluded_evidence, held_load_evidence
+from diagnostics.evidence.weak_response import WeakResponse
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
 from diagnostics.preprocessing.offset import OffsetTracker
 from diagnostics.preprocessing.readings import held
-from diagnostics.preprocessing.scale import LIGHT
+from diagnostics.preprocessing.rest_of_log import RestOfLog
 from diagnostics.preprocessing.transport import TransportState, invalid
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 MAX_EVENTS, KEPT_EVENTS = 40, 32  # with more events in a tile, all but the last are scored and dropped
 _SILENT, _NEVER_RECEIVED = 2 * SEGMENT, SEGMENT // 2  # consecutive frames without a reading: not chance any more
 _PAUSE = SEGMENT // 2  # frames of a segment after which old events are scored, a part with each frame
+_CLEAR = 4.0  # times the tolerance of two equal lines: lighter loads are equal by chance
 _EXCLUDED = 3.0  # log evidence from which on a cell of a tiled array is no predictor
 _STEPS = 8  # in which one pass over all tiles is split: a monitor does one step a frame
 
@@ -110,6 +112,7 @@ class StreamState:
         self.scale: Scale = reference.scale
         self._skin = EventLog()  # events of the whole skin, if there are several tiles
         self._offsets = OffsetTracker.begin(layout.n_cells)
+        self._rest, self._response = RestOfLog(), WeakResponse.begin(layout.n_cells)
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
         self._filled = 0
@@ -211,12 +214,12 @@ class StreamState:
             return _Rectangular(replace(model, log=own.on(model.log)), own)
         return self._models.setdefault(i, _Rectangular(known.of_tile(i, own.cells, own.layout), own))
 
-    @property
-    def _highest_rest(self) -> float:
-        """The highest load at which a working cell may rest: the lowest so far, of cells that moved."""
-        lowest = self._offsets.lowest[self.runs.moved & self.present]
-        at_rest = lowest <= LIGHT * self.scale.full_scale  # the others were loaded throughout
-        return float(lowest.max(initial=0.0, where=at_rest))
+    def _scale_of_log(self, plain: Scale, frames: NDArray[np.float64]) -> Scale:
+        """Return the scale of a cold start after ``frames``."""
+        moved = self.runs.moved & self.received & self.present
+        lowest = self.reference.scale.baseline + self._offsets.lowest
+        self._rest = self._rest.extend(frames[:, moved], lowest[moved], plain.full_scale)
+        return self._rest.scale(plain, lowest, moved)
 
     def views(self, onset: int) -> Iterator[tuple[Array, Cells, Cells, Model]]:
         """Yield, for each tile, its events since frame ``onset`` as features ``[n, 4, k]``.
@@ -265,7 +268,10 @@ class StreamState:
         explained = self.intermittency.intermittent | self.intermittency.excess | (explained is not None and explained)
         eligible = self.present & self.received & ~self.silent & ~explained
         nothing = np.zeros_like(eligible)
-        return CellState(self.runs, self.accumulated, self.temporal(), self._jumps(), eligible, nothing)
+        # What no event can tell from a broken cell is not tested; what it reads says something of the others.
+        untestable = self._response.untestable(self.scale.near) & self.rests()
+        runs = replace(self.runs, length=np.where(untestable, 0, self.runs.length))
+        return CellState(runs, self.accumulated, self.temporal(), self._jumps(), eligible, nothing)
 
     def _test(self, cells: CellState, events: TiledEvents, passes: int) -> Test:
         if self.tiled:
@@ -304,13 +310,16 @@ class StreamState:
         self._filled = 0
         self._offsets = self._offsets.extend(frames, self.reference.scale, self.present, self.reference.offset)
         self.scale = scale = plain = self._offsets.on(self.reference.scale)
-        if self.reference.model is None:  # a reading at which a working cell may rest is no load
-            self.scale = scale = replace(plain, near=max(plain.near, self._highest_rest))
+        if self.reference.model is None:
+            self.scale = scale = self._scale_of_log(plain, frames)
         start, known = self.runs.start, _known(frames, self.runs.last)
         self.runs = runs = self.runs.extend(frames, numbers, self.reference.tolerance, scale.baseline)
         # Evidence belongs to a constant run, and ends with it.
         self.accumulated = np.where(runs.start == start, self.accumulated, 0.0)
-        root, still = scale.root_load(self._offsets.off(known)), runs.start <= numbers[0]
+        steady = self._offsets.off(known)
+        root, still = scale.root_load(steady), runs.start <= numbers[0]
+        if self.reference.model is None:
+            self._response = self._response.extend(steady, scale.full_scale * root.astype(np.float64) ** 2, self.layout)
         self.touched = self.touched | root.any(axis=0)
         jumped = (self._jumps() >= SUDDEN_JUMP) & (runs.alone | still)
         self.local = self.local.extend(root, numbers, scale.root_near, runs.start, jumped)
@@ -320,7 +329,10 @@ class StreamState:
             # On long lines some cell is always dead: cells that never moved are no difference between two lines.
             frames = np.where(runs.moved, frames, np.nan)
         self.intermittency = self.intermittency.extend(known, root, numbers, plain, self.reference.usual, still)
-        self.duplicates = self.duplicates.extend(frames, numbers, informative(frames, still, plain), plain.near)
+        clear = plain
+        if self.reference.model is None:  # how often healthy lines with light loads agree is unknown
+            clear = replace(scale, near=max(scale.near, _CLEAR * plain.near))
+        self.duplicates = self.duplicates.extend(frames, numbers, informative(frames, still, clear), plain.near)
 
     @property
     def _crowded(self) -> bool:

@@ -1,0 +1,87 @@
+"""Weak response: cells that work, but read so little that no contact event can tell them from a broken cell.
+
+Detects, in a cold start, cells whose readings follow the loads of their neighbours and stay below what counts as load.
+With x the readings of a cell and l the mean load of its eight neighbours, each less its mean over a segment of the log,
+
+    z    = sum x l / sqrt(sum x^2 / n  sum l^2)     standard normal, if the cell is broken: it has white noise or none
+    gain = sum x l / sum l^2                        regression of the readings on the loads
+
+A cell works if z exceeds 4.75 (one in a million), as in a test of Pearson's correlation (``scipy.stats.pearsonr``). Its
+response is weak if gain times the highest l is no load. That a cell with a weak response reads no load is no evidence
+of a fault. It does not detect cells that respond with less than their noise, and takes a broken cell for a working one
+where crosstalk makes it follow its neighbours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+if TYPE_CHECKING:
+    from diagnostics.layout import SensorLayout
+
+_CERTAIN = float(norm.isf(1e-6))  # z from which on a cell follows its neighbours
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class WeakResponse:
+    """Sums over the segments so far, ``[D]`` each, in the layout's unit.
+
+    Attributes:
+        readings: float, sum x^2.
+        loads: float, sum l^2.
+        products: float, sum x l.
+        highest: float, highest l, not less its mean.
+        frames: their number, less one a segment.
+    """
+
+    readings: Floats
+    loads: Floats
+    products: Floats
+    highest: Floats
+    frames: int = 0
+
+    @classmethod
+    def begin(cls, n_cells: int) -> WeakResponse:
+        """Return the state before any frame."""
+        return cls(*np.zeros((4, n_cells)))
+
+    def extend(self, frames: Floats, loads: Floats, layout: SensorLayout) -> WeakResponse:
+        """Return the sums after one more segment.
+
+        Args:
+            frames: readings ``[t, D]``, NaN = missing.
+            loads: ``[t, D]``, readings above the baseline; 0 without load.
+            layout: the array.
+        """
+        around = _mean_of_neighbours(loads, layout)
+        of_load = around - around.mean(axis=0)
+        x = np.nan_to_num(frames - frames[0])  # exactly 0 for a constant cell
+        x -= x.mean(axis=0)
+        return WeakResponse(
+            self.readings + (x * x).sum(axis=0),
+            self.loads + (of_load * of_load).sum(axis=0),
+            self.products + (x * of_load).sum(axis=0),
+            np.maximum(self.highest, around.max(axis=0)),
+            self.frames + len(frames) - 1,
+        )
+
+    def untestable(self, near: float) -> NDArray[np.bool_]:
+        """Return the cells that work and respond by at most ``near``, bool ``[D]``."""
+        follows = self.products * np.sqrt(self.frames) > _CERTAIN * np.sqrt(self.readings * self.loads)
+        weak: NDArray[np.bool_] = self.products * self.highest <= near * self.loads
+        return follows & weak
+
+
+def _mean_of_neighbours(loads: Floats, layout: SensorLayout) -> Floats:
+    """Return the mean load ``[t, D]`` of the eight neighbours; those beyond an edge count as unloaded."""
+    grid = np.pad(layout.grid(loads), ((0, 0), (0, 0), (1, 1), (1, 1)))
+    rows, cols = layout.rows, layout.cols
+    block = sum(grid[..., down : down + rows, right : right + cols] for down in range(3) for right in range(3))
+    return (block.reshape(loads.shape) - loads) / 8

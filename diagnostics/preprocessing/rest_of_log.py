@@ -14,6 +14,7 @@ recognise them where most cells hold a load throughout.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import median_abs_deviation

@@ -92,12 +92,13 @@ def show(split: int, right: np.ndarray, windows: af.Windows, divisions: int) -> 
             within.append(((low <= reached) & (reached <= high)).mean())
             widths.append(((high - low) / 2).mean())
             errors.append((expected - reached).mean())
-            ranks.append(spearmanr(expected, reached).statistic)
+            if np.ptp(expected) and np.ptp(reached):
+                ranks.append(spearmanr(expected, reached).statistic)
         print(
             f"  {divisions} divisions {'stratified by class' if stratified else 'at random'}: coverage"
             f" {np.mean(within):.3f} +- {np.std(within) / np.sqrt(divisions):.3f} (standard error), half width"
             f" {np.mean(widths):.3f}, error {np.mean(errors):+.3f} +- {np.std(errors):.3f},"
-            f" Spearman {np.mean(ranks):.2f}"
+            f" Spearman {np.mean(ranks or [np.nan]):.2f}"
         )
 
 

@@ -4,8 +4,9 @@
 
 For each split one network is trained and kept in ``--out``. For each random fault set (cells, lines, blocks, a pad) a
 head is fitted, and the recordings that the network is not trained on are predicted by heads fitted without them. These
-recordings are then divided at random into two parts, many times. One part plays validation: it gives the forecast. The
-other plays test. All fault sets share the luck of a division, so that a single division says little about coverage.
+recordings are then divided into two parts, many times, at random or stratified by class as ``af.split`` does. One part
+plays validation: it gives the forecast. The other plays test. All fault sets share the luck of a division, so a single
+division says little about coverage.
 
 Killed and started again, it goes on where it was. Without GRASPS.npz the grasps are simulated.
 """
@@ -75,25 +76,30 @@ def measure(args: argparse.Namespace) -> None:
 
 def show(split: int, right: np.ndarray, windows: af.Windows, divisions: int) -> None:
     """Print coverage, width, error and rank correlation over divisions of the windows; right is ``[sets, N]``."""
-    within, widths, errors, ranks = [], [], [], []
-    bare = af.Windows(np.zeros((len(windows), 1, 1), "f4"), windows.y, windows.recording)
-    for seed in range(divisions):
-        known, _, test = af.split(bare, test=0.55, validation=0, seed=seed)
-        of, new = np.isin(windows.recording, known.recording), len(np.unique(test.recording))
-        forecasts = [Expected.of(one[of], windows.recording[of], new) for one in right]
-        expected, low, high = np.transpose([[f.accuracy, f.low, f.high] for f in forecasts])
-        reached = right[:, ~of].mean(axis=1)
-        within.append(((low <= reached) & (reached <= high)).mean())
-        widths.append(((high - low) / 2).mean())
-        errors.append((expected - reached).mean())
-        ranks.append(spearmanr(expected, reached).statistic)
-    print(
-        f"split {split}: {len(np.unique(windows.recording))} recordings, {divisions} divisions, {len(right)} fault sets"
-        f" with accuracies {right.mean(axis=1).min():.2f} to {right.mean(axis=1).max():.2f}\n"
-        f"  coverage {np.mean(within):.3f} +- {np.std(within) / np.sqrt(divisions):.3f} (standard error), half width"
-        f" {np.mean(widths):.3f}, error of a division {np.mean(errors):+.3f} +- {np.std(errors):.3f},"
-        f" Spearman {np.nanmean(ranks):.2f}, at least {np.nanquantile(ranks, 0.05):.2f} in 95 % of the divisions"
-    )
+    recordings, bare = np.unique(windows.recording), np.zeros((len(windows), 1, 1), np.float32)
+    low, high = right.mean(axis=1).min(), right.mean(axis=1).max()
+    print(f"split {split}: {len(recordings)} recordings, {len(right)} fault sets, accuracies {low:.2f} to {high:.2f}")
+    for stratified in (False, True):
+        classes = windows.y if stratified else np.zeros_like(windows.y)
+        drawn = af.Windows(bare, classes, windows.recording)
+        within, widths, errors, ranks = [], [], [], []
+        for seed in range(divisions):
+            known, _, test = af.split(drawn, test=0.55, validation=0, seed=seed)
+            of, new = np.isin(windows.recording, known.recording), len(np.unique(test.recording))
+            forecasts = [Expected.of(one[of], windows.recording[of], new) for one in right]
+            expected, low, high = np.transpose([[f.accuracy, f.low, f.high] for f in forecasts])
+            reached = right[:, ~of].mean(axis=1)
+            within.append(((low <= reached) & (reached <= high)).mean())
+            widths.append(((high - low) / 2).mean())
+            errors.append((expected - reached).mean())
+            if np.ptp(expected) and np.ptp(reached):
+                ranks.append(spearmanr(expected, reached).statistic)
+        print(
+            f"  {divisions} divisions {'stratified by class' if stratified else 'at random'}: coverage"
+            f" {np.mean(within):.3f} +- {np.std(within) / np.sqrt(divisions):.3f} (standard error), half width"
+            f" {np.mean(widths):.3f}, error {np.mean(errors):+.3f} +- {np.std(errors):.3f},"
+            f" Spearman {np.mean(ranks or [np.nan]):.2f}"
+        )
 
 
 def main() -> None:

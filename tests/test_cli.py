@@ -205,6 +205,7 @@ def test_a_label_table_that_names_a_missing_file_is_told_and_the_rest_is_used(tm
         (["adapt", "{home}/model", "{home}/grasps.npz", "--forecast"], "nothing to do"),
         (["adapt", "{home}/model", "--faults", "1", "--forecast"], "give the fault-free recordings"),
         (["forecast", "{home}/model", "{home}/grasps.npz"], "give --faults F, or --worst"),
+        (["forecast", "{home}/model", "{home}/grasps.npz", "--worst", "--new", "5"], "--new needs --faults"),
         (["forecast", "{home}/model", "{home}/grasps.npz", "--faults", "1", "--worst"], "give --faults F, or --worst"),
         (
             ["forecast", "{home}/model", "{home}/grasps.npz", "--faults", "1", "--picture", "a"],

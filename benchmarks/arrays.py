@@ -20,7 +20,7 @@ HAND, FINGERTIPS, SOLES = "sdh2x13x6_grasps36.npz", "icub5x1x12_grasps11.npz", "
 MAIN = ("cells", "onset", "healthy")
 EVERY = (
     "cells", "onset", "dither", "missing", "many", "cold", "reference_faults", "lines", "cut", "address", "healthy",
-    "holds", "untouched", "kind", "calibration", "changing", "gain", "rewired", "transport",
+    "holds", "untouched", "kind", "calibration", "changing", "gain", "rewired", "replaced", "transport",
 )  # fmt: skip
 
 
@@ -100,7 +100,10 @@ ARRAYS = [
     Array("hand", EVERY, real(HAND), 50, 2, 40, (*MAIN, "lines", "calibration", "cold"), HAND),
     Array(
         "fingertips",
-        (*MAIN, "many", "cold", "reference_faults", "holds", "untouched", "calibration", "rewired", "transport"),
+        (
+            *MAIN, "many", "cold", "reference_faults", "holds", "untouched", "calibration", "rewired", "replaced",
+            "transport",
+        ),
         real(FINGERTIPS), 60, 2, 40, (*MAIN, "cold"), FINGERTIPS,
     ),
     Array("fingertips, buses", (*MAIN, "groups"), on_buses, 60, 1, 40, (*MAIN, "groups"), FINGERTIPS),

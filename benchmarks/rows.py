@@ -30,6 +30,7 @@ from diagnostics import (
     line_fault,
     lose_frames,
 )
+from diagnostics.evidence.sensor_change import pad_change
 
 Log = list[np.ndarray]
 STUCK_KINDS = ("open", "short", "stuck")
@@ -38,6 +39,7 @@ HELD, WINDOW = 300, 50  # frames of a static hold; of a window in which a cell c
 REPEATED = 100  # frames of a frozen stream, beyond the longest repetition that still counts as idle
 CHANGING = (FaultKind.INTERMITTENT, FaultKind.NOISY, FaultKind.DRIFT)
 GAINS, FADED = (0.2, 0.35, 0.5), 0.1  # times the load; what is left at the end
+REPLACED = 12  # recordings with a new specimen of a pad
 LONG, LOADED = 30, 8  # recordings of a log that shows a gain; in so many of them the cell is loaded
 DEAD_BEFORE = 0.04  # share of the cells that were dead when the reference was recorded
 
@@ -480,6 +482,26 @@ def rewired(bench: Bench) -> Iterator[Count]:
     yield Count("healthy: a changed wiring named in a log", false, bench.count, higher=False)
 
 
+def replaced(bench: Bench) -> Iterator[Count]:
+    """One pad is a new specimen that reads half, or twice, as much; so many recordings show it."""
+    layout, told, wrong, healthy, blamed = bench.layout, 0, 0, 0, 0
+    cells = np.flatnonzero(layout.present)
+    reference = [np.asarray(bench.recordings.frames[i], dtype=np.float64) for i in bench.reference]
+    for _, log, rng in bench.logs(REPLACED):
+        healthy += pad_change(log, reference, layout, cells) is not None
+        pad, times = int(rng.integers(layout.pads)), rng.choice([0.5, 2.0])
+        on_it = np.arange(layout.n_cells) // (layout.n_cells // layout.pads) == pad
+        seen = [np.where(on_it, np.minimum(times * frames, layout.full_scale), frames) for frames in log]
+        change = pad_change(seen, reference, layout, cells)
+        told += change is not None and change.pad == pad
+        wrong += change is not None and change.pad != pad
+        blamed += len(bench.fitted.diagnose(seen).fault_set)
+    yield Count("a replaced pad: told", told, bench.count)
+    yield Count("  another pad told", wrong, bench.count, higher=False)
+    yield Count("  healthy cells blamed in a log", blamed, bench.count, higher=False)
+    yield Count("healthy: a replaced pad told in a log", healthy, bench.count, higher=False)
+
+
 def transport(bench: Bench) -> Iterator[Count]:
     layout, told, blamed = bench.layout, 0, 0
     for seed, log, rng in bench.logs():
@@ -544,6 +566,6 @@ ROWS: dict[str, Callable[[Bench], Iterator[Count]]] = {
     row.__name__: row
     for row in (
         cells, onset, dither, missing, many, cold, reference_faults, lines, cut, address, healthy, holds, untouched,
-        kind, calibration, changing, gain, rewired, groups, transport, speed,
+        kind, calibration, changing, gain, rewired, groups, replaced, transport, speed,
     )
 }  # fmt: skip

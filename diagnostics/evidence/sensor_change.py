@@ -105,11 +105,11 @@ def pad_change(
     contact, least = LIGHT * layout.full_scale, (np.log(GAIN), LIGHT * layout.full_scale)
     found = []
     for i in range(len(pads)):
-        own = [_beside(given, i, contact) for given in (new, old)]
-        gain, offset = (_change(*values, size) for *values, size in zip(*own, least, strict=True))
+        (log_new, idle_new), (log_old, idle_old) = (_beside(given, i, contact) for given in (new, old))
+        gain, offset = _change(log_new, log_old, least[0]), _change(idle_new, idle_old, least[1])
         if gain or offset:
-            alone = [(np.log(given[i, given[i, :, 1] > contact, 1]), given[i, :, 0]) for given in (new, old)]
-            strength = sum(abs(_shift(*values)[0]) / size for *values, size in zip(*alone, least, strict=True))
+            loads = [np.log(given[i, given[i, :, 1] > contact, 1]) for given in (new, old)]
+            strength = abs(_shift(*loads)[0]) / least[0] + abs(_shift(new[i, :, 0], old[i, :, 0])[0]) / least[1]
             found.append((strength, int(pads[i]), float(np.exp(gain)), offset))
     if not found:
         return None

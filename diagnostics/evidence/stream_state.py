@@ -331,7 +331,7 @@ class StreamState:
         self.intermittency = self.intermittency.extend(known, root, numbers, plain, self.reference.usual, still)
         clear = plain
         if self.reference.model is None:  # how often healthy lines with light loads agree is unknown
-            clear = replace(scale, near=max(scale.near, _CLEAR * plain.near))
+            clear = replace(plain, near=max(scale.near, _CLEAR * plain.near))
         self.duplicates = self.duplicates.extend(frames, numbers, informative(frames, still, clear), plain.near)
 
     @property

@@ -75,13 +75,16 @@ class WeakResponse:
     def untestable(self, near: float) -> NDArray[np.bool_]:
         """Return the cells that work and respond by at most ``near``, bool ``[D]``."""
         follows = self.products * np.sqrt(self.frames) > _CERTAIN * np.sqrt(self.readings * self.loads)
-        weak: NDArray[np.bool_] = self.products * self.highest <= near * self.loads
-        return follows & weak
+        weak = self.products * self.highest <= near * self.loads
+        return np.asarray(follows & weak)
 
 
 def _mean_of_neighbours(loads: Floats, layout: SensorLayout) -> Floats:
     """Return the mean load ``[t, D]`` of the eight neighbours; those beyond an edge count as unloaded."""
     grid = np.pad(layout.grid(loads), ((0, 0), (0, 0), (1, 1), (1, 1)))
     rows, cols = layout.rows, layout.cols
-    block = sum(grid[..., down : down + rows, right : right + cols] for down in range(3) for right in range(3))
+    block = np.zeros((*grid.shape[:2], rows, cols))
+    for down in range(3):
+        for right in range(3):
+            block += grid[..., down : down + rows, right : right + cols]
     return (block.reshape(loads.shape) - loads) / 8

@@ -32,6 +32,15 @@ def test_a_gain_of_all_cells_is_found_and_measured(gain):
     assert f"about {change.gain:.2g}x" in change.reason
 
 
+@pytest.mark.parametrize("gain", [0.3, 0.5])
+def test_a_gain_is_found_where_loads_are_a_small_part_of_the_full_scale(gain):
+    reference, new = grasps(60, 99), [gain * r for r in grasps(12, 1)]
+    layout = SensorLayout(1, 6, 6, full_scale=50.0)
+    change = sensor_change(new, reference, layout, CELLS)
+    assert change is not None
+    assert change.gain == pytest.approx(gain, rel=0.15)
+
+
 def test_an_offset_of_all_cells_is_found_and_measured():
     change = sensor_change([r + 1.5 for r in grasps(12, 1)], grasps(60, 99), LAYOUT, CELLS)
     assert change.offset == pytest.approx(1.5, abs=0.01)

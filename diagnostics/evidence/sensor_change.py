@@ -78,7 +78,7 @@ def sensor_change(
     offset, error = _shift(new[:, 0], old[:, 0])
     if abs(offset) < max(LIGHT * layout.full_scale, _ERRORS * error):
         offset = 0.0
-    contact = LIGHT * layout.full_scale
+    contact = LIGHT * float(old[:, 1].max(initial=0.0))
     loads = [np.log(given[given[:, 1] > contact, 1]) for given in (new, old)]
     change, error = _shift(*loads)
     gain = float(np.exp(change)) if abs(change) >= max(np.log(GAIN), _ERRORS * error) else 1.0
@@ -102,7 +102,7 @@ def pad_change(
     if len(pads) < 2:
         return None
     new, old = (_by_pad(list(given), [healthy[pad_of == pad] for pad in pads]) for given in (recordings, reference))
-    contact, least = LIGHT * layout.full_scale, (np.log(GAIN), LIGHT * layout.full_scale)
+    contact, least = LIGHT * float(old[..., 1].max(initial=0.0)), (np.log(GAIN), LIGHT * layout.full_scale)
     found = []
     for i in range(len(pads)):
         (log_new, idle_new), (log_old, idle_old) = (_beside(given, i, contact) for given in (new, old))

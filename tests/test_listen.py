@@ -211,13 +211,13 @@ def test_with_a_bundle_classes_are_told(tmp_path, capsys, monkeypatch):
 
     class Predictor(Scripted):
         @classmethod
-        def load(cls, path):
+        def load(cls, path, **trust):
             loaded.append((path, cls([Reading(None), Reading("cup"), Reading("ball")])))
             return loaded[-1][1]
 
     monkeypatch.setattr("adaptfault.robot.predictor.Predictor", Predictor)
     bare = types.SimpleNamespace(parts=types.SimpleNamespace(calibration=None))
-    monkeypatch.setattr("adaptfault.robot.bundle.Bundle.open", lambda path: bare)
+    monkeypatch.setattr("adaptfault.robot.bundle.Bundle.open", lambda path, **trust: bare)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "robot.bundle").mkdir()
     (tmp_path / "robot.bundle/bundle.json").touch()

@@ -29,7 +29,7 @@ _PARTS = 6  # of an event at most; beyond that the shortest neighbours are merge
 _RELEASED = 0.3  # share of the load that is left when an event ends
 _MIN_AMPLITUDE = 0.1  # root load, summed over the cells: smaller changes are noise
 _WEAKEST = 0.1  # of the largest amplitude so far: smaller changes do not end an event
-_SLIGHT = 0.05  # of the constant load: smaller changes are not its release
+_LEAST_OF_HELD = 0.05  # of the constant load: smaller changes are not its release
 _MOVING = 0.25  # share of the load that must move, and share that must be gone, at the end of an event
 _EXCHANGED = 0.2  # share of the load that vanishes and appears elsewhere in one frame where another event begins
 # In a static hold less suffices: 0.06 of the load and three times the 0.9 quantile over the frames.
@@ -219,7 +219,7 @@ class EventLog:
                 highest = np.maximum(highest, kept[-1].highest)
             # Loads that are constant since the event began would have to be released.
             held = constant & (start >= (kept[-1].since if ongoing else numbers[begin]))
-            weakest = max(_WEAKEST * largest, _MIN_AMPLITUDE, _SLIGHT * float(ahead[0] @ held))
+            weakest = max(_WEAKEST * largest, _MIN_AMPLITUDE, _LEAST_OF_HELD * float(ahead[0] @ held))
             end = _release(ahead @ weights, lowest @ weights, highest @ weights, weakest)
             if end:
                 part = Summary.of(ahead[:end], int(numbers[begin]), root_near)

@@ -268,9 +268,11 @@ class StreamState:
         explained = self.intermittency.intermittent | self.intermittency.excess | (explained is not None and explained)
         eligible = self.present & self.received & ~self.silent & ~explained
         nothing = np.zeros_like(eligible)
-        # What no event can tell from a broken cell is not tested; what it reads says something of the others.
-        untestable = self._response.untestable(self.scale.near) & self.rests()
-        runs = replace(self.runs, length=np.where(untestable, 0, self.runs.length))
+        runs = self.runs
+        if self.reference.model is None:
+            # What no event can tell from a broken cell is not tested; what it reads says something of the others.
+            untestable = self._response.untestable(self.scale.near) & self.rests()
+            runs = replace(runs, length=np.where(untestable, 0, runs.length))
         return CellState(runs, self.accumulated, self.temporal(), self._jumps(), eligible, nothing)
 
     def _test(self, cells: CellState, events: TiledEvents, passes: int) -> Test:

@@ -33,7 +33,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 import adaptfault as af
 from adaptfault.adaptation import heads
-from adaptfault.adaptation.forest import Forest
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
 from adaptfault.models import training
 from adaptfault.models.compact import CompactNetwork
@@ -165,16 +164,17 @@ def head_jobs(model: af.TactileTransformer, adapter: af.Adapter, faults: FaultSe
     both = [torch.cat(pair) for pair in zip(first, second, strict=True)]
     every = np.concatenate([targets, held_targets])
 
-    def kernels() -> object:
-        return heads.KernelFit(both, every, folds).fit((0.5, 0.5))
+    distances, _ = heads._distances(both)
+    kernel, targets = heads._kernel(distances, (0, 1, 2)), torch.from_numpy(every)
+
+    def regression() -> object:
+        return heads.ridge_regression(kernel, targets, folds, 0.05)
 
     m, n, c = len(first[0]), len(folds), every.shape[1]
     solves = m**3 / 3 + m**2 * (n + 2 * c) + 5 * (0.8 * n) ** 3 / 3 + n**3 / 3  # which torch does not count
-    yield Job(f"head: one kernel fit, {m + n} windows", kernels, count(kernels) + solves, 0, "count and formula")
-    trees = "head: one forest of 100 trees grown"
-    yield Job(trees, lambda: Forest.fit(both[1], every.argmax(axis=1), c), 0, 0, "no matrix product")
-    total = counted + 3 * solves
-    yield Job("adapt, method head, all of it", whole, total, 0, "features, 3 kernel fits, 2 or 3 forests")
+    yield Job(f"head: one regression, {m + n} windows", regression, count(regression) + solves, 0, "count and formula")
+    total = counted + 2 * solves
+    yield Job("adapt, method head, all of it", whole, total, 0, "features, 2 regressions")
 
 
 def diagnosis_jobs(grasps: af.Recordings, faults: FaultSet, most: int) -> Iterator[Job]:

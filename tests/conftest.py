@@ -150,8 +150,7 @@ def versions(made_once) -> dict[str, Path]:
 def export_versions(home: Path) -> None:
     import torch
 
-    from adaptfault.adaptation.forest import Forest
-    from adaptfault.adaptation.heads import Blend, KernelHead
+    from adaptfault.adaptation.heads import Head
     from adaptfault.adaptation.reduced_model import ReducedModel, phi
     from adaptfault.adaptation.result import Adaptation, Stage
     from adaptfault.data.windows import Windows
@@ -167,10 +166,9 @@ def export_versions(home: Path) -> None:
             front = CellStatistics.fit(windows).nearest(fault_set)
             with torch.no_grad():
                 views = ReducedModel(network, fault_set, front).views(torch.from_numpy(phi(windows.x, fault_set)))
-            weights = torch.from_numpy(np.random.default_rng(1).normal(0, 30, (60, 3)).astype("f4"))
-            kernel = KernelHead(views, (0.01, 2.0), (0.5, 0.5), weights, torch.zeros(3))
-            forest = Forest.fit(views[1][:9], windows.y[:9], 3)  # shallow: each level takes time to export
-            head = Blend(kernel, forest, 0.5, 2.0)
+            weights = torch.from_numpy(np.random.default_rng(1).normal(0, 3, (2, 60, 3)).astype("f4"))
+            widths = torch.stack([torch.cdist(view, view).square().median() for view in views])
+            head = Head(views, widths, weights, torch.zeros(3), torch.tensor([0.4, 0.6]))
         model = ReducedModel(network, fault_set, front, head).eval()
         Adaptation(model, fault_set, (Stage("fill", 0.1),), _validation=windows).save(home / name)
         add_onnx(home / name)

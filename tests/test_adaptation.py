@@ -62,9 +62,9 @@ def working_clock(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> Clock:
         clock.now += len(x) * 1e-3
         return features(network, x)
 
-    def fit_in_time(first, second, *rest):
+    def fit_in_time(first, second, *rest, **options):
         clock.now += (len(first[0]) + len(second[0])) * 2e-3
-        return fit(first, second, *rest)
+        return fit(first, second, *rest, **options)
 
     monkeypatch.setattr(TactileTransformer, "features", features_in_time)
     monkeypatch.setattr(stages, "fit_head", fit_in_time)
@@ -131,8 +131,7 @@ def test_on_fewer_numbers_the_network_gives_the_same_features_and_as_good_a_head
     one_window = 1.5 / len(adapter.validation)
     assert folded.fault_free_accuracy == pytest.approx(adapter.fault_free_accuracy, abs=one_window)
     usual, other = (a.adapt(F, method="head").predict(adapter.validation.x) for a in (adapter, folded))
-    # A forest grown on features that differ in their last bits may split some windows otherwise.
-    assert (usual == other).mean() > 0.95
+    assert (usual == other).mean() > 0.99
     fill = (a.forecast(F).stages["fill"].accuracy for a in (adapter, folded))
     assert next(fill) == pytest.approx(next(fill), abs=one_window)
 

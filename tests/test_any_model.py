@@ -204,28 +204,6 @@ def test_a_regression_is_repaired_and_scored_by_r2_and_mean_absolute_error(tmp_p
         adapted.predict_proba(x)
 
 
-def test_the_value_head_is_kernel_ridge_regression():
-    from sklearn.kernel_ridge import KernelRidge
-
-    from adaptfault.adaptation.heads import fit_value_head
-
-    rng = np.random.default_rng(0)
-    views = [torch.from_numpy(rng.normal(size=(60, p)).astype("f4")) for p in (3, 4)]
-    y = np.stack([views[0][:, 0] * 3 + 100, views[1][:, 1] - 5], axis=1).astype("f4")
-    first, second = [v[:40] for v in views], [v[40:] for v in views]
-    head, _ = fit_value_head(first, second, y[:40], y[40:], np.arange(20) % 5)
-    k = head.kernel
-    kernel = sum(
-        float(share) * np.exp(-(torch.cdist(v.double(), v.double()).numpy() ** 2) / float(width))
-        for v, width, share in zip(views, k.widths, k.shares, strict=True)
-    )
-    ridges = [KernelRidge(alpha=a, kernel="precomputed") for a in (0.05, 0.005, 0.0005)]
-    found = [y.mean(0) + y.std(0) * r.fit(kernel, (y - y.mean(0)) / y.std(0)).predict(kernel) for r in ridges]
-    with torch.no_grad():
-        out = head(views).numpy()
-    assert min(np.abs(out - expected).max() for expected in found) < 1e-2
-
-
 @pytest.mark.parametrize(
     ("model", "options", "message"),
     [

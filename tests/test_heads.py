@@ -1,15 +1,32 @@
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
+from sklearn.kernel_ridge import KernelRidge
 
-from adaptfault.adaptation.heads import KernelFit, KernelHead, calibrate, linear_head, summarise
+from adaptfault.adaptation.cell_summary import CellSummary
+from adaptfault.adaptation.heads import (
+    Head,
+    calibrate,
+    empty_head,
+    fit_head,
+    linear_head,
+    mixture,
+    ridge_regression,
+)
+from diagnostics import FaultSet, SensorLayout
+
+EARLIER = Path(__file__).parent / "earlier" / "head-1.npz"
 
 
-def windows(n: int = 90) -> tuple[list[torch.Tensor], np.ndarray]:
-    """Two views of three classes: one tells the first class from the others, the other the second."""
+def windows(n: int = 90, classes: int = 3) -> tuple[list[torch.Tensor], np.ndarray]:
+    """Three views of three classes: the first and second each tell another class from the rest, the third a little."""
     rng = np.random.default_rng(0)
-    y = rng.integers(0, 3, n)
-    views = [rng.normal((y == c)[:, None] * 2.0, 1.0, (n, 4)).astype(np.float32) for c in (0, 1)]
+    y = rng.integers(0, classes, n)
+    views = [rng.normal((y == c)[:, None] * far, 1.0, (n, 4)).astype(np.float32) for c, far in ((0, 2), (1, 2), (2, 1))]
     return [torch.from_numpy(v) for v in views], y
 
 
@@ -17,70 +34,165 @@ def one_hot(y: np.ndarray, n_classes: int = 3) -> np.ndarray:
     return np.eye(n_classes, dtype=np.float32)[y]
 
 
-def test_the_summary_is_the_root_of_mean_and_maximum():
+def parts(views: list[torch.Tensor], n: int) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """All but the last n windows, and these."""
+    return [view[:-n] for view in views], [view[-n:] for view in views]
+
+
+def fitted(n: int = 300, n_classes: int = 3) -> tuple[Head, torch.Tensor, list[torch.Tensor], np.ndarray]:
+    """A head for n windows, the outputs for its held-out half, and that half."""
+    views, y = windows(n)
+    held = n // 2
+    first, second = parts(views, held)
+    head, outputs = fit_head(
+        first, second, one_hot(y[:-held], n_classes), one_hot(y[-held:], n_classes), np.arange(held) % 5
+    )
+    return head, outputs, second, y[-held:]
+
+
+def kernel_of(views: list[torch.Tensor]) -> torch.Tensor:
+    return torch.exp(-sum(torch.cdist(view.double(), view.double()).square() for view in views) / 10)
+
+
+# The summary of the healthy cells
+
+
+LAYOUT = SensorLayout(2, 4, 3, present=tuple(bool(i != 5) for i in range(24)))
+
+
+def test_the_summary_of_the_cells_is_the_root_of_mean_and_maximum():
     x = torch.tensor([[[0.0, 0.25], [0.5, 0.25]]])  # one window of two frames
-    torch.testing.assert_close(summarise(x), torch.tensor([[0.5, 0.5, 0.5**0.5, 0.5]]))
-    assert torch.isfinite(summarise(x - 1)).all()
+    cells, _ = CellSummary(SensorLayout(1, 1, 2), FaultSet((), 2))(x)
+    torch.testing.assert_close(cells, torch.tensor([[0.5, 0.5, 0.5**0.5, 0.5]]))
+    assert torch.isfinite(torch.cat(CellSummary(SensorLayout(1, 1, 2), FaultSet((), 2))(x - 1), 1)).all()
 
 
-def test_the_head_is_kernel_ridge_regression():
+def test_the_smoothed_summary_is_a_gaussian_filter_of_each_pad_and_its_sum():
+    faults = FaultSet((0, 7, 20), 24)
+    x = np.random.default_rng(0).random((5, 3, 24)).astype(np.float32)
+    grid = np.where(LAYOUT.present.ravel() & ~faults.mask, x, 0).reshape(5, 3, 2, 4, 3)
+    smooth = gaussian_filter(grid, (0, 0, 0, 1, 1), mode="constant", truncate=3).reshape(5, 3, 24)
+    frames = np.concatenate([smooth[..., LAYOUT.present.ravel()], grid.sum((3, 4))], axis=2)
+    expected = np.sqrt(np.concatenate([frames.mean(1), frames.max(1)], axis=1))
+    _, found = CellSummary(LAYOUT, faults)(torch.from_numpy(x[..., faults.healthy]))
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
+
+
+def test_positions_that_the_array_lacks_do_not_reach_the_summary():
+    summary = CellSummary(LAYOUT, FaultSet((), 24))
+    x = torch.rand(4, 3, 24)
+    other = x.clone()
+    other[..., 5] = torch.nan
+    for one, two in zip(summary(x), summary(other), strict=True):
+        torch.testing.assert_close(one, two)
+
+
+def test_a_window_that_is_shifted_by_a_cell_is_nearer_after_smoothing():
+    layout = SensorLayout(1, 8, 8)
+    frame = np.zeros((8, 8), np.float32)
+    frame[2:4, 3:5] = 1.0
+    x = torch.from_numpy(np.stack([frame, np.roll(frame, 1, axis=0)]).reshape(2, 1, 64))
+    cells, smooth = (view / view.norm(dim=1, keepdim=True) for view in CellSummary(layout, FaultSet((), 64))(x))
+    assert (smooth[0] - smooth[1]).norm() < 0.7 * (cells[0] - cells[1]).norm()
+
+
+# The regression
+
+
+@pytest.mark.parametrize("ridge", [0.05, 0.0005])
+def test_the_regression_is_scikit_learns_and_the_held_out_one_that_without_the_fold(ridge):
     views, y = windows()
-    fit = KernelFit(views, one_hot(y), np.zeros(30, int))
-    head, _ = fit.fit((0.5, 0.5))
-    kernel = 0.5 * fit.kernels[0].numpy() + 0.5 * fit.kernels[1].numpy()
-    expected = kernel @ np.linalg.solve(kernel + 0.05 * np.eye(90), one_hot(y) - 1 / 3)
-    np.testing.assert_allclose(head(views).numpy(), expected, atol=1e-4)
-
-
-def test_held_out_logits_are_those_of_a_head_fitted_without_that_fold():
-    views, y = windows()
-    folds = np.arange(30) % 3
-    fit = KernelFit(views, one_hot(y), folds)
-    _, logits = fit.fit((0.7, 0.3))
-    kernel = 0.7 * fit.kernels[0].numpy() + 0.3 * fit.kernels[1].numpy()
+    kernel, targets, folds = kernel_of(views), torch.from_numpy(one_hot(y)).double(), np.arange(30) % 3
+    weights, held_out = ridge_regression(kernel, targets, folds, ridge)
+    expected = KernelRidge(alpha=ridge, kernel="precomputed").fit(kernel.numpy(), targets.numpy())
+    np.testing.assert_allclose(weights.numpy(), expected.dual_coef_, atol=1e-7)
     for fold in range(3):
         out = 60 + np.flatnonzero(folds == fold)
         known = np.setdiff1d(np.arange(90), out)
-        weights = np.linalg.solve(kernel[np.ix_(known, known)] + 0.05 * np.eye(len(known)), one_hot(y)[known] - 1 / 3)
-        np.testing.assert_allclose(logits[folds == fold].numpy(), kernel[np.ix_(out, known)] @ weights, atol=1e-4)
+        without = KernelRidge(alpha=ridge, kernel="precomputed").fit(kernel[known][:, known].numpy(), targets[known])
+        predicted = without.predict(kernel[out][:, known].numpy())
+        np.testing.assert_allclose(held_out[folds == fold].numpy(), predicted, atol=1e-7)
 
 
-def test_both_views_together_tell_more_than_either():
+# The head
+
+
+def test_views_tell_more_together_than_the_smoothed_cells_alone():
+    head, outputs, _, y = fitted()
+    views, classes = windows()
+    first, second = parts(views, 45)
+    blind = [[torch.zeros_like(v), torch.zeros_like(v), w] for v, _, w in (first, second)]
+    _, alone = fit_head(*blind, one_hot(classes[:-45]), one_hot(classes[-45:]), np.arange(45) % 5)
+    assert (outputs.argmax(1).numpy() == y).mean() > (alone.argmax(1).numpy() == classes[-45:]).mean() + 0.05
+    assert head.shares[1] > 0.5
+
+
+def test_shares_follow_the_kernel_that_predicts_held_out_windows():
     views, y = windows(300)
-    fit = KernelFit(views, one_hot(y), np.arange(150) % 5)
-    right = [(fit.fit(s)[1].argmax(1).numpy() == y[150:]).mean() for s in ((1.0, 0.0), (0.0, 1.0), (0.5, 0.5))]
-    assert right[2] > max(right[:2]) + 0.05
+    noise = torch.randn(300, 4, generator=torch.Generator().manual_seed(0)) * 5
+    first, second = parts([noise, noise, views[0] + views[1]], 150)
+    head, _ = fit_head(first, second, one_hot(y[:150]), one_hot(y[150:]), np.arange(150) % 5)
+    assert head.shares[0] > 0.5
+    assert head.shares.sum().item() == pytest.approx(1)
 
 
-def test_calibration_turns_scores_into_probabilities():
-    views, y = windows(600)
-    head, logits = KernelFit(views, one_hot(y), np.arange(300) % 5).fit((0.5, 0.5))
-    scale, loss = calibrate(logits, y[300:])
-    assert loss < torch.nn.functional.cross_entropy(logits, torch.from_numpy(y[300:])).item()
-    sure = torch.softmax(logits * scale, 1).max(1).values.mean()
-    assert sure == pytest.approx((logits.argmax(1).numpy() == y[300:]).mean(), abs=0.05)
-    torch.testing.assert_close(head.scaled(scale)(views), head(views) * scale, rtol=0, atol=1e-3)
+def test_probabilities_of_held_out_windows_are_as_sure_as_they_are_right():
+    _, outputs, _, y = fitted(600)
+    sure = torch.softmax(outputs, 1).max(1).values.mean()
+    assert sure == pytest.approx((outputs.argmax(1).numpy() == y).mean(), abs=0.05)
+    assert calibrate(outputs, y)[0] == pytest.approx(1, abs=0.15)
 
 
 def test_a_class_that_no_window_has_is_never_the_answer():
-    views, y = windows()
-    head, logits = KernelFit(views, one_hot(y, 5), np.zeros(30, int)).fit((0.5, 0.5))
-    for z in (head(views), logits):
+    head, outputs, held, _ = fitted(90, n_classes=5)
+    for z in (head(held), outputs):
         assert (z[:, 3:] < -1000).all()
+        assert torch.isfinite(z).all()
+    views, y = windows()
     weight, bias = linear_head(views[0].double().numpy(), y, 5)
     assert ((views[0] @ weight.T + bias)[:, 3:] < -1000).all()
 
 
 def test_identical_windows_do_not_break_the_fit():
-    views = [torch.ones(20, 3), torch.zeros(20, 2)]
-    head, logits = KernelFit(views, one_hot(np.arange(20) % 3), np.arange(10) % 5).fit((0.5, 0.5))
-    assert torch.isfinite(head(views)).all()
-    assert torch.isfinite(logits).all()
+    views = [torch.ones(20, 3), torch.zeros(20, 2), torch.zeros(20, 2)]
+    first, second = parts(views, 10)
+    head, outputs = fit_head(first, second, one_hot(np.arange(10) % 3), one_hot(np.arange(10) % 3), np.arange(10) % 5)
+    assert torch.isfinite(head(second)).all()
+    assert torch.isfinite(outputs).all()
+
+
+def test_values_are_predicted_in_their_own_unit():
+    views, _ = windows(200)
+    truth = np.stack([100 + 20 * np.tanh(views[0].numpy().mean(1)), np.full(200, 7.0)], axis=1).astype(np.float32)
+    first, second = parts(views, 100)
+    head, outputs = fit_head(first, second, truth[:100], truth[100:], np.arange(100) % 5, values=True)
+    for predicted in (head(second).numpy(), outputs.numpy()):
+        assert np.abs(predicted[:, 0] - truth[100:, 0]).mean() < 0.5 * truth[100:, 0].std()
+        np.testing.assert_allclose(predicted[:, 1], 7, atol=1e-3)
+
+
+def test_a_mixture_is_the_mean_of_probabilities():
+    one, other = torch.randn(2, 6, 3, generator=torch.Generator().manual_seed(0))
+    mixed = mixture([one, other], torch.tensor([0.3, 0.7]))
+    torch.testing.assert_close(mixed.exp(), 0.3 * one.softmax(1) + 0.7 * other.softmax(1))
+    torch.testing.assert_close(mixture([one, other], torch.tensor([1.0, 0.0])).exp(), one.softmax(1))
 
 
 def test_a_head_comes_back_from_its_state():
-    views, y = windows()
-    head, _ = KernelFit(views, one_hot(y), np.zeros(30, int)).fit((0.2, 0.8))
-    again = KernelHead.empty(head.shapes, 3)
+    head, _, held, _ = fitted(90)
+    again = empty_head(json.loads(json.dumps(head.about)), 3)
     again.load_state_dict(head.state_dict())
-    assert torch.equal(again(views), head(views))
+    assert torch.equal(again(held), head(held))
+
+
+@pytest.mark.parametrize(("forest", "logits"), [(True, "logits"), (False, "kernel_logits")])
+def test_a_head_of_an_earlier_version_gives_the_same_answers(forest, logits):
+    with np.load(EARLIER) as stored:
+        about = json.loads(str(stored["about"]))
+        state = {k.removeprefix("state."): torch.from_numpy(stored[k]) for k in stored.files if k.startswith("state.")}
+        if not forest:
+            about["forest"], state = None, {k: v for k, v in state.items() if k.startswith("kernel.")}
+        head = empty_head(about, 3)
+        head.load_state_dict(state)
+        views = [torch.from_numpy(stored[name]) for name in ("features", "cells")]
+        np.testing.assert_allclose(head([*views, torch.zeros(7, 9)]).numpy(), stored[logits], atol=1e-5)

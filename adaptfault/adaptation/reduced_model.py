@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.adaptation.heads import Blend, summarise
+from adaptfault.adaptation.cell_summary import CellSummary
+from adaptfault.adaptation.heads import AnyHead
 from adaptfault.data.windows import Windows
 from adaptfault.models.any_model import AnyModel
 from adaptfault.models.network import TactileTransformer
@@ -33,20 +32,17 @@ class ReducedModel(nn.Module):
         head: uses the features of the network and the healthy cells; None: the head of the network.
     """
 
-    seen: Tensor
-
     def __init__(
         self,
         network: TactileTransformer | AnyModel,
         fault_set: FaultSet,
         front: nn.Module | None,
-        head: Blend | None = None,
+        head: AnyHead | None = None,
     ) -> None:
         super().__init__()
         self.network, self.fault_set, self.head = network, fault_set, head
         self.front = front if len(fault_set) else None
-        seen = network.layout.present.ravel()[fault_set.healthy]  # without absent positions
-        self.register_buffer("seen", torch.from_numpy(np.flatnonzero(seen)), persistent=False)
+        self.summary = CellSummary(network.layout, fault_set)
 
     def complete(self, x: Tensor) -> Tensor:
         """Map the healthy cells' windows ``[N, T, D-k]`` to whole ones ``[N, T, D]``.
@@ -59,13 +55,14 @@ class ReducedModel(nn.Module):
             raise ValueError(f"expected windows of the {width} healthy cells [N, T, {width}], got {list(x.shape)}")
         return x if self.front is None else self.front(x)
 
-    def views(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def views(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Map windows of the healthy cells ``[N, T, D-k]`` to the input of a head.
 
         Returns:
-            The features of the network ``[N, p]``, and ``[N, 2 H]``, the summary of the H healthy cells.
+            The features of the network ``[N, p]``, and both results of
+            :class:`~adaptfault.adaptation.cell_summary.CellSummary`.
         """
-        return self.network.features(self.complete(x)), summarise(x[..., self.seen])
+        return self.network.features(self.complete(x)), *self.summary(x)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map windows of the healthy cells ``[N, T, D-k]``, scaled to 0..1, to logits ``[N, n_classes]``."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.adaptation.heads import Blend
+from adaptfault.adaptation.heads import empty_head
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
 from adaptfault.data.windows import Windows
 from adaptfault.evaluation.scores import Scores, ValueScores
@@ -154,7 +154,7 @@ class Adaptation:
             inner = network_from_config(about["network"], network, features)
             fault_set = FaultSet(tuple(about["fault_set"]), inner.layout.n_cells)
             front = _empty_front(about, fault_set)
-            head = None if about["head"] is None else Blend.empty(about["head"], inner.n_classes)
+            head = None if about["head"] is None else empty_head(about["head"], inner.n_classes)
             model = ReducedModel(inner, fault_set, front, head)
             model.load_state_dict(tensors)
             stages = tuple(Stage(**stage) for stage in about["stages"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from adaptfault.adaptation.fault_free import FaultFreeModel, Network
-from adaptfault.adaptation.heads import MOST_WINDOWS, Blend, calibrate, fit_head, fit_value_head, linear_head
+from adaptfault.adaptation.heads import MOST_WINDOWS, Head, calibrate, fit_head, linear_head
 from adaptfault.adaptation.reduced_model import ReducedModel, reduce_windows
 from adaptfault.adaptation.result import Adaptation, Stage
 from adaptfault.data.windows import Windows, evenly
@@ -209,7 +209,7 @@ class Run:
         likely = torch.log_softmax(scale * outputs.double(), 1)
         return np.asarray(likely.numpy()[np.arange(len(likely)), self.validation.y])
 
-    def _head(self, reduced: ReducedModel) -> tuple[Blend | None, Tensor] | None:
+    def _head(self, reduced: ReducedModel) -> tuple[Head | None, Tensor] | None:
         """Return a head, and the outputs for validation windows of heads fitted without them; None if time is short.
 
         A model without features keeps its own head.
@@ -225,15 +225,14 @@ class Run:
 
     def _fit(
         self,
-        first: list[Tensor] | tuple[Tensor, ...],
-        second: list[Tensor] | tuple[Tensor, ...],
+        first: Sequence[Tensor],
+        second: Sequence[Tensor],
         targets: NDArray[np.float32],
         held_targets: NDArray[np.float32],
         folds: NDArray[np.int64],
-    ) -> tuple[Blend, Tensor]:
-        if self.fault_free.task == "regression":
-            return fit_value_head(first, second, targets, held_targets, folds)
-        return fit_head(first, second, targets, held_targets, folds)
+    ) -> tuple[Head, Tensor]:
+        values = self.fault_free.task == "regression"
+        return fit_head(first, second, targets, held_targets, folds, values=values)
 
     def _behind(self, front: nn.Module | None, network: Network) -> ReducedModel:
         """Return the reduced model of a front end and a network, on the device of the adapter."""
@@ -247,12 +246,12 @@ class Run:
         same.add_module("network", self.quick)
         return same.eval()
 
-    def _views(self, reduced: ReducedModel, windows: Windows) -> tuple[Tensor, Tensor]:
-        """Return both views of windows, computed in batches, on the device of the adapter."""
+    def _views(self, reduced: ReducedModel, windows: Windows) -> tuple[Tensor, ...]:
+        """Return the views of windows, computed in batches, on the device of the adapter."""
         quick = self._quickly(reduced.eval())
         with torch.no_grad():
             views = [quick.views(x.to(self.device)) for x in torch.split(as_tensor(windows.x), _BATCH)]
-        return torch.cat([v[0] for v in views]), torch.cat([v[1] for v in views])
+        return tuple(torch.cat(parts) for parts in zip(*views, strict=True))
 
     def _too_long(self, reduced: ReducedModel, n: int) -> bool:
         """Return whether a head on n windows exceeds the time left, extrapolated from a trial on a few windows."""
@@ -271,7 +270,7 @@ class Run:
         began = time.perf_counter()
         first, second = [v[held:] for v in known], [v[:held] for v in known]
         self._fit(first, second, targets[held:], targets[:held], np.arange(held) % _FOLDS)
-        fit = (time.perf_counter() - began) * (n / m) ** 1.8  # between the exponents of forest (1) and kernel (3)
+        fit = (time.perf_counter() - began) * (n / m) ** 2.5  # between distances (2) and solves (3)
         return bool(pace * n + fit > self.left())
 
     def _train(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-    from adaptfault.adaptation.heads import Blend
+    from adaptfault.adaptation.heads import AnyHead
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.models.any_model import AnyModel
     from adaptfault.models.network import TactileTransformer
@@ -172,7 +172,7 @@ def save_model(
     *,
     class_names: Sequence[str] = (),
     extra: Mapping[str, Any] | None = None,
-    head: Blend | None = None,
+    head: AnyHead | None = None,
 ) -> None:
     """Write a model into a folder; an earlier model there is replaced in one step.
 
@@ -226,8 +226,8 @@ def load_healthy(folder: str | Path) -> Adaptation:
     return Adaptation(ReducedModel(model, none, None, head).eval(), none, ())
 
 
-def _load_model(folder: str | Path) -> tuple[TactileTransformer | AnyModel, Blend | None]:
-    from adaptfault.adaptation.heads import Blend
+def _load_model(folder: str | Path) -> tuple[TactileTransformer | AnyModel, AnyHead | None]:
+    from adaptfault.adaptation.heads import empty_head
     from adaptfault.models.any_model import network_from_config
     from adaptfault.models.builders import ModelNotAllowed
 
@@ -235,7 +235,7 @@ def _load_model(folder: str | Path) -> tuple[TactileTransformer | AnyModel, Blen
     try:
         model, head = network_from_config(manifest["config"]), None
         if (about := manifest.get("head")) is not None:
-            head = Blend.empty(about, model.n_classes)
+            head = empty_head(about, model.n_classes)
             head.load_state_dict({k.removeprefix(_HEAD): v for k, v in tensors.items() if k.startswith(_HEAD)})
         model.load_state_dict({k: v for k, v in tensors.items() if not k.startswith(_HEAD)})
     except ModelNotAllowed:

@@ -18,6 +18,9 @@ demo: .venv/installed
 
 PYTEST := $(BIN)/pytest -n auto --dist worksteal
 
+# Many tests start Python: where bytecode is not kept, each start compiles torch and scikit-learn, 5 to 10 seconds.
+export PYTHONDONTWRITEBYTECODE :=
+
 # Side by side: mypy takes one core, and the tests wait for each other now and then.
 test: .venv/installed-dev
 	@$(MAKE) --no-print-directory -j 2 check quick-tests

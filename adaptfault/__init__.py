@@ -39,7 +39,8 @@ if TYPE_CHECKING:
     from adaptfault.models.store import load_healthy, load_model, save_model
     from adaptfault.models.training import train
     from adaptfault.robot.bundle import Bundle
-    from adaptfault.robot.maintenance import MaintenanceReport, maintain
+    from adaptfault.robot.maintenance import maintain
+    from adaptfault.robot.maintenance_report import MaintenanceReport
     from adaptfault.robot.predictor import Predictor, Reading
     from adaptfault.robot.signature import sign_bundle
     from adaptfault.robot.versions import Untrusted
@@ -122,7 +123,7 @@ _HOMES = {
     "Forecast": "adaptation.forecast",
     "History": "models.history",
     "Inference": "models.inference",
-    "MaintenanceReport": "robot.maintenance",
+    "MaintenanceReport": "robot.maintenance_report",
     "NotAuthentic": "acquisition",
     "Predictor": "robot.predictor",
     "Reading": "robot.predictor",

@@ -29,7 +29,6 @@ from diagnostics.preprocessing.readings import RecordingBlocks
 SCHEMA = "adaptfault.diagnoser/10"
 
 _CERTAIN = 0.999  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
-_SUSPICIOUS_COLD = 3.0  # raw log ratio from which on a cell is no predictor, in a cold start
 _GROUP_SHARE = 0.5  # share of the evidence added with a group excluded, see _weight_of_groups
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
 
@@ -169,7 +168,7 @@ class SelfDiagnosis:
     def stream(self, needed: NDArray[np.bool_] | None = None) -> StreamState:
         """Return the state before any frame. Only tiles with a ``needed`` cell (bool ``[D]``; None: all) are scored."""
         reference = self.reference_ or Reference.unknown(self._planes)
-        exclusion = self.calibrator_.exclusion if reference.model else Exclusion(_SUSPICIOUS_COLD)
+        exclusion = self.calibrator_.exclusion if reference.model else Exclusion()
         return StreamState(self._planes, reference, exclusion, needed, self.load_, self._order)
 
     def evaluate(self, stream: StreamState, *, n_recordings: int = 1) -> Diagnosis:

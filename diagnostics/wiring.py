@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 Cells = NDArray[np.intp]
 
-_OUTSIDE = {"position": 0, "bus": 2}
+_INSIDE_OUT = "position", "group", "bus"  # of lines with the same cells
 _ACTIONS = {
     "position": "check the chip and the solder joints of {}",
     "connector": "reseat {}",
@@ -72,9 +72,8 @@ def nested(served: Mapping[Line, Cells]) -> dict[Line, Cells]:
     Raises:
         ValueError: two lines overlap, and neither contains the other.
     """
-    # Of two lines with the same cells a group is within a bus, a position within a group, and the earlier group is the
-    # inner one.
-    order = sorted(served, key=lambda line: (len(served[line]), _OUTSIDE.get(line.kind, 1), line.index))
+    # Of two groups with the same cells the earlier one is the inner one.
+    order = sorted(served, key=lambda line: (len(served[line]), _INSIDE_OUT.index(line.kind), line.index))
     inner: dict[int, Line] = {}
     for line in reversed(order):
         outer = {inner.get(cell) for cell in served[line].tolist()}

@@ -172,23 +172,23 @@ def test_auto_fine_tunes_only_with_a_budget_and_after_a_loss(adapter, working_cl
     assert all(stage.accuracy is not None for stage in stages)
 
 
-def test_a_larger_budget_never_ends_worse_and_none_is_overdrawn(adapter, working_clock):
+def test_a_larger_budget_never_ends_worse_and_none_is_overdrawn(quick, working_clock):
     hard, reached = FaultSet(range(30), D), []
-    for budget in (0.0, 2.0, 8.0):
+    for budget in (0.0, 1.0, 3.0):
         began = working_clock.now
-        adapted = adapter.adapt(hard, method="finetune", budget=budget, progress=False)
-        assert working_clock.now - began <= max(budget, 1.6)  # that goes for seeing what a head would take
+        adapted = quick.adapt(hard, method="finetune", budget=budget, progress=False)
+        assert working_clock.now - began <= max(budget, 0.7)  # that goes for seeing what a head would take
         reached.append(adapted.scores.accuracy)
     assert reached == sorted(reached)
     assert reached[-1] > reached[0]
     assert [stage.name for stage in adapted.stages] == ["fill", "head", "finetune"]
 
 
-def test_scratch_learns_a_new_network_on_the_healthy_cells(adapter, working_clock):
-    scratch = adapter.adapt(F, method="scratch", budget=3.0, progress=False)
+def test_scratch_learns_a_new_network_on_the_healthy_cells(quick, working_clock):
+    scratch = quick.adapt(F, method="scratch", budget=2.0, progress=False)
     assert [stage.name for stage in scratch.stages] == ["scratch"]
     assert scratch.scores.accuracy > 0.5
-    assert not torch.equal(scratch.model.network.head.weight, adapter.model.head.weight)
+    assert not torch.equal(scratch.model.network.head.weight, quick.model.head.weight)
 
 
 def test_adapting_never_changes_the_fault_free_model_so_order_does_not_matter(quick, working_clock):

@@ -330,7 +330,9 @@ def test_exchanged_rows_that_the_version_undoes_are_put_back_in_a_log_too_large_
     assert set(Diagnosis.from_dict(json.loads(capsys.readouterr().out)).fault_set) == set(broken_row.cells)
 
 
-def test_diagnose_tells_of_a_change_of_the_whole_sensor(made_bundle, small, later_grasps, tmp_path, capsys):
+def test_diagnose_tells_of_a_change_of_the_whole_sensor(
+    made_bundle, small, later_grasps, uncalibrated, tmp_path, capsys
+):
     save_npz(tmp_path / "healthy.npz", small)
     for reference, gain in ((made_bundle, 1.0), (made_bundle, 0.2), (tmp_path / "healthy.npz", 0.2)):
         save_npz(tmp_path / "log.npz", Recordings(tuple(gain * r for r in later_grasps), SMALL))

@@ -166,7 +166,8 @@ def test_a_stuck_address_bit_is_named_with_its_level_and_its_copies(kind: str, b
         moved = {i for i, _ in cause.copies}
         across = 1 if kind == "row_address" else 2
         assert moved == {LAYOUT.position(cell)[across] for cell in fault.cells}
-        assert all(j in (i | 1 << bit, i & ~(1 << bit), -1) for i, j in cause.copies)
+        lines = LAYOUT.rows if kind == "row_address" else LAYOUT.cols
+        assert all(j == (i ^ 1 << bit if i ^ 1 << bit < lines else -1) for i, j in cause.copies)
 
 
 def test_its_level_follows_from_the_loads_of_the_intact_lines(grasps, fitted):

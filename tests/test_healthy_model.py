@@ -114,19 +114,19 @@ def test_a_wider_range_of_loads_is_likelier_and_that_of_an_unknown_cell_is_certa
 
 
 def test_large_arrays_are_modelled_in_tiles_that_cover_every_cell():
-    layout = SensorLayout(1, 2, 260)
+    layout = SensorLayout(1, 2, 208)
     rng = np.random.default_rng(0)
-    column = np.arange(520) % 260
+    column = np.arange(416) % 208
     recordings = []
-    for _ in range(150):
+    for _ in range(120):
         force = 2 * np.sin(np.linspace(0, np.pi, 8))[:, None]
-        recordings.append(np.maximum(0, force * (1 - ((column - rng.uniform(0, 260)) / 12) ** 2)))
-    scale = Scale(np.zeros(520), 0.05, 5.0)
+        recordings.append(np.maximum(0, force * (1 - ((column - rng.uniform(0, 208)) / 12) ** 2)))
+    scale = Scale(np.zeros(416), 0.05, 5.0)
     model = fit_healthy_model(recordings, layout, scale)
     assert len(model.local_regressions) > 1
-    assert sorted(np.concatenate([regression.outputs for regression in model.local_regressions])) == list(range(520))
+    assert sorted(np.concatenate([regression.outputs for regression in model.local_regressions])) == list(range(416))
     features = excerpts(recordings, scale, rng)[0]
-    expected = model.predict(features, np.ones(520, bool))
+    expected = model.predict(features, np.ones(416, bool))
     assert np.isfinite(expected.spread).all()
     loaded = features[:, 2] > 0
     assert expected.never[loaded].mean() < 0.3

@@ -8,7 +8,8 @@ from adaptfault.data.windows import make_windows, scale
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.deployment_test import Judgement
 from adaptfault.robot.lock import Busy
-from adaptfault.robot.maintenance import MaintenanceReport, maintain
+from adaptfault.robot.maintenance import maintain
+from adaptfault.robot.maintenance_report import MaintenanceReport
 from adaptfault.robot.predictor import Predictor
 from adaptfault.robot.sensor_state import SensorState, weak_base
 from diagnostics import FaultKind, FaultSet, Line, SensorLayout, inject, line_fault

@@ -1,11 +1,12 @@
-"""Power cuts: every state of the disk that may follow one is a good state. The engine is examples/power_cut.py."""
+"""Power cuts: every state of the disk that may follow one is a good state. The engine is examples/disk/."""
 
 import os
 import sqlite3
 from pathlib import Path
 
 import pytest
-from power_cut import Trace, build, run
+from disk.power_cut_states import Trace, build
+from power_cut import run
 
 from adaptfault.data.atomic import atomic_write
 

@@ -146,6 +146,7 @@ def test_what_a_dropped_cell_reads_changes_nothing_and_an_infinite_reading_of_an
     for a, b in zip(held, wild, strict=True):
         usual, given = one.stream(a).probabilities, other.stream(b).probabilities
         assert (usual is None and given is None) or np.array_equal(usual, given)
+    assert given is not None
 
 
 def test_its_events_are_the_monitors(carried, fitted_small):

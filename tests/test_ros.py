@@ -60,11 +60,13 @@ def test_single_cells_warn_and_wires_are_errors_on_their_pad_and_group_only(fitt
 
 
 def test_a_tenth_of_a_pad_is_an_error_without_any_wire(fitted, log):
-    loaded = np.argsort(-log[:, :110].mean(axis=0))[:24:2]
-    diagnosis = fitted.diagnose(inject(log, [Fault("stuck", (int(c),), value=2.5) for c in loaded], LAYOUT))
-    if not any(fault.line for fault in diagnosis.faults):
-        assert levels(diagnostic_array(diagnosis))["pad 0"] == Level.ERROR
+    loaded = np.argsort(-log[:, :110].mean(axis=0))[:24:2].tolist()
+    # Each at a value of its own: no wire explains two of them.
+    stuck = [Fault("stuck", (cell,), value=1 + 0.25 * i) for i, cell in enumerate(loaded)]
+    diagnosis = fitted.diagnose(inject(log, stuck, LAYOUT))
     assert len(diagnosis.fault_set) >= 11
+    assert not any(fault.line for fault in diagnosis.faults)
+    assert levels(diagnostic_array(diagnosis))["pad 0"] == Level.ERROR
 
 
 def test_lost_frames_are_a_warning_of_the_stream_and_of_nothing_else(fitted, log):

@@ -92,6 +92,7 @@ def test_recordings_stay_together_in_validation():
         np.repeat(x, 5, axis=0), np.repeat(y, 5), groups=np.repeat(np.arange(60), 5)
     )
     tolerant.set_faults(F)
+    assert sorted(cell for _, test, *_ in tolerant._folds for cell in test) == list(range(300))
     for train, test, *_ in tolerant._folds:
         assert not set(train // 5) & set(test // 5)
 

@@ -50,7 +50,8 @@ def test_intervals_hold_in_90_percent_of_fleets_with_known_hazards(differ):
 def test_the_robots_that_fail_more_are_expected_to_go_on_and_the_others_are_near_the_fleet():
     life = fleet(1, differ=1.0, robots=200)
     survival = Survival.fit(life)
-    assert survival.spread == pytest.approx(1, abs=0.6)
+    spreads = [Survival.fit(fleet(seed, differ=1.0, robots=200)).spread for seed in range(8)]
+    assert np.mean(spreads) == pytest.approx(1, abs=0.3)
     expected, low, high = survival.next_faults(30)
     assert ((low <= expected) & (expected <= high)).all()
     past = np.bincount(life.robot, life.failed, 200)

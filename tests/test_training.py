@@ -198,25 +198,37 @@ def test_windows_that_would_train_nonsense_are_refused():
 
 
 def test_a_loss_that_is_no_longer_finite_ends_the_run_with_the_best_weights():
-    model = small()
-    before = weights(model)
+    model, best = small(), []
+
+    def third_epoch_fails(outputs: Tensor, y: Tensor) -> Tensor:
+        loss = nn.functional.cross_entropy(outputs, y)
+        return loss if len(best) < 2 else loss * float("nan")
+
+    def keep_best(history: History) -> None:
+        best.append(weights(model) if history.best_epoch == history.epochs else best[-1])
+
+    options = {"learning_rate": 0.01, "averaging": 0.0, "loss": third_epoch_fails, "on_epoch": keep_best}
     with pytest.raises(ValueError, match=r"loss became .* lower learning_rate"):
-        train(model, grasps(), grasps(12, 1), learning_rate=1e38, epochs=20, patience=None)
-    assert all(w.isfinite().all() for w in weights(model))
-    assert len(before) == len(weights(model))
+        train(model, grasps(), grasps(12, 1), **options)
+    assert len(best) == 2
+    assert same(weights(model), best[-1])
 
 
 def test_an_interrupted_run_leaves_the_best_weights_in_the_model():
     model, seen = small(), []
+    validation = grasps(30, 1)
+    wrong = Windows(validation.x, (validation.y + 1) % 3, validation.recording)  # the last epoch is not the best
 
     def stop(history: History) -> None:
-        seen.append(weights(model))
+        seen.append((history.best_epoch, weights(model)))
         if history.epochs == 3:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(model, grasps(), grasps(30, 1), learning_rate=0.01, averaging=0.0, on_epoch=stop)
-    assert any(same(weights(model), w) for w in seen)
+        train(model, grasps(), wrong, learning_rate=0.05, averaging=0.0, on_epoch=stop)
+    best, _ = seen[-1]
+    assert best < len(seen) == 3
+    assert same(weights(model), seen[best - 1][1])
     assert not model.training
 
 

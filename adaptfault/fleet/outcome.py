@@ -10,7 +10,7 @@ from adaptfault.fleet.listing import Robot
 
 if TYPE_CHECKING:  # passing outcomes on needs no torch
     from adaptfault.robot.bundle import Bundle
-    from adaptfault.robot.maintenance import Decision, MaintenanceReport
+    from adaptfault.robot.maintenance_report import Decision, MaintenanceReport
     from diagnostics import Fault
 
 _NOTES = 5

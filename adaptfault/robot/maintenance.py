@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,124 +21,24 @@ from adaptfault.robot.checksummed_json import Damaged
 from adaptfault.robot.converter_range import within_range
 from adaptfault.robot.deployment_test import Judgement, compare_candidate, with_faults
 from adaptfault.robot.known_faults import KnownFaults
+from adaptfault.robot.maintenance_report import Decision, MaintenanceReport
 from adaptfault.robot.plausibility import contradiction, implausible
 from adaptfault.robot.pointer import Pointer
-from adaptfault.robot.sensor_state import TECHNICIAN_BELOW, UNTESTED, judged_before, unhandled_cells, weak_base
+from adaptfault.robot.sensor_state import TECHNICIAN_BELOW, UNTESTED, judged_before, unhandled_cells
 from adaptfault.robot.versions import Version
-from diagnostics import Diagnosis, Fault, FaultSet, SelfDiagnosis
+from diagnostics import Diagnosis, FaultSet, SelfDiagnosis
 from diagnostics.evidence.ageing import cell_condition
-from diagnostics.evidence.sensor_change import SensorChange, pad_change, sensor_change
+from diagnostics.evidence.sensor_change import pad_change, sensor_change
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.data.windows import Windows
+    from diagnostics import SensorLayout
     from diagnostics.evidence.rewiring import Rewiring
-
-SCHEMA = "adaptfault.maintenance/1"
-Decision = Literal["unchanged", "deployed", "kept", "refused"]
 
 _CONTRADICTORY = 1.0  # residual variance ratio at which other cells predict no better than the mean
 _UNKNOWN = 3
-
-
-@dataclass(frozen=True, eq=False)
-class MaintenanceReport:
-    """Result of a maintenance run.
-
-    Attributes:
-        decision: "unchanged": no new fault, or the running version already excludes all faulty cells. "deployed": a new
-            version runs, on probation. "kept": no candidate is better than the running version. "refused": the
-            recordings do not fit this sensor, or no working model is left.
-        exit_code: 0 no fault known; 1 faults that are handled, or a warning; 2 a person is needed; 3 unusable
-            recordings.
-        reason: why, in one sentence.
-        fault_set: F, as known now.
-        version: number of the version that runs after this run.
-        faults: known faults after this run, one for each root cause.
-        diagnosis: of the new recordings; None without new recordings.
-        judgement: comparison of the last candidate with the running version; None without a candidate.
-        accuracy: of the version that runs now, under the known faults, on the held-out windows; None if not measured.
-        fault_free_accuracy: of version 1 on the same windows without faults; None if not measured.
-        change: of a pad, or of the whole sensor, against the reference (gain, offset); None where none was found.
-        rewiring: rows, columns or pads that answer in each other's place, as text; the deployed version undoes it.
-        stages: cost and result of each adaptation stage, as text.
-        used: names of the recordings whose diagnosis entered the known faults; empty where they were refused.
-        left_out: recordings, or readings of them, that were not used, with the reason.
-        warnings: damage found in the bundle.
-        dry_run: nothing was changed.
-        seconds: wall clock.
-        n_cells: cells of the array, without masked positions; 0 where that is not known.
-    """
-
-    decision: Decision
-    exit_code: int
-    reason: str
-    fault_set: FaultSet
-    version: int
-    faults: tuple[Fault, ...] = ()
-    diagnosis: Diagnosis | None = None
-    judgement: Judgement | None = None
-    accuracy: float | None = None
-    fault_free_accuracy: float | None = None
-    change: SensorChange | None = None
-    rewiring: tuple[str, ...] = ()
-    stages: tuple[str, ...] = ()
-    used: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    dry_run: bool = False
-    seconds: float = 0.0
-    n_cells: int = 0
-
-    def __str__(self) -> str:
-        status = ("OK", "WARNING", "CRITICAL", "UNKNOWN")[self.exit_code]
-        n, faulty = self.n_cells or self.fault_set.n_cells, len(self.fault_set)
-        measured = [f"faulty={faulty};;;0;{n}"]
-        if self.accuracy is not None:
-            measured.append(f"accuracy={self.accuracy:.4f};;;0;1")
-        would = " (dry run: nothing was changed)" if self.dry_run else ""
-        lines = [f"ADAPTFAULT {status} - {self.decision}: {self.reason}{would} | {' '.join(measured)}"]
-        lines.append(f"version {self.version} runs; {faulty} of {n} cells {'is' if faulty == 1 else 'are'} faulty")
-        if weak_base(self.accuracy, self.fault_free_accuracy):
-            both = f"{self.accuracy:.3f} repaired, {self.fault_free_accuracy:.3f} healthy"
-            lines.append(f"  weak base model: accuracy {both}; train it longer or on more recordings")
-        if self.diagnosis is not None:
-            lines += [f"  {fault.reason}" for fault in self.diagnosis.faults]
-            lines += [f"  {wire.reason}" for wire in self.diagnosis.possible]
-            lines += [f"  {fault.reason}" for fault in self.diagnosis.transport]
-            lines.append(f"  {self.diagnosis.coverage}")
-            lines += [f"  to test more: {touch}" for touch in self.diagnosis.coverage.advice[:3]]
-        lines += [f"  {stage}" for stage in self.stages]
-        if self.judgement is not None:
-            lines.append(f"  {self.judgement}")
-        lines += [f"left out: {text}" for text in self.left_out]
-        lines += [f"damage: {text}" for text in self.warnings]
-        return "\n".join(lines)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-safe dict."""
-        return {
-            "schema": SCHEMA,
-            "decision": self.decision,
-            "exit_code": self.exit_code,
-            "reason": self.reason,
-            "fault_set": list(self.fault_set),
-            "version": self.version,
-            "faults": [fault.to_dict() for fault in self.faults],
-            "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
-            "judgement": None if self.judgement is None else vars(self.judgement),
-            "accuracy": self.accuracy,
-            "fault_free_accuracy": self.fault_free_accuracy,
-            "change": None if self.change is None else vars(self.change),
-            "rewiring": list(self.rewiring),
-            "stages": list(self.stages),
-            "used": list(self.used),
-            "left_out": list(self.left_out),
-            "warnings": list(self.warnings),
-            "dry_run": self.dry_run,
-            "seconds": self.seconds,
-        }
 
 
 def maintain(
@@ -186,6 +86,13 @@ class _InputRecording:
     problem: str | None
     outside: int = 0  # readings out of the converter's range, missing in ``frames``
 
+    def left_out(self, layout: SensorLayout) -> str:
+        """Return what is not used of it and why, in one sentence; empty: all is used."""
+        if self.problem is not None:
+            return f"{self.name}: {self.problem}"
+        range_ = f"0 to {layout.full_scale:g} {layout.unit}"
+        return f"{self.name}: {self.outside} readings outside {range_} are missing" if self.outside else ""
+
 
 def _checked(
     recordings: ArrayLike | Sequence[ArrayLike], names: Sequence[str], bundle: Bundle
@@ -231,12 +138,7 @@ class _Maintenance:
         seen = bundle.journal.seen([r.digest for r in incoming])
         fresh = list({r.digest: r for r in incoming if r.digest not in seen}.values())
         usable = [r for r in fresh if r.problem is None]
-        self.left_out = tuple(f"{r.name}: {r.problem}" for r in fresh if r.problem is not None)
-        self.left_out += tuple(
-            f"{r.name}: {r.outside} readings outside 0 to {bundle.layout.full_scale:g} {bundle.layout.unit} are missing"
-            for r in usable
-            if r.outside
-        )
+        self.left_out = tuple(text for r in fresh if (text := r.left_out(bundle.layout)))
         if not fresh:
             code = self._code(self.before.fault_set)
             return self._report("unchanged", code, "all recordings were used before", self.before)
@@ -256,14 +158,7 @@ class _Maintenance:
         if report.used:
             self.condition = encode(cell_condition(loads, healthy, bundle.layout), diagnosis.verdicts)
         if rewiring is not None:
-            undone = "a new version would undo it" if self.dry_run else f"version {self.version.number} undoes it"
-            report = replace(
-                report,
-                decision="deployed" if report.decision == "unchanged" else report.decision,
-                exit_code=max(1, report.exit_code),
-                reason=f"{rewiring.reason}; {undone}; {report.reason}",
-                rewiring=rewiring.steps,
-            )
+            report = self._with_rewiring(report, rewiring)
         if not self.dry_run:
             self._write(report, usable)
         return report
@@ -293,6 +188,17 @@ class _Maintenance:
         version = self.bundle.write_version(Adaptation.load(self.version.folder), about)
         self.bundle.deploy(version.number)
         return version
+
+    def _with_rewiring(self, report: MaintenanceReport, rewiring: Rewiring) -> MaintenanceReport:
+        """Return the report with the changed wiring, which a deployed version undoes."""
+        undone = "a new version would undo it" if self.dry_run else f"version {self.version.number} undoes it"
+        return replace(
+            report,
+            decision="deployed" if report.decision == "unchanged" else report.decision,
+            exit_code=max(1, report.exit_code),
+            reason=f"{rewiring.reason}; {undone}; {report.reason}",
+            rewiring=rewiring.steps,
+        )
 
     def _with_coverage(self, report: MaintenanceReport) -> MaintenanceReport:
         """Return the report with the exit code of recordings that test nothing."""

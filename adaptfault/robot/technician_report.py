@@ -15,7 +15,7 @@ from adaptfault.robot.sensor_state import SensorState, unhandled_cells
 from diagnostics import Diagnosis
 
 if TYPE_CHECKING:
-    from adaptfault.robot.maintenance import MaintenanceReport
+    from adaptfault.robot.maintenance_report import MaintenanceReport
 
 
 _HEADLINES = (

@@ -28,12 +28,13 @@ from scipy.stats import mannwhitneyu, median_abs_deviation
 
 from diagnostics.evidence.drift import GAIN
 from diagnostics.layout import SensorLayout
+from diagnostics.preprocessing.baseline import LOW
 from diagnostics.preprocessing.scale import LIGHT
 
 _LEAST = 5  # recordings, new and reference, for a standard error that can be trusted
 _ERRORS = 4.0  # standard errors
 _RARE = 1e-4  # p of a pad that has not changed
-_LOW, _HIGH = 0.05, 0.99  # quantiles: baseline of a cell, load of a recording
+_HIGH = 0.99  # quantile of the readings of a recording: its load
 
 
 @dataclass(frozen=True)
@@ -163,7 +164,7 @@ def _statistics(recordings: Iterable[NDArray[Any]], healthy: NDArray[np.intp]) -
         frames = np.asarray(recording)[:, healthy]
         frames = frames[:, ~np.isnan(frames).all(axis=0)] if len(frames) else frames
         if frames.size:
-            baseline = float(np.median(np.nanquantile(frames, _LOW, axis=0)))
+            baseline = float(np.median(np.nanquantile(frames, LOW, axis=0)))
             rows.append((baseline, float(np.nanquantile(frames, _HIGH)) - baseline))
     return np.array(rows, dtype=np.float64).reshape(-1, 2)
 

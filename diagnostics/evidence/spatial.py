@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
     from diagnostics.preprocessing.scale import Scale
 
+UNCALIBRATED = 3.0  # log evidence from which on a cell is no predictor, in a cold start and in tiles
 _TESTED = 0.5  # log evidence from which on an event counts as one that tested the cell
 _ONE_LOAD = 0.5  # correlation of the evidence that events elsewhere give about one held load
 _MOST_ROUNDS = 8  # of scoring and updating the predictors
@@ -49,14 +50,14 @@ Floats = NDArray[np.float64]
 
 
 class Exclusion(NamedTuple):
-    """When a cell is excluded from the predictors.
+    """When a cell is excluded from the predictors; the defaults are those of a cold start and of tiles.
 
     Attributes:
         threshold: log evidence from which on a cell is excluded.
         gains: factor on the evidence of a changed gain, see :func:`~diagnostics.evidence.drift.gains_count`.
     """
 
-    threshold: float
+    threshold: float = UNCALIBRATED
     gains: float = 1.0
 
 

@@ -25,7 +25,14 @@ from diagnostics.events.tiles import Rectangle, Tile, tiles
 from diagnostics.evidence.conditional_test import SUDDEN_JUMP, CellState, Model
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
-from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, group_excluded_evidence, held_load_evidence
+from diagnostics.evidence.spatial import (
+    UNCALIBRATED,
+    Exclusion,
+    Spatial,
+    SpatialTest,
+    group_excluded_evidence,
+    held_load_evidence,
+)
 from diagnostics.evidence.weak_response import WeakResponse
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
 from diagnostics.preprocessing.offset import OffsetTracker
@@ -44,7 +51,6 @@ MAX_EVENTS, KEPT_EVENTS = 40, 32  # with more events in a tile, all but the last
 _SILENT, _NEVER_RECEIVED = 2 * SEGMENT, SEGMENT // 2  # consecutive frames without a reading: not chance any more
 _PAUSE = SEGMENT // 2  # frames of a segment after which old events are scored, a part with each frame
 _CLEAR = 4.0  # times the tolerance of two equal lines: lighter loads are equal by chance
-_EXCLUDED = 3.0  # log evidence from which on a cell of a tiled array is no predictor
 _STEPS = 8  # in which one pass over all tiles is split: a monitor does one step a frame
 
 Mask = NDArray[np.bool_]
@@ -99,7 +105,7 @@ class StreamState:
         every = tiles(layout) if model is None else tuple(Tile(r.inputs, r.outputs) for r in model.local_regressions)
         self.layout, self.reference = layout, reference
         self.tiled = len(every) > 1
-        self.exclusion = exclusion._replace(threshold=_EXCLUDED) if self.tiled else exclusion
+        self.exclusion = exclusion._replace(threshold=UNCALIBRATED) if self.tiled else exclusion
         self.present = layout.present.ravel()
         self.order, self.load, self.below = order, load, np.zeros(layout.n_cells, bool)
         self.transport = TransportState()

@@ -192,7 +192,7 @@ def _logistic(x: Array, y: Array, own: NDArray[np.intp]) -> tuple[Array, Array]:
     """Fit one ridge logistic regression for each column of ``y``, in which some weights are fixed at 0.
 
     Minimises a quadratic upper bound of the loss with one curvature for all columns (Boehning 1992), accelerated
-    (Nesterov 1983).
+    (Nesterov 1983). Each step is a ridge regression on the working responses ``odds / 4 + y - expit(odds)``.
 
     Args:
         x: ``[n, d]``.
@@ -204,20 +204,20 @@ def _logistic(x: Array, y: Array, own: NDArray[np.intp]) -> tuple[Array, Array]:
     """
     n, d = x.shape
     x = np.concatenate([x, np.ones((n, 1), np.float32)], axis=1)
-    penalty = np.full((d + 1, 1), RIDGE, np.float32)
-    penalty[d] = _BIAS_RIDGE
-    inverse = np.linalg.inv((x.T @ x).astype(np.float64) / (4 * n) + np.diag(penalty[:, 0])).astype(np.float32)
-    # Project each step onto the subspace in which the fixed weights do not change (Lagrange multipliers).
+    penalty = np.diag(np.append(np.full(d, RIDGE), _BIAS_RIDGE))
+    inverse = np.linalg.inv((x.T @ x).astype(np.float64) / (4 * n) + penalty).astype(np.float32)
+    solve = inverse @ x.T / np.float32(n)
+    # Project onto the subspace in which the fixed weights are 0 (Lagrange multipliers).
     block = np.linalg.inv(inverse[own[:, :, None], own[:, None, :]].astype(np.float64)).astype(np.float32)  # (k, f, f)
     projection = np.einsum("dkf,kfg->kdg", inverse[:, own], block)
     weight = np.zeros((d + 1, y.shape[1]), np.float32)
     weight[d] = logit((y.sum(axis=0) + 1) / (n + 2))  # Laplace smoothing keeps it finite
     ahead, column = weight, np.arange(len(own))[:, None]
     for step in range(_STEPS):
-        change = inverse @ (x.T @ ((expit(x @ ahead) - y) / np.float32(n)) + penalty * ahead)
-        change -= np.matmul(projection, change[own, column][:, :, None])[:, :, 0].T
-        change[own, column] = 0
-        following = ahead - change
+        odds = x @ ahead
+        following = solve @ (odds / 4 + y - expit(odds))
+        following -= np.matmul(projection, following[own, column][:, :, None])[:, :, 0].T
+        following[own, column] = 0
         ahead = following + np.float32(step / (step + 3)) * (following - weight)
         weight = following
     return weight[:d], weight[d]

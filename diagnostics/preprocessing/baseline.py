@@ -25,7 +25,7 @@ from diagnostics.preprocessing.scale import LIGHT
 if TYPE_CHECKING:
     from diagnostics.events.constant_runs import ConstantRuns
 
-_LOW = 0.05  # quantile of all readings of a cell
+LOW = 0.05  # quantile of all readings of a cell: its baseline
 _UNLOADED = 0.03  # quantile of the readings in one recording: its baseline there, unless loaded throughout
 _CALM = 0.25  # quantile of the noise over cells and recordings: loaded cells have more
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
@@ -191,7 +191,7 @@ def _low(recordings: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
             last[i, cells], peaks[i, cells] = frames[-1], _lowest_peak(frames)
         frames = np.concatenate(pieces)
         received = ~np.isnan(frames).all(axis=0)
-        low[cells[received]] = np.nanquantile(frames[:, received], _LOW, axis=0)
+        low[cells[received]] = np.nanquantile(frames[:, received], LOW, axis=0)
     return low, last, peaks
 
 

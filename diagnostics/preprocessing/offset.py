@@ -20,12 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.preprocessing.readings import RecordingBlocks, spread
-from diagnostics.preprocessing.scale import LIGHT, SLIGHT
+from diagnostics.preprocessing.scale import LEAST_LOADED, LIGHT, SLIGHT
 
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Scale
 
-_LEAST_LOADED = 0.25  # quantile over the cells: more are unloaded than this, and fewer are open
 _USUAL = 0.95  # quantile of the common offsets in the reference
 
 Floats = NDArray[np.float64]
@@ -93,7 +92,7 @@ class OffsetTracker:
             own = np.where((beyond > scale.near / 2) & (beyond < SLIGHT * scale.full_scale), beyond, 0.0)
         # Usually there is no common offset: enough cells stay at their baseline throughout.
         calm = present & (np.fmax.reduce(frames) - scale.baseline - own <= usual.most)
-        if np.count_nonzero(calm) > _LEAST_LOADED * np.count_nonzero(present):
+        if np.count_nonzero(calm) > LEAST_LOADED * np.count_nonzero(present):
             return OffsetTracker(lowest, own, np.zeros(len(frames)))
         common = usual.excess([_least_loaded(frame) for frame in (frames - scale.baseline - own)[:, present]])
         last = self.common[-1]
@@ -115,5 +114,5 @@ class OffsetTracker:
 def _least_loaded(above: Floats) -> float:
     """Return the 0.25 quantile of the readings above baseline, ``[n]``; 0 without any reading."""
     received = above[np.isfinite(above)]
-    k = int(_LEAST_LOADED * (len(received) - 1))
+    k = int(LEAST_LOADED * (len(received) - 1))
     return float(np.partition(received, k)[k]) if len(received) else 0.0

@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import median_abs_deviation
 
-from diagnostics.preprocessing.scale import LIGHT, Scale
+from diagnostics.preprocessing.scale import LEAST_LOADED, LIGHT, Scale
 
-_LEAST_LOADED = 0.25  # quantile over the cells
 _MARGIN = 4.0  # from the mean of such a cell to the highest reading of any cell at rest
 _OUTLYING = 3.0  # standard deviations from the median of all cells
 
@@ -50,7 +49,7 @@ class RestOfLog:
         """
         above = np.fmax.reduce(frames) - lowest
         above = above[np.isfinite(above)]
-        typical = float(np.quantile(above, _LEAST_LOADED)) if len(above) else np.inf
+        typical = float(np.quantile(above, LEAST_LOADED)) if len(above) else np.inf
         if typical > LIGHT * full_scale:
             return self
         return RestOfLog(self.varies + typical, self.segments + 1)

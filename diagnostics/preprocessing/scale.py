@@ -11,6 +11,7 @@ Array = NDArray[np.float32]
 
 LIGHT = 0.05  # of full scale: a lighter load may be drift of the baseline
 SLIGHT = 0.02  # of full scale: readings that differ by less agree
+LEAST_LOADED = 0.25  # quantile over the cells: more are unloaded than this, and fewer are open
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Scale:
     def root_load(self, frames: NDArray[np.float64]) -> Array:
         """Return ``sqrt((reading - baseline) / full_scale)``, ``[..., D]``; 0 up to ``near`` and where missing.
 
-        The square root stabilises the variance of noise that grows with the load (Anscombe 1948).
+        The square root stabilises the variance of noise that grows with the load (Bartlett 1947).
         """
         load = ((frames - self.baseline) / self.full_scale).astype(np.float32)
         # Comparisons with NaN are False: a missing reading is no load.

@@ -1,0 +1,113 @@
+"""Result of a maintenance run, as text and as JSON."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from adaptfault.robot.deployment_test import Judgement
+from adaptfault.robot.sensor_state import weak_base
+from diagnostics import Diagnosis, Fault, FaultSet
+from diagnostics.evidence.sensor_change import SensorChange
+
+SCHEMA = "adaptfault.maintenance/1"
+Decision = Literal["unchanged", "deployed", "kept", "refused"]
+
+
+@dataclass(frozen=True, eq=False)
+class MaintenanceReport:
+    """Result of a maintenance run.
+
+    Attributes:
+        decision: "unchanged": no new fault, or the running version already excludes all faulty cells. "deployed": a new
+            version runs, on probation. "kept": no candidate is better than the running version. "refused": the
+            recordings do not fit this sensor, or no working model is left.
+        exit_code: 0 no fault known; 1 faults that are handled, or a warning; 2 a person is needed; 3 unusable
+            recordings.
+        reason: why, in one sentence.
+        fault_set: F, as known now.
+        version: number of the version that runs after this run.
+        faults: known faults after this run, one for each root cause.
+        diagnosis: of the new recordings; None without new recordings.
+        judgement: comparison of the last candidate with the running version; None without a candidate.
+        accuracy: of the version that runs now, under the known faults, on the held-out windows; None if not measured.
+        fault_free_accuracy: of version 1 on the same windows without faults; None if not measured.
+        change: of a pad, or of the whole sensor, against the reference (gain, offset); None where none was found.
+        rewiring: rows, columns or pads that answer in each other's place, as text; the deployed version undoes it.
+        stages: cost and result of each adaptation stage, as text.
+        used: names of the recordings whose diagnosis entered the known faults; empty where they were refused.
+        left_out: recordings, or readings of them, that were not used, with the reason.
+        warnings: damage found in the bundle.
+        dry_run: nothing was changed.
+        seconds: wall clock.
+        n_cells: cells of the array, without masked positions; 0 where that is not known.
+    """
+
+    decision: Decision
+    exit_code: int
+    reason: str
+    fault_set: FaultSet
+    version: int
+    faults: tuple[Fault, ...] = ()
+    diagnosis: Diagnosis | None = None
+    judgement: Judgement | None = None
+    accuracy: float | None = None
+    fault_free_accuracy: float | None = None
+    change: SensorChange | None = None
+    rewiring: tuple[str, ...] = ()
+    stages: tuple[str, ...] = ()
+    used: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    dry_run: bool = False
+    seconds: float = 0.0
+    n_cells: int = 0
+
+    def __str__(self) -> str:
+        status = ("OK", "WARNING", "CRITICAL", "UNKNOWN")[self.exit_code]
+        n, faulty = self.n_cells or self.fault_set.n_cells, len(self.fault_set)
+        measured = [f"faulty={faulty};;;0;{n}"]
+        if self.accuracy is not None:
+            measured.append(f"accuracy={self.accuracy:.4f};;;0;1")
+        would = " (dry run: nothing was changed)" if self.dry_run else ""
+        lines = [f"ADAPTFAULT {status} - {self.decision}: {self.reason}{would} | {' '.join(measured)}"]
+        lines.append(f"version {self.version} runs; {faulty} of {n} cells {'is' if faulty == 1 else 'are'} faulty")
+        if weak_base(self.accuracy, self.fault_free_accuracy):
+            both = f"{self.accuracy:.3f} repaired, {self.fault_free_accuracy:.3f} healthy"
+            lines.append(f"  weak base model: accuracy {both}; train it longer or on more recordings")
+        if self.diagnosis is not None:
+            lines += [f"  {fault.reason}" for fault in self.diagnosis.faults]
+            lines += [f"  {wire.reason}" for wire in self.diagnosis.possible]
+            lines += [f"  {fault.reason}" for fault in self.diagnosis.transport]
+            lines.append(f"  {self.diagnosis.coverage}")
+            lines += [f"  to test more: {touch}" for touch in self.diagnosis.coverage.advice[:3]]
+        lines += [f"  {stage}" for stage in self.stages]
+        if self.judgement is not None:
+            lines.append(f"  {self.judgement}")
+        lines += [f"left out: {text}" for text in self.left_out]
+        lines += [f"damage: {text}" for text in self.warnings]
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict."""
+        return {
+            "schema": SCHEMA,
+            "decision": self.decision,
+            "exit_code": self.exit_code,
+            "reason": self.reason,
+            "fault_set": list(self.fault_set),
+            "version": self.version,
+            "faults": [fault.to_dict() for fault in self.faults],
+            "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
+            "judgement": None if self.judgement is None else vars(self.judgement),
+            "accuracy": self.accuracy,
+            "fault_free_accuracy": self.fault_free_accuracy,
+            "change": None if self.change is None else vars(self.change),
+            "rewiring": list(self.rewiring),
+            "stages": list(self.stages),
+            "used": list(self.used),
+            "left_out": list(self.left_out),
+            "warnings": list(self.warnings),
+            "dry_run": self.dry_run,
+            "seconds": self.seconds,
+        }

@@ -7,7 +7,7 @@ import importlib.util
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -300,6 +300,19 @@ def later_grasps() -> list[np.ndarray]:
     """24 grasps of the same small sensor, healthy, on a later day."""
     grasps = simulate(12, SIMULATED, n_frames=60, seed=99, classes=SMALL_CLASSES)
     return [frames for frames, label in zip(grasps.frames, grasps.labels, strict=True) if label > 0]
+
+
+def worn(recordings: Sequence[np.ndarray], layout: SensorLayout, what: str, force: float = 2.0) -> list[np.ndarray]:
+    """Return recordings with a "strap" over pad 0, or with "gloves": loads are weaker and spread to neighbours."""
+    if what == "strap":
+        y, x = np.indices(layout.shape[1:]) - (np.array(layout.shape[1:]) // 2)[:, None, None]
+        strap = np.zeros(layout.shape)
+        strap[0] = force * np.exp(-(x**2 + y**2) / 4)
+        return [np.minimum(r + strap.ravel(), layout.full_scale) for r in recordings]
+    from scipy.ndimage import gaussian_filter
+
+    grids = [r.reshape(-1, *layout.shape) for r in recordings]
+    return [0.6 * gaussian_filter(grid, (0, 0, 1, 1)).reshape(len(grid), -1) for grid in grids]
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ import errno
 import os
 import shutil
 import tempfile
+from collections import Counter
 from pathlib import Path
 from unittest import mock
 
@@ -36,6 +37,7 @@ class Life(RuleBasedStateMachine):
     """One robot. After every step it predicts, its known faults are true ones, and its files do not pile up."""
 
     home: Path  # of a bundle that is made once
+    happened: Counter[str]  # in all lives
 
     @initialize()
     def begin(self):
@@ -76,6 +78,7 @@ class Life(RuleBasedStateMachine):
         assert report.exit_code in (0, 1, 2, 3)
         assert report.version == af.Bundle.open(self.path).active().number
         again = af.maintain(af.Bundle.open(self.path), self.log)
+        self.happened[report.decision] += 1
         if report.used:
             assert (again.decision, again.fault_set) == ("unchanged", report.fault_set)
 
@@ -94,7 +97,8 @@ class Life(RuleBasedStateMachine):
         with mock.patch.object(os, call, failing):
             try:
                 af.maintain(af.Bundle.open(self.path), self.log)
-            except (OSError, Crash):
+            except (OSError, Crash) as error:
+                self.happened[type(error).__name__] += 1
                 assert af.Bundle.open(self.path).active().number in {before, *self.versions()}
             if full:  # prediction does not need the disk
                 af.Predictor.load(self.path).predict(self.x)
@@ -114,6 +118,7 @@ class Life(RuleBasedStateMachine):
         before = Pointer.read(self.path)
         if before.fallbacks:
             assert af.Bundle.open(self.path).rollback().number == before.fallbacks[0]
+            self.happened["rollback"] += 1
         else:
             with pytest.raises(ValueError, match="the first"):
                 af.Bundle.open(self.path).rollback()
@@ -132,19 +137,45 @@ class Life(RuleBasedStateMachine):
         assert set(version.fault_set) <= true
         assert set(bundle.known_faults().fault_set) <= true
         assert len(list(self.path.rglob("*"))) < 100
+        self.happened["checked"] += 1
 
 
-def life(home: Path, examples: int, steps: int) -> None:
-    Life.home = home
+def life(home: Path, examples: int, steps: int) -> Counter[str]:
+    """Live so many lives; return what happened in them."""
+    Life.home, Life.happened = home, Counter()
     run_state_machine_as_test(
         Life, settings=settings(max_examples=examples, stateful_step_count=steps, deadline=None, derandomize=True)
     )
+    return Life.happened
+
+
+def test_every_step_of_a_life_does_what_it_says(linear_bundle):
+    Life.home, Life.happened = linear_bundle.parent, Counter()
+    one = Life()
+    one.begin()
+    try:
+        one.break_row(1)
+        one.record()
+        one.maintain_until_it_crashes_or_the_disk_is_full("replace", 0, full=False)
+        one.maintain_until_it_crashes_or_the_disk_is_full("replace", 0, full=True)
+        one.maintain()
+        assert af.Bundle.open(one.path).active().fault_set == set(ROWS[1].cells)
+        one.start_and_confirm()
+        one.roll_back()
+        one.it_predicts_with_finite_probabilities()
+        assert one.happened == {"Crash": 1, "OSError": 1, "deployed": 1, "rollback": 1, "checked": 1}
+        one.ever.clear()  # so that the known faults are false ones
+        with pytest.raises(AssertionError):
+            one.it_predicts_with_finite_probabilities()
+    finally:
+        one.teardown()
 
 
 def test_whatever_happens_in_its_life_a_bundle_opens_and_predicts(linear_bundle):
-    life(linear_bundle.parent, 3, 8)
+    assert life(linear_bundle.parent, 3, 8)["checked"] > 3
 
 
 @pytest.mark.slow
 def test_whatever_happens_in_its_long_life_a_bundle_opens_and_predicts(linear_bundle):
-    life(linear_bundle.parent, 60, 40)
+    happened = life(linear_bundle.parent, 60, 40)
+    assert set(happened) >= {"deployed", "unchanged", "Crash", "OSError", "rollback"}

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import worn
 
 from adaptfault.cli import COMMANDS, main
 from adaptfault.cli.options import LogAboveBars
@@ -340,6 +341,16 @@ def test_diagnose_tells_of_a_change_of_the_whole_sensor(
         change = json.loads(capsys.readouterr().out)["change"]
         assert (code > 0) == (change is not None) == (gain < 1)
     assert change["gain"] < 0.5
+
+
+@pytest.mark.parametrize(("what", "told"), [("strap", "pad 0 changed"), ("gloves", "sensor changed")])
+def test_diagnose_tells_of_a_strap_and_of_gloves(made_bundle, later_grasps, tmp_path, capsys, what, told):
+    save_npz(tmp_path / "log.npz", Recordings(tuple(worn(later_grasps, SMALL, what)), SMALL))
+    code = main(["diagnose", str(tmp_path / "log.npz"), "--reference", str(made_bundle), "--quiet"])
+    said = capsys.readouterr().out
+    assert code > 0
+    assert told in said
+    assert "wiring changed" not in said
 
 
 def test_a_log_that_tests_nothing_exits_with_the_code_that_is_set(made_bundle, tmp_path, capsys):

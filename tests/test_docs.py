@@ -155,6 +155,13 @@ def test_benchmark_rows_and_arrays_that_the_results_name_exist():
     assert [skin for skin in skins if f'"{skin}"' not in sources + arrays] == []
 
 
+def test_tests_that_the_page_of_attacks_names_exist():
+    named = re.findall(r"`(?:tests/)?(test_\w+\.py)(?:::(\w+))?`", (HOME / "docs" / "attacks.md").read_text())
+    assert len(named) > 20
+    for file, name in named:
+        assert f"\ndef {name}(" in (HOME / "tests" / file).read_text() if name else (HOME / "tests" / file).exists()
+
+
 @pytest.mark.parametrize("page", [*PAGES, HOME / "CONTRIBUTING.md", HOME / "CHANGELOG.md"], ids=lambda page: page.name)
 def test_files_that_a_page_names_exist(page):
     places = [page.parent, HOME, HOME / "diagnostics", HOME / "diagnostics" / "decision"]

@@ -321,6 +321,50 @@ def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp
     assert sum(first[:-5]) == 0 and len(first) <= 6  # noqa: PT018  the last packet before the command may be in time
 
 
+def test_replays_of_old_packets_leave_a_session_in_one_file(tmp_path, monkeypatch):
+    monkeypatch.setattr("adaptfault.acquisition.station._DRAIN", 60.0)  # however slow the machine is
+    station = Station(SMALL, record=tmp_path, when="always", on_event=lambda event: None, quiet=True)
+    values = np.arange(1800.0).reshape(300, 6) % 5
+    datagrams = packets(values)
+    for i, data in enumerate(datagrams):
+        station.receiver.take(data, i / 10, "10.0.0.1")
+        for old in datagrams[: max(0, i - 100)][-3:]:
+            station.receiver.take(old, i / 10, "10.0.0.1")
+    station.receiver.close()
+    asyncio.run(station._take_all())
+    for session in station._sessions.values():
+        session.close()
+    counters = station.receiver.counters
+    assert (counters.received, counters.kept, counters.restarts) == (300 + 3 * 199 - 3, 300, 0)
+    (recording,) = load(tmp_path, layout=SMALL).recordings.frames
+    np.testing.assert_array_equal(recording, values)
+
+
+@pytest.mark.slow
+def test_it_quits_while_10000_packets_a_second_arrive():
+    """The limit is that of a machine that is busy: on an idle one it takes under a second, 10,000 packets."""
+    code = "import sys; from adaptfault.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "listen", "--port", "0", "--shape", "1x2x3"]
+    pipe = subprocess.PIPE
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "error"}
+    child = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment, bufsize=1)
+    with child, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+        port = int(re.search(r"port (\d+)", child.stderr.readline())[1])
+        sent, began, quit_after, most = 0, time.monotonic(), 20_000, 200_000
+        while child.poll() is None and sent < most:
+            due = int((time.monotonic() - began) * 10_000)
+            for i in range(sent, min(due, most)):
+                line.sendto(format_packet("a", i / 10_000, np.ones(6)), ("127.0.0.1", port))
+            if sent < quit_after <= due:
+                child.stdin.write("quit\n")
+            sent = max(sent, due)
+            time.sleep(0.001)
+        assert child.poll() == 0, f"it still runs {sent - quit_after} packets after it was told to quit"
+        counted = re.fullmatch(r"end: (\d+) received, .*", child.stdout.read().splitlines()[-1])
+    assert int(counted[1]) > 0
+    print(f"{sent - quit_after} packets after quit")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+from conftest import worn
 
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.data.windows import make_windows, scale
@@ -193,6 +194,13 @@ def test_a_change_of_the_whole_sensor_is_measured_and_needs_a_technician_where_i
         ]
         assert report.exit_code >= (2 if cost[1] < 0.9 * cost[0] else 1)
         json.dumps(report.to_dict(), allow_nan=False)
+
+
+@pytest.mark.parametrize(("what", "told"), [("strap", "pad 0 changed"), ("gloves", "sensor changed")])
+def test_a_strap_and_gloves_are_told_and_need_a_technician(bundle, later_grasps, what, told):
+    report = maintain(bundle, worn(later_grasps, bundle.layout, what))
+    assert told in str(report).splitlines()[0]
+    assert (report.exit_code, report.version, report.rewiring) == (2, 1, ())
 
 
 def test_one_bad_recording_does_not_stop_the_others(bundle, later_grasps, broken_row):

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import without_calibration
+from conftest import without_calibration, worn
 
+from adaptfault.data.simulated_grasps import simulate
 from diagnostics import SelfDiagnosis, SensorLayout
 
 LAYOUT = SensorLayout(2, 6, 5)
@@ -82,6 +83,18 @@ def test_dead_cells_are_no_change_of_the_wiring(fitted, small_grasps):
     for frames in broken:
         frames[:, dead[:5]], frames[:, dead[5:]] = 0.0, LAYOUT.full_scale
     assert fitted.rewiring(broken) is None
+
+
+def test_a_strap_is_no_change_of_the_wiring():
+    """A smooth load that never goes away fits exchanged lines better, by chance, wherever it lies."""
+    layout = SensorLayout(2, 8, 8)
+    grasps = simulate(8, layout, n_frames=60, seed=1)
+    with without_calibration():
+        fitted = SelfDiagnosis(layout).fit(grasps.frames)
+    later = simulate(4, layout, n_frames=60, seed=99)
+    for force in (1.0, 2.0):
+        strapped = worn(later.frames, layout, "strap", force)
+        assert fitted.rewiring(strapped) is None
 
 
 def test_what_the_data_cannot_tell_is_not_reported(fitted, small_grasps):

@@ -172,6 +172,18 @@ def test_a_probability_that_cannot_be_is_refused(p_floor):
         SelfDiagnosis.from_state(about, arrays)
 
 
-def test_restoring_needs_no_torch():
-    code = "import sys, diagnostics.decision.serialization, diagnostics; assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
+def test_restoring_needs_no_torch(tmp_path):
+    about, arrays = small_fit(SensorLayout(1, 3, 3)).state()
+    (tmp_path / "about.json").write_text(json.dumps(about))
+    (tmp_path / "arrays.safetensors").write_bytes(save(arrays))
+    code = """
+import json, sys
+from pathlib import Path
+from safetensors.numpy import load
+from diagnostics import SelfDiagnosis
+home = Path(sys.argv[1])
+about, arrays = json.loads((home / "about.json").read_text()), load((home / "arrays.safetensors").read_bytes())
+print(SelfDiagnosis.from_state(about, arrays).layout.n_cells, "torch" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], check=True, capture_output=True, text=True)
+    assert done.stdout.split() == ["9", "False"]

@@ -38,7 +38,7 @@ _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.
   adaptfault diagnose today/ --reference robot.bundle
       the healthy model of the bundle
       exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version excludes, nothing tested, or
-      another gain or offset of the whole sensor;
+      another gain or offset of the whole sensor or of a pad;
       2 a person is needed: a wire, exchanged wires, or a tenth of the cells; 3 unusable input"""
 
 _ROWS = 24  # of a map, which is followed by the summary if it has more: the first line has left the screen
@@ -61,9 +61,9 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Diagnose; the exit code says who has to act, as that of maintain."""
-    from adaptfault.data.recordings import Recordings
+    import numpy as np
+
     from adaptfault.data.recordings.blocks import is_large
-    from diagnostics import SelfDiagnosis
 
     bundle = _bundle(args)
     healthy = load_recordings(args, args.reference) if args.reference and bundle is None else None
@@ -75,14 +75,14 @@ def run(args: argparse.Namespace) -> int:
         report_inferred(args, log.inferred)
     else:
         log = load_recordings(args, args.recordings, layout=layout)
-    source, rewiring = _rewired(log, diagnoser, bundle)
-    diagnosis = _diagnosed(args, diagnoser or SelfDiagnosis(log.layout), log, source)
+    source = slice(None) if bundle is None else bundle.active().source
+    reference = bundle if healthy is None else list(healthy)
+    rewiring = _rewiring(log, diagnoser, source)
+    if rewiring is not None:
+        source = rewiring.undo(np.arange(log.layout.n_cells)[source])
+    diagnosis, change = _diagnosed(args, diagnoser, log, source, reference)
     _write(args, diagnosis)
     code, why = _severity(diagnosis, bundle, args.untested_code)
-    change = None
-    if diagnoser is not None and isinstance(log, Recordings):
-        frames = [frames[:, source] for frames in log.frames]
-        change = _change(diagnosis, diagnoser, frames, bundle if healthy is None else list(healthy))
     if change is not None:
         code, why = max(code, 1), f"{why}\n{change.reason}"
     if rewiring is not None:
@@ -108,21 +108,15 @@ def _write(args: argparse.Namespace, diagnosis: Diagnosis) -> None:
         write_diagnosis(args.html, diagnosis, name=", ".join(args.recordings), reference=bool(args.reference))
 
 
-def _rewired(
-    log: Recordings | Stream, diagnoser: SelfDiagnosis | None, bundle: Bundle | None
-) -> tuple[NDArray[np.intp] | slice, Rewiring | None]:
-    """Return the received cell that belongs at each place, and the change of the wiring that no version undoes yet."""
-    import numpy as np
-
+def _rewiring(
+    log: Recordings | Stream, diagnoser: SelfDiagnosis | None, source: NDArray[np.intp] | slice
+) -> Rewiring | None:
+    """Return the change of the wiring that no version undoes yet; None where there is none, or nothing to compare."""
     from adaptfault.data.recordings import Recordings
 
-    source = slice(None) if bundle is None else bundle.active().source
     if diagnoser is None or not isinstance(log, Recordings):  # too large to be searched
-        return source, None
-    rewiring = diagnoser.rewiring([frames[:, source] for frames in log.frames])
-    if rewiring is None:
-        return source, None
-    return rewiring.undo(np.arange(log.layout.n_cells)[source]), rewiring
+        return None
+    return diagnoser.rewiring([frames[:, source] for frames in log.frames])
 
 
 def _bundle(args: argparse.Namespace) -> Bundle | None:
@@ -154,21 +148,17 @@ def _change(
     diagnosis: Diagnosis,
     diagnoser: SelfDiagnosis,
     frames: list[NDArray[Any]],
-    reference: Bundle | list[NDArray[Any]] | None,
+    reference: Bundle | list[NDArray[Any]],
 ) -> SensorChange | None:
-    """Return how all cells together differ from the healthy recordings; None where they do not."""
-    import numpy as np
-
+    """Return how a pad, or all cells together, differ from the healthy recordings; None where they do not."""
     from adaptfault.data.windows import recordings_of
-    from diagnostics.evidence.sensor_change import sensor_change
+    from diagnostics.evidence.sensor_change import find_change
 
     if not isinstance(reference, list):
-        assert reference is not None
         reference = recordings_of(reference.parts.adapter().train, diagnosis.layout)
     load = diagnoser.load_
     new, old = (frames, reference) if load is None else ([*map(load.loads, frames)], [*map(load.loads, reference)])
-    cells = np.flatnonzero(diagnosis.layout.present.ravel() & ~diagnosis.fault_set.mask)
-    return sensor_change(new, old, diagnosis.layout, cells) if len(cells) else None
+    return find_change(new, old, diagnosis.layout, diagnosis.fault_set)
 
 
 def text_of(diagnosis: Diagnosis) -> str:
@@ -185,15 +175,21 @@ def text_of(diagnosis: Diagnosis) -> str:
 
 
 def _diagnosed(
-    args: argparse.Namespace, diagnoser: SelfDiagnosis, log: Recordings | Stream, source: NDArray[np.intp] | slice
-) -> Diagnosis:
-    """Pass the log through the diagnosis recording by recording, or block by block, in constant memory."""
+    args: argparse.Namespace,
+    diagnoser: SelfDiagnosis | None,
+    log: Recordings | Stream,
+    source: NDArray[np.intp] | slice,
+    reference: Bundle | list[NDArray[Any]] | None,
+) -> tuple[Diagnosis, SensorChange | None]:
+    """Diagnose the log recording by recording, or in blocks in constant memory, and compare it with the reference."""
     import numpy as np
     from tqdm import tqdm
 
     from adaptfault.data.recordings import Recordings
+    from diagnostics import SelfDiagnosis
 
-    stream = diagnoser.stream()
+    fitted = diagnoser or SelfDiagnosis(log.layout)
+    stream = fitted.stream()
     hide = None if (shown := progress(args)) is None else not shown
     total = len(log) if isinstance(log, Recordings) else None
     unit = "recording" if isinstance(log, Recordings) else "block"
@@ -202,4 +198,7 @@ def _diagnosed(
     if not isinstance(log, Recordings):
         for problem in log.problems:
             print(problem, file=sys.stderr)
-    return diagnoser.evaluate(stream, n_recordings=len(log))
+    diagnosis = fitted.evaluate(stream, n_recordings=len(log))
+    if diagnoser is None or reference is None or not isinstance(log, Recordings):
+        return diagnosis, None
+    return diagnosis, _change(diagnosis, diagnoser, [frames[:, source] for frames in log.frames], reference)

@@ -28,7 +28,7 @@ from adaptfault.robot.sensor_state import TECHNICIAN_BELOW, UNTESTED, judged_bef
 from adaptfault.robot.versions import Version
 from diagnostics import Diagnosis, FaultSet, SelfDiagnosis
 from diagnostics.evidence.ageing import cell_condition
-from diagnostics.evidence.sensor_change import pad_change, sensor_change
+from diagnostics.evidence.sensor_change import find_change
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
@@ -229,9 +229,7 @@ class _Maintenance:
         from adaptfault.adaptation.result import Adaptation
 
         layout, load = self.bundle.layout, self.diagnoser.load_
-        healthy = np.flatnonzero(layout.present.ravel() & ~report.fault_set.mask)
-        compared = loads, reference, layout, healthy
-        change = (pad_change(*compared) or sensor_change(*compared)) if len(healthy) else None
+        change = find_change(loads, reference, layout, report.fault_set)
         if change is None:
             return report
         gain, offset = change.of_cells(layout)

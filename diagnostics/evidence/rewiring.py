@@ -10,7 +10,8 @@ shifted by one, and exchanged pads. The best is taken, and the search goes on fr
 found. A permutation is reported if the gain sum_e w_e (l_e(P) - l_e(identity)) exceeds 24, is positive without the two
 events that favour it most, exceeds that of any other candidate by 12, and explains half of what a random order leaves
 unexplained; w_e discounts repeated events. Where the array is loaded symmetrically two wirings read alike, and nothing
-is reported. Lines that no event loads differently are not distinguished.
+is reported. Lines that no event loads differently are not distinguished. Where loads are spread widely, as by thick
+gloves, exchanged lines may be named by mistake: the whole sensor has then changed as well.
 """
 
 from __future__ import annotations
@@ -104,9 +105,10 @@ def find_rewiring(
     events = _events(recordings, reference.scale)
     if len(events) < _FEWEST:
         return None
-    # Constant cells may be broken: they are neither scored nor predictors.
+    # Constant cells may be broken, those that are never at rest loaded by a strap: neither scored nor predictors.
     moved = np.ptp(np.concatenate([event.frames for event in events]), axis=0) > reference.scale.near
-    test = _Test(events, reference, layout, moved)
+    rested = np.any([((reference.scale.root_load(r) == 0) & ~np.isnan(r)).any(axis=0) for r in recordings], axis=0)
+    test = _Test(events, reference, layout, moved & rested)
     source, total = np.arange(layout.n_cells), 0.0
     steps: list[str] = []
     now = test.score(source)

@@ -18,7 +18,7 @@ reference look like a change of the gain; of a pad, where it takes another part 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.stats import mannwhitneyu, median_abs_deviation
 
 from diagnostics.evidence.drift import GAIN
+from diagnostics.faults import FaultSet
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.baseline import LOW
 from diagnostics.preprocessing.scale import LIGHT
@@ -59,6 +60,20 @@ class SensorChange:
         """Return gain and offset of each cell, ``[D]`` each."""
         has_changed = np.full(layout.n_cells, True) if self.pad is None else _pad_of(layout) == self.pad
         return np.where(has_changed, self.gain, 1.0), np.where(has_changed, self.offset, 0.0)
+
+
+def find_change(
+    recordings: Sequence[NDArray[Any]],
+    reference: Sequence[NDArray[Any]],
+    layout: SensorLayout,
+    faulty: FaultSet,
+) -> SensorChange | None:
+    """Return the change of a pad, else of the whole sensor; None where none is found. ``faulty`` cells do not count."""
+    healthy = np.flatnonzero(layout.present.ravel() & ~faulty.mask)
+    if not len(healthy):
+        return None
+    compared = recordings, reference, layout, healthy
+    return pad_change(*compared) or sensor_change(*compared)
 
 
 def sensor_change(

@@ -42,6 +42,14 @@ from diagnostics import FaultSet, SensorLayout
 
 SEEDS = (20, 21, 22)
 COLUMNS = ("fault-free", "nothing", "zeros", "restored", "head", "finetuned", "anew", "head s", "anew s")
+COLOURS = {
+    "nothing": "0.75",
+    "zeros": "0.55",
+    "restored": "tab:cyan",
+    "head": "tab:blue",
+    "finetuned": "tab:purple",
+    "anew": "tab:orange",
+}
 ERRORS = ("restored/anew", "head/anew")  # mean absolute errors of a regression
 
 
@@ -266,8 +274,6 @@ def main() -> None:
 
 def report(found: dict[tuple[str, str], list[dict[str, float]]], out: str) -> None:
     """Print the table of means over the seeds, write it, and draw it."""
-    from matplotlib.figure import Figure
-
     table = {}
     for key, rows in found.items():
         table[key] = {c: float(np.mean([r[c] for r in rows])) for c in COLUMNS + ERRORS if all(c in r for r in rows)}
@@ -279,20 +285,35 @@ def report(found: dict[tuple[str, str], list[dict[str, float]]], out: str) -> No
         writer = csv.writer(file)
         writer.writerow(["consumer", "faults", *columns])
         writer.writerows([*key, *(row.get(c, "") for c in columns)] for key, row in table.items())
+    draw(table, f"{out}.png")
+
+
+def draw(table: dict[tuple[str, str], dict[str, float]], path: str) -> None:
+    """Draw the scores by kind of fault, one panel for each consumer."""
+    from matplotlib.figure import Figure
+
     names = list(dict.fromkeys(name for name, _ in table))
-    figure = Figure(figsize=(9, 2.2 * len(names)), layout="constrained")
-    axes = figure.subplots(len(names), 1, squeeze=False)[:, 0]
-    shown = ("nothing", "zeros", "restored", "head", "finetuned", "anew")
-    for ax, name in zip(axes, names, strict=True):
+    shown = [column for column in COLOURS if any(column in row for row in table.values())]
+    columns = min(2, len(names))
+    rows = -(-len(names) // columns)
+    figure = Figure(figsize=(6 * columns, 2.1 * rows + 0.6), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, name in zip(axes, names, strict=False):
         kinds = [kind for of, kind in table if of == name]
         for i, column in enumerate(shown):
+            at = np.arange(len(kinds)) + 0.8 * ((i + 0.5) / len(shown) - 0.5)
             heights = [table[name, kind].get(column, np.nan) for kind in kinds]
-            ax.bar(np.arange(len(kinds)) + 0.13 * (i - 2.5), heights, 0.13, label=column)
-        ax.axhline(table[name, kinds[0]]["fault-free"], color="0.5", linestyle="--", linewidth=1)
-        ax.set(title=name, ylabel="test score", ylim=(-0.2, 1))
+            ax.bar(at, heights, 0.8 / len(shown), color=COLOURS[column], label=column)
+        ax.axhline(table[name, kinds[0]]["fault-free"], color="0.3", linestyle="--", linewidth=1, label="fault-free")
+        regression = "head/anew" in table[name, kinds[0]]
+        ax.set(title=name, ylabel="R2" if regression else "accuracy", ylim=(0, 1))  # an R2 below 0 shows no bar
         ax.set_xticks(range(len(kinds)), kinds)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
-    figure.savefig(f"{out}.png", dpi=110)
+        ax.spines[["top", "right"]].set_visible(False)
+    for ax in axes[len(names) :]:
+        ax.set_axis_off()
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    figure.savefig(path, dpi=110)
 
 
 if __name__ == "__main__":

@@ -214,12 +214,29 @@ def test_a_regression_is_repaired_and_scored_by_r2_and_mean_absolute_error(tmp_p
         (nn.Sequential(nn.Flatten(), nn.Linear(T * D, 2)), {"layout": LAYOUT}, "labels run to 2, the model has 2"),
         (Recurrent(3), {"layout": LAYOUT, "features": "neck"}, r"features 'neck' of Recurrent .* \(lstm, last\)"),
         (Recurrent(3), {"layout": LAYOUT, "task": "regression"}, r"task 'regression' needs y float \[N, k\]"),
+        (Recurrent(3), {"layout": LAYOUT, "loss": nn.MSELoss()}, r"the loss fails on outputs \[4, 3\] and y \[4\]"),
+        (
+            Recurrent(3),
+            {"layout": LAYOUT, "loss": nn.CrossEntropyLoss(reduction="none")},
+            r"the loss of outputs \[4, 3\] and y \[4\] is \[4\]: expected a scalar",
+        ),
     ],
 )
 def test_what_cannot_be_adapted_is_said_before_any_work(model, options, message, training, validation):
     with pytest.raises(ValueError, match=message) as error:
         Adapter(model, training, validation, **options)
     assert "\n" not in str(error.value)
+
+
+def test_windows_of_which_no_model_can_learn_are_refused(training, validation):
+    longer = Windows(np.repeat(validation.x, 2, axis=1), validation.y, validation.recording)
+    with pytest.raises(ValueError, match=r"training windows are \[6, 32\], validation windows \[12, 32\]"):
+        Adapter(Recurrent(3), training, longer, layout=LAYOUT)
+    unknown = Windows(np.where(training.x > 0.3, np.nan, training.x), training.y, training.recording)
+    for parts in ((unknown, validation), (training, unknown)):
+        with pytest.raises(ValueError, match="windows hold NaN or infinity: make_windows") as error:
+            Adapter(Recurrent(3), *parts, layout=LAYOUT)
+        assert "\n" not in str(error.value)
 
 
 def test_outputs_that_do_not_fit_the_values_are_refused():
@@ -274,6 +291,11 @@ def test_what_cannot_be_built_or_stored_is_said(training, validation, tmp_path, 
         builders.allow_model("rm -rf")
     with pytest.raises(ValueError, match="cannot be imported"):
         builders.build_model("json:no", LAYOUT, 3)
+    with pytest.raises(
+        ValueError, match=r"classes' fails: .* it is called with \(layout, n_classes, length\)"
+    ) as error:
+        builders.build_model(f"{__name__}:classes", LAYOUT, 3)
+    assert "\n" not in str(error.value)
     with pytest.raises(ValueError, match="cannot be rebuilt from a file: make it with build_model"):
         save_adapter(tmp_path, Adapter(Recurrent(3), training, validation, layout=LAYOUT))
 

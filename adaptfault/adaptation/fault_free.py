@@ -18,6 +18,7 @@ from adaptfault.evaluation.scores import r2
 from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.imputation.tiled_statistics import LARGE, TiledStatistics
 from adaptfault.models.any_model import AnyModel, Features, device_of
+from adaptfault.models.builders import first_line
 from adaptfault.models.compact import CompactNetwork, compacted
 from adaptfault.models.network import TactileTransformer, as_tensor, logits_of
 from diagnostics import SensorLayout
@@ -51,6 +52,7 @@ class FaultFreeModel:
     ) -> None:
         if not len(train) or not len(validation):
             raise ValueError("an adapter needs fault-free windows to learn from and to validate on; one set is empty")
+        _check_windows(train, validation)
         self.task, self.loss = _task(task, train, validation), loss
         self.model = _wrapped(model, train, layout, features)
         _check_targets(self.model, self.task, train, validation)
@@ -58,6 +60,8 @@ class FaultFreeModel:
         validation = validation.select(evenly(len(validation), most))
         self.train, self.targets = _labelled(self.model, self.task, train)
         self.validation, self.validation_targets = _labelled(self.model, self.task, validation)
+        if loss is not None:
+            _check_loss(self.model, loss, self.train)
 
     @property
     def layout(self) -> SensorLayout:
@@ -121,6 +125,30 @@ def _wrapped(model: nn.Module, train: Windows, layout: SensorLayout | None, feat
     if isinstance(model, AnyModel) or (isinstance(model, TactileTransformer) and features is None):
         return model
     return AnyModel.probe(model, layout, as_tensor(train.x[:8]), features)
+
+
+def _check_windows(train: Windows, validation: Windows) -> None:
+    if train.x.shape[1:] != validation.x.shape[1:]:
+        shapes = f"{list(train.x.shape[1:])}, validation windows {list(validation.x.shape[1:])}"
+        raise ValueError(f"training windows are {shapes}: cut both with the same length and layout")
+    for name, windows in (("training", train), ("validation", validation)):
+        if not np.isfinite(windows.x).all():
+            raise ValueError(f"{name} windows hold NaN or infinity: make_windows holds the last reading of a cell")
+
+
+def _check_loss(model: Network, loss: Callable[[Tensor, Tensor], Tensor], windows: Windows) -> None:
+    few = windows.select(slice(0, model.n_classes + 1))  # more windows than outputs: a wrong shape does not broadcast
+    outputs, y = logits_of(model, few.x), as_tensor(few.y)
+    given = f"outputs {list(outputs.shape)} and y {list(y.shape)}"
+    try:
+        value = loss(outputs, y.float() if y.ndim == 2 else y)
+    except Exception as error:  # a loss may raise anything
+        raise ValueError(
+            f"the loss fails on {given}: {first_line(error)}; give one that maps them to a scalar"
+        ) from None
+    if not isinstance(value, Tensor) or value.numel() != 1:
+        shape = list(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        raise ValueError(f"the loss of {given} is {shape}: expected a scalar")
 
 
 def _task(task: str, train: Windows, validation: Windows) -> Task:

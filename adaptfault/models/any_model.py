@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.models.builders import ModelNotAllowed, build_model, builder_of
+from adaptfault.models.builders import ModelNotAllowed, build_model, builder_of, first_line
 from adaptfault.models.network import TactileTransformer, logits_of
 from diagnostics import SensorLayout
 
@@ -72,7 +72,7 @@ class AnyModel(nn.Module):
             outputs = _evaluate(module, lambda: module(x))
         except Exception as error:  # a model may raise anything
             raise ValueError(
-                f"{name} fails on windows of shape {shape}: {str(error).splitlines()[0] if str(error) else error!r};"
+                f"{name} fails on windows of shape {shape}: {first_line(error)};"
                 " an adapter needs a module from [N, T, D] to [N, n], so wrap one that takes another shape"
             ) from None
         finally:
@@ -101,7 +101,7 @@ class AnyModel(nn.Module):
             shape = list(found.shape) if isinstance(found, Tensor) else type(found).__name__
             problem = None if isinstance(found, Tensor) and found.dim() == 2 and len(found) == len(x) else shape
         except Exception as error:
-            problem = str(error).splitlines()[0] if str(error) else repr(error)
+            problem = first_line(error)
         if problem is None:
             return
         if given is not None:

@@ -45,7 +45,7 @@ def build_model(builder: str, layout: SensorLayout, n_classes: int, *, length: i
         length: frames in a window.
 
     Raises:
-        ValueError: the builder is not allowed, cannot be imported, or returns no torch module.
+        ValueError: the builder is not allowed, cannot be imported, fails, or returns no torch module.
     """
     if builder not in _allowed | set(os.environ.get(VARIABLE, "").replace(" ", "").split(",")):
         raise ModelNotAllowed(
@@ -53,13 +53,19 @@ def build_model(builder: str, layout: SensorLayout, n_classes: int, *, length: i
         )
     if not _PATH.fullmatch(builder):
         raise ModelNotAllowed(f"expected an import path package.module:function, got {builder!r}")
-    module, function = builder.split(":")
+    module, name = builder.split(":")
     try:
-        model = getattr(import_module(module), function)(layout, n_classes, length)
+        function = getattr(import_module(module), name)
     except (ImportError, AttributeError) as error:
         raise ModelNotAllowed(
             f"the builder {builder!r} cannot be imported ({error}): install its package or set PYTHONPATH"
         ) from None
+    try:
+        model = function(layout, n_classes, length)
+    except Exception as error:  # a builder may raise anything
+        raise ModelNotAllowed(
+            f"the builder {builder!r} fails: {first_line(error)}; it is called with (layout, n_classes, length)"
+        ) from error
     if not isinstance(model, nn.Module):
         raise ModelNotAllowed(f"the builder {builder!r} returned {type(model).__name__}, expected a torch.nn.Module")
     model.__dict__["adaptfault_builder"] = builder
@@ -70,3 +76,8 @@ def builder_of(model: nn.Module) -> str | None:
     """Return the import path of the builder of a module; None for one that was built otherwise."""
     builder: str | None = model.__dict__.get("adaptfault_builder")
     return builder
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of the message of an error, or its class where it has none."""
+    return (str(error) or repr(error)).splitlines()[0]

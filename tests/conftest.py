@@ -166,10 +166,12 @@ def export_versions(home: Path) -> None:
             front = CellStatistics.fit(windows).nearest(fault_set)
             with torch.no_grad():
                 views = ReducedModel(network, fault_set, front).views(torch.from_numpy(phi(windows.x, fault_set)))
-            weights = torch.from_numpy(np.random.default_rng(1).normal(0, 3, (2, 60, 3)).astype("f4"))
+            weights = torch.from_numpy(np.random.default_rng(1).normal(0, 3, (4, 60, 3)).astype("f4"))
             weights -= weights.mean(1, keepdim=True)  # no class is preferred everywhere
-            widths = torch.stack([torch.cdist(view, view).square().median() for view in views])
-            head = Head(views, widths, weights, torch.zeros(3), torch.tensor([0.4, 0.6]))
+            widths = [torch.cdist(view, view).square().median() for view in views]
+            widths += [torch.cdist(view, view, p=1).median() for view in views[:2]]
+            shares = torch.tensor([0.1, 0.4, 0.2, 0.3])
+            head = Head(views, ((2,), (0, 1, 2), (4,), (3, 4)), torch.stack(widths), weights, torch.zeros(3), shares)
         model = ReducedModel(network, fault_set, front, head).eval()
         Adaptation(model, fault_set, (Stage("fill", 0.1),), _validation=windows).save(home / name)
         add_onnx(home / name)

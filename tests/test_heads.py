@@ -185,6 +185,29 @@ def test_a_head_comes_back_from_its_state():
     assert torch.equal(again(held), head(held))
 
 
+def test_a_head_that_does_not_name_its_kernels_has_the_two_of_its_version():
+    views, _ = windows(30)
+    widths = torch.tensor([4.0, 5.0, 6.0])
+    weights = torch.randn(2, 30, 3, generator=torch.Generator().manual_seed(0))
+    head = empty_head({"known": [[30, 4]] * 3, "values": False}, 3)
+    parts = {"widths": widths, "weights": weights, "bias": torch.zeros(3), "shares": torch.tensor([0.3, 0.7])}
+    head.load_state_dict({**{f"known{i}": view for i, view in enumerate(views)}, **parts})
+    squares = [torch.cdist(view, view).square() / width for view, width in zip(views, widths, strict=True)]
+    expected = mixture([torch.exp(-squares[2]) @ weights[0], torch.exp(-sum(squares) / 3) @ weights[1]], head.shares)
+    torch.testing.assert_close(head(views), expected, atol=1e-4, rtol=0)
+
+
+def test_windows_that_differ_in_one_cell_are_told_apart_by_the_laplacian_kernels():
+    rng = np.random.default_rng(0)
+    cells = rng.random((400, 40)).astype(np.float32)
+    y = (cells[:, 0] > 0.5).astype(int) + 2 * (cells[:, 1] > 0.5)
+    views = [torch.zeros(400, 2), torch.from_numpy(cells), torch.zeros(400, 2)]
+    first, second = parts(views, 200)
+    head, outputs = fit_head(first, second, one_hot(y[:200], 4), one_hot(y[200:], 4), np.arange(200) % 5)
+    assert head.shares[2:].sum() > 0.5
+    assert (outputs.argmax(1).numpy() == y[200:]).mean() > 0.4  # 0.25 by chance
+
+
 @pytest.mark.parametrize(("forest", "logits"), [(True, "logits"), (False, "kernel_logits")])
 def test_a_head_of_an_earlier_version_gives_the_same_answers(forest, logits):
     with np.load(EARLIER) as stored:

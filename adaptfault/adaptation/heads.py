@@ -1,11 +1,12 @@
 """Heads fitted in closed form, without a gradient, to the features of the network and to the healthy cells.
 
 A head is a mixture of kernel ridge regressions on class indicators (as classifiers: Suykens and Vandewalle 1999) or on
-values. Each has a Gaussian kernel on some views of a window: the penultimate features of the network, the healthy
-cells, and these smoothed (:mod:`adaptfault.adaptation.cell_summary`). The network has seen its training windows, so its
-features tell them apart better than new ones; a kernel of the smoothed cells alone does not lean on them. The shares of
-the mixture are those with the highest likelihood of held-out windows (stacking of predictive distributions: Yao,
-Vehtari, Simpson and Gelman 2018).
+values. Each has a kernel of some views of a window: the penultimate features of the network, the healthy cells, and
+these smoothed (:mod:`adaptfault.adaptation.cell_summary`). A Gaussian kernel suits what changes smoothly with the
+readings, a Laplacian kernel what hangs on single cells: it is the limit of a forest of random trees (Balog,
+Lakshminarayanan, Ghahramani, Roy and Teh 2016). The network has seen its training windows, so its features tell them
+apart better than new ones; two of the kernels do not use them. The shares of the mixture are those with the highest
+likelihood of held-out windows (stacking of predictive distributions: Yao, Vehtari, Simpson and Gelman 2018).
 """
 
 from __future__ import annotations
@@ -24,8 +25,11 @@ from adaptfault.data.windows import evenly
 
 Views = Sequence[Tensor]
 
-_KERNELS = ((2,), (0, 1, 2))  # views of each: the smoothed cells; features, cells and smoothed cells
-_RIDGES = (0.05, 0.005, 0.0005)  # added to a kernel's diagonal, which is 1
+# Distances of a view (0: features, 1: cells, 2: smoothed cells), squared or absolute; kernels of these distances.
+_DISTANCES = ((0, True), (1, True), (2, True), (0, False), (1, False))
+_KERNELS = ((2,), (0, 1, 2), (4,), (3, 4))
+_EARLIER_KERNELS = _KERNELS[:2]  # of heads that do not store theirs
+_RIDGES = (0.2, 0.02, 0.002)  # added to a kernel's diagonal, which is 1
 _SAMPLE = 1_000  # windows on which widths and ridges are chosen
 _LINEAR_C = 0.3  # inverse strength of the linear head's ridge penalty
 _EM_STEPS = 100
@@ -38,7 +42,8 @@ class Head(nn.Module):
 
     Args:
         known: the three views of the M windows it was fitted on, each ``[M, p]``.
-        widths: of each view, a squared distance.
+        kernels: indices of the distances that each kernel adds.
+        widths: units of the distances.
         weights: ``[kernels, M, n]``.
         bias: ``[n]``.
         shares: of each kernel in the probabilities or values, summing to 1.
@@ -52,10 +57,18 @@ class Head(nn.Module):
     shares: Tensor
 
     def __init__(
-        self, known: Views, widths: Tensor, weights: Tensor, bias: Tensor, shares: Tensor, *, values: bool = False
+        self,
+        known: Views,
+        kernels: Sequence[Sequence[int]],
+        widths: Tensor,
+        weights: Tensor,
+        bias: Tensor,
+        shares: Tensor,
+        *,
+        values: bool = False,
     ) -> None:
         super().__init__()
-        self.values = values
+        self.kernels, self.values, self._views = kernels, values, len(known)
         for i, view in enumerate(known):
             self.register_buffer(f"known{i}", view)
         self.register_buffer("widths", widths)
@@ -66,30 +79,32 @@ class Head(nn.Module):
     @classmethod
     def empty(cls, about: Mapping[str, Any], n: int) -> Head:
         """Build a head to load a state into, from :attr:`about` and the number of classes or values."""
-        shapes, k = about["known"], len(_KERNELS)
-        known = list(starmap(torch.zeros, shapes))
-        weights, bias = torch.zeros(k, shapes[0][0], n), torch.zeros(n)
-        return cls(known, torch.zeros(len(shapes)), weights, bias, torch.zeros(k), values=about["values"])
+        shapes, kernels = about["known"], about.get("kernels", _EARLIER_KERNELS)
+        known, widths = list(starmap(torch.zeros, shapes)), torch.zeros(1 + max(map(max, kernels)))
+        weights, shares = torch.zeros(len(kernels), shapes[0][0], n), torch.zeros(len(kernels))
+        return cls(known, kernels, widths, weights, torch.zeros(n), shares, values=about["values"])
 
     @property
     def known(self) -> list[Tensor]:
         """The views of the windows it was fitted on."""
-        return [self.get_buffer(f"known{i}") for i in range(len(self.widths))]
+        return [self.get_buffer(f"known{i}") for i in range(self._views)]
 
     @property
     def about(self) -> dict[str, Any]:
         """Argument of :meth:`empty`; JSON-safe."""
-        return {"known": [list(view.shape) for view in self.known], "values": self.values}
+        kernels = [list(kernel) for kernel in self.kernels]
+        return {"known": [list(view.shape) for view in self.known], "kernels": kernels, "values": self.values}
 
     def forward(self, views: Views) -> Tensor:
         """Map views of N windows, each ``[N, p]``, to logits or values ``[N, n]``."""
         # Double precision: large weights of both signs nearly cancel; the error in single precision is up to 4e-4.
+        pairs = [(view.double(), known.double()) for view, known in zip(views, self.known, strict=True)]
         distances = [
-            _squared_distance(view.double(), known.double()) / width
-            for view, known, width in zip(views, self.known, self.widths, strict=True)
+            _distance(*pairs[view], squared=squared) / width
+            for (view, squared), width in zip(_DISTANCES, self.widths, strict=False)  # earlier heads: squared only
         ]
         outputs = [
-            _kernel(distances, of) @ weights.double() for of, weights in zip(_KERNELS, self.weights, strict=True)
+            _kernel(distances, of) @ weights.double() for of, weights in zip(self.kernels, self.weights, strict=True)
         ]
         return mixture([out + self.bias for out in outputs], self.shares, values=self.values).float()
 
@@ -176,8 +191,8 @@ def fit_head(
     m, n = len(training_targets), len(folds)
     few = np.concatenate([evenly(m, _SAMPLE), np.arange(m, m + n)])  # enough to compare ridges
     all_weights, all_held = [], []
-    for views in _KERNELS:
-        kernel = _kernel(distances, views)
+    for of in _KERNELS:
+        kernel = _kernel(distances, of)
         sample = kernel if len(few) == m + n else kernel[few][:, few]
         tried = [task.loss(ridge_regression(sample, targets[few], folds, ridge)[1].cpu()) for ridge in _RIDGES]
         weights, found = ridge_regression(kernel, targets, folds, _RIDGES[int(np.argmin(tried))])
@@ -185,7 +200,8 @@ def fit_head(
         all_weights.append(weights * scale.to(on))
         all_held.append(outputs)
     shares = task.shares(all_held)
-    head = Head(both, widths.to(on), torch.stack(all_weights), task.bias.to(on), shares.to(on), values=values)
+    weights = torch.stack(all_weights)
+    head = Head(both, _KERNELS, widths.to(on), weights, task.bias.to(on), shares.to(on), values=values)
     return head, mixture(all_held, shares, values=values)
 
 
@@ -247,18 +263,21 @@ class _Values:
 
 
 def _distances(views: Views) -> tuple[list[Tensor], Tensor]:
-    """Return the squared distances of the windows in each view, in units of their median, and the medians."""
-    distances = [_squared_distance(view, view) for view in views]
+    """Return all distances of the windows, in units of their medians, and the medians."""
+    distances = [
+        _distance(views[i], views[i], squared=True) if squared else _absolute_distances(views[i])
+        for i, squared in _DISTANCES
+    ]
     sample = evenly(len(views[0]), _SAMPLE)
     widths = [float(d[sample][:, sample].median()) or 1.0 for d in distances]
     return [d.div_(width) for d, width in zip(distances, widths, strict=True)], torch.tensor(widths)
 
 
-def _kernel(distances: Sequence[Tensor], views: Sequence[int]) -> Tensor:
-    """Return the Gaussian kernel of the mean distance in some views."""
-    total = distances[views[0]] * (-1 / len(views))
-    for view in views[1:]:
-        total.sub_(distances[view], alpha=1 / len(views))
+def _kernel(distances: Sequence[Tensor], of: Sequence[int]) -> Tensor:
+    """Return the kernel exp(-mean) of some distances: Gaussian of squared ones, Laplacian of absolute ones."""
+    total = distances[of[0]] * (-1 / len(of))
+    for i in of[1:]:
+        total.sub_(distances[i], alpha=1 / len(of))
     return total.exp_()
 
 
@@ -295,6 +314,18 @@ def linear_head(features: NDArray[np.float64], y: NDArray[np.int64], n_classes: 
     return weight, bias
 
 
-def _squared_distance(a: Tensor, b: Tensor) -> Tensor:
-    """Return the squared distances ``[N, M]`` of the rows of ``a [N, p]`` and ``b [M, p]``."""
+def _absolute_distances(x: Tensor) -> Tensor:
+    """Return the absolute distances ``[N, N]`` of the rows of ``x [N, p]``; ten times as fast as ``torch.cdist``."""
+    distances = x.new_zeros(len(x), len(x))
+    first, second = torch.triu_indices(len(x), len(x), 1, device=x.device)
+    distances[first, second] = nn.functional.pdist(x, p=1)
+    return distances.add_(distances.T.clone())
+
+
+def _distance(a: Tensor, b: Tensor, *, squared: bool) -> Tensor:
+    """Return the distances ``[N, M]`` of the rows of ``a [N, p]`` and ``b [M, p]``: sums of squares or of amounts."""
+    if not squared and torch.compiler.is_compiling():  # an export: ONNX has no cdist
+        return (a[:, None] - b).abs().sum(2)
+    if not squared:
+        return torch.cdist(a, b, p=1)
     return (a.square().sum(1)[:, None] + b.square().sum(1) - 2 * a @ b.T).clamp_min(0.0)

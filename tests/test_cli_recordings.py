@@ -136,7 +136,7 @@ def test_what_is_inferred_is_printed_once_and_what_is_stated_is_not(tmp_path, ca
     options = ["--shape", "6x5", "--full-scale", "2.5", "--unit", "V", "--rate", "10"]
     assert "inferred" not in run(capsys, "diagnose", tmp_path, *options)[2]
     code, _, said = run(capsys, "diagnose", tmp_path)
-    assert (code, "30 values a frame, expected 220" in said, "--shape" in said) == (3, True, True)
+    assert (code, "30 values a frame, and nothing states their rows" in said, "such as 5x6" in said) == (3, True, True)
 
 
 @pytest.mark.usefixtures("uncalibrated")
@@ -170,6 +170,7 @@ def test_diagnose_writes_a_page_with_the_verdict_first(file, tmp_path, capsys):
     [
         (["diagnose", "{file}", "--reference", "gone"], "gone: is not there"),
         (["train", "gone.npz", "--out", "m"], "gone.npz: is not there"),
+        (["diagnose", ""], "'': is not there"),  # not the current folder
         (["evaluate", "gone", "{file}"], "gone: is not there"),
         (["maintain", "gone", "{file}"], "gone: expected a bundle"),
         (["diagnose", "{file}", "--out", "gone/d.json"], "--out gone/d.json: the folder gone is not there"),
@@ -185,6 +186,15 @@ def test_bad_paths_are_refused_before_anything_heavy_is_imported(arguments, expe
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False, capture_output=True, text=True)
     assert done.returncode == 3
     assert expected in done.stderr
+
+
+def test_a_cell_that_always_reads_far_outside_the_range_is_a_fault_and_no_other_unit(file, skin, tmp_path, capsys):
+    frames = np.zeros((3, 24, 1, 6, 5), np.float32)
+    frames[..., 2, 3] = 1e30
+    np.savez(tmp_path / "idle.npz", frames=frames, full_scale=skin.layout.full_scale, rate=skin.layout.rate)
+    code, printed, told = run(capsys, "diagnose", tmp_path / "idle.npz", "--reference", file)
+    assert (code, "same unit" in told) == (1, False)
+    assert "row 2, column 3" in printed
 
 
 def test_the_version_and_the_help_are_printed_without_a_command(capsys):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.bag import STORAGES, read_bag
-from adaptfault.data.recordings.check import check_range, check_readings, check_width, other_lengths
+from adaptfault.data.recordings.check import check_range, check_readings, check_width, other_lengths, without_infinite
 from adaptfault.data.recordings.classes import class_indices, label_files
 from adaptfault.data.recordings.content import Content, Shape
 from adaptfault.data.recordings.csv_folder import read_csv
@@ -164,7 +164,7 @@ def _assemble(
         if not kept:
             continue
         usable.append(content)
-        readings = [content.frames[i] for i in kept]
+        readings = [without_infinite(content.frames[i]) for i in kept]
         if tables is not None:
             readings = [_calibrated(recording, tables, clamped) for recording in readings]
         readings = [recording.astype(np.float32, copy=False) for recording in readings]

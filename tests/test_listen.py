@@ -274,7 +274,15 @@ def wait_for(child, line, count):
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("end", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow), "quit"])
+@pytest.mark.parametrize(
+    "end",
+    [
+        pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+        signal.SIGHUP,
+        "quit",
+    ],
+)
 def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp_path, end):
     arguments = ["listen", "--port", "0", "--shape", "1x2x3", "--record", str(tmp_path), "--when", "command"]
     code = f"import sys; from adaptfault.cli import main; code = main({arguments!r})"
@@ -314,7 +322,7 @@ def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp
     assert (child.returncode, err) == (0, "")
     recorded, last = out.splitlines()
     assert "5 frames" in recorded
-    assert last == "end: 17 received, 17 kept, 1 devices, 1 restarts"
+    assert last == "end: 17 received, 17 kept, 1 device, 1 restart"
     recordings = load(tmp_path, layout=tmp_path / "layout.json").recordings
     first, second = (one[:, 0].tolist() for one in recordings.frames)
     assert (first[-5:], second) == ([1.0] * 5, [2.0] * 5)

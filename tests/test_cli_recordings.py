@@ -1,6 +1,9 @@
 """The commands that read, convert and simulate recordings, and what all commands do with paths and layouts."""
 
+import argparse
+import errno
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,10 +13,11 @@ import pytest
 
 from adaptfault import __version__
 from adaptfault.cli import main
+from adaptfault.cli.diagnose import _write as write_results
 from adaptfault.data.recordings import load, save_npz
 from adaptfault.data.simulated_grasps import simulate
 from adaptfault.data.summary import summarise
-from diagnostics import SensorLayout
+from diagnostics import SelfDiagnosis, SensorLayout
 
 SKIN = SensorLayout(1, 6, 5, full_scale=3.3, unit="V", rate=20)
 ROOT = Path(__file__).parents[1]
@@ -195,6 +199,21 @@ def test_a_cell_that_always_reads_far_outside_the_range_is_a_fault_and_no_other_
     code, printed, told = run(capsys, "diagnose", tmp_path / "idle.npz", "--reference", file)
     assert (code, "same unit" in told) == (1, False)
     assert "row 2, column 3" in printed
+
+
+def test_a_diagnosis_stays_whole_where_the_disk_is_full(skin, tmp_path, monkeypatch):
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    diagnosis = SelfDiagnosis(skin.layout).diagnose(skin.frames[:1])
+    arguments = argparse.Namespace(out=str(tmp_path / "d.json"), picture=None, html=None)
+    write_results(arguments, diagnosis, 0, [])
+    before = (tmp_path / "d.json").read_text()
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_results(arguments, diagnosis, 0, [])
+    assert (tmp_path / "d.json").read_text() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["d.json"]
 
 
 def test_the_version_and_the_help_are_printed_without_a_command(capsys):

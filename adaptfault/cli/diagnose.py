@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.options import (
@@ -98,8 +97,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _write(args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: list[str]) -> None:
     """Write the files that the options ask for; the page says what the exit code and the notes say."""
+    from adaptfault.data.atomic import atomic_write
+
     if args.out:
-        Path(args.out).write_text(json.dumps(diagnosis.to_dict(), allow_nan=False))
+        atomic_write(args.out, json.dumps(diagnosis.to_dict(), allow_nan=False).encode())
     if args.picture:
         diagnosis.plot().savefig(args.picture, dpi=150)
     if args.html:

@@ -200,6 +200,10 @@ def test_a_label_table_that_names_a_missing_file_is_told_and_the_rest_is_used(tm
         (["adapt", "{home}", "{home}/grasps.npz", "--faults", "1", "--out", "{home}/a"], "manifest.json"),
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--inject", "row:9:9=open"], "row:9:9=open"),
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--inject", "cell:0:0:0=stuck:9"], "outside 0..5"),
+        (
+            ["convert", "{home}/grasps.npz", "--out", "{home}/x.npz", "--inject", "cell:0:0:0=stuck:"],
+            "could not convert",
+        ),
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--inject", "melted"], "expected break the sensor"),
         (["adapt", "{home}/model", "{home}/grasps.npz", "--faults", "1"], "needs --out FOLDER or --forecast"),
         (["adapt", "{home}/model", "{home}/grasps.npz", "--forecast"], "nothing to do"),

@@ -14,6 +14,7 @@ import pytest
 from adaptfault import __version__
 from adaptfault.cli import main
 from adaptfault.cli.diagnose import _write as write_results
+from adaptfault.data.atomic import atomic_write
 from adaptfault.data.recordings import load, save_npz
 from adaptfault.data.simulated_grasps import simulate
 from adaptfault.data.summary import summarise
@@ -163,7 +164,7 @@ def test_diagnose_writes_a_page_with_the_verdict_first(file, tmp_path, capsys):
     page = tmp_path / "page.html"
     assert run(capsys, "diagnose", broken, "--reference", file, "--html", page)[0] == 2
     html = page.read_text()
-    assert "<h1>Call a technician</h1>" in html
+    assert ">Call a technician</h1>" in html
     assert html.index("Call a technician") < html.index("row 3 is short") < html.index("Verdicts")
     assert "not tested" in html
     assert "http" not in html.replace("http-equiv", "")
@@ -175,6 +176,8 @@ def test_diagnose_writes_a_page_with_the_verdict_first(file, tmp_path, capsys):
         (["diagnose", "{file}", "--reference", "gone"], "gone: is not there"),
         (["train", "gone.npz", "--out", "m"], "gone.npz: is not there"),
         (["diagnose", ""], "'': is not there"),  # not the current folder
+        (["maintain", "{file}", "{file}", "--report", ""], "expected a bundle"),
+        (["diagnose", "{file}", "--html", ""], "--html '': name a file"),
         (["evaluate", "gone", "{file}"], "gone: is not there"),
         (["maintain", "gone", "{file}"], "gone: expected a bundle"),
         (["diagnose", "{file}", "--out", "gone/d.json"], "--out gone/d.json: the folder gone is not there"),
@@ -199,6 +202,20 @@ def test_a_cell_that_always_reads_far_outside_the_range_is_a_fault_and_no_other_
     code, printed, told = run(capsys, "diagnose", tmp_path / "idle.npz", "--reference", file)
     assert (code, "same unit" in told) == (1, False)
     assert "row 2, column 3" in printed
+
+
+def test_a_simulation_that_would_fill_the_memory_is_refused(tmp_path, capsys):
+    code, _, told = run(capsys, "simulate", "--grasps", 10**9, "--out", tmp_path / "s.npz")
+    assert (code, "more than 2,147,483,648" in told, len(told.splitlines())) == (3, True, 1)
+
+
+def test_a_pipe_is_written_to_and_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    atomic_write(tmp_path / "pipe", b"page")
+    assert os.read(reader, 10) == b"page"
+    os.close(reader)
+    assert (tmp_path / "pipe").is_fifo()
 
 
 def test_a_diagnosis_stays_whole_where_the_disk_is_full(skin, tmp_path, monkeypatch):

@@ -288,6 +288,8 @@ def refuse_missing(args: argparse.Namespace) -> None:
         raise ValueError(f"{bundle}: {what}")
     for name in getattr(args, "writes", ()):
         path = getattr(args, name)
+        if path == "":  # as of a shell variable that is not set: nothing would be written
+            raise ValueError(f"--{name} '': name a file")
         folder = os.path.dirname(path) if path else ""
         if folder and not os.path.isdir(folder):
             raise ValueError(f"--{name} {path}: the folder {folder} is not there; create it first")

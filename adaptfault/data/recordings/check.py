@@ -15,15 +15,16 @@ from adaptfault.data.recordings.infer import GIVE_LAYOUT, SLACK, describe_width
 from diagnostics import SensorLayout
 
 
-def check_width(content: Content, layout: SensorLayout) -> None:
-    """Raise InputError if the frames of a file do not fit the layout."""
+def check_width(content: Content, layout: SensorLayout, stated: str = "") -> None:
+    """Raise InputError if the frames of a file do not fit the layout; ``stated`` names where the layout is from."""
     if content.shape is not None and content.shape != layout.shape:
         came, expected = (" x ".join(map(str, shape)) for shape in (content.shape, layout.shape))
-        what = f"frames of {came} (pads x rows x cols) where the layout has {expected}; {GIVE_LAYOUT}"
+        what = f"frames of {came} (pads x rows x cols) where the layout{stated} has {expected}; {GIVE_LAYOUT}"
         raise InputError.at(content.path, what)
     if content.width != layout.n_cells:
         expected = " x ".join(map(str, layout.shape))
-        what = f"{describe_width(content, layout.n_cells)}; the layout has {expected} cells, masked ones included"
+        width = describe_width(content, layout.n_cells)
+        what = f"{width}; the layout{stated} has {expected} cells, masked ones included"
         raise content.error(what, frame=0 if content.lines is not None else None)
 
 

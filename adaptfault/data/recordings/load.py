@@ -20,7 +20,7 @@ from adaptfault.data.recordings.csv_folder import read_csv
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.files import Found, find
-from adaptfault.data.recordings.layout_file import layout_beside
+from adaptfault.data.recordings.layout_file import LAYOUT_NAME, layout_beside
 from adaptfault.data.recordings.npz import read_npy, read_npz
 from adaptfault.data.recordings.resolve import Resolved, check_agreement, check_statements, given_array, resolve_layout
 from diagnostics import SensorLayout
@@ -112,7 +112,8 @@ def load(
             tables.check(resolved.layout)
         except ValueError as error:
             raise InputError(f"calibration: {error}") from None
-    return _assemble(contents, resolved, frames, tables, problems, strict=strict)
+    stated = f" of the {LAYOUT_NAME} beside the recordings" if layout is None and array is not None else ""
+    return _assemble(contents, resolved, frames, tables, problems, strict=strict, stated=stated)
 
 
 def _read(
@@ -140,6 +141,7 @@ def _assemble(
     problems: list[Problem],
     *,
     strict: bool,
+    stated: str,
 ) -> Loaded:
     """Check each file against the layout, calibrate it, and put the recordings of all together."""
     layout = resolved.layout
@@ -153,7 +155,7 @@ def _assemble(
     for file, content in contents:
         try:
             check_agreement(content, every, tables is not None)
-            check_width(content, layout)
+            check_width(content, layout, stated)
             if strict:
                 check_statements(content, layout, tables is not None)
         except InputError as error:

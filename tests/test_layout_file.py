@@ -20,7 +20,7 @@ def test_a_layout_beside_the_recordings_that_does_not_fit_is_named(tmp_path):
     write(tmp_path / "layout.json", json.dumps(SMALL.to_dict()))
     where = "where the layout of the layout.json beside the recordings has 1 x 2 x 3"
     assert where in refusal(archive(tmp_path / "a.npz", frames=counts(shape=(1, 3, 2))))
-    assert "beside" not in refusal(tmp_path / "a.npz", layout=SMALL)
+    assert "layout.json" not in refusal(tmp_path / "a.npz", layout=SMALL)
 
 
 def test_a_layout_file_is_read_and_its_scale_goes_before_the_archives(tmp_path):

@@ -117,7 +117,7 @@ class SensorLayout:
             object.__setattr__(self, name, number)
         if self.n_cells > _MOST_CELLS:
             raise ValueError(f"a layout has at most {_MOST_CELLS:,} cells; got {self.n_cells:,}")
-        if not isinstance(self.unit, str):
+        if not isinstance(self.unit, str) or not self.unit.isprintable():
             raise ValueError(f"a layout needs the name of a unit; got {self.unit!r}")
         present = np.ones(self.shape, bool) if self.present is None else np.array(self.present, bool)
         if self.axes > 1 and present.size * self.axes == self.n_cells:

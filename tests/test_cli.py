@@ -143,7 +143,6 @@ def errors_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         (lambda text: text.replace("\n", "\nabc,", 1).replace("abc,0.0000,", "abc,", 1), "line 2.*abc"),
         (lambda text: "", "empty"),
         (lambda text: text.replace("\n", ",1\n", 1), "line 1|line 2"),
-        (lambda text: text.replace("0.0000", "inf", 1), "inf"),
         (lambda text: "\x00\x01\x02", "not a text file"),
     ],
 )
@@ -201,6 +200,10 @@ def test_a_label_table_that_names_a_missing_file_is_told_and_the_rest_is_used(tm
         (["adapt", "{home}", "{home}/grasps.npz", "--faults", "1", "--out", "{home}/a"], "manifest.json"),
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--inject", "row:9:9=open"], "row:9:9=open"),
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--inject", "cell:0:0:0=stuck:9"], "outside 0..5"),
+        (
+            ["convert", "{home}/grasps.npz", "--out", "{home}/x.npz", "--inject", "cell:0:0:0=stuck:"],
+            "could not convert",
+        ),
         (["evaluate", "{home}/model", "{home}/grasps.npz", "--inject", "melted"], "expected break the sensor"),
         (["adapt", "{home}/model", "{home}/grasps.npz", "--faults", "1"], "needs --out FOLDER or --forecast"),
         (["adapt", "{home}/model", "{home}/grasps.npz", "--forecast"], "nothing to do"),
@@ -337,10 +340,13 @@ def test_diagnose_tells_of_a_change_of_the_whole_sensor(
     save_npz(tmp_path / "healthy.npz", small)
     for reference, gain in ((made_bundle, 1.0), (made_bundle, 0.2), (tmp_path / "healthy.npz", 0.2)):
         save_npz(tmp_path / "log.npz", Recordings(tuple(gain * r for r in later_grasps), SMALL))
-        code = main(["diagnose", str(tmp_path / "log.npz"), "--reference", str(reference), "--json", "--quiet"])
+        command = ["diagnose", str(tmp_path / "log.npz"), "--reference", str(reference), "--json", "--quiet"]
+        code = main([*command, "--html", str(tmp_path / "page.html")])
         change = json.loads(capsys.readouterr().out)["change"]
-        assert (code > 0) == (change is not None) == (gain < 1)
+        page = (tmp_path / "page.html").read_text()
+        assert (code > 0) == (change is not None) == ("Nothing to do" not in page) == (gain < 1)
     assert change["gain"] < 0.5
+    assert change["reason"][1:] in page
 
 
 @pytest.mark.parametrize(("what", "told"), [("strap", "pad 0 changed"), ("gloves", "sensor changed")])

@@ -1,6 +1,9 @@
 """The commands that read, convert and simulate recordings, and what all commands do with paths and layouts."""
 
+import argparse
+import errno
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,10 +13,12 @@ import pytest
 
 from adaptfault import __version__
 from adaptfault.cli import main
+from adaptfault.cli.diagnose import _write as write_results
+from adaptfault.data.atomic import atomic_write
 from adaptfault.data.recordings import load, save_npz
 from adaptfault.data.simulated_grasps import simulate
 from adaptfault.data.summary import summarise
-from diagnostics import SensorLayout
+from diagnostics import SelfDiagnosis, SensorLayout
 
 SKIN = SensorLayout(1, 6, 5, full_scale=3.3, unit="V", rate=20)
 ROOT = Path(__file__).parents[1]
@@ -136,7 +141,7 @@ def test_what_is_inferred_is_printed_once_and_what_is_stated_is_not(tmp_path, ca
     options = ["--shape", "6x5", "--full-scale", "2.5", "--unit", "V", "--rate", "10"]
     assert "inferred" not in run(capsys, "diagnose", tmp_path, *options)[2]
     code, _, said = run(capsys, "diagnose", tmp_path)
-    assert (code, "30 values a frame, expected 220" in said, "--shape" in said) == (3, True, True)
+    assert (code, "30 values a frame, and nothing states their rows" in said, "such as 5x6" in said) == (3, True, True)
 
 
 @pytest.mark.usefixtures("uncalibrated")
@@ -159,7 +164,7 @@ def test_diagnose_writes_a_page_with_the_verdict_first(file, tmp_path, capsys):
     page = tmp_path / "page.html"
     assert run(capsys, "diagnose", broken, "--reference", file, "--html", page)[0] == 2
     html = page.read_text()
-    assert "<h1>Call a technician</h1>" in html
+    assert ">Call a technician</h1>" in html
     assert html.index("Call a technician") < html.index("row 3 is short") < html.index("Verdicts")
     assert "not tested" in html
     assert "http" not in html.replace("http-equiv", "")
@@ -170,6 +175,9 @@ def test_diagnose_writes_a_page_with_the_verdict_first(file, tmp_path, capsys):
     [
         (["diagnose", "{file}", "--reference", "gone"], "gone: is not there"),
         (["train", "gone.npz", "--out", "m"], "gone.npz: is not there"),
+        (["diagnose", ""], "'': is not there"),  # not the current folder
+        (["maintain", "{file}", "{file}", "--report", ""], "expected a bundle"),
+        (["diagnose", "{file}", "--html", ""], "--html '': name a file"),
         (["evaluate", "gone", "{file}"], "gone: is not there"),
         (["maintain", "gone", "{file}"], "gone: expected a bundle"),
         (["diagnose", "{file}", "--out", "gone/d.json"], "--out gone/d.json: the folder gone is not there"),
@@ -185,6 +193,44 @@ def test_bad_paths_are_refused_before_anything_heavy_is_imported(arguments, expe
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False, capture_output=True, text=True)
     assert done.returncode == 3
     assert expected in done.stderr
+
+
+def test_a_cell_that_always_reads_far_outside_the_range_is_a_fault_and_no_other_unit(file, skin, tmp_path, capsys):
+    frames = np.zeros((3, 24, 1, 6, 5), np.float32)
+    frames[..., 2, 3] = 1e30
+    np.savez(tmp_path / "idle.npz", frames=frames, full_scale=skin.layout.full_scale, rate=skin.layout.rate)
+    code, printed, told = run(capsys, "diagnose", tmp_path / "idle.npz", "--reference", file)
+    assert (code, "same unit" in told) == (1, False)
+    assert "row 2, column 3" in printed
+
+
+def test_a_simulation_that_would_fill_the_memory_is_refused(tmp_path, capsys):
+    code, _, told = run(capsys, "simulate", "--grasps", 10**9, "--out", tmp_path / "s.npz")
+    assert (code, "more than 2,147,483,648" in told, len(told.splitlines())) == (3, True, 1)
+
+
+def test_a_pipe_is_written_to_and_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    atomic_write(tmp_path / "pipe", b"page")
+    assert os.read(reader, 10) == b"page"
+    os.close(reader)
+    assert (tmp_path / "pipe").is_fifo()
+
+
+def test_a_diagnosis_stays_whole_where_the_disk_is_full(skin, tmp_path, monkeypatch):
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    diagnosis = SelfDiagnosis(skin.layout).diagnose(skin.frames[:1])
+    arguments = argparse.Namespace(out=str(tmp_path / "d.json"), picture=None, html=None)
+    write_results(arguments, diagnosis, 0, [])
+    before = (tmp_path / "d.json").read_text()
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_results(arguments, diagnosis, 0, [])
+    assert (tmp_path / "d.json").read_text() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["d.json"]
 
 
 def test_the_version_and_the_help_are_printed_without_a_command(capsys):

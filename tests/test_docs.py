@@ -1,5 +1,6 @@
 """Blocks of Python and commands in the README and on the pages of docs/ run, and what the pages name exists."""
 
+import inspect
 import os
 import re
 import shlex
@@ -7,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 
@@ -17,9 +19,11 @@ from conftest import without_calibration, without_export, write_keys
 
 import adaptfault as af
 from adaptfault.cli import COMMANDS, main
-from adaptfault.data.recordings import Recordings, save_npz
+from adaptfault.data.recordings import Recordings, npz, save_npz
+from adaptfault.data.recordings.layout_file import read_layout
+from adaptfault.fleet import listing
 from adaptfault.robot.bundle import Bundle
-from diagnostics import FaultSet, inject
+from diagnostics import FaultSet, SensorLayout, inject
 
 HOME = Path(__file__).parents[1]
 GUIDES = [HOME / "README.md", *sorted((HOME / "docs").glob("*.md")), *sorted((HOME / "docs" / "methods").glob("*.md"))]
@@ -153,6 +157,24 @@ def test_benchmark_rows_and_arrays_that_the_results_name_exist():
     assert skins
     arrays = (HOME / "benchmarks" / "arrays.py").read_text()
     assert [skin for skin in skins if f'"{skin}"' not in sources + arrays] == []
+
+
+def test_the_page_of_formats_names_every_key_and_field_that_is_read(tmp_path):
+    page = HOME / "docs" / "file-formats.md"
+    layout_fields = {f.name for f in fields(SensorLayout)} | {"schema"}
+    beside = re.findall(r'beside\.get\("(\w+)"', inspect.getsource(npz))
+    assert len(beside) >= 6
+    read = {*npz._KEYS, *beside, *layout_fields, *listing._ENTRY, *listing._LISTING} - {"robots"}
+    assert sorted(name for name in read if not re.search(rf"`{name}`|^{name} = ", page.read_text(), re.MULTILINE)) == []
+    (entries, pattern), (_, layout) = blocks(page, "toml"), blocks(page, "json")
+    (tmp_path / "f.toml").write_text(entries)
+    assert listing.Fleet.read(tmp_path / "f.toml").robots[0].commissioned == "2025-03-01"
+    (tmp_path / "robots" / "r7" / "robot.bundle").mkdir(parents=True)
+    (tmp_path / "f.toml").write_text(pattern)
+    (robot,) = listing.Fleet.read(tmp_path / "f.toml").robots
+    assert (robot.name, robot.recordings) == ("r7", (str(tmp_path / "robots" / "r7" / "recordings" / "r7"),))
+    (tmp_path / "layout.json").write_text(layout)
+    assert str(read_layout(tmp_path / "layout.json")) == "1 x 6 x 9 cells, 0..3.3 V, 100 Hz"
 
 
 def test_tests_that_the_page_of_attacks_names_exist():

@@ -131,7 +131,7 @@ def test_a_fleet_is_maintained_through_the_command_line(made_bundle, later_grasp
     (tmp_path / "f.toml").write_text(listed)
     arguments = ["fleet", "maintain", str(tmp_path / "f.toml"), "--jobs", "1", "--limit", "600", "--quiet"]
     assert main(arguments) == 0
-    assert capsys.readouterr().out.startswith("ADAPTFAULT FLEET OK - 1 robots: 1 ok | ok=1;;;0;1 degraded=0")
+    assert capsys.readouterr().out.startswith("ADAPTFAULT FLEET OK - 1 robot: 1 ok | ok=1;;;0;1 degraded=0")
     assert len(Bundle.open(tmp_path / "r.bundle").journal.runs()) == 1
     assert main([*arguments, "--json"]) == 0  # the run ended: this is a new one, with nothing new to see
     document = json.loads(capsys.readouterr().out)

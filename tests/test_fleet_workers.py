@@ -91,6 +91,15 @@ def test_a_robot_that_crashes_is_an_error_with_one_worker_too():
     assert set(errors(done("a crash b", jobs=1))) == {"crash"}
 
 
+def test_an_address_without_a_port_is_refused_at_once():
+    pytest.importorskip("distributed")
+    with (
+        pytest.raises(ValueError, match="'bad': expected the address"),
+        engine(Task(work(), int), jobs=None, dask="bad"),
+    ):
+        pass
+
+
 def test_a_robot_that_kills_a_dask_worker_stops_no_other(cluster):
     found = errors(done("a b killer c d", dask=cluster))
     assert set(found) == {"killer"}, found

@@ -2,6 +2,7 @@ import shutil
 
 import pytest
 
+from adaptfault.robot.checksummed_json import Damaged
 from adaptfault.robot.journal import Journal
 
 
@@ -41,6 +42,16 @@ def test_every_damaged_byte_is_noticed_and_what_still_reads_is_kept(journal):
     journal.path.write_bytes(whole)
     assert journal.damage(repair=False) == []
     assert len(journal.runs()) == 2
+
+
+@pytest.mark.parametrize("content", [b"", b"x" * 5000])
+def test_reading_a_broken_journal_names_it_and_what_mends_it(journal, content):
+    journal.path.write_bytes(content)
+    for read in (journal.runs, journal.conditions, lambda: journal.last("version"), lambda: journal.seen(["aa"])):
+        if read == journal.conditions and not content:
+            continue  # SQLite reads an empty file as a database without tables
+        with pytest.raises(Damaged, match=r"journal.sqlite is damaged \(.*\); adaptfault maintain starts a new one"):
+            read()
 
 
 def test_a_broken_journal_is_set_aside_and_a_new_one_begun(journal, tmp_path):

@@ -66,6 +66,7 @@ def test_a_layout_survives_json():
         (lambda: SensorLayout(2, 3.5, 4), "rows >= 1"),
         (lambda: SensorLayout(2, 3, 4, full_scale=0), "full_scale > 0"),
         (lambda: SensorLayout(2, 3, 4, rate=float("nan")), "rate > 0"),
+        (lambda: SensorLayout(2, 3, 4, unit="N\n\x1b[31m"), "name of a unit"),
         (lambda: SensorLayout(2, 3, 4, present=np.ones(23, bool)), "one bool for each position"),
         (lambda: SensorLayout(2, 3, 4, present=np.zeros(24, bool)), "at least one cell"),
         (lambda: SensorLayout.from_dict({"pads": 2, "rows": 3}), "needs the field 'cols'"),

@@ -16,6 +16,13 @@ def test_a_layout_that_does_not_fit_says_both_shapes(tmp_path):
     assert "line 1: 7 values a frame, expected 6" in refusal(file, layout=SMALL)
 
 
+def test_a_layout_beside_the_recordings_that_does_not_fit_is_named(tmp_path):
+    write(tmp_path / "layout.json", json.dumps(SMALL.to_dict()))
+    where = "where the layout of the layout.json beside the recordings has 1 x 2 x 3"
+    assert where in refusal(archive(tmp_path / "a.npz", frames=counts(shape=(1, 3, 2))))
+    assert "layout.json" not in refusal(tmp_path / "a.npz", layout=SMALL)
+
+
 def test_a_layout_file_is_read_and_its_scale_goes_before_the_archives(tmp_path):
     layout = SensorLayout(1, 2, 3, full_scale=500, unit="count", rate=20, present=[[[1, 1, 1], [1, 1, 0]]])
     path = write(tmp_path / "layout.json", json.dumps(layout.to_dict()))

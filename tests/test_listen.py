@@ -274,7 +274,15 @@ def wait_for(child, line, count):
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("end", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow), "quit"])
+@pytest.mark.parametrize(
+    "end",
+    [
+        pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+        signal.SIGHUP,
+        "quit",
+    ],
+)
 def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp_path, end):
     arguments = ["listen", "--port", "0", "--shape", "1x2x3", "--record", str(tmp_path), "--when", "command"]
     code = f"import sys; from adaptfault.cli import main; code = main({arguments!r})"
@@ -314,7 +322,7 @@ def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp
     assert (child.returncode, err) == (0, "")
     recorded, last = out.splitlines()
     assert "5 frames" in recorded
-    assert last == "end: 17 received, 17 kept, 1 devices, 1 restarts"
+    assert last == "end: 17 received, 17 kept, 1 device, 1 restart"
     recordings = load(tmp_path, layout=tmp_path / "layout.json").recordings
     first, second = (one[:, 0].tolist() for one in recordings.frames)
     assert (first[-5:], second) == ([1.0] * 5, [2.0] * 5)
@@ -375,6 +383,11 @@ def test_it_quits_while_10000_packets_a_second_arrive():
         (["--port", "0", "--record", "{tmp}/file/new"], "Not a directory"),
         (["--port", "0", "--host", "256.1.1.1", "--seconds", "1"], ""),
         (["--port", "0", "--ticks", "0"], "--ticks 0"),
+        (["--port", "0", "--ticks", "inf"], "--ticks inf"),
+        (["--port", "0", "--seconds", "nan"], "--seconds nan"),
+        (["--port", "0", "--frames", "0"], "--frames 0"),
+        (["--port", "0", "--record", ""], "--record '': name a folder"),
+        (["", "--port", "0"], ": expected a bundle"),
         (["--port", "0", "--rate", "-1"], "rate > 0"),
         (["--port", "0", "--layout", "{tmp}/gone.json"], "gone.json"),
     ],

@@ -121,6 +121,17 @@ def test_a_malformed_version_gives_way_to_the_one_before(bundle):
     assert bundle.active().number == 1
 
 
+@pytest.mark.parametrize("name", ["bundle.json", "current.json"])
+def test_a_document_that_is_a_pipe_or_nests_too_deep_gives_way_to_its_copy(bundle, name):
+    path = bundle.path / name
+    path.write_text("[" * 100_000)
+    assert bundle.active().number == Bundle.open(bundle.path).active().number == 1
+    path.unlink()
+    assert bundle.active().number == Bundle.open(bundle.path).active().number == 1
+    os.mkfifo(path)
+    assert bundle.active().number == Bundle.open(bundle.path).active().number == 1
+
+
 def test_stray_files_where_folders_are_expected_are_passed_over(bundle, later_grasps):
     versions = bundle.path / "versions"
     (versions / "0007").write_text("stray")

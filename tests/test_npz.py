@@ -207,6 +207,10 @@ def test_labels_may_be_text_or_numbers_without_names(tmp_path):
         ({"frames": counts(), "class_names": 5}, "expected a list of text"),
         ({"frames": counts(), "names": ["a"]}, "array 'names' has 1 entries for 3 recordings"),
         ({"frames": counts(), "present": np.ones((1, 3), bool)}, "'present' is bool [1, 3]; expected bool [1, 2, 3]"),
+        (
+            {"frames": counts(), "present": np.ones((1, 3, 2), bool)},
+            "'present' is bool [1, 3, 2]; expected bool [1, 2, 3]",
+        ),
         ({"frames": counts(), "factory_mask": np.zeros((1, 2, 3), bool)}, "'factory_mask' is False everywhere"),
         ({"frames": counts(), "rate": -1.0}, "rate is -1.0; expected one number above 0"),
         ({"frames": counts(), "full_scale": np.nan}, "full_scale is nan"),
@@ -222,12 +226,16 @@ def test_a_bad_archive_is_refused_with_the_array_and_the_mend(tmp_path, arrays, 
 
 def test_single_recordings_of_an_archive_can_be_bad(tmp_path):
     values = counts().astype(float) / 250
-    values[1, 2, 0, 1, 1] = np.inf
+    values[2, 2, 0, 1, 1] = np.inf
     values[2, 7] = np.nan  # behind its length
-    loaded = load(archive(tmp_path / "a.npz", frames=values, lengths=[8, 8, 7]))
-    assert loaded.recordings.names == (f"{tmp_path / 'a.npz'}, recording 0", f"{tmp_path / 'a.npz'}, recording 2")
-    (problem,) = loaded.problems
-    assert problem.message.startswith(f"{tmp_path / 'a.npz'}, recording 1, frame 2: value 5 is infinite or too large;")
+    path = archive(tmp_path / "a.npz", frames=values, lengths=[8, 0, 7])
+    loaded = load(path)
+    assert loaded.recordings.names == (f"{path}, recording 0", f"{path}, recording 2")
+    assert [str(problem) for problem in loaded.problems] == [
+        f"error: {path}, recording 1: holds no frames; record it again or remove it",
+        f"warning: {path}: 1 infinite reading, first in recording 2, frame 2: taken as missing",
+    ]
+    assert np.argwhere(np.isnan(loaded.recordings.frames[1])).tolist() == [[2, 4]]
 
 
 def test_gaps_at_positions_without_a_cell_are_no_problem(tmp_path):
@@ -243,8 +251,18 @@ def test_a_flat_archive_takes_its_shape_from_the_mask_or_the_layout(tmp_path):
     masked = archive(tmp_path / "c.npz", frames=flat, present=np.ones((3, 2, 1), bool))
     assert load(masked).recordings.layout.shape == (3, 2, 1)
     message = refusal(tmp_path / "a.npz")
-    assert "6 values a frame, expected 220 (the paper's sensor); for another array give the layout" in message
-    assert "--layout FILE or --shape 2x13x6" in message
+    assert (
+        "6 values a frame, and nothing states their rows and columns; give --shape (rows x columns, such as" in message
+    )
+    assert "such as 2x3) or --layout FILE" in message
+
+
+def test_frames_whose_first_column_counts_are_refused_with_the_mend(tmp_path):
+    (tmp_path / "a.csv").write_text("".join(f"{i},{i % 3},2,3,4,{i % 5},6\n" for i in range(9)))
+    message = refusal(tmp_path / "a.csv")
+    assert "7 values a frame" in message
+    assert "the first column rises from line to line" in message
+    assert "such as 2x3" in message
 
 
 @pytest.mark.parametrize("shape", [(4, 5, 6), (5, 6), (4, 5, 1, 2, 3), (5, 1, 2, 3)])

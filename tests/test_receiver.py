@@ -278,5 +278,5 @@ def test_a_port_in_use_is_an_os_error_and_nothing_is_left_open():
 
 
 def test_counters_print_only_what_happened():
-    assert str(Counters(received=5, kept=4, malformed=1, devices=1)) == "5 received, 4 kept, 1 malformed, 1 devices"
+    assert str(Counters(received=5, kept=4, malformed=1, devices=1)) == "5 received, 4 kept, 1 malformed, 1 device"
     assert Counters().to_dict()["received"] == 0

@@ -109,6 +109,19 @@ def test_a_recorder_that_was_killed_leaves_a_recording_that_can_be_read(tmp_path
     np.testing.assert_array_equal(frames[:, 0], np.arange(len(frames)) % 4000)
 
 
+def test_a_disk_that_is_full_at_the_start_may_have_room_later(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with Recorder(tmp_path, SMALL) as recorder:
+        with pytest.raises(OSError, match="No space left"):
+            recorder.write(np.zeros(6), 0.0)
+        monkeypatch.undo()
+        recorder.write(np.ones(6), 5.0)
+    assert [len(one) for one in again(tmp_path).recordings.frames] == [1]
+
+
 def test_a_full_disk_is_an_os_error_and_what_was_written_stays(tmp_path, monkeypatch):
     with Recorder(tmp_path, SMALL) as recorder:
         recorder.write(np.zeros(6), 0.0)

@@ -51,6 +51,24 @@ def test_a_page_without_a_fault_says_how_many_cells_were_not_tested(tmp_path):
     assert "<b>85 %</b><span>of the cells tested" in page
 
 
+@pytest.mark.parametrize(
+    ("faults", "code", "note", "headline"),
+    [
+        ((ROW,), 1, "handled: version 2 runs", "Watch: the running version handles the faults"),
+        ((), 1, "the sensor changed", "No fault found, but see the reason"),
+        ((), 2, "rows 1 and 2 are exchanged", "Call a technician"),
+        ((CELL,), None, "", "Watch: single cells are faulty"),
+    ],
+)
+def test_the_page_says_what_the_exit_code_and_the_notes_say(tmp_path, faults, code, note, headline):
+    notes = [note] if note else []
+    page = write_diagnosis(
+        tmp_path / "page.html", diagnosed(*faults), name="log", reference=True, code=code, notes=notes
+    ).read_text()
+    assert f">{headline}</h1>" in page
+    assert note[1:] in page.split("<h2>")[0]
+
+
 def test_the_fault_set_holds_the_cells_of_all_faults():
     assert diagnosed(ROW, CELL).fault_set == {5, 6, 7, 8, 9, 30}
     assert len(diagnosed().fault_set) == 0

@@ -8,9 +8,11 @@ import zipfile
 import numpy as np
 import pytest
 
+from adaptfault.acquisition import read_key
 from adaptfault.data.calibration import Calibration
 from adaptfault.data.recordings import InputError, load
 from adaptfault.data.recordings.blocks import Stream
+from adaptfault.fleet.listing import Fleet
 
 
 def header(shape, kind) -> bytes:
@@ -75,11 +77,23 @@ def test_one_bad_file_does_not_end_a_run_in_blocks(tmp_path, name, make):
     ]
 
 
-def test_a_pipe_and_a_device_are_no_tables(tmp_path):
-    os.mkfifo(tmp_path / "pipe.csv")
-    for path in (tmp_path / "pipe.csv", "/dev/zero"):
+def private_key(path):
+    pytest.importorskip("cryptography")
+    from adaptfault.robot.signature import read_private_key
+
+    read_private_key(path)
+
+
+@pytest.mark.parametrize("read", [Calibration.read, Fleet.read, read_key, private_key])
+def test_a_pipe_and_a_device_are_no_documents(tmp_path, read):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", "/dev/zero"):
         with pytest.raises(InputError, match="is not a regular file"):
-            Calibration.read(path)
+            read(path)
+
+
+def test_a_pipe_is_no_recording(tmp_path):
+    os.mkfifo(tmp_path / "pipe.csv")
     with pytest.raises(InputError, match="no recording"):
         load(tmp_path / "pipe.csv")
 

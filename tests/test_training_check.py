@@ -47,4 +47,8 @@ def test_the_picture_shows_every_class_and_every_epoch():
     loss, accuracy, confusion, _ = figure.axes
     assert [len(line.get_xdata()) for line in loss.lines] == [3, 3]
     assert len(accuracy.lines[0].get_xdata()) == 3
+    assert [line.get_label() for line in accuracy.lines] == [
+        "validation, network in training",
+        "test, finished model: 0.840",
+    ]
     assert [tick.get_text() for tick in confusion.get_xticklabels()] == list(NAMES)

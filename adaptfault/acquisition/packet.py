@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from adaptfault.data.recordings.sizes import check_file
+
 TICKS = 1000.0
 """Time stamps count milliseconds, as the ESP32's ``millis()`` does."""
 
@@ -62,9 +64,10 @@ def read_key(path: str | os.PathLike[str]) -> bytes:
     """Return the key in a file, without white space at its ends.
 
     Raises:
-        ValueError: it is shorter than 16 bytes.
+        ValueError: it is shorter than 16 bytes, or no regular file (a pipe or a device may have no end).
         OSError: the file cannot be read.
     """
+    check_file(Path(path))
     key = Path(path).read_bytes().strip()
     if len(key) < _SHORTEST_KEY:
         raise ValueError(f"{path}: a key of {len(key)} bytes, expected {_SHORTEST_KEY} or more; openssl rand -hex 32")

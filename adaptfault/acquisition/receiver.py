@@ -61,7 +61,10 @@ class Counters:
     def __str__(self) -> str:
         named = {f.name: getattr(self, f.name) for f in fields(self)}
         head = f"{named.pop('received')} received, {named.pop('kept')} kept"
-        return ", ".join([head, *(f"{count} {name}" for name, count in named.items() if count)])
+        counted = (
+            f"{count} {name.removesuffix('s') if count == 1 else name}" for name, count in named.items() if count
+        )
+        return ", ".join([head, *counted])
 
     def to_dict(self) -> dict[str, int]:
         """Return a JSON-safe dict."""

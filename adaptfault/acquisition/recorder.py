@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import time
@@ -72,7 +73,11 @@ class Recorder:
         self.folder, self.layout, self.device = Path(folder), layout, device
         self.longest, self.interval = longest, interval
         make_folder(self.folder)
-        _write_layout(self.folder / "layout.json", layout)
+        try:
+            _write_layout(self.folder / "layout.json", layout)
+        except OSError as error:
+            if error.errno != errno.ENOSPC:  # a full disk may have room when the first recording begins
+                raise
         self._file: TextIO | None = None
         self._path = self.folder
         self._first = self._last = 0.0
@@ -139,6 +144,7 @@ class Recorder:
             self._disk.shutdown()
 
     def _open(self, at: float) -> TextIO:
+        _write_layout(self.folder / "layout.json", self.layout)
         began = datetime.now(timezone.utc)
         number = 0
         while True:  # after the clock is set back a name may exist already

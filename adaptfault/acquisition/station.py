@@ -41,7 +41,8 @@ class Station:
     """Monitors, classifies (with a bundle) and records every device that sends.
 
     Events go to stdout, one line each; the counters of all datagrams are the last line. It ends after ``seconds`` or
-    ``frames``, on SIGINT or SIGTERM, and on "quit" from stdin ("record", "stop" and "auto" switch the recording).
+    ``frames``, on SIGINT, SIGTERM or SIGHUP, and on "quit" from stdin ("record", "stop" and "auto" switch the
+    recording).
 
     Args:
         layout: the array; None: the bundle's.
@@ -121,7 +122,8 @@ class Station:
         try:
             async with self.receiver as receiver:
                 self._say(f"listening on {receiver.host}, port {receiver.port}, for {self.layout}")
-                for number in (signal.SIGINT, signal.SIGTERM):
+                ends = (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM))  # Windows has none
+                for number in ends:
                     with suppress(NotImplementedError, RuntimeError, ValueError):  # not in the main thread; Windows
                         loop.add_signal_handler(number, receiver.close)
                 if self.seconds is not None:

@@ -87,6 +87,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"adaptfault {args.command}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_INPUT
+    except MemoryError as error:
+        print(f"adaptfault {args.command}: error: not enough memory ({error})", file=sys.stderr)
+        return BAD_INPUT
     except KeyboardInterrupt:
         print(f"adaptfault {args.command}: interrupted", file=sys.stderr)
         return 130

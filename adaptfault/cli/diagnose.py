@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.options import (
@@ -81,31 +80,34 @@ def run(args: argparse.Namespace) -> int:
     if rewiring is not None:
         source = rewiring.undo(np.arange(log.layout.n_cells)[source])
     diagnosis, change = _diagnosed(args, diagnoser, log, source, reference)
-    _write(args, diagnosis)
-    code, why = _severity(diagnosis, bundle, args.untested_code)
+    code, notes = _severity(diagnosis, bundle, args.untested_code)
     if change is not None:
-        code, why = max(code, 1), f"{why}\n{change.reason}"
+        code, notes = max(code, 1), [*notes, change.reason]
     if rewiring is not None:
-        code, why = max(code, 2), f"{why}\n{rewiring.reason}; the verdicts are those with the readings put back"
+        code, notes = max(code, 2), [*notes, f"{rewiring.reason}; the verdicts are those with the readings put back"]
+    _write(args, diagnosis, code, notes)
     found = {
         **diagnosis.to_dict(),
         "rewiring": [] if rewiring is None else list(rewiring.steps),
         "change": None if change is None else vars(change),
     }
-    emit(args, found, text_of(diagnosis) + why)
+    emit(args, found, "\n".join([text_of(diagnosis), *notes]))
     return code
 
 
-def _write(args: argparse.Namespace, diagnosis: Diagnosis) -> None:
-    """Write the files that the options ask for."""
+def _write(args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: list[str]) -> None:
+    """Write the files that the options ask for; the page says what the exit code and the notes say."""
+    from adaptfault.data.atomic import atomic_write
+
     if args.out:
-        Path(args.out).write_text(json.dumps(diagnosis.to_dict(), allow_nan=False))
+        atomic_write(args.out, json.dumps(diagnosis.to_dict(), allow_nan=False).encode())
     if args.picture:
         diagnosis.plot().savefig(args.picture, dpi=150)
     if args.html:
         from adaptfault.evaluation.html_diagnosis import write_diagnosis
 
-        write_diagnosis(args.html, diagnosis, name=", ".join(args.recordings), reference=bool(args.reference))
+        name, reference = ", ".join(args.recordings), bool(args.reference)
+        write_diagnosis(args.html, diagnosis, name=name, reference=reference, code=code, notes=notes)
 
 
 def _rewiring(
@@ -130,18 +132,18 @@ def _bundle(args: argparse.Namespace) -> Bundle | None:
     return None
 
 
-def _severity(diagnosis: Diagnosis, bundle: Bundle | None, untested_code: int) -> tuple[int, str]:
-    """Return the exit code, and a line where it is another one than that of the faults."""
+def _severity(diagnosis: Diagnosis, bundle: Bundle | None, untested_code: int) -> tuple[int, list[str]]:
+    """Return the exit code, and a sentence where it is another one than that of the faults."""
     from adaptfault.robot.sensor_state import UNTESTED, SensorState, unhandled_cells
 
     code, share = diagnosis.exit_code, diagnosis.coverage.test_coverage
     if code == 0 and share < UNTESTED:
-        return untested_code, f"\nonly {share:.0%} of the cells were tested, so faults may be hidden"
+        return untested_code, [f"only {share:.0%} of the cells were tested, so faults may be hidden"]
     if code == 2 and bundle is not None:
         version = bundle.active()
         if not unhandled_cells(bundle, diagnosis.fault_set, version) and SensorState.of(bundle).exit_code < 2:
-            return 1, f"\nhandled: version {version.number} of {bundle.path} runs without these cells"
-    return code, ""
+            return 1, [f"handled: version {version.number} of {bundle.path} runs without these cells"]
+    return code, []
 
 
 def _change(

@@ -53,11 +53,11 @@ def parse_faults(texts: Sequence[str], layout: SensorLayout, rng: np.random.Gene
 def _kind(how: str, layout: SensorLayout) -> tuple[FaultKind, float | None]:
     from diagnostics import FaultKind
 
-    name, _, number = how.partition(":")
+    name, colon, number = how.partition(":")
     kind = FaultKind(name)
     if kind not in (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK):
         raise ValueError(f"{kind} needs more than a value")
-    if not number:
+    if not colon:
         return kind, layout.full_scale / 2 if kind is FaultKind.STUCK else None
     value = float(number)
     if not 0 <= value <= layout.full_scale:

@@ -64,8 +64,13 @@ def _station(args: argparse.Namespace) -> Station:
         raise ValueError("--trust needs BUNDLE: its signature is checked")
     if not 0 <= args.port < 65536:
         raise ValueError(f"--port {args.port}: expected 0 to 65535")
-    if not args.ticks > 0:
+    if not 0 < args.ticks < float("inf"):
         raise ValueError(f"--ticks {args.ticks:g}: expected a number above 0")
+    for name in ("seconds", "frames"):
+        if (end := getattr(args, name)) is not None and not end > 0:
+            raise ValueError(f"--{name} {end:g}: expected a number above 0")
+    if args.record == "":  # as of a shell variable that is not set: nothing would be recorded
+        raise ValueError("--record '': name a folder")
     table = args.calibration
     if args.bundle and not table:
         from adaptfault.robot.bundle import Bundle

@@ -252,7 +252,12 @@ def _check_scale(path: str, recordings: Recordings) -> None:
     import numpy as np
 
     layout = recordings.layout
-    readings = np.concatenate([frames[frames > 0] for frames in recordings])
+    # A cell that reads the same all the time shows no unit: it may be broken.
+    moving = [
+        frames[:, np.nanmin(frames, axis=0, initial=np.inf) < np.nanmax(frames, axis=0, initial=-np.inf)]
+        for frames in recordings
+    ]
+    readings = np.concatenate([frames[frames > 0] for frames in moving])
     if not readings.size:
         return
     full, largest = layout.full_scale, float(readings.max())
@@ -274,18 +279,25 @@ def refuse_missing(args: argparse.Namespace) -> None:
     many = [path for name in ("recordings", "reference", "trust") for path in getattr(args, name, None) or []]
     names = ("labels", "layout", "calibration", "adapted", "model", "fleet", "sign")
     one = [getattr(args, name, None) for name in names]
-    for path in filter(None, [*many, *one]):
-        if not os.path.lexists(path):
-            raise ValueError(f"{path}: is not there; check the path")
+    for path in (path for path in (*many, *one) if path is not None):
+        if not os.path.lexists(path):  # an empty path, as of a shell variable that is not set, is none either
+            raise ValueError(f"{path or repr(path)}: is not there; check the path")
     bundle = getattr(args, "bundle", None)
-    if bundle and not os.path.isfile(os.path.join(bundle, "bundle.json")):
+    if bundle is not None and not is_bundle(bundle):
         what = "expected a bundle, a folder with bundle.json; adaptfault train --out X.bundle makes one"
         raise ValueError(f"{bundle}: {what}")
     for name in getattr(args, "writes", ()):
         path = getattr(args, name)
+        if path == "":  # as of a shell variable that is not set: nothing would be written
+            raise ValueError(f"--{name} '': name a file")
         folder = os.path.dirname(path) if path else ""
         if folder and not os.path.isdir(folder):
             raise ValueError(f"--{name} {path}: the folder {folder} is not there; create it first")
+
+
+def is_bundle(folder: str | os.PathLike[str]) -> bool:
+    """Return whether a folder holds the document of a bundle, or its copy."""
+    return any(os.path.isfile(os.path.join(folder, name)) for name in ("bundle.json", "bundle.copy.json"))
 
 
 def fault_set(text: str, layout: SensorLayout) -> FaultSet:
@@ -304,12 +316,13 @@ def fault_set(text: str, layout: SensorLayout) -> FaultSet:
 
 
 def _diagnosed(path: Path, layout: SensorLayout) -> FaultSet:
+    from adaptfault.data.recordings.text import read_json_object
     from diagnostics import Diagnosis
 
     if not path.is_file():
         raise ValueError(f"--faults {path}: no such file, and not cell indices as 3,17,200")
     try:
-        diagnosis = Diagnosis.from_dict(json.loads(path.read_text()))
+        diagnosis = Diagnosis.from_dict(read_json_object(path))
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a diagnosis ({error}); write one with adaptfault diagnose --out") from None
     if diagnosis.layout.shape != layout.shape:

@@ -31,16 +31,20 @@ def add(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Simulate and write."""
     from adaptfault.data.recordings import save
+    from adaptfault.data.recordings.sizes import MOST_BYTES
     from adaptfault.data.simulated_grasps import CLASS_NAMES, simulate
 
     layout = layout_of(args)
+    classes = args.classes or CLASS_NAMES
+    if (size := 4 * len(classes) * args.grasps * args.frames * layout.n_cells) > MOST_BYTES:
+        raise ValueError(f"--grasps {args.grasps} --frames {args.frames}: {size:,} bytes, more than {MOST_BYTES:,}")
     say(args, f"simulating {args.grasps} grasps of each class on {layout}")
     recordings = simulate(
         args.grasps,
         layout,
         n_frames=args.frames,
         seed=args.seed,
-        classes=args.classes or CLASS_NAMES,
+        classes=classes,
         sensor_seed=args.sensor_seed,
     )
     recordings = select(args, recordings)

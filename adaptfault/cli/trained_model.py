@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adaptfault.adaptation.fault_free import Network
 from adaptfault.adaptation.result import Adaptation
-from adaptfault.cli.options import load_recordings, say, trust
+from adaptfault.cli.options import is_bundle, load_recordings, say, trust
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, make_windows, split
 from adaptfault.models.store import SCHEMA, load_healthy, read_manifest
@@ -121,7 +121,7 @@ def open_bundle(args: argparse.Namespace, folder: str) -> Bundle | None:
         FileNotFoundError, ValueError: the bundle is damaged or not signed by a trusted key; or no bundle, with --trust.
     """
     trusted = trust(args)
-    if not (Path(folder) / "bundle.json").is_file():
+    if not is_bundle(folder):
         if trusted["keys"]:
             raise ValueError(f"--trust: {folder} is no bundle, and only bundles are signed")
         return None

@@ -12,10 +12,15 @@ from pathlib import Path
 def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
     """Write a file so that after any crash, power loss included, it holds the old content or the new, never a part.
 
+    A device or a pipe is written to, not replaced.
+
     Raises:
         OSError: the folder does not exist or cannot be written; nothing is left behind.
     """
     path = Path(path)
+    if path.exists() and not path.is_file() and not path.is_dir():  # renaming a file to /dev/null would end it
+        path.write_bytes(data)
+        return
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with open(descriptor, "wb") as file:

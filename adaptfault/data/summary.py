@@ -77,9 +77,10 @@ class Summary:
         layout, present = self.layout, self.layout.present.ravel()
         least, most = int(self.lengths.min()), int(self.lengths.max())
         missing = int(self.missing[present].sum())
-        frames = f"{least} frames" if least == most else f"{least} to {most} frames"
+        each = " each" * (len(self.lengths) > 1)
+        frames = f"{least} frame{'s' * (least != 1)}{each}" if least == most else f"{least} to {most} frames each"
         rows = {
-            "recordings": f"{len(self.lengths)} of {frames} each, {self.lengths.sum() / layout.rate:.0f} s in all",
+            "recordings": f"{len(self.lengths)} of {frames}, {self.lengths.sum() / layout.rate:.0f} s in all",
             "array": str(layout),
             "readings": self._readings(),
             "rest level": f"{_number(_median(self.rest[present]))} (median over the cells)",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Literal
@@ -20,17 +21,27 @@ HEADLINES: dict[Verdict, str] = {
 _TESTED = 0.5  # below this share of tested cells, a log without a fault is no proof of health
 
 
-def verdict(diagnosis: Diagnosis) -> Verdict:
+def verdict(diagnosis: Diagnosis, code: int | None = None) -> Verdict:
     """Return the verdict of a diagnosis: ``"call"`` for a wire or a tenth of the cells, ``"watch"`` for single cells.
 
-    A log without a fault that tested less than half of the cells gives ``"watch"`` as well.
+    A log without a fault that tested less than half of the cells gives ``"watch"`` as well. ``code`` is the exit code
+    of ``adaptfault diagnose``, where more is known than the faults: 2 gives ``"call"``, 1 at least ``"watch"``.
     """
-    if diagnosis.exit_code >= 2:
+    code = diagnosis.exit_code if code is None else code
+    if code >= 2:
         return "call"
-    return "watch" if diagnosis.faults or diagnosis.coverage.test_coverage < _TESTED else "nothing"
+    return "watch" if code or diagnosis.faults or diagnosis.coverage.test_coverage < _TESTED else "nothing"
 
 
-def write_diagnosis(path: str | Path, diagnosis: Diagnosis, *, name: str, reference: bool) -> Path:
+def write_diagnosis(
+    path: str | Path,
+    diagnosis: Diagnosis,
+    *,
+    name: str,
+    reference: bool,
+    code: int | None = None,
+    notes: Sequence[str] = (),
+) -> Path:
     """Write the page; return its path.
 
     Args:
@@ -38,19 +49,25 @@ def write_diagnosis(path: str | Path, diagnosis: Diagnosis, *, name: str, refere
         diagnosis: what to show.
         name: of the log.
         reference: whether the diagnosis had fault-free recordings to compare with.
+        code: the exit code of the command; None: that of the diagnosis.
+        notes: sentences below the verdict: a changed sensor, exchanged wires, faults that are handled.
 
     Raises:
         OSError: the folder cannot be written.
     """
-    state = verdict(diagnosis)
+    state = verdict(diagnosis, code)
     headline = HEADLINES[state]
-    if state == "watch" and not diagnosis.faults:
-        headline = "No fault found, but most cells were not tested"
+    if state == "watch" and diagnosis.faults and code is not None and code < diagnosis.exit_code:
+        headline = "Watch: the running version handles the faults"
+    elif state == "watch" and not diagnosis.faults:
+        untested = diagnosis.coverage.test_coverage < _TESTED
+        headline = "No fault found, but " + ("most cells were not tested" if untested else "see the reason")
     return render(
         path,
         "diagnosis.html",
         name=name,
         state=state,
+        notes=[note[0].upper() + note[1:] for note in notes],
         headline=headline,
         diagnosis=diagnosis,
         layout=diagnosis.layout,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +23,7 @@ Engine = Callable[[Sequence[Robot]], Iterator[Outcome]]
 
 _WAIT = 60  # s to wait for a cluster's first worker, and without any worker later
 _LOOK = 0.1  # s between two checks for finished robots
+_ADDRESS = re.compile(r"(\w+://)?[^\s/]+:\d+")
 _DIED = "every Dask worker that processed it died; memory may be short"
 
 
@@ -30,7 +32,7 @@ def engine(task: Task, *, jobs: int | None, dask: str | None) -> Iterator[Engine
     """Return the engine for these options; see :func:`adaptfault.maintain_fleet` for the arguments.
 
     Raises:
-        ValueError: Dask is not installed.
+        ValueError: Dask is not installed, or the address has no port.
         OSError: no scheduler answers at the address, or it has no worker.
     """
     if dask is None:
@@ -49,6 +51,8 @@ def engine(task: Task, *, jobs: int | None, dask: str | None) -> Iterator[Engine
         from distributed import Client
     except ImportError:
         raise ValueError("a Dask cluster needs Dask: pip install 'adaptfault[fleet]'") from None
+    if not _ADDRESS.fullmatch(dask):  # a client of a wrong address waits for a minute before it fails
+        raise ValueError(f"{dask!r}: expected the address of a Dask scheduler, as tcp://host:8786")
     with Client(dask, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, timeout=_WAIT)

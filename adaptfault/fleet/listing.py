@@ -17,6 +17,9 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.sizes import check_file
+
 _ENTRY = {"name", "bundle", "recordings", "tags", "commissioned"}
 _LISTING = {"bundles", "recordings", "tags", "robots"}
 _EXPECTED = 'expected [[robots]] with name, bundle, recordings, or bundles = "robots/*/robot.bundle" and recordings'
@@ -110,12 +113,16 @@ class Fleet:
 
         Raises:
             OSError: the file cannot be read.
-            ValueError: it is not TOML, a key is missing, unknown or of the wrong type, or robots are not distinct.
+            ValueError: it is no file or not TOML, a key is missing, unknown or of the wrong type, or robots are not
+                distinct.
         """
         path = Path(path)
         try:
+            check_file(path)
             listed = tomllib.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
+        except InputError:
+            raise
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{path}: not a TOML file ({error})") from None
         _known(listed, _LISTING, str(path))
         entries = listed.get("robots", [])

@@ -66,8 +66,9 @@ class AgeGroup:
 
     def __str__(self) -> str:
         worst = f"; most often {self.worst}" if self.worst else ""
+        robots = f"{self.robots} robot{'s' * (self.robots != 1)} {'has' if self.degraded == 1 else 'have'}"
         return (
-            f"{self.years} to {self.years + 1} years: {self.degraded} of {self.robots} robots have faults,"
+            f"{self.years} to {self.years + 1} years: {self.degraded} of {robots} faults,"
             f" {self.wires:.2f} wires and {self.cells:.1f} cells each{worst}"
         )
 
@@ -166,7 +167,8 @@ class FleetReport:
         counts = ", ".join(f"{n} {state}" for state, n in self.counts.items() if n) or "none"
         measured = " ".join(f"{state}={n};;;0;{len(self.outcomes)}" for state, n in self.counts.items())
         would = " (dry run: nothing was changed)" if self.dry_run else ""
-        lines = [f"ADAPTFAULT FLEET {status} - {len(self.outcomes)} robots: {counts}{would} | {measured}"]
+        robots = f"{len(self.outcomes)} robot{'s' * (len(self.outcomes) != 1)}"
+        lines = [f"ADAPTFAULT FLEET {status} - {robots}: {counts}{would} | {measured}"]
         lines += _listed("need a technician, the most urgent first", [_needy(o) for o in self.technician])
         lines += _listed("weak base models, better repaired than healthy", [o.robot.name for o in self.weak])
         lines += _listed("most frequent faults", [str(wire) for wire in self.wires])

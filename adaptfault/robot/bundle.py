@@ -91,7 +91,7 @@ class Bundle:
         self, path: str | Path, *, keys: Sequence[str | os.PathLike[str]] | None = None, least_serial: int = 0
     ) -> None:
         self.path = Path(path)
-        if not (self.path / _ABOUT).is_file():
+        if not any((self.path / name).is_file() for name in (_ABOUT, "bundle.copy.json")):
             raise FileNotFoundError(
                 f"{self.path}: expected a bundle, a folder with {_ABOUT}; adaptfault train --out X.bundle makes one"
             )

@@ -33,15 +33,14 @@ def read_checksummed(path: Path, schema: str) -> dict[str, Any]:
         FileNotFoundError: the file does not exist.
         Damaged: the checksum does not match, or the schema differs.
     """
-    try:
-        data = path.read_bytes()
-    except (IsADirectoryError, NotADirectoryError):
-        raise Damaged(f"{path} is damaged: expected a file") from None
+    if path.exists() and not path.is_file():  # a pipe or a device may have no end
+        raise Damaged(f"{path} is damaged: expected a file")
+    data = path.read_bytes()
     try:
         document = json.loads(data)
         checksum = document.pop(_CHECKSUM)
         found = document["schema"]
-    except (ValueError, TypeError, KeyError, AttributeError):
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         raise Damaged(f"{path} is damaged: not JSON with a checksum") from None
     if (
         checksum != _hash(document)

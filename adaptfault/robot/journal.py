@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from adaptfault.data.atomic import atomic_write
-from adaptfault.robot.checksummed_json import hash_file
+from adaptfault.robot.checksummed_json import Damaged, hash_file
 from adaptfault.robot.lock import locked
 
 NAME, _CHECKSUM, _LOCK = "journal.sqlite", "journal.sha256", "journal.lock"
@@ -46,7 +46,7 @@ class Journal:
                     [f"{self.path} is missing: a new journal is started"] if (self.bundle / _CHECKSUM).exists() else []
                 )
             checksum = self.bundle / _CHECKSUM
-            if checksum.exists() and checksum.read_text() == hash_file(self.path):
+            if checksum.is_file() and checksum.read_bytes().decode("latin-1") == hash_file(self.path):
                 return []
             try:
                 with closing(self._connect()) as connection:
@@ -130,7 +130,10 @@ class Journal:
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
         with locked(self.bundle / _LOCK, wait=True, optional=True), closing(self._connect()) as connection:
-            yield connection
+            try:
+                yield connection
+            except sqlite3.DatabaseError as error:
+                raise Damaged(f"{self.path} is damaged ({error}); adaptfault maintain starts a new one") from None
 
     def _connect(self) -> sqlite3.Connection:
         """Connect for reading: with write access where possible, because SQLite rolls back after a crash."""

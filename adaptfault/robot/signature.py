@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.data.atomic import atomic_write
+from adaptfault.data.recordings.sizes import check_file
 from adaptfault.robot.checksummed_json import Damaged
 from adaptfault.robot.pointer import Pointer
 from adaptfault.robot.versions import Untrusted
@@ -75,6 +76,7 @@ def verify_bundle(bundle: Bundle, keys: Sequence[str | PathLike[str]], least_ser
     path = bundle.path / NAME
     trusted = [_read_public_key(key) for key in keys]
     try:
+        check_file(path)
         document = json.loads(path.read_bytes())
         signed, signature = document["signed"], bytes.fromhex(document["signature"])
         data = _canonical(signed)
@@ -82,7 +84,7 @@ def verify_bundle(bundle: Bundle, keys: Sequence[str | PathLike[str]], least_ser
         raise Untrusted(
             f"{bundle.path} is not signed; adaptfault train --sign or adaptfault.sign_bundle signs it"
         ) from None
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, RecursionError):
         raise Untrusted(f"{path} holds no signature; sign the bundle again") from None
     if not any(_verifies(key, signature, data) for key in trusted):
         raise Untrusted(f"{bundle.path} is not signed by one of the {len(keys)} trusted keys")
@@ -97,6 +99,7 @@ def verify_bundle(bundle: Bundle, keys: Sequence[str | PathLike[str]], least_ser
 
 def read_private_key(path: str | PathLike[str]) -> Ed25519PrivateKey:
     """Return the ed25519 key in a PEM file; raises ValueError, also where cryptography is not installed."""
+    check_file(Path(path))
     try:
         from cryptography.exceptions import UnsupportedAlgorithm
         from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -113,6 +116,7 @@ def read_private_key(path: str | PathLike[str]) -> Ed25519PrivateKey:
 
 
 def _read_public_key(path: str | PathLike[str]) -> Ed25519PublicKey:
+    check_file(Path(path))
     try:
         from cryptography.exceptions import UnsupportedAlgorithm
         from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey

@@ -94,7 +94,7 @@ class Extractor:
         for name in self.field.split("."):
             values = [getattr(value, name) for value in values]
             values = [one for value in values for one in (value if isinstance(value, list) else [value])]
-        with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
+        with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is missing
             parts = [np.asarray(value, dtype=np.float32).ravel() for value in values]
         return np.concatenate(parts) if parts else np.empty(0, np.float32)
 

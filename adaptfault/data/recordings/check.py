@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,54 +15,58 @@ from adaptfault.data.recordings.infer import GIVE_LAYOUT, SLACK, describe_width
 from diagnostics import SensorLayout
 
 
-def check_width(content: Content, layout: SensorLayout) -> None:
-    """Raise InputError if the frames of a file do not fit the layout."""
+def check_width(content: Content, layout: SensorLayout, stated: str = "") -> None:
+    """Raise InputError if the frames of a file do not fit the layout; ``stated`` names where the layout is from."""
     if content.shape is not None and content.shape != layout.shape:
         came, expected = (" x ".join(map(str, shape)) for shape in (content.shape, layout.shape))
-        what = f"frames of {came} (pads x rows x cols) where the layout has {expected}; {GIVE_LAYOUT}"
+        what = f"frames of {came} (pads x rows x cols) where the layout{stated} has {expected}; {GIVE_LAYOUT}"
         raise InputError.at(content.path, what)
     if content.width != layout.n_cells:
         expected = " x ".join(map(str, layout.shape))
-        what = f"{describe_width(content, layout.n_cells)}; the layout has {expected} cells, masked ones included"
+        width = describe_width(content, layout.n_cells)
+        what = f"{width}; the layout{stated} has {expected} cells, masked ones included"
         raise content.error(what, frame=0 if content.lines is not None else None)
 
 
 def check_readings(content: Content, layout: SensorLayout, length: int | None) -> tuple[list[int], list[Problem]]:
     """Return the recordings of a file that can be used, and the problems.
 
-    Recordings without frames, of another length than ``length``, or with infinite readings are left out with an error.
-    Missing readings are kept with a warning, which counts them over the cells that the layout has.
+    Recordings without frames or of another length than ``length`` are left out with an error. Missing and infinite
+    readings are kept with a warning, which counts them over the cells that the layout has.
     """
     kept: list[int] = []
     problems: list[Problem] = []
-    missing, first = 0, ""
+    counts = {"infinite": 0, "missing": 0}
+    first: dict[str, str] = {}
     present = layout.present.ravel()
     for i, frames in enumerate(content.frames):
         error = ""
         if not len(frames):
             error = "holds no frames; record it again or remove it"
         elif length is not None and len(frames) != length:
-            error = f"{len(frames)} {_rows(content)} where {length} were expected; record it again or change the number"
+            error = f"{_rows(content, len(frames))} where {length} were expected; record it again or change the number"
         if error:
             problems.append(Problem("error", str(content.error(error, i))))
             continue
         kept.append(i)
         if frames.dtype.kind != "f":
             continue
-        if np.isinf(frames).any():
-            frame, cell = np.argwhere(np.isinf(frames))[0]
-            what = f"value {cell + 1} is infinite or too large; write the reading, or 'nan' if it is missing"
-            problems.append(Problem("error", str(content.error(what, i, int(frame)))))
-            kept.pop()
-            continue
-        gaps = np.isnan(frames) & present
-        if gaps.any():
-            missing += int(gaps.sum())
-            first = first or content.where(i, int(np.flatnonzero(gaps.any(axis=1))[0]))
-    if missing:
-        readings = f"{missing} missing reading{'s' * (missing != 1)}"
-        problems.append(Problem("warning", located(content.path, f"{readings}, first in {first}: kept as missing")))
+        for name, found in (("infinite", np.isinf(frames)), ("missing", np.isnan(frames))):
+            gaps = found & present
+            if gaps.any():
+                counts[name] += int(gaps.sum())
+                first.setdefault(name, content.where(i, int(np.flatnonzero(gaps.any(axis=1))[0])))
+    for name, count in counts.items():
+        if count:
+            kept_as = "taken" if name == "infinite" else "kept"
+            what = f"{count} {name} reading{'s' * (count != 1)}, first in {first[name]}: {kept_as} as missing"
+            problems.append(Problem("warning", located(content.path, what)))
     return kept, problems
+
+
+def without_infinite(frames: NDArray[Any]) -> NDArray[Any]:
+    """Return readings ``[T, D]`` with NaN in place of what is infinite: no converter gives it."""
+    return np.where(np.isinf(frames), np.nan, frames) if frames.dtype.kind == "f" else frames
 
 
 def check_range(
@@ -100,10 +105,10 @@ def other_lengths(contents: Sequence[Content]) -> list[Problem]:
     problems = []
     for content in single:
         if (length := len(content.frames[0])) != common:
-            what = f"{length} {_rows(content)} where the others have {common}: kept; windows use whole windows only"
+            what = f"{_rows(content, length)} where the others have {common}: kept; windows use whole windows only"
             problems.append(Problem("warning", located(content.path, what)))
     return problems
 
 
-def _rows(content: Content) -> str:
-    return "rows" if content.lines is not None else "frames"
+def _rows(content: Content, count: int) -> str:
+    return f"{count} {'row' if content.lines is not None else 'frame'}{'s' * (count != 1)}"

@@ -80,7 +80,10 @@ class Piece:
         """
         if self.times is None or len(self.times) < 2:
             return None
-        period = float(np.nanmedian(np.diff(self.times)))
+        with np.errstate(all="ignore"):  # a time may be anything that a file can hold
+            periods = np.diff(self.times)
+        periods = periods[np.isfinite(periods)]
+        period = float(np.median(periods)) if periods.size else 0.0
         if not period > 0:
             return None
         rates = [_TICKS[unit] / period for unit in ([self.unit] if self.unit else _TICKS)]
@@ -166,7 +169,7 @@ def _parse(path: Path, data: bytes, before: _Before) -> Piece:
         return Piece(values.astype(np.float32, copy=False), lines, problems)
     if values.shape[1] < 2:
         raise InputError.at(path, "holds a column of times and no readings; add one column a cell", f"line {lines[0]}")
-    with np.errstate(all="ignore"):  # a reading that float32 cannot hold becomes infinite, and is refused as such
+    with np.errstate(all="ignore"):  # a reading that float32 cannot hold becomes infinite, and is missing
         return Piece(values[:, 1:].astype(np.float32), lines, problems, values[:, 0].astype(np.float64), unit)
 
 

@@ -5,6 +5,7 @@ Every function returns what it inferred together with the reason, so that the ca
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -74,8 +75,25 @@ def infer_shape(contents: Sequence[Content]) -> tuple[Shape, str]:
     if width == PAPER.n_cells:
         return PAPER.shape, f"{width} values a frame fit the paper's sensor"
     first = next(content for content in contents if content.width == width)
-    what = f"{describe_width(first, PAPER.n_cells)} (the paper's sensor); for another array {GIVE_LAYOUT}"
+    if first.lines is not None and abs(width - PAPER.n_cells) == 1:
+        what = f"{describe_width(first, PAPER.n_cells)} (the paper's sensor); for another array {GIVE_LAYOUT}"
+    else:
+        what = _unknown_shape(first)
     raise first.error(what, frame=0 if first.lines is not None else None)
+
+
+def _unknown_shape(content: Content) -> str:
+    """Return a sentence on frames of a width that no file explains, with a shape that would fit."""
+    width = content.width
+    text = f"{width} value{'s' * (width != 1)} a frame, and nothing states their rows and columns; "
+    column = content.frames[0][:, 0].astype(np.float64)
+    if content.lines is not None and width > 1 and len(column) > 2 and (np.diff(column) > 0).all():
+        text += (
+            "the first column rises from line to line: if it is a time or a number, name it 'time' in a header line; "
+        )
+        width -= 1
+    rows = max(rows for rows in range(1, math.isqrt(width) + 1) if width % rows == 0)
+    return f"{text}give --shape (rows x columns, such as {rows}x{width // rows}) or --layout FILE (layout= in Python)"
 
 
 def describe_width(content: Content, expected: int) -> str:

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.bag import STORAGES, read_bag
-from adaptfault.data.recordings.check import check_range, check_readings, check_width, other_lengths
+from adaptfault.data.recordings.check import check_range, check_readings, check_width, other_lengths, without_infinite
 from adaptfault.data.recordings.classes import class_indices, label_files
 from adaptfault.data.recordings.content import Content, Shape
 from adaptfault.data.recordings.csv_folder import read_csv
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.files import Found, find
-from adaptfault.data.recordings.layout_file import layout_beside
+from adaptfault.data.recordings.layout_file import LAYOUT_NAME, layout_beside
 from adaptfault.data.recordings.npz import read_npy, read_npz
 from adaptfault.data.recordings.resolve import Resolved, check_agreement, check_statements, given_array, resolve_layout
 from diagnostics import SensorLayout
@@ -112,7 +112,8 @@ def load(
             tables.check(resolved.layout)
         except ValueError as error:
             raise InputError(f"calibration: {error}") from None
-    return _assemble(contents, resolved, frames, tables, problems, strict=strict)
+    stated = f" of the {LAYOUT_NAME} beside the recordings" if layout is None and array is not None else ""
+    return _assemble(contents, resolved, frames, tables, problems, strict=strict, stated=stated)
 
 
 def _read(
@@ -140,6 +141,7 @@ def _assemble(
     problems: list[Problem],
     *,
     strict: bool,
+    stated: str,
 ) -> Loaded:
     """Check each file against the layout, calibrate it, and put the recordings of all together."""
     layout = resolved.layout
@@ -153,7 +155,7 @@ def _assemble(
     for file, content in contents:
         try:
             check_agreement(content, every, tables is not None)
-            check_width(content, layout)
+            check_width(content, layout, stated)
             if strict:
                 check_statements(content, layout, tables is not None)
         except InputError as error:
@@ -164,7 +166,7 @@ def _assemble(
         if not kept:
             continue
         usable.append(content)
-        readings = [content.frames[i] for i in kept]
+        readings = [without_infinite(content.frames[i]) for i in kept]
         if tables is not None:
             readings = [_calibrated(recording, tables, clamped) for recording in readings]
         readings = [recording.astype(np.float32, copy=False) for recording in readings]

@@ -191,7 +191,7 @@ def _recordings(
         raise InputError.at(path, f"frames have shape {list(frames.shape)} and hold no reading; record again")
     shape = grid_shape(frames.shape)
     if frames.dtype.kind == "f":
-        with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is refused as such
+        with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is missing
             frames = frames.astype(np.float32)
     if frames.ndim == 2 or (frames.ndim == 4 and frames.shape[1] == 1):
         frames = frames[None]
@@ -219,7 +219,11 @@ def _present(
         return None
     present = arrays[key]
     expected = shape or (present.shape if present.ndim == 3 and present.size == width else None)
-    if present.dtype.kind not in "biu" or expected is None or present.size != math.prod(expected):
+    # In another order of axes the mask would name other cells.
+    fitting = (
+        () if expected is None else (expected, expected[1:] if expected[0] == 1 else expected, (math.prod(expected),))
+    )
+    if present.dtype.kind not in "biu" or expected is None or present.shape not in fitting:
         size = list(expected) if expected else "[pads, rows, cols]"
         what = f"array {key!r} is {present.dtype} {list(present.shape)}; expected bool {size}"
         raise InputError.at(path, what)

@@ -62,6 +62,11 @@ def test_the_more_cells_read_0_the_less_it_counts_against_each_of_them():
     assert ratios[-1] < 1.5
 
 
+def test_many_idle_cells_that_rest_like_the_others_are_not_suspected():
+    for n in (1, 5, 20):
+        assert (resting(np.zeros((LENGTH, CELLS)), np.arange(CELLS) < n) < 0.2).all()
+
+
 def recordings(seed: int, noise: float, rest: float) -> list[np.ndarray]:
     rng, rests = np.random.default_rng(seed), rest * np.random.default_rng(99).uniform(0.5, 1.5, CELLS)
     read = [r + rests + noise * rng.standard_normal(r.shape) for r in events(seed, 6, 120)]

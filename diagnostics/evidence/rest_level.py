@@ -5,7 +5,7 @@ cells that moved rest above it or have noise. With v the level of a constant cel
 the same, the log likelihood ratio broken : healthy, beyond the prior of a rail, is
 
     log P(v, z | broken) / P(rail | broken) - log P(v, z | healthy)
-    P(v, z | healthy) = (1 - u) (k + p(v) p(z)) / (N + 1) + u m / n
+    P(v, z | healthy) = (1 - u) P + u max(P, m / n)        P = (k + p(v) p(z)) / (N + 1)
 
 Of N cells that moved, k have rested within two tolerances of v before, with the same z as far as it is known. p(v) is
 Student's t with 4 degrees of freedom about the median of their levels, scaled by the median absolute deviation
@@ -95,7 +95,7 @@ class RestLevel:
         m, n = _near(level, level, margin), np.count_nonzero(present)
         faults = betabinom.pmf(m, n, EXPECTED * EXPECTED_CELLS, (1 - EXPECTED) * EXPECTED_CELLS)
         unlike = 1 / (1 + (n + 1) * faults)
-        healthy = (1 - unlike) * like_others + unlike * m / n
+        healthy = (1 - unlike) * like_others + unlike * np.maximum(like_others, m / n)
         rail = level <= margin
         anywhere = ANYWHERE * 2 * margin / layout.full_scale
         broken = (rail + anywhere / ((1 - ANYWHERE) / 2)) * np.where(exact, 1 - _DITHERS, _DITHERS)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.special import expit, logit
 
 from diagnostics.events.tiles import MOST_CELLS
+from diagnostics.evidence.conditional_test import EXPECTED, EXPECTED_CELLS
 from diagnostics.evidence.drift import gains_count
 from diagnostics.evidence.spatial import Exclusion
 from diagnostics.evidence.stream_state import StreamState
@@ -52,8 +53,7 @@ _MAX_DISCOUNT, _HALF_DISCOUNT = 0.5, 22.0  # of the slopes; recordings held out 
 _PRIOR_VARIANCE = 10.0  # of the weights
 _CLIP = 6.0  # raw log ratios are clipped here for the fit: outliers must not steer the slope
 _MAX_RATIO = 24.0  # raw log ratios are clipped here
-_EXPECTED, _EXPECTED_LATE = 0.02, 0.005  # prior shares: faulty from the start, failing in the log
-_EXPECTED_CELLS, _EXPECTED_CELLS_LATE = 35.0, 25.0  # pseudo-counts of these priors
+_EXPECTED_LATE, _EXPECTED_CELLS_LATE = 0.005, 25.0  # prior share of cells that fail in the log, and its pseudo-count
 _MOVING_ODDS = -10.0  # log odds of a fault that holds one value, for a cell that moves
 
 Floats = NDArray[np.float64]
@@ -198,8 +198,8 @@ class Calibrator:
         late, early = scored & began, scored & ~began
         probability[late] = _posterior(log_ratio[late], _EXPECTED_LATE, _EXPECTED_CELLS_LATE)
         # Cells that never moved failed before the log, or in it at the same rate as cells that moved.
-        broke = probability[late].sum() / (began.sum() + _EXPECTED_CELLS)
-        probability[early] = _posterior(log_ratio[early], _EXPECTED + float(broke), _EXPECTED_CELLS)
+        broke = probability[late].sum() / (began.sum() + EXPECTED_CELLS)
+        probability[early] = _posterior(log_ratio[early], EXPECTED + float(broke), EXPECTED_CELLS)
         return probability
 
 

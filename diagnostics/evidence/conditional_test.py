@@ -30,7 +30,8 @@ from diagnostics.preprocessing.scale import Array, Scale
 if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
 
-_ANYWHERE = 0.2  # share of broken cells that stick at any value; the others stick to either rail equally often
+EXPECTED, EXPECTED_CELLS = 0.02, 35.0  # prior share of cells that are faulty from the start, and its pseudo-count
+ANYWHERE = 0.2  # share of broken cells that stick at any value; the others stick to either rail equally often
 P_MIN = 1e-4  # lower limit of P in one event: models err
 SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
 _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
@@ -109,8 +110,8 @@ class HeldValues:
         full = value >= scale.full_scale - 2 * tolerance
         low = scale.root_load(value - 2 * tolerance).astype(np.float64)
         high = np.where(full, np.inf, scale.root_load(value + 2 * tolerance))
-        anywhere = _ANYWHERE * 4 * tolerance / scale.full_scale
-        return cls(rests, low, high, np.log(np.where(rests | full, (1 - _ANYWHERE) / 2, anywhere)))
+        anywhere = ANYWHERE * 4 * tolerance / scale.full_scale
+        return cls(rests, low, high, np.log(np.where(rests | full, (1 - ANYWHERE) / 2, anywhere)))
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from diagnostics.events.tiles import Rectangle, Tile, tiles
 from diagnostics.evidence.conditional_test import SUDDEN_JUMP, CellState, Model
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
+from diagnostics.evidence.rest_level import RestLevel
 from diagnostics.evidence.spatial import (
     UNCALIBRATED,
     Exclusion,
@@ -119,6 +120,7 @@ class StreamState:
         self._skin = EventLog()  # events of the whole skin, if there are several tiles
         self._offsets = OffsetTracker.begin(layout.n_cells)
         self._rest, self._response = RestOfLog(), WeakResponse.begin(layout.n_cells)
+        self._level = RestLevel.begin(layout.n_cells)
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
         self._filled = 0
@@ -201,6 +203,8 @@ class StreamState:
     def temporal(self) -> NDArray[np.float64]:
         """Log likelihood ratio of the constant run, its level and noise, and the jump into it, ``[D]``."""
         reference, rests = self.reference, self.rests()
+        if reference.model is None:
+            return self._level.evidence(self.runs, rests, reference.tolerance, self.layout)
         lower = reference.least.lower(self.runs, rests & self.present)
         low = reference.least.evidence(self.runs, rests, reference.tolerance, self.present, lower)
         noise = reference.noise_loss.evidence(self.runs, rests, self.present, lower < -reference.tolerance)
@@ -321,12 +325,14 @@ class StreamState:
         if self.reference.model is None:
             self.scale = scale = self._scale_of_log(plain, frames)
         start, known = self.runs.start, _known(frames, self.runs.last)
-        self.runs = runs = self.runs.extend(frames, numbers, self.reference.tolerance, scale.baseline)
+        before, self.runs = self.runs, self.runs.extend(frames, numbers, self.reference.tolerance, scale.baseline)
+        runs = self.runs
         # Evidence belongs to a constant run, and ends with it.
         self.accumulated = np.where(runs.start == start, self.accumulated, 0.0)
         steady = self._offsets.off(known)
         root, still = scale.root_load(steady), runs.start <= numbers[0]
         if self.reference.model is None:
+            self._level = self._level.extend(before, runs.start != start)
             self._response = self._response.extend(steady, scale.full_scale * root.astype(np.float64) ** 2, self.layout)
         self.touched = self.touched | root.any(axis=0)
         jumped = (self._jumps() >= SUDDEN_JUMP) & (runs.alone | still)

@@ -1,0 +1,112 @@
+"""Rest level: what cells read without contact in a log without a reference.
+
+Detects, in a cold start, open cells that no contact tests: cells constant at the low rail of the converter, where the
+cells that moved rest above it or have noise. With v the level of a constant cell, and z whether all its readings are
+the same, the log likelihood ratio broken : healthy, beyond the prior of a rail, is
+
+    log P(v, z | broken) / P(rail | broken) - log P(v, z | healthy)
+    P(v, z | healthy) = (1 - u) P + u max(P, m / n)        P = (k + p(v) p(z)) / (N + 1)
+
+Of N cells that moved, k have rested within two tolerances of v before, with the same z as far as it is known. p(v) is
+Student's t with 4 degrees of freedom about the median of their levels, scaled by the median absolute deviation
+(Rousseeuw and Croux 1993). p(z) is the share of cells without noise, with Jeffreys' pseudo-count; 1 for readings that
+differ. This is the predictive distribution of a Dirichlet process of concentration 1 (Ferguson 1973).
+
+Cells that nothing reached may rest elsewhere than those that moved: on another pad, or where cells that moved were
+loaded throughout. u is the probability of that, from m of the n cells of the array being constant near v: a uniform
+distribution of m against the beta-binomial distribution of the number of broken cells. For the same reason a level
+above the rail only lowers the ratio. It detects nothing where healthy cells read a constant 0 without contact, in pads
+where it would count against more than half of the cells, and where fewer than eight cells moved and rested.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import betabinom, median_abs_deviation, t
+
+from diagnostics.events.constant_runs import SHORTEST_RUN
+from diagnostics.events.contact_events import SEGMENT
+from diagnostics.evidence.conditional_test import ANYWHERE, EXPECTED, EXPECTED_CELLS
+from diagnostics.preprocessing.baseline import CERTAIN_RATIO, FEWEST, MAJORITY
+
+if TYPE_CHECKING:
+    from diagnostics.events.constant_runs import ConstantRuns
+    from diagnostics.layout import SensorLayout
+
+_DITHERS = 0.1  # share of broken cells whose readings differ, within the tolerance
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class RestLevel:
+    """What each cell showed in earlier constant runs, of those that lasted where a segment ends; ``[D]`` each.
+
+    Attributes:
+        level: float, lowest of the highest readings of these runs, in the layout's unit; inf: none.
+        still: bool, whether a run lasted for a segment.
+        exact: bool, whether in such a run all readings were the same.
+    """
+
+    level: Floats
+    still: Mask
+    exact: Mask
+
+    @classmethod
+    def begin(cls, n_cells: int) -> RestLevel:
+        """Return the state before any frame."""
+        no = np.zeros(n_cells, bool)
+        return cls(np.full(n_cells, np.inf), no, no)
+
+    def extend(self, runs: ConstantRuns, ended: Mask) -> RestLevel:
+        """Return the state after the constant ``runs`` of some cells (bool ``[D]``) have ended."""
+        level = np.where(ended & (runs.length >= SHORTEST_RUN), np.minimum(self.level, runs.high), self.level)
+        still = ended & (runs.length >= SEGMENT)
+        return RestLevel(level, self.still | still, self.exact | (still & (runs.low == runs.high)))
+
+    def evidence(self, runs: ConstantRuns, rests: Mask, tolerance: float, layout: SensorLayout) -> Floats:
+        """Return the log likelihood ratio broken : healthy, ``[D]``; 0 for cells that are not constant at rest.
+
+        Args:
+            runs: the constant runs.
+            rests: bool ``[D]``, cells whose run lies at their baseline.
+            tolerance: a run stays within +- this of one value.
+            layout: the array.
+        """
+        present, ratio = layout.present.ravel(), np.zeros(layout.n_cells)
+        known = np.flatnonzero(present & np.isfinite(self.level))
+        cells = np.flatnonzero(present & rests & (runs.length >= SEGMENT))
+        if len(known) < FEWEST or not len(cells):
+            return ratio
+        others, still, margin = self.level[known], self.still[known], 2 * tolerance
+        level, exact = runs.high[cells], runs.low[cells] == runs.high[cells]
+        with_noise = still & ~self.exact[known]
+        scale = max(float(median_abs_deviation(others, scale="normal")), tolerance)
+        far = -np.abs(level - np.median(others))
+        p_level = t.cdf((far + margin) / scale, 4) - t.cdf((far - margin) / scale, 4)
+        p_exact = (np.count_nonzero(still & ~with_noise) + 0.5) / (np.count_nonzero(still) + 1)
+        k = _near(others, level, margin) - np.where(exact, _near(others[with_noise], level, margin), 0)
+        like_others = (k + p_level * np.where(exact, p_exact, 1.0)) / (len(known) + 1)
+        m, n = _near(level, level, margin), np.count_nonzero(present)
+        faults = betabinom.pmf(m, n, EXPECTED * EXPECTED_CELLS, (1 - EXPECTED) * EXPECTED_CELLS)
+        unlike = 1 / (1 + (n + 1) * faults)
+        healthy = (1 - unlike) * like_others + unlike * np.maximum(like_others, m / n)
+        rail = level <= margin
+        anywhere = ANYWHERE * 2 * margin / layout.full_scale
+        broken = (rail + anywhere / ((1 - ANYWHERE) / 2)) * np.where(exact, 1 - _DITHERS, _DITHERS)
+        ratio[cells] = np.minimum(np.log(broken / healthy), np.where(rail, CERTAIN_RATIO, 0.0))
+        pad = np.arange(layout.n_cells) // (layout.n_cells // layout.pads)
+        unusual = np.bincount(pad, ratio > 0) > MAJORITY * np.bincount(pad, present)
+        return np.where(unusual[pad], np.minimum(ratio, 0.0), ratio)
+
+
+def _near(others: Floats, level: Floats, margin: float) -> NDArray[np.intp]:
+    """Return how many of ``others`` lie within ``margin`` of each ``level``, int ``[n]``."""
+    ordered = np.sort(others)
+    low, high = np.searchsorted(ordered, level - margin), np.searchsorted(ordered, level + margin, side="right")
+    return np.asarray(high - low)

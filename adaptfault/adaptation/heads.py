@@ -30,7 +30,7 @@ _DISTANCES = ((0, True), (1, True), (2, True), (0, False), (1, False))
 _KERNELS = ((2,), (0, 1, 2), (4,), (3, 4))
 _EARLIER_KERNELS = _KERNELS[:2]  # of heads that do not store theirs
 _RIDGES = (0.2, 0.02, 0.002)  # added to a kernel's diagonal, which is 1
-_SAMPLE = 1_000  # windows on which widths and ridges are chosen
+_SAMPLE = 1_000  # windows on which widths and ridges are chosen, of training and of validation each
 _LINEAR_C = 0.3  # inverse strength of the linear head's ridge penalty
 _EM_STEPS = 100
 _NO_CLASS = -1e4  # logit of a class without training windows
@@ -189,12 +189,15 @@ def fit_head(
     distances, widths = _distances(both)
     targets = task.targets.to(on)
     m, n = len(training_targets), len(folds)
-    few = np.concatenate([evenly(m, _SAMPLE), np.arange(m, m + n)])  # enough to compare ridges
+    kept = evenly(n, _SAMPLE)
+    few = np.concatenate([evenly(m, _SAMPLE), m + kept])  # enough to compare ridges
     all_weights, all_held = [], []
     for of in _KERNELS:
         kernel = _kernel(distances, of)
         sample = kernel if len(few) == m + n else kernel[few][:, few]
-        tried = [task.loss(ridge_regression(sample, targets[few], folds, ridge)[1].cpu()) for ridge in _RIDGES]
+        tried = [
+            task.loss(ridge_regression(sample, targets[few], folds[kept], ridge)[1].cpu(), kept) for ridge in _RIDGES
+        ]
         weights, found = ridge_regression(kernel, targets, folds, _RIDGES[int(np.argmin(tried))])
         scale, outputs = task.outputs(found.cpu())
         all_weights.append(weights * scale.to(on))
@@ -214,8 +217,9 @@ class _Classes:
         self.y = held.argmax(axis=1)
         self.bias = torch.zeros(every.shape[1]).masked_fill(torch.from_numpy(every.max(axis=0) == 0), _NO_CLASS)
 
-    def loss(self, found: Tensor) -> float:
-        return calibrate(found + self.bias, self.y)[1]
+    def loss(self, found: Tensor, kept: NDArray[np.intp]) -> float:
+        """Return the loss of outputs for some of the held-out windows."""
+        return calibrate(found + self.bias, self.y[kept])[1]
 
     def outputs(self, found: Tensor) -> tuple[Tensor, Tensor]:
         """Return the scale ``[k]`` of the weights, and logits with that scale."""
@@ -244,8 +248,9 @@ class _Values:
         self.targets, self.unit, self.bias = ((every - mean) / unit).float(), unit.float(), mean.float()
         self.truth = self.targets[len(training) :]
 
-    def loss(self, found: Tensor) -> float:
-        return float((found - self.truth).square().mean())
+    def loss(self, found: Tensor, kept: NDArray[np.intp]) -> float:
+        """Return the loss of outputs for some of the held-out windows."""
+        return float((found - self.truth[kept]).square().mean())
 
     def outputs(self, found: Tensor) -> tuple[Tensor, Tensor]:
         """Return the scale ``[k]`` of the weights, and values."""

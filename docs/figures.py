@@ -35,7 +35,8 @@ from diagnostics import (
     line_fault,
 )
 from diagnostics.events.constant_runs import segments
-from diagnostics.events.contact_events import SEGMENT, ContactEvent, EventLog
+from diagnostics.events.contact_events import ContactEvent, EventLog
+from diagnostics.preprocessing.readings import SEGMENT
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,8 @@ from conftest import without_calibration
 
 from diagnostics import Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
 from diagnostics.events.constant_runs import ConstantRuns
-from diagnostics.preprocessing.baseline import LowerLimit, baseline
+from diagnostics.evidence.lower_limit import LowerLimit
+from diagnostics.preprocessing.baseline import baseline
 
 LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
 CELLS, PRESENT = LAYOUT.n_cells, np.ones(LAYOUT.n_cells, bool)
@@ -30,14 +31,20 @@ def noisy(recordings: list[np.ndarray], sigma: float, rest: float, seed: int = 9
     return [np.clip(r + offset + sigma * rng.standard_normal(r.shape), 0, 1) for r in recordings]
 
 
+def highest_and_limit(recordings, present, tolerance, full_scale) -> tuple[np.ndarray, LowerLimit]:
+    """Return the highest reading without contact of each cell, and the lower limit."""
+    found = baseline(recordings, present, tolerance, full_scale)
+    return found.highest, LowerLimit.fit(found, present, tolerance, full_scale)
+
+
 def test_an_array_that_thresholds_rests_at_one_value():
-    most, least = baseline(events(0), PRESENT, TOLERANCE, 1.0)
+    most, least = highest_and_limit(events(0), PRESENT, TOLERANCE, 1.0)
     np.testing.assert_array_equal(most, np.zeros(CELLS))
     np.testing.assert_array_equal(least.reading, np.full(CELLS, -2 * TOLERANCE))  # nothing is less than 0
 
 
 def test_noise_at_rest_is_no_load():
-    most, least = baseline(noisy(events(0), 0.01, 0.1), PRESENT, TOLERANCE, 1.0)
+    most, least = highest_and_limit(noisy(events(0), 0.01, 0.1), PRESENT, TOLERANCE, 1.0)
     idle = noisy([np.zeros((2000, CELLS))], 0.01, 0.1, seed=3)[0]
     assert (idle > most + 2 * TOLERANCE).mean() < 1e-3
     assert most.max() < 0.25
@@ -47,7 +54,9 @@ def test_noise_at_rest_is_no_load():
 def test_offsets_that_wander_between_recordings_are_no_load():
     rng = np.random.default_rng(2)
     offsets = rng.uniform(0, 0.02, 24)
-    most, _ = baseline([r + offset for r, offset in zip(events(0), offsets, strict=True)], PRESENT, TOLERANCE, 1.0)
+    most, _ = highest_and_limit(
+        [r + offset for r, offset in zip(events(0), offsets, strict=True)], PRESENT, TOLERANCE, 1.0
+    )
     assert (offsets <= most.min() + 2 * TOLERANCE).all()
     assert most.max() < 0.03
 
@@ -56,7 +65,9 @@ def test_offsets_that_each_cell_changes_for_itself_from_one_recording_to_the_nex
     rng = np.random.default_rng(2)
     recordings = events(0, 60)
     offsets = 0.1 + 0.006 * rng.standard_normal((60, CELLS))  # now and then far from the usual
-    most, _ = baseline([r + offset for r, offset in zip(recordings, offsets, strict=True)], PRESENT, TOLERANCE, 1.0)
+    most, _ = highest_and_limit(
+        [r + offset for r, offset in zip(recordings, offsets, strict=True)], PRESENT, TOLERANCE, 1.0
+    )
     later = 0.1 + 0.006 * np.random.default_rng(3).standard_normal((1000, CELLS))
     assert (later > most + 2 * TOLERANCE).mean() < 2e-4
     assert most.max() < 0.14
@@ -66,7 +77,7 @@ def test_cells_that_are_always_loaded_do_not_make_others_rest_higher():
     held = events(0)
     for recording in held:
         recording[:, 40:] = 0.03 + 0.2 * np.random.default_rng(0).random(CELLS - 40)
-    most, _ = baseline(held, PRESENT, TOLERANCE, 1.0)
+    most, _ = highest_and_limit(held, PRESENT, TOLERANCE, 1.0)
     np.testing.assert_array_equal(most[:40], np.zeros(40))
 
 
@@ -74,12 +85,12 @@ def test_a_cell_that_was_never_heard_rests_at_0():
     log = np.full((30, 3), 0.4)
     log[:, 1] = np.nan
     log[::2, 2] = np.nan
-    most, _ = baseline([log], np.ones(3, bool), TOLERANCE, 1.0)
+    most, _ = highest_and_limit([log], np.ones(3, bool), TOLERANCE, 1.0)
     assert most.tolist() == pytest.approx([0.4, 0, 0.4])
 
 
 def test_two_frames_give_no_noise_estimate_and_no_lower_limit():
-    most, least = baseline([np.full((2, 3), 0.4)], np.ones(3, bool), TOLERANCE, 1.0)
+    most, least = highest_and_limit([np.full((2, 3), 0.4)], np.ones(3, bool), TOLERANCE, 1.0)
     assert most.tolist() == [0.4] * 3
     assert (least.reading == -np.inf).all()
 
@@ -114,7 +125,7 @@ def test_where_all_rest_lower_by_now_less_is_not_less_than_healthy():
 def test_cells_that_wander_as_ever_have_not_all_sunk():
     rng = np.random.default_rng(5)
     recordings = [r + rng.normal(0, 0.01, CELLS) for r in noisy(events(0), 0.001, 0.06)]
-    most, least = baseline(recordings, PRESENT, TOLERANCE, 1.0)
+    most, least = highest_and_limit(recordings, PRESENT, TOLERANCE, 1.0)
     for frames in recordings:
         runs = ConstantRuns.begin(CELLS).extend(frames, np.arange(len(frames)), TOLERANCE)
         assert least.lower(runs, runs.value <= most) > -TOLERANCE / 2
@@ -124,7 +135,7 @@ def test_cells_that_wander_as_ever_have_not_all_sunk():
 
 def test_each_cell_has_a_least_of_its_own():
     recordings = noisy(events(0), 0.001, 0.04)
-    _, least = baseline(recordings, PRESENT, TOLERANCE, 1.0)
+    _, least = highest_and_limit(recordings, PRESENT, TOLERANCE, 1.0)
     fresh = noisy(events(1), 0.001, 0.04, seed=4)
     assert (np.min([r[a : a + 32].max(axis=0) for r in fresh for a in (0, 32)], axis=0) > least.reading).all()
     untouched = np.median(np.concatenate(recordings), axis=0)[48:]
@@ -137,7 +148,7 @@ def test_a_cell_that_is_always_loaded_has_no_rest_to_fall_short_of():
     rng = np.random.default_rng(0)
     for recording in held:
         recording[:, 60] += rng.uniform(0.1, 0.4)
-    _, least = baseline(held, PRESENT, TOLERANCE, 1.0)
+    _, least = highest_and_limit(held, PRESENT, TOLERANCE, 1.0)
     assert least.reading[60] < 0.04 < held[0][:, 60].min()
 
 

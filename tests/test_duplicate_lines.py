@@ -6,9 +6,9 @@ import pytest
 from diagnostics import Fault, FaultKind, Line, SensorLayout, bridge, inject, line_fault
 from diagnostics.decision.address_aliasing import Aliasing, find_aliasing
 from diagnostics.evidence.duplicate_lines import DuplicateLines, DuplicatePair, informative, pairs
+from diagnostics.evidence.reference import Reference
 from diagnostics.evidence.spatial import Exclusion
 from diagnostics.evidence.stream_state import StreamState
-from diagnostics.healthy.reference import Reference
 
 LAYOUT = SensorLayout(2, 6, 5)
 ROW, COLUMN = np.divmod(np.arange(30), 5)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from diagnostics import SensorLayout, freeze_stream
-from diagnostics.healthy.reference import Reference
+from diagnostics.evidence.reference import Reference
 
 LAYOUT = SensorLayout(1, 4, 4)
 CELLS = 16

@@ -6,7 +6,7 @@ from conftest import without_calibration
 
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Diagnosis, Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
-from diagnostics.healthy.reference import tolerance_of
+from diagnostics.evidence.reference import tolerance_of
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.preprocessing.readings import RecordingBlocks
 

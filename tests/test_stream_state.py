@@ -3,10 +3,10 @@ import pytest
 
 from adaptfault.data.recordings import Recordings
 from diagnostics import FaultKind, Line, SensorLayout, bridge, freeze_stream, inject, line_fault, lose_frames
+from diagnostics.evidence.reference import Reference
 from diagnostics.evidence.spatial import Exclusion
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault
-from diagnostics.healthy.reference import Reference
 
 LAYOUT = SensorLayout(2, 6, 5)
 ROW, COLUMN = np.divmod(np.arange(30), 5)

@@ -25,11 +25,11 @@ from scipy.special import expit, logit
 from diagnostics.events.tiles import MOST_CELLS
 from diagnostics.evidence.conditional_test import EXPECTED, EXPECTED_CELLS
 from diagnostics.evidence.drift import gains_count
+from diagnostics.evidence.reference import Reference
 from diagnostics.evidence.spatial import Exclusion
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.calibration_subset import calibration_subset
-from diagnostics.healthy.reference import Reference
 from diagnostics.preprocessing.baseline import FEWEST
 from diagnostics.simulation.injection import inject
 

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.running_extremes import highest_so_far, lowest_so_far
+from diagnostics.preprocessing.readings import SEGMENT
 from diagnostics.preprocessing.scale import Array
 
-SEGMENT = 32  # frames processed together: a size
 _PARTS = 6  # of an event at most; beyond that the shortest neighbours are merged: a size
 _RELEASED = 0.3  # share of the load that is left when an event ends
 _MIN_AMPLITUDE = 0.1  # root load, summed over the cells: smaller changes are noise

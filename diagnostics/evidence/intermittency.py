@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, segments
-from diagnostics.events.contact_events import SEGMENT
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.baseline import MARGIN
+from diagnostics.preprocessing.readings import SEGMENT
 from diagnostics.preprocessing.scale import LIGHT
 
 if TYPE_CHECKING:

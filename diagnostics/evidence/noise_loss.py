@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import ConstantRuns, same_for
-from diagnostics.preprocessing.baseline import FEWEST, MAJORITY, MARGIN, untouched_evidence
+from diagnostics.evidence.lower_limit import untouched_evidence
+from diagnostics.preprocessing.baseline import FEWEST, MAJORITY, MARGIN
 from diagnostics.preprocessing.readings import RecordingBlocks, held
 
 _CALM = 0.25  # of a recording: a cell with a longer identical run has no noise

@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 from scipy.stats import betabinom, median_abs_deviation, t
 
 from diagnostics.events.constant_runs import SHORTEST_RUN
-from diagnostics.events.contact_events import SEGMENT
 from diagnostics.evidence.conditional_test import ANYWHERE, EXPECTED, EXPECTED_CELLS
 from diagnostics.preprocessing.baseline import CERTAIN_RATIO, FEWEST, MAJORITY
+from diagnostics.preprocessing.readings import SEGMENT
 
 if TYPE_CHECKING:
     from diagnostics.events.constant_runs import ConstantRuns

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import ConstantRuns
-from diagnostics.events.contact_events import SEGMENT, EventLog
+from diagnostics.events.contact_events import EventLog
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import Rectangle, Tile, tiles
 from diagnostics.evidence.conditional_test import SUDDEN_JUMP, CellState, Model
@@ -37,13 +37,13 @@ from diagnostics.evidence.spatial import (
 from diagnostics.evidence.weak_response import WeakResponse
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
 from diagnostics.preprocessing.offset import OffsetTracker
-from diagnostics.preprocessing.readings import held
+from diagnostics.preprocessing.readings import SEGMENT, held
 from diagnostics.preprocessing.rest_of_log import RestOfLog
 from diagnostics.preprocessing.transport import TransportState, invalid
 
 if TYPE_CHECKING:
+    from diagnostics.evidence.reference import Reference
     from diagnostics.healthy.prediction import Prediction
-    from diagnostics.healthy.reference import Reference
     from diagnostics.layout import SensorLayout
     from diagnostics.preprocessing.load import LoadDirection
     from diagnostics.preprocessing.scale import Array, Scale

@@ -23,13 +23,14 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from diagnostics.events.constant_runs import segments
-from diagnostics.events.contact_events import SEGMENT, ContactEvent, EventLog, Summary, count_repeats
+from diagnostics.events.contact_events import ContactEvent, EventLog, Summary, count_repeats
 from diagnostics.healthy.cross_fitting import FOLDS, CrossFitting, RegressionFit
 from diagnostics.healthy.local_regression import LocalRegression, predict_regressions
 from diagnostics.healthy.prediction import Prediction
 from diagnostics.healthy.stacking import RegressionOutput, Stacking, neighbourhood
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.baseline import FEWEST
+from diagnostics.preprocessing.readings import SEGMENT
 
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Array, Scale

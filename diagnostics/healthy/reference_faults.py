@@ -46,7 +46,7 @@ def find_reference_faults(
     candidates = _enclosed_groups(never_moved, layout)
     if not candidates.any() or never_moved[present].mean() > MAJORITY:
         return np.zeros(layout.n_cells)
-    rest, _ = baseline(recordings, present & ~never_moved, tolerance, layout.full_scale)
+    rest = baseline(recordings, present & ~never_moved, tolerance, layout.full_scale).highest
     typical = rest[present & ~never_moved]
     # A cell that holds more than any baseline is loaded, or dead.
     rest = np.where(rest > typical.max(), np.median(typical), rest)

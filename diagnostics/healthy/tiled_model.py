@@ -17,14 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import segments
-from diagnostics.events.contact_events import SEGMENT
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import MOST_CELLS, Tile, tiles
 from diagnostics.healthy.cross_fitting import FOLDS, CrossFitting, RegressionFit
 from diagnostics.healthy.local_regression import FEATURES, RIDGE, LocalRegression, Start, predict_regressions
 from diagnostics.healthy.model import HealthyModel, ReferenceEvent, count_events, drawn, p_floor_of
 from diagnostics.healthy.shared_prior import Samples, SharedPrior
-from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks
 from diagnostics.preprocessing.scale import Array, Scale
 
 if TYPE_CHECKING:

@@ -12,6 +12,7 @@ from diagnostics.preprocessing.transport import invalid
 
 Recording = NDArray[np.float64]
 
+SEGMENT = 32  # frames processed together: a size
 _MOST_VALUES = 1 << 23  # in a block of frames: a size
 _RECORDINGS, CELLS, _FRAMES = 200, 2000, 20  # in a sample, about, and frames of each recording: sizes
 

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import JumpHistogram, segments
-from diagnostics.events.contact_events import SEGMENT
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import HealthyRates
+from diagnostics.evidence.lower_limit import LowerLimit
 from diagnostics.evidence.noise_loss import NoiseLoss
 from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
-from diagnostics.preprocessing.baseline import LowerLimit, baseline
+from diagnostics.preprocessing.baseline import baseline
 from diagnostics.preprocessing.offset import ReferenceOffset
-from diagnostics.preprocessing.readings import RecordingBlocks, spread
+from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks, spread
 from diagnostics.preprocessing.scale import Scale
 from diagnostics.preprocessing.transport import longest_repetition
 
@@ -83,8 +83,10 @@ class Reference:
         dead = np.zeros(layout.n_cells) if dead is None else dead
         layout = living(layout, dead)
         present = layout.present.ravel()
-        rest, least = baseline(recordings, present, tolerance, layout.full_scale)
-        rest[dead > 0] = np.median(rest[present])  # the baseline of a dead cell is unknown
+        readings = baseline(recordings, present, tolerance, layout.full_scale)
+        least = LowerLimit.fit(readings, present, tolerance, layout.full_scale)
+        # The baseline of a dead cell is unknown.
+        rest = np.where(dead > 0, np.median(readings.highest[present]), readings.highest)
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
         jumps_seen = JumpHistogram.fit(recordings, tolerance, layout.full_scale, rest)
         patience = max(SEGMENT, 2 * max(longest_repetition(r) for r in recordings))

@@ -14,7 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.healthy.model import MIN_P_FLOOR
+from diagnostics.healthy.prediction import OUTLIERS, log_student_t
 from diagnostics.layout import Line, LineKind, address_bits
+from diagnostics.preprocessing.baseline import CERTAIN_RATIO
 
 if TYPE_CHECKING:
     from diagnostics.evidence.duplicate_lines import DuplicatePair
@@ -145,7 +148,7 @@ def _level_ratio(line: Line, onset: int, stream: StreamState) -> float:
             loaded |= bool((features[:, 2, np.isin(cells, empty)] > 0).any())
         # An address without a line never reads a load.
         if loaded:
-            ratio -= sign * 10.0
+            ratio -= sign * CERTAIN_RATIO
     return ratio
 
 
@@ -153,7 +156,7 @@ def _plausible(features: NDArray[np.float32], expected: Prediction, cells: NDArr
     """Return the log likelihood of being loaded, and of the load, summed over cells and averaged over events."""
     loaded = features[:, 2, cells] > 0
     p = np.where(loaded, 1 - expected.never[:, cells], expected.never[:, cells])
-    # Student's t with 4 degrees of freedom, relative to its mode; 0 where the spread is unknown.
-    z = np.where(loaded, (features[:, 1, cells] - expected.mean[:, cells]) / expected.spread[cells], 0.0)
-    load = -2.5 * np.log1p(np.nan_to_num(z) ** 2 / 4)
-    return float((np.log(np.maximum(p, 1e-3)) + load).mean(axis=0).sum())
+    # 0 where the spread is unknown.
+    error = np.where(loaded, (features[:, 1, cells] - expected.mean[:, cells]) / expected.spread[cells], 0.0)
+    load = log_student_t(np.nan_to_num(error), OUTLIERS)
+    return float((np.log(np.maximum(p, MIN_P_FLOOR)) + load).mean(axis=0).sum())

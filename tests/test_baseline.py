@@ -7,6 +7,7 @@ from conftest import without_calibration
 from diagnostics import Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
 from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.evidence.lower_limit import LowerLimit
+from diagnostics.evidence.term import ConstantCells
 from diagnostics.preprocessing.baseline import baseline
 
 LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
@@ -99,7 +100,8 @@ def evidence_of(readings: np.ndarray, least: LowerLimit) -> np.ndarray:
     """Return the evidence of 40 frames of these readings."""
     frames, every = np.tile(readings, (40, 1)), np.ones(len(readings), bool)
     runs = ConstantRuns.begin(len(readings)).extend(frames, np.arange(40), TOLERANCE)
-    return least.evidence(runs, every, TOLERANCE, every, least.lower(runs, every))
+    layout = SensorLayout(1, 1, len(readings), full_scale=1.0)
+    return least.evidence(ConstantCells(layout, 1.0, TOLERANCE, runs, every, least.lower(runs, every)))
 
 
 def test_reading_less_than_ever_is_evidence_unless_half_of_the_cells_do():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from diagnostics.events.constant_runs import ConstantRuns, JumpHistogram, same_for
+from diagnostics.events.constant_runs import ConstantRuns, same_for
 from diagnostics.preprocessing.readings import held
 
 TOLERANCE = 0.02
@@ -124,38 +124,6 @@ def test_cells_that_rise_are_no_company_for_one_that_falls():
     log[12:, 0], log[12:, 1:6] = 0.0, FULL_SCALE  # many break at once
     company = runs_of(log).company
     assert company[:6] == pytest.approx([0.1] + [0.5] * 5)
-
-
-@pytest.fixture(scope="module")
-def gentle() -> list[np.ndarray]:
-    """Loads that come and go little by little, at another time in each cell."""
-    rng = np.random.default_rng(0)
-    t = np.arange(200)[:, None]
-    return [np.maximum(0, 3 * np.sin(t / 12 + rng.uniform(0, 6, 20))) for _ in range(10)]
-
-
-def test_a_cell_that_jumps_further_than_healthy_ones_do_is_suspect_and_one_released_gradually_is_not(gentle):
-    jumps_seen = JumpHistogram.fit(gentle, TOLERANCE, FULL_SCALE)
-    log = gentle[0][:60].copy()
-    log[30:, 4] = 5.0
-    evidence = jumps_seen.evidence(runs_of(log), FULL_SCALE)
-    assert evidence[4] > 0.5
-    let_go = runs_of(np.concatenate([log, np.linspace(log[-1], 0, 40), np.zeros((10, 20))]))
-    assert jumps_seen.evidence(let_go, FULL_SCALE)[5] < 0
-
-
-def test_jumps_in_company_and_cells_that_never_moved_are_no_evidence(gentle):
-    jumps_seen = JumpHistogram.fit(gentle, TOLERANCE, FULL_SCALE)
-    released = np.tile(np.linspace(1, 2, 20)[:, None], 10)
-    released[12:] = 0.0
-    released[:, 3] = 2.5
-    assert (jumps_seen.evidence(runs_of(released), FULL_SCALE) == 0).all()
-
-
-def test_without_a_reference_no_jump_is_evidence():
-    log = np.tile(np.linspace(1, 2, 20)[:, None], 10)
-    log[12:, 3] = 5.0
-    assert (JumpHistogram.silent().evidence(runs_of(log), FULL_SCALE) == 0).all()
 
 
 def test_how_long_a_cell_has_read_the_same_is_counted_over_blocks_and_gaps():

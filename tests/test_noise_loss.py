@@ -5,6 +5,7 @@ from test_baseline import events
 from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, SensorLayout, inject
 from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.evidence.noise_loss import NoiseLoss
+from diagnostics.evidence.term import ConstantCells
 
 LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
 CELLS, PRESENT = LAYOUT.n_cells, np.ones(LAYOUT.n_cells, bool)
@@ -22,6 +23,10 @@ def noisy_presses(seed: int, recordings: int = 24, noise: float = NOISE, rest: f
 
 def runs_of(frames: np.ndarray) -> ConstantRuns:
     return ConstantRuns.begin(CELLS).extend(frames, np.arange(len(frames)), 0.005)
+
+
+def cells_of(runs: ConstantRuns, rests: np.ndarray = PRESENT) -> ConstantCells:
+    return ConstantCells(LAYOUT, 1.0, 0.005, runs, rests)
 
 
 def test_the_longest_time_that_a_cell_read_the_same_is_found():
@@ -49,7 +54,7 @@ def test_a_cell_that_loses_its_noise_is_broken_unless_half_of_the_cells_do():
     def evidence_of(dead: int) -> np.ndarray:
         frames = idle.copy()
         frames[:, CELLS - dead :] = 0.0
-        return noise_loss.evidence(runs_of(frames), PRESENT, PRESENT, sunk=False)
+        return noise_loss.evidence(cells_of(runs_of(frames)))
 
     assert np.flatnonzero(evidence_of(10) > 0).tolist() == list(range(CELLS - 10, CELLS))
     assert not (evidence_of(40) > 0).any()
@@ -59,7 +64,7 @@ def test_missing_readings_are_not_identical_readings():
     noise_loss = NoiseLoss.fit(noisy_presses(0), PRESENT)
     frames = np.concatenate(noisy_presses(5, 5))
     frames[50:, 60] = np.nan
-    assert not (noise_loss.evidence(runs_of(frames), PRESENT, PRESENT, sunk=False) > 0).any()
+    assert not (noise_loss.evidence(cells_of(runs_of(frames))) > 0).any()
 
 
 @pytest.mark.usefixtures("uncalibrated")
@@ -78,7 +83,7 @@ def test_cells_that_have_all_sunk_some_of_them_to_the_rail_are_not_suspected_for
     for frames in read(1, 6, sunk=0.015):
         stream.extend(frames)
     stream = stream.complete()
-    same = fitted.reference_.noise_loss.evidence(stream.runs, stream.rests(), PRESENT, sunk=False)
+    same = fitted.reference_.noise_loss.evidence(cells_of(stream.runs, stream.rests()))
     assert (same > 0).any()  # they read 0, and nothing else
     assert not (stream.temporal() > 10).any()
 

@@ -1,17 +1,17 @@
 """Constant runs: since when each cell holds one value, and the jump into that run.
 
-Detects, for each cell, the longest run at the end of the log within +- tolerance of one value:
+Finds, for each cell, the longest run at the end of the log within +- tolerance of one value:
 
     start = min { s : max(x_s..x_T) - min(x_s..x_T) <= 2 tolerance }
 
-and scores the jump into it against the jumps of healthy cells (:class:`JumpHistogram`). A stuck cell is constant from
-its onset on, up to the dither of the converter. So is a healthy cell without contact, or under a static load: a
-constant run alone is no evidence of a fault; the spatial test decides (``diagnostics.evidence.spatial``).
+A stuck cell is constant from its onset on, up to the dither of the converter. So is a healthy cell without contact, or
+under a static load: a constant run alone is no evidence of a fault. The spatial test
+(:mod:`~diagnostics.evidence.spatial`) and the size of the jump (:mod:`~diagnostics.evidence.jumps`) decide.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,9 +22,7 @@ from diagnostics.preprocessing.readings import held
 Floats = NDArray[np.float64]
 
 SHORTEST_RUN = 5  # frames; shorter runs are not tested
-_JUMPS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 1.0])  # of full scale, bin edges
 _RECENT = 64  # frames since a cell last moved, while it counts as able to jump
-_MOST = 4.0  # log ratio: a jump alone proves no fault
 _COMPANY = 0.2  # share of the loaded cells that jump together when a grasp is released
 
 
@@ -183,51 +181,3 @@ def segments(
         numbers = np.arange(first, first + len(frames))
         runs = runs.extend(frames, numbers, tolerance)
         yield frames, numbers, runs.start
-
-
-@dataclass(frozen=True)
-class JumpHistogram:
-    """Scores the jump into a constant run against the jumps of healthy cells.
-
-    The statistic is ``log(0.5 + 0.5 p(jump | fault) / p(jump | healthy))``, at most 4, with a uniform density for
-    faults and a histogram with one pseudo-count a bin for healthy cells. A broken cell jumps by any amount; a healthy
-    cell is mostly released gradually, or together with its neighbours. Jumps together with many cells are not scored.
-
-    Attributes:
-        log_ratio: float ``[2, bins]``, log likelihood ratio fault : healthy of a fall and of a rise of each size.
-    """
-
-    log_ratio: Floats
-
-    @classmethod
-    def fit(
-        cls, recordings: Sequence[Floats], tolerance: float, full_scale: float, baseline: Floats | float = 0.0
-    ) -> JumpHistogram:
-        """Count the jumps in fault-free recordings, ``[T, D]`` each, with ``baseline`` (``[D]``) without contact."""
-        healthy = np.ones((2, len(_JUMPS) - 1))
-        for recording in recordings:
-            runs = ConstantRuns.begin(recording.shape[1])
-            for first in range(0, len(recording), SHORTEST_RUN):
-                frames = recording[first : first + SHORTEST_RUN]
-                runs = runs.extend(frames, np.arange(first, first + len(frames)), tolerance, baseline)
-                fresh = runs.moved & (runs.length >= SHORTEST_RUN) & (runs.length < 2 * SHORTEST_RUN) & runs.alone
-                for up in (0, 1):
-                    jumps = runs.jump[fresh & ((runs.jump > 0) == up)]
-                    healthy[up] += np.histogram(np.abs(jumps) / full_scale, _JUMPS)[0]
-        ratio = np.diff(_JUMPS) / (healthy / healthy.sum(axis=1, keepdims=True))
-        # A cell that was unloaded when it broke did not jump: half of the faults look healthy.
-        return cls(np.minimum(np.log(0.5 + 0.5 * ratio), _MOST))
-
-    @classmethod
-    def silent(cls) -> JumpHistogram:
-        """Return the histogram of a cold start: no evidence from jumps."""
-        return cls(np.zeros((2, len(_JUMPS) - 1)))
-
-    def evidence(self, runs: ConstantRuns, full_scale: float) -> Floats:
-        """Return the log likelihood ratio ``[D]``, 0 where a cell never moved or jumped with others."""
-        return np.where(runs.alone, self.size(runs, full_scale), 0.0)
-
-    def size(self, runs: ConstantRuns, full_scale: float) -> Floats:
-        """Return the log likelihood ratio ``[D]`` as if each cell jumped alone; 0 where it never moved."""
-        which = np.searchsorted(_JUMPS[1:-1], np.abs(runs.jump) / full_scale, side="right")
-        return np.where(runs.moved, self.log_ratio[(runs.jump > 0).astype(np.intp), which], 0.0)

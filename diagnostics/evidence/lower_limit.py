@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.preprocessing.baseline import CERTAIN_RATIO, FEWEST, MAJORITY, MARGIN, RARE
+from diagnostics.evidence.term import untouched_evidence
+from diagnostics.preprocessing.baseline import FEWEST, MAJORITY, MARGIN, RARE
 from diagnostics.preprocessing.readings import SEGMENT
 from diagnostics.preprocessing.scale import LIGHT
 
 if TYPE_CHECKING:
     from diagnostics.events.constant_runs import ConstantRuns
+    from diagnostics.evidence.term import ConstantCells
     from diagnostics.preprocessing.baseline import Baseline
-
-_AS_EVER = -2.0  # log likelihood ratio of a usual reading that an open cell does not give
 
 Floats = NDArray[np.float64]
 
@@ -75,41 +75,15 @@ class LowerLimit:
             return 0.0
         return min(0.0, float(np.median((runs.value - self.reading)[rests])) - self.usual)
 
-    def evidence(
-        self, runs: ConstantRuns, rests: NDArray[np.bool_], tolerance: float, present: NDArray[np.bool_], lower: float
-    ) -> Floats:
-        """Return the log likelihood ratio open : healthy of a constant run without contact, ``[D]``.
+    def evidence(self, cells: ConstantCells) -> Floats:
+        """Return the log likelihood ratio open : healthy, ``[D]``.
 
         12 for a run below the limit and below that of all cells, -2 for a usual one, 0 else.
-
-        Args:
-            runs: the constant runs.
-            rests: bool ``[D]``, cells at their baseline or below.
-            tolerance: readings within 2 tolerances of 0 are at the low rail.
-            present: bool ``[D]``.
-            lower: see :meth:`lower`.
         """
+        runs, present = cells.runs, cells.present
         received = present & np.isfinite(runs.value)
-        least = self.reading + lower
+        least = self.reading + cells.lower
         less = received & (runs.length >= SEGMENT) & (runs.high < least)
-        open_ = (runs.high <= 2 * tolerance) | (runs.high < least[present].min())
-        as_ever = rests & received & (runs.high >= least) & (least > tolerance)
+        open_ = (runs.high <= 2 * cells.tolerance) | (runs.high < least[present].min())
+        as_ever = cells.rests & received & (runs.high >= least) & (least > cells.tolerance)
         return untouched_evidence(less, less & open_, as_ever, present)
-
-
-def untouched_evidence(
-    unusual: NDArray[np.bool_], broken: NDArray[np.bool_], as_ever: NDArray[np.bool_], present: NDArray[np.bool_]
-) -> Floats:
-    """Return the log likelihood ratio fault : healthy of cells without contact, ``[D]``: 12, -2 or 0.
-
-    All are 0 where more than half of the cells are unusual.
-
-    Args:
-        unusual: bool ``[D]``, cells that behave as they never did in the reference.
-        broken: bool ``[D]``, those of them that only a fault explains: 12.
-        as_ever: bool ``[D]``, cells that behave as ever, unlike broken ones: -2.
-        present: bool ``[D]``.
-    """
-    if unusual.sum() > MAJORITY * present.sum():
-        return np.zeros(len(present))
-    return np.where(broken, CERTAIN_RATIO, np.where(as_ever, _AS_EVER, 0.0))

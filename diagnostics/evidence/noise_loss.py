@@ -15,14 +15,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.constant_runs import ConstantRuns, same_for
-from diagnostics.evidence.lower_limit import untouched_evidence
+from diagnostics.events.constant_runs import same_for
+from diagnostics.evidence.term import untouched_evidence
 from diagnostics.preprocessing.baseline import FEWEST, MAJORITY, MARGIN
 from diagnostics.preprocessing.readings import RecordingBlocks, held
+
+if TYPE_CHECKING:
+    from diagnostics.evidence.term import ConstantCells
 
 _CALM = 0.25  # of a recording: a cell with a longer identical run has no noise
 _QUIET = 0.02  # share of cells without noise off the rails, at most
@@ -70,16 +74,13 @@ class NoiseLoss:
         """Return the state of a cold start: no cell is known to have noise."""
         return cls(np.full(n_cells, np.inf), 1.0)
 
-    def evidence(self, runs: ConstantRuns, rests: NDArray[np.bool_], present: NDArray[np.bool_], sunk: bool) -> Floats:
-        """Return the log likelihood ratio fault : healthy, ``[D]``.
+    def evidence(self, cells: ConstantCells) -> Floats:
+        """Return the log likelihood ratio faulty : healthy, ``[D]``.
 
-        Args:
-            runs: the constant runs.
-            rests: bool ``[D]``, cells at their baseline or below.
-            present: bool ``[D]``.
-            sunk: all cells at rest read less than ever in the reference; at the low rail they have no noise.
+        Where all cells at rest read less than in the reference, they may lie at the low rail, and have no noise there.
         """
+        runs, present, sunk = cells.runs, cells.present, cells.lower < -cells.tolerance
         too_long = np.maximum(_LONGER * self.longest, MARGIN * self.recording)
         calm = present & (np.minimum(runs.same, runs.length) >= too_long)  # missing readings are not identical ones
-        as_ever = present & rests & (runs.length >= too_long) & (runs.same <= self.longest)
-        return untouched_evidence(calm, calm & ~(rests & sunk), as_ever, present)
+        as_ever = present & cells.rests & (runs.length >= too_long) & (runs.same <= self.longest)
+        return untouched_evidence(calm, calm & ~(cells.rests & sunk), as_ever, present)

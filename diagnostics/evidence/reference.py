@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.constant_runs import JumpHistogram, segments
+from diagnostics.events.constant_runs import segments
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import HealthyRates
+from diagnostics.evidence.jumps import JumpHistogram
 from diagnostics.evidence.lower_limit import LowerLimit
 from diagnostics.evidence.noise_loss import NoiseLoss
 from diagnostics.healthy.model import HealthyModel

@@ -35,7 +35,7 @@ from diagnostics.preprocessing.readings import SEGMENT
 
 if TYPE_CHECKING:
     from diagnostics.events.constant_runs import ConstantRuns
-    from diagnostics.layout import SensorLayout
+    from diagnostics.evidence.term import ConstantCells
 
 _DITHERS = 0.1  # share of broken cells whose readings differ, within the tolerance
 
@@ -69,22 +69,16 @@ class RestLevel:
         still = ended & (runs.length >= SEGMENT)
         return RestLevel(level, self.still | still, self.exact | (still & (runs.low == runs.high)))
 
-    def evidence(self, runs: ConstantRuns, rests: Mask, tolerance: float, layout: SensorLayout) -> Floats:
-        """Return the log likelihood ratio broken : healthy, ``[D]``; 0 for cells that are not constant at rest.
-
-        Args:
-            runs: the constant runs.
-            rests: bool ``[D]``, cells whose run lies at their baseline.
-            tolerance: a run stays within +- this of one value.
-            layout: the array.
-        """
+    def evidence(self, cells: ConstantCells) -> Floats:
+        """Return the log likelihood ratio broken : healthy, ``[D]``; 0 for cells that are not constant at rest."""
+        runs, rests, tolerance, layout = cells.runs, cells.rests, cells.tolerance, cells.layout
         present, ratio = layout.present.ravel(), np.zeros(layout.n_cells)
         known = np.flatnonzero(present & np.isfinite(self.level))
-        cells = np.flatnonzero(present & rests & (runs.length >= SEGMENT))
-        if len(known) < FEWEST or not len(cells):
+        tested = np.flatnonzero(present & rests & (runs.length >= SEGMENT))
+        if len(known) < FEWEST or not len(tested):
             return ratio
         others, still, margin = self.level[known], self.still[known], 2 * tolerance
-        level, exact = runs.high[cells], runs.low[cells] == runs.high[cells]
+        level, exact = runs.high[tested], runs.low[tested] == runs.high[tested]
         with_noise = still & ~self.exact[known]
         scale = max(float(median_abs_deviation(others, scale="normal")), tolerance)
         far = -np.abs(level - np.median(others))
@@ -99,7 +93,7 @@ class RestLevel:
         rail = level <= margin
         anywhere = ANYWHERE * 2 * margin / layout.full_scale
         broken = (rail + anywhere / ((1 - ANYWHERE) / 2)) * np.where(exact, 1 - _DITHERS, _DITHERS)
-        ratio[cells] = np.minimum(np.log(broken / healthy), np.where(rail, CERTAIN_RATIO, 0.0))
+        ratio[tested] = np.minimum(np.log(broken / healthy), np.where(rail, CERTAIN_RATIO, 0.0))
         pad = np.arange(layout.n_cells) // (layout.n_cells // layout.pads)
         unusual = np.bincount(pad, ratio > 0) > MAJORITY * np.bincount(pad, present)
         return np.where(unusual[pad], np.minimum(ratio, 0.0), ratio)

@@ -34,6 +34,7 @@ from diagnostics.evidence.spatial import (
     group_excluded_evidence,
     held_load_evidence,
 )
+from diagnostics.evidence.term import ConstantCells
 from diagnostics.evidence.weak_response import WeakResponse
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
 from diagnostics.preprocessing.offset import OffsetTracker
@@ -203,13 +204,12 @@ class StreamState:
     def temporal(self) -> NDArray[np.float64]:
         """Log likelihood ratio of the constant run, its level and noise, and the jump into it, ``[D]``."""
         reference, rests = self.reference, self.rests()
-        if reference.model is None:
-            return self._level.evidence(self.runs, rests, reference.tolerance, self.layout)
         lower = reference.least.lower(self.runs, rests & self.present)
-        low = reference.least.evidence(self.runs, rests, reference.tolerance, self.present, lower)
-        noise = reference.noise_loss.evidence(self.runs, rests, self.present, lower < -reference.tolerance)
-        untouched = np.where(np.abs(noise) > np.abs(low), noise, low)
-        return reference.jumps_seen.evidence(self.runs, reference.scale.full_scale) + untouched
+        cells = ConstantCells(self.layout, reference.scale.full_scale, reference.tolerance, self.runs, rests, lower)
+        if reference.model is None:
+            return self._level.evidence(cells)
+        low, noise = reference.least.evidence(cells), reference.noise_loss.evidence(cells)
+        return reference.jumps_seen.evidence(cells) + np.where(np.abs(noise) > np.abs(low), noise, low)
 
     def model_of(self, i: int, events: EventLog) -> Model:
         """Return the healthy model of tile i; without a reference, a model of its ``events``."""

@@ -1,10 +1,10 @@
 """A change of the whole sensor, or of a pad: gain, or offset, of all its cells. No single cell stands out as faulty.
 
 Statistic, per recording r over the healthy cells: the baseline b_r is the median over cells of each cell's 5 % quantile
-over time; the load l_r is the 99 % quantile of all readings above the baseline. The gain is exp(median log l_new - median
-log l_ref) and the offset is median b_new - median b_ref, of new and of reference recordings. A change is reported where
-the two-sample test of Kolmogorov and Smirnov (``scipy.stats.ks_2samp``) of the new against the reference recordings has
-p < 1e-4, and the size matters.
+over time; the load l_r is the 99 % quantile of all readings above the baseline. The gain is the ratio of the median
+loads of new and of reference recordings, and the offset is the difference of their median baselines. A change is
+reported where the two-sample test of Kolmogorov and Smirnov (``scipy.stats.ks_2samp``) of the new against the reference
+recordings has p < 1e-4, and the size matters.
 
 A pad is compared with the other pads of the same recordings: log l_r and b_r less their medians over the other pads.
 So another force or object, which all pads feel, is no change of a pad. Where two pads differ from each other, the one

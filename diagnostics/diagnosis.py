@@ -219,13 +219,14 @@ class SelfDiagnosis:
             inferred[cells] = True
         scale, intermittency = stream.scale, stream.intermittency
         working = np.empty_like(inferred)
-        working[every] = found.alive & ~inferred
+        moved = bool((stream.runs.moved & stream.present).any())
+        working[every] = ~inferred & (found.alive if moved else self.layout.present.ravel())
         return Diagnosis(
             layout=self.layout,
             faults=causes,
             probability=probability,
             tested=(found.alive & stream.touched[every]) | inferred,  # noise alone is no test
-            transport=stream.transport.faults(scale.baseline + scale.near, working, self.layout.rate),
+            transport=stream.transport.faults(scale.baseline + scale.near, working, self.layout.rate, moved),
             evidence={
                 "spatial": (spatial.evidence + spatial.offset + spatial.gain)[every],
                 "temporal": np.where(spatial.scored, stream.temporal(), intermittency.blinking + intermittency.noisy)[

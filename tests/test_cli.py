@@ -1,18 +1,20 @@
 """The routines end to end, through the command line."""
 
+import argparse
 import json
 import logging
 import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import worn
 
-from adaptfault.cli import COMMANDS, main
+from adaptfault.cli import COMMANDS, _parser, main
 from adaptfault.cli.options import LogAboveBars
 from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.data.simulated_grasps import simulate
@@ -277,6 +279,28 @@ def test_wrong_usage_is_exit_code_3(capsys):
             main(arguments)
         assert stop.value.code == 3
     assert "usage: adaptfault" in capsys.readouterr().err
+
+
+def numeric_options(parser: argparse.ArgumentParser, command: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Yield each option that takes a number, after its command."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, of_command in action.choices.items():
+                yield from numeric_options(of_command, (*command, name))
+        elif action.type in (int, float):
+            yield (*command, action.option_strings[-1])
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf", "1e400", "-1", "-0.5"])
+def test_every_numeric_option_refuses_what_is_negative_or_not_finite(number, capsys):
+    options = list(numeric_options(_parser()))
+    assert ("maintain", "--budget") in options
+    assert ("fleet", "maintain", "--budget") in options
+    for option in options:
+        with pytest.raises(SystemExit) as end:
+            main([*option, number])
+        assert end.value.code == 3
+        assert f"argument {option[-1]}: " in capsys.readouterr().err
 
 
 def test_help_comes_without_loading_torch_or_scikit_learn():

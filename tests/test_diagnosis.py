@@ -239,6 +239,16 @@ def test_a_stream_that_froze_for_good_makes_no_cell_faulty_either(fitted, log):
     assert [fault.kind for fault in diagnosis.transport] == ["frozen"]
 
 
+def test_a_stream_that_is_frozen_from_the_start_is_told_also_where_healthy_idle_frames_repeat_for_long(fitted, log):
+    held = np.repeat(log[3][50:51], 60, axis=0)
+    assert fitted.reference_.patience > len(held)
+    for frames in (np.concatenate([held, *log]), held):
+        diagnosis = fitted.diagnose(frames)
+        assert not diagnosis.faults
+        assert [(fault.kind, fault.onset, fault.frames) for fault in diagnosis.transport] == [("frozen", 0, 60)]
+        assert diagnosis.exit_code == 1
+
+
 @pytest.mark.parametrize("cold", [False, True])
 def test_an_idle_pad_that_repeats_zeros_is_no_fault(fitted, log, cold: bool):
     diagnosis = (COLD if cold else fitted).diagnose([*log, np.zeros((2000, 220))])

@@ -161,6 +161,28 @@ def test_identical_windows_do_not_break_the_fit():
     assert torch.isfinite(outputs).all()
 
 
+@pytest.mark.parametrize("share", [1.0, 0.8])
+@pytest.mark.parametrize("noise", [0.0, 1e-7, 1e-5, 1e-3])
+def test_windows_that_differ_by_noise_alone_do_not_break_the_fit(share, noise):
+    rng = np.random.default_rng(0)
+    x = 0.5 + noise * rng.normal(size=(400, 60))
+    x[: round((1 - share) * 400)] = rng.random((round((1 - share) * 400), 60))
+    views = [torch.from_numpy(v.astype(np.float32)) for v in (10 * x, x, x[:, ::2])]
+    first, second = parts(views, 100)
+    classes = one_hot(rng.integers(0, 3, 400))
+    head, outputs = fit_head(first, second, classes[:300], classes[300:], np.arange(100) % 5)
+    assert torch.isfinite(head(second)).all()
+    assert torch.isfinite(outputs).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, 1e30])
+def test_features_that_are_not_finite_are_refused(value):
+    views, y = windows()
+    views[0][3, 1] = value
+    with pytest.raises(ValueError, match="features that are not finite"):
+        fit_head(*parts(views, 45), one_hot(y[:-45]), one_hot(y[-45:]), np.arange(45) % 5)
+
+
 def test_values_are_predicted_in_their_own_unit():
     views, _ = windows(200)
     truth = np.stack([100 + 20 * np.tanh(views[0].numpy().mean(1)), np.full(200, 7.0)], axis=1).astype(np.float32)

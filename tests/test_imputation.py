@@ -50,6 +50,14 @@ def test_cells_that_never_moved_are_filled_with_their_value():
             np.testing.assert_allclose(fill(torch.full((1, 1, D - 2), 0.25)), 0.25, atol=1e-6)
 
 
+def test_cells_that_switch_together_between_two_levels_are_filled_from_each_other():
+    levels = np.tile([0.2, 0.6], 40)[:, None]
+    statistics = CellStatistics.of_frames(np.repeat(levels, D, axis=1).astype(np.float32))
+    weight, bias = statistics.conditional_mean(F)
+    np.testing.assert_allclose(levels @ weight.sum(axis=1)[None] + bias, np.repeat(levels, 2, axis=1), atol=1e-6)
+    assert np.isfinite(statistics.precision).all()
+
+
 def test_the_nearest_fill_knows_edges_that_the_linear_one_cannot():
     known, fresh = edges().x[:150], edges().x[150:]
     statistics = CellStatistics.fit(Windows(known, np.zeros(150), np.arange(150)))

@@ -47,9 +47,13 @@ def test_the_baseline_is_that_of_the_reference():
     np.testing.assert_allclose(reference.scale.baseline, offset, atol=0.02)
 
 
-def test_a_reference_with_repeated_frames_raises_the_patience(reference):
-    holds = [freeze_stream(r, 10, 80) for r in healthy(0)]
-    assert Reference.fit(holds, LAYOUT).patience > 70
+def test_repeated_frames_of_the_reference_raise_the_patience_with_load_only_where_they_are_loaded(reference):
+    idle = Reference.fit(
+        [freeze_stream(np.append(r, np.zeros((80, CELLS)), axis=0), 100, 180) for r in healthy(0)], LAYOUT
+    )
+    holds = Reference.fit([freeze_stream(r, 10, 80) for r in healthy(0)], LAYOUT)
+    assert (idle.patience, idle.loaded_patience) == (158, reference.loaded_patience)
+    assert holds.patience == holds.loaded_patience > 70
     assert reference.patience < 70
 
 

@@ -101,6 +101,7 @@ def test_a_position_without_a_cell_is_untested():
 def test_the_exit_code_distinguishes_no_fault_single_cells_and_faults_of_wires():
     assert diagnosed().exit_code == 0
     assert diagnosed(transport=(LOST,)).exit_code == 0
+    assert diagnosed(transport=(LOST, TransportFault("frozen", 50, 40, "it froze"))).exit_code == 1
     assert diagnosed(CELL).exit_code == 1
     assert diagnosed(CELL, ROW).exit_code == 2
     assert diagnosed(*(Fault("open", (c,)) for c in range(4))).exit_code == 2

@@ -24,6 +24,15 @@ def test_healthy_recordings_are_no_change():
     assert [sensor_change(grasps(12, seed), grasps(60, 99), LAYOUT, CELLS) for seed in range(20)] == [None] * 20
 
 
+def test_few_healthy_recordings_of_widely_different_loads_are_no_change():
+    def loads(n: int, seed: int) -> list[np.ndarray]:
+        force = np.random.default_rng(seed + 1000).lognormal(-1, 0.4, n)
+        return [f * r for f, r in zip(force, grasps(n, seed), strict=True)]
+
+    reference = loads(60, 99)
+    assert [sensor_change(loads(5, seed), reference, LAYOUT, CELLS) for seed in range(70, 80)] == [None] * 10
+
+
 @pytest.mark.parametrize("gain", [0.5, 2.0])
 def test_a_gain_of_all_cells_is_found_and_measured(gain):
     change = sensor_change([gain * r for r in grasps(12, 1)], grasps(60, 99), LAYOUT, CELLS)

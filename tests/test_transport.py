@@ -2,12 +2,13 @@ import numpy as np
 import pytest
 
 from diagnostics import TransportFault, freeze_stream, lose_frames
-from diagnostics.preprocessing.transport import TransportState, longest_repetition
+from diagnostics.preprocessing.transport import Patience, TransportState, repetitions
 
 CELLS = 10
 PRESENT = np.ones(CELLS, bool)
 LOADED_FROM = np.full(CELLS, 0.1)
 PATIENCE = 20
+LIMIT = Patience(PATIENCE, PATIENCE, LOADED_FROM)
 
 
 @pytest.fixture
@@ -15,11 +16,11 @@ def log() -> np.ndarray:
     return np.random.default_rng(0).uniform(0.5, 3, (200, CELLS))
 
 
-def received(frames: np.ndarray, size: int = 1000, present: np.ndarray = PRESENT) -> tuple[TransportState, list[int]]:
+def received(frames: np.ndarray, size: int = 1000, present: np.ndarray = PRESENT, patience=LIMIT):
     """Feed the frames in chunks; return the stream and the numbers of the frames that carry information."""
     transport, informative = TransportState(), []
     for first in range(0, len(frames), size):
-        transport, some = transport.receive(frames[first : first + size], present, PATIENCE)
+        transport, some = transport.receive(frames[first : first + size], present, patience)
         informative += (some + first).tolist()
     return transport, informative
 
@@ -80,7 +81,7 @@ def test_a_position_without_a_cell_does_not_make_a_lost_frame_arrive(log):
 
 def test_frames_that_were_never_received_count_as_lost(log):
     transport, _ = received(log[:50])
-    transport, _ = transport.without(3).receive(log[50:], PRESENT, PATIENCE)
+    transport, _ = transport.without(3).receive(log[50:], PRESENT, LIMIT)
     (fault,) = faults(transport.without(2))
     assert (fault.kind, fault.onset, fault.frames) == ("lost", 50, 5)
 
@@ -99,7 +100,34 @@ def test_a_transport_fault_survives_its_dict():
     assert TransportFault.from_dict(fault.to_dict()) == fault
 
 
-def test_the_longest_repetition_counts_how_often_a_frame_came_again(log):
-    assert longest_repetition(log) == 0
-    assert longest_repetition(freeze_stream(freeze_stream(log, 10, 13), 40, 50)) == 9
-    assert longest_repetition(np.full((5, 3), np.nan)) == 4
+def test_a_frame_with_load_is_frozen_sooner_than_an_idle_one(log):
+    log[:100] = 0
+    patience = Patience(150, PATIENCE, LOADED_FROM)
+    transport, informative = received(freeze_stream(log, 120, 160), patience=patience)
+    (fault,) = faults(transport)
+    assert (fault.kind, fault.onset, fault.frames) == ("frozen", 120, 40)
+    assert informative == [*range(120 + PATIENCE + 1), *range(160, 200)]
+
+
+def test_a_stream_that_never_moved_is_frozen_or_its_cells_are_stuck(log):
+    transport, _ = received(np.repeat(log[:1], 60, axis=0))
+    (fault,) = transport.faults(LOADED_FROM, PRESENT, rate=10, moved=False)
+    assert (fault.kind, fault.onset, fault.frames) == ("frozen", 0, 60)
+    assert "10 cells are loaded" in fault.reason
+    assert "frozen, or these cells are stuck" in fault.reason
+
+
+def test_patience_is_twice_the_longest_repetition_with_load_and_without(log):
+    idle, loaded = log.copy(), freeze_stream(log, 10, 25)
+    idle[50:90] = 0
+    idle[:, :2] = 5  # two loaded cells may be broken
+    patience = Patience.fit([idle, loaded, log], LOADED_FROM, 5)
+    assert (patience.idle, patience.loaded) == (2 * 39, 2 * 14)
+    assert Patience.fit([log], LOADED_FROM, 5) == Patience(5, 5, LOADED_FROM)
+
+
+def test_each_frame_is_counted_how_often_it_came_again(log):
+    assert not repetitions(log).any()
+    assert repetitions(freeze_stream(log, 40, 44))[38:46].tolist() == [0, 0, 0, 1, 2, 3, 0, 0]
+    assert repetitions(np.full((5, 3), np.nan)).tolist() == [0, 1, 2, 3, 4]
+    assert not len(repetitions(np.empty((0, 3))))

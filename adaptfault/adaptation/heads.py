@@ -268,14 +268,36 @@ class _Values:
 
 
 def _distances(views: Views) -> tuple[list[Tensor], Tensor]:
-    """Return all distances of the windows, in units of their medians, and the medians."""
-    distances = [
-        _distance(views[i], views[i], squared=True) if squared else _absolute_distances(views[i])
-        for i, squared in _DISTANCES
-    ]
+    """Return all distances of the windows, in units of their medians, and these units.
+
+    Raises:
+        ValueError: a view is not finite.
+    """
+    if not all(bool(view.square().sum().isfinite()) for view in views):
+        raise ValueError("the network gives features that are not finite: check the recordings, and train it anew")
+    distances, widths = [], []
     sample = evenly(len(views[0]), _SAMPLE)
-    widths = [float(d[sample][:, sample].median()) or 1.0 for d in distances]
-    return [d.div_(width) for d, width in zip(distances, widths, strict=True)], torch.tensor(widths)
+    for i, squared in _DISTANCES:
+        view, least = views[i], 0.0
+        distance = _distance(view, view, squared=True) if squared else _absolute_distances(view)
+        width = float(distance[sample][:, sample].median())
+        if squared and width < _rounding(view):
+            view = view.double()
+            distance, least = _distance(view, view, squared=True).float(), _rounding(view)
+            width = float(distance[sample][:, sample].median())
+        widths.append(max(width, least) or 1.0)
+        distances.append(distance.div_(widths[-1]))
+    return distances, torch.tensor(widths)
+
+
+def _rounding(view: Tensor) -> float:
+    """Return the unit of squared distances below which their rounding errors exceed the smallest ridge.
+
+    A squared distance is a difference of sums of p squares, so its error is about sqrt(p) eps times these (Higham and
+    Mary 2019). M x M random errors change an eigenvalue of a kernel by up to 2 sqrt(M) times their size (Wigner 1955).
+    """
+    m, p = view.shape
+    return 2 * (m * p) ** 0.5 * torch.finfo(view.dtype).eps * float(view.square().sum(1).mean()) / min(_RIDGES)
 
 
 def _kernel(distances: Sequence[Tensor], of: Sequence[int]) -> Tensor:

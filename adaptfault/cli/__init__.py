@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import sys
 import traceback
-from collections.abc import Sequence
-from typing import NoReturn
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
 
 from adaptfault import __version__
 from adaptfault.cli import (
@@ -56,16 +57,37 @@ COMMANDS = (
 BAD_INPUT = 3  # exit code for unusable input or usage, as monitoring tools understand it ("unknown")
 
 
+def _number(convert: Callable[[str], float]) -> Callable[[str], float]:
+    """Return a converter of the text of an option that refuses what is negative or not finite."""
+
+    def converted(text: str) -> float:
+        number = convert(text)
+        if not 0 <= number < math.inf:
+            raise argparse.ArgumentTypeError(f"expected a finite number, not below 0, got {text!r}")
+        return number
+
+    converted.__name__ = convert.__name__  # argparse names it
+    return converted
+
+
 class _Parser(argparse.ArgumentParser):
-    """argparse's own exit code for wrong usage is 2, which here means that a technician is needed."""
+    """A parser whose numbers are finite and not negative, and whose exit code for wrong usage is 3.
+
+    argparse's own, 2, means here that a technician is needed.
+    """
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        for kind in (int, float):
+            self.register("type", kind, _number(kind))
 
     def error(self, message: str) -> NoReturn:
         self.print_usage(sys.stderr)
         self.exit(BAD_INPUT, f"{self.prog}: error: {message}\n")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns its exit code: 0 fine, 1 degraded but handled, 2 needs a technician, 3 unusable input."""
+def _parser() -> _Parser:
+    """Return the parser of all commands."""
     parser = _Parser(
         prog="adaptfault",
         description="Finds the dead cells of a tactile array and repairs the classifier that reads it.",
@@ -75,6 +97,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for module in COMMANDS:
         module.add(commands)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns its exit code: 0 fine, 1 degraded but handled, 2 needs a technician, 3 unusable input."""
+    parser = _parser()
     args = parser.parse_args(argv)
     if args.command is None:
         parser.print_help()

@@ -28,7 +28,7 @@ class CellStatistics:
 
     Attributes:
         mean: ``[D]``, on the 0..1 scale.
-        covariance: ``[D, D]``, shrunk (Ledoit and Wolf 2004), so that each submatrix is invertible.
+        covariance: ``[D, D]``, shrunk (Ledoit and Wolf 2004).
         frames: ``[M, D]``, a sample of the frames for the kernel regression.
     """
 
@@ -78,7 +78,7 @@ class CellStatistics:
         if not len(missing) or not len(healthy):
             return np.zeros((len(missing), len(healthy))), self.mean[missing]
         between = self.covariance[np.ix_(healthy, missing)]
-        within = self.covariance[np.ix_(healthy, healthy)] + _STILL * np.eye(len(healthy))
+        within = _regular(self.covariance[np.ix_(healthy, healthy)])
         weight = cho_solve(cho_factor(within), between).T
         return weight, self.mean[missing] - weight @ self.mean[healthy]
 
@@ -87,7 +87,7 @@ class CellStatistics:
         """Inverse of the covariance, ``[D, D]``."""
         from scipy.linalg import cho_factor, cho_solve
 
-        factor = cho_factor(self.covariance + _STILL * np.eye(len(self.mean)))
+        factor = cho_factor(_regular(self.covariance))
         return np.asarray(cho_solve(factor, np.eye(len(self.mean))))
 
     def expected(self, frames: NDArray[Any], missing: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -100,6 +100,16 @@ class CellStatistics:
         within = self.precision[np.ix_(missing, missing)]
         # For a handful of cells numpy's solver is a few times faster than scipy's Cholesky.
         return np.asarray(self.mean[missing] - np.linalg.solve(within, deviation.T).T)
+
+
+def _regular(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a covariance whose variances are raised by the error of its factorization (Higham 2002, theorem 10.3).
+
+    The shrinkage is 0 where every frame deviates as far from the mean as any other, as of readings of two levels.
+    """
+    n = len(covariance)
+    error: float = (n + 1) * np.finfo(float).eps * np.trace(covariance)
+    return covariance + (error + _STILL) * np.eye(n)
 
 
 def near_distance(roots: NDArray[np.float32]) -> float:

@@ -154,7 +154,7 @@ class _Maintenance:
         diagnosis = self.diagnoser.diagnose(frames)
         report = self._decide(diagnosis, frames, tuple(r.name for r in usable))
         loads, healthy = self._loads(frames)
-        report = self._with_chance(self._with_change(self._with_coverage(report), loads, healthy))
+        report = self._with_chance(self._with_change(self._with_coverage(_with_transport(report)), loads, healthy))
         if report.used:
             self.condition = encode(cell_condition(loads, healthy, bundle.layout), diagnosis.verdicts)
         if rewiring is not None:
@@ -437,3 +437,11 @@ class _Maintenance:
     def _class_name(self, number: int) -> str:
         names = self.bundle.class_names
         return names[number] if names else f"class {number}"
+
+
+def _with_transport(report: MaintenanceReport) -> MaintenanceReport:
+    """Return the report with the exit code and the reason of a stream that was frozen."""
+    if report.diagnosis is None or not report.diagnosis.frozen:
+        return report
+    reason = f"{report.diagnosis.frozen[0].reason}; {report.reason}"
+    return replace(report, exit_code=max(1, report.exit_code), reason=reason)

@@ -76,6 +76,11 @@ class Diagnosis:
         """F: the cells of all faults; an adapter must not use their readings."""
         return FaultSet(tuple({c for fault in self.faults for c in fault.cells}), self.layout.n_cells)
 
+    @property
+    def frozen(self) -> tuple[TransportFault, ...]:
+        """The times when the stream was frozen."""
+        return tuple(fault for fault in self.transport if fault.kind == "frozen")
+
     def suspects(self, probability: float = 0.02) -> FaultSet:
         """Return F and every tested cell with at least this P(faulty): the cells that a classifier should ignore.
 
@@ -101,9 +106,11 @@ class Diagnosis:
 
     @property
     def exit_code(self) -> int:
-        """0: no fault. 1: faults of single cells only. 2: a fault of a wire, or of a tenth of the cells."""
+        """0: no fault. 1: single cells, or a frozen stream. 2: a fault of a wire, or of a tenth of the cells."""
         few = len(self.fault_set) < 0.1 * self.layout.present.sum()
-        return 0 if not self.faults else 1 if few and all(f.line is None for f in self.faults) else 2
+        if not self.faults:
+            return int(bool(self.frozen))
+        return 1 if few and all(f.line is None for f in self.faults) else 2
 
     def map(self) -> str:
         """Return the verdicts drawn as text, the pads side by side.

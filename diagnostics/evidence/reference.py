@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +21,7 @@ from diagnostics.preprocessing.baseline import baseline
 from diagnostics.preprocessing.offset import ReferenceOffset
 from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks, spread
 from diagnostics.preprocessing.scale import Scale
-from diagnostics.preprocessing.transport import longest_repetition
+from diagnostics.preprocessing.transport import Patience
 
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
@@ -43,11 +43,12 @@ class Reference:
         least: lower limit of the readings of healthy cells.
         noise_loss: longest runs of identical readings of healthy cells.
         offset: common offset of all cells.
-        patience: repetitions of a frame after which it counts as frozen.
+        patience: repetitions of a frame after which it carries no information.
         usual: rates of blinks and excess noise of healthy cells.
         duplicates: coincidences that two healthy lines may have.
         model: the healthy model; None: the k-NN spatial model of the log (cold start).
         dead: float ``[D]``, P(dead) of the reference faults, 0 for all other cells.
+        loaded_patience: the same of a frame with load; 0: as ``patience``.
     """
 
     tolerance: float
@@ -61,6 +62,13 @@ class Reference:
     duplicates: int
     model: HealthyModel | None
     dead: NDArray[np.float64]
+    loaded_patience: int = field(default=0, metadata={"newer": True})
+
+    def repeats(self, layout: SensorLayout) -> Patience:
+        """Return how often healthy frames repeat."""
+        present = living(layout, self.dead).present.ravel()
+        loaded_from = np.where(present, self.scale.baseline + self.scale.near, np.inf)
+        return Patience(self.patience, self.loaded_patience or self.patience, loaded_from)
 
     def check(self, layout: SensorLayout) -> None:
         """Check the numbers, and that the model covers each cell of ``layout`` once.
@@ -90,7 +98,7 @@ class Reference:
         rest = np.where(dead > 0, np.median(readings.highest[present]), readings.highest)
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
         jumps_seen = JumpHistogram.fit(recordings, tolerance, layout.full_scale, rest)
-        patience = max(SEGMENT, 2 * max(longest_repetition(r) for r in recordings))
+        patience = Patience.fit(recordings, np.where(present, rest + scale.near, np.inf), SEGMENT)
         model = fit_healthy_model(recordings, layout, scale)
         return cls(
             tolerance,
@@ -99,11 +107,12 @@ class Reference:
             least,
             NoiseLoss.fit(recordings, present),
             ReferenceOffset.fit(recordings, scale, present),
-            patience,
+            patience.idle,
             HealthyRates.fit(recordings, scale, layout),
             _usual_duplicates(recordings, layout, scale),
             model,
             dead,
+            patience.loaded,
         )
 
     @classmethod

@@ -1,15 +1,14 @@
 """A change of the whole sensor, or of a pad: gain, or offset, of all its cells. No single cell stands out as faulty.
 
 Statistic, per recording r over the healthy cells: the baseline b_r is the median over cells of each cell's 5 % quantile
-over time; the load l_r is the 99 % quantile of all readings above the baseline. With n new recordings and m reference
-recordings, the gain is exp(median log l_new - median log l_ref) and the offset is median b_new - median b_ref. A change
-is reported where it exceeds four standard errors, each from the median absolute deviation (Rousseeuw and Croux 1993),
-and a size that matters.
+over time; the load l_r is the 99 % quantile of all readings above the baseline. The gain is the ratio of the median
+loads of new and of reference recordings, and the offset is the difference of their median baselines. A change is
+reported where the two-sample test of Kolmogorov and Smirnov (``scipy.stats.ks_2samp``) of the new against the reference
+recordings has p < 1e-4, and the size matters.
 
 A pad is compared with the other pads of the same recordings: log l_r and b_r less their medians over the other pads.
-So another force or object, which all pads feel, is no change of a pad. A pad has changed where the rank-sum test of the
-new against the reference recordings has p < 1e-4 (``scipy.stats.mannwhitneyu``; Mann and Whitney 1947), and the size
-matters. Where two pads differ from each other, the one that differs more from itself has changed.
+So another force or object, which all pads feel, is no change of a pad. Where two pads differ from each other, the one
+that differs more from itself has changed.
 
 Not detected: a change with fewer than five recordings of contact, a change below the limits, swapped cells, and gains
 of single cells, also of a replaced pad whose cells read as much on average. Other objects or tasks than in the
@@ -24,7 +23,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import mannwhitneyu, median_abs_deviation
+from scipy.stats import ks_2samp
 
 from diagnostics.evidence.drift import GAIN
 from diagnostics.faults import FaultSet
@@ -32,9 +31,8 @@ from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.baseline import LOW
 from diagnostics.preprocessing.scale import LIGHT
 
-_LEAST = 5  # recordings, new and reference, for a standard error that can be trusted
-_ERRORS = 4.0  # standard errors
-_RARE = 1e-4  # p of a pad that has not changed
+_LEAST = 5  # recordings, new and reference
+_RARE = 1e-4  # p of what has not changed
 _HIGH = 0.99  # quantile of the readings of a recording: its load
 
 
@@ -91,13 +89,10 @@ def sensor_change(
         healthy: the cells to compare, int ``[n]``.
     """
     new, old = (_statistics(given, healthy) for given in (recordings, reference))
-    offset, error = _shift(new[:, 0], old[:, 0])
-    if abs(offset) < max(LIGHT * layout.full_scale, _ERRORS * error):
-        offset = 0.0
+    offset = _change(new[:, 0], old[:, 0], LIGHT * layout.full_scale)
     contact = LIGHT * float(old[:, 1].max(initial=0.0))
     loads = [np.log(given[given[:, 1] > contact, 1]) for given in (new, old)]
-    change, error = _shift(*loads)
-    gain = float(np.exp(change)) if abs(change) >= max(np.log(GAIN), _ERRORS * error) else 1.0
+    gain = float(np.exp(_change(*loads, np.log(GAIN))))
     if gain == 1.0 and offset == 0.0:
         return None
     return SensorChange(gain, offset, len(new), f"sensor changed: {_told(gain, offset, layout)}")
@@ -125,7 +120,7 @@ def pad_change(
         gain, offset = _change(log_new, log_old, least[0]), _change(idle_new, idle_old, least[1])
         if gain or offset:
             loads = [np.log(given[i, given[i, :, 1] > contact, 1]) for given in (new, old)]
-            strength = abs(_shift(*loads)[0]) / least[0] + abs(_shift(new[i, :, 0], old[i, :, 0])[0]) / least[1]
+            strength = abs(_shift(*loads)) / least[0] + abs(_shift(new[i, :, 0], old[i, :, 0])) / least[1]
             found.append((strength, int(pads[i]), float(np.exp(gain)), offset))
     if not found:
         return None
@@ -166,10 +161,8 @@ def _beside(given: NDArray[np.float64], pad: int, contact: float) -> tuple[NDArr
 
 def _change(new: NDArray[np.float64], old: NDArray[np.float64], least: float) -> float:
     """Return the difference of two medians, 0 where it is below ``least`` or may be chance."""
-    if min(len(new), len(old)) < _LEAST:
-        return 0.0
-    change = float(np.median(new) - np.median(old))
-    return change if abs(change) >= least and mannwhitneyu(new, old).pvalue < _RARE else 0.0
+    change = _shift(new, old)
+    return change if abs(change) >= least and ks_2samp(new, old).pvalue < _RARE else 0.0
 
 
 def _statistics(recordings: Iterable[NDArray[Any]], healthy: NDArray[np.intp]) -> NDArray[np.float64]:
@@ -184,10 +177,6 @@ def _statistics(recordings: Iterable[NDArray[Any]], healthy: NDArray[np.intp]) -
     return np.array(rows, dtype=np.float64).reshape(-1, 2)
 
 
-def _shift(new: NDArray[np.float64], old: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the difference of two medians and its standard error; 0 and infinite for too few values."""
-    if min(len(new), len(old)) < _LEAST:
-        return 0.0, np.inf
-    # The variance of a median of n normal values is pi / 2 / n of theirs.
-    variances = [np.pi / 2 * float(median_abs_deviation(v, scale="normal")) ** 2 / len(v) for v in (new, old)]
-    return float(np.median(new) - np.median(old)), float(np.sqrt(sum(variances)))
+def _shift(new: NDArray[np.float64], old: NDArray[np.float64]) -> float:
+    """Return the difference of two medians; 0 for too few values."""
+    return float(np.median(new) - np.median(old)) if min(len(new), len(old)) >= _LEAST else 0.0

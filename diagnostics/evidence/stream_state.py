@@ -110,7 +110,7 @@ class StreamState:
         self.exclusion = exclusion._replace(threshold=UNCALIBRATED) if self.tiled else exclusion
         self.present = layout.present.ravel()
         self.order, self.load, self.below = order, load, np.zeros(layout.n_cells, bool)
-        self.transport = TransportState()
+        self.transport, self._patience = TransportState(), reference.repeats(layout)
         self.runs = ConstantRuns.begin(layout.n_cells)
         self.local = TiledEvents.begin(every if self.tiled else tiles(layout), needed)
         self.accumulated = np.zeros(layout.n_cells)
@@ -145,7 +145,7 @@ class StreamState:
         if wrong is not None:
             frames, self.transport = np.where(wrong, np.nan, frames), self.transport.dropped(wrong)
         before = self.transport.seen
-        self.transport, new = self.transport.receive(frames, self.present, self.reference.patience)
+        self.transport, new = self.transport.receive(frames, self.present, self._patience)
         completed, taken = False, 0
         if self._dropping and self._dropping[0].step():
             self._drop()

@@ -1,13 +1,14 @@
 """Transport faults: lost frames, frozen streams and invalid readings between sensor and log; no faults of cells.
 
-Detects frames without any reading, one frame repeated more than ``patience`` times while at least 3 working cells are
-loaded, and readings that no converter gives. In a frozen stream every cell looks stuck, so repeated frames are not used
-as evidence. Arrays that send exact zeros repeat frames without contact: a repetition without load is no fault.
+Detects frames without any reading, one frame repeated too often while at least 3 working cells are loaded, and readings
+that no converter gives. In a frozen stream every cell looks stuck, so repeated frames are not used as evidence. Arrays
+that send exact zeros repeat frames without contact: a repetition without load is no fault. How often healthy frames
+repeat is learnt from the reference, apart for frames with load and for all frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -43,6 +44,42 @@ class TransportFault:
     def from_dict(cls, d: Mapping[str, Any]) -> TransportFault:
         """Rebuild from :meth:`to_dict`."""
         return cls(**d)
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How many times in a row a healthy frame comes again, at most.
+
+    Attributes:
+        idle: of a frame in which fewer than 3 cells are loaded.
+        loaded: of any other; not more than ``idle``.
+        loaded_from: float ``[D]``, the reading from which on each cell is loaded; infinite where there is no cell.
+    """
+
+    idle: int
+    loaded: int
+    loaded_from: NDArray[np.float64]
+
+    @classmethod
+    def fit(cls, recordings: Sequence[NDArray[np.float64]], loaded_from: NDArray[np.float64], least: int) -> Patience:
+        """Return twice the longest repetition in healthy recordings ``[T, D]``, and no less than ``least``."""
+        found = cls(least, least, loaded_from)
+        for frames in recordings:
+            times = 2 * repetitions(frames)
+            longer = np.flatnonzero(times > least)
+            loaded = times[longer[found.is_loaded(frames[longer])]]
+            idle, held = int(times.max(initial=found.idle)), int(loaded.max(initial=found.loaded))
+            found = cls(idle, held, loaded_from)
+        return found
+
+    def of(self, frames: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Return the patience with each frame of ``[t, D]``, int ``[t]``."""
+        return np.where(self.is_loaded(frames), self.loaded, self.idle)
+
+    def is_loaded(self, frames: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return in which frames of ``[t, D]`` at least 3 cells are loaded, bool ``[t]``."""
+        loaded: NDArray[np.bool_] = (frames > self.loaded_from).sum(axis=1) >= _LOADED_CELLS
+        return loaded
 
 
 @dataclass(frozen=True)
@@ -87,7 +124,7 @@ class TransportState:
     first_invalid: int = -1
 
     def receive(
-        self, frames: NDArray[np.float64], present: NDArray[np.bool_], patience: int
+        self, frames: NDArray[np.float64], present: NDArray[np.bool_], patience: Patience
     ) -> tuple[TransportState, NDArray[np.intp]]:
         """Return the state after more frames, and the indices of those that carry information, int ``[k]``.
 
@@ -117,9 +154,12 @@ class TransportState:
         # A repetition is recorded once it exceeds patience, and extended while it continues.
         numbers = self.seen + arrived_at
         since = np.where(fresh > 0, numbers[fresh - 1], self.since)
-        last_of_run = np.flatnonzero(np.append(~same[1:], True) & (repeats > patience))
-        for i in last_of_run.tolist():
-            known = repetitions[-1] if repetitions and fresh[i] == 0 and self.repeats > patience else None
+        limit = np.full(len(received), patience.loaded)
+        some = np.flatnonzero(repeats > patience.loaded)
+        limit[some] = patience.of(received[some])
+        beyond = repeats > limit
+        for i in np.flatnonzero(np.append(~same[1:], True) & beyond).tolist():
+            known = repetitions[-1] if repetitions and fresh[i] == 0 and self.repeats > limit[i] else None
             if known is not None:
                 repetitions[-1] = replace(known, frames=int(repeats[i]) + 1)
             else:
@@ -135,7 +175,7 @@ class TransportState:
             invalid=self.invalid,
             first_invalid=self.first_invalid,
         )
-        return state, arrived_at[repeats <= patience]
+        return state, arrived_at[~beyond]
 
     def dropped(self, invalid: NDArray[np.bool_]) -> TransportState:
         """Return the state with the ``invalid`` readings of the next frames, bool ``[t, D]``, counted."""
@@ -148,7 +188,7 @@ class TransportState:
         return replace(self, lost=self.lost + frames, first_lost=first)
 
     def faults(
-        self, loaded_from: NDArray[np.float64], working: NDArray[np.bool_], rate: float
+        self, loaded_from: NDArray[np.float64], working: NDArray[np.bool_], rate: float, moved: bool = True
     ) -> tuple[TransportFault, ...]:
         """Return the transport faults.
 
@@ -156,6 +196,7 @@ class TransportState:
             loaded_from: float ``[D]``, the reading from which on each cell is loaded.
             working: bool ``[D]``, cells that are known to work.
             rate: frames per second.
+            moved: whether any cell moved in the log; if none did, ``working`` are the cells not known to be faulty.
         """
         found = []
         if self.lost:
@@ -168,16 +209,16 @@ class TransportState:
         for r in self.repetitions:
             loaded = int((r.frame > loaded_from)[working].sum())
             if loaded >= _LOADED_CELLS:
-                text = f"frame {r.onset}, in which {loaded} working cells are loaded, was received {r.frames} times"
+                cells = f"{loaded} working cells" if moved else f"{loaded} cells"
+                text = f"frame {r.onset}, in which {cells} are loaded, was received {r.frames} times"
                 text += f" in a row ({r.frames / rate:.1f} s)"
-                found.append(
-                    TransportFault(
-                        "frozen",
-                        r.onset,
-                        r.frames,
-                        f"{text}: the stream was frozen, not the cells; check the link to the sensor",
-                    )
+                why = (
+                    "the stream was frozen, not the cells"
+                    if moved
+                    else "the stream was frozen, or these cells are stuck"
                 )
+                text += f": {why}; check the link to the sensor"
+                found.append(TransportFault("frozen", r.onset, r.frames, text))
         return tuple(found)
 
 
@@ -196,11 +237,11 @@ def invalid(frames: NDArray[Any], full_scale: float) -> NDArray[np.bool_] | None
     return np.asarray((frames < -full_scale) | (frames > 2 * full_scale))
 
 
-def longest_repetition(frames: NDArray[np.float64]) -> int:
-    """Return the largest number of times in a row that a frame of ``[T, D]`` is repeated."""
-    same = _as_before(frames)
-    counts = np.arange(1, len(same) + 1)
-    return int((counts - np.maximum.accumulate(np.where(same, 0, counts))).max(initial=0))
+def repetitions(frames: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return how many times in a row each frame of ``[T, D]`` was received before, int ``[T]``."""
+    same = np.append(False, _as_before(frames))[: len(frames)]
+    counts = np.arange(len(same))
+    return counts - np.maximum.accumulate(np.where(same, 0, counts))
 
 
 def _as_before(frames: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.decision.coverage import Coverage, coverage
+from diagnostics.evidence.static_loads import StaticLoad
 from diagnostics.faults import Fault, FaultKind, FaultSet
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.transport import TransportFault
@@ -56,6 +57,7 @@ class Diagnosis:
         n_recordings: number of recordings in the log.
         possible: wires that are more likely broken than not, but not proven. Their cells are in F only as faults of
             their own.
+        static_loads: objects that lie still on the array. Their cells are UNTESTED.
         transport: lost frames, frozen streams and invalid readings: faults of the link, not of cells.
         evidence: float ``[D]`` each: ``"spatial"`` and ``"temporal"``, log likelihood ratios faulty : healthy (0: no
             evidence), and ``"events"``, number of events that tested the cell. Evidence of wires is in ``faults``.
@@ -70,6 +72,7 @@ class Diagnosis:
     transport: tuple[TransportFault, ...] = ()
     evidence: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     possible: tuple[Fault, ...] = ()
+    static_loads: tuple[StaticLoad, ...] = ()
 
     @cached_property
     def fault_set(self) -> FaultSet:
@@ -101,9 +104,11 @@ class Diagnosis:
 
     @property
     def exit_code(self) -> int:
-        """0: no fault. 1: faults of single cells only. 2: a fault of a wire, or of a tenth of the cells."""
+        """0: no fault. 1: single cells, or a static load. 2: a fault of a wire, or of a tenth of the cells."""
         few = len(self.fault_set) < 0.1 * self.layout.present.sum()
-        return 0 if not self.faults else 1 if few and all(f.line is None for f in self.faults) else 2
+        if not self.faults:
+            return 1 if self.static_loads else 0
+        return 1 if few and all(f.line is None for f in self.faults) else 2
 
     def map(self) -> str:
         """Return the verdicts drawn as text, the pads side by side.
@@ -124,7 +129,8 @@ class Diagnosis:
     def __str__(self) -> str:
         found = f"{len(self.fault_set)} faulty cells" if len(self.fault_set) != 1 else "1 faulty cell"
         reasons = [line for fault in self.faults for line in (fault.reason, *(f"  or {a}" for a in fault.alternatives))]
-        reasons += [wire.reason for wire in self.possible] + [fault.reason for fault in self.transport]
+        reasons += [wire.reason for wire in self.possible] + [load.reason for load in self.static_loads]
+        reasons += [fault.reason for fault in self.transport]
         recordings = "1 recording" if self.n_recordings == 1 else f"{self.n_recordings} recordings"
         frames = "1 frame" if self.n_frames == 1 else f"{self.n_frames} frames"
         head = f"{found} in {recordings} ({frames}); {self.coverage}"
@@ -149,6 +155,7 @@ class Diagnosis:
             "verdicts": [v.name for v in self.verdicts],
             "probability": self.probability.tolist(),
             "evidence": {kind: values.tolist() for kind, values in self.evidence.items()},
+            "static_loads": [load.to_dict() for load in self.static_loads],
             "transport": [fault.to_dict() for fault in self.transport],
             "n_frames": self.n_frames,
             "n_recordings": self.n_recordings,
@@ -189,6 +196,8 @@ class Diagnosis:
             raise ValueError("the diagnosis is damaged: a transport fault needs a kind and a reason")
         if not all(np.isfinite(values).all() for values in diagnosis.evidence.values()):
             raise ValueError("the diagnosis is damaged: evidence must be finite")
+        for load in diagnosis.static_loads:
+            _ = FaultSet(load.cells, diagnosis.layout.n_cells)
         _ = diagnosis.fault_set  # raises ValueError for cells of another layout
         return diagnosis
 
@@ -204,4 +213,5 @@ class Diagnosis:
             evidence={kind: np.asarray(values, dtype=np.float64) for kind, values in d.get("evidence", {}).items()},
             transport=tuple(TransportFault.from_dict(f) for f in d.get("transport", ())),
             possible=tuple(Fault.from_dict(f) for f in d.get("possible", ())),
+            static_loads=tuple(StaticLoad.from_dict(load) for load in d.get("static_loads", ())),
         )

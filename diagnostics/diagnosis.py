@@ -199,14 +199,15 @@ class SelfDiagnosis:
         spatial, found = yield from self._tested(stream, explained)
         for beside in (False, True):
             while True:
-                loads = find_static_loads(stream, spatial, found.faulty, copies, still, beside=beside)
+                faulty = found.probability >= _DOUBTED if beside else found.faulty
+                loads = find_static_loads(stream, spatial, faulty, copies, still, beside=beside)
                 others = copies.copy()
                 others[[cell for load in loads for cell in load.cells]] = True
                 if (others == explained).all():
                     break
                 yield
                 tested = yield from self._tested(stream, others)
-                if tested[1].faulty.sum() >= found.faulty.sum():
+                if tested[1].probability.sum() >= found.probability.sum():  # it explains nothing
                     break
                 still, explained, (spatial, found) = loads, others, tested
         weight = found.weight.copy()

@@ -79,6 +79,11 @@ class Diagnosis:
         """F: the cells of all faults; an adapter must not use their readings."""
         return FaultSet(tuple({c for fault in self.faults for c in fault.cells}), self.layout.n_cells)
 
+    @cached_property
+    def lain_on(self) -> FaultSet:
+        """The cells of all static loads: healthy as far as the log tells, but their readings are not of contact."""
+        return FaultSet(tuple({c for load in self.static_loads for c in load.cells}), self.layout.n_cells)
+
     def suspects(self, probability: float = 0.02) -> FaultSet:
         """Return F and every tested cell with at least this P(faulty): the cells that a classifier should ignore.
 
@@ -196,9 +201,7 @@ class Diagnosis:
             raise ValueError("the diagnosis is damaged: a transport fault needs a kind and a reason")
         if not all(np.isfinite(values).all() for values in diagnosis.evidence.values()):
             raise ValueError("the diagnosis is damaged: evidence must be finite")
-        for load in diagnosis.static_loads:
-            _ = FaultSet(load.cells, diagnosis.layout.n_cells)
-        _ = diagnosis.fault_set  # raises ValueError for cells of another layout
+        _ = diagnosis.lain_on, diagnosis.fault_set  # raise ValueError for cells of another layout
         return diagnosis
 
     @classmethod

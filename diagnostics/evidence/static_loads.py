@@ -115,7 +115,8 @@ def find_static_loads(
     root[excluded | ~present | (root**2 < SLIGHT)] = 0.0
     values = HeldValues.of(scale.baseline + root**2 * scale.full_scale, scale, tolerance)
     # A healthy cell that contacts load without a pause does not return to the same load.
-    surprisal = np.maximum(spatial.surprisal + spatial.offset, np.maximum(returns - 1, 0) * -np.log(_RETURNS))
+    again = np.maximum(returns - 1, 0) * -np.log(_RETURNS)
+    surprisal = np.maximum(spatial.surprisal + spatial.offset + np.maximum(spatial.gain, 0.0), again)
     full, blamed = np.isinf(values.high), faulty & (root > 0)
 
     def explains(cells: Mask) -> bool:

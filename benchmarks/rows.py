@@ -39,6 +39,7 @@ HELD, WINDOW = 300, 50  # frames of a static hold; of a window in which a cell c
 REPEATED = 100  # frames of a frozen stream, beyond the longest repetition that still counts as idle
 CHANGING = (FaultKind.INTERMITTENT, FaultKind.NOISY, FaultKind.DRIFT)
 GAINS, FADED = (0.2, 0.35, 0.5), 0.1  # times the load; what is left at the end
+UNDER = 20  # recordings of a log in which an object lies still
 REPLACED = 12  # recordings with a new specimen of a pad
 LONG, LOADED = 30, 8  # recordings of a log that shows a gain; in so many of them the cell is loaded
 DEAD_BEFORE = 0.04  # share of the cells that were dead when the reference was recorded
@@ -502,6 +503,80 @@ def replaced(bench: Bench) -> Iterator[Count]:
     yield Count("healthy: a replaced pad told in a log", healthy, bench.count, higher=False)
 
 
+def neighbours(layout: SensorLayout, cell: int) -> list[int]:
+    """Return the present cells around a cell, diagonal ones included."""
+    pad, row, col = layout.position(cell)
+    near = layout.present[pad, max(0, row - 1) : row + 2, max(0, col - 1) : col + 2]
+    rows, cols = np.nonzero(near)
+    around = [
+        layout.cell(pad, max(0, row - 1) + int(r), max(0, col - 1) + int(c)) for r, c in zip(rows, cols, strict=True)
+    ]
+    return [other for other in around if other != cell]
+
+
+def object_of(bench: Bench, log_seed: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the loads ``[D]`` of an object that lies still: cut out of a recording, a bump, or a strap, in turn."""
+    layout, least = bench.layout, VISIBLE * bench.layout.full_scale
+    top = max(float(np.max(bench.recordings.frames[i])) for i in bench.rest)
+    while True:
+        load = np.zeros(layout.n_cells)
+        if log_seed % 3 == 0:
+            frames = np.asarray(bench.recordings.frames[rng.choice(bench.rest)], dtype=np.float64)
+            contact = frames[frames.sum(axis=1).argmax()] - frames.min(axis=0)
+            loaded = np.flatnonzero((contact > least) & layout.present.ravel())
+            if not len(loaded):
+                continue
+            patch = [int(rng.choice(loaded))]
+            size = int(rng.integers(3, 13))
+            for cell in patch:  # grows while it is walked through
+                more = [c for c in rng.permutation(neighbours(layout, cell)).tolist() if c in loaded and c not in patch]
+                patch += more[: size - len(patch)]
+            load[patch] = contact[patch]
+        else:
+            pad, row, col = layout.position(int(rng.choice(np.flatnonzero(layout.present))))
+            r, c = np.mgrid[: layout.rows, : layout.cols]
+            if log_seed % 3 == 1:
+                distance = np.hypot(r - row - rng.uniform(-0.5, 0.5), c - col - rng.uniform(-0.5, 0.5))
+                shape = rng.uniform(0.2, 0.8) * np.exp(-0.5 * (distance / rng.uniform(0.7, 1.5)) ** 2)
+            else:
+                angle = rng.uniform(0, np.pi)
+                across = (r - row) * np.sin(angle) + (c - col) * np.cos(angle)
+                along = (c - col) * np.sin(angle) - (r - row) * np.cos(angle)
+                uneven = 1 + 0.3 * np.sin(along / 2 + rng.uniform(0, 6))
+                shape = rng.uniform(0.15, 0.5) * uneven * np.exp(-0.5 * (across / 0.6) ** 2)
+            load = np.zeros(layout.shape)
+            load[pad] = top * shape
+            load = np.where(load.ravel() > least, load.ravel(), 0.0) * layout.present.ravel()
+        if np.count_nonzero(load) >= 3:
+            return load
+
+
+def static(bench: Bench) -> Iterator[Count]:
+    """An object lies still while the contacts of a log go on: constant, within a converter count, or with noise."""
+    layout, blamed, told, asked, invented = bench.layout, 0, 0, 0, 0
+    tally = Tally()
+    for seed, log, rng in bench.logs(UNDER):
+        load, length = object_of(bench, seed, rng), sum(map(len, log))
+        onset = int(length * rng.choice([0.0, rng.uniform(0.2, 0.6)]))
+        noise = layout.full_scale * rng.choice([0.0, 1 / 4095, 0.003])
+        whole = np.concatenate(log)
+        held = load + noise * rng.standard_normal(whole.shape).round(1) * (load > 0)
+        laid = np.where((np.arange(length) >= onset)[:, None], np.clip(whole + held, 0, layout.full_scale), whole)
+        diagnosis = bench.fitted.diagnose(parted(laid, log))
+        blamed += len(diagnosis.fault_set)
+        lie = {cell for still in diagnosis.static_loads for cell in still.cells}
+        under = set(np.flatnonzero(load).tolist())
+        asked, told = asked + 1, told + bool(lie & under)
+        invented += sum(not under & set(still.cells) for still in diagnosis.static_loads)
+        faults = [fault for fault in draw_faults(layout, 0.08, STUCK_KINDS, rng) if under.isdisjoint(fault.cells)]
+        seen = list(broken(parted(laid, log), faults, layout, 0.0, 0.0, seed))
+        tally.add(parted(laid, log), seen, faults, bench.fitted.diagnose(seen), 0)
+    yield Count("an object lies still: healthy cells blamed in a log", blamed, asked, higher=False)
+    yield Count("  told", told, asked)
+    yield Count("  told where nothing lies", invented, asked, higher=False)
+    yield from tally.counts("an object lies still, 8 % dead")
+
+
 def transport(bench: Bench) -> Iterator[Count]:
     layout, told, blamed = bench.layout, 0, 0
     for seed, log, rng in bench.logs():
@@ -566,6 +641,6 @@ ROWS: dict[str, Callable[[Bench], Iterator[Count]]] = {
     row.__name__: row
     for row in (
         cells, onset, dither, missing, many, cold, reference_faults, lines, cut, address, healthy, holds, untouched,
-        kind, calibration, changing, gain, rewired, groups, replaced, transport, speed,
+        kind, calibration, changing, gain, rewired, groups, replaced, static, transport, speed,
     )
 }  # fmt: skip

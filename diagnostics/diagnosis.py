@@ -19,6 +19,7 @@ from diagnostics.decision.serialization import Arrays, from_state, to_state
 from diagnostics.evidence.reference import Reference, highest_reading, living, tolerance_of
 from diagnostics.evidence.rewiring import Rewiring, find_rewiring
 from diagnostics.evidence.spatial import Exclusion, Spatial
+from diagnostics.evidence.static_loads import StaticLoad, find_static_loads
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
@@ -192,15 +193,23 @@ class SelfDiagnosis:
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
         aliased = find_aliasing(stream)
         yield
-        explained = np.zeros(self.layout.n_cells, bool)
-        explained[[cell for aliasing in aliased for cell in (*aliasing.cells, *aliasing.doubtful)]] = True
-        test = stream.spatial(explained)
-        yield
-        while not test.step():
-            yield
-        spatial = test.result
-        yield
-        found = self._found(stream, spatial, explained)
+        copies = np.zeros(self.layout.n_cells, bool)
+        copies[[cell for aliasing in aliased for cell in (*aliasing.cells, *aliasing.doubtful)]] = True
+        explained, still = copies, list[StaticLoad]()
+        spatial, found = yield from self._tested(stream, explained)
+        for beside in (False, True):
+            while True:
+                faulty = found.probability >= _DOUBTED if beside else found.faulty
+                loads = find_static_loads(stream, spatial, faulty, copies, still, beside=beside)
+                others = copies.copy()
+                others[[cell for load in loads for cell in load.cells]] = True
+                if (others == explained).all():
+                    break
+                yield
+                tested = yield from self._tested(stream, others)
+                if tested[1].probability.sum() >= found.probability.sum():  # it explains nothing
+                    break
+                still, explained, (spatial, found) = loads, others, tested
         weight = found.weight.copy()
         weight_of = self._weight_of_groups(found, stream)
         for group in self._groups(found, stream, weight_of(spatial.initial), explained):
@@ -213,6 +222,10 @@ class SelfDiagnosis:
         found = found.of(every)
         causes, possible = root_causes(found, aliased, self.layout)
         probability, inferred = found.probability.copy(), np.zeros(self.layout.n_cells, bool)
+        if self._order is not None:
+            still = [load.of(self._order, self.layout) for load in still]
+        for load in still:
+            probability[list(load.cells)] = 1 - load.probability
         for fault in causes:
             cells = list(fault.cells)
             probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
@@ -237,7 +250,19 @@ class SelfDiagnosis:
             n_frames=stream.transport.seen,
             n_recordings=n_recordings,
             possible=possible,
+            static_loads=tuple(still),
         )
+
+    def _tested(
+        self, stream: StreamState, explained: NDArray[np.bool_]
+    ) -> Generator[None, None, tuple[Spatial, CellFindings]]:
+        """Yield between steps of the spatial test without ``explained`` cells (bool ``[D]``); return its findings."""
+        test = stream.spatial(explained)
+        yield
+        while not test.step():
+            yield
+        yield
+        return test.result, self._found(stream, test.result, explained)
 
     def _diagnosed(self, log: RecordingBlocks, needed: NDArray[np.bool_] | None = None) -> Diagnosis:
         stream = self.stream(needed)

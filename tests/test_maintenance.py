@@ -203,6 +203,15 @@ def test_a_strap_and_gloves_are_told_and_need_a_technician(bundle, later_grasps,
     assert (report.exit_code, report.version, report.rewiring) == (2, 1, ())
 
 
+def test_an_object_that_lies_still_is_told_and_nothing_is_deployed(bundle, later_grasps):
+    load = np.zeros(bundle.layout.shape)
+    load[0, :3, :2] = [[0.4, 0.7], [0.9, 1.3], [0.5, 0.8]]
+    report = maintain(bundle, [np.minimum(r + load.ravel(), bundle.layout.full_scale) for r in later_grasps])
+    assert "something lies still on pad 0" in str(report).splitlines()[0]
+    assert (report.decision, report.version, report.exit_code) == ("unchanged", 1, 1)
+    assert not report.fault_set
+
+
 def test_one_bad_recording_does_not_stop_the_others(bundle, later_grasps, broken_row):
     log = [later_grasps[0][:, :7], *broken(later_grasps, broken_row)]
     report = maintain(bundle, log, names=["short.csv"])

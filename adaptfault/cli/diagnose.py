@@ -37,7 +37,7 @@ _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.
   adaptfault diagnose today/ --reference robot.bundle
       the healthy model of the bundle
       exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version excludes, nothing tested, or
-      another gain or offset of the whole sensor or of a pad;
+      an object that lies still, another gain or offset of the whole sensor or of a pad;
       2 a person is needed: a wire, exchanged wires, or a tenth of the cells; 3 unusable input"""
 
 _ROWS = 24  # of a map, which is followed by the summary if it has more: the first line has left the screen
@@ -160,7 +160,7 @@ def _change(
         reference = recordings_of(reference.parts.adapter().train, diagnosis.layout)
     load = diagnoser.load_
     new, old = (frames, reference) if load is None else ([*map(load.loads, frames)], [*map(load.loads, reference)])
-    return find_change(new, old, diagnosis.layout, diagnosis.fault_set)
+    return find_change(new, old, diagnosis.layout, diagnosis.fault_set | diagnosis.lain_on)
 
 
 def text_of(diagnosis: Diagnosis) -> str:

@@ -30,7 +30,7 @@ def verdict(diagnosis: Diagnosis, code: int | None = None) -> Verdict:
     code = diagnosis.exit_code if code is None else code
     if code >= 2:
         return "call"
-    return "watch" if code or diagnosis.faults or diagnosis.coverage.test_coverage < _TESTED else "nothing"
+    return "watch" if code or diagnosis.exit_code or diagnosis.coverage.test_coverage < _TESTED else "nothing"
 
 
 def write_diagnosis(
@@ -67,7 +67,7 @@ def write_diagnosis(
         "diagnosis.html",
         name=name,
         state=state,
-        notes=[note[0].upper() + note[1:] for note in notes],
+        notes=[note[0].upper() + note[1:] for note in (*notes, *(load.reason for load in diagnosis.static_loads))],
         headline=headline,
         diagnosis=diagnosis,
         layout=diagnosis.layout,

@@ -154,7 +154,8 @@ class _Maintenance:
         diagnosis = self.diagnoser.diagnose(frames)
         report = self._decide(diagnosis, frames, tuple(r.name for r in usable))
         loads, healthy = self._loads(frames)
-        report = self._with_chance(self._with_change(self._with_coverage(_with_transport(report)), loads, healthy))
+        report = self._with_change(self._with_coverage(_with_transport(report)), loads, healthy)
+        report = self._with_chance(self._with_static_loads(report))
         if report.used:
             self.condition = encode(cell_condition(loads, healthy, bundle.layout), diagnosis.verdicts)
         if rewiring is not None:
@@ -209,6 +210,12 @@ class _Maintenance:
         reason = f"the recordings test only {share:.0%} of the cells, so faults may be hidden; {report.reason}"
         return replace(report, exit_code=self.untested_code, reason=reason)
 
+    def _with_static_loads(self, report: MaintenanceReport) -> MaintenanceReport:
+        """Return the report with the objects that lie still on the array: its model reads them as contact."""
+        loads = () if report.diagnosis is None else report.diagnosis.static_loads
+        reason = "; ".join([*(load.reason for load in loads), report.reason])
+        return replace(report, exit_code=max(1, report.exit_code), reason=reason) if loads else report
+
     def _with_chance(self, report: MaintenanceReport) -> MaintenanceReport:
         """Return the report with exit code 2 where the accuracy that was measured is that of guessing."""
         if report.accuracy is None:
@@ -229,7 +236,8 @@ class _Maintenance:
         from adaptfault.adaptation.result import Adaptation
 
         layout, load = self.bundle.layout, self.diagnoser.load_
-        change = find_change(loads, reference, layout, report.fault_set)
+        lain_on = FaultSet((), layout.n_cells) if report.diagnosis is None else report.diagnosis.lain_on
+        change = find_change(loads, reference, layout, report.fault_set | lain_on)
         if change is None:
             return report
         gain, offset = change.of_cells(layout)
@@ -258,7 +266,8 @@ class _Maintenance:
         if not present - faulty:
             reason = "no healthy cell is left to predict from: replace the sensor"
             return self._report("refused", 2, reason, known, **found)
-        strange = contradiction(frames, faulty, adapter.statistics, self.bundle.layout)
+        untrue = faulty | diagnosis.lain_on  # neither says what the other cells should read
+        strange = contradiction(frames, untrue, adapter.statistics, self.bundle.layout)
         if strange > _CONTRADICTORY:
             reason = (
                 f"residual variance ratio {strange:.2f} of the cells taken as healthy exceeds {_CONTRADICTORY:g}:"

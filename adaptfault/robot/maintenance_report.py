@@ -78,6 +78,7 @@ class MaintenanceReport:
         if self.diagnosis is not None:
             lines += [f"  {fault.reason}" for fault in self.diagnosis.faults]
             lines += [f"  {wire.reason}" for wire in self.diagnosis.possible]
+            lines += [f"  {load.reason}" for load in self.diagnosis.static_loads]
             lines += [f"  {fault.reason}" for fault in self.diagnosis.transport]
             lines.append(f"  {self.diagnosis.coverage}")
             lines += [f"  to test more: {touch}" for touch in self.diagnosis.coverage.advice[:3]]

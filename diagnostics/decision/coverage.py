@@ -83,6 +83,16 @@ def _advice(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple[str, ...
     return tuple(text for _, text in sorted(regions, key=lambda region: -region[0]))
 
 
+def where(cells: NDArray[np.intp], layout: SensorLayout) -> str:
+    """Return the place of neighbouring cells of one pad in words: the rows and columns around them, or their names."""
+    if not layout.is_matrix:
+        named = [layout.place(cell) for cell in cells.tolist()]
+        return ", ".join(named[:_NAMED]) + ", ..." * (len(named) > _NAMED)
+    pad, row, col = np.array([layout.position(cell) for cell in cells.tolist()]).T
+    rows, cols = (slice(int(at.min()), int(at.max()) + 1) for at in (row, col))
+    return f"pad {pad[0]}, {_span('row', rows)}, {_span('column', cols)}"
+
+
 def _advice_by_group(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple[str, ...]:
     """Return one sentence per group, or pad, with untested cells, the one with most first."""
     cells: dict[str, list[int]] = {}

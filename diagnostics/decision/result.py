@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.decision.coverage import Coverage, coverage
+from diagnostics.evidence.static_loads import StaticLoad
 from diagnostics.faults import Fault, FaultKind, FaultSet
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.transport import TransportFault
@@ -56,6 +57,7 @@ class Diagnosis:
         n_recordings: number of recordings in the log.
         possible: wires that are more likely broken than not, but not proven. Their cells are in F only as faults of
             their own.
+        static_loads: objects that lie still on the array. Their cells are UNTESTED.
         transport: lost frames, frozen streams and invalid readings: faults of the link, not of cells.
         evidence: float ``[D]`` each: ``"spatial"`` and ``"temporal"``, log likelihood ratios faulty : healthy (0: no
             evidence), and ``"events"``, number of events that tested the cell. Evidence of wires is in ``faults``.
@@ -70,6 +72,7 @@ class Diagnosis:
     transport: tuple[TransportFault, ...] = ()
     evidence: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     possible: tuple[Fault, ...] = ()
+    static_loads: tuple[StaticLoad, ...] = ()
 
     @cached_property
     def fault_set(self) -> FaultSet:
@@ -80,6 +83,11 @@ class Diagnosis:
     def frozen(self) -> tuple[TransportFault, ...]:
         """The times when the stream was frozen."""
         return tuple(fault for fault in self.transport if fault.kind == "frozen")
+
+    @cached_property
+    def lain_on(self) -> FaultSet:
+        """The cells of all static loads: healthy as far as the log tells, but their readings are not of contact."""
+        return FaultSet(tuple({c for load in self.static_loads for c in load.cells}), self.layout.n_cells)
 
     def suspects(self, probability: float = 0.02) -> FaultSet:
         """Return F and every tested cell with at least this P(faulty): the cells that a classifier should ignore.
@@ -106,10 +114,10 @@ class Diagnosis:
 
     @property
     def exit_code(self) -> int:
-        """0: no fault. 1: single cells, or a frozen stream. 2: a fault of a wire, or of a tenth of the cells."""
+        """0: no fault. 1: single cells, a static load or a frozen stream. 2: a wire, or a tenth of the cells."""
         few = len(self.fault_set) < 0.1 * self.layout.present.sum()
         if not self.faults:
-            return int(bool(self.frozen))
+            return 1 if self.static_loads or self.frozen else 0
         return 1 if few and all(f.line is None for f in self.faults) else 2
 
     def map(self) -> str:
@@ -131,7 +139,8 @@ class Diagnosis:
     def __str__(self) -> str:
         found = f"{len(self.fault_set)} faulty cells" if len(self.fault_set) != 1 else "1 faulty cell"
         reasons = [line for fault in self.faults for line in (fault.reason, *(f"  or {a}" for a in fault.alternatives))]
-        reasons += [wire.reason for wire in self.possible] + [fault.reason for fault in self.transport]
+        reasons += [wire.reason for wire in self.possible] + [load.reason for load in self.static_loads]
+        reasons += [fault.reason for fault in self.transport]
         recordings = "1 recording" if self.n_recordings == 1 else f"{self.n_recordings} recordings"
         frames = "1 frame" if self.n_frames == 1 else f"{self.n_frames} frames"
         head = f"{found} in {recordings} ({frames}); {self.coverage}"
@@ -156,6 +165,7 @@ class Diagnosis:
             "verdicts": [v.name for v in self.verdicts],
             "probability": self.probability.tolist(),
             "evidence": {kind: values.tolist() for kind, values in self.evidence.items()},
+            "static_loads": [load.to_dict() for load in self.static_loads],
             "transport": [fault.to_dict() for fault in self.transport],
             "n_frames": self.n_frames,
             "n_recordings": self.n_recordings,
@@ -196,7 +206,7 @@ class Diagnosis:
             raise ValueError("the diagnosis is damaged: a transport fault needs a kind and a reason")
         if not all(np.isfinite(values).all() for values in diagnosis.evidence.values()):
             raise ValueError("the diagnosis is damaged: evidence must be finite")
-        _ = diagnosis.fault_set  # raises ValueError for cells of another layout
+        _ = diagnosis.lain_on, diagnosis.fault_set  # raise ValueError for cells of another layout
         return diagnosis
 
     @classmethod
@@ -211,4 +221,5 @@ class Diagnosis:
             evidence={kind: np.asarray(values, dtype=np.float64) for kind, values in d.get("evidence", {}).items()},
             transport=tuple(TransportFault.from_dict(f) for f in d.get("transport", ())),
             possible=tuple(Fault.from_dict(f) for f in d.get("possible", ())),
+            static_loads=tuple(StaticLoad.from_dict(load) for load in d.get("static_loads", ())),
         )

@@ -22,7 +22,7 @@ from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import EventLog
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import Rectangle, Tile, tiles
-from diagnostics.evidence.conditional_test import SUDDEN_JUMP, CellState, Model
+from diagnostics.evidence.conditional_test import SUDDEN_JUMP, CellState, HeldValues, Model
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.evidence.rest_level import RestLevel
@@ -268,6 +268,41 @@ class StreamState:
                 )  # fmt: skip
                 total[tile.outputs] = summed[tile.place]
         return total
+
+    def least_loads(self) -> tuple[NDArray[np.float64], Cells, Cells]:
+        """Return the least root load of each cell since an event last left it unloaded, ``[D]``; 0: the last one did.
+
+        With it the first frame of these events, 0 where these are all that are kept, and in how many of them the cell
+        returned to that load.
+        """
+        least = np.zeros(self.layout.n_cells)
+        since, returns = np.zeros(len(least), np.intp), np.zeros(len(least), np.intp)
+        same = 4 * self.reference.tolerance / self.scale.full_scale
+        for i, events in self.local.kept():
+            tile = self.local.tiles[i]
+            lowest = np.stack([event.lowest[tile.place] for event in events.kept])
+            lasting = np.logical_and.accumulate((lowest > self.scale.root_near)[::-1])[::-1]
+            first = np.array([event.first for event in events.kept])[lasting.argmax(axis=0)]
+            least[tile.outputs] = of_tile = np.where(lasting[-1], np.where(lasting, lowest, 1.0).min(axis=0), 0.0)
+            since[tile.outputs] = np.where(lasting[-1] & ~lasting[0], first, 0)
+            returns[tile.outputs] = (lasting & (lowest**2 <= of_tile**2 + same)).sum(axis=0)
+        return least, since, returns
+
+    def log_held(
+        self, root: NDArray[np.float64], predictors: Mask, cells: Cells, values: HeldValues
+    ) -> NDArray[np.float64]:
+        """Return log P(healthy ``cells`` hold their ``values``), given the root loads ``[D]`` of the ``predictors``."""
+        features = np.stack([root, root, root > 0, root > 0]).astype(np.float32)
+        likely = np.ones(len(root))
+        among = np.zeros(len(root), bool)
+        among[cells] = True
+        for i, tile in enumerate(self.local.tiles):
+            if among[tile.outputs].any():
+                inputs, own = tile.inputs, tile.place[among[tile.outputs]]
+                e = self.model_of(i, self.local.of[i]).predict(features[None, :, inputs], predictors[inputs])
+                these = inputs[own]
+                likely[these] = e.always[0, own] * e.within(values.low[these], values.high[these], own)[0]
+        return np.log(np.maximum(likely[cells], np.finfo(float).tiny))
 
     def suspected(self, spatial: Spatial) -> Mask:
         """Return the cells that are no predictors after a test, bool ``[D]``."""

@@ -1,0 +1,264 @@
+"""Static loads: an object or a strap that lies still on the array looks like stuck cells, and is no fault.
+
+Tests neighbouring cells that hold a load since the same time: an object, or independent faults? All other cells were
+unloaded at some time since, so that the loads that are left are those of the object alone. The log odds of an object,
+by the chain rule over the cells i of the group,
+
+    log P(object) + sum over i of  log P(v_i | object, cells before i, other cells unloaded) - log P(i stuck at v_i)
+
+take the first probability from the healthy model, in which the loads of a contact support each other, and the second
+from the share of cells that are stuck elsewhere on the array. The cells with the highest sum are the object; its
+probability is the logistic function of the log odds. Cells of an object are neither faulty nor tested.
+
+Not detected: objects on fewer than three cells; objects of a shape or load that no contact of the reference had;
+objects without a reference. Cells that are stuck at values that an object could have look like one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, logit
+
+from diagnostics.decision.coverage import where
+from diagnostics.evidence.conditional_test import ANYWHERE, EXPECTED, HeldValues
+from diagnostics.preprocessing.scale import SLIGHT
+
+if TYPE_CHECKING:
+    from diagnostics.evidence.spatial import Spatial
+    from diagnostics.evidence.stream_state import StreamState
+    from diagnostics.layout import SensorLayout
+
+_EXPECTED_OBJECTS = 0.1  # prior probability of an object in a log
+_ANY_SHAPE = 0.05  # share of objects of a shape and load that the healthy model does not know
+_RETURNS = 0.1  # probability that a healthy cell returns to the same load, other than none
+_CERTAIN = 1 - 1e-6  # P(object) from which on more cells make it no likelier
+_BESIDE = 0.3  # probability that such an object loads the cell beside a loaded one
+_ADJACENT = np.array([np.zeros((3, 3)), np.ones((3, 3)), np.zeros((3, 3))])  # of one pad, diagonal ones included
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Cells = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class StaticLoad:
+    """An object or a strap that lies still on some cells: neither these are faulty, nor does the log test them.
+
+    Attributes:
+        cells: ascending.
+        probability: P(object), against faults of these cells.
+        onset: number of its first frame, about; None: from the start.
+        reason: one plain sentence.
+    """
+
+    cells: tuple[int, ...]
+    probability: float
+    onset: int | None
+    reason: str
+
+    @classmethod
+    def on(cls, cells: Cells, probability: float, since: int, layout: SensorLayout) -> StaticLoad:
+        """Return the load with its sentence."""
+        n, from_when = len(cells), f"since about frame {since}" if since else "from the start"
+        reason = (
+            f"something lies still on {where(cells, layout)} {from_when} ({n} cells, P = {probability:.2f});"
+            " these cells are not tested: remove it and record again"
+        )
+        return cls(tuple(cells.tolist()), probability, since or None, reason)
+
+    def of(self, order: Cells, layout: SensorLayout) -> StaticLoad:
+        """Return the same load with cell i at ``order[i]`` of a layout."""
+        return self.on(np.unique(order[list(self.cells)]), self.probability, self.onset or 0, layout)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict that :meth:`from_dict` reads."""
+        return {**asdict(self), "cells": list(self.cells)}
+
+    @classmethod
+    def from_dict(cls, d: Mapping[str, Any]) -> StaticLoad:
+        """Rebuild from :meth:`to_dict`."""
+        return cls(tuple(d["cells"]), d["probability"], d["onset"], d["reason"])
+
+
+def find_static_loads(
+    stream: StreamState,
+    spatial: Spatial,
+    faulty: Mask,
+    excluded: Mask,
+    known: Sequence[StaticLoad],
+    *,
+    beside: bool = False,
+) -> list[StaticLoad]:
+    """Return the static loads: those that are ``known``, with more cells, and new ones.
+
+    Args:
+        stream: the log.
+        spatial: the result of the spatial test, in which the cells of known loads had no part.
+        faulty: bool ``[D]``, cells that look faulty; a new load has to explain one of them.
+        excluded: bool ``[D]``, cells that are explained otherwise.
+        known: loads found before.
+        beside: whether a faulty cell beside the load suffices. Cells that move on an object are healthy, but mislead
+            the test of the cells around it.
+    """
+    from scipy import ndimage
+
+    if stream.reference.model is None or not faulty.any():
+        return list(known)
+    scale, tolerance, present = stream.scale, stream.reference.tolerance, stream.present
+    root, since, returns = _held(stream, spatial)
+    root[excluded | ~present | (root**2 < SLIGHT)] = 0.0
+    values = HeldValues.of(scale.baseline + root**2 * scale.full_scale, scale, tolerance)
+    # A healthy cell that contacts load without a pause does not return to the same load.
+    again = np.maximum(returns - 1, 0) * -np.log(_RETURNS)
+    surprisal = np.maximum(spatial.surprisal + spatial.offset + np.maximum(spatial.gain, 0.0), again)
+    full, blamed = np.isinf(values.high), faulty & (root > 0)
+
+    def explains(cells: Mask) -> bool:
+        near = ndimage.binary_dilation(stream.layout.grid(cells), _ADJACENT).ravel() if beside else cells
+        return bool((near & faulty).any())
+
+    anywhere = 4 * tolerance / scale.full_scale
+    alternatives = (
+        (full, (1 - ANYWHERE) / 2, 1.0),
+        (spatial.scored & ~full, ANYWHERE, anywhere),
+        (~spatial.scored & ~full, ANYWHERE, anywhere),
+    )
+    lies = _mask([cell for load in known for cell in load.cells], len(root))
+    wires = _on_broken_wires(blamed & spatial.scored, stream)
+    holding = lies | ((surprisal > -np.log(_RETURNS)) & (root > 0) & ~wires)
+    groups = [_mask(group, len(root)) for group in _groups(holding, stream.layout)]
+    new = [group for group in groups if group.sum() > 1 and explains(group)]
+    found = [load for load in known if not any(group[list(load.cells)].any() for group in new)]
+    if not new:
+        return found
+    others = present & ~stream.suspected(spatial) & ~faulty & ~excluded & (root == 0)
+    chain = _Chain(stream, root, values, others)
+    supported = chain.log_likely(np.flatnonzero(np.any(new, axis=0)))
+    for group in new:
+        own = [load for load in known if group[list(load.cells)].any()]
+        stuck = np.empty(len(root))
+        for alike, share, width in alternatives:
+            stuck[alike] = max(EXPECTED * share, (blamed & alike & ~group).sum() / present.sum()) * width
+        otherwise = np.logaddexp(np.log(stuck), -surprisal)
+        expected = np.log(_EXPECTED_OBJECTS / present.sum())
+        if own:
+            expected = logit(min(*(load.probability for load in own), _CERTAIN))
+        first = [cell for load in own for cell in load.cells]
+        cells, odds = chain.most_likely(group, otherwise, supported, first, float(expected))
+        if own or (odds > 0 and explains(_mask(cells, len(root)))):
+            found.append(StaticLoad.on(cells, float(expit(odds)), int(np.median(since[cells])), stream.layout))
+    return found
+
+
+def _mask(cells: Cells | Sequence[int], n: int) -> Mask:
+    on = np.zeros(n, bool)
+    on[list(cells)] = True
+    return on
+
+
+def _held(stream: StreamState, spatial: Spatial) -> tuple[Floats, Cells, Cells]:
+    """Return the root load that each cell holds up to the end of the log, 0: none, ``[D]``.
+
+    With it since which frame, and in how many events it returned to that load.
+    """
+    runs, scale = stream.runs, stream.scale
+    least, since, returns = stream.least_loads()
+    value = np.minimum(np.nan_to_num(runs.value), scale.baseline + scale.full_scale)
+    root = np.where(spatial.scored, scale.root_load(value), least)
+    since = np.where(spatial.scored, np.where(least > 0, np.minimum(runs.start, since), runs.start), since)
+    return root, since, returns
+
+
+def _on_broken_wires(blamed: Mask, stream: StreamState) -> Mask:
+    """Return the ``blamed`` cells (bool ``[D]``) that read the same as most cells on one of their wires do."""
+    explained, value = np.zeros(len(blamed), bool), stream.runs.value
+    for line in stream.layout.lines:
+        cells = stream.layout.cells_on(line)
+        held = cells[blamed[cells]]
+        if len(held) > max(2, len(cells) / 2):
+            same = held[np.abs(value[held] - np.median(value[held])) <= stream.reference.tolerance / 2]
+            if len(same) > max(2, len(cells) / 2):
+                explained[same] = True
+    return explained
+
+
+def _groups(held: Mask, layout: SensorLayout) -> list[Cells]:
+    """Return the groups of neighbouring cells that hold a load (bool ``[D]``)."""
+    from scipy import ndimage
+
+    labelled, number = ndimage.label(layout.grid(held), _ADJACENT)
+    return [np.flatnonzero(labelled.ravel() == i) for i in range(1, number + 1)]
+
+
+@dataclass(frozen=True)
+class _Chain:
+    """The likelihood of an object, cell by cell.
+
+    Attributes:
+        stream: the log.
+        root: float ``[D]``, held root loads.
+        values: the same as values.
+        others: bool ``[D]``, cells that hold no load.
+    """
+
+    stream: StreamState
+    root: Floats
+    values: HeldValues
+    others: Mask
+
+    def log_likely(self, chosen: Sequence[int] | Cells) -> Floats:
+        """Return log P(value) of each cell, ``[D]``, with an object on it and the ``chosen`` cells."""
+        held = np.flatnonzero(self.root > 0)
+        predictors = self.others | _mask(chosen, len(self.root))
+        log_likely = np.zeros(len(self.root))
+        of_model = np.exp(self.stream.log_held(self.root, predictors, held, self.values))
+        log_likely[held] = np.log((1 - _ANY_SHAPE) * of_model + _ANY_SHAPE * _BESIDE * self.width[held])
+        return log_likely
+
+    @cached_property
+    def width(self) -> Floats:
+        """Of the root loads that count as the value of each cell, ``[D]``."""
+        width: Floats = np.minimum(self.values.high, 1.0) - np.minimum(self.values.low, 1.0)
+        return width
+
+    def most_likely(
+        self, group: Mask, otherwise: Floats, supported: Floats, first: Sequence[int], expected: float
+    ) -> tuple[Cells, float]:
+        """Return the cells of a group that one object explains best, and the log odds of the object.
+
+        Args:
+            group: bool ``[D]``, neighbouring cells that hold a load.
+            otherwise: float ``[D]``, log likelihood of each without an object.
+            supported: float ``[D]``, the same with an object, given all other cells of the group.
+            first: cells that are known to lie under the object.
+            expected: log odds of the object with these; of one at a given place where there are none.
+        """
+        from scipy import ndimage
+
+        chosen, sums = list(first), [expected]
+        if not chosen:
+            gain = np.where(group, supported - otherwise, -np.inf)
+            best = int(gain.argmax())
+            begin = expected + float(np.log(self.width[best]) - otherwise[best])
+            if begin + np.maximum(gain, 0.0).sum() - gain[best] <= 0:
+                return np.flatnonzero(group), -np.inf
+            chosen, sums = [best], [begin]
+        known = len(chosen)
+        while len(chosen) < group.sum():
+            on = _mask(chosen, len(group))
+            beside = ndimage.binary_dilation(self.stream.layout.grid(on), _ADJACENT).ravel() & ~on & group
+            gain = np.where(beside, self.log_likely(chosen) - otherwise, -np.inf)
+            # As many again as are known: few predictions, and cells that join together do not support each other.
+            more = np.argsort(-gain, kind="stable")[: min(len(chosen), int(beside.sum()))]
+            if not len(more):
+                break
+            chosen += more.tolist()
+            sums += (sums[-1] + np.cumsum(gain[more])).tolist()
+        most = int(np.argmax(sums))
+        return np.array(sorted(chosen[: known + most])), sums[most]

@@ -204,6 +204,13 @@ def test_a_cell_that_always_reads_far_outside_the_range_is_a_fault_and_no_other_
     assert "row 2, column 3" in printed
 
 
+@pytest.mark.parametrize("shape", ["", "10x", "abc", "2x3x4x5"])
+def test_an_option_shape_that_is_none_is_refused_as_a_shape(shape, file, capsys):
+    code, _, said = run(capsys, "info", file, "--shape", shape)
+    assert (code, said.count("\n")) == (3, 1)
+    assert "expected pads x rows x columns, such as 2x13x6" in said
+
+
 def test_a_simulation_that_would_fill_the_memory_is_refused(tmp_path, capsys):
     code, _, told = run(capsys, "simulate", "--grasps", 10**9, "--out", tmp_path / "s.npz")
     assert (code, "more than 2,147,483,648" in told, len(told.splitlines())) == (3, True, 1)

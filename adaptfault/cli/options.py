@@ -292,6 +292,11 @@ def refuse_missing(args: argparse.Namespace) -> None:
     for path in (path for path in (*many, *one) if path is not None):
         if not os.path.lexists(path):  # an empty path, as of a shell variable that is not set, is none either
             raise ValueError(f"{path or repr(path)}: is not there; check the path")
+    model = getattr(args, "model", None)
+    if model is not None and not is_bundle(model) and not os.path.isfile(os.path.join(model, "manifest.json")):
+        raise ValueError(
+            f"{model}: expected a model, a folder with manifest.json as adaptfault train writes it, or a bundle"
+        )
     bundle = getattr(args, "bundle", None)
     if bundle is not None and not is_bundle(bundle):
         what = "expected a bundle, a folder with bundle.json; adaptfault train --out X.bundle makes one"

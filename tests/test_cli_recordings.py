@@ -179,6 +179,7 @@ def test_diagnose_writes_a_page_with_the_verdict_first(file, tmp_path, capsys):
         (["maintain", "{file}", "{file}", "--report", ""], "expected a bundle"),
         (["diagnose", "{file}", "--html", ""], "--html '': name a file"),
         (["evaluate", "gone", "{file}"], "gone: is not there"),
+        (["evaluate", "{file}", "{file}"], "expected a model, a folder with manifest.json"),
         (["maintain", "gone", "{file}"], "gone: expected a bundle"),
         (["diagnose", "{file}", "--out", "gone/d.json"], "--out gone/d.json: the folder gone is not there"),
         (["info", "{file}", "--picture", "gone/p.png"], "--picture gone/p.png: the folder gone is not there"),
@@ -202,6 +203,22 @@ def test_a_cell_that_always_reads_far_outside_the_range_is_a_fault_and_no_other_
     code, printed, told = run(capsys, "diagnose", tmp_path / "idle.npz", "--reference", file)
     assert (code, "same unit" in told) == (1, False)
     assert "row 2, column 3" in printed
+
+
+def test_a_log_of_another_array_is_refused_before_the_reference_is_fitted(file, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(SelfDiagnosis, "fit", lambda *args, **options: pytest.fail("fitted"))
+    other = tmp_path / "other.npz"
+    np.savez(other, frames=np.ones((2, 20, 1, 7, 5), np.uint8))
+    code, _, said = run(capsys, "diagnose", other, "--reference", file)
+    assert code == 3
+    assert "frames of 1 x 7 x 5 (pads x rows x cols) where the layout has 1 x 6 x 5; use recordings of the same" in said
+
+
+@pytest.mark.parametrize("shape", ["", "10x", "abc", "2x3x4x5"])
+def test_an_option_shape_that_is_none_is_refused_as_a_shape(shape, file, capsys):
+    code, _, said = run(capsys, "info", file, "--shape", shape)
+    assert (code, said.count("\n")) == (3, 1)
+    assert "expected pads x rows x columns, such as 2x13x6" in said
 
 
 def test_a_simulation_that_would_fill_the_memory_is_refused(tmp_path, capsys):

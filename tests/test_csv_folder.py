@@ -125,6 +125,9 @@ def test_times_that_never_rise_give_no_rate(tmp_path, times):
         (text(newtons(6, 221)), "a.csv, line 1: 221 values a frame, expected 220: if the first column is a time"),
         (damaged(lambda r: [x + "," for x in r]), "expected 220: each line ends with a comma, remove it"),
         (damaged(lambda r: ["2024-05-01," + x for x in r]), "a.csv, line 1, column 1: '2024-05-01' is not a number"),
+        ("time,a,b\n1,2,3\nnoon,2,3\n", "a.csv, line 3, column 1: 'noon' is no time; write a number, or a date as"),
+        ("time,a,b\n2025-13-01 00:00:00,2,3\n", "a.csv, line 2, column 1: '2025-13-01 00:00:00' is no time"),
+        ("frame\n1\n2\n", "line 2: holds numbers of frames and no readings"),
         (text(newtons(6)).replace(",", ";"), "a.csv, line 1: separated by ';'? use commas"),
         (text(newtons(6)).replace(",", ";").replace(".", ","), "a.csv, line 1: separated by ';'? use commas"),
         (text(newtons(6)).replace(",", "\t"), "a.csv, line 1: separated by tabs? use commas"),
@@ -275,11 +278,12 @@ def test_no_function_is_called_for_each_number_of_a_file(tmp_path):
         ("time_ms", np.arange(50) * 50, 20),
         ("t [us]", np.arange(50) * 20_000.0, 50),
         ("time", np.arange(50) * 100, 10),  # neither 0.01 Hz nor 10 kHz
+        ("Timestamp", [f"{time}Z" for time in np.datetime64("2025-12-31T23:59:59.1") + 50 * np.arange(50)], 20),
     ],
 )
 def test_a_time_column_gives_the_rate_and_is_no_reading(tmp_path, header, times, rate, monkeypatch):
     values = newtons(50)
-    rows = [f"{time:.6f},{row}" for time, row in zip(times, text(values).splitlines(), strict=True)]
+    rows = [f"{time},{row}" for time, row in zip(times, text(values).splitlines(), strict=True)]
     rows[7] = rows[7].rpartition(",")[0] + ","  # a missing reading takes the slower parser
     names = ",".join([header, *(f"cell{i}" for i in range(220))])
     file = write(tmp_path / "a.csv", "\n".join([names, *rows]) + "\n")
@@ -292,6 +296,17 @@ def test_a_time_column_gives_the_rate_and_is_no_reading(tmp_path, header, times,
     stream = Stream(file)
     assert stream.layout == loaded.recordings.layout
     np.testing.assert_array_equal(np.concatenate(list(stream)), loaded.recordings.frames[0])
+
+
+@pytest.mark.parametrize("header", ["", "Unnamed: 0", "frame", "Index,time_ms", "sample_no,time_ms"])
+def test_a_first_column_of_frame_numbers_is_no_reading(tmp_path, header):
+    values, times = newtons(30), [f",{50 * i}" if "time" in header else "" for i in range(30)]
+    rows = [f"{i}{time},{row}" for i, (time, row) in enumerate(zip(times, text(values).splitlines(), strict=True))]
+    for cells in (map(str, range(220)), (f"cell{i}" for i in range(220))):  # pandas numbers the columns
+        file = write(tmp_path / "a.csv", "\n".join([",".join([header, *cells]), *rows]))
+        loaded = load(file)
+        np.testing.assert_allclose(loaded.recordings.frames[0], values, rtol=1e-6)
+        assert loaded.recordings.layout.rate == (20 if "time" in header else 10)
 
 
 def test_a_file_of_times_alone_is_refused(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from recording_files import SMALL, archive, counts, messages, newtons, refusal, write
 
@@ -92,6 +93,14 @@ def test_a_shape_that_is_none_is_refused(words):
 def test_an_option_that_makes_no_layout_is_refused(tmp_path, options):
     assert refusal(write(tmp_path / "a.csv", newtons(3)), **options).startswith("layout: ")
     assert "frames 0" in refusal(tmp_path / "a.csv", frames=0)
+
+
+def test_frames_of_one_pad_that_may_be_recordings_are_refused_with_both_shapes(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones((60, 4, 6)))
+    said = refusal(tmp_path / "a.npy")
+    assert "6 values a frame, and nothing states their rows and columns; give --shape (rows x columns, such as" in said
+    assert said.endswith("if these are 60 frames of one pad, --shape 4x6")
+    assert load(tmp_path / "a.npy", layout="4x6").recordings.frames[0].shape == (60, 24)
 
 
 TOML = """

@@ -1,4 +1,7 @@
+import base64
 import json
+import re
+import struct
 
 import numpy as np
 import pytest
@@ -67,6 +70,22 @@ def test_the_page_says_what_the_exit_code_and_the_notes_say(tmp_path, faults, co
     ).read_text()
     assert f">{headline}</h1>" in page
     assert note[1:] in page.split("<h2>")[0]
+
+
+def test_on_a_narrow_screen_the_pads_of_a_page_are_below_each_other(tmp_path):
+    def sizes(pads: int) -> list[tuple[int, int]]:
+        layout, cells = SensorLayout(pads, 30, 12), pads * 360
+        of = Diagnosis(layout, (), np.zeros(cells), np.ones(cells, bool), n_frames=9, n_recordings=1)
+        page = write_diagnosis(tmp_path / "page.html", of, name="log", reference=True).read_text()
+        pictures = re.findall(
+            r'(?:<source media="\(max-width: 40rem\)" srcset|<img class="" src)="data:.*?,(.*?)"', page
+        )
+        return [struct.unpack(">II", base64.b64decode(picture)[16:24]) for picture in pictures]  # in the head of a PNG
+
+    (narrow, high), (wide, low) = sizes(2)
+    assert narrow < 0.6 * wide
+    assert high > 1.8 * low
+    assert len(sizes(1)) == 1
 
 
 def test_the_fault_set_holds_the_cells_of_all_faults():

@@ -66,14 +66,17 @@ def run(args: argparse.Namespace) -> int:
 
     bundle = _bundle(args)
     healthy = load_recordings(args, args.reference) if args.reference and bundle is None else None
-    diagnoser = bundle.diagnoser() if bundle is not None else None if healthy is None else fit_diagnoser(args, healthy)
-    layout = None if diagnoser is None else diagnoser.layout
+    diagnoser = None if bundle is None else bundle.diagnoser()
+    known = diagnoser or healthy
+    layout = None if known is None else known.layout
     log: Recordings | Stream
     if args.frames is None and is_large(args.recordings):
         log = stream_recordings(args, args.recordings, layout)
         report_inferred(args, log.inferred)
     else:
         log = load_recordings(args, args.recordings, layout=layout)
+    if healthy is not None:  # fitted once the log is known to be of the same array
+        diagnoser = fit_diagnoser(args, healthy)
     source = slice(None) if bundle is None else bundle.active().source
     reference = bundle if healthy is None else list(healthy)
     rewiring = _rewiring(log, diagnoser, source)

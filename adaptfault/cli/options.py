@@ -151,9 +151,7 @@ def layout_of(args: argparse.Namespace, *, full_scale: float | None = None, unit
     from adaptfault.data.recordings.resolve import given_array
     from diagnostics import SensorLayout
 
-    if args.layout and args.shape:
-        raise ValueError("--layout and --shape both given: one of them is enough")
-    array = given_array(args.layout or args.shape) or SensorLayout.paper()
+    array = given_array(_array(args)) or SensorLayout.paper()
     layout = array if isinstance(array, SensorLayout) else SensorLayout(*array)
     stated = {
         "full_scale": full_scale if args.full_scale is None else args.full_scale,
@@ -218,12 +216,24 @@ def report_inferred(args: argparse.Namespace, inferred: Sequence[str]) -> None:
         say(args, f"inferred: {text}")
 
 
-def _array_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the options that describe the array, as :func:`adaptfault.load` takes them."""
+def _array(args: argparse.Namespace) -> str | tuple[int, int, int] | None:
+    """Return the file of the layout or the shape that the options state.
+
+    Raises:
+        ValueError: both are given, or the shape is none.
+    """
+    from adaptfault.data.recordings.layout_file import parse_shape
+
     if args.layout and args.shape:
         raise ValueError("--layout and --shape both given: one of them is enough")
+    layout: str | None = args.layout
+    return layout if args.shape is None else parse_shape(args.shape)
+
+
+def _array_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the options that describe the array, as :func:`adaptfault.load` takes them."""
     names = ("calibration", "full_scale", "unit", "rate", "topic", "field")
-    return {"layout": args.layout or args.shape, **{name: getattr(args, name) for name in names}}
+    return {"layout": _array(args), **{name: getattr(args, name) for name in names}}
 
 
 def _agreeing(args: argparse.Namespace, layout: SensorLayout) -> dict[str, Any]:
@@ -282,6 +292,11 @@ def refuse_missing(args: argparse.Namespace) -> None:
     for path in (path for path in (*many, *one) if path is not None):
         if not os.path.lexists(path):  # an empty path, as of a shell variable that is not set, is none either
             raise ValueError(f"{path or repr(path)}: is not there; check the path")
+    model = getattr(args, "model", None)
+    if model is not None and not is_bundle(model) and not os.path.isfile(os.path.join(model, "manifest.json")):
+        raise ValueError(
+            f"{model}: expected a model, a folder with manifest.json as adaptfault train writes it, or a bundle"
+        )
     bundle = getattr(args, "bundle", None)
     if bundle is not None and not is_bundle(bundle):
         what = "expected a bundle, a folder with bundle.json; adaptfault train --out X.bundle makes one"

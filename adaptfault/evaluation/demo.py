@@ -223,10 +223,11 @@ def _found(diagnosis: Diagnosis, injected: Sequence[Fault], n_log: int, seconds:
     true = {cell for fault in injected for cell in fault.cells}
     false = len(diagnosis.fault_set - true)
     missed = len(true & set(diagnosis.coverage.untested.tolist()))
+    logs = "1 recording" if n_log == 1 else f"{n_log} recordings"
     untested = f" ({missed} not tested by the log)" if missed else ""
     return (
         f"diagnosis    found {len(diagnosis.fault_set & true)} of {len(true)} broken cells{untested},"
-        f" {false} false alarm{'' if false == 1 else 's'}, from {n_log} recordings in {seconds:.2f} s;"
+        f" {false} false alarm{'' if false == 1 else 's'}, from {logs} in {seconds:.2f} s;"
         f" {diagnosis.coverage}"
     )
 

@@ -7,7 +7,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
-from adaptfault.evaluation.html_page import embedded, render, version_of
+from adaptfault.evaluation.html_page import Picture, render, version_of
 from diagnostics import Diagnosis
 
 Verdict = Literal["call", "watch", "nothing"]
@@ -73,7 +73,7 @@ def write_diagnosis(
         layout=diagnosis.layout,
         ordered=sorted(diagnosis.faults, key=lambda fault: (fault.line is None, -len(fault.cells))),
         reference=reference,
-        verdicts=embedded(diagnosis.plot()),
+        verdicts=Picture.of(diagnosis.plot),
         date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         versions=f"adaptfault {version_of('adaptfault')}",
     )

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Callable
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.data.atomic import atomic_write
 from diagnostics.decision.coverage import percent
+from diagnostics.decision.plot import PAGE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+_NARROW = 4.5
+"""Width of a page on a telephone, in inches: its letters are then legible."""
 
 
 def render(path: str | Path, template: str, **values: Any) -> Path:
@@ -31,8 +37,26 @@ def render(path: str | Path, template: str, **values: Any) -> Path:
     return path
 
 
-def embedded(figure: Figure) -> str:
-    """Return a figure as a data URI of a PNG."""
+@dataclass(frozen=True)
+class Picture:
+    """A figure for wide and for narrow screens, as data URIs of PNGs.
+
+    Attributes:
+        wide: the figure.
+        narrow: the same with the pads below each other; empty where it is narrow already.
+    """
+
+    wide: str
+    narrow: str
+
+    @classmethod
+    def of(cls, plot: Callable[[float], Figure]) -> Picture:
+        """Draw the figure with ``plot``, a function of the width of the page in inches."""
+        wide = plot(PAGE)
+        return cls(_embedded(wide), _embedded(plot(_NARROW)) if wide.get_figwidth() > _NARROW else "")
+
+
+def _embedded(figure: Figure) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=130)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

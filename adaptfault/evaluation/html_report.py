@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adaptfault.evaluation.html_page import embedded, render, version_of
+from adaptfault.evaluation.html_page import Picture, render, version_of
 from diagnostics import FaultSet
 from diagnostics.decision.plot import draw_forces, pads_figure
 
@@ -43,8 +43,8 @@ def write_report(path: str | Path, result: DemoResult) -> Path:
         layout=result.recordings.layout,
         rows=_rows(result),
         alarms=_false_alarm_texts(result),
-        forces=embedded(_draw_maps(result)),
-        verdicts=embedded(result.diagnosis.plot()),
+        forces=Picture.of(lambda page: _draw_maps(result, page)),
+        verdicts=Picture.of(result.diagnosis.plot),
         versions=", ".join(f"{name} {version_of(name)}" for name in ("adaptfault", "torch", "numpy", "scikit-learn")),
         python=platform.python_version(),
     )
@@ -73,10 +73,10 @@ def _false_alarm_texts(result: DemoResult) -> list[str]:
     return [layout.place(c) for c in result.false_alarms]
 
 
-def _draw_maps(result: DemoResult) -> Figure:
+def _draw_maps(result: DemoResult, page: float) -> Figure:
     """Draw mean forces as the paper's Figure 3, with a third row: the forces after imputation."""
     layout = result.recordings.layout
-    figure, axes = pads_figure(layout, n_rows=len(result.maps))
+    figure, axes = pads_figure(layout, n_rows=len(result.maps), page=page)
     masked = {name: np.where(layout.present.ravel(), values, np.nan) for name, values in result.maps.items()}
     # One colour scale for all, from the healthy map: a short is then off the scale.
     top = float(np.nanmax(masked["normal"])) or layout.full_scale

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from adaptfault.evaluation.html_page import embedded, render, version_of
+from adaptfault.evaluation.html_page import Picture, render, version_of
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.pointer import Pointer
 from adaptfault.robot.sensor_state import SensorState, unhandled_cells
@@ -76,7 +76,7 @@ def write_report(
             key=lambda fault: (fault not in state.unhandled, fault.line is None, -len(fault.cells)),
         ),
         diagnosis=diagnosis,
-        verdicts=None if diagnosis is None else embedded(diagnosis.plot()),
+        verdicts=None if diagnosis is None else Picture.of(diagnosis.plot),
         dry_run=run is not None and run.dry_run,
         runs=[_shown(one) for one in reversed(runs)],
         problems=problems,

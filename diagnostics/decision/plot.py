@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from diagnostics.layout import SensorLayout
 
-_PAGE = 10.0
+PAGE = 10.0
 """Width of the maps, in inches; pads that do not fit go below."""
 
 _WIDE = 5.0
@@ -24,7 +24,11 @@ _ALIVE, _FAULTY, _UNTESTED, _ABSENT = "#8fbf8f", "#c0392b", "#d9d9d9", "#ffffff"
 
 
 def draw(
-    layout: SensorLayout, verdicts: NDArray[np.intp], letters: Mapping[int, str], kinds: Mapping[str, str]
+    layout: SensorLayout,
+    verdicts: NDArray[np.intp],
+    letters: Mapping[int, str],
+    kinds: Mapping[str, str],
+    page: float = PAGE,
 ) -> Figure:
     """Draw each pad: green alive, red faulty, grey untested; the legend explains the letters that are on the map.
 
@@ -33,14 +37,15 @@ def draw(
         verdicts: int ``[D]``, 0 alive, 1 faulty, 2 untested, as :class:`~diagnostics.Verdict` counts.
         letters: letter of the fault kind, by cell.
         kinds: name of the fault kind, by letter.
+        page: width of the page, in inches.
     """
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    figure, ((*axes,),) = pads_figure(layout, n_rows=1, scale=False)
+    figure, ((*axes,),) = pads_figure(layout, n_rows=1, scale=False, page=page)
     colours = np.where(layout.present.ravel(), verdicts, 3)
     palette = ListedColormap([_ALIVE, _FAULTY, _UNTESTED, _ABSENT])
-    cell_points = 72 * _cell(layout)
+    cell_points = 72 * _cell(layout, page)
     for pad, ax in enumerate(axes):
         ax.imshow(layout.grid(colours)[pad], cmap=palette, vmin=-0.5, vmax=3.5)
         ax.set_title(f"pad {pad}", fontsize=10)
@@ -78,31 +83,33 @@ def draw_forces(ax: Axes, values: ArrayLike, layout: SensorLayout, dead: Iterabl
     return image
 
 
-def pads_figure(layout: SensorLayout, *, n_rows: int, scale: bool = True) -> tuple[Figure, Any]:
+def pads_figure(layout: SensorLayout, *, n_rows: int, scale: bool = True, page: float = PAGE) -> tuple[Figure, Any]:
     """Return a figure and its axes ``[n_rows, pads]``, sized to the pads; pads that do not fit a page go below.
 
     Args:
         layout: the array.
         n_rows: number of maps of each pad.
         scale: leave room for a colour scale beside the maps; otherwise for a legend below them.
+        page: width of the maps, in inches.
     """
     from matplotlib.figure import Figure
 
-    height, width = layout.rows * _cell(layout) + 0.7, max(layout.shape[2] * _cell(layout), 1.8) + 0.5
-    columns = max(1, min(layout.pads, int(_PAGE // width)))
+    cell, beside = _cell(layout, page), 1.2 if scale else 0.0
+    height, width = layout.rows * cell + 0.7, max(layout.shape[2] * cell, 1.8) + 0.5
+    columns = max(1, min(layout.pads, int(page // width)))
     rows = -(-layout.pads // columns)
-    page = max(columns * width, 3.0) + (1.2 if scale else 0)
-    below = 0.6 if scale else 0.5 if page > _WIDE else 0.9
-    figure = Figure(figsize=(page, n_rows * rows * height + below), layout="constrained")
+    across = max(columns * width, 3.0) + beside
+    below = 0.6 if scale else 0.5 if across > _WIDE else 0.9
+    figure = Figure(figsize=(across, n_rows * rows * height + below), layout="constrained")
     axes = figure.subplots(n_rows * rows, columns, squeeze=False).reshape(n_rows, rows * columns)
     for ax in axes[:, layout.pads :].ravel():
         ax.set_visible(False)
     return figure, axes[:, : layout.pads]
 
 
-def _cell(layout: SensorLayout) -> float:
+def _cell(layout: SensorLayout, page: float) -> float:
     """Return the size of a cell on the verdict map, in inches: less where the pad would not fit a page."""
-    return min(0.28, 8.0 / max(layout.rows, layout.shape[2]))
+    return min(0.28, 0.8 * page / layout.shape[2], 0.8 * PAGE / layout.rows)
 
 
 def _ticks(ax: Axes, layout: SensorLayout) -> None:

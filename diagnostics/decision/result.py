@@ -146,13 +146,13 @@ class Diagnosis:
         head = f"{found} in {recordings} ({frames}); {self.coverage}"
         return "\n".join([head, self.map(), *reasons])
 
-    def plot(self) -> Figure:
-        """Return the verdict map as a matplotlib Figure."""
+    def plot(self, page: float = 10.0) -> Figure:
+        """Return the verdict map as a matplotlib Figure; pads that do not fit ``page`` inches side by side go below."""
         from diagnostics.decision.plot import draw
 
         letters = {cell: LETTERS[fault.kind] for fault in self.faults for cell in fault.cells}
         kinds = {letter: kind.value for kind, letter in LETTERS.items()}
-        return draw(self.layout, self.verdicts.astype(np.intp), letters, kinds)
+        return draw(self.layout, self.verdicts.astype(np.intp), letters, kinds, page)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict (no NaN) that :meth:`from_dict` reads."""

@@ -15,11 +15,19 @@ from adaptfault.data.recordings.infer import GIVE_LAYOUT, SLACK, describe_width
 from diagnostics import SensorLayout
 
 
-def check_width(content: Content, layout: SensorLayout, stated: str = "") -> None:
-    """Raise InputError if the frames of a file do not fit the layout; ``stated`` names where the layout is from."""
+def check_width(content: Content, layout: SensorLayout, stated: str = "", *, strict: bool = False) -> None:
+    """Raise InputError if the frames of a file do not fit the layout.
+
+    Args:
+        content: of the file.
+        layout: the array.
+        stated: where the layout is from.
+        strict: the layout is that of a model or a reference, so the recordings are of another sensor.
+    """
     if content.shape is not None and content.shape != layout.shape:
         came, expected = (" x ".join(map(str, shape)) for shape in (content.shape, layout.shape))
-        what = f"frames of {came} (pads x rows x cols) where the layout{stated} has {expected}; {GIVE_LAYOUT}"
+        what = f"frames of {came} (pads x rows x cols) where the layout{stated} has {expected}"
+        what += "; use recordings of the same sensor" if strict else f"; {GIVE_LAYOUT}"
         raise InputError.at(content.path, what)
     if content.width != layout.n_cells:
         expected = " x ".join(map(str, layout.shape))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,10 @@ _TIME = re.compile(
     r"(?:time(?:[_ ]?stamp)?|stamp|t)(?:[_ ]?[\[(]?(s|sec|seconds|ms|us|ns)[\])]?)?", re.IGNORECASE | re.ASCII
 )
 
+_NUMBER = re.compile(r"|unnamed: 0|index|(?:frame|sample)(?:[_ ]?(?:id|no|number))?", re.IGNORECASE)
+
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?) ?(?:Z|[+-]\d\d:?\d\d)?", re.ASCII)
+
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -30,7 +36,8 @@ def read_csv(path: Path) -> Content:
     """Read a CSV file of T lines x D readings, comma separated, with or without a header line.
 
     A first column that the header names as a time (``time``, ``timestamp``, ``t``, with a unit as in ``time_ms``) is no
-    reading; it gives the rate. An empty cell and ``nan`` are missing readings and become NaN. Blank lines are skipped.
+    reading; it gives the rate. One without a name, or called ``index``, ``frame`` or ``sample``, is none either. An
+    empty cell and ``nan`` are missing readings and become NaN. Blank lines are skipped.
     A last line that a power failure cut off is left out with a warning, and so is everything from zero bytes on, which
     stand for data that did not reach the disk. A cut inside the last number of a full line cannot be detected.
 
@@ -54,6 +61,35 @@ def read_csv(path: Path) -> Content:
     )
 
 
+@dataclass(frozen=True)
+class _Leading:
+    """The first columns, which hold no readings.
+
+    Attributes:
+        columns: how many.
+        clock: which of them holds times; None where none does.
+        unit: of the times, where the header states it.
+    """
+
+    columns: int = 0
+    clock: int | None = None
+    unit: str | None = None
+
+    @classmethod
+    def of(cls, header: str) -> _Leading:
+        """Read the header line of a file."""
+        leading = cls()
+        for column, name in enumerate(map(_bare, header.split(","))):
+            if leading.clock is None and (time := _TIME.fullmatch(name)):
+                unit = (time[1] or "").lower() or None
+                leading = cls(column + 1, column, "s" if unit in ("sec", "seconds") else unit)
+            elif _NUMBER.fullmatch(name) and column < 2:
+                leading = replace(leading, columns=column + 1)
+            else:
+                break
+        return leading
+
+
 @dataclass(frozen=True, eq=False)
 class Piece:
     """Some lines of a file.
@@ -63,14 +99,14 @@ class Piece:
         lines: int ``[t]``, their numbers.
         problems: errors and warnings.
         times: float64 ``[t]``, of a time column; None where there is none.
-        unit: of the times, where the header states it: "s", "ms", "us" or "ns".
+        leading: the columns that hold no readings; its unit is "s", "ms", "us", "ns" or None.
     """
 
     values: NDArray[np.float32] | None
     lines: NDArray[np.intp]
     problems: tuple[Problem, ...] = ()
     times: NDArray[np.float64] | None = None
-    unit: str | None = None
+    leading: _Leading = _Leading()
 
     @property
     def rate(self) -> float | None:
@@ -86,8 +122,9 @@ class Piece:
         period = float(np.median(periods)) if periods.size else 0.0
         if not period > 0:
             return None
-        rates = [_TICKS[unit] / period for unit in ([self.unit] if self.unit else _TICKS)]
-        return next((float(f"{rate:.3g}") for rate in rates if self.unit or 0.5 <= rate <= 2000), None)
+        stated = self.leading.unit
+        rates = [_TICKS[unit] / period for unit in ([stated] if stated else _TICKS)]
+        return next((float(f"{rate:.3g}") for rate in rates if stated or 0.5 <= rate <= 2000), None)
 
 
 def csv_pieces(path: Path, size: int) -> Iterator[Piece]:
@@ -126,17 +163,15 @@ def csv_pieces(path: Path, size: int) -> Iterator[Piece]:
 
 @dataclass(frozen=True)
 class _Before:
-    """The lines before a piece of a file: how many, the last one, and whether the first column is a time."""
+    """The lines before a piece of a file: how many, the last one, and the columns that hold no readings."""
 
     lines: int = 0
     last: str = ""
-    timed: bool = False
-    unit: str | None = None
+    leading: _Leading = _Leading()
 
     def behind(self, piece: bytes, parsed: Piece) -> _Before:
-        timed, unit = self.timed or parsed.times is not None, self.unit or parsed.unit
         last = piece.rstrip(b"\r\n").rpartition(b"\n")[2]
-        return _Before(self.lines + piece.count(b"\n"), last.decode("utf-8", "replace"), timed, unit)
+        return _Before(self.lines + piece.count(b"\n"), last.decode("utf-8", "replace"), parsed.leading)
 
 
 def _parse(path: Path, data: bytes, before: _Before) -> Piece:
@@ -151,26 +186,41 @@ def _parse(path: Path, data: bytes, before: _Before) -> Piece:
         what = "cut off in this line: the lines before it are kept"
         problems = (Problem("warning", located(path, what, f"line {before.lines + numbers[-1]}")),)
         rows, numbers = rows[:-1], numbers[:-1]
-    timed, unit = before.timed, before.unit
+    leading = before.leading
     if rows and not before.lines and _is_header(rows[0]):
-        if clock := _TIME.fullmatch(_bare(rows[0].split(",")[0])):
-            unit = (clock[1] or "").lower() or None
-            timed, unit = True, "s" if unit in ("sec", "seconds") else unit
+        leading = _Leading.of(rows[0])
         rows, numbers = rows[1:], numbers[1:]
     lines = np.array(numbers, dtype=np.intp) + before.lines
     if not rows:
-        return Piece(None, lines, problems)
-    kind = np.float64 if timed else np.float32  # float32 holds a unix time to two minutes
+        return Piece(None, lines, problems, leading=leading)
+    if leading.clock is not None and _DATE.fullmatch(_cell(rows[0], leading.clock)):
+        rows, leading = [_in_seconds(row, leading.clock) for row in rows], replace(leading, unit="s")
+    kind = np.float64 if leading.columns else np.float32  # float32 holds a unix time to two minutes
     try:
         values = np.loadtxt(rows, dtype=kind, delimiter=",", comments=None, ndmin=2)
     except ValueError:  # numpy's parser is fast, but does not name the cell
-        values = _read_by_cell(path, rows, lines.tolist(), kind)
-    if not timed:
+        values = _read_by_cell(path, rows, lines.tolist(), kind, leading)
+    if not leading.columns:
         return Piece(values.astype(np.float32, copy=False), lines, problems)
-    if values.shape[1] < 2:
-        raise InputError.at(path, "holds a column of times and no readings; add one column a cell", f"line {lines[0]}")
+    if values.shape[1] <= leading.columns:
+        held = "a column of times" if leading.clock is not None else "numbers of frames"
+        raise InputError.at(path, f"holds {held} and no readings; add one column a cell", f"line {lines[0]}")
+    times = None if leading.clock is None else values[:, leading.clock].astype(np.float64)
     with np.errstate(all="ignore"):  # a reading that float32 cannot hold becomes infinite, and is missing
-        return Piece(values[:, 1:].astype(np.float32), lines, problems, values[:, 0].astype(np.float64), unit)
+        return Piece(values[:, leading.columns :].astype(np.float32), lines, problems, times, leading)
+
+
+def _cell(row: str, column: int) -> str:
+    return _bare((*row.split(",", column + 1), "")[column])
+
+
+def _in_seconds(row: str, column: int) -> str:
+    """Return a line with the date in a column as seconds; what is no date stays, for the parser to name."""
+    cells = row.split(",", column + 1)
+    if date := _DATE.fullmatch(_cell(row, column)):
+        with suppress(ValueError):  # the 45th of a month
+            cells[column] = repr(int(np.datetime64(date[1], "ns").astype(np.int64)) / 1e9)
+    return ",".join(cells)
 
 
 def _is_cut(line: str, before: str) -> bool:
@@ -189,13 +239,16 @@ def _is_header(line: str) -> bool:
     if first not in (None, 0.0, 1.0) and _number(cells[-1]) is not None:
         return False  # a shortcut for nearly every frame
     numbers = [_number(cell) for cell in cells if cell]
-    if None in numbers:
-        return 2 * numbers.count(None) > len(numbers)
+    if 2 * numbers.count(None) > len(numbers):
+        return True
+    counted = list(dropwhile(lambda number: number is None, numbers))  # behind the names of the first columns
     # pandas writes such a header by default; no array reads exactly that
-    return len(numbers) > 3 and any(numbers == list(range(start, start + len(numbers))) for start in (0, 1))
+    return len(counted) > 3 and any(counted == list(range(start, start + len(counted))) for start in (0, 1))
 
 
-def _read_by_cell(path: Path, rows: Sequence[str], numbers: Sequence[int], kind: type) -> NDArray[Any]:
+def _read_by_cell(
+    path: Path, rows: Sequence[str], numbers: Sequence[int], kind: type, leading: _Leading
+) -> NDArray[Any]:
     """Parse cell by cell: accepts missing readings, and names the line and column of a cell that is no number."""
     for separator, name in ((";", "';'"), ("\t", "tabs")):
         if separator in rows[0]:
@@ -217,7 +270,9 @@ def _read_by_cell(path: Path, rows: Sequence[str], numbers: Sequence[int], kind:
             reading = _number(_bare(cell)) if cell.strip() else np.nan
             if reading is None:
                 what = f"{shown(cell)} is not a number; write the reading, or leave the cell empty if it is missing"
-                if column == 0 and len(cells) > 1:
+                if column == leading.clock:
+                    what = f"{shown(cell)} is no time; write a number, or a date as 2025-03-01T12:00:00.05"
+                elif column == 0 and len(cells) > 1:
                     what += " (name a column of times in a header line, or remove it)"
                 raise InputError.at(path, what, f"line {number}, column {column + 1}")
             values[frame, column] = reading

@@ -84,16 +84,24 @@ def infer_shape(contents: Sequence[Content]) -> tuple[Shape, str]:
 
 def _unknown_shape(content: Content) -> str:
     """Return a sentence on frames of a width that no file explains, with a shape that would fit."""
-    width = content.width
+    width, stored = content.width, content.stored
     text = f"{width} value{'s' * (width != 1)} a frame, and nothing states their rows and columns; "
     column = content.frames[0][:, 0].astype(np.float64)
     if content.lines is not None and width > 1 and len(column) > 2 and (np.diff(column) > 0).all():
         text += (
-            "the first column rises from line to line: if it is a time or a number, name it 'time' in a header line; "
+            "the first column rises from line to line: if it is a time or the number of the frame, name it 'time' or"
+            " 'frame' in a header line; "
         )
         width -= 1
-    rows = max(rows for rows in range(1, math.isqrt(width) + 1) if width % rows == 0)
-    return f"{text}give --shape (rows x columns, such as {rows}x{width // rows}) or --layout FILE (layout= in Python)"
+    frames, rows = stored[:2] if len(stored) == 3 else (0, 0)
+    grid = f"; if these are {frames} frames of one pad, --shape {rows}x{content.width}" if rows > 1 else ""
+    return f"{text}give --shape (rows x columns, such as {_sides(width)}) or --layout FILE (layout= in Python){grid}"
+
+
+def _sides(cells: int) -> str:
+    """Return the rows and columns of the squarest array of so many cells."""
+    rows = max(rows for rows in range(1, math.isqrt(cells) + 1) if cells % rows == 0)
+    return f"{rows}x{cells // rows}"
 
 
 def describe_width(content: Content, expected: int) -> str:
@@ -103,7 +111,7 @@ def describe_width(content: Content, expected: int) -> str:
     if width == expected + 1 and content.lines is not None:
         if len(frames) and np.isnan(frames[:, -1].astype(np.float64)).all():
             return f"{text}: each line ends with a comma, remove it"
-        return f"{text}: if the first column is a time or a number of the frame, remove it (or head a time with 'time')"
+        return f"{text}: if the first column is a time or the number of the frame, head it with 'time' or 'frame'"
     if width == expected - 1 and content.lines is not None:
         return f"{text}: a column is missing, write an empty cell for a missing reading"
     return text

@@ -155,7 +155,7 @@ def _assemble(
     for file, content in contents:
         try:
             check_agreement(content, every, tables is not None)
-            check_width(content, layout, stated)
+            check_width(content, layout, stated, strict=strict)
             if strict:
                 check_statements(content, layout, tables is not None)
         except InputError as error:

@@ -292,7 +292,7 @@ def test_a_bundle_of_a_built_model_is_maintained_and_opens_only_where_its_builde
     assert report.decision in ("deployed", "kept")
     assert set(report.diagnosis.fault_set) >= {5, 21}
     monkeypatch.setattr(builders, "_allowed", set())
-    with pytest.raises(ValueError, match="which is not allowed") as error:
+    with pytest.raises(builders.ModelNotAllowed, match=r"^the model is built by .* which is not allowed") as error:
         Bundle.open(tmp_path / "b").parts.adapter()
     assert "\n" not in str(error.value)
     monkeypatch.setenv(builders.VARIABLE, f"other:build, {name}")

@@ -334,7 +334,9 @@ def test_the_command_line_trains_a_model_of_the_user_and_adapts_it(small_grasps,
     data, model = str(tmp_path / "grasps.npz"), str(tmp_path / "model")
     save_npz(data, small_grasps)
     command = ["train", data, "--out", model, "--epochs", "3", "--quiet", "--model", "own_network:build"]
-    assert main(command) == 0
+    assert main([*command, "--learning-rate", "0"]) == 3
+    assert "training needs epochs, batch_size, learning_rate > 0, got 3, 32, 0.0" in capsys.readouterr().err
+    assert main([*command, "--learning-rate", "0.01"]) == 0
     adapt = ["adapt", model, data, "--faults", "3,8", "--out", str(tmp_path / "adapted"), "--quiet"]
     assert main(adapt) == 0
     assert Adaptation.load(tmp_path / "adapted").model.network.config["builder"] == "own_network:build"

@@ -67,9 +67,35 @@ class SelfDiagnosis:
         self._planes, self._order = axis_planes(layout)
         self.false_discovery_rate = false_discovery_rate
 
+    def get_params(self, deep: bool = True) -> dict[str, Any]:
+        """Return the arguments of the constructor, for ``sklearn.base.clone`` and pipelines."""
+        return {"layout": self.layout, "false_discovery_rate": self.false_discovery_rate}
+
+    def set_params(self, **params: Any) -> SelfDiagnosis:
+        """Set arguments of the constructor and discard the fit.
+
+        Raises:
+            ValueError: an unknown argument.
+        """
+        known = self.get_params()
+        if unknown := sorted(set(params) - set(known)):
+            raise ValueError(f"SelfDiagnosis has no parameter {unknown[0]!r}: use {' or '.join(known)}")
+        SelfDiagnosis.__init__(self, **(known | params))
+        self.reference_, self.calibrator_ = None, Calibrator()
+        return self
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return self.reference_ is not None
+
+    def __sklearn_tags__(self) -> Any:
+        from sklearn.base import BaseEstimator
+
+        return BaseEstimator().__sklearn_tags__()
+
     def fit(
         self,
         recordings: ArrayLike | Sequence[ArrayLike],
+        y: object = None,
         *,
         progress: Callable[[float], None] = lambda share: None,
     ) -> SelfDiagnosis:
@@ -80,6 +106,7 @@ class SelfDiagnosis:
 
         Args:
             recordings: as :meth:`SensorLayout.recordings` takes them.
+            y: ignored, for pipelines of scikit-learn.
             progress: receives the share of the work that is done, 0 to 1, again and again.
 
         Raises:

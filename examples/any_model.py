@@ -3,19 +3,25 @@
 A 1-D CNN over time, an LSTM, a small 3-D CNN, an MLP on statistics and the paper's network; ExtraTrees, SVC and
 histogram boosting from scikit-learn; a regression of total force and its centre. For each kind of fault (10 % and 50 %
 of the cells at random, five rows, one pad, two lines) the table has the test score with the faults ignored, with zeros,
-restored, restored + head, fine-tuned for 60 s and trained anew, and the CPU seconds of head and training. Faulty cells
-read 0 or full scale. The score is the accuracy, or R2; a regression also has the mean absolute error of restored and of
-restored + head, divided by that of training anew. Without RECORDINGS, grasps are simulated. Writes OUT.csv and OUT.png;
-``--small`` takes seconds.
+restored, restored + head, fine-tuned for ``--finetune`` seconds and trained anew, and CPU seconds. Faulty cells read 0
+or full scale. The score is the accuracy, or R2; a regression also has the mean absolute
+error of restored and of restored + head, divided by that of training anew. Without RECORDINGS, grasps are simulated.
+
+Networks are trained until validation does not improve for 10 epochs; the paper's network 20 epochs, as in
+``adaptation_figures.py``, whose networks ``--bases`` takes instead. Each result is a line of OUT.jsonl; started again,
+the script goes on where it was. At the end it writes OUT.csv and OUT.png. ``--small`` takes seconds.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,10 +35,12 @@ from adaptfault import (
     Adapter,
     CellImputer,
     FaultTolerantClassifier,
+    Recordings,
     TactileTransformer,
     Windows,
     evaluate,
     load,
+    load_model,
     make_windows,
     simulate,
     split,
@@ -41,7 +49,19 @@ from adaptfault import (
 from diagnostics import FaultSet, SensorLayout
 
 SEEDS = (20, 21, 22)
-COLUMNS = ("fault-free", "nothing", "zeros", "restored", "head", "finetuned", "anew", "head s", "anew s")
+COLUMNS = (
+    "fault-free",
+    "nothing",
+    "zeros",
+    "restored",
+    "head",
+    "finetuned",
+    "anew",
+    "restored s",
+    "head s",
+    "anew s",
+    "anew epochs",
+)
 COLOURS = {
     "nothing": "0.75",
     "zeros": "0.55",
@@ -160,46 +180,72 @@ def error(model: object, windows: Windows) -> float:
     return float(np.mean(evaluate(model, windows).mae))
 
 
-def of_network(build, layout: SensorLayout, parts, kinds, args, rng) -> dict[str, dict[str, float]]:
-    """Measure one torch model under all kinds of fault."""
-    training, validation, test = parts
+def options(name: str, args: argparse.Namespace) -> dict[str, Any]:
+    """Return how a network is trained: the paper's as in ``adaptation_figures.py``, others until validation stops."""
+    if name == "TactileTransformer":
+        return {"epochs": min(20, args.epochs), "patience": None, "learning_rate": 1e-4, "progress": False}
+    return {"epochs": args.epochs, "learning_rate": 1e-3, "progress": False}
+
+
+def trained(name: str, layout: SensorLayout, parts, args: argparse.Namespace, seed: int) -> nn.Module:
+    """Return the fault-free network."""
+    if name == "TactileTransformer" and args.bases is not None:
+        return load_model(args.bases / f"base{seed}")
+    torch.manual_seed(seed)
+    model = fresh(name, layout, parts)
+    train(model, *parts[:2], **options(name, args))
+    return model
+
+
+def fresh(name: str, layout: SensorLayout, parts) -> nn.Module:
+    """Return a network with new weights."""
+    training = parts[0]
     n = training.y.shape[1] if training.y.ndim == 2 else int(training.y.max()) + 1
-    model = build(layout, test.x.shape[1], n)
-    options = {"epochs": args.epochs, "learning_rate": 1e-3, "progress": False}
-    train(model, training, validation, **options)
-    adapter, rows = Adapter(model, training, validation, layout=layout), {}
+    return NETWORKS.get(name, Statistics)(layout, training.x.shape[1], n)
+
+
+def of_network(
+    name: str, layout: SensorLayout, parts, kinds, args, seed: int
+) -> Iterator[tuple[str, dict[str, float]]]:
+    """Measure one torch model under some kinds of fault."""
+    training, validation, test = parts
+    rng = np.random.default_rng(seed)
+    model = trained(name, layout, parts, args, seed)
+    adapter = Adapter(model, training, validation, layout=layout)
+    _ = adapter.imputation, adapter.compact  # computed once, no cost of a fault set
     for kind, fault_set in kinds.items():
         broken = spoilt(test, fault_set, rng)
         zeros = Windows(np.where(fault_set.mask, 0, broken.x), test.y, test.recording)
         row = {"fault-free": score(model, test), "nothing": score(model, broken), "zeros": score(model, zeros)}
+        began = time.process_time()
         restored = adapter.adapt(fault_set, method="fill")
-        row["restored"] = score(restored, broken)
+        row["restored s"], row["restored"] = time.process_time() - began, score(restored, broken)
         began = time.process_time()
         head = adapter.adapt(fault_set, method="head")
         row["head s"], row["head"] = time.process_time() - began, score(head, broken)
         if args.finetune:
             tuned = adapter.adapt(fault_set, method="finetune", budget=args.finetune, progress=False)
             row["finetuned"] = score(tuned, broken)
-        began, fresh = time.process_time(), build(layout, test.x.shape[1], n)
-        without = [Windows(np.where(fault_set.mask, 0, w.x), w.y, w.recording) for w in (training, validation)]
-        train(fresh, *without, **options)
-        row["anew s"], row["anew"] = time.process_time() - began, score(fresh, zeros)
-        if test.y.ndim == 2:
-            least = error(fresh, zeros)
-            row |= {"restored/anew": error(restored, broken) / least, "head/anew": error(head, broken) / least}
-        rows[kind] = row
-    return rows
+        if not args.no_anew:
+            began, anew = time.process_time(), fresh(name, layout, parts)
+            without = [Windows(np.where(fault_set.mask, 0, w.x), w.y, w.recording) for w in (training, validation)]
+            row["anew epochs"] = train(anew, *without, **options(name, args)).epochs
+            row["anew s"], row["anew"] = time.process_time() - began, score(anew, zeros)
+            if test.y.ndim == 2:
+                least = error(anew, zeros)
+                row |= {"restored/anew": error(restored, broken) / least, "head/anew": error(head, broken) / least}
+        yield kind, row
 
 
-def of_classifier(estimator, parts, kinds, args, rng) -> dict[str, dict[str, float]]:
+def of_classifier(estimator, parts, kinds, seed: int) -> Iterator[tuple[str, dict[str, float]]]:
     """Measure one scikit-learn classifier; "head" is what FaultTolerantClassifier chose, "anew" the refit."""
     from sklearn.base import clone
 
     def table(windows: Windows) -> np.ndarray:
         return np.concatenate([windows.x.mean(1), windows.x.max(1)], axis=1)
 
-    training, _, test = parts
-    x, rows = table(training), {}
+    (training, _, test), rng = parts, np.random.default_rng(seed)
+    x = table(training)
     tolerant = FaultTolerantClassifier(estimator).fit(x, training.y, groups=training.recording)
     for kind, fault_set in kinds.items():
         broken = table(spoilt(test, fault_set, rng))
@@ -214,8 +260,7 @@ def of_classifier(estimator, parts, kinds, args, rng) -> dict[str, dict[str, flo
         began = time.process_time()
         refit = clone(estimator).fit(x[:, ~columns], training.y)
         row["anew s"], row["anew"] = time.process_time() - began, refit.score(broken[:, ~columns], test.y)
-        rows[kind] = row
-    return rows
+        yield kind, row
 
 
 def forces(windows: Windows, layout: SensorLayout) -> Windows:
@@ -234,10 +279,13 @@ def main() -> None:
     parser.add_argument("recordings", nargs="*", help="labelled recordings; none: simulated grasps")
     parser.add_argument("--small", action="store_true", help="one seed, little training, two models")
     parser.add_argument("--only", nargs="+", help="names of consumers")
+    parser.add_argument("--kinds", nargs="+", help="kinds of fault, as the table names them")
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
-    parser.add_argument("--epochs", type=int, default=20)
+    parser.add_argument("--epochs", type=int, default=200, help="at most")
+    parser.add_argument("--bases", type=Path, help="folder with trained networks base20, base21, ...")
+    parser.add_argument("--no-anew", action="store_true", help="leave out training anew")
     parser.add_argument("--finetune", type=float, default=60.0, help="seconds; 0 leaves it out")
-    parser.add_argument("--out", default="any_model", help="name of the table and the picture")
+    parser.add_argument("--out", default="any_model", help="name of the results, the table and the picture")
     args = parser.parse_args()
     if args.small:
         args.epochs, args.finetune = 2, 0.0
@@ -249,34 +297,44 @@ def main() -> None:
         recordings = simulate(20, SensorLayout(2, 6, 5), n_frames=40, seed=1, classes=classes)
     else:
         recordings = simulate(60, seed=0)
-    layout = recordings.layout
-    windows = make_windows(recordings.frames, recordings.labels, layout)
+    measure(recordings, args)
     found: dict[tuple[str, str], list[dict[str, float]]] = {}
+    for line in Path(f"{args.out}.jsonl").read_text().splitlines():
+        result = json.loads(line)
+        found.setdefault((result["consumer"], result["faults"]), []).append(result["row"])
+    report(found, args.out)
+
+
+def measure(recordings: Recordings, args: argparse.Namespace) -> None:
+    """Append a line for each seed, consumer and kind of fault that OUT.jsonl lacks."""
+    layout, path = recordings.layout, Path(f"{args.out}.jsonl")
+    windows = make_windows(recordings.frames, recordings.labels, layout)
+    results = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    done = {(result["seed"], result["consumer"], result["faults"]) for result in results}
     for seed in args.seeds[: 1 if args.small else None]:
-        rng = np.random.default_rng(seed)
-        torch.manual_seed(seed)
         parts = split(windows, seed=seed)
-        kinds = fault_sets(layout, rng)
         of_forces = tuple(forces(w, layout) for w in parts)
-        for name in [*NETWORKS, *CLASSIFIERS, "forces"]:
-            if args.only and name not in args.only:
+        every = fault_sets(layout, np.random.default_rng(seed))
+        for name in args.only or [*NETWORKS, *CLASSIFIERS, "forces"]:
+            kinds = {k: f for k, f in every.items() if k in (args.kinds or every) and (seed, name, k) not in done}
+            if not kinds:
                 continue
             if name in CLASSIFIERS:
-                rows = of_classifier(CLASSIFIERS[name], parts, kinds, args, rng)
+                rows = of_classifier(CLASSIFIERS[name], parts, kinds, seed)
             else:
-                build = NETWORKS.get(name, Statistics)
-                rows = of_network(build, layout, of_forces if name == "forces" else parts, kinds, args, rng)
+                rows = of_network(name, layout, of_forces if name == "forces" else parts, kinds, args, seed)
+            for kind, row in rows:
+                with path.open("a") as file:
+                    file.write(json.dumps({"seed": seed, "consumer": name, "faults": kind, "row": row}) + "\n")
             print(f"seed {seed}: {name} done", file=sys.stderr, flush=True)
-            for kind, row in rows.items():
-                found.setdefault((name, kind), []).append(row)
-    report(found, args.out)
 
 
 def report(found: dict[tuple[str, str], list[dict[str, float]]], out: str) -> None:
     """Print the table of means over the seeds, write it, and draw it."""
     table = {}
     for key, rows in found.items():
-        table[key] = {c: float(np.mean([r[c] for r in rows])) for c in COLUMNS + ERRORS if all(c in r for r in rows)}
+        known = {c: [row[c] for row in rows if c in row] for c in COLUMNS + ERRORS}
+        table[key] = {c: float(np.mean(values)) for c, values in known.items() if values}
     columns = [c for c in COLUMNS + ERRORS if any(c in row for row in table.values())]
     print(f"{'consumer':20s}{'faults':12s}" + "".join(f"{c:>14s}" for c in columns))
     for (name, kind), row in table.items():

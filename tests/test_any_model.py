@@ -84,6 +84,13 @@ class Frozen(nn.Module):
         return -20 * torch.cdist(x.mean(1), self.templates)
 
 
+class Lost(nn.Module):
+    """Training diverged: every output is NaN."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x.mean(1)[:, :3] * torch.nan
+
+
 @pytest.fixture(scope="module")
 def training() -> Windows:
     return classes(240, 0)
@@ -211,8 +218,18 @@ def test_a_regression_is_repaired_and_scored_by_r2_and_mean_absolute_error(tmp_p
         (nn.Flatten(), {"layout": SensorLayout(1, 4, 4)}, "has 16 cells, the windows have 32"),
         (nn.Linear(7, 3), {"layout": LAYOUT}, r"Linear fails on windows of shape \[3, 6, 32\]"),
         (nn.Linear(D, 3), {"layout": LAYOUT}, r"returns \[3, 6, 3\] for windows .* expected \[3, n\]"),
-        (nn.Sequential(nn.Flatten(), nn.Linear(T * D, 2)), {"layout": LAYOUT}, "labels run to 2, the model has 2"),
+        (
+            nn.Sequential(nn.Flatten(), nn.Linear(T * D, 2)),
+            {"layout": LAYOUT},
+            r"Sequential has 2 outputs, labels run to 2: give a model with at least 3",
+        ),
         (Recurrent(3), {"layout": LAYOUT, "features": "neck"}, r"features 'neck' of Recurrent .* \(lstm, last\)"),
+        (
+            Recurrent(3),
+            {"layout": LAYOUT, "features": nn.Module.state_dict},
+            "features 'state_dict' of Recurrent are not",
+        ),
+        (Lost(), {"layout": LAYOUT}, "Lost returns NaN or infinity .*: give a model with finite weights"),
         (Recurrent(3), {"layout": LAYOUT, "task": "regression"}, r"task 'regression' needs y float \[N, k\]"),
         (Recurrent(3), {"layout": LAYOUT, "loss": nn.MSELoss()}, r"the loss fails on outputs \[4, 3\] and y \[4\]"),
         (
@@ -240,7 +257,7 @@ def test_windows_of_which_no_model_can_learn_are_refused(training, validation):
 
 
 def test_outputs_that_do_not_fit_the_values_are_refused():
-    with pytest.raises(ValueError, match="Recurrent has 3 outputs, the targets have 2 values"):
+    with pytest.raises(ValueError, match="Recurrent has 3 outputs, the targets 2 values: give a model with 2"):
         Adapter(Recurrent(3), values(10, 0), values(10, 1), layout=LAYOUT)
 
 
@@ -275,7 +292,7 @@ def test_a_bundle_of_a_built_model_is_maintained_and_opens_only_where_its_builde
     assert report.decision in ("deployed", "kept")
     assert set(report.diagnosis.fault_set) >= {5, 21}
     monkeypatch.setattr(builders, "_allowed", set())
-    with pytest.raises(ValueError, match="which is not allowed") as error:
+    with pytest.raises(builders.ModelNotAllowed, match=r"^the model is built by .* which is not allowed") as error:
         Bundle.open(tmp_path / "b").parts.adapter()
     assert "\n" not in str(error.value)
     monkeypatch.setenv(builders.VARIABLE, f"other:build, {name}")
@@ -317,7 +334,9 @@ def test_the_command_line_trains_a_model_of_the_user_and_adapts_it(small_grasps,
     data, model = str(tmp_path / "grasps.npz"), str(tmp_path / "model")
     save_npz(data, small_grasps)
     command = ["train", data, "--out", model, "--epochs", "3", "--quiet", "--model", "own_network:build"]
-    assert main(command) == 0
+    assert main([*command, "--learning-rate", "0"]) == 3
+    assert "training needs epochs, batch_size, learning_rate > 0, got 3, 32, 0.0" in capsys.readouterr().err
+    assert main([*command, "--learning-rate", "0.01"]) == 0
     adapt = ["adapt", model, data, "--faults", "3,8", "--out", str(tmp_path / "adapted"), "--quiet"]
     assert main(adapt) == 0
     assert Adaptation.load(tmp_path / "adapted").model.network.config["builder"] == "own_network:build"

@@ -2,10 +2,12 @@ import json
 
 import pytest
 
+from adaptfault.models.builders import ModelNotAllowed
 from adaptfault.robot.checksummed_json import (
     Damaged,
     check_files,
     damage,
+    decoding,
     hash_files,
     read_checksummed,
     read_with_copy,
@@ -93,3 +95,10 @@ def test_a_changed_or_missing_file_is_noticed(tmp_path):
     (tmp_path / "sub" / "weights").unlink()
     with pytest.raises(Damaged, match="missing"):
         check_files(tmp_path, hashes)
+
+
+def test_a_model_that_is_not_allowed_is_not_damaged(tmp_path):
+    with pytest.raises(ModelNotAllowed, match=r"^not allowed"), decoding(tmp_path):
+        raise ModelNotAllowed("not allowed")
+    with pytest.raises(Damaged, match="is damaged: KeyError"), decoding(tmp_path):
+        raise KeyError("x")

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 import torch
 from conftest import DROPPED, small_windows
+from torch import nn
 
+from adaptfault.adaptation.reduced_model import ReducedModel
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.models import export
+from adaptfault.models.any_model import AnyModel
 from adaptfault.models.export import ExportError, add_onnx, to_onnx
 from adaptfault.models.inference import open_session, run_session
+from diagnostics import FaultSet, SensorLayout
 
 
 @pytest.mark.parametrize("name", DROPPED)
@@ -60,6 +64,28 @@ def test_a_file_whose_outputs_differ_from_the_model_is_refused(versions, monkeyp
     monkeypatch.setattr(torch.onnx, "export", lambda *_, **__: exported)
     with pytest.raises(ExportError, match="differ from the model on 1 windows"):
         to_onnx(Adaptation.load(versions["head"]).model)
+
+
+class DataDependent(nn.Module):
+    """Branches on the values of its input, which torch.export cannot follow."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.last = nn.Linear(18, 3)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        loudest = x.amax(1)
+        return self.last(loudest * 2 if loudest.sum().item() > 5 else loudest)
+
+
+@pytest.mark.slow
+def test_a_model_that_does_not_export_is_named_in_one_line(capfd):
+    layout = SensorLayout(2, 3, 3)
+    model = AnyModel.probe(DataDependent(), layout, torch.rand(3, 5, 18))
+    with pytest.raises(ExportError, match=r"the model could not be exported: .*data-dependent") as error:
+        to_onnx(ReducedModel(model, FaultSet((), 18), None).eval())
+    assert "\n" not in str(error.value)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_the_manifest_states_the_file_and_keeps_all_else(versions, tmp_path, monkeypatch):

@@ -191,6 +191,15 @@ def test_every_frame_is_relayed_once_and_in_order_and_a_cell_that_breaks_is_rest
     assert ((late - frames[-100:])[:, cells] ** 2).mean() < 0.2 * ((broken - frames)[-100:, cells] ** 2).mean()
 
 
+def test_frames_are_relayed_before_they_wait_for_the_monitor(made_bundle, consumer):
+    station = Station(None, bundle=str(made_bundle), relay=address(consumer), quiet=True)
+    d = station.layout.n_cells
+    for i in range(3):  # nothing fetches them
+        station.receiver.take(format_packet("a", i / station.layout.rate, np.full(d, i + 1.0)), i)
+    station._relay.close()
+    assert [parse_packet(consumer.recv(1 << 16), d).values[0] for _ in range(3)] == [1, 2, 3]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -5,14 +5,16 @@ import numpy as np
 import pytest
 from sklearn.base import clone
 from sklearn.ensemble import ExtraTreesClassifier
+from sklearn.exceptions import NotFittedError
 from sklearn.linear_model import LogisticRegression, Ridge
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import SVC
 from sklearn.utils.estimator_checks import parametrize_with_checks
+from sklearn.utils.validation import check_is_fitted
 
 from adaptfault.imputation.scikit_learn import CellImputer, FaultTolerantClassifier, FaultTolerantRegressor
-from diagnostics import FaultSet
+from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
 D = 24
 F = FaultSet((1, 4, 5, 11, 20), D)
@@ -101,6 +103,39 @@ def test_without_a_healthy_cell_nothing_is_predicted():
     x, y = contacts(60, 0)
     with pytest.raises(ValueError, match="F holds all cells"):
         FaultTolerantClassifier(LogisticRegression()).fit(x, y).set_faults(range(D))
+
+
+def presses(n: int, seed: int) -> np.ndarray:
+    """A recording of n presses of ten frames."""
+    frames = contacts(n, seed)[0][:, None] * np.sin(np.linspace(0, np.pi, 10))[:, None]
+    return np.maximum(frames, 0).reshape(-1, D)
+
+
+def test_the_diagnosis_clones_and_ends_a_pipeline():
+    layout = SensorLayout(1, 4, 6, full_scale=1.0)
+    diagnoser = SelfDiagnosis(layout, false_discovery_rate=0.01)
+    assert diagnoser.get_params() == {"layout": layout, "false_discovery_rate": 0.01}
+    pipeline = make_pipeline(FunctionTransformer(lambda counts: counts / 255), diagnoser)
+    assert pipeline.fit(255 * presses(60, 0))[-1] is diagnoser
+    check_is_fitted(pipeline)
+    broken = np.where(np.arange(D) == 9, 1.0, presses(30, 1))
+    assert 9 in diagnoser.diagnose(pipeline[:-1].transform(255 * broken)).fault_set
+    again = clone(pipeline)[-1]
+    assert again.get_params() == diagnoser.get_params()
+    assert again.reference_ is None
+    with pytest.raises(NotFittedError):
+        check_is_fitted(again)
+    assert diagnoser.reference_ is not None
+
+
+def test_new_parameters_of_a_diagnosis_discard_its_fit():
+    diagnoser = SelfDiagnosis(SensorLayout(1, 4, 6, full_scale=1.0)).fit(presses(60, 0))
+    smaller = SensorLayout(1, 2, 3)
+    assert diagnoser.set_params(layout=smaller) is diagnoser
+    assert (diagnoser.layout, diagnoser.reference_) == (smaller, None)
+    diagnoser.diagnose(np.zeros((20, 6)))
+    with pytest.raises(ValueError, match="no parameter 'rate': use layout or false_discovery_rate"):
+        diagnoser.set_params(rate=0.1)
 
 
 WITHOUT_TORCH = """

@@ -6,7 +6,7 @@ import asyncio
 import socket
 import time
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from ipaddress import ip_address
@@ -90,6 +90,7 @@ class Receiver(asyncio.DatagramProtocol):
         window: packets of a device held back for a late one.
         key: packets without the right authentication code are refused (see :func:`parse_packet`). Time stamps must then
             never go back, not even when the device restarts: that excludes replays.
+        on_frame: called with each frame before it waits to be fetched, also where the queue discards it.
 
     Raises:
         ValueError: an address in ``devices`` is none.
@@ -107,8 +108,9 @@ class Receiver(asyncio.DatagramProtocol):
         queue: int = QUEUE,
         window: int = WINDOW,
         key: bytes | None = None,
+        on_frame: Callable[[Frame], None] | None = None,
     ) -> None:
-        self.layout, self.port, self.host, self.ticks = layout, port, host, ticks
+        self.layout, self.port, self.host, self.ticks, self.on_frame = layout, port, host, ticks, on_frame
         self.devices = None if devices is None else dict(map(_device, devices))
         self.most_devices, self.window, self.key = most_devices, window, key
         self._queue: deque[Frame] = deque(maxlen=queue)
@@ -272,6 +274,8 @@ class Receiver(asyncio.DatagramProtocol):
 
     def _put(self, frames: Iterable[Frame]) -> None:
         for frame in frames:
+            if self.on_frame is not None:
+                self.on_frame(frame)
             self._dropped += len(self._queue) == self._queue.maxlen
             self._queue.append(frame)
             self._news.set()

@@ -106,8 +106,12 @@ class Station:
         self._relay = None if relay is None else self._make_relay(relay, host, port, ticks)
         if not self._ready:
             self._ready.append(self._monitor())  # takes a second, so before the first frame
+        self._first = self._ready[0]
         queue = max(64, _WAITING // (8 * layout.n_cells))
-        self.receiver = Receiver(layout, port, host=host, devices=devices, ticks=ticks, queue=queue, key=key)
+        send = None if self._relay is None else self._send
+        self.receiver = Receiver(
+            layout, port, host=host, devices=devices, ticks=ticks, queue=queue, key=key, on_frame=send
+        )
         self._sessions: dict[str, Session] = {}
         self._outside = 0  # readings outside the layout's range
         self._command: bool | None = None  # the last command, also for devices that come later
@@ -167,21 +171,28 @@ class Station:
             for gone in self._sessions.keys() - self.receiver.arrivals.keys():  # the receiver has forgotten them
                 self._emit(self._sessions.pop(gone).close())
             session = self._sessions[frame.device] = self._begin(frame.device)
-        received = frame.values
-        if self.calibration is not None:
-            newtons = self.calibration.apply(frame.values)[0].astype(float)
-            frame = replace(frame, values=newtons)
-        values, outside = within_range(frame.values, self.layout)
-        if outside:
-            self._outside += outside
-            frame = replace(frame, values=values)
-        if self._relay is not None:  # first: monitoring and classifying take longer
-            source = getattr(session.watcher, "source", None)
-            self._relay.send(frame.device, frame.time, received, frame.values, source)
+        frame, outside = self._in_unit(frame)
+        self._outside += outside
         events = session.take(frame, time.monotonic())
         self._emit(events)
         if self._relay is not None and any(event.kind in ("fault", "gone") for event in events):
             self._relay.found(frame.device, session.fault_set)
+
+    def _send(self, frame: Frame) -> None:
+        """Send a frame on, before it waits for monitoring and classification, which take longer."""
+        assert self._relay is not None  # for the type checker
+        session = self._sessions.get(frame.device)
+        watcher = self._first if session is None else session.watcher
+        whole, _ = self._in_unit(frame)
+        self._relay.send(frame.device, frame.time, frame.values, whole.values, getattr(watcher, "source", None))
+
+    def _in_unit(self, frame: Frame) -> tuple[Frame, int]:
+        """Return a frame in the unit of the layout, and how many of its readings are outside the range."""
+        values = frame.values
+        if self.calibration is not None:
+            values = self.calibration.apply(values)[0].astype(float)
+        values, outside = within_range(values, self.layout)
+        return replace(frame, values=values), outside
 
     def _begin(self, device: str) -> Session:
         watcher = self._ready.pop() if self._ready else self._monitor() if self.bundle is None else self._predictor()

@@ -166,11 +166,15 @@ def _check_targets(model: Network, task: Task, *parts: Windows) -> None:
     name = type(model.module if isinstance(model, AnyModel) else model).__name__
     for windows in parts:
         if task == "regression" and windows.y.shape[1] != model.n_classes:
-            raise ValueError(f"{name} has {model.n_classes} outputs, the targets have {windows.y.shape[1]} values")
+            k = windows.y.shape[1]
+            raise ValueError(f"{name} has {model.n_classes} outputs, the targets {k} values: give a model with {k}")
         if task == "regression" and not np.isfinite(windows.y).all():
             raise ValueError("the targets hold NaN or infinity: leave these windows out")
         if task == "classification" and windows.y.max() >= model.n_classes:
-            raise ValueError(f"labels run to {windows.y.max()}, the model has {model.n_classes} classes")
+            n = windows.y.max() + 1
+            raise ValueError(
+                f"{name} has {model.n_classes} outputs, labels run to {n - 1}: give a model with at least {n}"
+            )
 
 
 def _labelled(model: Network, task: Task, windows: Windows) -> tuple[Windows, NDArray[np.float32]]:

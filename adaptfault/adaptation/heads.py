@@ -100,11 +100,12 @@ class Head(nn.Module):
         # Double precision: large weights of both signs nearly cancel; the error in single precision is up to 4e-4.
         pairs = [(view.double(), known.double()) for view, known in zip(views, self.known, strict=True)]
         distances = [
-            _distance(*pairs[view], squared=squared) / width
-            for (view, squared), width in zip(_DISTANCES, self.widths, strict=False)  # earlier heads: squared only
+            _distance(*pairs[view], squared=squared)
+            for (view, squared), _ in zip(_DISTANCES, self.widths, strict=False)  # earlier heads: squared only
         ]
         outputs = [
-            _kernel(distances, of) @ weights.double() for of, weights in zip(self.kernels, self.weights, strict=True)
+            _kernel(distances, self.widths.double(), of) @ weights.double()
+            for of, weights in zip(self.kernels, self.weights, strict=True)
         ]
         return mixture([out + self.bias for out in outputs], self.shares, values=self.values).float()
 
@@ -126,10 +127,11 @@ def mixture(outputs: Sequence[Tensor], shares: Tensor, *, values: bool = False) 
 
 
 def ridge_regression(kernel: Tensor, targets: Tensor, folds: NDArray[np.int64], ridge: float) -> tuple[Tensor, Tensor]:
-    """Fit a kernel ridge regression, and the same without each fold.
+    """Fit a kernel ridge regression, and the same without each fold, from one Cholesky decomposition.
 
-    Equivalent to ``sklearn.kernel_ridge.KernelRidge(alpha=ridge, kernel="precomputed")``. The windows that are never
-    held out are eliminated first; the remaining Schur complement is a small system for each fold.
+    Equivalent to ``sklearn.kernel_ridge.KernelRidge(alpha=ridge, kernel="precomputed")``. The residual of the windows f
+    of a fold, predicted without them, is P_ff^-1 (P r)_f: P is the block of the inverse of the kernel, and P r the
+    weights, of all windows that are held out.
 
     Args:
         kernel: ``[M, M]``.
@@ -140,24 +142,24 @@ def ridge_regression(kernel: Tensor, targets: Tensor, folds: NDArray[np.int64], 
     Returns:
         The weights ``[M, k]``, and ``[n, k]``: what a fit without its fold predicts for each held-out window.
     """
-    n = len(folds)
-    m = len(targets) - n  # never held out
-    kernel = kernel.clone()
-    kernel.diagonal().add_(ridge)
-    root = torch.linalg.cholesky(kernel[:m, :m])
-    half = torch.linalg.solve_triangular(root, torch.cat([kernel[:m, m:], targets[:m]], dim=1), upper=False)
-    between, first = half[:, :n], half[:, n:]
-    expected = between.T @ first  # of the held-out windows by the others
-    rest, residual = kernel[m:, m:] - between.T @ between, targets[m:] - expected
+    m = len(targets) - len(folds)  # never held out
+    diagonal = kernel.diagonal()
+    original = diagonal.clone()
+    diagonal.add_(ridge)
+    root = torch.linalg.cholesky(kernel)
+    diagonal.copy_(original)
+    within, between = root[:m, :m], root[m:, :m]
+    first = torch.linalg.solve_triangular(within, targets[:m], upper=False)
+    inverse = torch.cholesky_inverse(root[m:, m:])
+    last = inverse @ (targets[m:] - between @ first)
+    weights = torch.cat([torch.linalg.solve_triangular(within.T, first - between.T @ last, upper=True), last])
 
-    held_out = torch.empty_like(residual)
+    held_out = targets[m:].clone()
     fold = torch.from_numpy(folds).to(kernel.device)
     for each in torch.unique(fold):
-        out, known = fold == each, fold != each
-        within = torch.linalg.cholesky(rest[known][:, known])
-        held_out[out] = expected[out] + rest[out][:, known] @ torch.cholesky_solve(residual[known], within)
-    last = torch.cholesky_solve(residual, torch.linalg.cholesky(rest))
-    return torch.cat([torch.linalg.solve_triangular(root.T, first - between @ last, upper=True), last]), held_out
+        out = fold == each
+        held_out[out] -= torch.cholesky_solve(last[out], torch.linalg.cholesky(inverse[out][:, out]))
+    return weights, held_out
 
 
 def fit_head(
@@ -193,7 +195,7 @@ def fit_head(
     few = np.concatenate([evenly(m, _SAMPLE), m + kept])  # enough to compare ridges
     all_weights, all_held = [], []
     for of in _KERNELS:
-        kernel = _kernel(distances, of)
+        kernel = _kernel(distances, widths, of)
         sample = kernel if len(few) == m + n else kernel[few][:, few]
         tried = [
             task.loss(ridge_regression(sample, targets[few], folds[kept], ridge)[1].cpu(), kept) for ridge in _RIDGES
@@ -204,7 +206,7 @@ def fit_head(
         all_held.append(outputs)
     shares = task.shares(all_held)
     weights = torch.stack(all_weights)
-    head = Head(both, _KERNELS, widths.to(on), weights, task.bias.to(on), shares.to(on), values=values)
+    head = Head(both, _KERNELS, widths, weights, task.bias.to(on), shares.to(on), values=values)
     return head, mixture(all_held, shares, values=values)
 
 
@@ -268,7 +270,7 @@ class _Values:
 
 
 def _distances(views: Views) -> tuple[list[Tensor], Tensor]:
-    """Return all distances of the windows, in units of their medians, and these units.
+    """Return all distances of the windows, and the units of each: their medians.
 
     Raises:
         ValueError: a view is not finite.
@@ -286,8 +288,8 @@ def _distances(views: Views) -> tuple[list[Tensor], Tensor]:
             distance, least = _distance(view, view, squared=True).float(), _rounding(view)
             width = float(distance[sample][:, sample].median())
         widths.append(max(width, least) or 1.0)
-        distances.append(distance.div_(widths[-1]))
-    return distances, torch.tensor(widths)
+        distances.append(distance)
+    return distances, torch.tensor(widths, device=views[0].device)
 
 
 def _rounding(view: Tensor) -> float:
@@ -300,11 +302,14 @@ def _rounding(view: Tensor) -> float:
     return 2 * (m * p) ** 0.5 * torch.finfo(view.dtype).eps * float(view.square().sum(1).mean()) / min(_RIDGES)
 
 
-def _kernel(distances: Sequence[Tensor], of: Sequence[int]) -> Tensor:
-    """Return the kernel exp(-mean) of some distances: Gaussian of squared ones, Laplacian of absolute ones."""
-    total = distances[of[0]] * (-1 / len(of))
+def _kernel(distances: Sequence[Tensor], widths: Tensor, of: Sequence[int]) -> Tensor:
+    """Return the kernel exp(-mean) of some distances in units of their widths.
+
+    It is Gaussian for squared distances, Laplacian for absolute ones.
+    """
+    total = distances[of[0]] / (-len(of) * widths[of[0]])
     for i in of[1:]:
-        total.sub_(distances[i], alpha=1 / len(of))
+        total.addcdiv_(distances[i], widths[i], value=-1 / len(of))
     return total.exp_()
 
 
@@ -343,10 +348,10 @@ def linear_head(features: NDArray[np.float64], y: NDArray[np.int64], n_classes: 
 
 def _absolute_distances(x: Tensor) -> Tensor:
     """Return the absolute distances ``[N, N]`` of the rows of ``x [N, p]``; ten times as fast as ``torch.cdist``."""
-    distances = x.new_zeros(len(x), len(x))
-    first, second = torch.triu_indices(len(x), len(x), 1, device=x.device)
-    distances[first, second] = nn.functional.pdist(x, p=1)
-    return distances.add_(distances.T.clone())
+    from scipy.spatial.distance import squareform
+
+    pairs = nn.functional.pdist(x, p=1).cpu().numpy()
+    return torch.from_numpy(squareform(pairs, checks=False)).to(x.device)
 
 
 def _distance(a: Tensor, b: Tensor, *, squared: bool) -> Tensor:
@@ -355,4 +360,4 @@ def _distance(a: Tensor, b: Tensor, *, squared: bool) -> Tensor:
         return (a[:, None] - b).abs().sum(2)
     if not squared:
         return torch.cdist(a, b, p=1)
-    return (a.square().sum(1)[:, None] + b.square().sum(1) - 2 * a @ b.T).clamp_min(0.0)
+    return torch.addmm(b.square().sum(1), a, b.T, alpha=-2).add_(a.square().sum(1)[:, None]).clamp_min_(0.0)

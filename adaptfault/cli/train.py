@@ -47,6 +47,9 @@ def add(commands: Commands) -> None:
     add_recordings(parser)
     parser.add_argument("--out", required=True, metavar="FOLDER", help="where the model goes; X.bundle: a bundle")
     parser.add_argument("--epochs", type=int, default=50, help="at most so many epochs (default 50)")
+    parser.add_argument(
+        "--learning-rate", type=float, default=1e-4, metavar="X", help="of Adam (default 1e-4; small models need more)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="random seed of split, weights and training (default 0)")
     parser.add_argument("--length", type=int, default=10, help="frames in a window (default 10)")
     parser.add_argument(
@@ -147,6 +150,7 @@ def _trained(
         parts[0],
         parts[1],
         epochs=args.epochs,
+        learning_rate=args.learning_rate,
         seed=args.seed,
         repairable=args.repairable,
         checkpoint=checkpoint,

@@ -81,6 +81,8 @@ class AnyModel(nn.Module):
         if not isinstance(outputs, Tensor) or outputs.dim() != 2 or len(outputs) != len(x):
             given = list(outputs.shape) if isinstance(outputs, Tensor) else type(outputs).__name__
             raise ValueError(f"{name} returns {given} for windows of shape {shape}: expected [{len(x)}, n]")
+        if not torch.isfinite(outputs).all():
+            raise ValueError(f"{name} returns NaN or infinity for finite windows: give a model with finite weights")
         wrapped.n_classes = outputs.shape[1]
         if isinstance(features, str):
             wrapped.layer = features
@@ -106,6 +108,7 @@ class AnyModel(nn.Module):
             return
         if given is not None:
             layers = [at for at, _ in self.module.named_modules() if at]
+            given = given if isinstance(given, str) else getattr(given, "__name__", type(given).__name__)
             raise ValueError(
                 f"the features {given!r} of {name} are not [{len(x)}, p] for {len(x)} windows: {problem};"
                 f" name one of its layers ({', '.join(layers[:8])}{', ...' if len(layers) > 8 else ''})"

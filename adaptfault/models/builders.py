@@ -8,10 +8,12 @@ from __future__ import annotations
 import os
 import re
 from importlib import import_module
-
-from torch import nn
+from typing import TYPE_CHECKING
 
 from diagnostics import SensorLayout
+
+if TYPE_CHECKING:
+    from torch import nn
 
 VARIABLE = "ADAPTFAULT_MODELS"  # environment variable with allowed import paths, separated by commas
 _PATH = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
@@ -47,6 +49,8 @@ def build_model(builder: str, layout: SensorLayout, n_classes: int, *, length: i
     Raises:
         ValueError: the builder is not allowed, cannot be imported, fails, or returns no torch module.
     """
+    from torch import nn
+
     if builder not in _allowed | set(os.environ.get(VARIABLE, "").replace(" ", "").split(",")):
         raise ModelNotAllowed(
             f"the model is built by {builder!r}, which is not allowed: call allow_model({builder!r}) or set {VARIABLE}"

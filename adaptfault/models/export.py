@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import copy
+import io
 import logging
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from torch import Tensor, nn
 
 from adaptfault.adaptation.reduced_model import ReducedModel
 from adaptfault.adaptation.result import Adaptation
+from adaptfault.models.builders import first_line
 from adaptfault.models.compact import CompactNetwork
 from adaptfault.models.inference import ONNX_FILE, open_session, run_session
 from adaptfault.models.network import TactileTransformer
@@ -24,6 +26,7 @@ from adaptfault.models.store import attach
 TOLERANCE = 1e-5  # of a probability
 
 _EXAMPLE = 2  # windows in the batch of the export
+_LOGS = ("torch.onnx._internal.exporter._registration", "torch.fx.experimental.symbolic_shapes")
 _BATCHES = (1, 7)  # of the comparison: an export with a fixed batch size raises no error by itself
 
 
@@ -105,7 +108,8 @@ def _translate(whole: _WholeWindows, example: Tensor) -> bytes:
                 verbose=False,
             )
         except torch.onnx.OnnxExporterError as error:
-            raise ExportError(f"the model could not be exported: {error}") from error
+            cause = error.__cause__ if isinstance(error.__cause__, Exception) else error  # names the operation
+            raise ExportError(f"the model could not be exported: {first_line(cause)}") from error
     assert program is not None  # with dynamo, and no file named, it is returned
     data: bytes = program.model_proto.SerializeToString()
     return data
@@ -140,13 +144,15 @@ def _probes(model: ReducedModel, n: int) -> NDArray[np.float32]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence warnings of the exporter about its own deprecated calls and optional packages."""
-    log = logging.getLogger("torch.onnx._internal.exporter._registration")
-    level = log.level
-    log.setLevel(logging.ERROR)
+    """Silence the exporter: its own deprecated calls and optional packages, and the graph of what it cannot export."""
+    logs = [logging.getLogger(name) for name in _LOGS]
+    levels = [log.level for log in logs]
+    for log in logs:
+        log.setLevel(logging.ERROR)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), redirect_stderr(io.StringIO()):
             warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)` is deprecated", FutureWarning)
             yield
     finally:
-        log.setLevel(level)
+        for log, level in zip(logs, levels, strict=True):
+            log.setLevel(level)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from adaptfault.data.atomic import atomic_write
+from adaptfault.models.builders import ModelNotAllowed
 
 _CHECKSUM = "sha256"
 _CHUNK = 1 << 20
@@ -54,10 +55,13 @@ def read_checksummed(path: Path, schema: str) -> dict[str, Any]:
 
 @contextmanager
 def decoding(path: Path) -> Iterator[None]:
-    """Raise Damaged for any error in decoding the content of ``path``, whose checksum may be right all the same."""
+    """Raise Damaged for any error in decoding the content of ``path``, whose checksum may be right all the same.
+
+    A model whose builder is not allowed is not damaged.
+    """
     try:
         yield
-    except (OSError, ImportError, Damaged):
+    except (OSError, ImportError, Damaged, ModelNotAllowed):
         raise
     except Exception as error:  # a malformed document raises any of a dozen kinds, SafetensorError among them
         raise Damaged(f"{path} is damaged: {type(error).__name__} {error}") from None

@@ -84,6 +84,11 @@ class Head(nn.Module):
         weights, shares = torch.zeros(len(kernels), shapes[0][0], n), torch.zeros(len(kernels))
         return cls(known, kernels, widths, weights, torch.zeros(n), shares, values=about["values"])
 
+    @classmethod
+    def blank(cls, known: Views, n: int) -> Head:
+        """Build a head for n classes that knows some windows and has learnt nothing from them."""
+        return cls.empty({"known": [list(view.shape) for view in known], "kernels": _KERNELS, "values": False}, n)
+
     @property
     def known(self) -> list[Tensor]:
         """The views of the windows it was fitted on."""
@@ -94,6 +99,10 @@ class Head(nn.Module):
         """Argument of :meth:`empty`; JSON-safe."""
         kernels = [list(kernel) for kernel in self.kernels]
         return {"known": [list(view.shape) for view in self.known], "kernels": kernels, "values": self.values}
+
+    def knowing(self, known: Views) -> Head:
+        """Return the same head with other views of the windows it was fitted on."""
+        return Head(known, self.kernels, self.widths, self.weights, self.bias, self.shares, values=self.values)
 
     def forward(self, views: Views) -> Tensor:
         """Map views of N windows, each ``[N, p]``, to logits or values ``[N, n]``."""

@@ -1,6 +1,7 @@
-"""What prediction costs on a robot, on ONNX Runtime and on torch: latency of one window, share of a core in a 10 Hz
-loop with the monitor, resident memory; and what it costs to write a repaired version, the export in the first place.
-The paper's network, one thread; bare, and with fill and head for 20 dead cells. Needs Linux and pip install 'adaptfault[deploy]'. Run: python examples/deploy_speed.py [--seconds 20]
+"""What a model costs on a robot: latency of one window, share of a core in a 10 Hz loop with the monitor, resident
+memory, on ONNX Runtime and on torch; and what it costs to read the adapter and to export a repair. The paper's
+network, one thread; bare, and with fill and head for 20 dead cells.
+Needs Linux and pip install 'adaptfault[deploy]'. Run: python examples/deploy_speed.py [--seconds 20]
 """
 
 import argparse

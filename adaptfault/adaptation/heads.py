@@ -311,6 +311,12 @@ def calibrate(logits: Tensor, y: NDArray[np.int64]) -> tuple[float, float]:
     return float(np.exp(found.x)), float(found.fun)
 
 
+def log_likelihood(logits: Tensor, y: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the log probability ``[N]`` of the classes y, of logits ``[N, n_classes]`` in their best scale for y."""
+    likely = torch.log_softmax(calibrate(logits, y)[0] * logits.double(), 1)
+    return np.asarray(likely.numpy()[np.arange(len(likely)), y])
+
+
 def linear_head(features: NDArray[np.float64], y: NDArray[np.int64], n_classes: int) -> tuple[Tensor, Tensor]:
     """Return weight ``[n_classes, p]`` and bias ``[n_classes]`` of a multinomial logistic regression on ``[N, p]``."""
     from sklearn.linear_model import LogisticRegression

@@ -45,7 +45,8 @@ def add_onnx(folder: str | Path, graph: bytes | None = None) -> Path:
 
     Args:
         folder: with the adaptation.
-        graph: see :func:`to_onnx`.
+        graph: of the network with a head in closed form, as a bundle holds it (``bundle.parts.graph``); it saves the
+            seconds of a new export. One that does not fit has no effect.
 
     Raises:
         ExportError: the export failed, or the outputs differ from the model.

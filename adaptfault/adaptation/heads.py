@@ -107,10 +107,14 @@ class Head(nn.Module):
     def forward(self, views: Views) -> Tensor:
         """Map views of N windows, each ``[N, p]``, to logits or values ``[N, n]``."""
         # Double precision: large weights of both signs nearly cancel; the error in single precision is up to 4e-4.
-        pairs = [(view.double(), known.double()) for view, known in zip(views, self.known, strict=True)]
+        # Absolute distances, the most expensive part, are sums without cancellation: in single precision 4e-7.
+        precise = {True: torch.double, False: torch.float}
+        pairs = [
+            [each.to(precise[squared]) for each in (views[view], self.known[view])] for view, squared in _DISTANCES
+        ]
         distances = [
-            _distance(*pairs[view], squared=squared) / width
-            for (view, squared), width in zip(_DISTANCES, self.widths, strict=False)  # earlier heads: squared only
+            _distance(*pair, squared=squared).double() / width
+            for pair, (_, squared), width in zip(pairs, _DISTANCES, self.widths, strict=False)  # earlier: squared only
         ]
         outputs = [
             _kernel(distances, of) @ weights.double() for of, weights in zip(self.kernels, self.weights, strict=True)

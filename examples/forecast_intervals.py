@@ -8,7 +8,8 @@ that the network is not trained on are predicted by heads fitted without them. T
 two parts, many times, at random or stratified by class as ``af.split`` does. One part plays validation: it gives the
 forecast. The other plays test. All fault sets share the luck of a division, so a single division says little about
 coverage. Fault sets are ranked by the accuracy of the known part, and by the mean probability and the mean log
-probability of the true class there.
+probability of the true class there. How well the mean probability in the test part ranks them shows the noise of the
+accuracy reached.
 
 Killed and started again, it goes on where it was. Without GRASPS.npz the grasps are simulated.
 """
@@ -111,6 +112,7 @@ def show(name: str, right: np.ndarray, likely: np.ndarray, windows: af.Windows, 
                 "accuracy": expected,
                 "probability": likely[:, of].mean(axis=1),
                 "log probability": np.log(np.maximum(likely[:, of], 1e-5)).mean(axis=1),
+                "probability in the test part itself": likely[:, ~of].mean(axis=1),
             }
             for score, values in scores.items():
                 if np.ptp(values) and np.ptp(reached):

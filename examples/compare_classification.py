@@ -8,8 +8,8 @@ cells F, and one thread. When they learn:
     adapted  before the fault, and once F is known in what seconds it takes: adaptfault.
     anew     once F is known, from scratch on the healthy cells.
 
-"before" are the seconds until the fault, "repair" those after F is known, "predict" the milliseconds a test window. On
-a busy machine only CPU times compare.
+"before" are the seconds until the fault, "repair" those after F is known, "predict" the milliseconds a test window,
+"memory" the most megabytes that repair and prediction add. On a busy machine only CPU times compare.
 Each peer gets its shortest correct call. Tables (SVC, boosting) see mean and maximum of each cell over the window.
 
 Results go to ``--out`` as they come, a line of CSV each; killed and started again, it goes on where it was. Without
@@ -23,8 +23,11 @@ from __future__ import annotations
 import argparse
 import contextlib
 import csv
+import gc
 import io
 import math
+import os
+import threading
 import time
 import warnings
 from collections import defaultdict
@@ -58,6 +61,31 @@ class Row:
     repair: float
     repair_cpu: float
     predict_ms: float
+    memory_mb: float = math.nan
+
+
+class PeakMemory:
+    """Measures by how much a block raises the resident memory of the process, 50 times a second. Linux."""
+
+    def __enter__(self) -> PeakMemory:
+        self.megabytes, self._ended, start = 0.0, threading.Event(), resident()
+
+        def watch() -> None:
+            while not self._ended.wait(0.02):
+                self.megabytes = max(self.megabytes, resident() - start)
+
+        self._thread = threading.Thread(target=watch, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+
+def resident() -> float:
+    """Return the resident memory of this process in megabytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 class Stopwatch:
@@ -94,13 +122,16 @@ def measure(peer: Peer, task: Task, sets: dict[str, FaultSet], done: set[tuple[s
         for name, repair in repairs.items():
             if (name, label) in done:
                 continue
-            with quiet(), Stopwatch() as repairing:
-                predict = repair(faults)
-            with quiet(), Stopwatch() as predicting:
-                classes = np.asarray(predict(task.test.x))
+            gc.collect()
+            with PeakMemory() as peak:
+                with quiet(), Stopwatch() as repairing:
+                    predict = repair(faults)
+                with quiet(), Stopwatch() as predicting:
+                    classes = np.asarray(predict(task.test.x))
             yield Row(
                 task.seed, label, len(faults), name, peer.protocol, float((classes == task.test.y).mean()),
                 *spent, repairing.wall, repairing.cpu, 1000 * predicting.cpu / len(classes),
+                peak.megabytes,
             )  # fmt: skip
 
 
@@ -147,6 +178,7 @@ class Reached:
     repair: float
     repair_cpu: float
     predict_ms: float
+    memory_mb: float
 
 
 def summed(rows: list[Row]) -> dict[str, Reached]:
@@ -159,7 +191,7 @@ def summed(rows: list[Row]) -> dict[str, Reached]:
         broken = [row for row in mine if row.dead]
         median = {
             key: float(np.median([v for row in broken if not math.isnan(v := getattr(row, key))] or [math.nan]))
-            for key in ("before_cpu", "repair", "repair_cpu", "predict_ms")
+            for key in ("before_cpu", "repair", "repair_cpu", "predict_ms", "memory_mb")
         }
         result[name] = Reached(mine[0].protocol, dict(accuracy), **median)
     return result
@@ -168,14 +200,14 @@ def summed(rows: list[Row]) -> dict[str, Reached]:
 def show(table: dict[str, Reached]) -> None:
     names = list(next(iter(table.values())).accuracy)
     print(f"\n{'accuracy ± spread (seeds)':34s}" + "".join(f"{name:>22s}" for name in names), end="")
-    print("   before s CPU   repair s (CPU)   predict ms")
+    print("   before s CPU   repair s (CPU)   predict ms   memory MB")
     for name, got in table.items():
         cells = [list(got.accuracy.get(case, {}).values()) for case in names]
         text = "".join(
             f"{np.mean(c):10.3f} ± {np.std(c):.3f}{f'({len(c)})':>4s}" if c else f"{'-':>22s}" for c in cells
         )
         print(f"{name:24s}{got.protocol:10s}{text}{got.before_cpu:15.1f}", end="")
-        print(f"{got.repair:9.2f} ({got.repair_cpu:.2f})".ljust(20) + f"{got.predict_ms:8.2f}")
+        print(f"{got.repair:9.2f} ({got.repair_cpu:.2f})".ljust(20) + f"{got.predict_ms:8.2f}{got.memory_mb:12.0f}")
 
 
 def verdict(table: dict[str, Reached]) -> Iterator[str]:

@@ -1,5 +1,6 @@
-"""What prediction costs on a robot, on ONNX Runtime and on torch: latency of one window, share of a core in a 10 Hz
-loop with the monitor, resident memory. The paper's network, one thread; bare, and with fill and head for 20 dead cells.
+"""What a model costs on a robot: latency of one window, share of a core in a 10 Hz loop with the monitor, resident
+memory, on ONNX Runtime and on torch; and what it costs to read the adapter and to export a repair. The paper's
+network, one thread; bare, and with fill and head for 20 dead cells.
 Needs Linux and pip install 'adaptfault[deploy]'. Run: python examples/deploy_speed.py [--seconds 20]
 """
 
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +24,12 @@ RUNS = 100
 
 def prepare(folder: Path) -> None:
     """Make two bundles and a recording; the weights are untrained, which costs the same."""
-    import adaptfault as af
+    import torch
 
+    import adaptfault as af
+    from adaptfault.models.export import to_onnx
+
+    torch.set_num_threads(1)
     grasps = af.simulate(n_per_class=10, seed=0)
     windows = af.make_windows(grasps.frames, grasps.labels, grasps.layout)
     training, validation, test = af.split(windows)
@@ -33,10 +39,23 @@ def prepare(folder: Path) -> None:
     shutil.copytree(folder / "bare", folder / "adapted")
     adapted = af.Bundle.open(folder / "adapted")
     dead = FaultSet(tuple(range(0, 220, 11)), 220)
-    version = adapted.write_version(adapter.adapt(dead, method="head", progress=False), {"reason": "measured"})
+    repair = adapter.adapt(dead, method="head", progress=False)
+    seconds = {
+        "adapter read": cpu_seconds(adapted.parts.adapter),
+        "head exported": cpu_seconds(lambda: to_onnx(repair.model)),
+        "with the graph of the bundle": cpu_seconds(lambda: to_onnx(repair.model, adapted.parts.graph)),
+    }
+    print("; ".join(f"{what} in {took:.1f} s CPU" for what, took in seconds.items()))
+    version = adapted.write_version(repair, {"reason": "measured"})
     adapted.deploy(version.number)
     adapted.confirm()
     np.save(folder / "frames.npy", np.concatenate(grasps.frames[:20]))
+
+
+def cpu_seconds(call: Callable[[], object]) -> float:
+    began = time.process_time()
+    call()
+    return time.process_time() - began
 
 
 def latency(folder: Path) -> None:

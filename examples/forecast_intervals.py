@@ -1,12 +1,15 @@
 """How often the intervals of a forecast hold the accuracy of other recordings, and whether it ranks fault sets.
 
-    python examples/forecast_intervals.py [GRASPS.npz] [--sets 60] [--splits 0 1] [--small]
+    python examples/forecast_intervals.py [GRASPS.npz] [--sets 60] [--alike 20] [--splits 0 1] [--small]
 
-For each split one network is trained and kept in ``--out``. For each random fault set (cells, lines, blocks, a pad) a
-head is fitted, and the recordings that the network is not trained on are predicted by heads fitted without them. These
-recordings are then divided into two parts, many times, at random or stratified by class as ``af.split`` does. One part
-plays validation: it gives the forecast. The other plays test. All fault sets share the luck of a division, so a single
-division says little about coverage.
+For each split one network is trained and kept in ``--out``. For each random fault set (``--sets`` of mixed shapes and
+sizes: cells, lines, blocks, a pad; ``--alike`` of random cells, a fifth of them) a head is fitted, and the recordings
+that the network is not trained on are predicted by heads fitted without them. These recordings are then divided into
+two parts, many times, at random or stratified by class as ``af.split`` does. One part plays validation: it gives the
+forecast. The other plays test. All fault sets share the luck of a division, so a single division says little about
+coverage. Fault sets are ranked by the accuracy of the known part, and by the mean probability and the mean log
+probability of the true class there. How well the mean probability in the test part ranks them shows the noise of the
+accuracy reached.
 
 Killed and started again, it goes on where it was. Without GRASPS.npz the grasps are simulated.
 """
@@ -15,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -44,11 +48,21 @@ def fault_set(layout: SensorLayout, rng: np.random.Generator) -> FaultSet:
     return faults if len(faults) else fault_set(layout, rng)
 
 
-def known_right(adapter: af.Adapter, faults: FaultSet) -> list[bool]:
-    """Return for each validation window whether a head fitted without it, for F, is right."""
+def alike(layout: SensorLayout, rng: np.random.Generator) -> FaultSet:
+    present = np.flatnonzero(layout.present)
+    return FaultSet(tuple(int(c) for c in rng.choice(present, len(present) // 5, replace=False)), layout.n_cells)
+
+
+def held_out(adapter: af.Adapter, faults: FaultSet) -> dict[str, list]:
+    """Return for each validation window whether a head fitted without it, for F, is right, and P(true class)."""
     run = Run(adapter, faults, None, 0, False)
     run.execute("head")
-    return (run.held_out().argmax(1).numpy() == adapter.validation.y).tolist()
+    likely, y = run.held_out().double().softmax(1).numpy(), adapter.validation.y
+    return {
+        "dead": len(faults),
+        "right": (likely.argmax(1) == y).tolist(),
+        "likely": np.round(likely[np.arange(len(y)), y], 5).tolist(),
+    }
 
 
 def measure(args: argparse.Namespace) -> None:
@@ -62,27 +76,29 @@ def measure(args: argparse.Namespace) -> None:
         rest = windows.select(~np.isin(windows.recording, training.recording))
         adapter = af.Adapter(model, training.select(evenly(len(training), args.windows)), rest)
         path = args.out / f"right{split}.jsonl"
-        right = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
         rng = np.random.default_rng(1000 + split)
-        for number, faults in enumerate(fault_set(layout, rng) for _ in range(args.sets)):
-            if number < len(right):
-                continue
-            right.append(known_right(adapter, faults))
+        sets = [fault_set(layout, rng) for _ in range(args.sets)] + [alike(layout, rng) for _ in range(args.alike)]
+        for faults in sets[len(rows) :]:
+            rows.append(held_out(adapter, faults))
             with path.open("a") as file:
-                file.write(json.dumps(right[-1]) + "\n")
-            print(f"split {split}, {len(faults)} cells dead: accuracy {np.mean(right[-1]):.3f}", flush=True)
-        show(split, np.array(right[: args.sets], bool), adapter.validation, args.divisions)
+                file.write(json.dumps(rows[-1]) + "\n")
+            print(f"split {split}, {len(faults)} cells dead: accuracy {np.mean(rows[-1]['right']):.3f}", flush=True)
+        right, likely = (np.array([row[key] for row in rows]) for key in ("right", "likely"))
+        for name, of in {"mixed": slice(0, args.sets), "alike": slice(args.sets, len(sets))}.items():
+            if len(right[of]):
+                show(f"split {split}, {name}", right[of], likely[of], adapter.validation, args.divisions)
 
 
-def show(split: int, right: np.ndarray, windows: af.Windows, divisions: int) -> None:
-    """Print coverage, width, error and rank correlation over divisions of the windows; right is ``[sets, N]``."""
+def show(name: str, right: np.ndarray, likely: np.ndarray, windows: af.Windows, divisions: int) -> None:
+    """Print coverage, width, error and rank correlations over divisions of the N windows; arrays are ``[sets, N]``."""
     recordings, bare = np.unique(windows.recording), np.zeros((len(windows), 1, 1), np.float32)
     low, high = right.mean(axis=1).min(), right.mean(axis=1).max()
-    print(f"split {split}: {len(recordings)} recordings, {len(right)} fault sets, accuracies {low:.2f} to {high:.2f}")
+    print(f"{name}: {len(recordings)} recordings, {len(right)} fault sets, accuracies {low:.2f} to {high:.2f}")
     for stratified in (False, True):
         classes = windows.y if stratified else np.zeros_like(windows.y)
         drawn = af.Windows(bare, classes, windows.recording)
-        within, widths, errors, ranks = [], [], [], []
+        within, widths, errors, ranks = [], [], [], defaultdict(list)
         for seed in range(divisions):
             known, _, test = af.split(drawn, test=0.55, validation=0, seed=seed)
             of, new = np.isin(windows.recording, known.recording), len(np.unique(test.recording))
@@ -92,13 +108,20 @@ def show(split: int, right: np.ndarray, windows: af.Windows, divisions: int) -> 
             within.append(((low <= reached) & (reached <= high)).mean())
             widths.append(((high - low) / 2).mean())
             errors.append((expected - reached).mean())
-            if np.ptp(expected) and np.ptp(reached):
-                ranks.append(spearmanr(expected, reached).statistic)
+            scores = {
+                "accuracy": expected,
+                "probability": likely[:, of].mean(axis=1),
+                "log probability": np.log(np.maximum(likely[:, of], 1e-5)).mean(axis=1),
+                "probability in the test part itself": likely[:, ~of].mean(axis=1),
+            }
+            for score, values in scores.items():
+                if np.ptp(values) and np.ptp(reached):
+                    ranks[score].append(spearmanr(values, reached).statistic)
         print(
             f"  {divisions} divisions {'stratified by class' if stratified else 'at random'}: coverage"
             f" {np.mean(within):.3f} +- {np.std(within) / np.sqrt(divisions):.3f} (standard error), half width"
             f" {np.mean(widths):.3f}, error {np.mean(errors):+.3f} +- {np.std(errors):.3f},"
-            f" Spearman {np.mean(ranks or [np.nan]):.2f}"
+            f" Spearman by {', '.join(f'{score} {np.mean(values):.2f}' for score, values in ranks.items())}"
         )
 
 
@@ -106,7 +129,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="?", help="labelled recordings of a healthy array")
     parser.add_argument("--splits", type=int, nargs="+", default=[0, 1], help="seeds of split and weights")
-    parser.add_argument("--sets", type=int, default=60, help="random fault sets of each split")
+    parser.add_argument("--sets", type=int, default=60, help="random fault sets of each split, of mixed shapes")
+    parser.add_argument("--alike", type=int, default=20, help="random fault sets of each split, a fifth of the cells")
     parser.add_argument("--divisions", type=int, default=200, help="of the recordings")
     parser.add_argument("--windows", type=int, default=5000, help="training windows of a head, at most")
     parser.add_argument("--grasps", type=int, default=40, help="simulated grasps of each class")
@@ -115,7 +139,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("forecast_intervals"), help="where networks and results go")
     args = parser.parse_args()
     if args.small:
-        args.splits, args.sets, args.divisions, args.grasps, args.epochs = [0], 3, 5, 6, 1
+        args.splits, args.sets, args.alike, args.divisions, args.grasps, args.epochs = [0], 3, 2, 5, 6, 1
     measure(args)
 
 

@@ -45,7 +45,10 @@ def small_versions() -> Iterator[None]:
     import adaptfault as af
 
     af.allow_model("power_cut:linear")
-    with mock.patch("adaptfault.models.export.add_onnx", side_effect=ImportError("left out here")):
+    absent = ImportError("left out here")
+    with mock.patch.multiple(
+        "adaptfault.models.export", add_onnx=mock.Mock(side_effect=absent), graph_of=mock.Mock(side_effect=absent)
+    ):
         yield
 
 

@@ -228,11 +228,12 @@ def without_export() -> Iterator[None]:
     """As where the export's packages are missing: it takes seconds, and has tests of its own."""
     pytest.importorskip("torch")
 
-    def missing(folder: Path) -> None:
+    def missing(*_: object) -> None:
         raise ImportError("left out in this test")
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("adaptfault.models.export.add_onnx", missing)
+        patch.setattr("adaptfault.models.export.graph_of", missing)
         yield
 
 

@@ -9,7 +9,7 @@ from conftest import Clock
 
 from adaptfault.adaptation import stages
 from adaptfault.adaptation.adapter import Adapter
-from adaptfault.adaptation.forecast import Forecast
+from adaptfault.adaptation.forecast import Expected, Forecast
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.data.windows import Windows
@@ -289,6 +289,15 @@ def test_the_forecast_names_the_class_that_loses_most():
     assert forecast.stages["scratch"].high >= forecast.stages["fault-free"].accuracy
 
 
+def test_fault_sets_of_one_accuracy_rank_by_the_probability_of_the_true_class(adapter):
+    half, nearly_all = (adapter.forecast(FaultSet(tuple(range(1, D, step)), D)).stages["head"] for step in (2, 1))
+    assert half.likelihood > nearly_all.likelihood
+    right = np.ones(20, dtype=bool)
+    low, high = (Expected.of(right, np.arange(20), likely=np.full(20, p)) for p in (0.6, 0.9))
+    assert (low.accuracy, low.low) == (high.accuracy, high.low)
+    assert (low.likelihood, high.likelihood) == (pytest.approx(0.6), pytest.approx(0.9))
+
+
 def test_with_f_empty_the_forecast_is_the_fault_free_accuracy_alone(adapter):
     forecast = adapter.forecast(FaultSet((), D))
     assert list(forecast.stages) == ["fault-free"]
@@ -302,7 +311,7 @@ def test_the_worst_wires_and_pads_are_listed_and_mapped(adapter, tmp_path):
     worst = worst_faults(few, among=2)
     assert [len(part) for part in (worst.wires, worst.pairs, worst.pads)] == [16, 1, 2]
     for part in (worst.wires, worst.pairs, worst.pads):
-        reached = [loss.expected.accuracy for loss in part]
+        reached = [loss.expected.likelihood for loss in part]
         assert reached == sorted(reached)
     first, second = worst.wires[:2]
     assert worst.pairs[0].fault_set == first.fault_set | second.fault_set

@@ -45,6 +45,20 @@ def test_a_bundle_holds_all_that_a_robot_needs(bundle, small_grasps, later_grasp
     assert bundle.problems() == []
 
 
+def test_all_versions_are_exported_from_one_graph_and_without_it_where_it_is_damaged(bundle, tmp_path, monkeypatch):
+    given = []
+    monkeypatch.setattr("adaptfault.models.export.graph_of", lambda network: b"graph")
+    monkeypatch.setattr("adaptfault.models.export.add_onnx", lambda folder, graph: given.append(graph))
+    adapter, check = bundle.parts.adapter(), bundle.parts.check_windows()
+    made = Bundle.create(tmp_path / "made", adapter.model, adapter, bundle.diagnoser(), check=check)
+    deploy(made, 3)
+    (made.path / "parts" / "graph.onnx").write_bytes(b"other")
+    opened = Bundle.open(made.path)
+    deploy(opened, 4)
+    assert given == [b"graph", b"graph", None]
+    assert "graph.onnx" in " ".join(opened.problems())
+
+
 def test_what_new_versions_are_judged_on_was_never_learned_from(bundle):
     adapter, check = bundle.parts.adapter(), bundle.parts.check_windows()
     learned = set(adapter.train.recording) | set(adapter.validation.recording)

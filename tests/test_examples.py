@@ -26,6 +26,7 @@ ON_RECORDINGS = {
     "compare_classification.py": ["--small", "--only", "adaptfault"],
     "compare_keras.py": ["--epochs", "1", "--windows", "32"],
     "esp32_sender.py": ["--frames", "20"],
+    "fine_tuning.py": ["--small"],
     "forecast_intervals.py": ["--small"],
     "simulated_vs_real.py": [],
     "wrong_fault_set.py": ["--draws", "1"],
@@ -33,6 +34,7 @@ ON_RECORDINGS = {
 LESS = {  # they take minutes
     "attack.py": ["--small"],
     "design_study.py": ["--small"],
+    "fine_tuning.py": ["--small"],
     "forecast_intervals.py": ["--small"],
     "restore_speed.py": ["--grasps", "1", "--repeats", "5"],
     "soak.py": ["--hours", "12", "--frames", "500"],
@@ -49,6 +51,7 @@ SLOW = {  # they take long, or a test of the library proves the same
     "deploy_speed.py",
     "esp32_sender.py",
     "design_study.py",
+    "fine_tuning.py",
     "fleet_scaling.py",
     "forecast_intervals.py",
     "attack.py",
@@ -70,6 +73,7 @@ SLOW_ON_RECORDINGS = {
     "adaptation_figures.py",
     "compare_classification.py",
     "compare_keras.py",
+    "fine_tuning.py",
     "forecast_intervals.py",
     "wrong_fault_set.py",
 }

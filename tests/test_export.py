@@ -9,11 +9,13 @@ import torch
 from conftest import DROPPED, small_windows
 from torch import nn
 
+from adaptfault.adaptation.adapter import Adapter
 from adaptfault.adaptation.reduced_model import ReducedModel
 from adaptfault.adaptation.result import Adaptation
+from adaptfault.data.windows import Windows
 from adaptfault.models import export
 from adaptfault.models.any_model import AnyModel
-from adaptfault.models.export import ExportError, add_onnx, to_onnx
+from adaptfault.models.export import ExportError, add_onnx, graph_of, to_onnx
 from adaptfault.models.inference import open_session, run_session
 from diagnostics import FaultSet, SensorLayout
 
@@ -41,6 +43,26 @@ def test_what_a_dropped_cell_reads_changes_not_a_bit(versions):
     for anything in (np.nan, np.inf, -np.inf, 1e30, 0.0):
         x[..., list(DROPPED["head"])] = anything
         np.testing.assert_array_equal(run_session(session, x), usual)
+
+
+def test_one_graph_serves_every_fault_set_and_number_of_known_windows(versions, monkeypatch):
+    network = Adaptation.load(versions["whole"]).model.network
+    graph = graph_of(network)
+    monkeypatch.setattr(torch.onnx, "export", None)  # from here on the exporter is not there
+    x = small_windows(5)
+    for n, cells in ((40, ()), (50, (3,)), (50, (0, 4, 9, 10, 11, 17))):
+        windows = Windows(small_windows(n, seed=3), np.arange(n) % 3, np.arange(n))
+        head = Adapter(network, windows, windows.select(slice(0, 20))).adapt(FaultSet(cells, 18), method="head")
+        assert head.model.head is not None
+        x[..., list(cells)] = np.nan
+        said = run_session(open_session(to_onnx(head.model, graph)), x)
+        np.testing.assert_allclose(said, head.predict_proba(x), rtol=0, atol=1e-5)
+
+
+def test_a_graph_of_another_kind_of_model_has_no_effect(versions, monkeypatch):
+    model, exported = Adaptation.load(versions["head"]).model, (versions["head"] / "model.onnx").read_bytes()
+    monkeypatch.setattr(export, "_translate", lambda *_: exported)
+    assert to_onnx(model, (versions["whole"] / "model.onnx").read_bytes()) == exported
 
 
 def test_a_file_that_is_fixed_at_one_size_of_batch_is_refused_and_the_model_is_left_as_it_was(versions, monkeypatch):
@@ -92,7 +114,7 @@ def test_the_manifest_states_the_file_and_keeps_all_else(versions, tmp_path, mon
     adaptation = Adaptation.load(versions["whole"])
     adaptation.save(tmp_path)
     before = json.loads((tmp_path / "manifest.json").read_text())
-    monkeypatch.setattr(export, "to_onnx", lambda model: b"a file")
+    monkeypatch.setattr(export, "to_onnx", lambda model, graph: b"a file")
     path = add_onnx(tmp_path)
     assert (path, path.read_bytes()) == (tmp_path / "model.onnx", b"a file")
     after = json.loads((tmp_path / "manifest.json").read_text())

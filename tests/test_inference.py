@@ -63,6 +63,15 @@ def test_torch_does_without_onnx_runtime(versions, monkeypatch):
     np.testing.assert_array_equal(alone.predict(x), expected)
 
 
+def test_a_long_log_is_predicted_a_few_windows_at_a_time(versions, monkeypatch):
+    model, sizes = Inference.load(versions["head"], runtime="onnx"), []
+    once = model._run
+    monkeypatch.setattr(model, "_run", lambda x: sizes.append(len(x)) or once(x))
+    x = small_windows(50)
+    np.testing.assert_allclose(model.predict_proba(x)[-3:], model.predict_proba(x[-3:]), rtol=0, atol=1e-6)
+    assert max(sizes) <= 16  # the memory of the absolute distances grows with them
+
+
 def test_without_an_onnx_file_it_runs_on_torch(copied):
     manifest = json.loads((copied / "manifest.json").read_text())
     del manifest["onnx"]

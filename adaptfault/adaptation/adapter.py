@@ -6,10 +6,12 @@ import copy
 from functools import cached_property
 from typing import get_args
 
+import numpy as np
 import torch
 
 from adaptfault.adaptation.fault_free import FaultFreeModel
 from adaptfault.adaptation.forecast import Forecast
+from adaptfault.adaptation.heads import log_likelihood
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.adaptation.stages import Method, Run
 from adaptfault.models.any_model import AnyModel, not_resettable
@@ -119,7 +121,8 @@ class Adapter(FaultFreeModel):
             values = {name: out.numpy() for name, out in outputs.items()}
             return Forecast.of_values(fault_set, windows.y, windows.recording, values, recordings)
         predicted = {name: out.argmax(1).numpy() for name, out in outputs.items()}
-        return Forecast.of(fault_set, windows.y, windows.recording, predicted, recordings)
+        likely = {name: np.exp(log_likelihood(out, windows.y)) for name, out in outputs.items()}
+        return Forecast.of(fault_set, windows.y, windows.recording, predicted, recordings, likely)
 
     def to(self, device: str | torch.device) -> Adapter:
         """Return an adapter that works on a device, as "cuda"; this one stays. Its adaptations are on that device."""

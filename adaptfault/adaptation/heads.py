@@ -11,6 +11,7 @@ likelihood of held-out windows (stacking of predictive distributions: Yao, Vehta
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import starmap
 from typing import Any
@@ -84,6 +85,11 @@ class Head(nn.Module):
         weights, shares = torch.zeros(len(kernels), shapes[0][0], n), torch.zeros(len(kernels))
         return cls(known, kernels, widths, weights, torch.zeros(n), shares, values=about["values"])
 
+    @classmethod
+    def blank(cls, known: Views, n: int) -> Head:
+        """Build a head for n classes that knows some windows and has learnt nothing from them."""
+        return cls.empty({"known": [list(view.shape) for view in known], "kernels": _KERNELS, "values": False}, n)
+
     @property
     def known(self) -> list[Tensor]:
         """The views of the windows it was fitted on."""
@@ -95,13 +101,21 @@ class Head(nn.Module):
         kernels = [list(kernel) for kernel in self.kernels]
         return {"known": [list(view.shape) for view in self.known], "kernels": kernels, "values": self.values}
 
+    def knowing(self, known: Views) -> Head:
+        """Return the same head with other views of the windows it was fitted on."""
+        return Head(known, self.kernels, self.widths, self.weights, self.bias, self.shares, values=self.values)
+
     def forward(self, views: Views) -> Tensor:
         """Map views of N windows, each ``[N, p]``, to logits or values ``[N, n]``."""
         # Double precision: large weights of both signs nearly cancel; the error in single precision is up to 4e-4.
-        pairs = [(view.double(), known.double()) for view, known in zip(views, self.known, strict=True)]
+        # Absolute distances, the most expensive part, are sums without cancellation: in single precision 4e-7.
+        precise = {True: torch.double, False: torch.float}
+        pairs = [
+            [each.to(precise[squared]) for each in (views[view], self.known[view])] for view, squared in _DISTANCES
+        ]
         distances = [
-            _distance(*pairs[view], squared=squared)
-            for (view, squared), _ in zip(_DISTANCES, self.widths, strict=False)  # earlier heads: squared only
+            _distance(*pair, squared=squared).double()
+            for pair, (_, squared), _ in zip(pairs, _DISTANCES, self.widths, strict=False)  # earlier: squared only
         ]
         outputs = [
             _kernel(distances, self.widths.double(), of) @ weights.double()
@@ -299,7 +313,8 @@ def _rounding(view: Tensor) -> float:
     Mary 2019). M x M random errors change an eigenvalue of a kernel by up to 2 sqrt(M) times their size (Wigner 1955).
     """
     m, p = view.shape
-    return 2 * (m * p) ** 0.5 * torch.finfo(view.dtype).eps * float(view.square().sum(1).mean()) / min(_RIDGES)
+    size = float(view.square().sum(1).mean())
+    return 2.0 * math.sqrt(m * p) * torch.finfo(view.dtype).eps * size / min(_RIDGES)
 
 
 def _kernel(distances: Sequence[Tensor], widths: Tensor, of: Sequence[int]) -> Tensor:
@@ -327,6 +342,12 @@ def calibrate(logits: Tensor, y: NDArray[np.int64]) -> tuple[float, float]:
         method="bounded",
     )
     return float(np.exp(found.x)), float(found.fun)
+
+
+def log_likelihood(logits: Tensor, y: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the log probability ``[N]`` of the classes y, of logits ``[N, n_classes]`` in their best scale for y."""
+    likely = torch.log_softmax(calibrate(logits, y)[0] * logits.double(), 1)
+    return np.asarray(likely.numpy()[np.arange(len(likely)), y])
 
 
 def linear_head(features: NDArray[np.float64], y: NDArray[np.int64], n_classes: int) -> tuple[Tensor, Tensor]:

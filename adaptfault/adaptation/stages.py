@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from adaptfault.adaptation.fault_free import FaultFreeModel, Network
-from adaptfault.adaptation.heads import MOST_WINDOWS, Head, calibrate, fit_head, linear_head
+from adaptfault.adaptation.heads import MOST_WINDOWS, Head, calibrate, fit_head, linear_head, log_likelihood
 from adaptfault.adaptation.reduced_model import ReducedModel, reduce_windows
 from adaptfault.adaptation.result import Adaptation, Stage
 from adaptfault.data.windows import Windows, evenly
@@ -205,9 +205,7 @@ class Run:
         """Return for each validation window the log probability of its class, or its negative squared error."""
         if self.fault_free.task == "regression":
             return np.asarray(-((outputs.numpy() - self.validation.y) ** 2).mean(axis=1, dtype=np.float64))
-        scale, _ = calibrate(outputs, self.validation.y)
-        likely = torch.log_softmax(scale * outputs.double(), 1)
-        return np.asarray(likely.numpy()[np.arange(len(likely)), self.validation.y])
+        return log_likelihood(outputs, self.validation.y)
 
     def _head(self, reduced: ReducedModel) -> tuple[Head | None, Tensor] | None:
         """Return a head, and the outputs for validation windows of heads fitted without them; None if time is short.

@@ -40,7 +40,7 @@ class Loss:
 
 @dataclass(frozen=True, eq=False)
 class WorstFaults:
-    """Faults in the order of the accuracy after repair, lowest first.
+    """Faults in the order of the mean probability of the true class after repair, lowest first.
 
     Attributes:
         layout: the array.
@@ -120,7 +120,7 @@ def worst_faults(adapter: Adapter, *, among: int = 5, say: Callable[[str], None]
             if 0 < len(faults) < len(index):
                 stages = adapter.forecast(faults).stages
                 losses.append(Loss(what, faults, max(stages["fill"], stages["head"], key=lambda e: e.accuracy)))
-        return tuple(sorted(losses, key=lambda loss: loss.expected.accuracy))
+        return tuple(sorted(losses, key=lambda loss: loss.expected.likelihood))
 
     say(f"forecasting {len(wires)} wires")
     alone = ranked(wires.items())

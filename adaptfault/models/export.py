@@ -7,21 +7,27 @@ import io
 import logging
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager, redirect_stderr, suppress
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from adaptfault.adaptation.heads import Head
 from adaptfault.adaptation.reduced_model import ReducedModel
 from adaptfault.adaptation.result import Adaptation
+from adaptfault.models.any_model import AnyModel
 from adaptfault.models.builders import first_line
 from adaptfault.models.compact import CompactNetwork
 from adaptfault.models.inference import ONNX_FILE, open_session, run_session
 from adaptfault.models.network import TactileTransformer
 from adaptfault.models.store import attach
+from adaptfault.models.whole_windows import Masked, Selected
+from diagnostics import FaultSet
 
 TOLERANCE = 1e-5  # of a probability
 
@@ -34,26 +40,16 @@ class ExportError(RuntimeError):
     """The export failed, or the outputs of the exported file differ from the outputs of the model."""
 
 
-class _WholeWindows(nn.Module):
-    """Selects the healthy cells first, so that NaN or infinity in a dropped cell cannot reach the output."""
-
-    healthy: Tensor
-
-    def __init__(self, model: ReducedModel) -> None:
-        super().__init__()
-        self.model = model
-        self.register_buffer("healthy", torch.from_numpy(model.fault_set.healthy.copy()))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map windows ``[N, T, D]`` to probabilities ``[N, n_classes]``."""
-        return torch.softmax(self.model(x[..., self.healthy]), dim=1)
-
-
-def add_onnx(folder: str | Path) -> Path:
+def add_onnx(folder: str | Path, graph: bytes | None = None) -> Path:
     """Export the adaptation that :meth:`Adaptation.save` wrote into ``folder``, and return the new file's path.
 
     The file lies beside the weights, and ``manifest.json`` states its hash. Do not call it on a folder that a robot
     is running from: a power cut between the two writes leaves a file that does not match its hash.
+
+    Args:
+        folder: with the adaptation.
+        graph: of the network with a head in closed form, as a bundle holds it (``bundle.parts.graph``); it saves the
+            seconds of a new export. One that does not fit has no effect.
 
     Raises:
         ExportError: the export failed, or the outputs differ from the model.
@@ -61,10 +57,10 @@ def add_onnx(folder: str | Path) -> Path:
         FileNotFoundError, ValueError: there is no whole adaptation in the folder.
     """
     adaptation = Adaptation.load(folder)
-    return attach(folder, "onnx", ONNX_FILE, to_onnx(adaptation.model))
+    return attach(folder, "onnx", ONNX_FILE, to_onnx(adaptation.model, graph))
 
 
-def to_onnx(model: ReducedModel) -> bytes:
+def to_onnx(model: ReducedModel, graph: bytes | None = None) -> bytes:
     """Return a model as the content of an ONNX file.
 
     The input ``x`` is a batch of whole windows, float32 ``[N, T, D]`` on the 0..1 scale, any N. The output
@@ -72,14 +68,44 @@ def to_onnx(model: ReducedModel) -> bytes:
     (:mod:`adaptfault.models.compact`). The file is run on batches of 1 and 7 windows; its outputs agree with the model
     within 1e-5.
 
+    Args:
+        model: adapted to any F.
+        graph: of :func:`graph_of`, for the same network: a new file takes a second with it. One that does not fit the
+            model has no effect.
+
     Raises:
         ExportError: the export failed, or the outputs differ.
         ImportError: the packages for it are not installed.
     """
     model = copy.deepcopy(model).cpu().eval()
-    data = _translate(_WholeWindows(_compacted(model)).eval(), torch.from_numpy(_probes(model, _EXAMPLE)))
+    whole = _whole(model)
+    if graph is not None:
+        with suppress(ExportError):
+            data = _with_state(graph, whole)
+            _verify(data, model)
+            return data
+    data = _translate(whole, torch.from_numpy(_probes(model, _EXAMPLE)))
     _verify(data, model)
     return data
+
+
+def graph_of(network: TactileTransformer | AnyModel) -> bytes:
+    """Return the ONNX graph of a network with a head in closed form, without the state, for :func:`to_onnx`.
+
+    Raises the errors of :func:`to_onnx`.
+    """
+    none = FaultSet((), network.layout.n_cells)
+    model = ReducedModel(copy.deepcopy(network).cpu(), none, None).eval()
+    with torch.no_grad():
+        views = model.views(torch.from_numpy(_probes(model, _EXAMPLE)))
+    model.head = Head.blank(views, network.n_classes)
+    whole = _whole(model)
+    return _stripped(_translate(whole, torch.from_numpy(_probes(model, _EXAMPLE))), whole)
+
+
+def _whole(model: ReducedModel) -> nn.Module:
+    compact = _compacted(model)
+    return (Masked(compact) if Masked.suits(compact) else Selected(compact)).eval()
 
 
 def _compacted(model: ReducedModel) -> ReducedModel:
@@ -91,11 +117,9 @@ def _compacted(model: ReducedModel) -> ReducedModel:
     return compact
 
 
-def _translate(whole: _WholeWindows, example: Tensor) -> bytes:
-    try:
-        import onnxscript  # noqa: F401  torch's exporter needs it
-    except ImportError:
-        raise ImportError("the export to ONNX needs more packages: pip install 'adaptfault[deploy]'") from None
+def _translate(whole: nn.Module, example: Tensor) -> bytes:
+    """Return the ONNX file of a module, its parameters and buffers under their own names."""
+    _require("onnxscript")  # torch's exporter needs it
     with _quiet():
         try:
             program = torch.onnx.export(
@@ -106,6 +130,7 @@ def _translate(whole: _WholeWindows, example: Tensor) -> bytes:
                 input_names=["x"],
                 output_names=["probabilities"],
                 verbose=False,
+                optimize=False,  # it folds parameters into new constants; ONNX Runtime optimises what it opens
             )
         except torch.onnx.OnnxExporterError as error:
             cause = error.__cause__ if isinstance(error.__cause__, Exception) else error  # names the operation
@@ -115,9 +140,47 @@ def _translate(whole: _WholeWindows, example: Tensor) -> bytes:
     return data
 
 
+def _require(package: str) -> Any:
+    try:
+        return import_module(package)
+    except ImportError:
+        raise ImportError("the export to ONNX needs more packages: pip install 'adaptfault[deploy]'") from None
+
+
+def _stripped(data: bytes, whole: nn.Module) -> bytes:
+    """Return an ONNX file without the parameters and buffers of a module."""
+    onnx = _require("onnx")
+    graph, state = onnx.load_from_string(data), whole.state_dict()
+    for tensor in graph.graph.initializer:
+        if tensor.name in state:
+            tensor.CopyFrom(onnx.TensorProto(name=tensor.name, data_type=tensor.data_type, dims=[0]))
+    del graph.graph.value_info[:]  # shapes of the example
+    for node in graph.graph.node:
+        del node.metadata_props[:]  # where in the code it comes from
+    stripped: bytes = graph.SerializeToString()
+    return stripped
+
+
+def _with_state(data: bytes, whole: nn.Module) -> bytes:
+    """Return an ONNX file with the parameters and buffers of a module that has its structure."""
+    onnx = _require("onnx")
+    graph, state = onnx.load_from_string(data), whole.state_dict()
+    for tensor in graph.graph.initializer:
+        if list(tensor.dims) == [0]:
+            if tensor.name not in state:
+                raise ExportError(f"the graph is of another kind of model: this one has no {tensor.name}")
+            tensor.CopyFrom(onnx.numpy_helper.from_array(state[tensor.name].numpy(), tensor.name))
+    whole_file: bytes = graph.SerializeToString()
+    return whole_file
+
+
 def _verify(data: bytes, model: ReducedModel) -> None:
     """Run the file on batch sizes other than that of the export, and compare its outputs with the model."""
-    session, whole = open_session(data), _WholeWindows(model).eval()
+    whole = Selected(model).eval()
+    try:
+        session = open_session(data)
+    except ValueError as error:
+        raise ExportError(str(error)) from None
     for n in _BATCHES:
         x = _probes(model, n)
         with torch.no_grad():

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 ONNX_FILE = "model.onnx"
 Runtime = Literal["onnx", "torch"]
 
-_BATCH = 256  # windows run at once
+_BATCH = 16  # windows run at once; ONNX has no kernel of absolute distances that holds less than all differences
 
 
 class Inference:

@@ -152,7 +152,7 @@ class Bundle:
         shutil.rmtree(new, ignore_errors=True)  # left by a crash
         if check is None:
             adapter, check = split_validation(adapter)
-        Parts.write(new / _PARTS, adapter, diagnoser, check, calibration)
+        Parts.write(new / _PARTS, adapter, diagnoser, check, calibration, _graph(adapter))
         about: dict[str, Any] = {
             "schema": SCHEMA,
             "layout": model.layout.to_dict(),
@@ -303,7 +303,7 @@ class Bundle:
     def write_version(self, adaptation: Adaptation, about: dict[str, Any]) -> Version:
         """Write an adaptation as a new version without activating it."""
         version = self.versions.write(
-            partial(_save, adaptation),
+            partial(_save, adaptation, self.parts.graph),
             layout=self.layout,
             class_names=self.class_names,
             length=adaptation.model.network.length,
@@ -342,12 +342,24 @@ def _check_parts(
         raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
 
 
-def _save(adaptation: Adaptation, folder: Path) -> None:
+def _graph(adapter: Adapter) -> bytes | None:
+    """Return the ONNX graph that repairs of this adapter share, so that each is exported in a second."""
+    from adaptfault.imputation.tiled_statistics import LARGE
+    from adaptfault.models.export import ExportError, graph_of
+
+    if not adapter.has_features or adapter.layout.n_cells > LARGE:  # a large array has another front end for each F
+        return None
+    with suppress(ImportError, ExportError):  # logged with version 1
+        return graph_of(adapter.model)
+    return None
+
+
+def _save(adaptation: Adaptation, graph: bytes | None, folder: Path) -> None:
     """Write an adaptation and its ONNX file; without the ONNX file the version runs on torch."""
     from adaptfault.models.export import ExportError, add_onnx
 
     adaptation.save(folder)
     try:
-        add_onnx(folder)
+        add_onnx(folder, graph)
     except (ImportError, ExportError) as error:
         _log.warning("no ONNX export, this version runs on torch: %s", error)

@@ -1,4 +1,4 @@
-"""The constant parts of a bundle: adapter, reference of the diagnosis, held-out windows, calibration."""
+"""The constant parts of a bundle: adapter, reference of the diagnosis, held-out windows, calibration, ONNX graph."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _ADAPTER, _REFERENCE, _CHECK, _CALIBRATION = "adapter", "reference", "check", "calibration.csv"
 _COPY = "reference.copy"
+_GRAPH = "graph.onnx"
 _SCHEMA = "adaptfault.reference/1"
 
 
@@ -41,8 +42,9 @@ class Parts:
         diagnoser: SelfDiagnosis,
         check: Windows,
         calibration: Calibration | None,
+        graph: bytes | None,
     ) -> None:
-        """Write the parts into a new folder.
+        """Write the parts into a new folder; see :func:`~adaptfault.models.export.graph_of` for ``graph``.
 
         Raises:
             ValueError: the diagnoser is not fitted.
@@ -59,6 +61,8 @@ class Parts:
             save_arrays(folder / name, _SCHEMA, {"diagnosis": about}, arrays)
         if calibration is not None:
             calibration.write(folder / _CALIBRATION)
+        if graph is not None:
+            atomic_write(folder / _GRAPH, graph)
 
     def check(self, *, repair: bool = False) -> None:
         """Check all of them; ``repair`` restores the reference or its copy from the other. Raises Damaged."""
@@ -116,6 +120,13 @@ class Parts:
         """Path of the calibration table from raw counts to the layout's unit; None without one."""
         path = self._verified(_CALIBRATION)
         return path if path.is_file() else None
+
+    @property
+    def graph(self) -> bytes | None:
+        """ONNX graph of the network with a head in closed form; None without one, or where it is damaged."""
+        with suppress(Damaged, FileNotFoundError):
+            return self._verified(_GRAPH).read_bytes()
+        return None
 
 
 def _diagnoser(path: Path) -> SelfDiagnosis:

@@ -91,8 +91,8 @@ def sensor_change(
     new, old = (_statistics(given, healthy) for given in (recordings, reference))
     offset = _change(new[:, 0], old[:, 0], LIGHT * layout.full_scale)
     contact = LIGHT * float(old[:, 1].max(initial=0.0))
-    loads = [np.log(given[given[:, 1] > contact, 1]) for given in (new, old)]
-    gain = float(np.exp(_change(*loads, np.log(GAIN))))
+    loads, loads_before = (np.log(given[given[:, 1] > contact, 1]) for given in (new, old))
+    gain = float(np.exp(_change(loads, loads_before, np.log(GAIN))))
     if gain == 1.0 and offset == 0.0:
         return None
     return SensorChange(gain, offset, len(new), f"sensor changed: {_told(gain, offset, layout)}")

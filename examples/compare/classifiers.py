@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from adaptation_figures import rate, summary
-from sklearn.ensemble import HistGradientBoostingClassifier
+from sklearn.ensemble import ExtraTreesClassifier, HistGradientBoostingClassifier
 from sklearn.experimental import enable_iterative_imputer  # noqa: F401
 from sklearn.impute import IterativeImputer, KNNImputer, SimpleImputer
 from sklearn.linear_model import Ridge
@@ -33,7 +33,7 @@ class Effort:
     """How much each one may learn, for what they cost: a run has to end."""
 
     epochs: int  # of the network
-    trees: int  # of boosting, for each class
+    trees: int  # of boosting, for each class; a forest has three times as many
     gru_epochs: int  # of GRU-D
     kernels: int  # of MiniRocket
     gappy: int  # windows that IterativeImputer learns from, whole and with gaps
@@ -236,6 +236,12 @@ PEERS = (
         "scikit-learn",
         "anew",
         partial(retrained, lambda task: make_pipeline(StandardScaler(), SVC(C=10))),
+    ),
+    Peer(
+        "ExtraTrees anew",
+        "scikit-learn",
+        "anew",
+        partial(retrained, lambda task: ExtraTreesClassifier(3 * task.effort.trees, random_state=task.seed)),
     ),
     Peer("boosting ready", "scikit-learn", "ready", boosting_ready),
     Peer(

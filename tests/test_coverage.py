@@ -39,8 +39,14 @@ def test_advice_names_each_region_of_untested_cells_the_largest_first():
 def test_100_percent_are_tested_only_if_no_cell_is_left():
     layout = SensorLayout(1, 20, 20)
     untested, nothing = np.arange(400) == 7, np.zeros(400)
-    assert str(coverage(untested, nothing > 0, nothing, layout)).startswith("99% of the cells tested")
-    assert str(coverage(nothing > 0, nothing > 0, nothing, layout)).startswith("100% of the cells tested")
+    told = str(coverage(untested, nothing > 0, nothing, layout))
+    assert told == "99% of the cells tested; a fault of the other cell would not be found"
+    assert str(coverage(nothing > 0, nothing > 0, nothing, layout)) == "100% of the cells tested"
+
+
+def test_the_text_counts_the_untested_cells_and_estimates_nothing():
+    told = str(coverage(cells(0, 1, 2, 3), NONE, np.full(40, 0.3), LAYOUT))
+    assert told == "90% of the cells tested; a fault of the other 4 cells would not be found"
 
 
 def test_positions_without_a_cell_do_not_count():

@@ -148,7 +148,9 @@ def test_after_a_rollback_the_page_and_the_command_name_the_faults_that_are_not_
     repaired, log, capsys, tmp_path
 ):
     page, bundle = tmp_path / "page.html", repaired
-    assert "not handled now: pad 1, row 2 is short" in told(capsys, "rollback", bundle.path)[1]
+    said = told(capsys, "rollback", bundle.path)[1]
+    assert "not handled now: pad 1, row 2 is short" in said
+    assert re.match(r"version 1, with all \d+ cells runs; version 2 is not deployed", said)
     told(capsys, "report", bundle.path, "--out", page)
     assert heading(page) == "Call a technician"
     assert "1 known fault is <b>not handled</b>: version 1 runs" in page.read_text()

@@ -167,12 +167,8 @@ def _change(
 
 
 def text_of(diagnosis: Diagnosis) -> str:
-    """Return the diagnosis as text, with what was not tested and what would test it."""
+    """Return the diagnosis as text, with what would test the other cells."""
     lines = str(diagnosis).splitlines()
-    untested = len(diagnosis.coverage.untested)
-    if untested:
-        cells = "1 cell was" if untested == 1 else f"{untested} cells were"
-        lines.append(f"{cells} not tested: a fault there would not be found")
     lines += [f"to test more: {touch}" for touch in diagnosis.coverage.advice[:5]]
     if diagnosis.layout.rows > _ROWS:
         lines.append(lines[0])

@@ -68,7 +68,10 @@ class Version:
         return source
 
     def __str__(self) -> str:
-        return f"version {self.number}, without {len(self.fault_set)} of {self.layout.present.sum()} cells"
+        cells, faulty = self.layout.present.sum(), len(self.fault_set)
+        return f"version {self.number}, " + (
+            f"without {faulty} of {cells} cells" if faulty else f"with all {cells} cells"
+        )
 
     @classmethod
     def read(cls, folder: Path) -> Version:

@@ -34,8 +34,10 @@ class Coverage:
     advice: tuple[str, ...]
 
     def __str__(self) -> str:
-        tested, found = percent(self.test_coverage), percent(self.fault_coverage)
-        return f"{tested}% of the cells tested, an estimated {found}% of the faults found"
+        tested, others = f"{percent(self.test_coverage)}% of the cells tested", len(self.untested)
+        if not others:
+            return tested
+        return f"{tested}; a fault of the other {'cell' if others == 1 else f'{others} cells'} would not be found"
 
 
 def percent(share: float) -> int:

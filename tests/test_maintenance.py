@@ -181,6 +181,13 @@ def test_a_log_that_tests_nothing_says_so_in_the_first_line_and_by_its_exit_code
     assert maintain(bundle, log, dry_run=True, untested_code=0).exit_code == 0
 
 
+def test_a_frozen_stream_is_told_in_the_first_line_and_by_the_exit_code(bundle, later_grasps):
+    loaded = max(later_grasps[0], key=np.sum)
+    report = maintain(bundle, [np.repeat(loaded[None], 100, axis=0), *later_grasps], dry_run=True)
+    assert (report.decision, report.exit_code, report.fault_set) == ("unchanged", 1, set())
+    assert "the stream was frozen" in str(report).splitlines()[0]
+
+
 def test_a_change_of_the_whole_sensor_is_measured_and_needs_a_technician_where_it_costs(bundle, later_grasps):
     assert maintain(bundle, later_grasps, dry_run=True).change is None
     weak = maintain(bundle, [0.3 * r for r in later_grasps], dry_run=True)

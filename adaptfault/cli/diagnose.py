@@ -36,8 +36,8 @@ _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.
       without --reference each cell is compared with the cells around it
   adaptfault diagnose today/ --reference robot.bundle
       the healthy model of the bundle
-      exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version excludes, nothing tested, or
-      an object that lies still, another gain or offset of the whole sensor or of a pad;
+      exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version excludes, nothing tested, an
+      object that lies still, a frozen stream, another gain or offset of the whole sensor or of a pad;
       2 a person is needed: a wire, exchanged wires, or a tenth of the cells; 3 unusable input"""
 
 _ROWS = 24  # of a map, which is followed by the summary if it has more: the first line has left the screen

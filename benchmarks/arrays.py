@@ -18,6 +18,7 @@ from diagnostics import SensorLayout
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 HAND, FINGERTIPS, SOLES = "sdh2x13x6_grasps36.npz", "icub5x1x12_grasps11.npz", "insole2x33x15.npz"
 MAIN = ("cells", "onset", "healthy")
+SKIN = (*MAIN, "lines", "cold", "static")
 EVERY = (
     "cells", "onset", "dither", "missing", "many", "cold", "reference_faults", "lines", "cut", "address", "healthy",
     "holds", "untouched", "kind", "calibration", "changing", "gain", "rewired", "replaced", "static", "transport",
@@ -117,11 +118,11 @@ ARRAYS = [
     ),
     *(Array(f"hand, {name}", MAIN, sensor(name), 30, file=HAND) for name in (*SENSORS, *DRIFTS) if name != "as it is"),
     *(
-        Array(f"fabric, {name}", (*MAIN, "lines", "cold", "static"), simulated(skin.recordings), 30, 1, 12 * (name == "10 x 10"))
+        Array(f"fabric, {name}", SKIN, simulated(skin.recordings), 30, 1, 12 * (name == "10 x 10"))
         for name, skin in gestures.SKINS.items()
     ),
     *(
-        Array(f"posture, {name}", (*MAIN, "lines", "cold", "static"), simulated(skin.recordings), 20, 1, 12 * (name == "seat"))
+        Array(f"posture, {name}", SKIN, simulated(skin.recordings), 20, 1, 12 * (name == "seat"))
         for name, skin in static_holds.SKINS.items()
     ),
     Array("grasps, 2 x 11 x 10", (*MAIN, "lines", "cold"), simulated(grasps(SensorLayout.paper())), 30),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.options import (
@@ -40,6 +41,8 @@ _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.
       an object that lies still, another gain or offset of the whole sensor or of a pad;
       2 a person is needed: a wire, exchanged wires, or a tenth of the cells; 3 unusable input"""
 
+Undo = Callable[["NDArray[Any]"], "NDArray[Any]"]  # returns readings as the running version takes them
+
 _ROWS = 24  # of a map, which is followed by the summary if it has more: the first line has left the screen
 
 
@@ -74,12 +77,11 @@ def run(args: argparse.Namespace) -> int:
         report_inferred(args, log.inferred)
     else:
         log = load_recordings(args, args.recordings, layout=layout)
-    source = slice(None) if bundle is None else bundle.active().source
+    running: Undo = np.asarray if bundle is None else bundle.active().undo
     reference = bundle if healthy is None else list(healthy)
-    rewiring = _rewiring(log, diagnoser, source)
-    if rewiring is not None:
-        source = rewiring.undo(np.arange(log.layout.n_cells)[source])
-    diagnosis, change = _diagnosed(args, diagnoser, log, source, reference)
+    rewiring = _rewiring(log, diagnoser, running)
+    undo: Undo = running if rewiring is None else lambda frames: rewiring.undo(running(frames))
+    diagnosis, change = _diagnosed(args, diagnoser, log, undo, reference)
     code, notes = _severity(diagnosis, bundle, args.untested_code)
     if change is not None:
         code, notes = max(code, 1), [*notes, change.reason]
@@ -110,15 +112,13 @@ def _write(args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: lis
         write_diagnosis(args.html, diagnosis, name=name, reference=reference, code=code, notes=notes)
 
 
-def _rewiring(
-    log: Recordings | Stream, diagnoser: SelfDiagnosis | None, source: NDArray[np.intp] | slice
-) -> Rewiring | None:
+def _rewiring(log: Recordings | Stream, diagnoser: SelfDiagnosis | None, undo: Undo) -> Rewiring | None:
     """Return the change of the wiring that no version undoes yet; None where there is none, or nothing to compare."""
     from adaptfault.data.recordings import Recordings
 
     if diagnoser is None or not isinstance(log, Recordings):  # too large to be searched
         return None
-    return diagnoser.rewiring([frames[:, source] for frames in log.frames])
+    return diagnoser.rewiring([undo(np.asarray(frames)) for frames in log.frames])
 
 
 def _bundle(args: argparse.Namespace) -> Bundle | None:
@@ -180,7 +180,7 @@ def _diagnosed(
     args: argparse.Namespace,
     diagnoser: SelfDiagnosis | None,
     log: Recordings | Stream,
-    source: NDArray[np.intp] | slice,
+    undo: Undo,
     reference: Bundle | list[NDArray[Any]] | None,
 ) -> tuple[Diagnosis, SensorChange | None]:
     """Diagnose the log recording by recording, or in blocks in constant memory, and compare it with the reference."""
@@ -196,11 +196,11 @@ def _diagnosed(
     total = len(log) if isinstance(log, Recordings) else None
     unit = "recording" if isinstance(log, Recordings) else "block"
     for frames in tqdm(log, total=total, unit=unit, desc="diagnosing", disable=hide, leave=False):
-        stream.extend(np.asarray(frames, dtype=np.float64)[:, source])
+        stream.extend(undo(np.asarray(frames, dtype=np.float64)))
     if not isinstance(log, Recordings):
         for problem in log.problems:
             print(problem, file=sys.stderr)
     diagnosis = fitted.evaluate(stream, n_recordings=len(log))
     if diagnoser is None or reference is None or not isinstance(log, Recordings):
         return diagnosis, None
-    return diagnosis, _change(diagnosis, diagnoser, [frames[:, source] for frames in log.frames], reference)
+    return diagnosis, _change(diagnosis, diagnoser, [undo(np.asarray(frames)) for frames in log.frames], reference)

@@ -21,7 +21,8 @@ MAIN = ("cells", "onset", "healthy")
 SKIN = (*MAIN, "lines", "cold", "static")
 EVERY = (
     "cells", "onset", "dither", "missing", "many", "cold", "reference_faults", "lines", "cut", "address", "healthy",
-    "holds", "untouched", "kind", "calibration", "changing", "gain", "rewired", "replaced", "static", "transport",
+    "holds", "untouched", "kind", "calibration", "changing", "gain", "rewired", "replaced", "specimen", "static",
+    "transport",
 )  # fmt: skip
 
 
@@ -103,7 +104,7 @@ ARRAYS = [
         "fingertips",
         (
             *MAIN, "many", "cold", "reference_faults", "holds", "untouched", "calibration", "rewired", "replaced",
-            "static", "transport",
+            "specimen", "static", "transport",
         ),
         real(FINGERTIPS), 60, 2, 40, (*MAIN, "cold"), FINGERTIPS,
     ),

@@ -18,10 +18,11 @@ from diagnostics import SensorLayout
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 HAND, FINGERTIPS, SOLES = "sdh2x13x6_grasps36.npz", "icub5x1x12_grasps11.npz", "insole2x33x15.npz"
 MAIN = ("cells", "onset", "healthy")
-SKIN_ROWS = (*MAIN, "lines", "cold", "static")
+SKIN = (*MAIN, "lines", "cold", "static")
 EVERY = (
     "cells", "onset", "dither", "missing", "many", "cold", "reference_faults", "lines", "cut", "address", "healthy",
-    "holds", "untouched", "kind", "calibration", "changing", "gain", "rewired", "replaced", "static", "transport",
+    "holds", "untouched", "kind", "calibration", "changing", "gain", "rewired", "replaced", "specimen", "static",
+    "transport",
 )  # fmt: skip
 
 
@@ -103,7 +104,7 @@ ARRAYS = [
         "fingertips",
         (
             *MAIN, "many", "cold", "reference_faults", "holds", "untouched", "calibration", "rewired", "replaced",
-            "static", "transport",
+            "specimen", "static", "transport",
         ),
         real(FINGERTIPS), 60, 2, 40, (*MAIN, "cold"), FINGERTIPS,
     ),
@@ -118,11 +119,11 @@ ARRAYS = [
     ),
     *(Array(f"hand, {name}", MAIN, sensor(name), 30, file=HAND) for name in (*SENSORS, *DRIFTS) if name != "as it is"),
     *(
-        Array(f"fabric, {name}", SKIN_ROWS, simulated(skin.recordings), 30, 1, 12 * (name == "10 x 10"))
+        Array(f"fabric, {name}", SKIN, simulated(skin.recordings), 30, 1, 12 * (name == "10 x 10"))
         for name, skin in gestures.SKINS.items()
     ),
     *(
-        Array(f"posture, {name}", SKIN_ROWS, simulated(skin.recordings), 20, 1, 12 * (name == "seat"))
+        Array(f"posture, {name}", SKIN, simulated(skin.recordings), 20, 1, 12 * (name == "seat"))
         for name, skin in static_holds.SKINS.items()
     ),
     Array("grasps, 2 x 11 x 10", (*MAIN, "lines", "cold"), simulated(grasps(SensorLayout.paper())), 30),

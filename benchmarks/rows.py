@@ -15,6 +15,7 @@ from functools import cache, cached_property
 from itertools import combinations
 
 import numpy as np
+from sklearn.ensemble import ExtraTreesClassifier
 
 from adaptfault.data.recordings import Recordings
 from diagnostics import (
@@ -30,6 +31,7 @@ from diagnostics import (
     line_fault,
     lose_frames,
 )
+from diagnostics.evidence.recalibration import find_recalibration
 from diagnostics.evidence.sensor_change import pad_change
 
 Log = list[np.ndarray]
@@ -40,6 +42,7 @@ REPEATED = 100  # frames of a frozen stream, beyond the longest repetition that 
 CHANGING = (FaultKind.INTERMITTENT, FaultKind.NOISY, FaultKind.DRIFT)
 GAINS, FADED = (0.2, 0.35, 0.5), 0.1  # times the load; what is left at the end
 UNDER = 20  # recordings of a log in which an object lies still
+SPECIMEN = 48  # recordings from which a new specimen is learned
 REPLACED = 12  # recordings with a new specimen of a pad
 LONG, LOADED = 30, 8  # recordings of a log that shows a gain; in so many of them the cell is loaded
 DEAD_BEFORE = 0.04  # share of the cells that were dead when the reference was recorded
@@ -503,6 +506,47 @@ def replaced(bench: Bench) -> Iterator[Count]:
     yield Count("healthy: a replaced pad told in a log", healthy, bench.count, higher=False)
 
 
+def summaries(recordings: Sequence[np.ndarray]) -> np.ndarray:
+    """Return mean and maximum of each cell in each recording, ``[n, 2 D]``."""
+    return np.array([np.concatenate([frames.mean(axis=0), frames.max(axis=0)]) for frames in recordings])
+
+
+def specimen(bench: Bench) -> Iterator[Count]:
+    """A pad, or in every other draw all pads, have other gains, offsets and noise for each cell: recalibrated."""
+    layout, fitted, draws = bench.layout, bench.fitted, max(2, bench.count // 15)
+    frames, labels = [np.asarray(f, dtype=np.float64) for f in bench.recordings.frames], bench.recordings.labels
+    reference, full = [frames[i] for i in bench.reference], layout.full_scale
+    pad_of = np.arange(layout.n_cells) // (layout.n_cells // layout.pads)
+    trees = ExtraTreesClassifier(300, random_state=0).fit(summaries(reference), labels[bench.reference])
+    told, blamed, right, of = 0, Counter(), Counter(), 0
+    for draw in range(draws):
+        rng = np.random.default_rng(1000 * bench.repeat + draw)
+        on = pad_of == rng.integers(layout.pads) if draw % 2 == 0 else np.full(layout.n_cells, True)
+        gain = np.where(on, np.exp(rng.uniform(-np.log(2), np.log(2), layout.n_cells)), 1.0)
+        offset = np.where(on, np.abs(rng.normal(0, 0.02 * full, layout.n_cells)), 0.0)
+        noise = [0.002 * full * on * rng.standard_normal(f.shape) for f in frames]
+        seen = [np.clip(gain * f + offset + n, 0, full) for f, n in zip(frames, noise, strict=True)]
+        order = rng.permutation(bench.rest)
+        new, test = order[:SPECIMEN], order[SPECIMEN:]
+        faulty = np.zeros(layout.n_cells, bool)
+        lain_on = fitted.diagnose([seen[i] for i in new]).lain_on.mask
+        assert fitted.reference_ is not None
+        found = find_recalibration([seen[i] for i in new], reference, fitted.reference_, layout, faulty, lain_on)
+        told += found is not None and set(found.pads) == set(pad_of[on].tolist())
+        given = {"earlier": frames, "new": seen, "recalibrated": seen}
+        if found is not None:
+            given["recalibrated"] = [found.undo(f, full) for f in seen]
+        of += len(test)
+        for name, readings in given.items():
+            predicted = trees.predict(summaries([readings[i] for i in test]))
+            right[name] += int((predicted == labels[test]).sum())
+            blamed[name] += len(fitted.diagnose([readings[i] for i in test[:6]]).fault_set)
+    yield Count("another specimen of a pad: told", told, draws)
+    for name in right:
+        yield Count(f"  accuracy, {name}", right[name], of)
+        yield Count(f"  healthy cells blamed in a log, {name}", blamed[name], draws, higher=False)
+
+
 def neighbours(layout: SensorLayout, cell: int) -> list[int]:
     """Return the present cells around a cell, diagonal ones included."""
     pad, row, col = layout.position(cell)
@@ -641,6 +685,6 @@ ROWS: dict[str, Callable[[Bench], Iterator[Count]]] = {
     row.__name__: row
     for row in (
         cells, onset, dither, missing, many, cold, reference_faults, lines, cut, address, healthy, holds, untouched,
-        kind, calibration, changing, gain, rewired, groups, replaced, static, transport, speed,
+        kind, calibration, changing, gain, rewired, groups, replaced, specimen, static, transport, speed,
     )
 }  # fmt: skip

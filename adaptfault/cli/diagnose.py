@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.options import (
@@ -39,6 +40,8 @@ _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.
       exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version excludes, nothing tested, an
       object that lies still, a frozen stream, another gain or offset of the whole sensor or of a pad;
       2 a person is needed: a wire, exchanged wires, or a tenth of the cells; 3 unusable input"""
+
+Undo = Callable[["NDArray[Any]"], "NDArray[Any]"]  # returns readings as the running version takes them
 
 _ROWS = 24  # of a map, which is followed by the summary if it has more: the first line has left the screen
 
@@ -77,12 +80,11 @@ def run(args: argparse.Namespace) -> int:
         log = load_recordings(args, args.recordings, layout=layout)
     if healthy is not None:  # fitted once the log is known to be of the same array
         diagnoser = fit_diagnoser(args, healthy)
-    source = slice(None) if bundle is None else bundle.active().source
+    running: Undo = np.asarray if bundle is None else bundle.active().undo
     reference = bundle if healthy is None else list(healthy)
-    rewiring = _rewiring(log, diagnoser, source)
-    if rewiring is not None:
-        source = rewiring.undo(np.arange(log.layout.n_cells)[source])
-    diagnosis, change = _diagnosed(args, diagnoser, log, source, reference)
+    rewiring = _rewiring(log, diagnoser, running)
+    undo: Undo = running if rewiring is None else lambda frames: rewiring.undo(running(frames))
+    diagnosis, change = _diagnosed(args, diagnoser, log, undo, reference)
     code, notes = _severity(diagnosis, bundle, args.untested_code)
     if change is not None:
         code, notes = max(code, 1), [*notes, change.reason]
@@ -113,15 +115,13 @@ def _write(args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: lis
         write_diagnosis(args.html, diagnosis, name=name, reference=reference, code=code, notes=notes)
 
 
-def _rewiring(
-    log: Recordings | Stream, diagnoser: SelfDiagnosis | None, source: NDArray[np.intp] | slice
-) -> Rewiring | None:
+def _rewiring(log: Recordings | Stream, diagnoser: SelfDiagnosis | None, undo: Undo) -> Rewiring | None:
     """Return the change of the wiring that no version undoes yet; None where there is none, or nothing to compare."""
     from adaptfault.data.recordings import Recordings
 
     if diagnoser is None or not isinstance(log, Recordings):  # too large to be searched
         return None
-    return diagnoser.rewiring([frames[:, source] for frames in log.frames])
+    return diagnoser.rewiring([undo(np.asarray(frames)) for frames in log.frames])
 
 
 def _bundle(args: argparse.Namespace) -> Bundle | None:
@@ -179,7 +179,7 @@ def _diagnosed(
     args: argparse.Namespace,
     diagnoser: SelfDiagnosis | None,
     log: Recordings | Stream,
-    source: NDArray[np.intp] | slice,
+    undo: Undo,
     reference: Bundle | list[NDArray[Any]] | None,
 ) -> tuple[Diagnosis, SensorChange | None]:
     """Diagnose the log recording by recording, or in blocks in constant memory, and compare it with the reference."""
@@ -195,11 +195,11 @@ def _diagnosed(
     total = len(log) if isinstance(log, Recordings) else None
     unit = "recording" if isinstance(log, Recordings) else "block"
     for frames in tqdm(log, total=total, unit=unit, desc="diagnosing", disable=hide, leave=False):
-        stream.extend(np.asarray(frames, dtype=np.float64)[:, source])
+        stream.extend(undo(np.asarray(frames, dtype=np.float64)))
     if not isinstance(log, Recordings):
         for problem in log.problems:
             print(problem, file=sys.stderr)
     diagnosis = fitted.evaluate(stream, n_recordings=len(log))
     if diagnoser is None or reference is None or not isinstance(log, Recordings):
         return diagnosis, None
-    return diagnosis, _change(diagnosis, diagnoser, [frames[:, source] for frames in log.frames], reference)
+    return diagnosis, _change(diagnosis, diagnoser, [undo(np.asarray(frames)) for frames in log.frames], reference)

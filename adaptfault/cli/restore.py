@@ -48,8 +48,8 @@ def run(args: argparse.Namespace) -> int:
         print(problem, file=sys.stderr)
     say(args, f"{len(faults)} of {layout.present.sum()} cells are faulty; restoring {len(incoming.frames)} recordings")
     restorer = bundle.restorer()
-    source = bundle.active().source  # exchanged wires are put back, as the running version does
-    given = [layout.check_recording(frames)[:, source] for frames in incoming.frames]
+    version = bundle.active()  # wires are put back and pads recalibrated, as it does
+    given = [version.undo(layout.check_recording(frames)) for frames in incoming.frames]
     restored = [restorer.transform(frames, faults).astype(np.float32) for frames in given]
     missing = sum(int(np.isnan(frames[:, faults.healthy]).sum()) for frames in given)
     deviation = restorer.deviation(faults)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adaptfault.adaptation.fault_free import Network
 from adaptfault.adaptation.result import Adaptation
@@ -20,6 +19,7 @@ from adaptfault.models.store import SCHEMA, load_healthy, read_manifest
 
 if TYPE_CHECKING:
     from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.versions import Version
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class TrainedModel:
         adaptation: the version that a bundle runs; of a model, its form for the healthy sensor, with the head in closed
             form if it has one.
         calibration: the bundle's table from raw counts to the layout's unit.
-        source: see ``Version.source``; None of a model.
+        version: that a bundle runs; None of a model.
     """
 
     network: Network
@@ -41,7 +41,7 @@ class TrainedModel:
     split_seed: int | None
     adaptation: Adaptation
     calibration: Path | None = None
-    source: NDArray[np.intp] | None = None
+    version: Version | None = None
 
     @classmethod
     def open(cls, args: argparse.Namespace, folder: str) -> TrainedModel:
@@ -62,7 +62,7 @@ class TrainedModel:
             return cls(healthy.model.network, tuple(manifest["class_names"]), seed, healthy)
         version = bundle.active()
         active = Adaptation.load(version.folder)
-        return cls(active.model.network, bundle.class_names, None, active, bundle.parts.calibration, version.source)
+        return cls(active.model.network, bundle.class_names, None, active, bundle.parts.calibration, version)
 
     def recordings(self, args: argparse.Namespace, paths: Sequence[str]) -> Recordings:
         """Read labelled recordings in the layout of the model.
@@ -78,10 +78,10 @@ class TrainedModel:
         return recordings
 
     def rewired(self, recordings: Recordings) -> Recordings:
-        """Return recordings with exchanged wires put back, as the version that a bundle runs does on the robot."""
-        if self.source is None:
+        """Return recordings as the version that a bundle runs reads them on the robot; see ``Version.undo``."""
+        if self.version is None:
             return recordings
-        return replace(recordings, frames=tuple(frames[:, self.source] for frames in recordings.frames))
+        return replace(recordings, frames=tuple(self.version.undo(np.asarray(frames)) for frames in recordings.frames))
 
     def _in_order(self, recordings: Recordings) -> Recordings:
         """Return the recordings with the classes of the model, in the order of the model."""

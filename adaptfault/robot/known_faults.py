@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diagnostics import Diagnosis, Fault, FaultKind, FaultSet, Verdict
 
@@ -53,6 +54,11 @@ class KnownFaults:
                 kept.append(fault if cells == fault.cells else replace(fault, cells=cells))
         merged = KnownFaults(self.n_cells, (*diagnosis.faults, *kept))
         return replace(merged, proofs={cell: n for cell, n in proofs.items() if n and cell in merged.fault_set})
+
+    def without(self, cells: NDArray[np.bool_]) -> KnownFaults:
+        """Return the faults of the other cells; ``cells`` (bool ``[D]``) were replaced."""
+        kept = [replace(f, cells=left) for f in self.faults if (left := tuple(c for c in f.cells if not cells[c]))]
+        return replace(self, faults=tuple(kept), proofs={c: n for c, n in self.proofs.items() if not cells[c]})
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict that :meth:`from_dict` reads."""

@@ -26,8 +26,9 @@ from adaptfault.robot.plausibility import contradiction, implausible
 from adaptfault.robot.pointer import Pointer
 from adaptfault.robot.sensor_state import TECHNICIAN_BELOW, UNTESTED, judged_before, unhandled_cells
 from adaptfault.robot.versions import Version
-from diagnostics import Diagnosis, FaultSet, SelfDiagnosis
+from diagnostics import Diagnosis, FaultKind, FaultSet, SelfDiagnosis
 from diagnostics.evidence.ageing import cell_condition
+from diagnostics.evidence.recalibration import Recalibration, find_recalibration
 from diagnostics.evidence.sensor_change import find_change
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 _CONTRADICTORY = 1.0  # residual variance ratio at which other cells predict no better than the mean
 _UNKNOWN = 3
+_DEAD = (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK, FaultKind.ALIAS)  # no predictors of how a pad reads
 
 
 def maintain(
@@ -145,13 +147,20 @@ class _Maintenance:
         if not usable:
             return self._report("refused", _UNKNOWN, "no recording is usable", self.before)
         self.say(f"diagnosing {len(usable)} new recordings")
-        frames = [r.frames[:, self.version.source] for r in usable if r.frames is not None]
+        frames = [self.version.undo(r.frames) for r in usable if r.frames is not None]
         rewiring = self.diagnoser.rewiring(frames)
         if rewiring is not None:
             frames = [rewiring.undo(recording) for recording in frames]
             if not self.dry_run:
                 self.version = self._undone(rewiring)
         diagnosis = self.diagnoser.diagnose(frames)
+        recalibration = None if rewiring is not None else self._recalibration(frames, diagnosis)
+        if recalibration is not None:
+            frames = [recalibration.undo(recording, bundle.layout.full_scale) for recording in frames]
+            self.before = self.before.without(recalibration.on(bundle.layout))
+            if not self.dry_run:
+                self.version = self._recalibrated(recalibration)
+            diagnosis = self.diagnoser.diagnose(frames)
         report = self._decide(diagnosis, frames, tuple(r.name for r in usable))
         loads, healthy = self._loads(frames)
         report = self._with_change(self._with_coverage(_with_transport(report)), loads, healthy)
@@ -159,7 +168,9 @@ class _Maintenance:
         if report.used:
             self.condition = encode(cell_condition(loads, healthy, bundle.layout), diagnosis.verdicts)
         if rewiring is not None:
-            report = self._with_rewiring(report, rewiring)
+            report = self._with_new_readings(report, rewiring.reason, rewiring=rewiring.steps)
+        if recalibration is not None:
+            report = self._with_new_readings(report, recalibration.reason, replaced_pads=recalibration.pads)
         if not self.dry_run:
             self._write(report, usable)
         return report
@@ -184,21 +195,47 @@ class _Maintenance:
         from adaptfault.adaptation.result import Adaptation
 
         self.say(rewiring.reason)
-        source = self.version.source[rewiring.source]
-        about = {**self.version.about, "reason": rewiring.reason, "source": source.tolist()}
+        readings = {name: [of[i] for i in rewiring.source.tolist()] for name, of in self.version.readings.items()}
+        about = {**self.version.about, "reason": rewiring.reason, **readings}
         version = self.bundle.write_version(Adaptation.load(self.version.folder), about)
         self.bundle.deploy(version.number)
         return version
 
-    def _with_rewiring(self, report: MaintenanceReport, rewiring: Rewiring) -> MaintenanceReport:
-        """Return the report with the changed wiring, which a deployed version undoes."""
+    def _recalibration(self, frames: list[NDArray[np.float64]], diagnosis: Diagnosis) -> Recalibration | None:
+        """Return how replaced pads read; None where none is replaced."""
+        if self.diagnoser.load_ is not None or self.diagnoser.reference_ is None:
+            return None
+        faulty = np.zeros(self.bundle.layout.n_cells, bool)
+        faulty[[cell for f in diagnosis.faults if f.kind in _DEAD for cell in f.cells]] = True
+        healthy = recordings_of(self.adapter.train, self.bundle.layout)
+        return find_recalibration(
+            frames, healthy, self.diagnoser.reference_, self.bundle.layout, faulty, diagnosis.lain_on.mask
+        )
+
+    def _recalibrated(self, recalibration: Recalibration) -> Version:
+        """Deploy the running model as a version that reads the replaced pads as the earlier ones."""
+        from adaptfault.adaptation.result import Adaptation
+
+        self.say(recalibration.reason)
+        readings = {
+            **self.version.readings,
+            "gain": (self.version.gain * recalibration.gain).tolist(),
+            "offset": (self.version.offset + self.version.gain * recalibration.offset).tolist(),
+        }
+        about = {**self.version.about, "reason": recalibration.reason, **readings}
+        version = self.bundle.write_version(Adaptation.load(self.version.folder), about)
+        self.bundle.deploy(version.number)
+        return version
+
+    def _with_new_readings(self, report: MaintenanceReport, reason: str, **found: Any) -> MaintenanceReport:
+        """Return the report with changed wires or replaced pads, which a deployed version undoes."""
         undone = "a new version would undo it" if self.dry_run else f"version {self.version.number} undoes it"
         return replace(
             report,
             decision="deployed" if report.decision == "unchanged" else report.decision,
             exit_code=max(1, report.exit_code),
-            reason=f"{rewiring.reason}; {undone}; {report.reason}",
-            rewiring=rewiring.steps,
+            reason=f"{reason}; {undone}; {report.reason}",
+            **found,
         )
 
     def _with_coverage(self, report: MaintenanceReport) -> MaintenanceReport:
@@ -345,7 +382,7 @@ class _Maintenance:
         for number in reversed(self.bundle.versions.numbers):
             with suppress(Damaged, FileNotFoundError):
                 version = self.bundle.versions[number]
-                if version.fault_set == faulty and np.array_equal(version.source, self.version.source):
+                if version.fault_set == faulty and version.readings == self.version.readings:
                     return version
         return None
 
@@ -379,7 +416,7 @@ class _Maintenance:
         about = {
             "reason": f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}",
             "knowledge": known.to_dict(),
-            "source": self.version.source.tolist(),
+            **self.version.readings,
             "accuracy": judgement.candidate,
             "fault_free_accuracy": free,
             "chance": chance(self.bundle.parts.check_windows().y)[1],

@@ -34,6 +34,7 @@ class MaintenanceReport:
         fault_free_accuracy: of version 1 on the same windows without faults; None if not measured.
         change: of a pad, or of the whole sensor, against the reference (gain, offset); None where none was found.
         rewiring: rows, columns or pads that answer in each other's place, as text; the deployed version undoes it.
+        replaced_pads: pads that read otherwise; the deployed version recalibrates them.
         stages: cost and result of each adaptation stage, as text.
         used: names of the recordings whose diagnosis entered the known faults; empty where they were refused.
         left_out: recordings, or readings of them, that were not used, with the reason.
@@ -55,6 +56,7 @@ class MaintenanceReport:
     fault_free_accuracy: float | None = None
     change: SensorChange | None = None
     rewiring: tuple[str, ...] = ()
+    replaced_pads: tuple[int, ...] = ()
     stages: tuple[str, ...] = ()
     used: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
@@ -105,6 +107,7 @@ class MaintenanceReport:
             "fault_free_accuracy": self.fault_free_accuracy,
             "change": None if self.change is None else vars(self.change),
             "rewiring": list(self.rewiring),
+            "replaced_pads": list(self.replaced_pads),
             "stages": list(self.stages),
             "used": list(self.used),
             "left_out": list(self.left_out),

@@ -68,7 +68,6 @@ class _Running:
     version: Version
     model: Inference
     bundle: Bundle
-    source: NDArray[np.intp]  # see Version.source
 
 
 class Predictor:
@@ -136,7 +135,7 @@ class Predictor:
     @property
     def source(self) -> NDArray[np.intp]:
         """The received cell that belongs at each place ``[D]``: the running version puts exchanged wires back."""
-        return self._running.source
+        return self._running.version.source
 
     @property
     def version(self) -> int:
@@ -174,7 +173,7 @@ class Predictor:
         given = self.layout.check_frame(frame)
         if time is not None and not np.isfinite(time):
             raise ValueError(f"time {time}: expected seconds, or None where it is unknown")
-        given = given[self._running.source]
+        given = self._running.version.undo(given)
         reading, outside = within_range(given, self.layout)
         if outside and not self.outside:
             _log.warning("%d readings outside the range of %s count as missing", outside, self.layout)
@@ -229,9 +228,9 @@ class Predictor:
         return f"version {self.version}: {self._running.model}"
 
     def _rewired(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return windows with each reading at its cell, where the running version undoes a changed wiring."""
-        source = self._running.source
-        return x[..., source] if x.shape[-1:] == source.shape else x  # the model refuses another shape
+        """Return windows as the model reads them; see ``Version.undo``."""
+        version = self._running.version
+        return version.undo(x, 1.0) if x.shape[-1:] == version.source.shape else x  # the model refuses another shape
 
     def _keep_up(self) -> None:
         """Switch to a new version once it is loaded; check for one every second."""
@@ -241,7 +240,7 @@ class Predictor:
             self._loading = None
             if self._ready is not None:
                 before, self._running, self._ready = self._running, self._ready, None
-                if not np.array_equal(before.source, self._running.source):  # the frames so far are of another order
+                if before.version.readings != self._running.version.readings:  # the frames so far read otherwise
                     self._monitor = Monitor(_reference(self._running.bundle))
                     self.reset()
                 self._decision = self._new_decision()
@@ -286,7 +285,8 @@ def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
     if model.layout != layout:
         raise ValueError(f"the version is for {model.layout}, the bundle for {layout}")
     model.predict_proba(np.zeros((1, model.length, layout.n_cells), np.float32))
-    return _Running(version, model, bundle, version.source)
+    _ = version.readings  # raises Damaged
+    return _Running(version, model, bundle)
 
 
 def _finite(x: NDArray[Any]) -> NDArray[np.float32]:

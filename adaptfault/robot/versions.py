@@ -25,6 +25,7 @@ from adaptfault.robot.checksummed_json import (
     write_checksummed,
 )
 from diagnostics import FaultSet, SensorLayout
+from diagnostics.evidence.recalibration import recalibrated
 
 SCHEMA = "adaptfault.version/1"
 ABOUT = "version.json"
@@ -48,6 +49,7 @@ class Version:
         length: frames in a window.
         fault_set: F, the cells that it does not use.
         about: origin of the version, JSON. ``source``, where given: a permutation that undoes a changed wiring.
+            ``gain`` and ``offset``, where given: of each cell of a replaced pad.
     """
 
     number: int
@@ -66,6 +68,43 @@ class Version:
         if not np.array_equal(np.sort(source), every):
             raise Damaged(f"{self.folder / ABOUT}: source is no permutation of {self.layout.n_cells} cells")
         return source
+
+    @cached_property
+    def gain(self) -> NDArray[np.float64]:
+        """float ``[D]``; cell i reads ``gain[i]`` times what the model was trained on, plus ``offset[i]``."""
+        gain = self._of_cells("gain", 1.0)
+        if not (gain > 0).all():
+            raise Damaged(f"{self.folder / ABOUT}: a gain is not positive")
+        return gain
+
+    @cached_property
+    def offset(self) -> NDArray[np.float64]:
+        """float ``[D]``, in the layout's unit; see ``gain``."""
+        return self._of_cells("offset", 0.0)
+
+    def _of_cells(self, name: str, otherwise: float) -> NDArray[np.float64]:
+        values = np.asarray(self.about.get(name, np.full(self.layout.n_cells, otherwise)), dtype=np.float64)
+        if values.shape != (self.layout.n_cells,) or not np.isfinite(values).all():
+            raise Damaged(f"{self.folder / ABOUT}: {name} is not a number for each of {self.layout.n_cells} cells")
+        return values
+
+    @property
+    def readings(self) -> dict[str, list[Any]]:
+        """How readings become those of the model: what ``about`` of a version with the same sensor holds."""
+        return {name: getattr(self, name).tolist() for name in ("source", "gain", "offset")}
+
+    def undo(self, frames: NDArray[Any], full_scale: float | None = None) -> NDArray[Any]:
+        """Return frames ``[..., D]`` as the model reads them: wires put back, replaced pads recalibrated.
+
+        Args:
+            frames: in the layout's unit.
+            full_scale: in which unit they are instead, as 1 for scaled windows.
+        """
+        frames = frames[..., self.source]
+        if (self.gain == 1).all() and not self.offset.any():
+            return frames
+        top = self.layout.full_scale if full_scale is None else full_scale
+        return recalibrated(frames, self.gain, self.offset * (top / self.layout.full_scale), top)
 
     def __str__(self) -> str:
         cells, faulty = self.layout.present.sum(), len(self.fault_set)

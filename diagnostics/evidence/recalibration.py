@@ -1,0 +1,267 @@
+"""Recalibration: gain and offset of each cell of a replaced pad, learned from recordings without labels.
+
+A new specimen of a pad has other gains and offsets. The reading of cell i is modelled as
+
+    reading = g_i usual reading + o_i
+
+o_i follows from the least readings. log g_i is the mean of 2 log(y_e / m_e) over the events e that load the cell, for
+its root load y_e and the mean m_e that the healthy model expects from the other cells; the readings are corrected and
+the means computed again, until they agree (Gauss-Seidel). Cells of one pad share a normal prior of log g, with mean and
+variance estimated from them (random-effects model, DerSimonian and Laird 1986), so that cells with few events take the
+gain of their pad. A pad is corrected only where that raises the pseudo-likelihood of recordings that the correction was
+not learned from, by more than four standard errors over these recordings.
+
+Not detected: other noise, other thresholds, and gains of cells that no event loads: these take the mean of their pad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics.healthy.model import contact_events
+from diagnostics.healthy.prediction import OUTLIERS, log_student_t
+from diagnostics.preprocessing.baseline import LOW
+from diagnostics.preprocessing.readings import held
+
+if TYPE_CHECKING:
+    from diagnostics.healthy.prediction import Prediction
+    from diagnostics.healthy.reference import Reference
+    from diagnostics.layout import SensorLayout
+    from diagnostics.preprocessing.scale import Array
+
+_FEWEST = 12  # recordings
+_ERRORS = 4.0  # standard errors of the gain in pseudo-likelihood
+_ROUNDS, _STEP = 4, 0.6  # of the correction; share of each correction that is applied: neighbours err together
+_LOADED = 1.5  # times the lowest root load that counts as loaded: expected in an event that shows the gain
+_LEAST_EVENTS = 3  # that show the gain of a cell
+_LEAST_VARIANCE = 0.02  # of 2 log(y / m) in one event: events of a log are similar
+_WIDE = 1.5  # standardised errors beyond this count less (Huber 1964)
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Recalibration:
+    """Gains and offsets of replaced pads: reading = gain x usual reading + offset.
+
+    Attributes:
+        gain, offset: float ``[D]``; 1 and 0 on pads that were not replaced.
+        pads: the replaced pads.
+        recordings: number of recordings that it was learned from.
+    """
+
+    gain: Floats
+    offset: Floats
+    pads: tuple[int, ...]
+    recordings: int
+
+    @property
+    def reason(self) -> str:
+        """One sentence."""
+        pads = f"pad{'s' if len(self.pads) > 1 else ''} {', '.join(map(str, self.pads))}"
+        return f"{pads} replaced: gains and offsets learned from {self.recordings} recordings"
+
+    def on(self, layout: SensorLayout) -> Mask:
+        """Return the cells of the replaced pads, bool ``[D]``."""
+        pad = np.arange(layout.n_cells) // (layout.n_cells // layout.pads)
+        return np.isin(pad, self.pads)
+
+    def undo(self, frames: NDArray[Any], full_scale: float) -> NDArray[Any]:
+        """Return frames ``[..., D]`` as the reference would read them, within 0 to ``full_scale``."""
+        return recalibrated(frames, self.gain, self.offset, full_scale)
+
+
+def recalibrated(frames: NDArray[Any], gain: Floats, offset: Floats, full_scale: float) -> NDArray[Any]:
+    """Return ``(frames - offset) / gain`` within 0 to ``full_scale``; readings that no converter gives stay."""
+    frames = frames if frames.dtype.kind == "f" else frames.astype(np.float64)
+    given = (np.abs(frames - full_scale / 2) <= 1.5 * full_scale) & ((gain != 1) | (offset != 0))
+    return np.where(given, np.clip((frames - offset) / gain, 0.0, full_scale), frames).astype(frames.dtype)
+
+
+def find_recalibration(
+    recordings: Sequence[NDArray[Any]],
+    healthy: Sequence[NDArray[Any]],
+    reference: Reference,
+    layout: SensorLayout,
+    excluded: Mask,
+    lain_on: Mask,
+) -> Recalibration | None:
+    """Return gains and offsets of the pads that read otherwise; None where none does, or the data do not tell.
+
+    Args:
+        recordings: new ones, loads ``[T, D]`` each; NaN = missing.
+        healthy: those of the reference, likewise.
+        reference: fitted to them.
+        layout: the array.
+        excluded: bool ``[D]``, cells that are faulty.
+        lain_on: bool ``[D]``, cells that seem to lie under an object. Its pad was replaced only if the other cells read
+            otherwise too, with offsets that are independent of each other: those at the edge of an object are not.
+    """
+    used = layout.present.ravel() & ~excluded & (reference.dead == 0)
+    new = [filled for r in recordings if (filled := _filled(r, reference)) is not None]
+    old = [filled for r in healthy if (filled := _filled(r, reference)) is not None]
+    if reference.model is None or len(new) < _FEWEST or len(old) < _FEWEST:
+        return None
+    fit = _Fit(reference, layout, used, np.quantile(np.concatenate(old), LOW, axis=0))
+    halves = new[::2], new[1::2]
+    gains = []  # of pseudo-likelihood in each recording, [recordings, with gains or without, pads]
+    for learned, other in (halves, halves[::-1]):
+        log_gain, offset = fit.learned(learned)
+        plain = fit.scores(other, 0 * log_gain, 0 * offset)
+        clear = [on & ~lain_on for on in fit.pads]
+        gains.append([[fit.scores(other, s * log_gain * on, offset * on) - plain for on in clear] for s in (1, 0)])
+    gained = np.concatenate(gains, axis=2)
+    best = gained.mean(axis=2).argmax(axis=0)
+    log_gain, offset = fit.learned(new)
+    gain, rest = np.ones_like(log_gain), reference.scale.baseline
+    replaced, moved = [], np.zeros_like(offset)
+    for pad, on in enumerate(fit.pads):
+        hidden = lain_on[on].any() and not _independent(offset, on & ~lain_on, layout)
+        if _certain(gained[best[pad], pad]) and not hidden:
+            replaced.append(pad)
+            gain[on] = np.exp(log_gain[on]) if best[pad] == 0 else 1.0
+            moved[on] = (rest + offset - gain * rest)[on]
+    return Recalibration(gain, moved, tuple(replaced), len(new)) if replaced else None
+
+
+def _independent(offset: Floats, on: Mask, layout: SensorLayout) -> bool:
+    """Return whether the offsets (``[D]``) of neighbouring cells of a pad (bool ``[D]``) are uncorrelated."""
+    values, known = layout.grid(offset), layout.grid(on)
+    pairs = [
+        np.stack([a[both], b[both]])
+        for axis in (1, 2)
+        for a, b, both in [
+            (
+                np.delete(values, -1, axis),
+                np.delete(values, 0, axis),
+                np.delete(known, -1, axis) & np.delete(known, 0, axis),
+            )
+        ]
+    ]
+    a, b = np.concatenate(pairs, axis=1)
+    if len(a) < _FEWEST or not a.std() or not b.std():
+        return False
+    return bool(abs(np.corrcoef(a, b)[0, 1]) * np.sqrt(len(a)) < _ERRORS)
+
+
+def _certain(gained: Floats) -> bool:
+    """Return whether the mean of values ``[n]`` is positive beyond chance."""
+    return bool(gained.mean() > _ERRORS * gained.std(ddof=1) / np.sqrt(len(gained)) and gained.mean() > 0)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Gains and offsets of a sensor against its reference.
+
+    Attributes:
+        reference: of the array.
+        layout: the array.
+        used: bool ``[D]``, cells that serve as predictors.
+        least: float ``[D]``, low quantile of the readings of the reference.
+    """
+
+    reference: Reference
+    layout: SensorLayout
+    used: Mask
+    least: Floats
+
+    @property
+    def pads(self) -> list[Mask]:
+        """The cells of each pad, bool ``[D]``."""
+        pad = np.arange(self.layout.n_cells) // (self.layout.n_cells // self.layout.pads)
+        present = self.layout.present.ravel()
+        return [(pad == i) & present for i in range(self.layout.pads)]
+
+    def learned(self, recordings: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """Return log gain and offset of each cell, ``[D]``; the offset in the layout's unit, of the baseline."""
+        offset = np.quantile(np.concatenate(recordings), LOW, axis=0) - self.least
+        log_gain = np.zeros(len(offset))
+        for _ in range(_ROUNDS):
+            features, _ = self._events(recordings, log_gain, offset)
+            if not len(features):
+                break
+            ratio, variance = self._ratios(features, self._predicted(features))
+            for pad in self.pads:
+                on = pad & self.used
+                log_gain[on] += _STEP * (_shrunk((log_gain + ratio)[on], variance[on]) - log_gain[on])
+        return log_gain, offset
+
+    def scores(self, recordings: Sequence[Floats], log_gain: Floats, offset: Floats) -> Floats:
+        """Return the log pseudo-likelihood of each recording, with the readings corrected."""
+        features, of = self._events(recordings, log_gain, offset)
+        if not len(features):
+            return np.zeros(len(recordings))
+        expected, loaded = self._predicted(features), features[:, 2] > 0
+        never = np.clip(expected.never, 1e-6, 1 - 1e-6)
+        error = np.where(loaded, features[:, 1] - expected.mean, 0.0) / np.nan_to_num(expected.spread, nan=np.inf)
+        # A density of readings: a higher gain spreads them.
+        of_load = log_student_t(error, OUTLIERS) - log_gain / 2
+        score = np.where(loaded, np.log1p(-never) + of_load, np.log(never))[:, self.used].sum(axis=1)
+        by_recording: Floats = np.bincount(of, score, len(recordings)).astype(np.float64)
+        return by_recording
+
+    def _predicted(self, features: Array) -> Prediction:
+        assert self.reference.model is not None
+        return self.reference.model.predict(features, self.used)
+
+    def _events(self, recordings: Sequence[Floats], log_gain: Floats, offset: Floats) -> tuple[Array, NDArray[np.intp]]:
+        """Return the features ``[n, 4, D]`` of the events with the readings corrected, and the recording of each."""
+        rest, gain, top = self.reference.scale.baseline, np.exp(log_gain), self.layout.full_scale
+        found = [
+            (event.suffixes()[0].features(), i)
+            for i, recording in enumerate(recordings)
+            for event in contact_events(
+                np.clip((recording - rest - offset) / gain + rest, 0.0, top), self.reference.scale
+            )
+        ]
+        if not found:
+            return np.zeros((0, 4, len(offset)), np.float32), np.zeros(0, np.intp)
+        features, of = zip(*found, strict=True)
+        return np.stack(features), np.array(of)
+
+    def _ratios(self, features: Array, expected: Prediction) -> tuple[Floats, Floats]:
+        """Return the mean of 2 log(y / m) of each cell, and its variance, ``[D]``; NaN: too few events."""
+        load, spread = features[:, 1].astype(np.float64), np.nan_to_num(expected.spread, nan=np.inf)
+        shown = (features[:, 3] > 0.5) & (expected.mean > _LOADED * self.reference.scale.root_near)
+        ratio = np.where(shown, 2 * np.log(np.maximum(load, 1e-6) / np.maximum(expected.mean, 1e-6)), 0.0)
+        error = 2 * spread / np.maximum(expected.mean, 1e-6)
+        plain = weight = np.where(shown & np.isfinite(spread), 1 / error**2, 0.0)
+        mean = np.zeros(load.shape[1])
+        for _ in range(10):  # iteratively reweighted
+            mean = (weight * ratio).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
+            weight = plain * np.minimum(1.0, _WIDE * error / np.maximum(np.abs(ratio - mean), 1e-12))
+        total = np.maximum(weight.sum(axis=0), 1e-12)
+        variance = np.maximum((weight * (ratio - mean) ** 2).sum(axis=0) / total, _LEAST_VARIANCE)
+        variance *= (weight**2).sum(axis=0) / total**2  # 1 / effective number of events
+        few = (weight > 0).sum(axis=0) < _LEAST_EVENTS
+        return np.where(few, np.nan, mean), np.where(few, np.nan, variance)
+
+
+def _shrunk(log_gain: Floats, variance: Floats) -> Floats:
+    """Return log gains ``[n]`` shrunk to their common mean (random-effects model); NaN becomes the mean."""
+    known = np.isfinite(log_gain)
+    if known.sum() < 2:
+        return np.zeros(len(log_gain))
+    x, weight = log_gain[known], 1 / variance[known]
+    mean = (weight * x).sum() / weight.sum()
+    surplus = (weight * (x - mean) ** 2).sum() - (len(x) - 1)
+    between = max(0.0, surplus / (weight.sum() - (weight**2).sum() / weight.sum()))
+    mean = (x / (variance[known] + between)).sum() / (1 / (variance[known] + between)).sum()
+    shrunk = np.full(len(log_gain), mean)
+    shrunk[known] += between / (between + variance[known]) * (x - mean)
+    return shrunk
+
+
+def _filled(recording: NDArray[Any], reference: Reference) -> Floats | None:
+    """Return a recording with the last reading where one is missing; None without any reading."""
+    frames = np.asarray(recording, dtype=np.float64)
+    if not np.isfinite(frames).any():
+        return None
+    known: Floats = held(frames, np.full(frames.shape[1], np.nan))[1:]
+    return np.where(np.isnan(known), reference.scale.baseline, known)

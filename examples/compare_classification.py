@@ -182,7 +182,7 @@ class Reached:
 
 
 def summed(rows: list[Row]) -> dict[str, Reached]:
-    """Return for each classifier its accuracies, and medians of its times (repair: where cells are dead)."""
+    """Return for each classifier its accuracies, medians of its times and its most memory, where cells are dead."""
     result = {}
     for name in dict.fromkeys(row.name for row in rows):
         mine, accuracy = [row for row in rows if row.name == name], defaultdict(dict)
@@ -191,9 +191,10 @@ def summed(rows: list[Row]) -> dict[str, Reached]:
         broken = [row for row in mine if row.dead]
         median = {
             key: float(np.median([v for row in broken if not math.isnan(v := getattr(row, key))] or [math.nan]))
-            for key in ("before_cpu", "repair", "repair_cpu", "predict_ms", "memory_mb")
+            for key in ("before_cpu", "repair", "repair_cpu", "predict_ms")
         }
-        result[name] = Reached(mine[0].protocol, dict(accuracy), **median)
+        most = max((row.memory_mb for row in broken), default=math.nan)  # memory that was freed before is used again
+        result[name] = Reached(mine[0].protocol, dict(accuracy), **median, memory_mb=most)
     return result
 
 

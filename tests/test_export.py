@@ -10,6 +10,7 @@ from conftest import DROPPED, small_windows
 from torch import nn
 
 from adaptfault.adaptation.adapter import Adapter
+from adaptfault.adaptation.heads import Head
 from adaptfault.adaptation.reduced_model import ReducedModel
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.data.windows import Windows
@@ -17,6 +18,8 @@ from adaptfault.models import export
 from adaptfault.models.any_model import AnyModel
 from adaptfault.models.export import ExportError, add_onnx, graph_of, to_onnx
 from adaptfault.models.inference import open_session, run_session
+from adaptfault.models.network import TactileTransformer
+from adaptfault.models.whole_windows import Masked, Selected
 from diagnostics import FaultSet, SensorLayout
 
 
@@ -57,6 +60,17 @@ def test_one_graph_serves_every_fault_set_and_number_of_known_windows(versions, 
         x[..., list(cells)] = np.nan
         said = run_session(open_session(to_onnx(head.model, graph)), x)
         np.testing.assert_allclose(said, head.predict_proba(x), rtol=0, atol=1e-5)
+
+
+def test_a_large_array_is_exported_without_a_matrix_of_its_cells(monkeypatch):
+    monkeypatch.setattr("adaptfault.models.whole_windows.LARGE", 17)
+    none = FaultSet((), 18)
+    model = ReducedModel(TactileTransformer(SensorLayout(2, 3, 3), 3, length=5), none, None).eval()
+    with torch.no_grad():
+        model.head = Head.blank(model.views(torch.from_numpy(small_windows(4))), 3)
+    assert isinstance(export._whole(model), Selected)
+    monkeypatch.undo()
+    assert isinstance(export._whole(model), Masked)
 
 
 def test_a_graph_of_another_kind_of_model_has_no_effect(versions, monkeypatch):

@@ -10,6 +10,7 @@ from adaptfault.adaptation.cell_summary import CellSummary
 from adaptfault.adaptation.heads import Head
 from adaptfault.adaptation.reduced_model import ReducedModel
 from adaptfault.imputation.linear import AffineFill
+from adaptfault.imputation.tiled_statistics import LARGE
 from diagnostics import FaultSet
 
 
@@ -61,8 +62,9 @@ class Masked(nn.Module):
 
     @staticmethod
     def suits(model: ReducedModel) -> bool:
-        """Return whether the model has parts of these kinds."""
-        return isinstance(model.head, Head) and isinstance(model.front, AffineFill | None)
+        """Return whether the model has parts of these kinds, and not too many cells for a matrix of them."""
+        small = model.fault_set.n_cells <= LARGE
+        return small and isinstance(model.head, Head) and isinstance(model.front, AffineFill | None)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map windows ``[N, T, D]`` to probabilities ``[N, n_classes]``."""

@@ -29,8 +29,8 @@ from diagnostics.preprocessing.baseline import LOW
 from diagnostics.preprocessing.readings import held
 
 if TYPE_CHECKING:
+    from diagnostics.evidence.reference import Reference
     from diagnostics.healthy.prediction import Prediction
-    from diagnostics.healthy.reference import Reference
     from diagnostics.layout import SensorLayout
     from diagnostics.preprocessing.scale import Array
 

@@ -104,10 +104,11 @@ def adaptfault(task: Task) -> dict[str, Repair]:
         )  # fmt: skip
     adapter = af.Adapter(model, task.train, task.validation)
     adapter.statistics, adapter.fault_free_accuracy  # noqa: B018 - known before the fault
-    return {
-        f"adaptfault {method}": lambda faults, method=method: adapter.adapt(faults, method=method).predict
-        for method in ("fill", "auto")
-    }
+
+    def auto(faults: FaultSet) -> Predict:
+        return adapter.adapt(faults).predict if len(faults) else adapter.healthy.predict
+
+    return {"adaptfault fill": lambda faults: adapter.adapt(faults, method="fill").predict, OURS: auto}
 
 
 def imputed_svc(imputer, task: Task) -> Repair:

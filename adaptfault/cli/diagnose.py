@@ -118,7 +118,7 @@ def _rewiring(log: Recordings | Stream, diagnoser: SelfDiagnosis | None, undo: U
 
     if diagnoser is None or not isinstance(log, Recordings):  # too large to be searched
         return None
-    return diagnoser.rewiring([undo(np.asarray(frames)) for frames in log.frames])
+    return diagnoser.rewiring([undo(frames) for frames in log.frames])
 
 
 def _bundle(args: argparse.Namespace) -> Bundle | None:
@@ -203,4 +203,4 @@ def _diagnosed(
     diagnosis = fitted.evaluate(stream, n_recordings=len(log))
     if diagnoser is None or reference is None or not isinstance(log, Recordings):
         return diagnosis, None
-    return diagnosis, _change(diagnosis, diagnoser, [undo(np.asarray(frames)) for frames in log.frames], reference)
+    return diagnosis, _change(diagnosis, diagnoser, [undo(frames) for frames in log.frames], reference)

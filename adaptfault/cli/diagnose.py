@@ -23,7 +23,6 @@ from adaptfault.cli.options import (
 )
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from adaptfault.data.recordings import Recordings

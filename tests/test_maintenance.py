@@ -226,7 +226,6 @@ def test_a_replaced_pad_is_recalibrated_without_labels(bundle, later_grasps, mon
     layout, healthy = bundle.layout, bundle.diagnoser().diagnose(later_grasps).fault_set
     log = as_another_specimen(later_grasps, layout, pad=1)
     report = maintain(bundle, log)
-    print(report)
     assert (report.decision, report.version, report.replaced_pads) == ("deployed", 2, (1,))
     assert report.fault_set == healthy
     assert "pad 1 replaced" in str(report).splitlines()[0]

@@ -23,7 +23,6 @@ from adaptfault.cli.options import (
 )
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from adaptfault.data.recordings import Recordings
@@ -121,7 +120,7 @@ def _rewiring(log: Recordings | Stream, diagnoser: SelfDiagnosis | None, undo: U
 
     if diagnoser is None or not isinstance(log, Recordings):  # too large to be searched
         return None
-    return diagnoser.rewiring([undo(np.asarray(frames)) for frames in log.frames])
+    return diagnoser.rewiring([undo(frames) for frames in log.frames])
 
 
 def _bundle(args: argparse.Namespace) -> Bundle | None:
@@ -202,4 +201,4 @@ def _diagnosed(
     diagnosis = fitted.evaluate(stream, n_recordings=len(log))
     if diagnoser is None or reference is None or not isinstance(log, Recordings):
         return diagnosis, None
-    return diagnosis, _change(diagnosis, diagnoser, [undo(np.asarray(frames)) for frames in log.frames], reference)
+    return diagnosis, _change(diagnosis, diagnoser, [undo(frames) for frames in log.frames], reference)

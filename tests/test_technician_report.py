@@ -150,7 +150,7 @@ def test_after_a_rollback_the_page_and_the_command_name_the_faults_that_are_not_
     page, bundle = tmp_path / "page.html", repaired
     said = told(capsys, "rollback", bundle.path)[1]
     assert "not handled now: pad 1, row 2 is short" in said
-    assert re.match(r"version 1, with all \d+ cells runs; version 2 is not deployed", said)
+    assert re.match(r"running: version 1, with all \d+ cells; version 2 is not deployed", said)
     told(capsys, "report", bundle.path, "--out", page)
     assert heading(page) == "Call a technician"
     assert "1 known fault is <b>not handled</b>: version 1 runs" in page.read_text()

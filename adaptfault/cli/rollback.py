@@ -25,6 +25,6 @@ def run(args: argparse.Namespace) -> int:
     version = bundle.rollback()
     unhandled = [fault.reason for fault in SensorState.of(bundle).unhandled]
     result = {"schema": "adaptfault.rollback/1", "left": left, "version": version.number, "not_handled": unhandled}
-    lines = [f"{version} runs; version {left} is not deployed for the same faults again"]
+    lines = [f"running: {version}; version {left} is not deployed for the same faults again"]
     emit(args, result, "\n".join([*lines, *(f"not handled now: {reason}" for reason in unhandled)]))
     return 0

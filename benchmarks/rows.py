@@ -529,9 +529,11 @@ def specimen(bench: Bench) -> Iterator[Count]:
         order = rng.permutation(bench.rest)
         new, test = order[:SPECIMEN], order[SPECIMEN:]
         faulty = np.zeros(layout.n_cells, bool)
-        lain_on = fitted.diagnose([seen[i] for i in new]).lain_on.mask
+        statically_loaded = fitted.diagnose([seen[i] for i in new]).statically_loaded.mask
         assert fitted.reference_ is not None
-        found = find_recalibration([seen[i] for i in new], reference, fitted.reference_, layout, faulty, lain_on)
+        found = find_recalibration(
+            [seen[i] for i in new], reference, fitted.reference_, layout, faulty, statically_loaded
+        )
         told += found is not None and set(found.pads) == set(pad_of[on].tolist())
         given = {"earlier": frames, "new": seen, "recalibrated": seen}
         if found is not None:

@@ -209,7 +209,7 @@ class _Maintenance:
         faulty[[cell for f in diagnosis.faults if f.kind in _DEAD for cell in f.cells]] = True
         healthy = recordings_of(self.adapter.train, self.bundle.layout)
         return find_recalibration(
-            frames, healthy, self.diagnoser.reference_, self.bundle.layout, faulty, diagnosis.lain_on.mask
+            frames, healthy, self.diagnoser.reference_, self.bundle.layout, faulty, diagnosis.statically_loaded.mask
         )
 
     def _recalibrated(self, recalibration: Recalibration) -> Version:
@@ -273,8 +273,9 @@ class _Maintenance:
         from adaptfault.adaptation.result import Adaptation
 
         layout, load = self.bundle.layout, self.diagnoser.load_
-        lain_on = FaultSet((), layout.n_cells) if report.diagnosis is None else report.diagnosis.lain_on
-        change = find_change(loads, reference, layout, report.fault_set | lain_on)
+        if report.diagnosis is not None and report.diagnosis.static_loads:  # the object changes the loads beside it
+            return report
+        change = find_change(loads, reference, layout, report.fault_set)
         if change is None:
             return report
         gain, offset = change.of_cells(layout)
@@ -303,7 +304,7 @@ class _Maintenance:
         if not present - faulty:
             reason = "no healthy cell is left to predict from: replace the sensor"
             return self._report("refused", 2, reason, known, **found)
-        untrue = faulty | diagnosis.lain_on  # neither says what the other cells should read
+        untrue = faulty | diagnosis.statically_loaded  # neither says what the other cells should read
         strange = contradiction(frames, untrue, adapter.statistics, self.bundle.layout)
         if strange > _CONTRADICTORY:
             reason = (

@@ -85,7 +85,7 @@ class Diagnosis:
         return tuple(fault for fault in self.transport if fault.kind == "frozen")
 
     @cached_property
-    def lain_on(self) -> FaultSet:
+    def statically_loaded(self) -> FaultSet:
         """The cells of all static loads: healthy as far as the log tells, but their readings are not of contact."""
         return FaultSet(tuple({c for load in self.static_loads for c in load.cells}), self.layout.n_cells)
 
@@ -206,7 +206,7 @@ class Diagnosis:
             raise ValueError("the diagnosis is damaged: a transport fault needs a kind and a reason")
         if not all(np.isfinite(values).all() for values in diagnosis.evidence.values()):
             raise ValueError("the diagnosis is damaged: evidence must be finite")
-        _ = diagnosis.lain_on, diagnosis.fault_set  # raise ValueError for cells of another layout
+        _ = diagnosis.statically_loaded, diagnosis.fault_set  # raise ValueError for cells of another layout
         return diagnosis
 
     @classmethod

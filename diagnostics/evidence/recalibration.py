@@ -90,7 +90,7 @@ def find_recalibration(
     reference: Reference,
     layout: SensorLayout,
     excluded: Mask,
-    lain_on: Mask,
+    statically_loaded: Mask,
 ) -> Recalibration | None:
     """Return gains and offsets of the pads that read otherwise; None where none does, or the data do not tell.
 
@@ -100,7 +100,7 @@ def find_recalibration(
         reference: fitted to them.
         layout: the array.
         excluded: bool ``[D]``, cells that are faulty.
-        lain_on: bool ``[D]``, cells that seem to lie under an object. Its pad was replaced only if the other cells read
+        statically_loaded: bool ``[D]``, cells that seem to lie under an object. Its pad was replaced only if the other cells read
             otherwise too, with offsets that are independent of each other: those at the edge of an object are not.
     """
     used = layout.present.ravel() & ~excluded & (reference.dead == 0)
@@ -114,7 +114,7 @@ def find_recalibration(
     for learned, other in (halves, halves[::-1]):
         log_gain, offset = fit.learned(learned)
         plain = fit.scores(other, 0 * log_gain, 0 * offset)
-        clear = [on & ~lain_on for on in fit.pads]
+        clear = [on & ~statically_loaded for on in fit.pads]
         gains.append([[fit.scores(other, s * log_gain * on, offset * on) - plain for on in clear] for s in (1, 0)])
     gained = np.concatenate(gains, axis=2)
     best = gained.mean(axis=2).argmax(axis=0)
@@ -122,7 +122,7 @@ def find_recalibration(
     gain, rest = np.ones_like(log_gain), reference.scale.baseline
     replaced, moved = [], np.zeros_like(offset)
     for pad, on in enumerate(fit.pads):
-        hidden = lain_on[on].any() and not _independent(offset, on & ~lain_on, layout)
+        hidden = statically_loaded[on].any() and not _independent(offset, on & ~statically_loaded, layout)
         if _certain(gained[best[pad], pad]) and not hidden:
             replaced.append(pad)
             gain[on] = np.exp(log_gain[on]) if best[pad] == 0 else 1.0

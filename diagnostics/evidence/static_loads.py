@@ -116,7 +116,8 @@ def find_static_loads(
     values = HeldValues.of(scale.baseline + root**2 * scale.full_scale, scale, tolerance)
     # A healthy cell that contacts load without a pause does not return to the same load.
     again = np.maximum(returns - 1, 0) * -np.log(_RETURNS)
-    surprisal = np.maximum(spatial.surprisal + spatial.offset + np.maximum(spatial.gain, 0.0), again)
+    evidence = spatial.surprisal + spatial.offset + np.maximum(spatial.gain, 0.0)
+    surprisal = np.maximum(evidence, again)
     full, blamed = np.isinf(values.high), faulty & (root > 0)
 
     def explains(cells: Mask) -> bool:
@@ -145,7 +146,7 @@ def find_static_loads(
         stuck = np.empty(len(root))
         for alike, share, width in alternatives:
             stuck[alike] = max(EXPECTED * share, (blamed & alike & ~group).sum() / present.sum()) * width
-        otherwise = np.logaddexp(np.log(stuck), -surprisal)
+        otherwise = np.logaddexp(np.log(stuck), -evidence)
         expected = np.log(_EXPECTED_OBJECTS / present.sum())
         if own:
             expected = logit(min(*(load.probability for load in own), _CERTAIN))

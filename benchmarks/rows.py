@@ -529,7 +529,7 @@ def specimen(bench: Bench) -> Iterator[Count]:
         order = rng.permutation(bench.rest)
         new, test = order[:SPECIMEN], order[SPECIMEN:]
         faulty = np.zeros(layout.n_cells, bool)
-        statically_loaded = fitted.diagnose([seen[i] for i in new]).statically_loaded.mask
+        under = fitted.diagnose([seen[i] for i in new]).statically_loaded.mask
         assert fitted.reference_ is not None
         found = find_recalibration(
             [seen[i] for i in new], reference, fitted.reference_, layout, faulty, statically_loaded

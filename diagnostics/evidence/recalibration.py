@@ -100,7 +100,7 @@ def find_recalibration(
         reference: fitted to them.
         layout: the array.
         excluded: bool ``[D]``, cells that are faulty.
-        statically_loaded: bool ``[D]``, cells that seem to lie under an object. Its pad was replaced only if the other cells read
+        statically_loaded: bool ``[D]``, cells under an object. Its pad was replaced only if the other cells read
             otherwise too, with offsets that are independent of each other: those at the edge of an object are not.
     """
     used = layout.present.ravel() & ~excluded & (reference.dead == 0)

@@ -531,9 +531,7 @@ def specimen(bench: Bench) -> Iterator[Count]:
         faulty = np.zeros(layout.n_cells, bool)
         under = fitted.diagnose([seen[i] for i in new]).statically_loaded.mask
         assert fitted.reference_ is not None
-        found = find_recalibration(
-            [seen[i] for i in new], reference, fitted.reference_, layout, faulty, statically_loaded
-        )
+        found = find_recalibration([seen[i] for i in new], reference, fitted.reference_, layout, faulty, under)
         told += found is not None and set(found.pads) == set(pad_of[on].tolist())
         given = {"earlier": frames, "new": seen, "recalibrated": seen}
         if found is not None:

@@ -5,8 +5,8 @@ Needs numpy, scipy, statsmodels and scikit-learn; never torch, so that a robot c
 
 from diagnostics.decision.coverage import Coverage
 from diagnostics.decision.result import Diagnosis, Verdict
+from diagnostics.decision.static_loads import StaticLoad
 from diagnostics.diagnosis import SelfDiagnosis
-from diagnostics.evidence.static_loads import StaticLoad
 from diagnostics.faults import Fault, FaultKind, FaultSet
 from diagnostics.layout import Line, SensorLayout
 from diagnostics.monitor import Monitor

@@ -16,10 +16,10 @@ from diagnostics.decision.line_cover import candidate_groups
 from diagnostics.decision.result import Diagnosis
 from diagnostics.decision.root_causes import CellFindings, root_causes
 from diagnostics.decision.serialization import Arrays, from_state, to_state
+from diagnostics.decision.static_loads import StaticLoad, find_static_loads
 from diagnostics.evidence.reference import Reference, highest_reading, living, tolerance_of
 from diagnostics.evidence.rewiring import Rewiring, find_rewiring
 from diagnostics.evidence.spatial import Exclusion, Spatial
-from diagnostics.evidence.static_loads import StaticLoad, find_static_loads
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout

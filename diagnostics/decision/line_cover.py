@@ -39,7 +39,7 @@ _TESTED = 0.3  # log ratio of a tested cell
 _CORRELATION, _MAX_CORRELATION = 0.0125, 0.3  # rho per cell on the line (long lines run along edges), and at most
 _MIN_RATIO = -1.0  # log ratio that one uncertain cell can bring against its wire
 _UNCERTAIN_COST = np.log(10.0)  # more, where no cell on the wire is certain: at the edge of a contact errors are common
-_PROVEN = np.log(9.0)  # log odds from which on a wire is reported: single cells are the safer answer
+PROVEN = np.log(9.0)  # log odds from which on a wire is reported: single cells are the safer answer
 _ROUNDS = 5  # of re-estimating q, at most: a size
 # Wires that may be broken; address wires: see ``address_aliasing``.
 _WIRES = "row", "column", "converter", "position", "bus", "group"
@@ -272,7 +272,7 @@ def _cheapest(
     faulty: NDArray[np.bool_],
     support: NDArray[np.float64],
     cell_cost: float,
-    least: float = _PROVEN,
+    least: float = PROVEN,
 ) -> list[_Candidate]:
     """Return the wires of the cover of least cost, with log odds above ``least``."""
     # A wire that costs more than it can save is in no optimal cover.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.decision.coverage import Coverage, coverage
-from diagnostics.evidence.static_loads import StaticLoad
+from diagnostics.decision.static_loads import StaticLoad
 from diagnostics.faults import Fault, FaultKind, FaultSet
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.transport import TransportFault

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.special import expit, logit
 
 from diagnostics.decision.coverage import where
+from diagnostics.decision.line_cover import PROVEN
 from diagnostics.evidence.conditional_test import ANYWHERE, EXPECTED, HeldValues
 from diagnostics.preprocessing.scale import SLIGHT
 
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from diagnostics.evidence.stream_state import StreamState
     from diagnostics.layout import SensorLayout
 
+_FEWEST = 3  # cells of an object
 _EXPECTED_OBJECTS = 0.1  # prior probability of an object in a log
 _ANY_SHAPE = 0.05  # share of objects of a shape and load that the healthy model does not know
 _RETURNS = 0.1  # probability that a healthy cell returns to the same load, other than none
@@ -134,7 +136,7 @@ def find_static_loads(
     wires = _on_broken_wires(blamed & spatial.scored, stream)
     holding = lies | ((surprisal > -np.log(_RETURNS)) & (root > 0) & ~wires)
     groups = [_mask(group, len(root)) for group in _groups(holding, stream.layout)]
-    new = [group for group in groups if group.sum() > 1 and explains(group)]
+    new = [group for group in groups if group.sum() >= _FEWEST and explains(group)]
     found = [load for load in known if not any(group[list(load.cells)].any() for group in new)]
     if not new:
         return found
@@ -152,7 +154,7 @@ def find_static_loads(
             expected = logit(min(*(load.probability for load in own), _CERTAIN))
         first = [cell for load in own for cell in load.cells]
         cells, odds = chain.most_likely(group, otherwise, supported, first, float(expected))
-        if own or (odds > 0 and explains(_mask(cells, len(root)))):
+        if own or (odds > PROVEN and len(cells) >= _FEWEST and explains(_mask(cells, len(root)))):
             found.append(StaticLoad.on(cells, float(expit(odds)), int(np.median(since[cells])), stream.layout))
     return found
 
@@ -173,6 +175,8 @@ def _held(stream: StreamState, spatial: Spatial) -> tuple[Floats, Cells, Cells]:
     value = np.minimum(np.nan_to_num(runs.value), scale.baseline + scale.full_scale)
     root = np.where(spatial.scored, scale.root_load(value), least)
     since = np.where(spatial.scored, np.where(least > 0, np.minimum(runs.start, since), runs.start), since)
+    events = stream.events.kept
+    root[since >= (events[-1].first if events else 0)] = 0.0  # the load of the last contact, which may still go on
     return root, since, returns
 
 

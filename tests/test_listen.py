@@ -383,12 +383,9 @@ def test_it_quits_while_10000_packets_a_second_arrive():
         (["--port", "0", "--record", "{tmp}/file/new"], "Not a directory"),
         (["--port", "0", "--host", "256.1.1.1", "--seconds", "1"], ""),
         (["--port", "0", "--ticks", "0"], "--ticks 0"),
-        (["--port", "0", "--ticks", "inf"], "--ticks inf"),
-        (["--port", "0", "--seconds", "nan"], "--seconds nan"),
         (["--port", "0", "--frames", "0"], "--frames 0"),
         (["--port", "0", "--record", ""], "--record '': name a folder"),
         (["", "--port", "0"], ": expected a bundle"),
-        (["--port", "0", "--rate", "-1"], "rate > 0"),
         (["--port", "0", "--layout", "{tmp}/gone.json"], "gone.json"),
     ],
 )

@@ -344,10 +344,11 @@ from types import SimpleNamespace
 import numpy as np
 from adaptfault import Predictor
 from adaptfault.models.store import ADAPTATION, read_manifest
-from diagnostics import SelfDiagnosis, SensorLayout
+from adaptfault.robot.versions import Version
+from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 folder = Path(sys.argv[1])
 layout = SensorLayout.from_dict(read_manifest(folder, ADAPTATION)["network"]["layout"])
-version = SimpleNamespace(number=1, folder=folder, source=np.arange(layout.n_cells))
+version = Version(1, folder, layout, (), 10, FaultSet((), layout.n_cells))
 predictor = Predictor(lambda: SimpleNamespace(
     layout=layout, class_names=(), pointer=folder, active=lambda: version, begin=lambda starter: version,
     diagnoser=lambda: SelfDiagnosis(layout),

@@ -158,13 +158,11 @@ def _change(
     from adaptfault.data.windows import recordings_of
     from diagnostics.evidence.sensor_change import find_change
 
-    if diagnosis.static_loads:  # an object changes the loads of cells beside it
-        return None
     if not isinstance(reference, list):
         reference = recordings_of(reference.parts.adapter().train, diagnosis.layout)
     load = diagnoser.load_
     new, old = (frames, reference) if load is None else ([*map(load.loads, frames)], [*map(load.loads, reference)])
-    return find_change(new, old, diagnosis.layout, diagnosis.fault_set)
+    return find_change(new, old, diagnosis.layout, diagnosis.fault_set | diagnosis.disturbed)
 
 
 def text_of(diagnosis: Diagnosis) -> str:

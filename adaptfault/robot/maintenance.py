@@ -273,9 +273,8 @@ class _Maintenance:
         from adaptfault.adaptation.result import Adaptation
 
         layout, load = self.bundle.layout, self.diagnoser.load_
-        if report.diagnosis is not None and report.diagnosis.static_loads:  # the object changes the loads beside it
-            return report
-        change = find_change(loads, reference, layout, report.fault_set)
+        disturbed = FaultSet((), layout.n_cells) if report.diagnosis is None else report.diagnosis.disturbed
+        change = find_change(loads, reference, layout, report.fault_set | disturbed)
         if change is None:
             return report
         gain, offset = change.of_cells(layout)

@@ -89,6 +89,12 @@ class Diagnosis:
         """The cells of all static loads: healthy as far as the log tells, but their readings are not of contact."""
         return FaultSet(tuple({c for load in self.static_loads for c in load.cells}), self.layout.n_cells)
 
+    @property
+    def disturbed(self) -> FaultSet:
+        """The statically loaded cells and those beside them, which the edge of an object may load."""
+        beside = self.layout.beside[list(self.statically_loaded)].ravel()
+        return self.statically_loaded | FaultSet(tuple(beside[beside >= 0].tolist()), self.layout.n_cells)
+
     def suspects(self, probability: float = 0.02) -> FaultSet:
         """Return F and every tested cell with at least this P(faulty): the cells that a classifier should ignore.
 

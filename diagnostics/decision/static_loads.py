@@ -114,12 +114,11 @@ def find_static_loads(
         return list(known)
     scale, tolerance, present = stream.scale, stream.reference.tolerance, stream.present
     root, since, returns = _held(stream, spatial)
-    root[excluded | ~present | (root**2 < SLIGHT)] = 0.0
+    root[excluded | ~present | (stream.reference.dead > 0) | (root**2 < SLIGHT)] = 0.0
     values = HeldValues.of(scale.baseline + root**2 * scale.full_scale, scale, tolerance)
     # A healthy cell that contacts load without a pause does not return to the same load.
     again = np.maximum(returns - 1, 0) * -np.log(_RETURNS)
-    evidence = spatial.surprisal + spatial.offset + np.maximum(spatial.gain, 0.0)
-    surprisal = np.maximum(evidence, again)
+    surprisal = np.maximum(spatial.surprisal + spatial.offset + np.maximum(spatial.gain, 0.0), again)
     full, blamed = np.isinf(values.high), faulty & (root > 0)
 
     def explains(cells: Mask) -> bool:
@@ -148,7 +147,7 @@ def find_static_loads(
         stuck = np.empty(len(root))
         for alike, share, width in alternatives:
             stuck[alike] = max(EXPECTED * share, (blamed & alike & ~group).sum() / present.sum()) * width
-        otherwise = np.logaddexp(np.log(stuck), -evidence)
+        otherwise = np.logaddexp(np.log(stuck), -surprisal)
         expected = np.log(_EXPECTED_OBJECTS / present.sum())
         if own:
             expected = logit(min(*(load.probability for load in own), _CERTAIN))

@@ -8,8 +8,10 @@ o_i follows from the least readings. log g_i is the mean of 2 log(y_e / m_e) ove
 its root load y_e and the mean m_e that the healthy model expects from the other cells; the readings are corrected and
 the means computed again, until they agree (Gauss-Seidel). Cells of one pad share a normal prior of log g, with mean and
 variance estimated from them (random-effects model, DerSimonian and Laird 1986), so that cells with few events take the
-gain of their pad. A pad is corrected only where that raises the pseudo-likelihood of recordings that the correction was
-not learned from, by more than four standard errors over these recordings.
+gain of their pad. A pad was replaced where its cells differ from each other: either half of the recordings gives them
+the same gains or offsets, with a standard deviation over the cells (the root of the covariance of the halves) of half
+of log 1.3 or 1 % of full scale. Another task changes the loads of all cells alike. The correction must also raise the
+pseudo-likelihood of recordings that it was not learned from, by more than four standard errors over these recordings.
 
 Not detected: other noise, other thresholds, and gains of cells that no event loads: these take the mean of their pad.
 """
@@ -23,10 +25,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.evidence.drift import GAIN
 from diagnostics.healthy.model import contact_events
 from diagnostics.healthy.prediction import OUTLIERS, log_student_t
 from diagnostics.preprocessing.baseline import LOW
 from diagnostics.preprocessing.readings import held
+from diagnostics.preprocessing.scale import SLIGHT
 
 if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
@@ -110,9 +114,10 @@ def find_recalibration(
         return None
     fit = _Fit(reference, layout, used, np.quantile(np.concatenate(old), LOW, axis=0))
     halves = new[::2], new[1::2]
-    gains = []  # of pseudo-likelihood in each recording, [recordings, with gains or without, pads]
+    gains, of_halves = [], []  # of pseudo-likelihood in each recording, [recordings, with gains or without, pads]
     for learned, other in (halves, halves[::-1]):
         log_gain, offset = fit.learned(learned)
+        of_halves.append((log_gain, offset))
         plain = fit.scores(other, 0 * log_gain, 0 * offset)
         clear = [on & ~statically_loaded for on in fit.pads]
         gains.append([[fit.scores(other, s * log_gain * on, offset * on) - plain for on in clear] for s in (1, 0)])
@@ -123,7 +128,11 @@ def find_recalibration(
     replaced, moved = [], np.zeros_like(offset)
     for pad, on in enumerate(fit.pads):
         hidden = statically_loaded[on].any() and not _independent(offset, on & ~statically_loaded, layout)
-        if _certain(gained[best[pad], pad]) and not hidden:
+        (gain_1, offset_1), (gain_2, offset_2) = of_halves
+        by_gain, by_offset = _common_spread(gain_1, gain_2, on & used), _common_spread(offset_1, offset_2, on & used)
+        # What is learned is shrunk: half of what matters is enough.
+        differ = by_gain >= np.log(GAIN) / 2 or by_offset >= SLIGHT / 2 * reference.scale.full_scale
+        if differ and _certain(gained[best[pad], pad]) and not hidden:
             replaced.append(pad)
             gain[on] = np.exp(log_gain[on]) if best[pad] == 0 else 1.0
             moved[on] = (rest + offset - gain * rest)[on]
@@ -148,6 +157,12 @@ def _independent(offset: Floats, on: Mask, layout: SensorLayout) -> bool:
     if len(a) < _FEWEST or not a.std() or not b.std():
         return False
     return bool(abs(np.corrcoef(a, b)[0, 1]) * np.sqrt(len(a)) < _ERRORS)
+
+
+def _common_spread(one: Floats, other: Floats, on: Mask) -> float:
+    """Return the standard deviation over some cells of what two estimates (``[D]``) have in common."""
+    covariance = np.mean((one[on] - one[on].mean()) * (other[on] - other[on].mean())) if on.any() else 0.0
+    return float(np.sqrt(max(covariance, 0.0)))
 
 
 def _certain(gained: Floats) -> bool:

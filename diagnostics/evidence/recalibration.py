@@ -10,7 +10,8 @@ the means computed again, until they agree (Gauss-Seidel). Cells of one pad shar
 variance estimated from them (random-effects model, DerSimonian and Laird 1986), so that cells with few events take the
 gain of their pad. A pad was replaced where its cells differ from each other: either half of the recordings gives them
 the same gains or offsets, with a standard deviation over the cells (the root of the covariance of the halves) of half
-of log 1.3 or 1 % of full scale. Another task changes the loads of all cells alike. The correction must also raise the
+of log 1.3 or 1 % of full scale. Another task changes the loads of all cells alike; a strap gives
+neighbours alike offsets, those of a new pad are independent. The correction must also raise the
 pseudo-likelihood of recordings that it was not learned from, by more than four standard errors over these recordings.
 
 Not detected: other noise, other thresholds, and gains of cells that no event loads: these take the mean of their pad.
@@ -105,7 +106,7 @@ def find_recalibration(
         layout: the array.
         excluded: bool ``[D]``, cells that are faulty.
         statically_loaded: bool ``[D]``, cells under an object. Its pad was replaced only if the other cells read
-            otherwise too, with offsets that are independent of each other: those at the edge of an object are not.
+            otherwise too.
     """
     used = layout.present.ravel() & ~excluded & (reference.dead == 0)
     new = [filled for r in recordings if (filled := _filled(r, reference)) is not None]
@@ -127,7 +128,9 @@ def find_recalibration(
     gain, rest = np.ones_like(log_gain), reference.scale.baseline
     replaced, moved = [], np.zeros_like(offset)
     for pad, on in enumerate(fit.pads):
-        hidden = statically_loaded[on].any() and not _independent(offset, on & ~statically_loaded, layout)
+        correlation, errors = _correlation(offset, on & ~statically_loaded, layout)
+        # A strap or an object loads neighbouring cells alike; what lies on few pairs of cells is not told from it.
+        hidden = correlation > _ERRORS * errors or (statically_loaded[on].any() and not np.isfinite(errors))
         (gain_1, offset_1), (gain_2, offset_2) = of_halves
         by_gain, by_offset = _common_spread(gain_1, gain_2, on & used), _common_spread(offset_1, offset_2, on & used)
         # What is learned is shrunk: half of what matters is enough.
@@ -139,8 +142,8 @@ def find_recalibration(
     return Recalibration(gain, moved, tuple(replaced), len(new)) if replaced else None
 
 
-def _independent(offset: Floats, on: Mask, layout: SensorLayout) -> bool:
-    """Return whether the offsets (``[D]``) of neighbouring cells of a pad (bool ``[D]``) are uncorrelated."""
+def _correlation(offset: Floats, on: Mask, layout: SensorLayout) -> tuple[float, float]:
+    """Return the correlation of the offsets (``[D]``) of neighbouring cells of a pad (bool ``[D]``), and its error."""
     values, known = layout.grid(offset), layout.grid(on)
     pairs = [
         np.stack([a[both], b[both]])
@@ -155,8 +158,8 @@ def _independent(offset: Floats, on: Mask, layout: SensorLayout) -> bool:
     ]
     a, b = np.concatenate(pairs, axis=1)
     if len(a) < _FEWEST or not a.std() or not b.std():
-        return False
-    return bool(abs(np.corrcoef(a, b)[0, 1]) * np.sqrt(len(a)) < _ERRORS)
+        return 0.0, np.inf
+    return float(np.corrcoef(a, b)[0, 1]), 1 / np.sqrt(len(a))
 
 
 def _common_spread(one: Floats, other: Floats, on: Mask) -> float:

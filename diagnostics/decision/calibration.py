@@ -73,6 +73,8 @@ class _Trial(NamedTuple):
 class Calibrator:
     """Calibrated log ratio of each kind of constant cell; the defaults are those of a cold start.
 
+    The default of kind 0 is fitted to simulated grasps and postures (``benchmarks/cold_calibration.py``).
+
     Kind 0 never moved in the log, kind 1 came to rest, kind 2 came to hold a load.
 
     Attributes:
@@ -82,8 +84,8 @@ class Calibrator:
         gains: factor on the evidence of a changed gain.
     """
 
-    offset: tuple[float, ...] = (0.0, -1.0, -1.0)
-    slope: tuple[float, ...] = (0.6, 0.6, 0.6)
+    offset: tuple[float, ...] = (-1.3, -1.0, -1.0)
+    slope: tuple[float, ...] = (1.0, 0.45, 0.45)
     temporal: tuple[float, ...] = (1.0, 0.5, 0.5)
     gains: float = 1.0
 

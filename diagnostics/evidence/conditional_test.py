@@ -5,7 +5,8 @@ Computes for event e and constant cell i the surprisal
     -w_e log P(cell i reads v_i throughout e | healthy, predictors)
 
 with weight w_e = 1 / (1 + 0.15 r_e), r_e earlier events that load the same cells (effective sample size, Kish 1965);
-w_e = 1 / (1 + r_e) where the model knows the surroundings of a cell only (cold start).
+Where the model knows the surroundings of a cell only (cold start), any two events share its errors: with u_e =
+1 / (1 + r_e), w_e = 2.2 u_e / (1 + 0.15 (sum u - 1)), the design effect of all events.
 P is the predicted probability of staying unloaded for a cell at its baseline, and of staying loaded near v_i for one
 that holds a load. In unusual events the model errs about many cells at once. So the log odds are averaged over powers
 0.25 to 1 (tempered likelihoods), weighted by how well they fit the moving cells of the same event; the spread of loads
@@ -38,7 +39,7 @@ _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 _FIT_WEIGHT = 0.5  # factor on the log likelihood of the moving cells: neighbours err together
 _PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit of the inflation
 _REPEATS, _THE_SAME = 0.15, 0.95  # correlation of events that load the same cells, and cosine of their mean loads
-_REPEATS_COLD = 1.0  # without a reference the same surroundings are predicted with the same error
+_COLD_SCALE = 2.2  # weight of a single event without a reference: benchmarks/cold_calibration.py
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -166,8 +167,10 @@ class ConditionalTest:
 
     def novelty(self, own: bool) -> Floats:
         """Return the weight w_e of each excerpt, ``[n, 1]``; ``own``: whether predictions are specific to each cell."""
-        novelty: Floats = 1 / (1 + (_REPEATS if own else _REPEATS_COLD) * self.repeats)
-        return novelty
+        if own:
+            return np.asarray(1 / (1 + _REPEATS * self.repeats))
+        distinct = 1 / (1 + self.repeats)
+        return np.asarray(_COLD_SCALE * distinct / (1 + _REPEATS * (distinct[self.begins].sum() - 1)))
 
     def summed(self, surprisal: Floats) -> Floats:
         """Return the evidence ``[D]`` of all events, earlier ones included."""

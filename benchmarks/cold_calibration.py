@@ -5,7 +5,8 @@ cells dead. For the cells that never moved and rest, a logistic regression with 
 
     log odds = a + b * surprisal + temporal
 
-b near 1 and a near ``Calibrator().offset[0]`` mean that the defaults are calibrated. Each kind of array counts alike.
+b near 1 and a near ``Calibrator.cold().offset[0]`` mean that a cold start is calibrated. Each kind of array counts
+alike.
 """
 
 from __future__ import annotations

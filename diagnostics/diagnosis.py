@@ -59,7 +59,7 @@ class SelfDiagnosis:
     """
 
     reference_: Reference | None = None
-    calibrator_: Calibrator = Calibrator()
+    calibrator_: Calibrator = Calibrator.cold()
 
     def __init__(self, layout: SensorLayout, *, false_discovery_rate: float = 0.006) -> None:
         self.layout = layout
@@ -81,7 +81,7 @@ class SelfDiagnosis:
         if unknown := sorted(set(params) - set(known)):
             raise ValueError(f"SelfDiagnosis has no parameter {unknown[0]!r}: use {' or '.join(known)}")
         SelfDiagnosis.__init__(self, **(known | params))
-        self.reference_, self.calibrator_ = None, Calibrator()
+        self.reference_, self.calibrator_ = None, Calibrator.cold()
         return self
 
     def __sklearn_is_fitted__(self) -> bool:

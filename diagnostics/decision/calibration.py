@@ -71,9 +71,7 @@ class _Trial(NamedTuple):
 
 @dataclass(frozen=True)
 class Calibrator:
-    """Calibrated log ratio of each kind of constant cell; the defaults are those of a cold start.
-
-    The default of kind 0 is fitted to simulated grasps and postures (``benchmarks/cold_calibration.py``).
+    """Calibrated log ratio of each kind of constant cell; the defaults are those of too few recordings to fit any.
 
     Kind 0 never moved in the log, kind 1 came to rest, kind 2 came to hold a load.
 
@@ -84,10 +82,18 @@ class Calibrator:
         gains: factor on the evidence of a changed gain.
     """
 
-    offset: tuple[float, ...] = (-1.3, -1.0, -1.0)
-    slope: tuple[float, ...] = (1.0, 0.45, 0.45)
+    offset: tuple[float, ...] = (0.0, -1.0, -1.0)
+    slope: tuple[float, ...] = (0.6, 0.6, 0.6)
     temporal: tuple[float, ...] = (1.0, 0.5, 0.5)
     gains: float = 1.0
+
+    @classmethod
+    def cold(cls) -> Calibrator:
+        """Return the calibration of a cold start; kind 3 never moved and holds a load.
+
+        That of kind 0 is fitted to simulated grasps and postures (``benchmarks/cold_calibration.py``).
+        """
+        return cls((-1.3, -1.0, -1.0, 0.0), (1.0, 0.45, 0.6, 0.6), (1.0, 0.5, 0.5, 1.0))
 
     @classmethod
     def fit(
@@ -156,6 +162,7 @@ class Calibrator:
         """Fit to simulated logs; a kind with too few broken or healthy cells keeps the defaults."""
         *measured, gain = zip(*trials, strict=True)
         kind, ratio, temporal, dead = (np.concatenate(column) for column in measured)
+        kind = np.where(kind == 3, 0, kind)
         evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
         default = cls()
         found = list(zip(default.offset, default.slope, default.temporal, strict=True))
@@ -183,7 +190,8 @@ class Calibrator:
             temporal: float ``[D]``, temporal log likelihood ratio.
             kind: int ``[D]``, see the class.
         """
-        offset, slope, share = (np.array(of)[kind] for of in (self.offset, self.slope, self.temporal))
+        known = np.where(kind < len(self.slope), kind, 0)
+        offset, slope, share = (np.array(of)[known] for of in (self.offset, self.slope, self.temporal))
         log_ratio: Floats = offset + slope * np.clip(ratio, -_MAX_RATIO, _MAX_RATIO) + share * temporal
         return log_ratio
 
@@ -196,7 +204,7 @@ class Calibrator:
             scored: bool ``[D]``, constant cells; the others move and get log odds -10.
         """
         probability = np.full(len(log_ratio), float(expit(_MOVING_ODDS)))
-        began = kind > 0  # its run within the log
+        began = (kind == 1) | (kind == 2)  # its run within the log
         late, early = scored & began, scored & ~began
         probability[late] = _posterior(log_ratio[late], _EXPECTED_LATE, _EXPECTED_CELLS_LATE)
         # Cells that never moved failed before the log, or in it at the same rate as cells that moved.
@@ -250,7 +258,8 @@ def _excerpt(recording: Floats, rng: np.random.Generator) -> Floats:
 
 def kinds(stream: StreamState) -> NDArray[np.intp]:
     """Return the kind of each cell, ``[D]``, see :class:`Calibrator`."""
-    return np.where(stream.runs.moved, np.where(stream.rests(), 1, 2), 0)
+    rests = stream.rests()
+    return np.where(stream.runs.moved, np.where(rests, 1, 2), np.where(rests, 0, 3))
 
 
 def _trial(

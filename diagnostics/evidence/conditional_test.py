@@ -5,8 +5,8 @@ Computes for event e and constant cell i the surprisal
     -w_e log P(cell i reads v_i throughout e | healthy, predictors)
 
 with weight w_e = 1 / (1 + 0.15 r_e), r_e earlier events that load the same cells (effective sample size, Kish 1965);
-Where the model knows the surroundings of a cell only (cold start), any two events share its errors: with u_e =
-1 / (1 + r_e), w_e = 2.2 u_e / (1 + 0.15 (sum u - 1)), the design effect of all events.
+Where the model knows the surroundings of a cell only (cold start), repeats tell nothing new: w_e = u_e = 1 / (1 + r_e);
+for a cell at rest w_e = 2.2 u_e / (1 + 0.15 (sum u - 1)), as any two events share the errors (design effect).
 P is the predicted probability of staying unloaded for a cell at its baseline, and of staying loaded near v_i for one
 that holds a load. In unusual events the model errs about many cells at once. So the log odds are averaged over powers
 0.25 to 1 (tempered likelihoods), weighted by how well they fit the moving cells of the same event; the spread of loads
@@ -162,15 +162,20 @@ class ConditionalTest:
         inflation = _inflation(expected, self.features, predictors)
         within = expected.within(self.values.low[held], self.values.high[held], held, inflation)
         likely[:, held] = expected.always[:, held] * within
-        surprisal = -self.novelty(expected.own) * np.log(np.maximum(likely, P_MIN))
+        surprisal = -self._weights(expected.own) * np.log(np.maximum(likely, P_MIN))
         return expected, np.where(self.counted, surprisal, 0.0)
 
     def novelty(self, own: bool) -> Floats:
         """Return the weight w_e of each excerpt, ``[n, 1]``; ``own``: whether predictions are specific to each cell."""
+        return np.asarray(1 / (1 + (_REPEATS if own else 1.0) * self.repeats))
+
+    def _weights(self, own: bool) -> Floats:
+        """Return the weight of each excerpt for each cell, ``[n, D]`` or ``[n, 1]``, see the module."""
+        weights = self.novelty(own)
         if own:
-            return np.asarray(1 / (1 + _REPEATS * self.repeats))
-        distinct = 1 / (1 + self.repeats)
-        return np.asarray(_COLD_SCALE * distinct / (1 + _REPEATS * (distinct[self.begins].sum() - 1)))
+            return weights
+        scale = _COLD_SCALE / (1 + _REPEATS * (weights[self.begins].sum() - 1))
+        return weights * np.where(self.values.rests, scale, 1.0)
 
     def summed(self, surprisal: Floats) -> Floats:
         """Return the evidence ``[D]`` of all events, earlier ones included."""

@@ -172,8 +172,9 @@ def _statistics(recordings: Iterable[NDArray[Any]], healthy: NDArray[np.intp]) -
         frames = np.asarray(recording)[:, healthy]
         frames = frames[:, ~np.isnan(frames).all(axis=0)] if len(frames) else frames
         if frames.size:
-            baseline = float(np.median(np.nanquantile(frames, LOW, axis=0)))
-            rows.append((baseline, float(np.nanquantile(frames, _HIGH)) - baseline))
+            quantile = np.nanquantile if np.isnan(frames).any() else np.quantile  # the latter is ten times as fast
+            baseline = float(np.median(quantile(frames, LOW, axis=0)))
+            rows.append((baseline, float(quantile(frames, _HIGH)) - baseline))
     return np.array(rows, dtype=np.float64).reshape(-1, 2)
 
 

@@ -494,7 +494,7 @@ def replaced(bench: Bench) -> Iterator[Count]:
     for _, log, rng in bench.logs(REPLACED):
         healthy += pad_change(log, reference, layout, cells) is not None
         pad, times = int(rng.integers(layout.pads)), rng.choice([0.5, 2.0])
-        on_it = np.arange(layout.n_cells) // (layout.n_cells // layout.pads) == pad
+        on_it = layout.pad_of == pad
         seen = [np.where(on_it, np.minimum(times * frames, layout.full_scale), frames) for frames in log]
         change = pad_change(seen, reference, layout, cells)
         told += change is not None and change.pad == pad
@@ -516,7 +516,7 @@ def specimen(bench: Bench) -> Iterator[Count]:
     layout, fitted, draws = bench.layout, bench.fitted, max(2, bench.count // 15)
     frames, labels = [np.asarray(f, dtype=np.float64) for f in bench.recordings.frames], bench.recordings.labels
     reference, full = [frames[i] for i in bench.reference], layout.full_scale
-    pad_of = np.arange(layout.n_cells) // (layout.n_cells // layout.pads)
+    pad_of = layout.pad_of
     trees = ExtraTreesClassifier(300, random_state=0).fit(summaries(reference), labels[bench.reference])
     told, blamed, right, of = 0, Counter(), Counter(), 0
     for draw in range(draws):

@@ -259,6 +259,11 @@ class SensorLayout:
             raise IndexError(f"{line} is not a wire of {self}") from None
 
     @cached_property
+    def pad_of(self) -> NDArray[np.intp]:
+        """The pad of each cell, int ``[D]``."""
+        return np.arange(self.n_cells) // (self.n_cells // self.pads)
+
+    @cached_property
     def beside(self) -> NDArray[np.intp]:
         """The eight neighbours of each cell on its pad, row by row, int ``[D, 8]``; -1: none."""
         index = np.full((self.pads, self.rows + 2, self.cols + 2), -1, dtype=np.intp)

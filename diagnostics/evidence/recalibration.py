@@ -74,8 +74,7 @@ class Recalibration:
 
     def on(self, layout: SensorLayout) -> Mask:
         """Return the cells of the replaced pads, bool ``[D]``."""
-        pad = np.arange(layout.n_cells) // (layout.n_cells // layout.pads)
-        return np.isin(pad, self.pads)
+        return np.isin(layout.pad_of, self.pads)
 
     def undo(self, frames: NDArray[Any], full_scale: float) -> NDArray[Any]:
         """Return frames ``[..., D]`` as the reference would read them, within 0 to ``full_scale``."""
@@ -192,9 +191,8 @@ class _Fit:
     @property
     def pads(self) -> list[Mask]:
         """The cells of each pad, bool ``[D]``."""
-        pad = np.arange(self.layout.n_cells) // (self.layout.n_cells // self.layout.pads)
         present = self.layout.present.ravel()
-        return [(pad == i) & present for i in range(self.layout.pads)]
+        return [(self.layout.pad_of == i) & present for i in range(self.layout.pads)]
 
     def learned(self, recordings: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Return log gain and offset of each cell, ``[D]``; the offset in the layout's unit, of the baseline."""

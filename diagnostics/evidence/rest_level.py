@@ -94,7 +94,7 @@ class RestLevel:
         anywhere = ANYWHERE * 2 * margin / layout.full_scale
         broken = (rail + anywhere / ((1 - ANYWHERE) / 2)) * np.where(exact, 1 - _DITHERS, _DITHERS)
         ratio[tested] = np.minimum(np.log(broken / healthy), np.where(rail, CERTAIN_RATIO, 0.0))
-        pad = np.arange(layout.n_cells) // (layout.n_cells // layout.pads)
+        pad = layout.pad_of
         unusual = np.bincount(pad, ratio > 0) > MAJORITY * np.bincount(pad, present)
         return np.where(unusual[pad], np.minimum(ratio, 0.0), ratio)
 

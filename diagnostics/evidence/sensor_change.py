@@ -56,7 +56,7 @@ class SensorChange:
 
     def of_cells(self, layout: SensorLayout) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return gain and offset of each cell, ``[D]`` each."""
-        has_changed = np.full(layout.n_cells, True) if self.pad is None else _pad_of(layout) == self.pad
+        has_changed = np.full(layout.n_cells, True) if self.pad is None else layout.pad_of == self.pad
         return np.where(has_changed, self.gain, 1.0), np.where(has_changed, self.offset, 0.0)
 
 
@@ -108,7 +108,7 @@ def pad_change(
 
     Of several pads that have changed, the one whose readings changed most is returned.
     """
-    pad_of = _pad_of(layout)[healthy]
+    pad_of = layout.pad_of[healthy]
     pads = np.unique(pad_of)
     if len(pads) < 2:
         return None
@@ -128,11 +128,6 @@ def pad_change(
     reason = f"pad {pad} changed: {_told(gain, offset, layout)}, compared with the other pads"
     advice = "if it was replaced, record healthy data with it and train anew"
     return SensorChange(gain, offset, new.shape[1], f"{reason}; {advice}", pad)
-
-
-def _pad_of(layout: SensorLayout) -> NDArray[np.intp]:
-    """Return the pad of each cell, int ``[D]``."""
-    return np.arange(layout.n_cells) // (layout.n_cells // layout.pads)
 
 
 def _told(gain: float, offset: float, layout: SensorLayout) -> str:

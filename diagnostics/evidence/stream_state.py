@@ -34,7 +34,7 @@ from diagnostics.evidence.spatial import (
     group_excluded_evidence,
     held_load_evidence,
 )
-from diagnostics.evidence.term import ConstantCells
+from diagnostics.evidence.term import ConstantCells, Term
 from diagnostics.evidence.weak_response import WeakResponse
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
 from diagnostics.preprocessing.offset import OffsetTracker
@@ -208,8 +208,9 @@ class StreamState:
         cells = ConstantCells(self.layout, reference.scale.full_scale, reference.tolerance, self.runs, rests, lower)
         if reference.model is None:
             return self._level.evidence(cells)
-        low, noise = reference.least.evidence(cells), reference.noise_loss.evidence(cells)
-        return reference.jumps_seen.evidence(cells) + np.where(np.abs(noise) > np.abs(low), noise, low)
+        terms: tuple[Term, ...] = reference.jumps_seen, reference.least, reference.noise_loss
+        jump, low, noise = (term.evidence(cells) for term in terms)
+        return jump + np.where(np.abs(noise) > np.abs(low), noise, low)
 
     def model_of(self, i: int, events: EventLog) -> Model:
         """Return the healthy model of tile i; without a reference, a model of its ``events``."""

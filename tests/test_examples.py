@@ -115,6 +115,21 @@ def test_the_example_runs_on_recordings(name: str, small_grasps: Recordings, tmp
     assert any(character.isdigit() for character in said)  # its figures
 
 
+@pytest.mark.parametrize("name", [path.stem for path in EXAMPLES if "__main__" in path.read_text()])
+def test_what_an_example_imports_is_there(name: str):
+    """Also of those that are slow: a move within the library breaks them first."""
+    spec = importlib.util.spec_from_file_location(f"example_{name}", HOME / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        del sys.modules[spec.name]
+    assert callable(module.main)
+
+
 def test_no_example_that_takes_recordings_is_left_out():
     takes = {path.name for path in EXAMPLES if 'argument("recording' in path.read_text() or "[REC" in path.read_text()}
     assert takes == set(ON_RECORDINGS)

@@ -23,13 +23,13 @@ from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.baseline import CERTAIN_RATIO
+from diagnostics.preprocessing.baseline import CERTAIN_RATIO, RARE
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
 
 SCHEMA = "adaptfault.diagnoser/10"
 
-_CERTAIN = 0.999  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
+_CERTAIN = 1 - RARE  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
 _GROUP_SHARE = 0.5  # share of the evidence added with a group excluded, see _weight_of_groups
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
 

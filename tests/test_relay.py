@@ -4,6 +4,7 @@ import json
 import socket
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from adaptfault.acquisition import FrameRepair, Relay, Station, format_packet, p
 from adaptfault.cli import main
 from adaptfault.data.calibration import Calibration
 from adaptfault.imputation.restorer import Restorer
+from adaptfault.robot.versions import Version
 from diagnostics import Fault, FaultSet, SensorLayout, inject
 
 LAYOUT = SensorLayout(1, 3, 4, full_scale=4000.0, unit="count", rate=100.0)
@@ -90,11 +92,29 @@ def test_restored_values_come_in_the_unit_of_the_sender(restorer, healthy, consu
     np.testing.assert_allclose(packet.values[list(DEAD)], healthy[0, list(DEAD)] * 65535 / 4000, atol=350)
 
 
+def version(about) -> Version:
+    return Version(2, Path("version-2"), LAYOUT, ("a", "b"), 10, DEAD, about)
+
+
+def test_cells_of_a_replaced_pad_are_sent_as_the_earlier_pad_would_have_read(restorer, healthy, consumer):
+    gain, offset = np.ones(12), np.zeros(12)
+    gain[[0, 6]], offset[[0, 2]] = 0.5, 8.0
+    relay = Relay(address(consumer), restorer, DEAD)
+    received = np.where(DEAD.mask, 0, healthy[5] * gain + offset)
+    relay.send("a", 0.0, received, received, version({"gain": gain.tolist(), "offset": offset.tolist()}))
+    data = consumer.recv(1 << 16)
+    relay.close()
+    packet = parse_packet(data, 12)
+    np.testing.assert_allclose(packet.values[DEAD.healthy], healthy[5, DEAD.healthy], atol=0.5)
+    assert np.abs(packet.values - healthy[5]).max() < 20
+    assert packet.restored == tuple(DEAD)  # the others were measured
+
+
 def test_exchanged_cells_are_put_back_before_cells_are_restored(restorer, healthy, consumer):
     source = np.array([3, 1, 2, 0, *range(4, 12)])
     relay = Relay(address(consumer), restorer, DEAD)
     received = np.where(DEAD.mask, 0, healthy[5])[source]  # 0 and 3 exchanged
-    relay.send("a", 0.0, received, received, source)
+    relay.send("a", 0.0, received, received, version({"source": source.tolist()}))
     packet = parse_packet(consumer.recv(1 << 16), 12)
     relay.close()
     np.testing.assert_array_equal(packet.values[DEAD.healthy], healthy[5, DEAD.healthy])

@@ -15,6 +15,7 @@ from diagnostics import FaultSet
 if TYPE_CHECKING:
     from adaptfault.data.calibration import Calibration
     from adaptfault.imputation.restorer import Restorer
+    from adaptfault.robot.versions import Version
 
 _DIGITS = 15  # every decimal number of so many digits is sent on as it came
 
@@ -121,27 +122,29 @@ class Relay:
         time: float,
         received: NDArray[np.float64],
         values: NDArray[np.float64],
-        source: NDArray[np.intp] | None = None,
+        version: Version | None = None,
     ) -> None:
-        """Send one frame on.
+        """Send one frame on, as the model of ``version`` reads it: wires put back, replaced pads recalibrated.
 
         Args:
             device: name of the sender.
             time: seconds.
             received: ``[D]`` as they came.
             values: ``[D]`` in the layout's unit; NaN = missing.
-            source: ``[D]``, the received cell that belongs at each place, where wires are exchanged; None: the same.
+            version: of the model that runs; None: readings are sent where they came from.
         """
-        source = np.arange(len(values)) if source is None else source
-        received, values = received[source], values[source]
+        source = np.arange(len(values)) if version is None else version.source
+        received, given = received[source], values[source]
+        values = given if version is None else version.undo(values)
+        recalibrated = np.isfinite(values) & (values != given)
         repair = self._repairs.setdefault(device, FrameRepair(self.restorer, self.known))
         frame, restored = repair(values)
         whole = self._whole.get(device, True) and not np.any(received[~restored] % 1)
         self._whole[device] = whole
-        if restored.any():
-            self.relayed.restored += 1
+        self.relayed.restored += bool(restored.any())
+        if (other := restored | recalibrated).any():
             back = frame if self.calibration is None else self._counts(frame, source)
-            received = np.where(restored, np.rint(back) if whole else back, received)
+            received = np.where(other, np.rint(back) if whole else back, received)
         data = format_packet(device, time, received, ticks=self.ticks, restored=restored, digits=_DIGITS)
         try:
             self._socket.sendto(data, self._to)

@@ -184,7 +184,7 @@ class Station:
         session = self._sessions.get(frame.device)
         watcher = self._first if session is None else session.watcher
         whole, _ = self._in_unit(frame)
-        self._relay.send(frame.device, frame.time, frame.values, whole.values, getattr(watcher, "source", None))
+        self._relay.send(frame.device, frame.time, frame.values, whole.values, getattr(watcher, "running", None))
 
     def _in_unit(self, frame: Frame) -> tuple[Frame, int]:
         """Return a frame in the unit of the layout, and how many of its readings are outside the range."""

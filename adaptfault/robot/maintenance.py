@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.data.windows import Windows
     from diagnostics import SensorLayout
-    from diagnostics.evidence.rewiring import Rewiring
 
 _CONTRADICTORY = 1.0  # residual variance ratio at which other cells predict no better than the mean
 _UNKNOWN = 3
@@ -151,15 +150,18 @@ class _Maintenance:
         rewiring = self.diagnoser.rewiring(frames)
         if rewiring is not None:
             frames = [rewiring.undo(recording) for recording in frames]
-            if not self.dry_run:
-                self.version = self._undone(rewiring)
+            readings = self.version.readings.items()
+            self._deploy_readings(
+                rewiring.reason, **{name: [of[i] for i in rewiring.source.tolist()] for name, of in readings}
+            )
         diagnosis = self.diagnoser.diagnose(frames)
         recalibration = None if rewiring is not None else self._recalibration(frames, diagnosis)
         if recalibration is not None:
             frames = [recalibration.undo(recording, bundle.layout.full_scale) for recording in frames]
             self.before = self.before.without(recalibration.on(bundle.layout))
-            if not self.dry_run:
-                self.version = self._recalibrated(recalibration)
+            gain = self.version.gain * recalibration.gain
+            offset = self.version.offset + self.version.gain * recalibration.offset
+            self._deploy_readings(recalibration.reason, gain=gain.tolist(), offset=offset.tolist())
             diagnosis = self.diagnoser.diagnose(frames)
         report = self._decide(diagnosis, frames, tuple(r.name for r in usable))
         loads, healthy = self._loads(frames)
@@ -185,21 +187,15 @@ class _Maintenance:
         """The adapter of the bundle, with the fault-free model and windows."""
         return self.bundle.parts.adapter()
 
+    @cached_property
+    def healthy(self) -> list[NDArray[np.float64]]:
+        """Healthy recordings of the bundle, ``[T, D]`` each."""
+        return recordings_of(self.adapter.train, self.bundle.layout)
+
     def _loads(self, frames: list[NDArray[np.float64]]) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
         """Return new recordings, and the healthy ones of the bundle, as loads, ``[T, D]`` each."""
-        load, healthy = self.diagnoser.load_, recordings_of(self.adapter.train, self.bundle.layout)
+        load, healthy = self.diagnoser.load_, self.healthy
         return (frames, healthy) if load is None else ([*map(load.loads, frames)], [*map(load.loads, healthy)])
-
-    def _undone(self, rewiring: Rewiring) -> Version:
-        """Deploy the running model as a version that puts the readings back."""
-        from adaptfault.adaptation.result import Adaptation
-
-        self.say(rewiring.reason)
-        readings = {name: [of[i] for i in rewiring.source.tolist()] for name, of in self.version.readings.items()}
-        about = {**self.version.about, "reason": rewiring.reason, **readings}
-        version = self.bundle.write_version(Adaptation.load(self.version.folder), about)
-        self.bundle.deploy(version.number)
-        return version
 
     def _recalibration(self, frames: list[NDArray[np.float64]], diagnosis: Diagnosis) -> Recalibration | None:
         """Return how replaced pads read; None where none is replaced."""
@@ -207,25 +203,19 @@ class _Maintenance:
             return None
         faulty = np.zeros(self.bundle.layout.n_cells, bool)
         faulty[[cell for f in diagnosis.faults if f.kind in _DEAD for cell in f.cells]] = True
-        healthy = recordings_of(self.adapter.train, self.bundle.layout)
-        return find_recalibration(
-            frames, healthy, self.diagnoser.reference_, self.bundle.layout, faulty, diagnosis.statically_loaded.mask
-        )
+        held = diagnosis.statically_loaded.mask
+        return find_recalibration(frames, self.healthy, self.diagnoser.reference_, self.bundle.layout, faulty, held)
 
-    def _recalibrated(self, recalibration: Recalibration) -> Version:
-        """Deploy the running model as a version that reads the replaced pads as the earlier ones."""
+    def _deploy_readings(self, reason: str, **readings: list[Any]) -> None:
+        """Deploy the running model as a version that puts the readings back; a dry run changes nothing."""
         from adaptfault.adaptation.result import Adaptation
 
-        self.say(recalibration.reason)
-        readings = {
-            **self.version.readings,
-            "gain": (self.version.gain * recalibration.gain).tolist(),
-            "offset": (self.version.offset + self.version.gain * recalibration.offset).tolist(),
-        }
-        about = {**self.version.about, "reason": recalibration.reason, **readings}
-        version = self.bundle.write_version(Adaptation.load(self.version.folder), about)
-        self.bundle.deploy(version.number)
-        return version
+        if self.dry_run:
+            return
+        self.say(reason)
+        about = {**self.version.about, "reason": reason, **self.version.readings, **readings}
+        self.version = self.bundle.write_version(Adaptation.load(self.version.folder), about)
+        self.bundle.deploy(self.version.number)
 
     def _with_new_readings(self, report: MaintenanceReport, reason: str, **found: Any) -> MaintenanceReport:
         """Return the report with changed wires or replaced pads, which a deployed version undoes."""

@@ -133,9 +133,9 @@ class Predictor:
         return self._running.model.fault_set
 
     @property
-    def source(self) -> NDArray[np.intp]:
-        """The received cell that belongs at each place ``[D]``: the running version puts exchanged wires back."""
-        return self._running.version.source
+    def running(self) -> Version:
+        """The running version: its model, and how readings reach it (``Version.undo``)."""
+        return self._running.version
 
     @property
     def version(self) -> int:

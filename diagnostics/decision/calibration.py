@@ -46,7 +46,6 @@ _PIECE = 100  # frames of a piece, at least
 _REFERENCE_TIME = 50  # of fitting a reference, in diagnoses of a simulated log; for the progress only
 _MOST_FRAMES = 600  # of a recording in one simulated log: a size
 _TRAINING_SHARE = 0.75  # of the recordings; the others make the simulated logs
-_MOST_TEMPORAL = 1.0  # upper limit of d: a jump alone proves no fault
 _SUSPICIOUS = 2.8  # calibrated log ratio from which on a cell is excluded from the predictors
 _SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw log ratio at that point
 _MAX_DISCOUNT, _HALF_DISCOUNT = 0.5, 22.0  # of the slopes; recordings held out that halve it (one split)
@@ -245,7 +244,7 @@ def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) ->
         value = np.logaddexp(0, odds).sum() - odds[dead].sum() + 0.5 * (weights[1:] @ weights[1:]) / _PRIOR_VARIANCE
         return float(value), x.T @ residual + np.array([0, *weights[1:]]) / _PRIOR_VARIANCE
 
-    bounds = [(None, 0.0), (0.0, None), (0.0, _MOST_TEMPORAL)]
+    bounds = [(None, 0.0), (0.0, None), (0.0, 1.0)]  # a jump alone proves no fault
     offset, slope, temporal = minimize(loss, [0.0, 1.0, 0.5], jac=True, bounds=bounds).x.tolist()
     return offset, slope, temporal
 

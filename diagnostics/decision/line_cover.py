@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from diagnostics.layout import Line, SensorLayout
+from diagnostics.preprocessing.baseline import RARE
 
 _LINE_COST = np.log(200.0)  # prior: one wire in 200
 _CUT_COST = np.log(2.0)  # prior: a break in the middle of a wire is half as likely
-_CONTRADICTION_COST = np.log(1000.0)  # one working cell in 1000 is wrongly called alive
 _MOST_CONTRADICTIONS = 1  # working cells on a wire that can still be broken
 _RAREST, _MOST_COMMON = 0.005, 0.5  # bounds on the prevalence q, which few cells cannot estimate
 _MIN_SUPPORT, _SUPPORT_SHARE = 2, 1 / 3  # supporting cells of a broken wire, and share of its tested cells
@@ -241,7 +241,7 @@ def _candidates(
     contradictions = int(contradicting[cells].sum())
     found = []
     if contradictions <= _MOST_CONTRADICTIONS and proven(cells):
-        found.append(_Candidate(line, cells, cost(cells) + _CONTRADICTION_COST * contradictions, True, len(cells)))
+        found.append(_Candidate(line, cells, cost(cells) + np.log(1 / RARE) * contradictions, True, len(cells)))
     for behind in _ends(line, cells, contradicting):  # from the first supporting cell on
         seen = np.flatnonzero(supporting[behind])
         if len(seen):

@@ -30,9 +30,8 @@ from diagnostics.evidence.intermittency import ALIKE, LONGEST_BLINK
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.baseline import LOW
 from diagnostics.preprocessing.readings import CELLS
-from diagnostics.preprocessing.scale import LIGHT, SLIGHT
+from diagnostics.preprocessing.scale import LEAST_LOADED, LIGHT, SLIGHT
 
-_QUARTER = 0.25  # quantile of the readings of a cell that agrees with the baseline where it rests
 _CONTACTS, _LOADED, _UNLOADED = 5, 20, 8  # contacts and frames without which a statistic is NaN
 
 Floats = NDArray[np.float64]
@@ -112,7 +111,7 @@ class _Measured:
             return cls(unknown, unknown, unknown, unknown, none, LIGHT * layout.full_scale)
         blocks = [slice(first, first + CELLS) for first in range(0, d, CELLS)]
         pooled = (np.concatenate([frames[:, block] for frames in recordings]) for block in blocks)
-        low, quarter = np.hstack([[_quantile(readings, share) for share in (LOW, _QUARTER)] for readings in pooled])
+        low, quarter = np.hstack([[_quantile(readings, share) for share in (LOW, LEAST_LOADED)] for readings in pooled])
         rests = quarter - low <= SLIGHT * layout.full_scale
         if reference is None:
             largest = max((float(np.fmax.reduce(frames - low, axis=None)) for frames in recordings), default=np.nan)

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-_CLEAR = 1.5  # times the lowest load of all cells
 _BLINK_RATE = 0.05  # blinks per loaded frame of a loose contact
 LONGEST_BLINK = 6  # frames
 _ON_ROW, _ON_COLUMN = [3, 4], [1, 6]  # neighbours on the same row and column, see SensorLayout.beside
@@ -240,7 +239,7 @@ def _measure(
     if np.isnan(x).any():
         x = np.nan_to_num(x)
     near, top = scale.near, scale.full_scale - scale.near
-    loaded = x > max(LIGHT * scale.full_scale, _CLEAR * lowest)
+    loaded = x > max(LIGHT * scale.full_scale, MARGIN * lowest)
     rests, full = x <= near, frames >= top
     moderate = loaded & ~full
 

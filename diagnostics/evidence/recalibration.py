@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from diagnostics.evidence.drift import GAIN
 from diagnostics.healthy.model import contact_events
 from diagnostics.healthy.prediction import OUTLIERS, log_student_t
-from diagnostics.preprocessing.baseline import LOW
+from diagnostics.preprocessing.baseline import LOW, MARGIN
 from diagnostics.preprocessing.readings import held
 from diagnostics.preprocessing.scale import SLIGHT
 
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 _FEWEST = 12  # recordings
 _ERRORS = 4.0  # standard errors of the gain in pseudo-likelihood
 _ROUNDS, _STEP = 4, 0.6  # of the correction; share of each correction that is applied: neighbours err together
-_LOADED = 1.5  # times the lowest root load that counts as loaded: expected in an event that shows the gain
 _LEAST_EVENTS = 3  # that show the gain of a cell
 _LEAST_VARIANCE = 0.02  # of 2 log(y / m) in one event: events of a log are similar
 _WIDE = 1.5  # standardised errors beyond this count less (Huber 1964)
@@ -244,7 +243,7 @@ class _Fit:
     def _ratios(self, features: Array, expected: Prediction) -> tuple[Floats, Floats]:
         """Return the mean of 2 log(y / m) of each cell, and its variance, ``[D]``; NaN: too few events."""
         load, spread = features[:, 1].astype(np.float64), np.nan_to_num(expected.spread, nan=np.inf)
-        shown = (features[:, 3] > 0.5) & (expected.mean > _LOADED * self.reference.scale.root_near)
+        shown = (features[:, 3] > 0.5) & (expected.mean > MARGIN * self.reference.scale.root_near)
         ratio = np.where(shown, 2 * np.log(np.maximum(load, 1e-6) / np.maximum(expected.mean, 1e-6)), 0.0)
         error = 2 * spread / np.maximum(expected.mean, 1e-6)
         plain = weight = np.where(shown & np.isfinite(spread), 1 / error**2, 0.0)

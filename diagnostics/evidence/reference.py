@@ -17,7 +17,7 @@ from diagnostics.evidence.lower_limit import LowerLimit
 from diagnostics.evidence.noise_loss import NoiseLoss
 from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
-from diagnostics.preprocessing.baseline import baseline
+from diagnostics.preprocessing.baseline import MARGIN, baseline
 from diagnostics.preprocessing.offset import ReferenceOffset
 from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks, spread
 from diagnostics.preprocessing.scale import Scale
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
 _TOLERANCE = 0.005  # of full scale: half the range of a stuck cell's reading, the dither of a converter
-_STEPS = 1.5  # and at least so many converter steps
 _DUPLICATES = 5  # coincidences that two healthy lines may have, in a cold start
 _MANY = 250  # recordings after which the largest count seen is the limit; one more for each halving
 
@@ -155,7 +154,7 @@ def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout
     steps = np.diff(np.unique(sample[np.isfinite(sample)]))
     steps = steps[steps > 1e-6 * layout.full_scale]  # smaller differences are rounding
     step = float(steps.min()) if len(steps) else 0.0
-    return max(_TOLERANCE * layout.full_scale, min(_STEPS * step, 2 * _TOLERANCE * layout.full_scale))
+    return max(_TOLERANCE * layout.full_scale, min(MARGIN * step, 2 * _TOLERANCE * layout.full_scale))
 
 
 def _usual_duplicates(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale) -> int:

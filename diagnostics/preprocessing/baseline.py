@@ -15,16 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.preprocessing.readings import CELLS, SEGMENT, RecordingBlocks
-from diagnostics.preprocessing.scale import LIGHT
+from diagnostics.preprocessing.scale import LEAST_LOADED, LIGHT
 
 LOW = 0.05  # quantile of all readings of a cell: its baseline
 _UNLOADED = 0.03  # quantile of the readings in one recording: its baseline there, unless loaded throughout
-_CALM = 0.25  # quantile of the noise over cells and recordings: loaded cells have more
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
 RARE = 0.001  # share of cells and recordings that is ignored
 FEWEST = 8  # recordings from which differences between recordings can be estimated
 MAJORITY = 0.5  # of recordings, frames or cells: what most do is usual
-MARGIN = 1.5  # times the most that healthy cells showed: what no healthy cell shows
+MARGIN = 1.5  # times a limit that healthy cells, or noise, reach: clearly above it
 CERTAIN_RATIO = 12.0  # log likelihood ratio fault : healthy of what only a fault explains
 
 Floats = NDArray[np.float64]
@@ -71,7 +70,7 @@ def baseline(recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance
         return Baseline(low, low, np.nan, last, peaks)
     offset = np.concatenate(offsets)
     light = offset[offset < LIGHT * full_scale]
-    noise = float(np.quantile(np.concatenate(curvatures), _CALM)) / (0.6745 * np.sqrt(6))
+    noise = float(np.quantile(np.concatenate(curvatures), LEAST_LOADED)) / (0.6745 * np.sqrt(6))
     highest = low + max(0.0, _highest(light) + _NOISE * noise - tolerance)
     return Baseline(low, highest, noise, last, peaks)
 

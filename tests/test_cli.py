@@ -92,7 +92,7 @@ def test_the_demo_runs_on_the_users_recordings_and_writes_a_report_that_needs_no
     assert html.count('src="data:image/png;base64,') == 2
     assert not re.search(r"(src|href)=.?(http|//|file)", html)
     result = json.loads((out / "result.json").read_text())
-    assert f"{100 * result['repaired']['accuracy']:.1f} %" in html
+    assert f"{100 * result['repaired']['accuracy']:.1f}%" in html
     assert sum(len(f["cells"]) for f in result["injected"]) == SMALL.cols + 3
     assert {f["kind"] for f in result["injected"]} == {"open", "short", "stuck"}
     assert not (out / "training.safetensors").exists()

@@ -260,7 +260,7 @@ def test_the_robot_with_the_least_accuracy_left_comes_first():
         outcome(r[3], exit_code=2, faulty=60, decision="refused", reason="no healthy cell is left"),
     )
     assert [o.robot.name for o in left.technician] == ["r3", "r1", "r0"]
-    assert "r1: 44 % of the accuracy is left; 5 of 60 cells are faulty" in str(left)
+    assert "r1: 44% of the accuracy is left; 5 of 60 cells are faulty" in str(left)
     assert "r3: no healthy cell is left" in str(left)
 
 

@@ -41,7 +41,7 @@ class WireCount:
 
     def __str__(self) -> str:
         robots = f"{self.robots} robot{'' if self.robots == 1 else 's'}"
-        return f"{self.wire} {self.kind}: {robots} ({100 * self.share:.1f} %), {self.cells} cells"
+        return f"{self.wire} {self.kind}: {robots} ({100 * self.share:.1f}%), {self.cells} cells"
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,7 @@ def _group(years: int, outcomes: list[Outcome]) -> AgeGroup:
 
 def _needy(o: Outcome) -> str:
     tags = f" [{', '.join(o.robot.tags)}]" if o.robot.tags else ""
-    left = f"{100 * o.kept:.0f} % of the accuracy is left" if o.accuracy is not None else o.reason
+    left = f"{100 * o.kept:.0f}% of the accuracy is left" if o.accuracy is not None else o.reason
     return f"{o.robot.name}{tags}: {left}; {o.faulty} of {o.cells} cells are faulty"
 
 

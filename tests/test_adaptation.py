@@ -317,7 +317,7 @@ def test_the_worst_wires_and_pads_are_listed_and_mapped(adapter, tmp_path):
     assert worst.pairs[0].fault_set == first.fault_set | second.fault_set
     stages = few.forecast(first.fault_set).stages
     assert first.expected.accuracy == max(stages[name].accuracy for name in ("fill", "head"))
-    assert f"  {first.expected}  {first.what}" in str(worst)
+    assert f"  {first.expected.likelihood:.3f}; {first.expected}  {first.what}" in str(worst)
     json.dumps(worst.to_dict(), allow_nan=False)
     worst.plot().savefig(tmp_path / "worst.png")
 

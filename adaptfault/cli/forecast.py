@@ -45,7 +45,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--among", type=int, default=5, metavar="N", help="forecast all pairs of the N worst wires (default 5)"
     )
-    parser.add_argument("--picture", metavar="PNG", help="with --worst: a map of the accuracy lost")
+    parser.add_argument("--picture", metavar="PNG", help="with --worst: a map of what each wire costs")
     add_device(parser)
     add_trust(parser)
     parser.set_defaults(run=run)

@@ -30,7 +30,7 @@ from diagnostics.evidence.spatial import Exclusion
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.calibration_subset import calibration_subset
-from diagnostics.preprocessing.baseline import FEWEST
+from diagnostics.preprocessing.baseline import FEWEST, SUSPICIOUS
 from diagnostics.simulation.injection import inject
 
 if TYPE_CHECKING:
@@ -39,21 +39,16 @@ if TYPE_CHECKING:
 _LOGS, _LOGS_OF_LARGE = 192, 32  # simulated logs: sizes; large arrays have more cells in each
 _LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
 _DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
-_FEWEST_CELLS = 10  # broken, and healthy, cells of a kind: with fewer it keeps the defaults
 _ENOUGH = 100  # recordings that are held out in all, over the splits
 _FEW = 32  # recordings: fewer are cut into pieces, so that one long recording can be split
 _PIECE = 100  # frames of a piece, at least
 _REFERENCE_TIME = 50  # of fitting a reference, in diagnoses of a simulated log; for the progress only
 _MOST_FRAMES = 600  # of a recording in one simulated log: a size
 _TRAINING_SHARE = 0.75  # of the recordings; the others make the simulated logs
-_SUSPICIOUS = 2.8  # calibrated log ratio from which on a cell is excluded from the predictors
-_SUSPICIOUS_BOUNDS = 1.0, 8.0  # of the raw log ratio at that point
 _MAX_DISCOUNT, _HALF_DISCOUNT = 0.5, 22.0  # of the slopes; recordings held out that halve it (one split)
 _PRIOR_VARIANCE = 10.0  # of the weights
 _CLIP = 6.0  # raw log ratios are clipped here for the fit: outliers must not steer the slope
-_MAX_RATIO = 24.0  # raw log ratios are clipped here
 _EXPECTED_LATE, _EXPECTED_CELLS_LATE = 0.005, 25.0  # prior share of cells that fail in the log, and its pseudo-count
-_MOVING_ODDS = -10.0  # log odds of a fault that holds one value, for a cell that moves
 
 Floats = NDArray[np.float64]
 
@@ -88,11 +83,11 @@ class Calibrator:
 
     @classmethod
     def cold(cls) -> Calibrator:
-        """Return the calibration of a cold start; kind 3 never moved and holds a load.
+        """Return the calibration of a cold start; kind 0 is fitted to simulated grasps and postures.
 
-        That of kind 0 is fitted to simulated grasps and postures (``benchmarks/cold_calibration.py``).
+        ``benchmarks/cold_calibration.py`` fits it.
         """
-        return cls((-1.3, -1.0, -1.0, 0.0), (1.0, 0.45, 0.6, 0.6), (1.0, 0.5, 0.5, 1.0))
+        return cls((-1.3, -1.0, -1.0), (1.0, 0.6, 0.6))
 
     @classmethod
     def fit(
@@ -161,13 +156,12 @@ class Calibrator:
         """Fit to simulated logs; a kind with too few broken or healthy cells keeps the defaults."""
         *measured, gain = zip(*trials, strict=True)
         kind, ratio, temporal, dead = (np.concatenate(column) for column in measured)
-        kind = np.where(kind == 3, 0, kind)
         evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
         default = cls()
         found = list(zip(default.offset, default.slope, default.temporal, strict=True))
         for k in range(len(found)):
             of, same_origin = kind == k, (kind > 0) == (k > 0)
-            if min(dead[of].sum(), (~dead[of]).sum()) >= _FEWEST_CELLS:
+            if min(dead[of].sum(), (~dead[of]).sum()) >= FEWEST:
                 base = float(logit(dead[same_origin].mean()))
                 fitted = _bounded_logistic(evidence[of], dead[of], base)
                 if fitted[1] > 0:
@@ -178,8 +172,7 @@ class Calibrator:
     @property
     def exclusion(self) -> Exclusion:
         """The raw log ratio from which on a cell is excluded from the predictors, and the factor of gains."""
-        threshold = (_SUSPICIOUS - self.offset[0]) / max(self.slope[0], 1e-9)
-        return Exclusion(float(np.clip(threshold, *_SUSPICIOUS_BOUNDS)), self.gains)
+        return Exclusion((SUSPICIOUS - self.offset[0]) / max(self.slope[0], 1e-9), self.gains)
 
     def calibrate(self, ratio: Floats, temporal: Floats, kind: NDArray[np.intp]) -> Floats:
         """Return the calibrated log likelihood ratio faulty : healthy, ``[D]``.
@@ -189,9 +182,8 @@ class Calibrator:
             temporal: float ``[D]``, temporal log likelihood ratio.
             kind: int ``[D]``, see the class.
         """
-        known = np.where(kind < len(self.slope), kind, 0)
-        offset, slope, share = (np.array(of)[known] for of in (self.offset, self.slope, self.temporal))
-        log_ratio: Floats = offset + slope * np.clip(ratio, -_MAX_RATIO, _MAX_RATIO) + share * temporal
+        offset, slope, share = (np.array(of)[kind] for of in (self.offset, self.slope, self.temporal))
+        log_ratio: Floats = offset + slope * ratio + share * temporal
         return log_ratio
 
     def probability(self, log_ratio: Floats, kind: NDArray[np.intp], scored: NDArray[np.bool_]) -> Floats:
@@ -200,10 +192,10 @@ class Calibrator:
         Args:
             log_ratio: float ``[D]``, calibrated log likelihood ratio.
             kind: int ``[D]``, see the class.
-            scored: bool ``[D]``, constant cells; the others move and get log odds -10.
+            scored: bool ``[D]``, constant cells; the others move: 0.
         """
-        probability = np.full(len(log_ratio), float(expit(_MOVING_ODDS)))
-        began = (kind == 1) | (kind == 2)  # its run within the log
+        probability = np.zeros(len(log_ratio))
+        began = kind > 0  # its run within the log
         late, early = scored & began, scored & ~began
         probability[late] = _posterior(log_ratio[late], _EXPECTED_LATE, _EXPECTED_CELLS_LATE)
         # Cells that never moved failed before the log, or in it at the same rate as cells that moved.
@@ -257,8 +249,7 @@ def _excerpt(recording: Floats, rng: np.random.Generator) -> Floats:
 
 def kinds(stream: StreamState) -> NDArray[np.intp]:
     """Return the kind of each cell, ``[D]``, see :class:`Calibrator`."""
-    rests = stream.rests()
-    return np.where(stream.runs.moved, np.where(rests, 1, 2), np.where(rests, 0, 3))
+    return np.where(stream.runs.moved, np.where(stream.rests(), 1, 2), 0)
 
 
 def _trial(

@@ -1,16 +1,15 @@
 """Line cover: the most probable set of broken wires and single faulty cells that explains the findings.
 
-Costs are negative log probabilities: log 200 for a broken wire, log 2 more if it is broken in its middle, -log q for a
-single fault of prevalence q, and log 1000 for each working cell on a broken wire. A cell that is not certainly faulty
-supports its wire with
+Costs are negative log probabilities: log 200 for a broken wire, -log q for a single fault of prevalence q, and log 1000
+for each working cell on a broken wire. A cell that is not certainly faulty supports its wire with
 
     c (w - log(1 - q + q exp w)),        c = 1 / (1 + rho (n - 1))
 
 the log ratio of "broken wire" against "single fault or none", where w is its log likelihood ratio and c discounts the
 correlation rho of the n uncertain cells on the wire (design effect, Kish 1965): neighbours at the edge of a contact err
 together. Minimum weight set cover, solved by enumeration or by ``scipy.optimize.milp``; q is re-estimated from the
-solution until it no longer changes. Wires with fewer than two tested cells are not found. Wires that are more likely
-broken than not, at odds below 9, are returned as possible: one more contact tells.
+solution until it no longer changes, between 1 in 200 and one half. Wires with fewer than two tested cells are not
+found. Wires that are more likely broken than not, at odds below 9, are returned as possible: one more contact tells.
 
 With declared wiring the wires are buses and nested groups (``SensorLayout.groups``), which are
 broken as a whole. Of those that explain the same cells the innermost is named.
@@ -26,18 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
+from diagnostics.evidence.conditional_test import TESTED
 from diagnostics.layout import Line, SensorLayout
-from diagnostics.preprocessing.baseline import RARE
+from diagnostics.preprocessing.baseline import MAJORITY, RARE, SUSPICIOUS
 
-_LINE_COST = np.log(200.0)  # prior: one wire in 200
-_CUT_COST = np.log(2.0)  # prior: a break in the middle of a wire is half as likely
+_LINE_COST = np.log(200.0)  # prior: one wire in 200; and the rarest single fault, which few cells cannot estimate
 _MOST_CONTRADICTIONS = 1  # working cells on a wire that can still be broken
-_RAREST, _MOST_COMMON = 0.005, 0.5  # bounds on the prevalence q, which few cells cannot estimate
-_MIN_SUPPORT, _SUPPORT_SHARE = 2, 1 / 3  # supporting cells of a broken wire, and share of its tested cells
-SUPPORTING = 2.5  # log ratio of a supporting cell
-_TESTED = 0.3  # log ratio of a tested cell
+_MIN_SUPPORT = 2  # supporting cells of a broken wire
 _CORRELATION, _MAX_CORRELATION = 0.0125, 0.3  # rho per cell on the line (long lines run along edges), and at most
-_MIN_RATIO = -1.0  # log ratio that one uncertain cell can bring against its wire
 _UNCERTAIN_COST = np.log(10.0)  # more, where no cell on the wire is certain: at the edge of a contact errors are common
 PROVEN = np.log(9.0)  # log odds from which on a wire is reported: single cells are the safer answer
 _ROUNDS = 5  # of re-estimating q, at most: a size
@@ -124,7 +119,7 @@ def candidate_groups(
         weight: float ``[D]``, an upper estimate of the log likelihood ratio.
         layout: the array.
     """
-    supporting, groups = consistent & (weight >= SUPPORTING), []
+    supporting, groups = consistent & (weight >= SUSPICIOUS), []
     pads = set(np.flatnonzero(layout.grid(supporting).sum(axis=(1, 2)) >= _MIN_SUPPORT).tolist())
     enough = bool(pads) if layout.is_matrix else supporting.sum() >= _MIN_SUPPORT
     for line in layout.lines if enough else ():
@@ -178,14 +173,14 @@ def _explain_pad(
     layout: SensorLayout,
     common: float,
 ) -> list[Cause]:
-    weight = np.where(consistent, np.maximum(weight, _MIN_RATIO), 0.0)
-    supporting = consistent & (faulty | (weight >= SUPPORTING))
-    tested_cells = consistent & (faulty | (weight > _TESTED))
+    weight = np.where(consistent, weight, 0.0)
+    supporting = consistent & (faulty | (weight >= SUSPICIOUS))
+    tested_cells = consistent & (faulty | (weight > TESTED))
     candidates = []
     lines = layout.lines if supporting.sum() >= 2 else ()
     for line in lines:
         if line.kind in _WIRES:
-            candidates += _candidates(line, layout.cells_on(line), contradicting, supporting, tested_cells, faulty)
+            candidates += _candidates(line, layout.cells_on(line), contradicting, supporting, faulty)
     if not layout.is_matrix:  # of groups that explain the same cells, the innermost: it comes first
         candidates = list({tuple(c.cells[supporting[c.cells]].tolist()): c for c in candidates[::-1]}.values())
     present = layout.present.ravel()
@@ -193,10 +188,11 @@ def _explain_pad(
     tested = int((contradicting & present).sum()) + len(found)
     chosen_wires: list[_Candidate] = []
     discount = _discount(candidates, tested_cells & ~faulty)
-    support, cell_cost = weight, float(-np.log(_RAREST))
+    support, cell_cost = weight, float(_LINE_COST)
     singles = 0
     for _ in range(_ROUNDS if candidates else 0):
-        cell_cost = float(-np.log(np.clip(max(singles / max(tested, 1), common), _RAREST, _MOST_COMMON)))
+        prevalence = np.clip(max(singles / max(tested, 1), common), np.exp(-_LINE_COST), MAJORITY)
+        cell_cost = float(-np.log(prevalence))
         support = discount * (weight - np.logaddexp(np.log1p(-np.exp(-cell_cost)), weight - cell_cost))
         chosen_wires = _cheapest(candidates, found, faulty, support, cell_cost)
         behind = np.zeros(layout.n_cells, bool)
@@ -227,13 +223,12 @@ def _candidates(
     cells: NDArray[np.intp],
     contradicting: NDArray[np.bool_],
     supporting: NDArray[np.bool_],
-    tested_cells: NDArray[np.bool_],
     faulty: NDArray[np.bool_],
 ) -> list[_Candidate]:
     """Return the wire broken as a whole, and in its middle with either end working, where enough cells support it."""
 
     def proven(behind: NDArray[np.intp]) -> bool:
-        return bool(supporting[behind].sum() >= max(_MIN_SUPPORT, _SUPPORT_SHARE * float(tested_cells[behind].sum())))
+        return bool(supporting[behind].sum() >= _MIN_SUPPORT)
 
     def cost(behind: NDArray[np.intp]) -> float:
         return float(_LINE_COST + (0.0 if faulty[behind].any() else _UNCERTAIN_COST))
@@ -247,7 +242,7 @@ def _candidates(
         if len(seen):
             dead = np.sort(behind[seen[0] :])
             if proven(dead):
-                found.append(_Candidate(line, dead, cost(dead) + _CUT_COST, False, len(cells)))
+                found.append(_Candidate(line, dead, cost(dead), False, len(cells)))
     return found
 
 

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.decision.line_cover import SUPPORTING, Cause, solve
+from diagnostics.decision.line_cover import Cause, solve
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, LineKind, SensorLayout
+from diagnostics.preprocessing.baseline import SUSPICIOUS
 from diagnostics.preprocessing.scale import SLIGHT
 from diagnostics.wiring import action, counted
 
@@ -104,7 +105,7 @@ def _causes(
         contradicting = found.alive | (found.faulty & ~consistent) | aliased
         if kind in (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK):
             # A cell that became constant before the wire broke does not contradict it.
-            leading = faulty if faulty.any() else consistent & (found.weight >= SUPPORTING)
+            leading = faulty if faulty.any() else consistent & (found.weight >= SUSPICIOUS)
             begun = int(np.median(found.since[leading])) if leading.any() else 0
             contradicting &= ~(consistent & ~faulty & (found.since <= begun) & (begun > 0))
             contradicting |= ~consistent & ~found.silent

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from diagnostics.evidence.conditional_test import (
     P_MIN,
     SUDDEN_JUMP,
+    TESTED,
     CellState,
     ConditionalTest,
     HeldValues,
@@ -34,14 +35,13 @@ from diagnostics.evidence.conditional_test import (
     Model,
 )
 from diagnostics.evidence.drift import drifting, gain_evidence, misleading, offset_evidence
+from diagnostics.preprocessing.baseline import SUSPICIOUS
 
 if TYPE_CHECKING:
     from diagnostics.events.contact_events import ContactEvent
     from diagnostics.healthy.prediction import Prediction
     from diagnostics.preprocessing.scale import Scale
 
-UNCALIBRATED = 3.0  # log evidence from which on a cell is no predictor, in a cold start and in tiles
-_TESTED = 0.5  # log evidence from which on an event counts as one that tested the cell
 _ONE_LOAD = 0.5  # correlation of the evidence that events elsewhere give about one held load
 _MOST_ROUNDS = 8  # of scoring and updating the predictors
 _MOST_DRIFTING = 16  # rounds of excluding drifting cells
@@ -57,7 +57,7 @@ class Exclusion(NamedTuple):
         gains: factor on the evidence of a changed gain, see :func:`~diagnostics.evidence.drift.gains_count`.
     """
 
-    threshold: float = UNCALIBRATED
+    threshold: float = SUSPICIOUS
     gains: float = 1.0
 
 
@@ -186,7 +186,7 @@ class SpatialTest:
             summed,
             self._initial,
             test.scored,
-            np.where(of_gain, gain.events, (surprisal > _TESTED).sum(axis=0)),
+            np.where(of_gain, gain.events, (surprisal > TESTED).sum(axis=0)),
             offset,
             gain.evidence,
             factor=np.where(of_gain, gain.factor, np.nan),

@@ -27,7 +27,6 @@ from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.evidence.rest_level import RestLevel
 from diagnostics.evidence.spatial import (
-    UNCALIBRATED,
     Exclusion,
     Spatial,
     SpatialTest,
@@ -37,6 +36,7 @@ from diagnostics.evidence.spatial import (
 from diagnostics.evidence.term import ConstantCells, Term
 from diagnostics.evidence.weak_response import WeakResponse
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
+from diagnostics.preprocessing.baseline import SUSPICIOUS
 from diagnostics.preprocessing.offset import OffsetTracker
 from diagnostics.preprocessing.readings import SEGMENT, held
 from diagnostics.preprocessing.rest_of_log import RestOfLog
@@ -107,7 +107,7 @@ class StreamState:
         every = tiles(layout) if model is None else tuple(Tile(r.inputs, r.outputs) for r in model.local_regressions)
         self.layout, self.reference = layout, reference
         self.tiled = len(every) > 1
-        self.exclusion = exclusion._replace(threshold=UNCALIBRATED) if self.tiled else exclusion
+        self.exclusion = exclusion._replace(threshold=SUSPICIOUS) if self.tiled else exclusion
         self.present = layout.present.ravel()
         self.order, self.load, self.below = order, load, np.zeros(layout.n_cells, bool)
         self.transport, self._patience = TransportState(), reference.repeats(layout)

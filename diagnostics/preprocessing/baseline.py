@@ -25,6 +25,7 @@ FEWEST = 8  # recordings from which differences between recordings can be estima
 MAJORITY = 0.5  # of recordings, frames or cells: what most do is usual
 MARGIN = 1.5  # times a limit that healthy cells, or noise, reach: clearly above it
 CERTAIN_RATIO = 12.0  # log likelihood ratio fault : healthy of what only a fault explains
+SUSPICIOUS = 3.0  # the same from which on a cell is no predictor, and supports a broken wire
 
 Floats = NDArray[np.float64]
 

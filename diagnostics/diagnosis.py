@@ -261,12 +261,14 @@ class SelfDiagnosis:
         working = np.empty_like(inferred)
         moved = bool((stream.runs.moved & stream.present).any())
         working[every] = ~inferred & (found.alive if moved else self.layout.present.ravel())
+        # Where cells moved, loads of a frozen frame come or go: other cells have another offset.
+        rest = np.maximum(scale.baseline, stream.lowest) if moved else scale.baseline
         return Diagnosis(
             layout=self.layout,
             faults=causes,
             probability=probability,
             tested=(found.alive & stream.touched[every]) | inferred,  # noise alone is no test
-            transport=stream.transport.faults(scale.baseline + scale.near, working, self.layout.rate, moved),
+            transport=stream.transport.faults(rest + scale.near, working, self.layout.rate, moved),
             evidence={
                 "spatial": (spatial.evidence + spatial.offset + spatial.gain)[every],
                 "temporal": np.where(spatial.scored, stream.temporal(), intermittency.blinking + intermittency.noisy)[

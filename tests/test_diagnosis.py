@@ -249,6 +249,11 @@ def test_a_stream_that_is_frozen_from_the_start_is_told_also_where_healthy_idle_
         assert diagnosis.exit_code == 1
 
 
+def test_idle_frames_of_a_sensor_with_another_offset_are_not_frozen(fitted, log):
+    shifted = [np.clip(frames + 1.5, 0.0, LAYOUT.full_scale) for frames in [np.zeros((400, 220)), *log]]
+    assert not fitted.diagnose(shifted).transport
+
+
 @pytest.mark.parametrize("cold", [False, True])
 def test_an_idle_pad_that_repeats_zeros_is_no_fault(fitted, log, cold: bool):
     diagnosis = (COLD if cold else fitted).diagnose([*log, np.zeros((2000, 220))])

@@ -228,9 +228,13 @@ class StreamState:
     def _scale_of_log(self, plain: Scale, frames: NDArray[np.float64]) -> Scale:
         """Return the scale of a cold start after ``frames``."""
         moved = self.runs.moved & self.received & self.present
-        lowest = self.reference.scale.baseline + self._offsets.lowest
-        self._rest = self._rest.extend(frames[:, moved], lowest[moved], plain.full_scale)
-        return self._rest.scale(plain, lowest, moved)
+        self._rest = self._rest.extend(frames[:, moved], self.lowest[moved], plain.full_scale)
+        return self._rest.scale(plain, self.lowest, moved)
+
+    @property
+    def lowest(self) -> NDArray[np.float64]:
+        """The lowest reading of each cell so far, ``[D]``; inf: none."""
+        return self.reference.scale.baseline + self._offsets.lowest
 
     def views(self, onset: int) -> Iterator[tuple[Array, Cells, Cells, Model]]:
         """Yield, for each tile, its events since frame ``onset`` as features ``[n, 4, k]``.

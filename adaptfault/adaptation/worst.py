@@ -80,7 +80,7 @@ class WorstFaults:
         return {"schema": SCHEMA, "layout": self.layout.to_dict(), "fault_free": asdict(self.fault_free), **kinds}
 
     def plot(self) -> Any:
-        """Draw what each cell costs with the worse of its two wires, as they are ordered; return the matplotlib figure."""
+        """Draw what each cell costs with the worse of its two wires; return the matplotlib figure."""
         from diagnostics.decision.plot import draw_forces, pads_figure
 
         lost = np.full(self.layout.n_cells, np.nan)

@@ -33,7 +33,6 @@ _GAIN = 7.0  # log evidence from which on a cell has another gain: three events
 _OFFSET = 9.5  # the same, of an offset: four events, as a reading may hold a residue of the last load
 _GAINS = np.array([0.1, 0.2, 0.35, 0.5, 2.0, 3.0])  # faulty gains: a grid
 GAIN = 1.3  # up or down: a smaller change is no fault, the mean may err by as much
-_LOADED = 2.0  # times the lowest root load that counts as loaded: expected in an event that tests the gain
 _FROM_START = 0.5  # prior that a wrong gain is wrong from the start of the log
 
 Floats = NDArray[np.float64]
@@ -86,7 +85,7 @@ def gain_evidence(
         counts: ``[n, 1]``, weight of each event, see :func:`gains_count`.
     """
     informative = (
-        moved & np.isfinite(expected.spread) & expected.own & (whole[:, 2] > 0) & (expected.mean > _LOADED * root_near)
+        moved & np.isfinite(expected.spread) & expected.own & (whole[:, 2] > 0) & (expected.mean > MARGIN * root_near)
     )
     n, d = informative.shape
     result = Gain(np.zeros(d), np.ones(d), np.zeros(d, np.intp), np.zeros(d, np.intp))

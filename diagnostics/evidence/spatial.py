@@ -43,8 +43,7 @@ if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Scale
 
 _ONE_LOAD = 0.5  # correlation of the evidence that events elsewhere give about one held load
-_MOST_ROUNDS = 8  # of scoring and updating the predictors
-_MOST_DRIFTING = 16  # rounds of excluding drifting cells
+_MOST_ROUNDS = 16  # of scoring and updating the predictors, and of excluding drifting cells: a size
 
 Floats = NDArray[np.float64]
 
@@ -194,7 +193,7 @@ class SpatialTest:
         )
         more = misleading(offset, gain.evidence, self._drifts)
         self._exclusions += 1
-        if not more.any() or self._exclusions >= _MOST_DRIFTING:
+        if not more.any() or self._exclusions >= _MOST_ROUNDS:
             return True
         self._drifts = self._drifts | more
         self._test = replace(test, eligible=test.eligible & ~more)

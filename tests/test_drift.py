@@ -63,7 +63,7 @@ def test_events_without_information_about_a_gain_do_not_count():
     unmoved = moved.copy()
     unmoved[:, 4] = False
     unknown = replace(expected, spread=np.where(one_has(0.0) == 0, np.nan, SPREAD))
-    faint = replace(expected, mean=np.minimum(expected.mean, 1.9 * NEAR))
+    faint = replace(expected, mean=np.minimum(expected.mean, 1.4 * NEAR))
     for result in (
         gain_evidence(unloaded, expected, moved, NEAR),
         gain_evidence(whole, expected, unmoved, NEAR),

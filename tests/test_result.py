@@ -51,7 +51,7 @@ def test_nothing_on_the_map_is_cut_off_or_covered(shape):
 def test_a_page_without_a_fault_says_how_many_cells_were_not_tested(tmp_path):
     page = write_diagnosis(tmp_path / "page.html", diagnosed(), name="log", reference=True).read_text()
     assert "No faulty cell was found. 6 cells were not tested: a fault there would not be found." in page
-    assert "<b>85 %</b><span>of the cells tested; 6 cells were not</span>" in page
+    assert "<b>85%</b><span>of the cells tested; 6 cells were not</span>" in page
 
 
 @pytest.mark.parametrize(

@@ -83,11 +83,11 @@ class Calibrator:
 
     @classmethod
     def cold(cls) -> Calibrator:
-        """Return the calibration of a cold start; kind 0 is fitted to simulated grasps and postures.
+        """Return the calibration of a cold start; kind 3 never moved and holds a load.
 
-        ``benchmarks/cold_calibration.py`` fits it.
+        That of kind 0 is fitted to simulated grasps and postures (``benchmarks/cold_calibration.py``).
         """
-        return cls((-1.3, -1.0, -1.0), (1.0, 0.6, 0.6))
+        return cls((-1.3, -1.0, -1.0, 0.0), (1.0, 0.6, 0.6, 0.6), (1.0, 0.5, 0.5, 1.0))
 
     @classmethod
     def fit(
@@ -157,6 +157,7 @@ class Calibrator:
         *measured, gain = zip(*trials, strict=True)
         kind, ratio, temporal, dead = (np.concatenate(column) for column in measured)
         evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
+        kind = np.where(kind == 3, 0, kind)
         default = cls()
         found = list(zip(default.offset, default.slope, default.temporal, strict=True))
         for k in range(len(found)):
@@ -182,7 +183,8 @@ class Calibrator:
             temporal: float ``[D]``, temporal log likelihood ratio.
             kind: int ``[D]``, see the class.
         """
-        offset, slope, share = (np.array(of)[kind] for of in (self.offset, self.slope, self.temporal))
+        known = np.where(kind < len(self.slope), kind, 0)
+        offset, slope, share = (np.array(of)[known] for of in (self.offset, self.slope, self.temporal))
         log_ratio: Floats = offset + slope * ratio + share * temporal
         return log_ratio
 
@@ -195,7 +197,7 @@ class Calibrator:
             scored: bool ``[D]``, constant cells; the others move: 0.
         """
         probability = np.zeros(len(log_ratio))
-        began = kind > 0  # its run within the log
+        began = (kind == 1) | (kind == 2)  # its run within the log
         late, early = scored & began, scored & ~began
         probability[late] = _posterior(log_ratio[late], _EXPECTED_LATE, _EXPECTED_CELLS_LATE)
         # Cells that never moved failed before the log, or in it at the same rate as cells that moved.
@@ -249,7 +251,8 @@ def _excerpt(recording: Floats, rng: np.random.Generator) -> Floats:
 
 def kinds(stream: StreamState) -> NDArray[np.intp]:
     """Return the kind of each cell, ``[D]``, see :class:`Calibrator`."""
-    return np.where(stream.runs.moved, np.where(stream.rests(), 1, 2), 0)
+    rests = stream.rests()
+    return np.where(stream.runs.moved, np.where(rests, 1, 2), np.where(rests, 0, 3))
 
 
 def _trial(

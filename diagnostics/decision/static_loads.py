@@ -112,71 +112,93 @@ def find_static_loads(
 
     if stream.reference.model is None or not faulty.any():
         return list(known)
-    scale, tolerance, present = stream.scale, stream.reference.tolerance, stream.present
-    root, since, returns = _held(stream, spatial)
-    root[excluded | ~present | (stream.reference.dead > 0) | (root**2 < SLIGHT)] = 0.0
-    values = HeldValues.of(scale.baseline + root**2 * scale.full_scale, scale, tolerance)
-    # A healthy cell that contacts load without a pause does not return to the same load.
-    again = np.maximum(returns - 1, 0) * -np.log(_RETURNS)
-    surprisal = np.maximum(spatial.surprisal + spatial.offset + np.maximum(spatial.gain, 0.0), again)
-    full, blamed = np.isinf(values.high), faulty & (root > 0)
+    held = _HeldLoads.of(stream, spatial, excluded)
+    blamed, loaded = faulty & (held.root > 0), _mask([cell for load in known for cell in load.cells], len(faulty))
+    wires = _on_broken_wires(blamed & spatial.scored, stream)
+    holding = loaded | ((held.surprisal > -np.log(_RETURNS)) & (held.root > 0) & ~wires)
 
     def explains(cells: Mask) -> bool:
         near = ndimage.binary_dilation(stream.layout.grid(cells), _ADJACENT).ravel() if beside else cells
         return bool((near & faulty).any())
 
-    anywhere = 4 * tolerance / scale.full_scale
-    alternatives = (
-        (full, (1 - ANYWHERE) / 2, 1.0),
-        (spatial.scored & ~full, ANYWHERE, anywhere),
-        (~spatial.scored & ~full, ANYWHERE, anywhere),
-    )
-    lies = _mask([cell for load in known for cell in load.cells], len(root))
-    wires = _on_broken_wires(blamed & spatial.scored, stream)
-    holding = lies | ((surprisal > -np.log(_RETURNS)) & (root > 0) & ~wires)
-    groups = [_mask(group, len(root)) for group in _groups(holding, stream.layout)]
+    groups = [_mask(group, len(faulty)) for group in _groups(holding, stream.layout)]
     new = [group for group in groups if group.sum() >= _FEWEST and explains(group)]
     found = [load for load in known if not any(group[list(load.cells)].any() for group in new)]
     if not new:
         return found
-    others = present & ~stream.suspected(spatial) & ~faulty & ~excluded & (root == 0)
-    chain = _Chain(stream, root, values, others)
+    others = stream.present & ~stream.suspected(spatial) & ~faulty & ~excluded & (held.root == 0)
+    chain = _Chain(stream, held.root, held.values, others)
     supported = chain.log_likely(np.flatnonzero(np.any(new, axis=0)))
     for group in new:
         own = [load for load in known if group[list(load.cells)].any()]
-        stuck = np.empty(len(root))
-        for alike, share, width in alternatives:
-            stuck[alike] = max(EXPECTED * share, (blamed & alike & ~group).sum() / present.sum()) * width
-        otherwise = np.logaddexp(np.log(stuck), -surprisal)
-        expected = np.log(_EXPECTED_OBJECTS / present.sum())
+        expected = np.log(_EXPECTED_OBJECTS / stream.present.sum())
         if own:
             expected = logit(min(*(load.probability for load in own), _CERTAIN))
         first = [cell for load in own for cell in load.cells]
+        otherwise = held.without_object(blamed & ~group)
         cells, odds = chain.most_likely(group, otherwise, supported, first, float(expected))
-        if own or (odds > PROVEN and len(cells) >= _FEWEST and explains(_mask(cells, len(root)))):
-            found.append(StaticLoad.on(cells, float(expit(odds)), int(np.median(since[cells])), stream.layout))
+        if own or (odds > PROVEN and len(cells) >= _FEWEST and explains(_mask(cells, len(faulty)))):
+            found.append(StaticLoad.on(cells, float(expit(odds)), int(np.median(held.since[cells])), stream.layout))
     return found
+
+
+@dataclass(frozen=True)
+class _HeldLoads:
+    """What each cell holds up to the end of the log, ``[D]`` each.
+
+    Attributes:
+        stream: the log.
+        root: float, root load; 0: none.
+        since: int, the frame since which it is held.
+        surprisal: float, -log P(these readings | healthy, no object).
+        values: the loads as values.
+        constant: bool, cells that do not move.
+    """
+
+    stream: StreamState
+    root: Floats
+    since: Cells
+    surprisal: Floats
+    values: HeldValues
+    constant: Mask
+
+    @classmethod
+    def of(cls, stream: StreamState, spatial: Spatial, excluded: Mask) -> _HeldLoads:
+        """Return the loads of a log; those of ``excluded`` cells (bool ``[D]``) do not count."""
+        scale, runs = stream.scale, stream.runs
+        least, since, returns = stream.least_loads()
+        value = np.minimum(np.nan_to_num(runs.value), scale.baseline + scale.full_scale)
+        root = np.where(spatial.scored, scale.root_load(value), least)
+        since = np.where(spatial.scored, np.where(least > 0, np.minimum(runs.start, since), runs.start), since)
+        events = stream.events.kept
+        root[since >= (events[-1].first if events else 0)] = 0.0  # the load of the last contact, which may still go on
+        root[excluded | ~stream.present | (stream.reference.dead > 0) | (root**2 < SLIGHT)] = 0.0
+        values = HeldValues.of(scale.baseline + root**2 * scale.full_scale, scale, stream.reference.tolerance)
+        # A healthy cell that contacts load without a pause does not return to the same load.
+        again = np.maximum(returns - 1, 0) * -np.log(_RETURNS)
+        surprisal = np.maximum(spatial.surprisal + spatial.offset + np.maximum(spatial.gain, 0.0), again)
+        return cls(stream, root, since, surprisal, values, spatial.scored)
+
+    def without_object(self, blamed: Mask) -> Floats:
+        """Return the log likelihood without an object, ``[D]``; ``blamed`` (bool ``[D]``) are the faults elsewhere."""
+        full, constant, present = np.isinf(self.values.high), self.constant, self.stream.present
+        anywhere = 4 * self.stream.reference.tolerance / self.stream.scale.full_scale
+        alternatives = (
+            (full, (1 - ANYWHERE) / 2, 1.0),
+            (constant & ~full, ANYWHERE, anywhere),
+            (~constant & ~full, ANYWHERE, anywhere),
+        )
+        stuck = np.empty(len(self.root))
+        for alike, share, width in alternatives:
+            stuck[alike] = max(EXPECTED * share, (blamed & alike).sum() / present.sum()) * width
+        log_likely: Floats = np.logaddexp(np.log(stuck), -self.surprisal)
+        return log_likely
 
 
 def _mask(cells: Cells | Sequence[int], n: int) -> Mask:
     on = np.zeros(n, bool)
     on[list(cells)] = True
     return on
-
-
-def _held(stream: StreamState, spatial: Spatial) -> tuple[Floats, Cells, Cells]:
-    """Return the root load that each cell holds up to the end of the log, 0: none, ``[D]``.
-
-    With it since which frame, and in how many events it returned to that load.
-    """
-    runs, scale = stream.runs, stream.scale
-    least, since, returns = stream.least_loads()
-    value = np.minimum(np.nan_to_num(runs.value), scale.baseline + scale.full_scale)
-    root = np.where(spatial.scored, scale.root_load(value), least)
-    since = np.where(spatial.scored, np.where(least > 0, np.minimum(runs.start, since), runs.start), since)
-    events = stream.events.kept
-    root[since >= (events[-1].first if events else 0)] = 0.0  # the load of the last contact, which may still go on
-    return root, since, returns
 
 
 def _on_broken_wires(blamed: Mask, stream: StreamState) -> Mask:

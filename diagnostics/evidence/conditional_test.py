@@ -9,7 +9,7 @@ Where the model knows the surroundings of a cell only (cold start), repeats tell
 for a cell at rest w_e = 2.2 u_e / (1 + 0.15 (sum u - 1)), as any two events share the errors (design effect).
 P is the predicted probability of staying unloaded for a cell at its baseline, and of staying loaded near v_i for one
 that holds a load. In unusual events the model errs about many cells at once. So the log odds are averaged over powers
-0.5 and 1 (tempered likelihoods), weighted by how well they fit the moving cells of the same event; the spread of loads
+0.25 to 1 (tempered likelihoods), weighted by how well they fit the moving cells of the same event; the spread of loads
 is inflated by their median error. Errors that no moving cell shows are not recognised.
 """
 
@@ -36,9 +36,9 @@ ANYWHERE = 0.2  # share of broken cells that stick at any value; the others stic
 P_MIN = 1e-4  # lower limit of P in one event: models err
 TESTED = 0.5  # log ratio from which on a cell was tested
 SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
-_POWERS = (0.5, 1.0)  # of the likelihood of the model, in one event
+_POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 _FIT_WEIGHT = 0.5  # factor on the log likelihood of the moving cells: neighbours err together
-_PRIOR_CELLS = 4  # pseudo-count of cells with a usual error
+_PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit: all cells may be dead
 _REPEATS, _THE_SAME = 0.15, 0.95  # correlation of events that load the same cells, and cosine of their mean loads
 _COLD_SCALE = 2.2  # weight of a single event without a reference: benchmarks/cold_calibration.py
 
@@ -202,7 +202,7 @@ def _excerpts(events: Sequence[ContactEvent], runs: ConstantRuns, scored: Mask) 
 
 
 def _inflation(expected: Prediction, features: Array, working: Mask) -> Floats:
-    """Return the factor on the spread in each excerpt, ``[n]``, 1 or more.
+    """Return the factor on the spread in each excerpt, ``[n]``, 1 to 4.
 
     The median error of the ``working`` cells (bool ``[D]``) relative to that of Student's t.
     """
@@ -212,7 +212,7 @@ def _inflation(expected: Prediction, features: Array, working: Mask) -> Floats:
     error = np.column_stack([np.where(loaded, error, np.inf), np.full((len(features), _PRIOR_CELLS), MEDIAN_ERROR)])
     middle = (loaded.sum(axis=1) + _PRIOR_CELLS) // 2
     half: Floats = np.sort(error, axis=1)[np.arange(len(features)), middle]
-    return np.maximum(half / MEDIAN_ERROR, 1.0)
+    return np.clip(half / MEDIAN_ERROR, 1.0, _MAX_INFLATION)
 
 
 def _tempered(never: Floats, unloaded: NDArray[np.bool_], working: NDArray[np.bool_]) -> Floats:

@@ -179,12 +179,19 @@ def test_every_frame_is_relayed_once_and_in_order_and_a_cell_that_breaks_is_rest
     broken = inject(frames, [Fault("short", broken_row.cells, onset=100)], layout)
     packets = [format_packet("a", i / layout.rate, frame) for i, frame in enumerate(broken)]
     packets[20:22] = [packets[21], packets[20], packets[20]]  # swapped, and one twice
-    port = free_port()
+    port, told, relay_found = free_port(), threading.Event(), Relay.found
+
+    def found(self, device, faulty) -> None:
+        relay_found(self, device, faulty)
+        if set(broken_row.cells) <= set(faulty):
+            told.set()
 
     def send() -> None:
         time.sleep(0.5)  # until the socket is bound
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
-            for data in packets:
+            for i, data in enumerate(packets):
+                if i == len(packets) - 100:  # the monitor comes after the relay, and may be slow
+                    told.wait(50)
                 line.sendto(data, ("127.0.0.1", port))
                 time.sleep(0.002)
 
@@ -198,6 +205,7 @@ def test_every_frame_is_relayed_once_and_in_order_and_a_cell_that_breaks_is_rest
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Station, "listen", listen_and_send)
+        patch.setattr(Relay, "found", found)
         assert main(["listen", str(bundle.path), *options, "--json", "--quiet"]) == 0
     sending.join()
     end = json.loads(capsys.readouterr().out.splitlines()[-1])

@@ -39,7 +39,7 @@ LONGEST_BLINK = 6  # frames
 _ON_ROW, _ON_COLUMN = [3, 4], [1, 6]  # neighbours on the same row and column, see SensorLayout.beside
 ALIKE = 0.3  # of a load: largest change during a blink; and of its change: a neighbour that changes as much shares it
 _NOISY_SHARE = 0.8  # share of the segments of a noisy cell above the limit
-_LEVELS = np.linspace(0, 0.8, 5)  # of the mean root load, bin edges: noise grows with load
+_LEVELS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8])  # of the mean root load, bin edges: noise grows with load
 _ALONE = 0.3  # share of the loaded cells that may be noisy together: with more the contact moves
 _THRESHOLD = 14.0  # of the CUSUM: a prior of one in a thousand, and P(faulty) = 0.999
 _MAX = 40.0  # upper limit of the CUSUM, so that a repaired cell is cleared soon

@@ -5,7 +5,7 @@ whenever it begins, and cleared when it has gone:
 
     S <- clip(S + c g, 0, 40),    faulty if S >= 14
     blinks:  g = n log(0.05 / r) - m (0.05 - r)         n blinks in m loaded frames, Poisson, healthy rate r
-    noise:   g = log(0.8 / 0.001) if noisier than the limit of its load, else log(0.2 / 0.999)       Bernoulli
+    noise:   g = log(0.8 / 0.002) if noisier than the limit of its load, else log(0.2 / 0.998)       Bernoulli
 
 A blink leaves a load in one step and returns to it in one step within 6 frames. The load must exceed 1.5 times the
 lowest load that any cell shows: where a threshold hides small loads, weak ones come and go in one step. Noise is the
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, segments
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.baseline import MARGIN, RARE
+from diagnostics.preprocessing.baseline import MARGIN
 from diagnostics.preprocessing.readings import SEGMENT
 from diagnostics.preprocessing.scale import LIGHT
 
@@ -38,9 +38,11 @@ _BLINK_RATE = 0.05  # blinks per loaded frame of a loose contact
 LONGEST_BLINK = 6  # frames
 _ON_ROW, _ON_COLUMN = [3, 4], [1, 6]  # neighbours on the same row and column, see SensorLayout.beside
 ALIKE = 0.3  # of a load: largest change during a blink; and of its change: a neighbour that changes as much shares it
+_RARE = 0.002  # healthy blinks per loaded frame, in a cold start; share of healthy segments above the limit of noise
 _NOISY_SHARE = 0.8  # share of the segments of a noisy cell above the limit
 _LEVELS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8])  # of the mean root load, bin edges: noise grows with load
 _ALONE = 0.3  # share of the loaded cells that may be noisy together: with more the contact moves
+_CROWD = 0.2  # the same, of all cells
 _THRESHOLD = 14.0  # of the CUSUM: a prior of one in a thousand, and P(faulty) = 0.999
 _MAX = 40.0  # upper limit of the CUSUM, so that a repaired cell is cleared soon
 _HEALTHY = 0.99  # quantile of the cells, of the largest CUSUM in the reference
@@ -94,11 +96,11 @@ class HealthyRates:
         limit = np.zeros(len(_LEVELS))
         for k, of_level in enumerate(noise):
             # One pseudo-sample with the noise of a cold start: rare noise is not seen in few samples.
-            limit[k] = np.quantile(np.concatenate([*of_level, [LIGHT]]), 1 - RARE)
+            limit[k] = np.quantile(np.concatenate([*of_level, [LIGHT]]), 1 - _RARE)
         # Readings within +- tolerance (near / 2) have second differences up to 2 near.
         limit = np.maximum.accumulate(np.maximum(limit, 2 * scale.near / scale.full_scale))
         # One pseudo-blink, in as many frames as it takes at the rate of a cold start.
-        usual = cls(max(0.1 * RARE, (blinks + 1) / (loaded + 1 / RARE)), limit, alone=alone, lowest=lowest)
+        usual = cls(max(0.1 * _RARE, (blinks + 1) / (loaded + 1 / _RARE)), limit, alone=alone, lowest=lowest)
         intermittency = Intermittency.begin(layout)
         reached = np.stack([intermittency.blinking, intermittency.noisy])
         for recording in recordings:
@@ -114,7 +116,7 @@ class HealthyRates:
     @classmethod
     def unknown(cls, scale: Scale) -> HealthyRates:
         """Return the rates of a cold start, at which only gross faults count."""
-        return cls(RARE, np.full(len(_LEVELS), LIGHT))
+        return cls(_RARE, np.full(len(_LEVELS), LIGHT))
 
 
 @dataclass(frozen=True)
@@ -182,10 +184,10 @@ class Intermittency:
         blinking = self.blinking.copy()
         blinking[moving] = np.clip(blinking[moving] + usual.blinks_count * gain, 0.0, full)
         noisier = self._noisier(noise_level, usual.noise[level], moving, usual.alone)
-        if noisier.sum() > crowd:
+        if noisier.sum() > max(crowd, _CROWD * len(constant)):
             noisier[:] = False
-        gain = np.where(events > 1, 0.0, np.log(_NOISY_SHARE / RARE))  # blinks are noise as well: count them once
-        noisy = self.noisy + usual.noise_counts * np.log((1 - _NOISY_SHARE) / (1 - RARE))
+        gain = np.where(events > 1, 0.0, np.log(_NOISY_SHARE / _RARE))  # blinks are noise as well: count them once
+        noisy = self.noisy + usual.noise_counts * np.log((1 - _NOISY_SHARE) / (1 - _RARE))
         noisy[moving] = np.where(noisier, self.noisy[moving] + usual.noise_counts * gain, noisy[moving])
         noisy = np.clip(noisy, 0.0, full)
         blinks, to_full = np.zeros(len(constant), np.intp), np.zeros(len(constant), np.intp)

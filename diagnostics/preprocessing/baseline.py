@@ -20,7 +20,7 @@ from diagnostics.preprocessing.scale import LEAST_LOADED, LIGHT
 LOW = 0.05  # quantile of all readings of a cell: its baseline
 _UNLOADED = 0.03  # quantile of the readings in one recording: its baseline there, unless loaded throughout
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
-RARE = 0.001  # share of cells, recordings or frames that is ignored: what healthy cells do as rarely is unusual
+RARE = 0.001  # share of cells and recordings that is ignored
 FEWEST = 8  # recordings from which differences between recordings can be estimated
 MAJORITY = 0.5  # of recordings, frames or cells: what most do is usual
 MARGIN = 1.5  # times a limit that healthy cells, or noise, reach: clearly above it

@@ -58,6 +58,11 @@ def fit(cells: list[np.ndarray]) -> tuple[float, float]:
     return a, b
 
 
+def show(name: str, cells: list[np.ndarray]) -> None:
+    a, b = fit(cells)
+    print(f"{name:28}{sum(map(len, cells)):7} cells: a = {a:.2f}, b = {b:.2f}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Fits the calibration of a cold start")
     parser.add_argument("--logs", type=int, default=24, help="of each array and split (default 24)")
@@ -68,10 +73,8 @@ def main() -> None:
         if array.name in options.arrays:
             cells = np.concatenate([cells_at_rest(array.bench(split, 0, options.logs)) for split in (0, 1)])
             every.append(cells)
-            print(
-                f"{array.name:28}{len(cells):7} cells: a = {fit([cells])[0]:.2f}, b = {fit([cells])[1]:.2f}", flush=True
-            )
-    print(f"{'all':28}{sum(map(len, every)):7} cells: a = {fit(every)[0]:.2f}, b = {fit(every)[1]:.2f}")
+            show(array.name, [cells])
+    show("all", every)
 
 
 if __name__ == "__main__":

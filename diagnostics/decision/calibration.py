@@ -156,8 +156,8 @@ class Calibrator:
         """Fit to simulated logs; a kind with too few broken or healthy cells keeps the defaults."""
         *measured, gain = zip(*trials, strict=True)
         kind, ratio, temporal, dead = (np.concatenate(column) for column in measured)
-        evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
         kind = np.where(kind == 3, 0, kind)
+        evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
         default = cls()
         found = list(zip(default.offset, default.slope, default.temporal, strict=True))
         for k in range(len(found)):

@@ -272,6 +272,19 @@ class SensorLayout:
         around = [index[:, down : down + self.rows, across : across + self.cols] for down, across in steps]
         return np.stack(around, axis=-1).reshape(self.n_cells, len(steps))
 
+    def connected(self, cells: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Return the number of the group of neighbouring ``cells`` (bool ``[D]``) of each, int ``[D]``; 0: none."""
+        from scipy.ndimage import label
+
+        of_pad = np.pad(np.ones((1, 3, 3)), ((1, 1), (0, 0), (0, 0)))  # diagonal neighbours included
+        return np.asarray(label(self.grid(cells), of_pad)[0].ravel(), dtype=np.intp)
+
+    def with_neighbours(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return ``cells`` (bool ``[D]``) and their neighbours on the same pad, bool ``[D]``."""
+        every, near = cells.copy(), self.beside[cells]
+        every[near[near >= 0]] = True
+        return every
+
     @cached_property
     def _served(self) -> dict[Line, NDArray[np.intp]]:
         present = self.present.ravel()

@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 from diagnostics.healthy.model import MIN_P_FLOOR
 from diagnostics.healthy.prediction import OUTLIERS, log_student_t
 from diagnostics.layout import Line, LineKind, address_bits
-from diagnostics.preprocessing.baseline import CERTAIN_RATIO
+from diagnostics.preprocessing.baseline import CERTAIN_RATIO, SUSPICIOUS
 
 if TYPE_CHECKING:
     from diagnostics.evidence.duplicate_lines import DuplicatePair
     from diagnostics.evidence.stream_state import StreamState
     from diagnostics.healthy.prediction import Prediction
-
-_CLEAR = 3.0  # log ratio of the two levels of a bit; below it both are reported
 
 
 @dataclass(frozen=True)
@@ -115,7 +113,7 @@ def _stuck_bit(line: Line, pairs: list[DuplicatePair], onset: int, stream: Strea
         copies[moved] = max(
             read, copies.get(moved, -1)
         )  # a position without a cell reads nothing, its line is read still
-    clear = abs(ratio) >= _CLEAR
+    clear = abs(ratio) >= SUSPICIOUS
     return Aliasing(
         line,
         level,

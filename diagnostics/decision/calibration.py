@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
 _LOGS, _LOGS_OF_LARGE = 192, 32  # simulated logs: sizes; large arrays have more cells in each
-_LOG_SIZES = (1, 2, 4, 8)  # recordings in each, in turn
-_DEAD_SHARES = (0.04, 0.08, 0.16, 0.32)  # of the cells, in turn
+_LOG_SIZES = 1 << np.arange(4)  # recordings in each, in turn
+_DEAD_SHARES = 0.04 * _LOG_SIZES  # of the cells, in turn
 _ENOUGH = 100  # recordings that are held out in all, over the splits
 _FEW = 32  # recordings: fewer are cut into pieces, so that one long recording can be split
 _PIECE = 100  # frames of a piece, at least
@@ -129,10 +129,10 @@ class Calibrator:
         logs = []
         for i in range(n_logs):
             turn = (i + i // len(_LOG_SIZES)) % turns
-            size = min(_LOG_SIZES[i % len(_LOG_SIZES)], held_out)
+            size = min(int(_LOG_SIZES[i % len(_LOG_SIZES)]), held_out)
             drawn = rng.choice(parts[turn][1], size, replace=False).tolist()
             log = np.concatenate([_excerpt(recordings[j], rng) for j in drawn])
-            share = _DEAD_SHARES[i // len(_LOG_SIZES) % len(_DEAD_SHARES)]
+            share = float(_DEAD_SHARES[i // len(_LOG_SIZES) % len(_DEAD_SHARES)])
             onset = int(rng.uniform(0, 0.8) * len(log)) if i % 2 else None
             logs.append((log, _random_faults(layout, share, onset, rng), layout, references[turn]))
         # Evidence depends on the exclusion threshold and that on the calibration: fit roughly, then with all logs.

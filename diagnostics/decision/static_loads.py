@@ -41,7 +41,6 @@ _ANY_SHAPE = 0.05  # share of objects of a shape and load that the healthy model
 _RETURNS = 0.1  # probability that a healthy cell returns to the same load, other than none
 _CERTAIN = 1 - 1e-6  # P(object) from which on more cells make it no likelier
 _BESIDE = 0.3  # probability that such an object loads the cell beside a loaded one
-_ADJACENT = np.array([np.zeros((3, 3)), np.ones((3, 3)), np.zeros((3, 3))])  # of one pad, diagonal ones included
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -108,8 +107,6 @@ def find_static_loads(
         beside: whether a faulty cell beside the load suffices. Cells that move on an object are healthy, but mislead
             the test of the cells around it.
     """
-    from scipy import ndimage
-
     if stream.reference.model is None or not faulty.any():
         return list(known)
     held = _HeldLoads.of(stream, spatial, excluded)
@@ -118,10 +115,11 @@ def find_static_loads(
     holding = loaded | ((held.surprisal > -np.log(_RETURNS)) & (held.root > 0) & ~wires)
 
     def explains(cells: Mask) -> bool:
-        near = ndimage.binary_dilation(stream.layout.grid(cells), _ADJACENT).ravel() if beside else cells
+        near = stream.layout.with_neighbours(cells) if beside else cells
         return bool((near & faulty).any())
 
-    groups = [_mask(group, len(faulty)) for group in _groups(holding, stream.layout)]
+    group_of = stream.layout.connected(holding)
+    groups = [group_of == i for i in range(1, group_of.max() + 1)]
     new = [group for group in groups if group.sum() >= _FEWEST and explains(group)]
     found = [load for load in known if not any(group[list(load.cells)].any() for group in new)]
     if not new:
@@ -214,14 +212,6 @@ def _on_broken_wires(blamed: Mask, stream: StreamState) -> Mask:
     return explained
 
 
-def _groups(held: Mask, layout: SensorLayout) -> list[Cells]:
-    """Return the groups of neighbouring cells that hold a load (bool ``[D]``)."""
-    from scipy import ndimage
-
-    labelled, number = ndimage.label(layout.grid(held), _ADJACENT)
-    return [np.flatnonzero(labelled.ravel() == i) for i in range(1, number + 1)]
-
-
 @dataclass(frozen=True)
 class _Chain:
     """The likelihood of an object, cell by cell.
@@ -265,8 +255,6 @@ class _Chain:
             first: cells that are known to lie under the object.
             expected: log odds of the object with these; of one at a given place where there are none.
         """
-        from scipy import ndimage
-
         chosen, sums = list(first), [expected]
         if not chosen:
             gain = np.where(group, supported - otherwise, -np.inf)
@@ -278,7 +266,7 @@ class _Chain:
         known = len(chosen)
         while len(chosen) < group.sum():
             on = _mask(chosen, len(group))
-            beside = ndimage.binary_dilation(self.stream.layout.grid(on), _ADJACENT).ravel() & ~on & group
+            beside = self.stream.layout.with_neighbours(on) & ~on & group
             gain = np.where(beside, self.log_likely(chosen) - otherwise, -np.inf)
             # As many again as are known: few predictions, and cells that join together do not support each other.
             more = np.argsort(-gain, kind="stable")[: min(len(chosen), int(beside.sum()))]

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from diagnostics.events.contact_events import ContactEvent
 
 _NEIGHBOURS = 20  # k
-_PRIOR_WEIGHT = 1.0  # pseudo-count of the share over all samples
 _MOST_SAMPLES = 20_000  # in the search tree: a size
 _MEANS = [0, 1, 3, 4]  # of the surroundings: the means, without the enclosure
 _MIN_SPREAD = 0.05  # of the root load: no reading is predicted more exactly
@@ -109,7 +108,7 @@ class NearestNeighbours:
 
         def share(of: NDArray[np.bool_], overall: NDArray[np.bool_]) -> NDArray[np.float64]:
             prior = (overall.sum() + 0.5) / (len(overall) + 1)
-            result: NDArray[np.float64] = (of.sum(axis=1) + prior * _PRIOR_WEIGHT) / (neighbours + _PRIOR_WEIGHT)
+            result: NDArray[np.float64] = (of.sum(axis=1) + prior) / (neighbours + 1)
             return result[which]
 
         spread = max(float(near[..., 1].std(axis=1)[which].mean()), _MIN_SPREAD)

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 from diagnostics.healthy.stacking import enclosed
 from diagnostics.preprocessing.baseline import MAJORITY, baseline
@@ -64,9 +63,8 @@ def _constant(recordings: RecordingBlocks, most: float) -> NDArray[np.bool_]:
 def _enclosed_groups(never_moved: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.bool_]:
     """Return the groups of ``never_moved`` cells in which one is enclosed by cells that moved, bool ``[D]``."""
     moved = layout.grid(~never_moved & layout.present.ravel())
-    beside = np.pad(np.ones((1, 3, 3)), [(1, 1), (0, 0), (0, 0)])  # 8 neighbours on one pad
-    groups, _ = label(layout.grid(never_moved), beside)
-    candidates: NDArray[np.bool_] = np.isin(groups, groups[enclosed(moved[..., None])[..., 0] & (groups > 0)]).ravel()
+    groups = layout.connected(never_moved)
+    candidates: NDArray[np.bool_] = np.isin(groups, groups[enclosed(moved[..., None]).ravel() & never_moved])
     return candidates
 
 

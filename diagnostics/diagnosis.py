@@ -23,7 +23,7 @@ from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.baseline import CERTAIN_RATIO, RARE
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, RARE
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
 

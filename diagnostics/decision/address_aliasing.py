@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from diagnostics.healthy.model import MIN_P_FLOOR
 from diagnostics.healthy.prediction import OUTLIERS, log_student_t
 from diagnostics.layout import Line, LineKind, address_bits
-from diagnostics.preprocessing.baseline import CERTAIN_RATIO, SUSPICIOUS
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, SUSPICIOUS
 
 if TYPE_CHECKING:
     from diagnostics.evidence.duplicate_lines import DuplicatePair

@@ -23,14 +23,13 @@ from numpy.typing import NDArray
 from scipy.special import expit, logit
 
 from diagnostics.events.tiles import MOST_CELLS
-from diagnostics.evidence.conditional_test import EXPECTED, EXPECTED_CELLS
 from diagnostics.evidence.drift import gains_count
 from diagnostics.evidence.reference import Reference
 from diagnostics.evidence.spatial import Exclusion
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.calibration_subset import calibration_subset
-from diagnostics.preprocessing.baseline import FEWEST, SUSPICIOUS
+from diagnostics.preprocessing.levels import EXPECTED, EXPECTED_CELLS, EXPECTED_LATE, FEWEST, SUSPICIOUS
 from diagnostics.simulation.injection import inject
 
 if TYPE_CHECKING:
@@ -48,7 +47,7 @@ _TRAINING_SHARE = 0.75  # of the recordings; the others make the simulated logs
 _MAX_DISCOUNT, _HALF_DISCOUNT = 0.5, 22.0  # of the slopes; recordings held out that halve it (one split)
 _PRIOR_VARIANCE = 10.0  # of the weights
 _CLIP = 6.0  # raw log ratios are clipped here for the fit: outliers must not steer the slope
-_EXPECTED_LATE, _EXPECTED_CELLS_LATE = 0.005, 25.0  # prior share of cells that fail in the log, and its pseudo-count
+_EXPECTED_CELLS_LATE = 25.0  # pseudo-count of the prior share of cells that fail in the log
 
 Floats = NDArray[np.float64]
 
@@ -199,7 +198,7 @@ class Calibrator:
         probability = np.zeros(len(log_ratio))
         began = (kind == 1) | (kind == 2)  # its run within the log
         late, early = scored & began, scored & ~began
-        probability[late] = _posterior(log_ratio[late], _EXPECTED_LATE, _EXPECTED_CELLS_LATE)
+        probability[late] = _posterior(log_ratio[late], EXPECTED_LATE, _EXPECTED_CELLS_LATE)
         # Cells that never moved failed before the log, or in it at the same rate as cells that moved.
         broke = probability[late].sum() / (began.sum() + EXPECTED_CELLS)
         probability[early] = _posterior(log_ratio[early], EXPECTED + float(broke), EXPECTED_CELLS)

@@ -25,11 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from diagnostics.evidence.conditional_test import TESTED
 from diagnostics.layout import Line, SensorLayout
-from diagnostics.preprocessing.baseline import MAJORITY, RARE, SUSPICIOUS
+from diagnostics.preprocessing.levels import EXPECTED_LATE, MAJORITY, RARE, SUSPICIOUS, TESTED
 
-_LINE_COST = np.log(200.0)  # prior: one wire in 200; and the rarest single fault, which few cells cannot estimate
+_LINE_COST = -np.log(EXPECTED_LATE)  # of a broken wire, and of the rarest single fault: few cells cannot estimate it
 _MOST_CONTRADICTIONS = 1  # working cells on a wire that can still be broken
 _MIN_SUPPORT = 2  # supporting cells of a broken wire
 _CORRELATION, _MAX_CORRELATION = 0.0125, 0.3  # rho per cell on the line (long lines run along edges), and at most

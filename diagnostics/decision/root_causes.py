@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from diagnostics.decision.line_cover import Cause, solve
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, LineKind, SensorLayout
-from diagnostics.preprocessing.baseline import SUSPICIOUS
-from diagnostics.preprocessing.scale import SLIGHT
+from diagnostics.preprocessing.levels import SLIGHT, SUSPICIOUS
 from diagnostics.wiring import action, counted
 
 if TYPE_CHECKING:

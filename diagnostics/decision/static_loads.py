@@ -27,8 +27,8 @@ from scipy.special import expit, logit
 
 from diagnostics.decision.coverage import where
 from diagnostics.decision.line_cover import PROVEN
-from diagnostics.evidence.conditional_test import ANYWHERE, EXPECTED, HeldValues
-from diagnostics.preprocessing.scale import SLIGHT
+from diagnostics.evidence.conditional_test import HeldValues
+from diagnostics.preprocessing.levels import ANYWHERE, EXPECTED, SLIGHT
 
 if TYPE_CHECKING:
     from diagnostics.evidence.spatial import Spatial

@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 
 from diagnostics.evidence.intermittency import ALIKE, LONGEST_BLINK
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.baseline import LOW
+from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, SLIGHT
 from diagnostics.preprocessing.readings import CELLS
-from diagnostics.preprocessing.scale import LEAST_LOADED, LIGHT, SLIGHT
 
 _CONTACTS, _LOADED, _UNLOADED = 5, 20, 8  # contacts and frames without which a statistic is NaN
 

@@ -26,15 +26,13 @@ from scipy.special import expit, logit, softmax
 from diagnostics.events.constant_runs import SHORTEST_RUN, ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, count_repeats
 from diagnostics.healthy.prediction import MEDIAN_ERROR
+from diagnostics.preprocessing.levels import ANYWHERE
 from diagnostics.preprocessing.scale import Array, Scale
 
 if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
 
-EXPECTED, EXPECTED_CELLS = 0.02, 35.0  # prior share of cells that are faulty from the start, and its pseudo-count
-ANYWHERE = 0.2  # share of broken cells that stick at any value; the others stick to either rail equally often
 P_MIN = 1e-4  # lower limit of P in one event: models err
-TESTED = 0.5  # log ratio from which on a cell was tested
 SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
 _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 _FIT_WEIGHT = 0.5  # factor on the log likelihood of the moving cells: neighbours err together

@@ -20,20 +20,18 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from diagnostics.healthy.prediction import MEDIAN_ERROR, log_student_t
-from diagnostics.preprocessing.baseline import MARGIN
-from diagnostics.preprocessing.scale import SLIGHT
+from diagnostics.preprocessing.levels import MARGIN, SLIGHT
 
 if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
     from diagnostics.preprocessing.scale import Array
 
-_FEWEST = 3  # events; fewer prove no gain
+FEWEST_EVENTS = 3  # fewer prove no gain
 _OUTLIERS = 0.05  # share of events that are independent of gain and offset: none brings more than log 20
 _GAIN = 7.0  # log evidence from which on a cell has another gain: three events
 _OFFSET = 9.5  # the same, of an offset: four events, as a reading may hold a residue of the last load
 _GAINS = np.array([0.1, 0.2, 0.35, 0.5, 2.0, 3.0])  # faulty gains: a grid
 GAIN = 1.3  # up or down: a smaller change is no fault, the mean may err by as much
-_FROM_START = 0.5  # prior that a wrong gain is wrong from the start of the log
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -89,7 +87,7 @@ def gain_evidence(
     )
     n, d = informative.shape
     result = Gain(np.zeros(d), np.ones(d), np.zeros(d, np.intp), np.zeros(d, np.intp))
-    cells = np.flatnonzero(informative.sum(axis=0) >= _FEWEST)
+    cells = np.flatnonzero(informative.sum(axis=0) >= FEWEST_EVENTS)
     if not len(cells):
         return result
     informative, root = informative[:, cells], whole[:, 1, cells]
@@ -102,8 +100,9 @@ def gain_evidence(
         of_event = log_student_t((root - np.float32(np.sqrt(gain)) * mean) / spread, _OUTLIERS)
         return np.where(informative, counts * of_event, 0.0)[::-1].cumsum(axis=0)[::-1]
 
-    chance = np.full(n, (1 - _FROM_START) / max(n - 1, 1))
-    chance[0] = _FROM_START
+    # A wrong gain is as likely wrong from the start of the log as from any later event.
+    chance = np.full(n, 0.5 / max(n - 1, 1))
+    chance[0] = 0.5
     wrong = np.stack([log_likelihood(gain) for gain in _GAINS]) - np.max(
         [log_likelihood(gain) for gain in (1 / GAIN, 1.0, GAIN)], axis=0
     )

@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, segments
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.baseline import MARGIN
+from diagnostics.preprocessing.levels import LIGHT, MARGIN
 from diagnostics.preprocessing.readings import SEGMENT
-from diagnostics.preprocessing.scale import LIGHT
 
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Array, Scale

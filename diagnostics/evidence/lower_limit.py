@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.evidence.term import untouched_evidence
-from diagnostics.preprocessing.baseline import FEWEST, MAJORITY, MARGIN, RARE
+from diagnostics.preprocessing.levels import FEWEST, LIGHT, MAJORITY, MARGIN, RARE
 from diagnostics.preprocessing.readings import SEGMENT
-from diagnostics.preprocessing.scale import LIGHT
 
 if TYPE_CHECKING:
     from diagnostics.events.constant_runs import ConstantRuns

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import same_for
 from diagnostics.evidence.term import untouched_evidence
-from diagnostics.preprocessing.baseline import FEWEST, MAJORITY, MARGIN
+from diagnostics.preprocessing.levels import FEWEST, MAJORITY, MARGIN
 from diagnostics.preprocessing.readings import RecordingBlocks, held
 
 if TYPE_CHECKING:

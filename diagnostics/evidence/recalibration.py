@@ -26,12 +26,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.evidence.drift import GAIN
+from diagnostics.evidence.drift import FEWEST_EVENTS, GAIN
 from diagnostics.healthy.model import contact_events
 from diagnostics.healthy.prediction import OUTLIERS, log_student_t
-from diagnostics.preprocessing.baseline import LOW, MARGIN
+from diagnostics.preprocessing.levels import LOW, MARGIN, SLIGHT
 from diagnostics.preprocessing.readings import held
-from diagnostics.preprocessing.scale import SLIGHT
 
 if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
 _FEWEST = 12  # recordings
 _ERRORS = 4.0  # standard errors of the gain in pseudo-likelihood
 _ROUNDS, _STEP = 4, 0.6  # of the correction; share of each correction that is applied: neighbours err together
-_LEAST_EVENTS = 3  # that show the gain of a cell
 _LEAST_VARIANCE = 0.02  # of 2 log(y / m) in one event: events of a log are similar
 _WIDE = 1.5  # standardised errors beyond this count less (Huber 1964)
 
@@ -254,7 +252,7 @@ class _Fit:
         total = np.maximum(weight.sum(axis=0), 1e-12)
         variance = np.maximum((weight * (ratio - mean) ** 2).sum(axis=0) / total, _LEAST_VARIANCE)
         variance *= (weight**2).sum(axis=0) / total**2  # 1 / effective number of events
-        few = (weight > 0).sum(axis=0) < _LEAST_EVENTS
+        few = (weight > 0).sum(axis=0) < FEWEST_EVENTS
         return np.where(few, np.nan, mean), np.where(few, np.nan, variance)
 
 

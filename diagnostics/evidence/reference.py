@@ -17,7 +17,8 @@ from diagnostics.evidence.lower_limit import LowerLimit
 from diagnostics.evidence.noise_loss import NoiseLoss
 from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
-from diagnostics.preprocessing.baseline import MARGIN, baseline
+from diagnostics.preprocessing.baseline import baseline
+from diagnostics.preprocessing.levels import MARGIN
 from diagnostics.preprocessing.offset import ReferenceOffset
 from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks, spread
 from diagnostics.preprocessing.scale import Scale

@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 from scipy.stats import betabinom, median_abs_deviation, t
 
 from diagnostics.events.constant_runs import SHORTEST_RUN
-from diagnostics.evidence.conditional_test import ANYWHERE, EXPECTED, EXPECTED_CELLS
-from diagnostics.preprocessing.baseline import CERTAIN_RATIO, FEWEST, MAJORITY
+from diagnostics.preprocessing.levels import ANYWHERE, CERTAIN_RATIO, EXPECTED, EXPECTED_CELLS, FEWEST, MAJORITY
 from diagnostics.preprocessing.readings import SEGMENT
 
 if TYPE_CHECKING:

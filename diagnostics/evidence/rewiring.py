@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from diagnostics.events.contact_events import Summary, count_repeats
 from diagnostics.healthy.model import MIN_P_FLOOR, contact_events
 from diagnostics.healthy.prediction import OUTLIERS, log_student_t
-from diagnostics.preprocessing.baseline import CERTAIN_RATIO
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
 from diagnostics.preprocessing.readings import held
 
 if TYPE_CHECKING:
@@ -44,7 +44,6 @@ _WORK = 6400  # lines times cells, about: a size
 _LIMIT = 2 * CERTAIN_RATIO  # log likelihood gained, all events together
 _WITHOUT = 2  # events without which there must be a gain too: one odd contact proves nothing
 _MOST_STEPS = 4  # permutations that are combined
-_UNEXPLAINED = 0.5  # of what a random order leaves: with more it is another sensor
 
 Floats = NDArray[np.float64]
 Cells = NDArray[np.intp]
@@ -127,8 +126,8 @@ def find_rewiring(
     if not steps:
         return None
     at_random = test.score(np.random.default_rng(0).permutation(layout.n_cells))
-    if now.surplus.sum() < _UNEXPLAINED * at_random.surplus.sum():
-        return None
+    if now.surplus.sum() < MAJORITY * at_random.surplus.sum():
+        return None  # another sensor
     return Rewiring(source, tuple(steps), total, len(events))
 
 

@@ -28,8 +28,7 @@ from scipy.stats import ks_2samp
 from diagnostics.evidence.drift import GAIN
 from diagnostics.faults import FaultSet
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.baseline import LOW
-from diagnostics.preprocessing.scale import LIGHT
+from diagnostics.preprocessing.levels import LIGHT, LOW
 
 _LEAST = 5  # recordings, new and reference
 _RARE = 1e-4  # p of what has not changed

@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from diagnostics.evidence.conditional_test import (
     P_MIN,
     SUDDEN_JUMP,
-    TESTED,
     CellState,
     ConditionalTest,
     HeldValues,
@@ -35,7 +34,7 @@ from diagnostics.evidence.conditional_test import (
     Model,
 )
 from diagnostics.evidence.drift import drifting, gain_evidence, misleading, offset_evidence
-from diagnostics.preprocessing.baseline import SUSPICIOUS
+from diagnostics.preprocessing.levels import SUSPICIOUS, TESTED
 
 if TYPE_CHECKING:
     from diagnostics.events.contact_events import ContactEvent

@@ -36,7 +36,7 @@ from diagnostics.evidence.spatial import (
 from diagnostics.evidence.term import ConstantCells, Term
 from diagnostics.evidence.weak_response import WeakResponse
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
-from diagnostics.preprocessing.baseline import SUSPICIOUS
+from diagnostics.preprocessing.levels import SUSPICIOUS
 from diagnostics.preprocessing.offset import OffsetTracker
 from diagnostics.preprocessing.readings import SEGMENT, held
 from diagnostics.preprocessing.rest_of_log import RestOfLog

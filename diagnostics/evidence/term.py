@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.preprocessing.baseline import CERTAIN_RATIO, MAJORITY
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
 
 if TYPE_CHECKING:
     from diagnostics.events.constant_runs import ConstantRuns

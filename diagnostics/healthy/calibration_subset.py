@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from diagnostics.events.tiles import MOST_CELLS
 from diagnostics.layout import SensorLayout
+from diagnostics.preprocessing.levels import LIGHT
 from diagnostics.preprocessing.readings import CELLS, RecordingBlocks
-from diagnostics.preprocessing.scale import LIGHT
 
 _SIDE = 24  # rows and columns of a block, at most: nine tiles
 _CELLS = 1000  # in all, about: a size

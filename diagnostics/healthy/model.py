@@ -29,7 +29,7 @@ from diagnostics.healthy.local_regression import LocalRegression, predict_regres
 from diagnostics.healthy.prediction import Prediction
 from diagnostics.healthy.stacking import RegressionOutput, Stacking, neighbourhood
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.baseline import FEWEST
+from diagnostics.preprocessing.levels import FEWEST
 from diagnostics.preprocessing.readings import SEGMENT
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.healthy.stacking import enclosed
-from diagnostics.preprocessing.baseline import MAJORITY, baseline
+from diagnostics.preprocessing.baseline import baseline
+from diagnostics.preprocessing.levels import MAJORITY
 from diagnostics.preprocessing.readings import RecordingBlocks
 
 if TYPE_CHECKING:

@@ -1,8 +1,8 @@
 """Shared prior: one translation-invariant logistic regression for all cells of a large array.
 
 Estimates the log odds that a cell stays unloaded, or loaded, throughout an event from the 7 x 7 cells around it:
-``log odds = bias + sum w[feature, row offset, column offset] x``, fitted by Newton's method; equals scikit-learn's
-``LogisticRegression`` on the flattened neighbourhoods. A tile sees a few dozen events, all tiles together thousands.
+``log odds = bias + sum w[feature, row offset, column offset] x``, with scikit-learn's ``LogisticRegression`` on the
+flattened neighbourhoods. A tile sees a few dozen events, all tiles together thousands.
 The regression of each tile adds its own weights, shrunk towards these (hierarchical shrinkage). The prior does not
 represent differences between places on the array.
 """
@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
-from scipy.special import expit
+from scipy.special import logit
 
 from diagnostics.healthy.local_regression import FEATURES
 from diagnostics.preprocessing.scale import Array
@@ -26,8 +25,7 @@ if TYPE_CHECKING:
 
 REACH = 3  # rows and columns
 _MOST, _UNLOADED = 20_000, 0.2  # samples; share of them without any load around, which are all equal
-_RIDGE = 1e-3  # per sample: keeps the Hessian regular
-_STEPS = 12  # of Newton's method: converged
+_RIDGE = 1e-3  # per sample: the weights of correlated neighbours are not determined without it
 
 
 @dataclass(frozen=True)
@@ -78,21 +76,19 @@ class SharedPrior:
     @classmethod
     def fit(cls, parts: list[Samples]) -> SharedPrior:
         """Fit to samples of many tiles."""
-        x = np.concatenate([part.neighbourhoods.reshape(len(part.neighbourhoods), -1) for part in parts]).astype(
-            np.float64
-        )[:_MOST]
-        y = np.concatenate([part.did for part in parts]).astype(np.float64)[:_MOST]
-        x = np.concatenate([x, np.ones((len(x), 1))], axis=1)
-        w = np.zeros((x.shape[1], 2))
-        for q in range(2):
-            for _ in range(_STEPS):
-                p = expit(x @ w[:, q])
-                variance = np.maximum(p * (1 - p), 1e-3)
-                gradient = x.T @ (p - y[:, q]) / len(x) + _RIDGE * w[:, q]
-                hessian = (x * variance[:, None]).T @ x / len(x) + _RIDGE * np.eye(len(w))
-                w[:, q] -= linalg.solve(hessian, gradient, assume_a="pos")
+        from sklearn.linear_model import LogisticRegression
+
+        x = np.concatenate([part.neighbourhoods.reshape(len(part.neighbourhoods), -1) for part in parts])[:_MOST]
+        did = np.concatenate([part.did for part in parts])[:_MOST]
+        weight, bias = np.zeros((2, x.shape[1])), np.zeros(2)
+        for q, y in enumerate(did.T):
+            if np.ptp(y):
+                fit = LogisticRegression(C=1 / (len(x) * _RIDGE), solver="newton-cholesky").fit(x.astype(np.float64), y)
+                weight[q], bias[q] = fit.coef_[0], fit.intercept_[0]
+            else:  # no cell did, or all did
+                bias[q] = logit((y.sum() + 1) / (len(y) + 2))
         side = 2 * REACH + 1
-        return cls(w[:-1].T.reshape(2, FEATURES, side, side), w[-1])
+        return cls(weight.reshape(2, FEATURES, side, side), bias)
 
     def on(self, tile: Tile, layout: SensorLayout) -> NDArray[np.float64]:
         """Return the weights for a tile, ``[4, inputs, 2, outputs]``."""

@@ -22,7 +22,7 @@ from diagnostics.events.tiles import MOST_CELLS, Tile, tiles
 from diagnostics.healthy.cross_fitting import FOLDS, CrossFitting, RegressionFit
 from diagnostics.healthy.local_regression import FEATURES, RIDGE, LocalRegression, Start, predict_regressions
 from diagnostics.healthy.model import HealthyModel, ReferenceEvent, count_events, drawn, p_floor_of
-from diagnostics.healthy.shared_prior import Samples, SharedPrior
+from diagnostics.healthy.shared_prior import REACH, Samples, SharedPrior
 from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks
 from diagnostics.preprocessing.scale import Array, Scale
 
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 _SAMPLES = 256  # excerpts for the model of one tile: a size
 _RIDGE = 30.0  # towards the shared prior, divided by the number of events of the tile
-_TAPER = 3.0  # cells: standard deviation of the Gaussian taper of covariances in a tile
 _PRIOR_TILES, _EXCERPTS, _PRIOR_SAMPLES = 100, 64, 600  # tiles of the shared prior; excerpts and samples of each: sizes
 _STACKING_TILES = 12  # tiles with the most events, from which the stacking is fitted: a size
 
@@ -144,4 +143,4 @@ def _taper(tile: Tile, layout: SensorLayout) -> NDArray[np.float64]:
     """Return the factor on the covariance of two inputs, exp(-distance^2 / (2 * 3^2)), ``[inputs, inputs]``."""
     rows, cols = tile.inputs // layout.cols % layout.rows, tile.inputs % layout.cols
     squared = (rows[:, None] - rows) ** 2 + (cols[:, None] - cols) ** 2
-    return np.asarray(np.exp(-squared / (2 * _TAPER**2)))
+    return np.asarray(np.exp(-squared / (2 * REACH**2)))

@@ -14,18 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, RARE
 from diagnostics.preprocessing.readings import CELLS, SEGMENT, RecordingBlocks
-from diagnostics.preprocessing.scale import LEAST_LOADED, LIGHT
 
-LOW = 0.05  # quantile of all readings of a cell: its baseline
 _UNLOADED = 0.03  # quantile of the readings in one recording: its baseline there, unless loaded throughout
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
-RARE = 0.001  # share of cells and recordings that is ignored
-FEWEST = 8  # recordings from which differences between recordings can be estimated
-MAJORITY = 0.5  # of recordings, frames or cells: what most do is usual
-MARGIN = 1.5  # times a limit that healthy cells, or noise, reach: clearly above it
-CERTAIN_RATIO = 12.0  # log likelihood ratio fault : healthy of what only a fault explains
-SUSPICIOUS = 3.0  # the same from which on a cell is no predictor, and supports a broken wire
 
 Floats = NDArray[np.float64]
 

@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.preprocessing.baseline import MAJORITY
+from diagnostics.preprocessing.levels import MAJORITY, SLIGHT
 from diagnostics.preprocessing.readings import CELLS, RecordingBlocks, spread
-from diagnostics.preprocessing.scale import SLIGHT
 from diagnostics.preprocessing.transport import invalid
 
 if TYPE_CHECKING:

@@ -19,13 +19,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, SLIGHT
 from diagnostics.preprocessing.readings import RecordingBlocks, spread
-from diagnostics.preprocessing.scale import LEAST_LOADED, LIGHT, SLIGHT
 
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Scale
-
-_USUAL = 0.95  # quantile of the common offsets in the reference
 
 Floats = NDArray[np.float64]
 
@@ -48,7 +46,7 @@ class ReferenceOffset(NamedTuple):
         above = RecordingBlocks.of(recordings).thinned(cells) - scale.baseline[cells]
         common = [_least_loaded(frame) for frame in above]
         mostly = min(0.0, float(np.median(common)))
-        return cls(mostly, max(mostly + scale.near / 2, float(np.quantile(common, _USUAL))))
+        return cls(mostly, max(mostly + scale.near / 2, float(np.quantile(common, 1 - LOW))))
 
     def excess(self, offset: ArrayLike) -> Floats:
         """Return offsets ``[...]`` relative to the median of the reference; 0 for usual ones."""

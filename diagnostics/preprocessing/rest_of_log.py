@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import median_abs_deviation
 
-from diagnostics.preprocessing.scale import LEAST_LOADED, LIGHT, Scale
+from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT
+from diagnostics.preprocessing.scale import Scale
 
 _MARGIN = 4.0  # from the mean of such a cell to the highest reading of any cell at rest
 _OUTLYING = 3.0  # standard deviations from the median of all cells

@@ -9,10 +9,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 
-LIGHT = 0.05  # of full scale: a lighter load may be drift of the baseline
-SLIGHT = 0.02  # of full scale: readings that differ by less agree
-LEAST_LOADED = 0.25  # quantile over cells or frames: more are unloaded than this, and fewer are open
-
 
 @dataclass(frozen=True)
 class Scale:

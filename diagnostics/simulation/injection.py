@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, SensorLayout
-from diagnostics.preprocessing.scale import LIGHT
+from diagnostics.preprocessing.levels import LIGHT
 
 # Defaults of ``Fault.value`` and thresholds, as shares of full scale.
 _NOISE = 0.05  # NOISY: standard deviation of the added noise

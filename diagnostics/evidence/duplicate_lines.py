@@ -2,8 +2,8 @@
 
 Detects, among the pairs that one address bit or one bridge can join, those that agree within a tolerance in every frame
 while informative cells (loaded, moving, not saturated) support the agreement: a *coincidence*. A pair counts when it
-has at least 4 coincidences, and 3 more than any healthy pair, and when its difference d is white noise around zero, as
-of one cell read twice:
+has 3 coincidences more than any healthy pair, and when its difference d is white noise around zero, as of one cell read
+twice:
 
     mean over cells of (sum d)^2 / sum d^2 <= 5        and        sqrt(n) sum d_t d_{t-1} / sum d^2 <= 3
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Scale
 
 _EVERY = 4  # every fourth frame is compared: faults last longer
-_FEWEST = 4  # coincidences, and three more than healthy lines ever had
 _MOST_AT_ONCE = 3  # coincidences counted in one segment: neighbours under one object are correlated
 _STEADY = 5.0  # mean squared z value of a difference; 1 for noise around zero
 _SMOOTH = 3.0  # standard deviations of the lag-1 autocorrelation of a difference; 0 for noise
@@ -190,7 +189,7 @@ class DuplicateLines:
 
     def duplicate_pairs(self, usual: int) -> list[DuplicatePair]:
         """Return the pairs that differ by noise and have more coincidences than healthy ones (``usual``)."""
-        needed = max(_FEWEST, usual + 3)
+        needed = usual + _MOST_AT_ONCE
         return [
             DuplicatePair(
                 pad, kind, int(each.first[i]), int(each.second[i]),

@@ -28,7 +28,6 @@ from diagnostics.preprocessing.readings import RecordingBlocks, held
 if TYPE_CHECKING:
     from diagnostics.evidence.term import ConstantCells
 
-_CALM = 0.25  # of a recording: a cell with a longer identical run has no noise
 _QUIET = 0.02  # share of cells without noise off the rails, at most
 _LONGER = 2.0  # times the longest run
 
@@ -64,7 +63,7 @@ class NoiseLoss:
             lowest = np.fmin.reduce(frames, None, initial=lowest)
             highest = np.fmax.reduce(frames, None, initial=highest)
         recording = float(np.median([len(r) for r in recordings]))
-        has_noise = longest <= _CALM * recording
+        has_noise = longest <= MAJORITY * recording
         quiet = ~has_noise & (value > lowest) & (value < highest)
         few = len(recordings) < FEWEST or has_noise[present].mean() < MAJORITY or quiet[present].mean() > _QUIET
         return cls.unknown(len(present)) if few else cls(np.where(has_noise, longest, np.inf), recording)

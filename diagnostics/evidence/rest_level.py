@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from diagnostics.events.constant_runs import ConstantRuns
     from diagnostics.evidence.term import ConstantCells
 
-_DITHERS = 0.1  # share of broken cells whose readings differ, within the tolerance
-
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -91,7 +89,8 @@ class RestLevel:
         healthy = (1 - unlike) * like_others + unlike * np.maximum(like_others, m / n)
         rail = level <= margin
         anywhere = ANYWHERE * 2 * margin / layout.full_scale
-        broken = (rail + anywhere / ((1 - ANYWHERE) / 2)) * np.where(exact, 1 - _DITHERS, _DITHERS)
+        # A cell that sticks anywhere may read differently within the tolerance; one at a rail does not.
+        broken = (rail + anywhere / ((1 - ANYWHERE) / 2)) * np.where(exact, 1 - ANYWHERE, ANYWHERE)
         ratio[tested] = np.minimum(np.log(broken / healthy), np.where(rail, CERTAIN_RATIO, 0.0))
         pad = layout.pad_of
         unusual = np.bincount(pad, ratio > 0) > MAJORITY * np.bincount(pad, present)

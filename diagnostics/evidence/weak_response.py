@@ -6,7 +6,7 @@ With x the readings of a cell and l the mean load of its eight neighbours, each 
     z    = sum x l / sqrt(sum x^2 / n  sum l^2)     standard normal, if the cell is broken: it has white noise or none
     gain = sum x l / sum l^2                        regression of the readings on the loads
 
-A cell works if z exceeds 4.75 (one in a million), as in a test of Pearson's correlation (``scipy.stats.pearsonr``). Its
+A cell works if z exceeds 4.4 (six in a million), as in a test of Pearson's correlation (``scipy.stats.pearsonr``). Its
 response is weak if gain times the highest l is no load. That a cell with a weak response reads no load is no evidence
 of a fault. It does not detect cells that respond with less than their noise, and takes a broken cell for a working one
 where crosstalk makes it follow its neighbours.
@@ -21,10 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from diagnostics.preprocessing.levels import CERTAIN_RATIO
+
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
-_CERTAIN = float(norm.isf(1e-6))  # z from which on a cell follows its neighbours
+_CERTAIN = float(norm.isf(np.exp(-CERTAIN_RATIO)))  # z from which on a cell follows its neighbours
 
 Floats = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
 FOLDS = 4  # of the sources
-_LEFT_OUT = (0.03, 0.06, 0.12, 0.2, 0.4, 0.7, 0.95)  # shares of the cells that are no predictors, in turn
+_LEFT_OUT = np.geomspace(0.03, 0.95, 7)  # shares of the cells that are no predictors, in turn
 _SCORED = 0.12  # share of the cells, at most, that give samples in one round
 _SAMPLES = 100_000  # in all, about: a size
 

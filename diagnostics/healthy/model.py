@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from diagnostics.events.constant_runs import segments
+from diagnostics.events.constant_runs import SHORTEST_RUN, segments
 from diagnostics.events.contact_events import ContactEvent, EventLog, Summary, count_repeats
 from diagnostics.healthy.cross_fitting import FOLDS, CrossFitting, RegressionFit
 from diagnostics.healthy.local_regression import LocalRegression, predict_regressions
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 _SAMPLES = 3000  # excerpts of events to fit on, about
 _MOST_DRAWS = 8  # excerpts of one event: more of them are nearly the same
-_SHORTEST = 6  # frames of an excerpt
 MIN_P_FLOOR = 0.002  # lower limit of the probabilities, however many events there are: models err
 _BATCH = 6144  # cells times excerpts in one batch: bounds memory
 
@@ -199,7 +198,7 @@ def drawn(
         root = scale.root_load(read(i, slice(first, first + n)))
         n = len(root)
         for draw in range(draws):
-            length = int(rng.integers(min(_SHORTEST, n), n + 1)) if draw else n
+            length = int(rng.integers(min(SHORTEST_RUN, n), n + 1)) if draw else n
             at = int(rng.integers(0, n - length + 1))
             features.append(Summary.of(root[at : at + length], first + at, scale.root_near).features())
     sources = range(len(seen)) if _few_recordings(seen) else [event.recording for event in seen]

@@ -1,9 +1,9 @@
 """Reference faults: cells that were dead already while the reference was recorded.
 
 Used arrays often have some. The reference is therefore diagnosed first as in a cold start, by the k-NN spatial model;
-cells with P(faulty) >= 0.99 are excluded from fitting. Candidates are connected groups of cells that never moved in any
-recording and that have, somewhere, cells that moved on two opposite sides. Cells that fail during the reference, and
-groups at the border without such neighbours, are not detected.
+cells with P(faulty) >= 0.999 are excluded from fitting. Candidates are connected groups of cells that never moved in
+any recording and that have, somewhere, cells that moved on two opposite sides. Cells that fail during the reference,
+and groups at the border without such neighbours, are not detected.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from diagnostics.healthy.stacking import enclosed
 from diagnostics.preprocessing.baseline import baseline
-from diagnostics.preprocessing.levels import MAJORITY
+from diagnostics.preprocessing.levels import MAJORITY, RARE
 from diagnostics.preprocessing.readings import RecordingBlocks
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
 _PIECES, _FRAMES = 60, 200  # pieces that are diagnosed, evenly spread, and frames of each: sizes
-_CERTAIN = 0.99  # P(faulty) from which on a cell counts as dead in every later log
 
 
 def find_reference_faults(
@@ -51,7 +50,7 @@ def find_reference_faults(
     # A cell that holds more than any baseline is loaded, or dead.
     rest = np.where(rest > typical.max(), np.median(typical), rest)
     found = diagnose(_sample(recordings), candidates, rest, layout)
-    dead = never_moved & found.fault_set.mask & (found.probability >= _CERTAIN)
+    dead = never_moved & found.fault_set.mask & (found.probability >= 1 - RARE)
     return np.where(dead, found.probability, 0.0)
 
 

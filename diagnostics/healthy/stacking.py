@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
+from diagnostics.preprocessing.levels import RARE
+
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
     from diagnostics.preprocessing.scale import Array
@@ -26,8 +28,6 @@ if TYPE_CHECKING:
 _MAX_ODDS = 8.0  # log odds of the regressions are clipped here
 _PRIOR_CELLS = np.float32(0.5)  # pseudo-count of a ring: the mean of the pad; of the pad: the mean of the array
 _HIDDEN, _DECAY, _EPOCHS, _BATCH, _RATE = 32, 0.3, 20, 512, 2e-3  # units, L2 penalty, epochs, batch, learning rate
-_MIN_SCALE = 1e-3  # of a standardised feature: avoids division by 0
-_RARE = 0.005  # lower and upper (1 -) limit of the share of events that load a cell
 N_FEATURES = 28  # per cell, see neighbourhood
 
 Floats = NDArray[np.float64]
@@ -81,9 +81,11 @@ class Stacking:
             never, always: bool ``[m]``, whether the cell stayed unloaded, or loaded, throughout.
             events: number of events behind the samples.
         """
-        mean, scale = samples.mean(axis=0), np.maximum(samples.std(axis=0), _MIN_SCALE)
-        hidden, threshold, out, bias = _network((samples - mean) / scale, np.stack([never, always], axis=1))
-        return cls(mean, scale, bias, hidden, threshold, out, events)
+        from sklearn.preprocessing import StandardScaler
+
+        scaler = StandardScaler().fit(samples)
+        hidden, threshold, out, bias = _network(scaler.transform(samples), np.stack([never, always], axis=1))
+        return cls(scaler.mean_, scaler.scale_, bias, hidden, threshold, out, events)
 
     def predict(self, samples: Array) -> tuple[Floats, Floats]:
         """Return P(unloaded throughout) and P(loaded throughout), ``[...]`` each, of samples ``[k, ...]``."""
@@ -135,7 +137,7 @@ def neighbourhood(
         np.clip(regressed.never[:, selected], -_MAX_ODDS, _MAX_ODDS),
         np.clip(regressed.always[:, selected], -_MAX_ODDS, _MAX_ODDS),
         regressed.mean[:, selected],
-        logit(np.clip(regressed.usual[:, selected], _RARE, 1 - _RARE)),
+        logit(np.clip(regressed.usual[:, selected], RARE, 1 - RARE)),
     )
     for values, output in zip(of_cells, own, strict=True):
         values[:] = output.T

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, RARE
 from diagnostics.preprocessing.readings import CELLS, SEGMENT, RecordingBlocks
 
-_UNLOADED = 0.03  # quantile of the readings in one recording: its baseline there, unless loaded throughout
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
 
 Floats = NDArray[np.float64]
@@ -56,7 +55,7 @@ def baseline(recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance
         received = ~np.isnan(frames).any(axis=0)
         if len(frames) > 2 and received.any():
             whole = frames[:, received]
-            offsets.append(np.quantile(whole, _UNLOADED, axis=0) - low[cells[received]])
+            offsets.append(np.quantile(whole, LOW, axis=0) - low[cells[received]])
             curvatures.append(
                 np.median(np.abs(np.diff(whole, 2, axis=0)), axis=0)
             )  # a load changes slowly: its second difference is small

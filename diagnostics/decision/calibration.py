@@ -47,7 +47,6 @@ _TRAINING_SHARE = 0.75  # of the recordings; the others make the simulated logs
 _MAX_DISCOUNT, _HALF_DISCOUNT = 0.5, 22.0  # of the slopes; recordings held out that halve it (one split)
 _PRIOR_VARIANCE = 10.0  # of the weights
 _CLIP = 6.0  # raw log ratios are clipped here for the fit: outliers must not steer the slope
-_EXPECTED_CELLS_LATE = 25.0  # pseudo-count of the prior share of cells that fail in the log
 
 Floats = NDArray[np.float64]
 
@@ -198,7 +197,7 @@ class Calibrator:
         probability = np.zeros(len(log_ratio))
         began = (kind == 1) | (kind == 2)  # its run within the log
         late, early = scored & began, scored & ~began
-        probability[late] = _posterior(log_ratio[late], EXPECTED_LATE, _EXPECTED_CELLS_LATE)
+        probability[late] = _posterior(log_ratio[late], EXPECTED_LATE, EXPECTED_CELLS)
         # Cells that never moved failed before the log, or in it at the same rate as cells that moved.
         broke = probability[late].sum() / (began.sum() + EXPECTED_CELLS)
         probability[early] = _posterior(log_ratio[early], EXPECTED + float(broke), EXPECTED_CELLS)

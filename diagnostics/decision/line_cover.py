@@ -32,8 +32,7 @@ _LINE_COST = -np.log(EXPECTED_LATE)  # of a broken wire, and of the rarest singl
 _MOST_CONTRADICTIONS = 1  # working cells on a wire that can still be broken
 _MIN_SUPPORT = 2  # supporting cells of a broken wire
 _CORRELATION, _MAX_CORRELATION = 0.0125, 0.3  # rho per cell on the line (long lines run along edges), and at most
-_UNCERTAIN_COST = np.log(10.0)  # more, where no cell on the wire is certain: at the edge of a contact errors are common
-PROVEN = np.log(9.0)  # log odds from which on a wire is reported: single cells are the safer answer
+PROVEN = np.log(9.0)  # log odds from which on a wire is reported, without a certain cell twice that: edges err together
 _ROUNDS = 5  # of re-estimating q, at most: a size
 # Wires that may be broken; address wires: see ``address_aliasing``.
 _WIRES = "row", "column", "converter", "position", "bus", "group"
@@ -230,7 +229,7 @@ def _candidates(
         return bool(supporting[behind].sum() >= _MIN_SUPPORT)
 
     def cost(behind: NDArray[np.intp]) -> float:
-        return float(_LINE_COST + (0.0 if faulty[behind].any() else _UNCERTAIN_COST))
+        return float(_LINE_COST + (0.0 if faulty[behind].any() else PROVEN))
 
     contradictions = int(contradicting[cells].sum())
     found = []

@@ -8,9 +8,10 @@ with weight w_e = 1 / (1 + 0.15 r_e), r_e earlier events that load the same cell
 Where the model knows the surroundings of a cell only (cold start), repeats tell nothing new: w_e = u_e = 1 / (1 + r_e);
 for a cell at rest w_e = 2.2 u_e / (1 + 0.15 (sum u - 1)), as any two events share the errors (design effect).
 P is the predicted probability of staying unloaded for a cell at its baseline, and of staying loaded near v_i for one
-that holds a load. In unusual events the model errs about many cells at once. So the log odds are averaged over powers
-0.25 to 1 (tempered likelihoods), weighted by how well they fit the moving cells of the same event; the spread of loads
-is inflated by their median error. Errors that no moving cell shows are not recognised.
+that holds a load. In unusual events the model errs about many cells at once. So the probability is averaged over powers
+0.25 to 1 of the odds (tempered likelihoods), each with its posterior given the moving cells of the same event (Bayesian
+model averaging); the spread of loads is inflated by their median error. Errors that no moving cell shows are not
+recognised.
 """
 
 from __future__ import annotations
@@ -26,16 +27,14 @@ from scipy.special import expit, logit, softmax
 from diagnostics.events.constant_runs import SHORTEST_RUN, ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, count_repeats
 from diagnostics.healthy.prediction import MEDIAN_ERROR
-from diagnostics.preprocessing.levels import ANYWHERE
+from diagnostics.preprocessing.levels import ANYWHERE, P_MIN
 from diagnostics.preprocessing.scale import Array, Scale
 
 if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
 
-P_MIN = 1e-4  # lower limit of P in one event: models err
 SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
 _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
-_FIT_WEIGHT = 0.5  # factor on the log likelihood of the moving cells: neighbours err together
 _PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit: all cells may be dead
 _REPEATS, _THE_SAME = 0.15, 0.95  # correlation of events that load the same cells, and cosine of their mean loads
 _COLD_SCALE = 2.2  # weight of a single event without a reference: benchmarks/cold_calibration.py
@@ -224,7 +223,7 @@ def _tempered(never: Floats, unloaded: NDArray[np.bool_], working: NDArray[np.bo
     odds = logit(np.maximum(never, P_MIN))
     right = np.where(unloaded | np.isinf(odds), odds, -odds)[:, working]  # infinite odds: no model of the cell
     likelihood = -np.stack([np.log1p(np.exp(-power * right)).sum(axis=1) for power in _POWERS])
-    share = softmax(_FIT_WEIGHT * likelihood, axis=0)  # (powers, n)
+    share = softmax(likelihood, axis=0)  # (powers, n)
     averaged = np.sum([p[:, None] * expit(w * odds) for p, w in zip(share, _POWERS, strict=True)], axis=0)
     tempered: Floats = np.maximum(never, averaged)  # tempering never adds evidence against a cell
     return tempered

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from diagnostics.healthy.prediction import MEDIAN_ERROR, log_student_t
-from diagnostics.preprocessing.levels import MARGIN, SLIGHT
+from diagnostics.preprocessing.levels import MARGIN, P_MIN, RARE, SLIGHT
 
 if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 FEWEST_EVENTS = 3  # fewer prove no gain
 _OUTLIERS = 0.05  # share of events that are independent of gain and offset: none brings more than log 20
-_GAIN = 7.0  # log evidence from which on a cell has another gain: three events
-_OFFSET = 9.5  # the same, of an offset: four events, as a reading may hold a residue of the last load
+_GAIN = float(-np.log(RARE))  # log evidence from which on a cell has another gain: three events
+_OFFSET = float(-np.log(P_MIN))  # the same, of an offset: four events, as a reading may hold a residue of the last load
 _GAINS = np.array([0.1, 0.2, 0.35, 0.5, 2.0, 3.0])  # faulty gains: a grid
 GAIN = 1.3  # up or down: a smaller change is no fault, the mean may err by as much
 

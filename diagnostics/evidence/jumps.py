@@ -1,6 +1,6 @@
 """Jumps: the size of the step into a constant run, compared with the steps of healthy cells.
 
-Detects cells that broke under load. The statistic is ``log(0.5 + 0.5 p(jump | fault) / p(jump | healthy))``, at most 4,
+Detects cells that broke under load. The statistic is ``log(0.5 + 0.5 p(jump | fault) / p(jump | healthy))``, at most 3,
 with a uniform density for faults and a histogram with one pseudo-count a bin for healthy cells. A broken cell jumps by
 any amount; a healthy cell is mostly released gradually, or together with its neighbours. It does not detect jumps
 together with many cells, as at the end of a grasp, and cells that broke without load.
@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, ConstantRuns
+from diagnostics.preprocessing.levels import SUSPICIOUS
 
 if TYPE_CHECKING:
     from diagnostics.evidence.term import ConstantCells
 
 _JUMPS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 1.0])  # of full scale, bin edges
-_MOST = 4.0  # log ratio: a jump alone proves no fault
 
 Floats = NDArray[np.float64]
 
@@ -52,8 +52,8 @@ class JumpHistogram:
                     jumps = runs.jump[fresh & ((runs.jump > 0) == up)]
                     healthy[up] += np.histogram(np.abs(jumps) / full_scale, _JUMPS)[0]
         ratio = np.diff(_JUMPS) / (healthy / healthy.sum(axis=1, keepdims=True))
-        # A cell that was unloaded when it broke did not jump: half of the faults look healthy.
-        return cls(np.minimum(np.log(0.5 + 0.5 * ratio), _MOST))
+        # A cell that was unloaded when it broke did not jump: half of the faults look healthy. A jump proves no fault.
+        return cls(np.minimum(np.log(0.5 + 0.5 * ratio), SUSPICIOUS))
 
     @classmethod
     def silent(cls) -> JumpHistogram:

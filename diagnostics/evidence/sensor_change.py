@@ -28,10 +28,9 @@ from scipy.stats import ks_2samp
 from diagnostics.evidence.drift import GAIN
 from diagnostics.faults import FaultSet
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.levels import LIGHT, LOW
+from diagnostics.preprocessing.levels import LIGHT, LOW, P_MIN
 
 _LEAST = 5  # recordings, new and reference
-_RARE = 1e-4  # p of what has not changed
 _HIGH = 0.99  # quantile of the readings of a recording: its load
 
 
@@ -156,7 +155,7 @@ def _beside(given: NDArray[np.float64], pad: int, contact: float) -> tuple[NDArr
 def _change(new: NDArray[np.float64], old: NDArray[np.float64], least: float) -> float:
     """Return the difference of two medians, 0 where it is below ``least`` or may be chance."""
     change = _shift(new, old)
-    return change if abs(change) >= least and ks_2samp(new, old).pvalue < _RARE else 0.0
+    return change if abs(change) >= least and ks_2samp(new, old).pvalue < P_MIN else 0.0
 
 
 def _statistics(recordings: Iterable[NDArray[Any]], healthy: NDArray[np.intp]) -> NDArray[np.float64]:

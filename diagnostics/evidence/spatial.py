@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.evidence.conditional_test import (
-    P_MIN,
     SUDDEN_JUMP,
     CellState,
     ConditionalTest,
@@ -34,7 +33,7 @@ from diagnostics.evidence.conditional_test import (
     Model,
 )
 from diagnostics.evidence.drift import drifting, gain_evidence, misleading, offset_evidence
-from diagnostics.preprocessing.levels import SUSPICIOUS, TESTED
+from diagnostics.preprocessing.levels import P_MIN, SUSPICIOUS, TESTED
 
 if TYPE_CHECKING:
     from diagnostics.events.contact_events import ContactEvent

@@ -121,7 +121,7 @@ def test_cells_stuck_at_different_values_share_no_cause():
 def test_a_wire_that_the_log_does_not_prove_is_possible_and_says_what_will_tell():
     cells = row(0, 3)[2:]
     found = untested(HEALTHY, cells)
-    found = replace(found, weight=np.where(at(cells), 3.1, found.weight))
+    found = replace(found, weight=np.where(at(cells), 3.02, found.weight))
     certain, (possible,) = root_causes(found, (), LAYOUT)
     assert certain == ()
     assert (possible.line, possible.kind, possible.cells) == (Line(0, "row", 3), FaultKind.OPEN, tuple(cells))

@@ -29,6 +29,7 @@ from diagnostics.evidence.spatial import Exclusion
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.calibration_subset import calibration_subset
+from diagnostics.healthy.cross_fitting import FOLDS
 from diagnostics.preprocessing.levels import EXPECTED, EXPECTED_CELLS, EXPECTED_LATE, FEWEST, SUSPICIOUS
 from diagnostics.simulation.injection import inject
 
@@ -43,7 +44,6 @@ _FEW = 32  # recordings: fewer are cut into pieces, so that one long recording c
 _PIECE = 100  # frames of a piece, at least
 _REFERENCE_TIME = 50  # of fitting a reference, in diagnoses of a simulated log; for the progress only
 _MOST_FRAMES = 600  # of a recording in one simulated log: a size
-_TRAINING_SHARE = 0.75  # of the recordings; the others make the simulated logs
 _MAX_DISCOUNT, _HALF_DISCOUNT = 0.5, 22.0  # of the slopes; recordings held out that halve it (one split)
 _PRIOR_VARIANCE = 10.0  # of the weights
 _CLIP = 6.0  # raw log ratios are clipped here for the fit: outliers must not steer the slope
@@ -113,7 +113,7 @@ class Calibrator:
         if len(recordings) < FEWEST:
             return cls()
         order = np.arange(len(recordings))
-        n_training = round(_TRAINING_SHARE * len(order))
+        n_training = round((FOLDS - 1) / FOLDS * len(order))  # the others make the simulated logs
         held_out = len(order) - n_training
         # Repeated splits, more with fewer recordings: so unusual events are held out at least once.
         turns = max(2, min(len(order), _ENOUGH) // held_out)

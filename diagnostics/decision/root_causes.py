@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 from diagnostics.decision.line_cover import Cause, solve
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, LineKind, SensorLayout
-from diagnostics.preprocessing.levels import SLIGHT, SUSPICIOUS
+from diagnostics.preprocessing.levels import ANYWHERE, SLIGHT, SUSPICIOUS
 from diagnostics.wiring import action, counted
 
 if TYPE_CHECKING:
     from diagnostics.decision.address_aliasing import Aliasing
 
-_SAME_KIND = 1 / 3  # share of the single faults that are of one kind: open, short or stuck
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -86,7 +85,7 @@ def root_causes(
     singles = sum(cause.line is None for _, _, cause in causes)
     if 0 < singles < sum(cause.proven for _, _, cause in causes):
         # With many single faults, some are neighbours on a wire by chance: solve again with a higher prevalence.
-        common = _SAME_KIND * singles / int((found.alive | found.faulty).sum())
+        common = (1 - ANYWHERE) / 2 * singles / int((found.alive | found.faulty).sum())
         causes = _causes(found, aliased, layout, common)
     faults += [_fault(kind, value, cause, found, layout) for kind, value, cause in causes if cause.proven]
     faults = _addresses_of_dead_rows(faults, found, layout)

@@ -29,7 +29,7 @@ from diagnostics.decision.coverage import where
 from diagnostics.decision.line_cover import PROVEN
 from diagnostics.evidence.conditional_test import HeldValues
 from diagnostics.healthy.prediction import OUTLIERS
-from diagnostics.preprocessing.levels import ANYWHERE, EXPECTED, SLIGHT
+from diagnostics.preprocessing.levels import ANYWHERE, EXPECTED, P_MIN, SLIGHT
 
 if TYPE_CHECKING:
     from diagnostics.evidence.spatial import Spatial
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 _FEWEST = 3  # cells of an object
 _EXPECTED_OBJECTS = 0.1  # prior probability of an object in a log
 _RETURNS = 0.1  # probability that a healthy cell returns to the same load, other than none
-_CERTAIN = 1 - 1e-6  # P(object) from which on more cells make it no likelier
 _BESIDE = 0.3  # probability that an object of any shape and load (contamination) loads the cell beside a loaded one
 
 Floats = NDArray[np.float64]
@@ -131,7 +130,7 @@ def find_static_loads(
         own = [load for load in known if group[list(load.cells)].any()]
         expected = np.log(_EXPECTED_OBJECTS / stream.present.sum())
         if own:
-            expected = logit(min(*(load.probability for load in own), _CERTAIN))
+            expected = logit(min(*(load.probability for load in own), 1 - P_MIN))
         first = [cell for load in own for cell in load.cells]
         otherwise = held.without_object(blamed & ~group)
         cells, odds = chain.most_likely(group, otherwise, supported, first, float(expected))

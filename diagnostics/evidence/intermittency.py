@@ -35,13 +35,11 @@ Floats = NDArray[np.float64]
 
 _BLINK_RATE = 0.05  # blinks per loaded frame of a loose contact
 LONGEST_BLINK = 6  # frames
-_ON_ROW, _ON_COLUMN = [3, 4], [1, 6]  # neighbours on the same row and column, see SensorLayout.beside
 ALIKE = 0.3  # of a load: largest change during a blink; and of its change: a neighbour that changes as much shares it
 _RARE = 0.002  # healthy blinks per loaded frame, in a cold start; share of healthy segments above the limit of noise
 _NOISY_SHARE = 0.8  # share of the segments of a noisy cell above the limit
 _LEVELS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8])  # of the mean root load, bin edges: noise grows with load
-_ALONE = 0.3  # share of the loaded cells that may be noisy together: with more the contact moves
-_CROWD = 0.2  # the same, of all cells
+_CROWD = 0.25  # share of the loaded cells, and of all, that may be noisy together: with more the contact moves
 _THRESHOLD = 14.0  # of the CUSUM: a prior of one in a thousand, and P(faulty) = 0.999
 _MAX = 40.0  # upper limit of the CUSUM, so that a repaired cell is cleared soon
 _HEALTHY = 0.99  # quantile of the cells, of the largest CUSUM in the reference
@@ -176,7 +174,7 @@ class Intermittency:
         )
         low, high, loaded, noise_level, level = _measure(frames, root, scale, moving, self.layout, usual.alone, lowest)
         events = low + high
-        crowd = max(1.0, _ALONE * float((loaded > 0).sum()))
+        crowd = max(1.0, _CROWD * float((loaded > 0).sum()))
         if (events > 0).sum() > crowd:
             events = np.zeros_like(events)
         gain = events * np.log(_BLINK_RATE / usual.blinks) - loaded * (_BLINK_RATE - usual.blinks)
@@ -285,7 +283,7 @@ def _lowest_load(frames: Floats, scale: Scale) -> float:
 def _shared(neighbours: NDArray[np.intp], change: Floats, own: Floats | Array) -> NDArray[np.bool_]:
     """Return which changes of single cells a neighbour shares, bool ``[n]``.
 
-    Exactly both neighbours on one row, or on one column, do not count: they may lie on the same bad wire.
+    Exactly two opposite neighbours do not count: they may lie on the same bad wire.
 
     Args:
         neighbours: int ``[n, 8]``, see ``SensorLayout.beside``.
@@ -293,8 +291,8 @@ def _shared(neighbours: NDArray[np.intp], change: Floats, own: Floats | Array) -
         own: ``[n]``, change of the cell.
     """
     much = (neighbours >= 0) & (change >= ALIKE * own[:, None])
-    of_wire = [much[:, on].all(axis=1) & (much.sum(axis=1) == 2) for on in (_ON_ROW, _ON_COLUMN)]
-    return np.asarray(much.any(axis=1) & ~of_wire[0] & ~of_wire[1])
+    opposite = (much & much[:, ::-1]).any(axis=1) & (much.sum(axis=1) == 2)
+    return np.asarray(much.any(axis=1) & ~opposite)
 
 
 def _median(values: NDArray[np.float32]) -> Floats:

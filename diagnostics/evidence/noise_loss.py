@@ -22,13 +22,12 @@ from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import same_for
 from diagnostics.evidence.term import untouched_evidence
-from diagnostics.preprocessing.levels import FEWEST, MAJORITY, MARGIN
+from diagnostics.preprocessing.levels import EXPECTED, FEWEST, MAJORITY, MARGIN
 from diagnostics.preprocessing.readings import RecordingBlocks, held
 
 if TYPE_CHECKING:
     from diagnostics.evidence.term import ConstantCells
 
-_QUIET = 0.02  # share of cells without noise off the rails, at most
 _LONGER = 2.0  # times the longest run
 
 Floats = NDArray[np.float64]
@@ -65,7 +64,7 @@ class NoiseLoss:
         recording = float(np.median([len(r) for r in recordings]))
         has_noise = longest <= MAJORITY * recording
         quiet = ~has_noise & (value > lowest) & (value < highest)
-        few = len(recordings) < FEWEST or has_noise[present].mean() < MAJORITY or quiet[present].mean() > _QUIET
+        few = len(recordings) < FEWEST or has_noise[present].mean() < MAJORITY or quiet[present].mean() > EXPECTED
         return cls.unknown(len(present)) if few else cls(np.where(has_noise, longest, np.inf), recording)
 
     @classmethod

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _NEIGHBOURS = 20  # k
 _MOST_SAMPLES = 20_000  # in the search tree: a size
-_MEANS = [0, 1, 3, 4]  # of the surroundings: the means, without the enclosure
+_MEANS = slice(4)  # of the surroundings: the means, without the enclosure
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def _describe(features: Array, predictors: NDArray[np.bool_], layout: SensorLayo
     # A cell that has only adjacent, or only diagonal, neighbours is described by these.
     near, far = np.where(np.isnan(near), far, near), np.where(np.isnan(far), near, far)
     pairs = np.minimum(np.concatenate([beside, diagonal]), np.concatenate([opposite, across]))
-    described = np.stack([near, far, np.fmax.reduce(pairs)], axis=2)  # (n, 2, 3, pads, rows, cols)
+    described = np.stack([near, far, np.fmax.reduce(pairs)], axis=1)  # (n, 3, 2, pads, rows, cols)
     return np.moveaxis(described.reshape(len(features), 6, layout.n_cells), 1, 2)
 
 

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from diagnostics.layout import Rest, SensorLayout
 
 _MOVES = 0.1  # of full scale: range of a cell that was loaded
-_ONE_WAY = 0.1  # share of the range on the other side of the rest, at most, where load moves all cells one way
-_BOTH_WAYS = 0.15  # from half of the range, at most, where load moves cells either way: offsets drift less than that
+_ASIDE = 0.15  # of the range, at most: rest from its end where load moves cells one way, from its middle where both
 
 Floats = NDArray[np.float64]
 
@@ -103,9 +102,9 @@ def _learned(readings: RecordingBlocks, layout: SensorLayout) -> Rest:
     up = float(np.median((high - rest) / (high - low)))
     quiet = float(np.median((np.abs(sample - rest) <= SLIGHT * layout.full_scale).mean(axis=0)))
     # Where a load is held most of the time, it differs between cells more than the readings without it do.
-    if up >= 1 - _ONE_WAY or quiet < MAJORITY or _spread(rest) > _spread(low):
+    if up >= 1 - _ASIDE or quiet < MAJORITY or _spread(rest) > _spread(low):
         return "low"
-    return "high" if up <= _ONE_WAY else "middle" if abs(up - 0.5) <= _BOTH_WAYS else "low"
+    return "high" if up <= _ASIDE else "middle" if abs(up - 0.5) <= _ASIDE else "low"
 
 
 def _spread(values: Floats) -> float:

@@ -77,7 +77,7 @@ class LowerLimit:
     def evidence(self, cells: ConstantCells) -> Floats:
         """Return the log likelihood ratio open : healthy, ``[D]``.
 
-        12 for a run below the limit and below that of all cells, -2 for a usual one, 0 else.
+        12 for a run below the limit and below that of all cells, -3 for a usual one, 0 else.
         """
         runs, present = cells.runs, cells.present
         received = present & np.isfinite(runs.value)

@@ -4,7 +4,7 @@ Detects broken cells without any contact, whatever value they hold. The statisti
 with an identical reading, against the longest run L of the cell in the reference:
 
     12   if r >= max(2 L, 1.5 recordings)          (log likelihood ratio fault : healthy)
-    -2   if the constant run is as long but r <= L
+    -3   if the constant run is as long but r <= L
     0    else
 
 A runs test for a sensor "flatline", as in data quality control (QARTOD 2020). It detects nothing on arrays that

@@ -13,13 +13,11 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY, SUSPICIOUS
 
 if TYPE_CHECKING:
     from diagnostics.events.constant_runs import ConstantRuns
     from diagnostics.layout import SensorLayout
-
-_AS_EVER = -2.0  # log likelihood ratio of a usual reading that a broken cell does not give
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -60,16 +58,16 @@ class Term(Protocol):
 def untouched_evidence(
     unusual: NDArray[np.bool_], broken: NDArray[np.bool_], as_ever: NDArray[np.bool_], present: NDArray[np.bool_]
 ) -> Floats:
-    """Return the log likelihood ratio fault : healthy of cells without contact, ``[D]``: 12, -2 or 0.
+    """Return the log likelihood ratio fault : healthy of cells without contact, ``[D]``: 12, -3 or 0.
 
     All are 0 where more than half of the cells are unusual.
 
     Args:
         unusual: bool ``[D]``, cells that behave as they never did in the reference.
         broken: bool ``[D]``, those of them that only a fault explains: 12.
-        as_ever: bool ``[D]``, cells that behave as ever, unlike broken ones: -2.
+        as_ever: bool ``[D]``, cells that behave as ever, unlike broken ones: -3.
         present: bool ``[D]``.
     """
     if unusual.sum() > MAJORITY * present.sum():
         return np.zeros(len(present))
-    return np.where(broken, CERTAIN_RATIO, np.where(as_ever, _AS_EVER, 0.0))
+    return np.where(broken, CERTAIN_RATIO, np.where(as_ever, -SUSPICIOUS, 0.0))

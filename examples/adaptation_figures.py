@@ -3,7 +3,8 @@
 For each seed (of the split, the weights, the faults) a fault-free network is trained once. Then each fault set goes
 to each method, and the accuracy on test recordings and the seconds it took are kept in ``--out``, a line of JSON each.
 Killed and started again, it goes on where it was. At the end a table (mean over the seeds, and spread) and a picture,
-accuracy against seconds. ``--only METHOD ...`` picks methods. Without RECORDINGS a few simulated grasps must do, unless
+accuracy against seconds. The head is also scored on whole grasps, by the product of the probabilities of their windows.
+``--only METHOD ...`` picks methods. Without RECORDINGS a few simulated grasps must do, unless
 ``--grasps`` asks for more of them.
 
 All that learns anew may use training and validation windows; the scratch network is chosen by the latter.
@@ -54,7 +55,10 @@ def cases(layout: SensorLayout, seed: int, simulated: bool) -> dict[str, FaultSe
 
 
 class Repairs:
-    """Every method, on one fault-free network: ``method(F) -> (predict, seconds to repair)``."""
+    """Every method, on one fault-free network: ``method(F) -> (predict, seconds to repair)``.
+
+    ``predict`` gives classes ``[N]`` or probabilities ``[N, n_classes]``.
+    """
 
     def __init__(self, model: af.TactileTransformer, parts: Parts, seed: int, scratch_epochs: int) -> None:
         self.model, self.layout, self.seed, self.scratch_epochs = model, model.layout, seed, scratch_epochs
@@ -84,7 +88,7 @@ class Repairs:
     def _adapted(self, faults: FaultSet, method: str) -> tuple[Callable, float]:
         began = time.perf_counter()
         adaptation = self.adapter.adapt(faults, method=method, seed=self.seed, progress=False)
-        return adaptation.predict, time.perf_counter() - began
+        return adaptation.predict_proba, time.perf_counter() - began
 
     def _linear(self, faults: FaultSet) -> tuple[Callable, float]:
         began = time.perf_counter()
@@ -139,6 +143,14 @@ def summary(x: np.ndarray) -> np.ndarray:
     return np.concatenate([x.mean(axis=1), x.max(axis=1)], axis=1)
 
 
+def whole_grasps(probabilities: np.ndarray, windows: af.Windows) -> float:
+    """Return the share of recordings whose class has the highest product of the probabilities of its windows."""
+    _, first, of = np.unique(windows.recording, return_index=True, return_inverse=True)
+    total = np.zeros((len(first), probabilities.shape[1]))
+    np.add.at(total, of, np.log(np.maximum(probabilities, 1e-30)))
+    return float((total.argmax(axis=1) == windows.y[first]).mean())
+
+
 def rate(model: af.TactileTransformer) -> float:
     return 2e-4 if model.init == "glorot" else 1e-4
 
@@ -176,12 +188,15 @@ def measure(args: argparse.Namespace) -> list[dict]:
         if args.cases is not None:
             sets = dict(list(sets.items())[: args.cases])
         for name, faults in {"none": FaultSet((), recordings.layout.n_cells), **sets}.items():
-            for method in ("fill",) if name == "none" else args.only or repairs.methods:
+            for method in ("fill", "head") if name == "none" else args.only or repairs.methods:
                 if (seed, name, method) in done:
                     continue
                 predict, seconds = repairs.methods[method](faults)
-                accuracy = float((predict(repairs.test.x) == repairs.test.y).mean())
                 row = {"seed": seed, "faults": name, "k": len(faults), "method": method}
+                answers = predict(repairs.test.x)
+                if answers.ndim == 2:
+                    answers, row["grasps"] = answers.argmax(axis=1), whole_grasps(answers, repairs.test)
+                accuracy = float((answers == repairs.test.y).mean())
                 rows.append({**row, "accuracy": accuracy, "seconds": seconds})
                 with results.open("a") as file:
                     file.write(json.dumps(rows[-1]) + "\n")
@@ -199,8 +214,14 @@ def table(rows: list[dict]) -> dict[tuple[str, str], tuple[float, float, float, 
         accuracy, seconds = np.transpose(results)
         summed[key] = float(accuracy.mean()), float(accuracy.std()), float(np.median(seconds)), len(results)
     names = list(dict.fromkeys(row["faults"] for row in rows if row["faults"] != "none"))
-    free = summed.get(("fill", "none"))
-    print(f"\nfault-free: {free[0]:.3f} +- {free[1]:.3f} over {free[3]} seeds" if free else "")
+    print()
+    for method in ("fill", "head"):
+        if free := summed.get((method, "none")):
+            print(f"fault-free, {method}: {free[0]:.3f} +- {free[1]:.3f} over {free[3]} seeds")
+    for name in dict.fromkeys(row["faults"] for row in rows):
+        whole = [row["grasps"] for row in rows if row["faults"] == name and row["method"] == "head" and "grasps" in row]
+        if whole:
+            print(f"whole grasps, head, {name}: {np.mean(whole):.3f} +- {np.std(whole):.3f}")
     print(f"{'':24s}" + "".join(f"{name:>22s}" for name in names) + "     seconds")
     for method in dict.fromkeys(method for method, name in summed if name != "none"):
         cells = [summed.get((method, name)) for name in names]

@@ -169,9 +169,10 @@ def export_versions(home: Path) -> None:
             weights = torch.from_numpy(np.random.default_rng(1).normal(0, 3, (4, 60, 3)).astype("f4"))
             weights -= weights.mean(1, keepdim=True)  # no class is preferred everywhere
             widths = [torch.cdist(view, view).square().median() for view in views]
-            widths += [torch.cdist(view, view, p=1).median() for view in views[:2]]
+            amounts = [torch.cdist(view, view, p=1).median() for view in (*views[:2], views[3])]
+            widths = torch.stack([*widths[:3], *amounts[:2], widths[3], amounts[2]])
             shares = torch.tensor([0.1, 0.4, 0.2, 0.3])
-            head = Head(views, ((2,), (0, 1, 2), (4,), (3, 4)), torch.stack(widths), weights, torch.zeros(3), shares)
+            head = Head(views, ((2,), (0, 1, 2, 5), (5,), (6,)), widths, weights, torch.zeros(3), shares)
         model = ReducedModel(network, fault_set, front, head).eval()
         Adaptation(model, fault_set, (Stage("fill", 0.1),), _validation=windows).save(home / name)
         add_onnx(home / name)

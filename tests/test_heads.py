@@ -23,10 +23,11 @@ EARLIER = Path(__file__).parent / "earlier" / "head-1.npz"
 
 
 def windows(n: int = 90, classes: int = 3) -> tuple[list[torch.Tensor], np.ndarray]:
-    """Three views of three classes: the first and second each tell another class from the rest, the third a little."""
+    """Four views of three classes: the first two each tell another class from the rest, the others a little."""
     rng = np.random.default_rng(0)
     y = rng.integers(0, classes, n)
-    views = [rng.normal((y == c)[:, None] * far, 1.0, (n, 4)).astype(np.float32) for c, far in ((0, 2), (1, 2), (2, 1))]
+    told = ((0, 2), (1, 2), (2, 1), (2, 0.5))
+    views = [rng.normal((y == c)[:, None] * far, 1.0, (n, 4)).astype(np.float32) for c, far in told]
     return [torch.from_numpy(v) for v in views], y
 
 
@@ -121,7 +122,7 @@ def test_views_tell_more_together_than_the_smoothed_cells_alone():
     head, outputs, _, y = fitted()
     views, classes = windows()
     first, second = parts(views, 45)
-    blind = [[torch.zeros_like(v), torch.zeros_like(v), w] for v, _, w in (first, second)]
+    blind = [[torch.zeros_like(v), torch.zeros_like(v), w, torch.zeros_like(v)] for v, _, w, _ in (first, second)]
     _, alone = fit_head(*blind, one_hot(classes[:-45]), one_hot(classes[-45:]), np.arange(45) % 5)
     assert (outputs.argmax(1).numpy() == y).mean() > (alone.argmax(1).numpy() == classes[-45:]).mean() + 0.05
     assert head.shares[1] > 0.5
@@ -130,7 +131,7 @@ def test_views_tell_more_together_than_the_smoothed_cells_alone():
 def test_shares_follow_the_kernel_that_predicts_held_out_windows():
     views, y = windows(300)
     noise = torch.randn(300, 4, generator=torch.Generator().manual_seed(0)) * 5
-    first, second = parts([noise, noise, views[0] + views[1]], 150)
+    first, second = parts([noise, noise, views[0] + views[1], noise], 150)
     head, _ = fit_head(first, second, one_hot(y[:150]), one_hot(y[150:]), np.arange(150) % 5)
     assert head.shares[0] > 0.5
     assert head.shares.sum().item() == pytest.approx(1)
@@ -154,7 +155,7 @@ def test_a_class_that_no_window_has_is_never_the_answer():
 
 
 def test_identical_windows_do_not_break_the_fit():
-    views = [torch.ones(20, 3), torch.zeros(20, 2), torch.zeros(20, 2)]
+    views = [torch.ones(20, 3), *torch.zeros(3, 20, 2)]
     first, second = parts(views, 10)
     head, outputs = fit_head(first, second, one_hot(np.arange(10) % 3), one_hot(np.arange(10) % 3), np.arange(10) % 5)
     assert torch.isfinite(head(second)).all()
@@ -167,7 +168,7 @@ def test_windows_that_differ_by_noise_alone_do_not_break_the_fit(share, noise):
     rng = np.random.default_rng(0)
     x = 0.5 + noise * rng.normal(size=(400, 60))
     x[: round((1 - share) * 400)] = rng.random((round((1 - share) * 400), 60))
-    views = [torch.from_numpy(v.astype(np.float32)) for v in (10 * x, x, x[:, ::2])]
+    views = [torch.from_numpy(v.astype(np.float32)) for v in (10 * x, x, x[:, ::2], x[:, :5])]
     first, second = parts(views, 100)
     classes = one_hot(rng.integers(0, 3, 400))
     head, outputs = fit_head(first, second, classes[:300], classes[300:], np.arange(100) % 5)
@@ -213,21 +214,51 @@ def test_a_head_that_does_not_name_its_kernels_has_the_two_of_its_version():
     weights = torch.randn(2, 30, 3, generator=torch.Generator().manual_seed(0))
     head = empty_head({"known": [[30, 4]] * 3, "values": False}, 3)
     parts = {"widths": widths, "weights": weights, "bias": torch.zeros(3), "shares": torch.tensor([0.3, 0.7])}
-    head.load_state_dict({**{f"known{i}": view for i, view in enumerate(views)}, **parts})
-    squares = [torch.cdist(view, view).square() / width for view, width in zip(views, widths, strict=True)]
+    few = views[:3]
+    head.load_state_dict({**{f"known{i}": view for i, view in enumerate(few)}, **parts})
+    squares = [torch.cdist(view, view).square() / width for view, width in zip(few, widths, strict=True)]
     expected = mixture([torch.exp(-squares[2]) @ weights[0], torch.exp(-sum(squares) / 3) @ weights[1]], head.shares)
     torch.testing.assert_close(head(views), expected, atol=1e-4, rtol=0)
 
 
-def test_windows_that_differ_in_one_cell_are_told_apart_by_the_laplacian_kernels():
+def test_windows_that_differ_in_one_moment_are_told_apart_by_the_laplacian_kernel():
     rng = np.random.default_rng(0)
-    cells = rng.random((400, 40)).astype(np.float32)
-    y = (cells[:, 0] > 0.5).astype(int) + 2 * (cells[:, 1] > 0.5)
-    views = [torch.zeros(400, 2), torch.from_numpy(cells), torch.zeros(400, 2)]
+    moments = rng.random((400, 40)).astype(np.float32)
+    y = (moments[:, 0] > 0.5).astype(int) + 2 * (moments[:, 1] > 0.5)
+    views = [*torch.zeros(3, 400, 2), torch.from_numpy(moments)]
     first, second = parts(views, 200)
     head, outputs = fit_head(first, second, one_hot(y[:200], 4), one_hot(y[200:], 4), np.arange(200) % 5)
-    assert head.shares[2:].sum() > 0.5
+    assert head.shares[3] > 0.5
     assert (outputs.argmax(1).numpy() == y[200:]).mean() > 0.4  # 0.25 by chance
+
+
+def test_moments_count_in_their_own_units():
+    views, y = windows(300)
+    views[3] = views[0] + views[1]
+    scaled = [*views[:3], views[3] * torch.tensor([1e-3, 1.0, 1e3, 0.0]) + torch.tensor([0.0, 0.0, 0.0, 5.0])]
+    plain = [*views[:3], views[3] * torch.tensor([1.0, 1.0, 1.0, 0.0])]
+    found = []
+    for each in (plain, scaled):
+        first, second = parts(each, 150)
+        head, _ = fit_head(first, second, one_hot(y[:150]), one_hot(y[150:]), np.arange(150) % 5)
+        found.append(head(second).softmax(1))
+    torch.testing.assert_close(found[0], found[1], atol=1e-3, rtol=0)
+
+
+def test_a_head_of_a_version_without_moments_gives_the_same_answers():
+    views, _ = windows(30)
+    kernels, few = ((2,), (0, 1, 2), (4,), (3, 4)), views[:3]
+    squares = [torch.cdist(view, view).square() / 4 for view in few]
+    amounts = [torch.cdist(view, view, p=1) / 9 for view in few[:2]]
+    mean = [squares[2], sum(squares) / 3, amounts[1], sum(amounts) / 2]
+    weights = torch.randn(4, 30, 3, generator=torch.Generator().manual_seed(0))
+    head = empty_head({"known": [[30, 4]] * 3, "kernels": kernels, "values": False}, 3)
+    state = {"widths": torch.tensor([4.0, 4, 4, 9, 9]), "weights": weights, "bias": torch.zeros(3)}
+    state |= {f"known{i}": view for i, view in enumerate(few)} | {"shares": torch.tensor([0.1, 0.4, 0.2, 0.3])}
+    head.load_state_dict(state)
+    expected = mixture([torch.exp(-far) @ each for far, each in zip(mean, weights, strict=True)], head.shares)
+    torch.testing.assert_close(head(views), expected, atol=1e-4, rtol=0)
+    torch.testing.assert_close(head.knowing(few)(views), expected, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize(("forest", "logits"), [(True, "logits"), (False, "kernel_logits")])

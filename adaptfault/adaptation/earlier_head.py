@@ -18,8 +18,6 @@ class EarlierHead(nn.Module):
         n_classes: number of logits.
     """
 
-    smoothed = False  # of the views, the first two are used
-
     def __init__(self, about: Mapping[str, Any], n_classes: int) -> None:
         super().__init__()
         self.about, self.n_classes = dict(about), n_classes

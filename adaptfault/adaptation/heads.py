@@ -1,12 +1,13 @@
 """Heads fitted in closed form, without a gradient, to the features of the network and to the healthy cells.
 
 A head is a mixture of kernel ridge regressions on class indicators (as classifiers: Suykens and Vandewalle 1999) or on
-values. Each has a kernel of some views of a window: the penultimate features of the network, the healthy cells, and
-these smoothed (:mod:`adaptfault.adaptation.cell_summary`). A Gaussian kernel suits what changes smoothly with the
-readings, a Laplacian kernel what hangs on single cells: it is the limit of a forest of random trees (Balog,
-Lakshminarayanan, Ghahramani, Roy and Teh 2016). The network has seen its training windows, so its features tell them
-apart better than new ones; two of the kernels do not use them. The shares of the mixture are those with the highest
-likelihood of held-out windows (stacking of predictive distributions: Yao, Vehtari, Simpson and Gelman 2018).
+values. Each has a kernel of some views of a window: the penultimate features of the network, the healthy cells, these
+smoothed (:mod:`adaptfault.adaptation.cell_summary`), and moments of the contact on each pad
+(:mod:`adaptfault.adaptation.contact_moments`). A Gaussian kernel suits what changes smoothly, a Laplacian kernel what
+hangs on single values: it is the limit of a forest of random trees (Balog, Lakshminarayanan, Ghahramani, Roy and Teh
+2016). The network has seen its training windows, so its features tell them apart better than new ones; three of the
+kernels do not use them. The shares of the mixture are those with the highest likelihood of held-out windows (stacking
+of predictive distributions: Yao, Vehtari, Simpson and Gelman 2018).
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ from adaptfault.data.windows import evenly
 
 Views = Sequence[Tensor]
 
-# Distances of a view (0: features, 1: cells, 2: smoothed cells), squared or absolute; kernels of these distances.
-_DISTANCES = ((0, True), (1, True), (2, True), (0, False), (1, False))
-_KERNELS = ((2,), (0, 1, 2), (4,), (3, 4))
-_EARLIER_KERNELS = _KERNELS[:2]  # of heads that do not store theirs
+# Distances of a view (0: features, 1: cells, 2: smoothed cells, 3: moments), squared or absolute; kernels of these.
+_DISTANCES = ((0, True), (1, True), (2, True), (0, False), (1, False), (3, True), (3, False))
+_KERNELS = ((2,), (0, 1, 2, 5), (5,), (6,))
+_MOMENTS = 3  # index of their view
+_EARLIER_KERNELS = ((2,), (0, 1, 2))  # of heads that do not store theirs
 _RIDGES = (0.2, 0.02, 0.002)  # added to a kernel's diagonal, which is 1
 _SAMPLE = 1_000  # windows on which widths and ridges are chosen, of training and of validation each
 _LINEAR_C = 0.3  # inverse strength of the linear head's ridge penalty
@@ -42,16 +44,16 @@ class Head(nn.Module):
     """Kernel expansions: each known window is weighted by its similarity to the input.
 
     Args:
-        known: the three views of the M windows it was fitted on, each ``[M, p]``.
+        known: the views of the M windows it was fitted on, each ``[M, p]``; heads of earlier versions lack the moments.
         kernels: indices of the distances that each kernel adds.
         widths: units of the distances.
         weights: ``[kernels, M, n]``.
         bias: ``[n]``.
         shares: of each kernel in the probabilities or values, summing to 1.
+        units: of the moments ``[p]``, by which those in ``known`` are divided; None: 1.
         values: the outputs are values, not logits.
     """
 
-    smoothed = True  # of the views, the third is used
     widths: Tensor
     weights: Tensor
     bias: Tensor
@@ -66,12 +68,15 @@ class Head(nn.Module):
         bias: Tensor,
         shares: Tensor,
         *,
+        units: Tensor | None = None,
         values: bool = False,
     ) -> None:
         super().__init__()
         self.kernels, self.values, self._views = kernels, values, len(known)
         for i, view in enumerate(known):
             self.register_buffer(f"known{i}", view)
+        if len(known) > _MOMENTS:
+            self.register_buffer("units", torch.ones(known[_MOMENTS].shape[1]) if units is None else units)
         self.register_buffer("widths", widths)
         self.register_buffer("weights", weights)
         self.register_buffer("bias", bias)
@@ -103,20 +108,21 @@ class Head(nn.Module):
 
     def knowing(self, known: Views) -> Head:
         """Return the same head with other views of the windows it was fitted on."""
-        return Head(known, self.kernels, self.widths, self.weights, self.bias, self.shares, values=self.values)
+        units = dict(self.named_buffers()).get("units")
+        parts = known, self.kernels, self.widths, self.weights, self.bias, self.shares
+        return Head(*parts, units=units, values=self.values)
 
     def forward(self, views: Views) -> Tensor:
         """Map views of N windows, each ``[N, p]``, to logits or values ``[N, n]``."""
         # Double precision: large weights of both signs nearly cancel; the error in single precision is up to 4e-4.
         # Absolute distances, the most expensive part, are sums without cancellation: in single precision 4e-7.
-        precise = {True: torch.double, False: torch.float}
-        pairs = [
-            [each.to(precise[squared]) for each in (views[view], self.known[view])] for view, squared in _DISTANCES
-        ]
-        distances = [
-            _distance(*pair, squared=squared).double()
-            for pair, (_, squared), _ in zip(pairs, _DISTANCES, self.widths, strict=False)  # earlier: squared only
-        ]
+        if self._views > _MOMENTS:
+            views = _in_units(views, self.get_buffer("units"))
+        distances = {}
+        for i in _used(self.kernels):
+            view, squared = _DISTANCES[i]
+            pair = [each.to(torch.double if squared else torch.float) for each in (views[view], self.known[view])]
+            distances[i] = _distance(*pair, squared=squared).double()
         outputs = [
             _kernel(distances, self.widths.double(), of) @ weights.double()
             for of, weights in zip(self.kernels, self.weights, strict=True)
@@ -190,7 +196,7 @@ def fit_head(
     The loss is the cross entropy, or the mean squared error of values.
 
     Args:
-        training, held: the three views of windows, each ``[M, p]`` and ``[n, p]``.
+        training, held: the views of windows, each ``[M, p]`` and ``[n, p]``.
         training_targets, held_targets: ``[M, k]`` and ``[n, k]``, class indicators, probabilities or values; a class
             without windows is never predicted.
         folds: int ``[n]``; the windows of a fold are held out together.
@@ -202,6 +208,8 @@ def fit_head(
     task = (_Values if values else _Classes)(training_targets, held_targets)
     both = [torch.cat(pair) for pair in zip(training, held, strict=True)]
     on = both[0].device
+    units = _units(both[_MOMENTS])
+    both = _in_units(both, units)
     distances, widths = _distances(both)
     targets = task.targets.to(on)
     m, n = len(training_targets), len(folds)
@@ -220,7 +228,7 @@ def fit_head(
         all_held.append(outputs)
     shares = task.shares(all_held)
     weights = torch.stack(all_weights)
-    head = Head(both, _KERNELS, widths, weights, task.bias.to(on), shares.to(on), values=values)
+    head = Head(both, _KERNELS, widths, weights, task.bias.to(on), shares.to(on), units=units, values=values)
     return head, mixture(all_held, shares, values=values)
 
 
@@ -283,26 +291,43 @@ class _Values:
         return torch.from_numpy((shares / total if total > 0 else even).astype(np.float32))
 
 
-def _distances(views: Views) -> tuple[list[Tensor], Tensor]:
-    """Return all distances of the windows, and the units of each: their medians.
+def _used(kernels: Sequence[Sequence[int]]) -> list[int]:
+    """Return the indices of the distances that kernels use."""
+    return sorted({i for kernel in kernels for i in kernel})
+
+
+def _units(moments: Tensor) -> Tensor:
+    """Return the standard deviation of each moment ``[N, p]``; 1 where it is constant, up to rounding."""
+    spread, size = moments.std(0, correction=0), moments.square().mean(0).sqrt()
+    return torch.where(spread > math.sqrt(torch.finfo(moments.dtype).eps) * size, spread, 1.0)
+
+
+def _in_units(views: Views, units: Tensor) -> list[Tensor]:
+    """Return views with the moments divided by their units."""
+    return [view / units if i == _MOMENTS else view for i, view in enumerate(views)]
+
+
+def _distances(views: Views) -> tuple[dict[int, Tensor], Tensor]:
+    """Return the distances of the windows that kernels use, and the units of all: their medians, 1 if not used.
 
     Raises:
         ValueError: a view is not finite.
     """
     if not all(bool(view.square().sum().isfinite()) for view in views):
         raise ValueError("the network gives features that are not finite: check the recordings, and train it anew")
-    distances, widths = [], []
+    distances, widths = {}, [1.0] * len(_DISTANCES)
     sample = evenly(len(views[0]), _SAMPLE)
-    for i, squared in _DISTANCES:
-        view, least = views[i], 0.0
+    for i in _used(_KERNELS):
+        index, squared = _DISTANCES[i]
+        view, least = views[index], 0.0
         distance = _distance(view, view, squared=True) if squared else _absolute_distances(view)
         width = float(distance[sample][:, sample].median())
         if squared and width < _rounding(view):
             view = view.double()
             distance, least = _distance(view, view, squared=True).float(), _rounding(view)
             width = float(distance[sample][:, sample].median())
-        widths.append(max(width, least) or 1.0)
-        distances.append(distance)
+        widths[i] = max(width, least) or 1.0
+        distances[i] = distance
     return distances, torch.tensor(widths, device=views[0].device)
 
 
@@ -317,7 +342,7 @@ def _rounding(view: Tensor) -> float:
     return 2.0 * math.sqrt(m * p) * torch.finfo(view.dtype).eps * size / min(_RIDGES)
 
 
-def _kernel(distances: Sequence[Tensor], widths: Tensor, of: Sequence[int]) -> Tensor:
+def _kernel(distances: Mapping[int, Tensor], widths: Tensor, of: Sequence[int]) -> Tensor:
     """Return the kernel exp(-mean) of some distances in units of their widths.
 
     It is Gaussian for squared distances, Laplacian for absolute ones.

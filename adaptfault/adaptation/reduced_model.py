@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from adaptfault.adaptation.cell_summary import CellSummary
+from adaptfault.adaptation.contact_moments import ContactMoments
 from adaptfault.adaptation.heads import AnyHead
 from adaptfault.data.windows import Windows
 from adaptfault.models.any_model import AnyModel
@@ -43,6 +44,7 @@ class ReducedModel(nn.Module):
         self.network, self.fault_set, self.head = network, fault_set, head
         self.front = front if len(fault_set) else None
         self.summary = CellSummary(network.layout, fault_set)
+        self.moments = ContactMoments(network.layout)
 
     def complete(self, x: Tensor) -> Tensor:
         """Map the healthy cells' windows ``[N, T, D-k]`` to whole ones ``[N, T, D]``.
@@ -55,14 +57,16 @@ class ReducedModel(nn.Module):
             raise ValueError(f"expected windows of the {width} healthy cells [N, T, {width}], got {list(x.shape)}")
         return x if self.front is None else self.front(x)
 
-    def views(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def views(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Map windows of the healthy cells ``[N, T, D-k]`` to the input of a head.
 
         Returns:
-            The features of the network ``[N, p]``, and both results of
-            :class:`~adaptfault.adaptation.cell_summary.CellSummary`.
+            The features of the network ``[N, p]``, both results of
+            :class:`~adaptfault.adaptation.cell_summary.CellSummary`, and the
+            :class:`~adaptfault.adaptation.contact_moments.ContactMoments` of the whole windows.
         """
-        return self.network.features(self.complete(x)), *self.summary(x)
+        whole = self.complete(x)
+        return self.network.features(whole), *self.summary(x), self.moments(whole)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map windows of the healthy cells ``[N, T, D-k]``, scaled to 0..1, to logits ``[N, n_classes]``."""

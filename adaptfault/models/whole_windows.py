@@ -53,12 +53,12 @@ class Masked(nn.Module):
         self.register_buffer("used", torch.from_numpy(present & ~faults.mask))
         self.register_buffer("weight", weight)
         self.register_buffer("bias", bias)
-        self.network, self.summary = model.network, CellSummary(layout, FaultSet((), d))
+        self.network, self.summary, self.moments = model.network, CellSummary(layout, FaultSet((), d)), model.moments
         assert isinstance(model.head, Head)
-        features, cells, *smoothed = model.head.known
+        features, cells, *others = model.head.known
         wide = cells.new_zeros(len(cells), 2, int(present.sum()))
         wide[..., torch.from_numpy(~faults.mask[present])] = cells.view(len(cells), 2, -1)  # means and maxima
-        self.head = model.head.knowing((features, wide.flatten(1), *smoothed))
+        self.head = model.head.knowing((features, wide.flatten(1), *others))
 
     @staticmethod
     def suits(model: ReducedModel) -> bool:
@@ -70,5 +70,6 @@ class Masked(nn.Module):
         """Map windows ``[N, T, D]`` to probabilities ``[N, n_classes]``."""
         known = torch.where(self.used, x, 0.0)
         filled = nn.functional.linear(known, self.weight, self.bias).clamp(0.0, 1.0)
-        features = self.network.features(torch.where(self.used, x, filled))
-        return torch.softmax(self.head((features, *self.summary(known))), dim=1)
+        whole = torch.where(self.used, x, filled)
+        views = (self.network.features(whole), *self.summary(known), self.moments(whole))
+        return torch.softmax(self.head(views), dim=1)

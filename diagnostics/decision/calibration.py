@@ -85,7 +85,7 @@ class Calibrator:
 
         That of kind 0 is fitted to simulated grasps and postures (``benchmarks/cold_calibration.py``).
         """
-        return cls((-1.3, -1.0, -1.0, 0.0), (1.0, 0.6, 0.6, 0.6), (1.0, 0.5, 0.5, 1.0))
+        return cls((-1.4, -1.0, -1.0, 0.0), (1.0, 0.6, 0.6, 0.6), (1.0, 0.5, 0.5, 1.0))
 
     @classmethod
     def fit(

@@ -6,7 +6,7 @@ Computes for event e and constant cell i the surprisal
 
 with weight w_e = 1 / (1 + 0.15 r_e), r_e earlier events that load the same cells (effective sample size, Kish 1965);
 Where the model knows the surroundings of a cell only (cold start), repeats tell nothing new: w_e = u_e = 1 / (1 + r_e);
-for a cell at rest w_e = 2.2 u_e / (1 + 0.15 (sum u - 1)), as any two events share the errors (design effect).
+for a cell at rest w_e = 2.5 u_e / (1 + 0.15 (sum u - 1)), as any two events share the errors (design effect).
 P is the predicted probability of staying unloaded for a cell at its baseline, and of staying loaded near v_i for one
 that holds a load. In unusual events the model errs about many cells at once. So the probability is averaged over powers
 0.25 to 1 of the odds (tempered likelihoods), each with its posterior given the moving cells of the same event (Bayesian
@@ -37,7 +37,7 @@ SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
 _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 _PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit: all cells may be dead
 _REPEATS, _THE_SAME = 0.15, 0.95  # correlation of events that load the same cells, and cosine of their mean loads
-_COLD_SCALE = 2.2  # weight of a single event without a reference: benchmarks/cold_calibration.py
+_COLD_SCALE = 2.5  # weight of a single event without a reference: benchmarks/cold_calibration.py
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -1,7 +1,8 @@
 """Drift: cells that move, but never return to their baseline (offset), or scale every load wrongly (gain).
 
 The evidence of an offset is the sum of -log P(loaded throughout | other cells) over the last events, as far as the cell
-is loaded throughout each. That of a gain g is the log likelihood ratio
+is loaded throughout each; in a cold start repeated events tell nothing new (``ConditionalTest.novelty``). That of a
+gain g is the log likelihood ratio
 
     log sum_{g, s} P(g) P(s) L_s(g) / max_{1/1.3 <= h <= 1.3} L_s(h),    L_s(g) = prod_{e >= s} t_4(y_e; sqrt(g) m_e)
 
@@ -37,18 +38,19 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-def offset_evidence(whole: Array, always: Floats, moving: Mask) -> Floats:
+def offset_evidence(whole: Array, always: Floats, moving: Mask, counts: Floats | float = 1.0) -> Floats:
     """Return the log likelihood ratio ``[D]`` that a moving cell never returns to its baseline.
 
     Args:
         whole: features ``[n, 4, D]`` of n events (see ``Summary.features``), in time order.
         always: ``[n, D]``, P(loaded throughout) of a healthy cell.
         moving: bool ``[D]``, cells that move.
+        counts: ``[n, 1]``, weight of each event.
     """
     loaded = (whole[:, 3] == 1) & (whole[:, 1] ** 2 >= SLIGHT)
     lasting = np.logical_and.accumulate(loaded[::-1])[::-1]  # unbroken up to the end
     surprisal = -np.log(np.maximum(always, _OUTLIERS))
-    return np.where(moving, np.where(lasting, surprisal, 0.0).sum(axis=0), 0.0)
+    return np.where(moving, np.where(lasting, counts * surprisal, 0.0).sum(axis=0), 0.0)
 
 
 class Gain(NamedTuple):

@@ -173,9 +173,10 @@ class SpatialTest:
         first = np.array([event.first for event in self._events])
         moved = cells.eligible & cells.runs.moved & (first[:, None] <= cells.runs.start)
         whole, on_whole = test.features[test.begins], expected.on(test.begins)
-        offset = offset_evidence(whole, on_whole.always, moved[-1] & np.isfinite(on_whole.spread))
-        counts = self._exclusion.gains * test.novelty(expected.own)[test.begins]
-        gain = gain_evidence(whole, on_whole, moved, self._scale.root_near, counts)
+        novelty = test.novelty(expected.own)[test.begins]
+        moving = moved[-1] & np.isfinite(on_whole.spread)
+        offset = offset_evidence(whole, on_whole.always, moving, 1.0 if expected.own else novelty)
+        gain = gain_evidence(whole, on_whole, moved, self._scale.root_near, self._exclusion.gains * novelty)
         of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
         assert self._initial is not None
         self.result = Spatial(

@@ -1,8 +1,9 @@
 """The k-NN spatial model: the healthy model of a cold start, built from the log itself without a reference.
 
 Estimates the load of a cell from 20 cells with the most similar surroundings, anywhere on the array and in any event.
-Surroundings are the mean load of the four adjacent predictors, of the four diagonal ones, and the enclosure (maximum
-over pairs of opposite neighbours of the smaller load), for highest and mean root load:
+Surroundings are the mean load of the four adjacent predictors, of the four diagonal ones, of the 16 of the ring around
+these, and the enclosure (maximum over pairs of opposite neighbours of the smaller load), for highest and mean root
+load:
 
     P(never loaded) = (count of never loaded neighbours + prior) / (k + 1)
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 _NEIGHBOURS = 20  # k
 _MOST_SAMPLES = 20_000  # in the search tree: a size
-_MEANS = slice(4)  # of the surroundings: the means, without the enclosure
+_MEANS = slice(6)  # of the surroundings: the means, without the enclosure
 
 
 @dataclass(frozen=True)
@@ -121,24 +122,26 @@ class NearestNeighbours:
 
 
 def _describe(features: Array, predictors: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.float64]:
-    """Return the surroundings of each cell in each excerpt, ``[n, D, 6]``; NaN without two opposite predictors."""
+    """Return the surroundings of each cell in each excerpt, ``[n, D, 8]``; NaN without two opposite predictors."""
     grid = layout.grid(
         np.where(predictors & layout.present.ravel(), features[:, :2], np.nan)
     )  # (n, 2, pads, rows, cols)
-    padded = np.pad(grid, ((0, 0), (0, 0), (0, 0), (1, 1), (1, 1)), constant_values=np.nan)
+    padded = np.pad(grid, ((0, 0), (0, 0), (0, 0), (2, 2), (2, 2)), constant_values=np.nan)
     rows, cols = layout.rows, layout.cols
 
     def shifted(*offsets: tuple[int, int]) -> NDArray[np.float64]:
-        return np.stack([padded[..., 1 + r : 1 + r + rows, 1 + c : 1 + c + cols] for r, c in offsets])
+        return np.stack([padded[..., 2 + r : 2 + r + rows, 2 + c : 2 + c + cols] for r, c in offsets])
 
     beside, opposite = shifted((-1, 0), (0, -1)), shifted((1, 0), (0, 1))
     diagonal, across = shifted((-1, -1), (-1, 1)), shifted((1, 1), (1, -1))
     near, far = _mean(np.concatenate([beside, opposite])), _mean(np.concatenate([diagonal, across]))
+    ring = _mean(shifted(*((r, c) for r in range(-2, 3) for c in range(-2, 3) if max(abs(r), abs(c)) == 2)))
     # A cell that has only adjacent, or only diagonal, neighbours is described by these.
     near, far = np.where(np.isnan(near), far, near), np.where(np.isnan(far), near, far)
+    ring = np.where(np.isnan(ring), far, ring)
     pairs = np.minimum(np.concatenate([beside, diagonal]), np.concatenate([opposite, across]))
-    described = np.stack([near, far, np.fmax.reduce(pairs)], axis=1)  # (n, 3, 2, pads, rows, cols)
-    return np.moveaxis(described.reshape(len(features), 6, layout.n_cells), 1, 2)
+    described = np.stack([near, far, ring, np.fmax.reduce(pairs)], axis=1)  # (n, 4, 2, pads, rows, cols)
+    return np.moveaxis(described.reshape(len(features), 8, layout.n_cells), 1, 2)
 
 
 def _mean(values: NDArray[np.float64]) -> NDArray[np.float64]:

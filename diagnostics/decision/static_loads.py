@@ -28,7 +28,6 @@ from scipy.special import expit, logit
 from diagnostics.decision.coverage import where
 from diagnostics.decision.line_cover import PROVEN
 from diagnostics.evidence.conditional_test import HeldValues
-from diagnostics.healthy.prediction import OUTLIERS
 from diagnostics.preprocessing.levels import ANYWHERE, EXPECTED, P_MIN, SLIGHT
 
 if TYPE_CHECKING:
@@ -39,7 +38,8 @@ if TYPE_CHECKING:
 _FEWEST = 3  # cells of an object
 _EXPECTED_OBJECTS = 0.1  # prior probability of an object in a log
 _RETURNS = 0.1  # probability that a healthy cell returns to the same load, other than none
-_BESIDE = 0.3  # probability that an object of any shape and load (contamination) loads the cell beside a loaded one
+_ANY_SHAPE = 0.05  # share of objects of a shape and load that the healthy model does not know
+_BESIDE = 0.3  # probability that such an object loads the cell beside a loaded one
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -233,7 +233,7 @@ class _Chain:
         predictors = self.others | _mask(chosen, len(self.root))
         log_likely = np.zeros(len(self.root))
         of_model = np.exp(self.stream.log_held(self.root, predictors, held, self.values))
-        log_likely[held] = np.log((1 - OUTLIERS) * of_model + OUTLIERS * _BESIDE * self.width[held])
+        log_likely[held] = np.log((1 - _ANY_SHAPE) * of_model + _ANY_SHAPE * _BESIDE * self.width[held])
         return log_likely
 
     @cached_property

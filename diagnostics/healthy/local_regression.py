@@ -20,7 +20,6 @@ from scipy.special import expit, logit
 
 from diagnostics.healthy.dual_ridge import covariance_and_precision
 from diagnostics.healthy.dual_ridge import logistic as dual_logistic
-from diagnostics.healthy.prediction import MIN_SPREAD
 from diagnostics.healthy.stacking import RegressionOutput
 from diagnostics.preprocessing.levels import FEWEST
 from diagnostics.preprocessing.scale import Array
@@ -28,6 +27,7 @@ from diagnostics.preprocessing.scale import Array
 FEATURES = 4  # per cell and event, see Summary.features
 RIDGE = 0.03  # per sample, on standardised inputs
 _BIAS_RIDGE = 1e-6  # the bias is free; above 0 so that the bound can be inverted
+_MIN_SPREAD = 0.02  # of the root load: no reading is predicted more exactly
 _STEPS = 25  # of accelerated descent: converged, thanks to the ridge
 
 
@@ -137,7 +137,7 @@ class LocalRegression:
         loaded = x[:, 2, place] > 0
         spread = np.sqrt((error**2 * loaded).sum(axis=0) / np.maximum(loaded.sum(axis=0), 1))
         typical = float(np.sqrt(np.mean(spread**2)))
-        spread = np.maximum(np.where(loaded.sum(axis=0) < FEWEST, 2 * typical, spread), MIN_SPREAD)
+        spread = np.maximum(np.where(loaded.sum(axis=0) < FEWEST, 2 * typical, spread), _MIN_SPREAD)
         spread[~loaded.any(axis=0)] = np.nan
         return cls(
             inputs, outputs, place, mean, scale, weight, bias,

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.healthy.prediction import MIN_SPREAD, Prediction
+from diagnostics.healthy.prediction import Prediction
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.scale import Array
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 _NEIGHBOURS = 20  # k
 _MOST_SAMPLES = 20_000  # in the search tree: a size
+_MIN_SPREAD = 0.05  # of the root load: no reading is predicted more exactly
 _MEANS = slice(6)  # of the surroundings: the means, without the enclosure
 
 
@@ -111,7 +112,7 @@ class NearestNeighbours:
             result: NDArray[np.float64] = (of.sum(axis=1) + prior) / (neighbours + 1)
             return result[which]
 
-        spread = max(float(near[..., 1].std(axis=1)[which].mean()), MIN_SPREAD)
+        spread = max(float(near[..., 1].std(axis=1)[which].mean()), _MIN_SPREAD)
         return Prediction(
             never=share(near[..., 2] == 0, targets[:, 2] == 0),
             always=share(near[..., 3] == 1, targets[:, 3] == 1),

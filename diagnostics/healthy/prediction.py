@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 OUTLIERS = 0.1  # share of events in which any load is equally likely (contamination)
-MIN_SPREAD = 0.02  # of the root load: no reading is predicted more exactly
 MEDIAN_ERROR = 0.741  # median of |t| with 4 degrees of freedom
 
 

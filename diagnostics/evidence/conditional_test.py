@@ -37,7 +37,7 @@ SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
 _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 _PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit: all cells may be dead
 _REPEATS, _THE_SAME = 0.15, 0.95  # correlation of events that load the same cells, and cosine of their mean loads
-_COLD_SCALE = 2.5  # weight of a single event without a reference: benchmarks/cold_calibration.py
+_COLD_SCALE = 2.5  # of an event without a reference; benchmarks/cold_calibration.py fits 2.9, at less precision
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -3,13 +3,13 @@
 Detects both with a CUSUM of log likelihood ratios over segments of 32 frames (Page 1954), so that a fault is found
 whenever it begins, and cleared when it has gone:
 
-    S <- clip(S + c g, 0, 36),    faulty if S >= 12
+    S <- clip(S + c g, 0, 40),    faulty if S >= 14
     blinks:  g = n log(0.05 / r) - m (0.05 - r)         n blinks in m loaded frames, Poisson, healthy rate r
     noise:   g = log(0.8 / 0.002) if noisier than the limit of its load, else log(0.2 / 0.998)       Bernoulli
 
 A blink leaves a load in one step and returns to it in one step within 6 frames. The load must exceed 1.5 times the
 lowest load that any cell shows: where a threshold hides small loads, weak ones come and go in one step. Noise is the
-median absolute second difference. The factor c <= 1 keeps all but 1 % of healthy cells below 12 / 1.5 (overdispersion,
+median absolute second difference. The factor c <= 1 keeps all but 1 % of healthy cells below 14 / 1.5 (overdispersion,
 as in a quasi-likelihood: McCullagh and Nelder 1989). Segments in which many cells blink or are noisy together do not
 count: the contact moves. Blinks without load, and noise of constant cells, are not detected.
 """
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, segments
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.levels import CERTAIN_RATIO, LIGHT, MARGIN
+from diagnostics.preprocessing.levels import LIGHT, MARGIN
 from diagnostics.preprocessing.readings import SEGMENT
 
 if TYPE_CHECKING:
@@ -35,12 +35,14 @@ Floats = NDArray[np.float64]
 
 _BLINK_RATE = 0.05  # blinks per loaded frame of a loose contact
 LONGEST_BLINK = 6  # frames
+_ON_ROW, _ON_COLUMN = [3, 4], [1, 6]  # neighbours on the same row and column, see SensorLayout.beside
 ALIKE = 0.3  # of a load: largest change during a blink; and of its change: a neighbour that changes as much shares it
 _RARE = 0.002  # healthy blinks per loaded frame, in a cold start; share of healthy segments above the limit of noise
 _NOISY_SHARE = 0.8  # share of the segments of a noisy cell above the limit
 _LEVELS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8])  # of the mean root load, bin edges: noise grows with load
 _CROWD = 0.25  # share of the loaded cells, and of all, that may be noisy together: with more the contact moves
-_MAX = 3 * CERTAIN_RATIO  # upper limit of the CUSUM, so that a repaired cell is cleared soon
+_THRESHOLD = 14.0  # of the CUSUM: a prior of one in a thousand, and P(faulty) = 0.999
+_MAX = 40.0  # upper limit of the CUSUM, so that a repaired cell is cleared soon
 _HEALTHY = 0.99  # quantile of the cells, of the largest CUSUM in the reference
 
 
@@ -106,7 +108,7 @@ class HealthyRates:
                     frames, scale.root_load(frames), numbers, scale, usual, constant, np.inf
                 )
                 reached = np.maximum(reached, [intermittency.blinking, intermittency.noisy])
-        counts = CERTAIN_RATIO / np.maximum(CERTAIN_RATIO, MARGIN * np.quantile(reached, _HEALTHY, axis=1))
+        counts = _THRESHOLD / np.maximum(_THRESHOLD, MARGIN * np.quantile(reached, _HEALTHY, axis=1))
         return replace(usual, blinks_count=float(counts[0]), noise_counts=float(counts[1]))
 
     @classmethod
@@ -213,13 +215,13 @@ class Intermittency:
     @property
     def intermittent(self) -> NDArray[np.bool_]:
         """bool ``[D]``, intermittent cells."""
-        found: NDArray[np.bool_] = (self.blinking >= CERTAIN_RATIO) & (self.blinking > self.noisy)
+        found: NDArray[np.bool_] = (self.blinking >= _THRESHOLD) & (self.blinking > self.noisy)
         return found
 
     @property
     def excess(self) -> NDArray[np.bool_]:
         """bool ``[D]``, cells with excess noise that are not intermittent."""
-        found: NDArray[np.bool_] = (self.noisy >= CERTAIN_RATIO) & ~self.intermittent
+        found: NDArray[np.bool_] = (self.noisy >= _THRESHOLD) & ~self.intermittent
         return found
 
 
@@ -282,7 +284,7 @@ def _lowest_load(frames: Floats, scale: Scale) -> float:
 def _shared(neighbours: NDArray[np.intp], change: Floats, own: Floats | Array) -> NDArray[np.bool_]:
     """Return which changes of single cells a neighbour shares, bool ``[n]``.
 
-    Exactly two opposite neighbours do not count: they may lie on the same bad wire.
+    Exactly both neighbours on one row, or on one column, do not count: they may lie on the same bad wire.
 
     Args:
         neighbours: int ``[n, 8]``, see ``SensorLayout.beside``.
@@ -290,8 +292,8 @@ def _shared(neighbours: NDArray[np.intp], change: Floats, own: Floats | Array) -
         own: ``[n]``, change of the cell.
     """
     much = (neighbours >= 0) & (change >= ALIKE * own[:, None])
-    opposite = (much & much[:, ::-1]).any(axis=1) & (much.sum(axis=1) == 2)
-    return np.asarray(much.any(axis=1) & ~opposite)
+    of_wire = [much[:, on].all(axis=1) & (much.sum(axis=1) == 2) for on in (_ON_ROW, _ON_COLUMN)]
+    return np.asarray(much.any(axis=1) & ~of_wire[0] & ~of_wire[1])
 
 
 def _median(values: NDArray[np.float32]) -> Floats:

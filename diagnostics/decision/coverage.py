@@ -75,13 +75,11 @@ def _advice(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple[str, ...
     regions: list[tuple[int, str]] = []
     if not layout.is_matrix:
         return _advice_by_group(untested, layout)
-    for pad, grid in enumerate(layout.grid(untested)):
-        labelled, _ = ndimage.label(grid, structure=np.ones((3, 3)))
-        sizes = np.bincount(labelled.ravel())
-        for i, (rows, cols) in enumerate(ndimage.find_objects(labelled), start=1):
-            size = int(sizes[i])
-            where = f"pad {pad}, {_span('row', rows)}, {_span('column', cols)}"
-            regions.append((size, f"press {where} ({size} {'cell' if size == 1 else 'cells'} untested)"))
+    region_of = layout.connected(untested)
+    sizes = np.bincount(region_of).tolist()
+    for i, (pad, rows, cols) in enumerate(ndimage.find_objects(layout.grid(region_of)), start=1):
+        where = f"pad {pad.start}, {_span('row', rows)}, {_span('column', cols)}"
+        regions.append((sizes[i], f"press {where} ({sizes[i]} {'cell' if sizes[i] == 1 else 'cells'} untested)"))
     return tuple(text for _, text in sorted(regions, key=lambda region: -region[0]))
 
 

@@ -2,11 +2,14 @@
 
 A head is a mixture of kernel ridge regressions on class indicators (as classifiers: Suykens and Vandewalle 1999) or on
 values. Each has a kernel of some views of a window: the penultimate features of the network, the healthy cells, these
-smoothed (:mod:`adaptfault.adaptation.cell_summary`), and moments of the contact on each pad
-(:mod:`adaptfault.adaptation.contact_moments`). A Gaussian kernel suits what changes smoothly, a Laplacian kernel what
-hangs on single values: it is the limit of a forest of random trees (Balog, Lakshminarayanan, Ghahramani, Roy and Teh
-2016). The network has seen its training windows, so its features tell them apart better than new ones; three of the
-kernels do not use them. The shares of the mixture are those with the highest likelihood of held-out windows (stacking
+smoothed (:mod:`adaptfault.adaptation.cell_summary`), the moments of the contact on each pad as the healthy cells show
+them (:mod:`adaptfault.adaptation.contact_moments`), and the same moments restored to those of all cells. They are
+restored by one more kernel ridge regression, on windows of the time when no cell was dead: what is known of the
+training windows alone helps to learn (privileged information: Vapnik and Vashist 2009). It is cross-fitted, so a window
+is restored without its own dead cells. A Gaussian kernel suits what changes smoothly, a Laplacian kernel what hangs on
+single values: it is the limit of a forest of random trees (Balog, Lakshminarayanan, Ghahramani, Roy and Teh 2016). The
+network has seen its training windows, so its features tell them apart better than new ones; three of the kernels do not
+use them. The shares of the mixture are those with the highest likelihood of held-out windows (stacking
 of predictive distributions: Yao, Vehtari, Simpson and Gelman 2018).
 """
 
@@ -27,10 +30,10 @@ from adaptfault.data.windows import evenly
 
 Views = Sequence[Tensor]
 
-# Distances of a view (0: features, 1: cells, 2: smoothed cells, 3: moments), squared or absolute; kernels of these.
-_DISTANCES = ((0, True), (1, True), (2, True), (0, False), (1, False), (3, True), (3, False))
-_KERNELS = ((2,), (0, 1, 2, 5), (5,), (6,))
-_MOMENTS = 3  # index of their view
+# Distances of a view (0: features, 1: cells, 2: smoothed cells, 3: moments, 4: restored moments), squared or absolute.
+_DISTANCES = ((0, True), (1, True), (2, True), (0, False), (1, False), (3, True), (3, False), (4, True), (4, False))
+_KERNELS = ((0, 1, 2, 5), (6,), (7,), (8,))  # of these; the first also restores
+_MOMENTS, _RESTORED = 3, 4  # indices of the views
 _EARLIER_KERNELS = ((2,), (0, 1, 2))  # of heads that do not store theirs
 _RIDGES = (0.2, 0.02, 0.002)  # added to a kernel's diagonal, which is 1
 _SAMPLE = 1_000  # windows on which widths and ridges are chosen, of training and of validation each
@@ -44,13 +47,15 @@ class Head(nn.Module):
     """Kernel expansions: each known window is weighted by its similarity to the input.
 
     Args:
-        known: the views of the M windows it was fitted on, each ``[M, p]``; heads of earlier versions lack the moments.
+        known: the views of the M windows it was fitted on, each ``[M, p]``; heads of earlier versions lack the restored
+            moments, and the oldest all moments.
         kernels: indices of the distances that each kernel adds.
         widths: units of the distances.
         weights: ``[kernels, M, n]``.
         bias: ``[n]``.
         shares: of each kernel in the probabilities or values, summing to 1.
         units: of the moments ``[p]``, by which those in ``known`` are divided; None: 1.
+        restoring: weights ``[M, p]`` of the regression that restores moments, in these units; None: 0.
         values: the outputs are values, not logits.
     """
 
@@ -69,6 +74,7 @@ class Head(nn.Module):
         shares: Tensor,
         *,
         units: Tensor | None = None,
+        restoring: Tensor | None = None,
         values: bool = False,
     ) -> None:
         super().__init__()
@@ -77,6 +83,9 @@ class Head(nn.Module):
             self.register_buffer(f"known{i}", view)
         if len(known) > _MOMENTS:
             self.register_buffer("units", torch.ones(known[_MOMENTS].shape[1]) if units is None else units)
+        if self.restores:
+            none = torch.zeros_like(known[_RESTORED])
+            self.register_buffer("restoring", none if restoring is None else restoring)
         self.register_buffer("widths", widths)
         self.register_buffer("weights", weights)
         self.register_buffer("bias", bias)
@@ -92,13 +101,19 @@ class Head(nn.Module):
 
     @classmethod
     def blank(cls, known: Views, n: int) -> Head:
-        """Build a head for n classes that knows some windows and has learnt nothing from them."""
+        """Build a head for n classes that knows four views of some windows and has learnt nothing from them."""
+        known = [*known, known[_MOMENTS]]
         return cls.empty({"known": [list(view.shape) for view in known], "kernels": _KERNELS, "values": False}, n)
 
     @property
     def known(self) -> list[Tensor]:
         """The views of the windows it was fitted on."""
         return [self.get_buffer(f"known{i}") for i in range(self._views)]
+
+    @property
+    def restores(self) -> bool:
+        """Whether it restores moments. If not, it takes those of imputed windows, as in earlier versions."""
+        return self._views > _RESTORED
 
     @property
     def about(self) -> dict[str, Any]:
@@ -108,26 +123,38 @@ class Head(nn.Module):
 
     def knowing(self, known: Views) -> Head:
         """Return the same head with other views of the windows it was fitted on."""
-        units = dict(self.named_buffers()).get("units")
+        own = dict(self.named_buffers())
         parts = known, self.kernels, self.widths, self.weights, self.bias, self.shares
-        return Head(*parts, units=units, values=self.values)
+        return Head(*parts, units=own.get("units"), restoring=own.get("restoring"), values=self.values)
 
     def forward(self, views: Views) -> Tensor:
-        """Map views of N windows, each ``[N, p]``, to logits or values ``[N, n]``."""
-        # Double precision: large weights of both signs nearly cancel; the error in single precision is up to 4e-4.
-        # Absolute distances, the most expensive part, are sums without cancellation: in single precision 4e-7.
+        """Map views of N windows, each ``[N, p]``, to logits or values ``[N, n]``; the restored moments are not given."""
         if self._views > _MOMENTS:
             views = _in_units(views, self.get_buffer("units"))
-        distances = {}
-        for i in _used(self.kernels):
-            view, squared = _DISTANCES[i]
-            pair = [each.to(torch.double if squared else torch.float) for each in (views[view], self.known[view])]
-            distances[i] = _distance(*pair, squared=squared).double()
+        widths = self.widths.double()
+        distances = self._distances(views)
+        if self.restores:
+            restored = _kernel(distances, widths, self.kernels[0]) @ self.get_buffer("restoring").double()
+            distances |= self._distances([*views, views[_MOMENTS] + restored.float()], _RESTORED)
         outputs = [
-            _kernel(distances, self.widths.double(), of) @ weights.double()
+            _kernel(distances, widths, of) @ weights.double()
             for of, weights in zip(self.kernels, self.weights, strict=True)
         ]
         return mixture([out + self.bias for out in outputs], self.shares, values=self.values).float()
+
+    def _distances(self, views: Views, first: int = 0) -> dict[int, Tensor]:
+        """Return the distances to the known windows that kernels use, of the given views from ``first`` on.
+
+        Double precision: large weights of both signs nearly cancel; the error in single precision is up to 4e-4.
+        Absolute distances, the most expensive part, are sums without cancellation: in single precision 4e-7.
+        """
+        distances = {}
+        for i in _used(self.kernels):
+            view, squared = _DISTANCES[i]
+            if first <= view < len(views):
+                pair = [each.to(torch.double if squared else torch.float) for each in (views[view], self.known[view])]
+                distances[i] = _distance(*pair, squared=squared).double()
+        return distances
 
 
 AnyHead = Head | EarlierHead
@@ -189,6 +216,7 @@ def fit_head(
     held_targets: NDArray[np.float32],
     folds: NDArray[np.int64],
     *,
+    whole: Tensor | None = None,
     values: bool = False,
 ) -> tuple[Head, Tensor]:
     """Fit a head to all windows; ridges, scales and shares minimise the loss of held-out windows.
@@ -199,7 +227,8 @@ def fit_head(
         training, held: the views of windows, each ``[M, p]`` and ``[n, p]``.
         training_targets, held_targets: ``[M, k]`` and ``[n, k]``, class indicators, probabilities or values; a class
             without windows is never predicted.
-        folds: int ``[n]``; the windows of a fold are held out together.
+        folds: int ``[M + n]``; the windows of a fold are held out together.
+        whole: the moments ``[M + n, p]`` of the windows with all cells; None: no cell is dead.
         values: the targets are values.
 
     Returns:
@@ -208,12 +237,18 @@ def fit_head(
     task = (_Values if values else _Classes)(training_targets, held_targets)
     both = [torch.cat(pair) for pair in zip(training, held, strict=True)]
     on = both[0].device
-    units = _units(both[_MOMENTS])
+    whole = both[_MOMENTS] if whole is None else whole
+    units = _units(whole)
     both = _in_units(both, units)
-    distances, widths = _distances(both)
+    distances, first = _distances(both)
+    similar = _kernel(distances, torch.tensor(first, device=on), _KERNELS[0])
+    restoring, restored = _restore(similar, both[_MOMENTS], whole / units, folds)
+    both.append(restored)
+    more, second = _distances(both, _RESTORED)
+    distances, widths = distances | more, torch.tensor(first + second, device=on)
     targets = task.targets.to(on)
-    m, n = len(training_targets), len(folds)
-    kept = evenly(n, _SAMPLE)
+    m, n = len(training_targets), len(held_targets)
+    folds, kept = folds[m:], evenly(n, _SAMPLE)
     few = np.concatenate([evenly(m, _SAMPLE), m + kept])  # enough to compare ridges
     all_weights, all_held = [], []
     for of in _KERNELS:
@@ -228,8 +263,22 @@ def fit_head(
         all_held.append(outputs)
     shares = task.shares(all_held)
     weights = torch.stack(all_weights)
-    head = Head(both, _KERNELS, widths, weights, task.bias.to(on), shares.to(on), units=units, values=values)
+    parts = both, _KERNELS, widths, weights, task.bias.to(on), shares.to(on)
+    head = Head(*parts, units=units, restoring=restoring, values=values)
     return head, mixture(all_held, shares, values=values)
+
+
+def _restore(kernel: Tensor, shown: Tensor, whole: Tensor, folds: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
+    """Return weights that add to the moments shown ``[N, p]`` what is missing to whole ones, and cross-fitted results."""
+    missing = whole - shown
+    if not missing.any():
+        return torch.zeros_like(shown), shown
+    few = evenly(len(folds), _SAMPLE)
+    sample = kernel[few][:, few]
+    tried = [ridge_regression(sample, missing[few], folds[few], ridge)[1] - missing[few] for ridge in _RIDGES]
+    ridge = _RIDGES[int(np.argmin([float(error.square().mean()) for error in tried]))]
+    weights, found = ridge_regression(kernel, missing, folds, ridge)
+    return weights, shown + found
 
 
 class _Classes:
@@ -307,18 +356,24 @@ def _in_units(views: Views, units: Tensor) -> list[Tensor]:
     return [view / units if i == _MOMENTS else view for i, view in enumerate(views)]
 
 
-def _distances(views: Views) -> tuple[dict[int, Tensor], Tensor]:
-    """Return the distances of the windows that kernels use, and the units of all: their medians, 1 if not used.
+def _distances(views: Views, first: int = 0) -> tuple[dict[int, Tensor], list[float]]:
+    """Return the distances of the windows that kernels use, and the units of all, of the given views from ``first`` on.
+
+    The units are medians, and 1 where they are not used.
 
     Raises:
         ValueError: a view is not finite.
     """
     if not all(bool(view.square().sum().isfinite()) for view in views):
         raise ValueError("the network gives features that are not finite: check the recordings, and train it anew")
-    distances, widths = {}, [1.0] * len(_DISTANCES)
+    distances, widths = {}, []
     sample = evenly(len(views[0]), _SAMPLE)
-    for i in _used(_KERNELS):
-        index, squared = _DISTANCES[i]
+    for i, (index, squared) in enumerate(_DISTANCES):
+        if not first <= index < len(views):
+            continue
+        widths.append(1.0)
+        if i not in _used(_KERNELS):
+            continue
         view, least = views[index], 0.0
         distance = _distance(view, view, squared=True) if squared else _absolute_distances(view)
         width = float(distance[sample][:, sample].median())
@@ -326,9 +381,9 @@ def _distances(views: Views) -> tuple[dict[int, Tensor], Tensor]:
             view = view.double()
             distance, least = _distance(view, view, squared=True).float(), _rounding(view)
             width = float(distance[sample][:, sample].median())
-        widths[i] = max(width, least) or 1.0
+        widths[-1] = max(width, least) or 1.0
         distances[i] = distance
-    return distances, torch.tensor(widths, device=views[0].device)
+    return distances, widths
 
 
 def _rounding(view: Tensor) -> float:

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from adaptfault.adaptation.contact_moments import ContactMoments
 from adaptfault.adaptation.fault_free import FaultFreeModel, Network
 from adaptfault.adaptation.heads import MOST_WINDOWS, Head, calibrate, fit_head, linear_head, log_likelihood
 from adaptfault.adaptation.reduced_model import ReducedModel, reduce_windows
@@ -218,8 +219,11 @@ class Run:
             return None
         used = evenly(len(self.training), MOST_WINDOWS - len(self.validation))
         first, second = (self._views(reduced, of) for of in (self.training.select(used), self.validation))
-        folds = np.unique(self.validation.recording, return_inverse=True)[1] % _FOLDS
-        return self._fit(first, second, self.fault_free.targets[used], self.fault_free.validation_targets, folds)
+        recordings = (self.training.recording[used], self.validation.recording)
+        folds = np.concatenate([np.unique(of, return_inverse=True)[1] % _FOLDS for of in recordings])
+        whole = self._whole(self.fault_free.train.select(used), self.fault_free.validation)
+        targets = self.fault_free.targets[used], self.fault_free.validation_targets
+        return self._fit(first, second, *targets, folds, whole)
 
     def _fit(
         self,
@@ -228,9 +232,15 @@ class Run:
         targets: NDArray[np.float32],
         held_targets: NDArray[np.float32],
         folds: NDArray[np.int64],
+        whole: Tensor,
     ) -> tuple[Head, Tensor]:
         values = self.fault_free.task == "regression"
-        return fit_head(first, second, targets, held_targets, folds, values=values)
+        return fit_head(first, second, targets, held_targets, folds, whole=whole, values=values)
+
+    def _whole(self, *parts: Windows) -> Tensor:
+        """Return the moments of windows with all cells, those of F included."""
+        moments = ContactMoments(self.fault_free.model.layout)
+        return torch.cat([moments(as_tensor(part.x)) for part in parts]).to(self.device)
 
     def _behind(self, front: nn.Module | None, network: Network) -> ReducedModel:
         """Return the reduced model of a front end and a network, on the device of the adapter."""
@@ -267,7 +277,9 @@ class Run:
             targets = self.fault_free.targets[np.arange(m) % len(self.fault_free.targets)]
         began = time.perf_counter()
         first, second = [v[held:] for v in known], [v[:held] for v in known]
-        self._fit(first, second, targets[held:], targets[:held], np.arange(held) % _FOLDS)
+        whole = self._whole(self.fault_free.train.select(slice(0, _BATCH)))
+        whole = whole[torch.arange(m) % len(few)].roll(-held, 0)
+        self._fit(first, second, targets[held:], targets[:held], np.arange(m) % _FOLDS, whole)
         fit = (time.perf_counter() - began) * (n / m) ** 2.5  # between distances (2) and solves (3)
         return bool(pace * n + fit > self.left())
 

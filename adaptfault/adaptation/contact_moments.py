@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from diagnostics import FaultSet, SensorLayout
+from diagnostics import SensorLayout
 
 _STEP = 1 / 4095  # of a 12-bit converter: a load below it has no place
 _CELL = 1 / 12  # variance of a load that is spread evenly over the width of a cell
@@ -21,26 +21,22 @@ class ContactMoments(nn.Module):
 
     Args:
         layout: the array.
-        fault_set: F; its cells count as 0. None: empty.
     """
 
-    used: Tensor
+    present: Tensor
     products: Tensor
 
-    def __init__(self, layout: SensorLayout, fault_set: FaultSet | None = None) -> None:
+    def __init__(self, layout: SensorLayout) -> None:
         super().__init__()
         self.pads, rows, cols = layout.shape
         y, x = np.mgrid[:rows, :cols].reshape(2, -1) - np.array([[(rows - 1) / 2], [(cols - 1) / 2]])
         products = np.stack([np.ones_like(x), y, x, y * y, x * x, y * x], axis=1).astype(np.float32)
-        used = layout.present.ravel().copy()
-        if fault_set is not None:
-            used &= ~fault_set.mask
-        self.register_buffer("used", torch.from_numpy(used), persistent=False)
+        self.register_buffer("present", torch.from_numpy(layout.present.ravel().copy()), persistent=False)
         self.register_buffer("products", torch.from_numpy(products), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map windows ``[N, T, D]`` to ``[N, 16 pads]``; positions without a cell may hold anything."""
-        x = torch.where(self.used, x, 0.0)
+        x = torch.where(self.present, x, 0.0)
         frames = torch.stack([x.mean(1), x[:, 0], x[:, -1]], dim=1).clamp_min(0.0)
         mean, first, last = self._of(torch.unflatten(frames, 2, (self.pads, -1))).unbind(1)
         return torch.cat([mean, last - first], dim=2).flatten(1)

@@ -2,11 +2,11 @@
 
 A head is a mixture of kernel ridge regressions on class indicators (as classifiers: Suykens and Vandewalle 1999) or on
 values. Each has a kernel of some views of a window: the penultimate features of the network, the healthy cells, these
-smoothed (:mod:`adaptfault.adaptation.cell_summary`), the moments of the contact on each pad as the healthy cells show
-them (:mod:`adaptfault.adaptation.contact_moments`), and the same moments restored to those of all cells. They are
-restored by one more kernel ridge regression, on windows of the time when no cell was dead: what is known of the
-training windows alone helps to learn (privileged information: Vapnik and Vashist 2009). It is cross-fitted, so a window
-is restored without its own dead cells. A Gaussian kernel suits what changes smoothly, a Laplacian kernel what hangs on
+smoothed (:mod:`adaptfault.adaptation.cell_summary`), the moments of the contact on each pad in the imputed windows
+(:mod:`adaptfault.adaptation.contact_moments`), and these corrected. The correction is one more kernel ridge regression,
+of the error that the imputation makes on training windows, whose dead cells are known: what only these windows have
+helps to learn (privileged information: Vapnik and Vashist 2009). It is cross-fitted, so a window is corrected without
+its own dead cells. A Gaussian kernel suits what changes smoothly, a Laplacian kernel what hangs on
 single values: it is the limit of a forest of random trees (Balog, Lakshminarayanan, Ghahramani, Roy and Teh 2016). The
 network has seen its training windows, so its features tell them apart better than new ones; three of the kernels do not
 use them. The shares of the mixture are those with the highest likelihood of held-out windows (stacking
@@ -112,7 +112,7 @@ class Head(nn.Module):
 
     @property
     def restores(self) -> bool:
-        """Whether it restores moments. If not, it takes those of imputed windows, as in earlier versions."""
+        """Whether it corrects the moments of imputed windows; heads of earlier versions do not."""
         return self._views > _RESTORED
 
     @property
@@ -268,17 +268,17 @@ def fit_head(
     return head, mixture(all_held, shares, values=values)
 
 
-def _restore(kernel: Tensor, shown: Tensor, whole: Tensor, folds: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
-    """Return weights that add to the moments shown ``[N, p]`` what is missing to whole ones, and cross-fitted results."""
-    missing = whole - shown
+def _restore(kernel: Tensor, imputed: Tensor, whole: Tensor, folds: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
+    """Return weights of what has to be added to imputed moments ``[N, p]``, and cross-fitted restored ones."""
+    missing = whole - imputed
     if not missing.any():
-        return torch.zeros_like(shown), shown
+        return torch.zeros_like(imputed), imputed
     few = evenly(len(folds), _SAMPLE)
     sample = kernel[few][:, few]
     tried = [ridge_regression(sample, missing[few], folds[few], ridge)[1] - missing[few] for ridge in _RIDGES]
     ridge = _RIDGES[int(np.argmin([float(error.square().mean()) for error in tried]))]
     weights, found = ridge_regression(kernel, missing, folds, ridge)
-    return weights, shown + found
+    return weights, imputed + found
 
 
 class _Classes:

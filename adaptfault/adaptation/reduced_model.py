@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from adaptfault.adaptation.cell_summary import CellSummary
 from adaptfault.adaptation.contact_moments import ContactMoments
-from adaptfault.adaptation.heads import AnyHead, Head
+from adaptfault.adaptation.heads import AnyHead
 from adaptfault.data.windows import Windows
 from adaptfault.models.any_model import AnyModel
 from adaptfault.models.network import TactileTransformer
@@ -44,8 +44,7 @@ class ReducedModel(nn.Module):
         self.network, self.fault_set, self.head = network, fault_set, head
         self.front = front if len(fault_set) else None
         self.summary = CellSummary(network.layout, fault_set)
-        imputed = isinstance(head, Head) and not head.restores
-        self.moments = ContactMoments(network.layout, None if imputed else fault_set)
+        self.moments = ContactMoments(network.layout)
 
     def complete(self, x: Tensor) -> Tensor:
         """Map the healthy cells' windows ``[N, T, D-k]`` to whole ones ``[N, T, D]``.
@@ -64,7 +63,7 @@ class ReducedModel(nn.Module):
         Returns:
             The features of the network ``[N, p]``, both results of
             :class:`~adaptfault.adaptation.cell_summary.CellSummary`, and the
-            :class:`~adaptfault.adaptation.contact_moments.ContactMoments` of the healthy cells.
+            :class:`~adaptfault.adaptation.contact_moments.ContactMoments` of the whole windows.
         """
         whole = self.complete(x)
         return self.network.features(whole), *self.summary(x), self.moments(whole)

@@ -232,13 +232,15 @@ class Run:
         targets: NDArray[np.float32],
         held_targets: NDArray[np.float32],
         folds: NDArray[np.int64],
-        whole: Tensor,
+        whole: Tensor | None,
     ) -> tuple[Head, Tensor]:
         values = self.fault_free.task == "regression"
         return fit_head(first, second, targets, held_targets, folds, whole=whole, values=values)
 
-    def _whole(self, *parts: Windows) -> Tensor:
-        """Return the moments of windows with all cells, those of F included."""
+    def _whole(self, *parts: Windows) -> Tensor | None:
+        """Return the moments of windows with all cells, those of F included; None if F is empty."""
+        if not len(self.fault_set):
+            return None
         moments = ContactMoments(self.fault_free.model.layout)
         return torch.cat([moments(as_tensor(part.x)) for part in parts]).to(self.device)
 
@@ -278,7 +280,7 @@ class Run:
         began = time.perf_counter()
         first, second = [v[held:] for v in known], [v[:held] for v in known]
         whole = self._whole(self.fault_free.train.select(slice(0, _BATCH)))
-        whole = whole[torch.arange(m) % len(few)].roll(-held, 0)
+        whole = None if whole is None else whole[torch.arange(m) % len(few)].roll(-held, 0)
         self._fit(first, second, targets[held:], targets[:held], np.arange(m) % _FOLDS, whole)
         fit = (time.perf_counter() - began) * (n / m) ** 2.5  # between distances (2) and solves (3)
         return bool(pace * n + fit > self.left())

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor, nn
 
 from adaptfault.adaptation.cell_summary import CellSummary
-from adaptfault.adaptation.contact_moments import ContactMoments
 from adaptfault.adaptation.heads import Head
 from adaptfault.adaptation.reduced_model import ReducedModel
 from adaptfault.imputation.linear import AffineFill
@@ -36,8 +35,7 @@ class Masked(nn.Module):
     A dropped cell reads 0 in the windows and in those that the head knows, so it adds nothing to a distance.
 
     Args:
-        model: with a linear front end or none, and a :class:`~adaptfault.adaptation.heads.Head` that restores moments;
-            see :meth:`suits`.
+        model: with a linear front end or none, and a :class:`~adaptfault.adaptation.heads.Head`; see :meth:`suits`.
     """
 
     used: Tensor
@@ -55,7 +53,7 @@ class Masked(nn.Module):
         self.register_buffer("used", torch.from_numpy(present & ~faults.mask))
         self.register_buffer("weight", weight)
         self.register_buffer("bias", bias)
-        self.network, self.summary, self.moments = model.network, CellSummary(layout, FaultSet((), d)), ContactMoments(layout)
+        self.network, self.summary, self.moments = model.network, CellSummary(layout, FaultSet((), d)), model.moments
         assert isinstance(model.head, Head)
         features, cells, *others = model.head.known
         wide = cells.new_zeros(len(cells), 2, int(present.sum()))
@@ -66,13 +64,12 @@ class Masked(nn.Module):
     def suits(model: ReducedModel) -> bool:
         """Return whether the model has parts of these kinds, and not too many cells for a matrix of them."""
         small = model.fault_set.n_cells <= LARGE
-        with_head = isinstance(model.head, Head) and model.head.restores
-        return small and with_head and isinstance(model.front, AffineFill | None)
+        return small and isinstance(model.head, Head) and isinstance(model.front, AffineFill | None)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map windows ``[N, T, D]`` to probabilities ``[N, n_classes]``."""
         known = torch.where(self.used, x, 0.0)
         filled = nn.functional.linear(known, self.weight, self.bias).clamp(0.0, 1.0)
         whole = torch.where(self.used, x, filled)
-        views = (self.network.features(whole), *self.summary(known), self.moments(known))
+        views = (self.network.features(whole), *self.summary(known), self.moments(whole))
         return torch.softmax(self.head(views), dim=1)

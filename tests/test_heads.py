@@ -233,7 +233,7 @@ def test_windows_that_differ_in_one_moment_are_told_apart_by_the_laplacian_kerne
 
 
 def with_dead_cells(n: int = 400) -> tuple[list[torch.Tensor], torch.Tensor, np.ndarray]:
-    """Views of windows whose class lies in a moment that is not shown, but follows from the cells; the whole moments."""
+    """Views of windows whose class lies in a moment that only the cells show, the whole moments, and the classes."""
     rng = np.random.default_rng(0)
     cells = rng.random((n, 3)).astype(np.float32)
     hidden = cells[:, :1] + cells[:, 1:2] ** 2

@@ -128,7 +128,7 @@ class Head(nn.Module):
         return Head(*parts, units=own.get("units"), restoring=own.get("restoring"), values=self.values)
 
     def forward(self, views: Views) -> Tensor:
-        """Map views of N windows, each ``[N, p]``, to logits or values ``[N, n]``; the restored moments are not given."""
+        """Map views of N windows, each ``[N, p]``, without the restored moments, to logits or values ``[N, n]``."""
         if self._views > _MOMENTS:
             views = _in_units(views, self.get_buffer("units"))
         widths = self.widths.double()

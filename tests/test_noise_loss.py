@@ -47,6 +47,12 @@ def test_few_recordings_give_no_evidence():
     assert np.isinf(NoiseLoss.fit(noisy_presses(0, recordings=7), PRESENT).longest).all()
 
 
+def test_cells_that_held_their_reading_for_a_third_of_a_recording_are_no_evidence_when_they_do_so_again():
+    recordings = noisy_presses(0)
+    recordings[3][10:32] = recordings[3][10]
+    assert np.isinf(NoiseLoss.fit(recordings, PRESENT).longest).all()
+
+
 def test_a_cell_that_loses_its_noise_is_broken_unless_half_of_the_cells_do():
     noise_loss = NoiseLoss.fit(noisy_presses(0), PRESENT)
     idle = np.concatenate(noisy_presses(5, 4))[:200]

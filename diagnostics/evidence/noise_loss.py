@@ -22,13 +22,15 @@ from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import same_for
 from diagnostics.evidence.term import untouched_evidence
-from diagnostics.preprocessing.levels import EXPECTED, FEWEST, MAJORITY, MARGIN
+from diagnostics.preprocessing.levels import FEWEST, MAJORITY, MARGIN
 from diagnostics.preprocessing.readings import RecordingBlocks, held
 
 if TYPE_CHECKING:
     from diagnostics.evidence.term import ConstantCells
 
 _LONGER = 2.0  # times the longest run
+_CALM = 0.25  # of a recording: a cell with a longer identical run has no noise
+_QUIET = 0.02  # share of cells without noise off the rails, at most
 
 Floats = NDArray[np.float64]
 
@@ -62,9 +64,9 @@ class NoiseLoss:
             lowest = np.fmin.reduce(frames, None, initial=lowest)
             highest = np.fmax.reduce(frames, None, initial=highest)
         recording = float(np.median([len(r) for r in recordings]))
-        has_noise = longest <= MAJORITY * recording
+        has_noise = longest <= _CALM * recording
         quiet = ~has_noise & (value > lowest) & (value < highest)
-        few = len(recordings) < FEWEST or has_noise[present].mean() < MAJORITY or quiet[present].mean() > EXPECTED
+        few = len(recordings) < FEWEST or has_noise[present].mean() < MAJORITY or quiet[present].mean() > _QUIET
         return cls.unknown(len(present)) if few else cls(np.where(has_noise, longest, np.inf), recording)
 
     @classmethod

@@ -258,7 +258,7 @@ def made_bundle(small_grasps: Recordings, made_once) -> Path:
 
     def make(home: Path) -> None:
         save_npz(home / "grasps.npz", small_grasps)
-        command = ["train", str(home / "grasps.npz"), "--out", str(home / "robot.bundle"), "--epochs", "8", "--quiet"]
+        command = ["train", str(home / "grasps.npz"), "--out", str(home / "robot.bundle"), "--epochs", "5", "--quiet"]
         with without_export():
             assert main(command) == 0
 

@@ -245,14 +245,15 @@ def fit_head(
     restoring, restored = _restore(similar, both[_MOMENTS], whole / units, folds)
     both.append(restored)
     more, second = _distances(both, _RESTORED)
-    distances, widths = distances | more, torch.tensor(first + second, device=on)
+    distances = {i: each for i, each in distances.items() if i not in _KERNELS[0]} | more  # large: no more than needed
+    widths = torch.tensor(first + second, device=on)
     targets = task.targets.to(on)
     m, n = len(training_targets), len(held_targets)
     folds, kept = folds[m:], evenly(n, _SAMPLE)
     few = np.concatenate([evenly(m, _SAMPLE), m + kept])  # enough to compare ridges
     all_weights, all_held = [], []
     for of in _KERNELS:
-        kernel = _kernel(distances, widths, of)
+        kernel = similar if of is _KERNELS[0] else _kernel(distances, widths, of)
         sample = kernel if len(few) == m + n else kernel[few][:, few]
         tried = [
             task.loss(ridge_regression(sample, targets[few], folds[kept], ridge)[1].cpu(), kept) for ridge in _RIDGES

@@ -59,6 +59,7 @@ def test_readings_below_zero_and_above_full_scale_survive(tmp_path):
     np.testing.assert_allclose(load_adapter(tmp_path).train.x, wide.x, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_papers_layout_fits_into_20_mb_with_many_windows(tmp_path):
     layout = SensorLayout.paper()
     rng = np.random.default_rng(0)

@@ -1,6 +1,7 @@
 """The condition of cells is measured run by run, and what drifts in it is told, with intervals that hold."""
 
 import json
+import shutil
 from datetime import datetime, timedelta, timezone
 
 import numpy as np
@@ -125,8 +126,6 @@ def test_a_perfect_line_and_its_crossing_are_exact_and_few_runs_prove_nothing():
 def test_runs_of_a_robot_show_the_cell_that_weakens_and_when_it_will_be_too_weak(
     linear_bundle, tmp_path, monkeypatch, capsys
 ):
-    import shutil
-
     import power_cut
 
     import adaptfault as af
@@ -180,7 +179,9 @@ def test_a_journal_of_an_earlier_version_has_no_conditions_and_takes_them(tmp_pa
     assert journal.conditions() == [(run, "2026-01-02T00:00:00+00:00", b"abc")]
 
 
-def test_a_row_of_a_wrong_size_is_damage(bundle):
+def test_a_row_of_a_wrong_size_is_damage(linear_bundle, tmp_path):
+    shutil.copytree(linear_bundle, tmp_path / "robot.bundle")
+    bundle = Bundle.open(tmp_path / "robot.bundle")
     bundle.journal.add("2026-01-01T00:00:00+00:00", "unchanged", {"version": 1}, condition=b"abc")
     with pytest.raises(Damaged, match="wrong size"):
         AgeingTable.of(bundle)

@@ -37,7 +37,7 @@ def home(small: Recordings, made_once, tmp_path_factory: pytest.TempPathFactory)
 
     def make(home: Path) -> None:
         save_npz(home / "grasps.npz", small)
-        command = ["train", str(home / "grasps.npz"), "--out", str(home / "model"), "--epochs", "10", "--quiet"]
+        command = ["train", str(home / "grasps.npz"), "--out", str(home / "model"), "--epochs", "6", "--quiet"]
         assert main(command) == 0
 
     return shutil.copytree(made_once("home", make), tmp_path_factory.mktemp("home") / "home")

@@ -124,6 +124,7 @@ def test_processes_go_on_from_robot_to_robot():
     assert len({o.reason for o in done("a b c d e f", jobs=2).values()}) <= 2
 
 
+@pytest.mark.slow
 def test_a_process_that_grew_is_replaced_and_its_warning_is_no_error():
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -124,6 +124,7 @@ def test_windows_added_can_be_chosen_but_not_none(home, capsys):
     assert json.loads((out / "config.json").read_text())["settings"]["samples"] == [32, 64]
 
 
+@pytest.mark.slow
 def test_every_strategy_of_every_figure_answers_every_test_window(bench):
     tasks = [t for t in TINY.tasks(60, (2, 4, 5, 6, 7)) if t.seed == 0]
     assert {t.figure for t in tasks} == {2, 4, 5, 6, 7}

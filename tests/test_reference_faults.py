@@ -96,6 +96,7 @@ def test_a_stored_diagnosis_keeps_them(worn, fitted):
     np.testing.assert_array_equal(again.probability, fitted.diagnose(worn[1:12:2]).probability)
 
 
+@pytest.mark.slow
 def test_on_a_large_array_only_tiles_of_candidates_are_scored_with_the_same_result():
     skin, rng = SensorLayout(1, 40, 40), np.random.default_rng(0)
     places = np.argwhere(np.ones((40, 40)))

@@ -151,6 +151,7 @@ def test_a_dead_row_of_an_array_of_10000_cells_is_found_without_a_reference():
     assert set(fault.cells) <= set(found.fault_set)
 
 
+@pytest.mark.slow
 def test_memory_per_cell_does_not_grow_with_the_array_in_fitting_or_diagnosing():
     peaks = []
     for pads in (2, 6):

@@ -240,13 +240,13 @@ def fit_head(
     whole = both[_MOMENTS] if whole is None else whole
     units = _units(whole)
     both = _in_units(both, units)
-    distances, first = _distances(both)
-    similar = _kernel(distances, torch.tensor(first, device=on), _KERNELS[0])
+    widths = torch.ones(len(_DISTANCES), device=on)
+    distances = _distances(both, widths)
+    similar = _kernel(distances, widths, _KERNELS[0])
     restoring, restored = _restore(similar, both[_MOMENTS], whole / units, folds)
     both.append(restored)
-    more, second = _distances(both, _RESTORED)
-    distances = {i: each for i, each in distances.items() if i not in _KERNELS[0]} | more  # large: no more than needed
-    widths = torch.tensor(first + second, device=on)
+    distances = {i: each for i, each in distances.items() if i not in _KERNELS[0]}  # large: no more than needed
+    distances |= _distances(both, widths, _RESTORED)
     targets = task.targets.to(on)
     m, n = len(training_targets), len(held_targets)
     folds, kept = folds[m:], evenly(n, _SAMPLE)
@@ -357,23 +357,21 @@ def _in_units(views: Views, units: Tensor) -> list[Tensor]:
     return [view / units if i == _MOMENTS else view for i, view in enumerate(views)]
 
 
-def _distances(views: Views, first: int = 0) -> tuple[dict[int, Tensor], list[float]]:
-    """Return the distances of the windows that kernels use, and the units of all, of the given views from ``first`` on.
+def _distances(views: Views, widths: Tensor, first: int = 0) -> dict[int, Tensor]:
+    """Return the distances of the windows that kernels use, of the given views from ``first`` on.
 
-    The units are medians, and 1 where they are not used.
+    Their units, the medians, are put into ``widths``.
 
     Raises:
         ValueError: a view is not finite.
     """
     if not all(bool(view.square().sum().isfinite()) for view in views):
         raise ValueError("the network gives features that are not finite: check the recordings, and train it anew")
-    distances, widths = {}, []
+    distances = {}
     sample = evenly(len(views[0]), _SAMPLE)
-    for i, (index, squared) in enumerate(_DISTANCES):
+    for i in _used(_KERNELS):
+        index, squared = _DISTANCES[i]
         if not first <= index < len(views):
-            continue
-        widths.append(1.0)
-        if i not in _used(_KERNELS):
             continue
         view, least = views[index], 0.0
         distance = _distance(view, view, squared=True) if squared else _absolute_distances(view)
@@ -382,9 +380,9 @@ def _distances(views: Views, first: int = 0) -> tuple[dict[int, Tensor], list[fl
             view = view.double()
             distance, least = _distance(view, view, squared=True).float(), _rounding(view)
             width = float(distance[sample][:, sample].median())
-        widths[-1] = max(width, least) or 1.0
+        widths[i] = max(width, least) or 1.0
         distances[i] = distance
-    return distances, widths
+    return distances
 
 
 def _rounding(view: Tensor) -> float:

@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.adaptation.contact_moments import ContactMoments
 from adaptfault.adaptation.fault_free import FaultFreeModel, Network
 from adaptfault.adaptation.heads import MOST_WINDOWS, Head, calibrate, fit_head, linear_head, log_likelihood
 from adaptfault.adaptation.reduced_model import ReducedModel, reduce_windows
@@ -241,8 +240,7 @@ class Run:
         """Return the moments of windows with all cells, those of F included; None if F is empty."""
         if not len(self.fault_set):
             return None
-        moments = ContactMoments(self.fault_free.model.layout)
-        return torch.cat([moments(as_tensor(part.x)) for part in parts]).to(self.device)
+        return torch.cat([self.reduced.moments(as_tensor(part.x).to(self.device)) for part in parts])
 
     def _behind(self, front: nn.Module | None, network: Network) -> ReducedModel:
         """Return the reduced model of a front end and a network, on the device of the adapter."""

@@ -45,6 +45,16 @@ def test_an_offset_of_one_cell_is_its_lowest_reading_and_a_large_one_is_a_load()
     assert baseline[60] == pytest.approx(0.015)
 
 
+def test_offsets_that_most_cells_have_are_no_loads():
+    offsets = np.linspace(0, 0.03, CELLS)
+    frames = events(1)[0][:5] * 0 + offsets
+    frames[:, 7] = 0.3
+    tracker = OffsetTracker.begin(CELLS).extend(frames, SCALE, PRESENT, ReferenceOffset(0.0, 1.0))
+    removed = tracker.own + tracker.common[-1]
+    np.testing.assert_allclose(np.delete(removed, 7), np.where(offsets > 0.005, offsets, 0)[np.arange(CELLS) != 7])
+    assert removed[7] == 0
+
+
 def test_an_offset_as_in_the_reference_is_usual():
     assert ReferenceOffset.fit(events(0), SCALE, PRESENT) == USUAL
     assert ReferenceOffset.fit([r + 0.02 for r in events(0)], SCALE, PRESENT) == pytest.approx((0, 0.02))
@@ -92,6 +102,8 @@ def test_offsets_of_single_cells_and_those_that_change_between_recordings_are_no
     log, rng = events(1, 8), np.random.default_rng(0)
     assert not fitted.diagnose([r + 0.015 * np.linspace(0, 1, CELLS) for r in log]).fault_set
     assert not fitted.diagnose([r + rng.uniform(0, 0.02) for r in log]).fault_set
+    offsets = rng.permutation(np.linspace(0, 0.02, CELLS))  # 3 % of the range
+    assert not fitted.diagnose([r + offsets for r in log]).fault_set
 
 
 def test_a_little_noise_that_the_reference_did_not_have_is_no_fault(fitted):

@@ -6,8 +6,9 @@ Estimates two offsets above the reference baseline b:
     own_i     = min over t of (x_i(t) - b_i) - common           where it exceeds the noise
 
 A quantile filter over cells and a running minimum over time, as in baseline correction by minimum statistics (Martin
-2001). Common offsets up to 5 % and own offsets up to 2 % of full scale are removed. Larger ones are not tracked: such a
-cell is loaded or faulty.
+2001). Common offsets up to 5 % of full scale are removed, and own offsets up to 2 %, or up to what is usual in the log:
+three robust standard deviations above the median of all cells, at most 5 %. Larger ones are not
+tracked: such a cell is loaded or faulty.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, SLIGHT
 from diagnostics.preprocessing.readings import RecordingBlocks, spread
+from diagnostics.preprocessing.scale import usual_limit
 
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Scale
@@ -87,7 +89,9 @@ class OffsetTracker:
         if (lowest > scale.near / 2).any():
             shared = usual.excess(_least_loaded(lowest[present]))
             beyond = lowest - np.where(shared < LIGHT * scale.full_scale, shared, 0.0)
-            own = np.where((beyond > scale.near / 2) & (beyond < SLIGHT * scale.full_scale), beyond, 0.0)
+            usual_own = usual_limit(beyond[present & np.isfinite(beyond)]) / scale.full_scale
+            limit = min(max(usual_own, SLIGHT), LIGHT) * scale.full_scale
+            own = np.where((beyond > scale.near / 2) & (beyond < limit), beyond, 0.0)
         # Usually there is no common offset: enough cells stay at their baseline throughout.
         calm = present & (np.fmax.reduce(frames) - scale.baseline - own <= usual.most)
         if np.count_nonzero(calm) > LEAST_LOADED * np.count_nonzero(present):

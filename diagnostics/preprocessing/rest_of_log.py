@@ -17,13 +17,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import median_abs_deviation
 
 from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT
-from diagnostics.preprocessing.scale import Scale
+from diagnostics.preprocessing.scale import Scale, usual_limit
 
 _MARGIN = 4.0  # from the mean of such a cell to the highest reading of any cell at rest
-_OUTLYING = 3.0  # standard deviations from the median of all cells
 
 Floats = NDArray[np.float64]
 
@@ -66,8 +64,7 @@ class RestOfLog:
         known = lowest[moved]
         if not len(known):
             return plain
-        usual = float(np.median(known) + _OUTLYING * median_abs_deviation(known, scale="normal"))
-        highest = float(known.max(initial=0.0, where=known <= max(LIGHT * plain.full_scale, usual)))
+        highest = float(known.max(initial=0.0, where=known <= max(LIGHT * plain.full_scale, usual_limit(known))))
         near = _MARGIN * self.varies / max(self.segments, 1)
         baseline = np.maximum(plain.baseline, np.minimum(lowest, highest))
         return replace(plain, baseline=baseline, near=max(plain.near, near))

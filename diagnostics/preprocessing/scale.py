@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import median_abs_deviation
+
+_OUTLYING = 3.0  # standard deviations from the median
 
 Array = NDArray[np.float32]
 
@@ -42,3 +45,13 @@ class Scale:
     def root_near(self) -> float:
         """The root load above which a cell counts as loaded."""
         return float(np.sqrt(self.near / self.full_scale))
+
+
+def usual_limit(values: NDArray[np.float64]) -> float:
+    """Return the median of ``values`` ``[n]`` plus three robust standard deviations: higher ones are outliers.
+
+    The filter of Hampel (1974), with ``scipy.stats.median_abs_deviation(scale="normal")``; -inf without values.
+    """
+    if not len(values):
+        return -np.inf
+    return float(np.median(values) + _OUTLYING * median_abs_deviation(values, scale="normal"))

@@ -63,6 +63,17 @@ def test_a_cell_with_excess_noise_is_noisy_and_dated(usual):
     assert 288 <= intermittency.noisy_since[7] <= 384
 
 
+def test_noise_that_now_and_then_reaches_the_baseline_is_seldom_taken_for_blinks(usual):
+    named = 0
+    for seed in range(10):
+        log = healthy(31, 192)
+        log[:, :4] = np.clip(np.random.default_rng(seed).normal(1.0, 1.2, (192, 4)), 0, 5)
+        evidence = evidence_of(log, usual)
+        assert cells(evidence.excess | evidence.intermittent) == [0, 1, 2, 3]
+        named += evidence.excess.sum()
+    assert named >= 28  # of 40
+
+
 def test_a_fault_that_has_gone_is_forgotten(usual):
     faults = [Fault("intermittent", (7,)), Fault("noisy", (12,), value=0.5)]
     log = inject(healthy(32, 1600), faults, LAYOUT, seed=0, until=480)

@@ -184,9 +184,9 @@ class Intermittency:
         noisier = self._noisier(noise_level, usual.noise[level], moving, usual.alone)
         if noisier.sum() > max(crowd, _CROWD * len(constant)):
             noisier[:] = False
-        gain = np.where(events > 1, 0.0, np.log(_NOISY_SHARE / _RARE))  # blinks are noise as well: count them once
         noisy = self.noisy + usual.noise_counts * np.log((1 - _NOISY_SHARE) / (1 - _RARE))
-        noisy[moving] = np.where(noisier, self.noisy[moving] + usual.noise_counts * gain, noisy[moving])
+        more = usual.noise_counts * np.log(_NOISY_SHARE / _RARE)
+        noisy[moving] = np.where(noisier, self.noisy[moving] + more, noisy[moving])
         noisy = np.clip(noisy, 0.0, full)
         blinks, to_full = np.zeros(len(constant), np.intp), np.zeros(len(constant), np.intp)
         blinks[moving], to_full[moving] = events, np.where(events > 0, high, 0)

@@ -1,12 +1,12 @@
 """Fits the calibration of a cold start: python benchmarks/cold_calibration.py [--logs N] [--arrays NAME ...]
 
 Logs of simulated grasps and postures are diagnosed without a reference, healthy ones and ones with 4 to 16 % of the
-cells dead. For the cells that never moved and rest, a logistic regression with balanced classes is fitted,
+cells dead. For the cells that never moved and rest, and of which an event tells anything, a logistic regression with
+balanced classes is fitted,
 
-    log odds = a + b * surprisal + temporal
+    log odds = a + surprisal + temporal
 
-b near 1 and a near ``Calibrator.cold().offset[0]`` mean that a cold start is calibrated. Each kind of array counts
-alike.
+a near ``Calibrator.cold().offset[0]`` means that a cold start is calibrated. Each kind of array counts alike.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CLIP = 5.0  # temporal log ratios beyond do not steer the fit
 
 
 def cells_at_rest(bench: Bench) -> np.ndarray:
-    """Return surprisal, temporal log ratio, and whether it is dead, of each cell that never moved, ``[n, 3]``."""
+    """Return surprisal, temporal log ratio, and whether it is dead, of each such cell, ``[n, 3]``."""
     diagnoser, found = SelfDiagnosis(bench.layout), []
     for seed, log, rng in bench.logs():
         faults = draw_faults(bench.layout, SHARES[seed % len(SHARES)], STUCK_KINDS, rng)
@@ -36,7 +36,8 @@ def cells_at_rest(bench: Bench) -> np.ndarray:
                 stream.extend(frames)
             stream = stream.complete()
             spatial = stream.spatial().finish()
-            cells = np.flatnonzero(stream.present & stream.rests() & spatial.scored & ~stream.runs.moved)
+            still = stream.present & stream.rests() & spatial.scored & ~stream.runs.moved
+            cells = np.flatnonzero(still & (spatial.surprisal > 0))
             found.append(
                 np.stack(
                     [spatial.surprisal[cells], stream.temporal()[cells], np.isin(cells, list(kind_of_cells(dead)))], 1
@@ -45,22 +46,20 @@ def cells_at_rest(bench: Bench) -> np.ndarray:
     return np.concatenate(found)
 
 
-def fit(cells: list[np.ndarray]) -> tuple[float, float]:
-    """Return a and b; each array, and in it the dead and the healthy cells, count alike."""
+def fit(cells: list[np.ndarray]) -> float:
+    """Return a; each array, and in it the dead and the healthy cells, count alike."""
     weight = np.concatenate([np.where(c[:, 2] > 0, 1 / c[:, 2].sum(), 1 / (1 - c[:, 2]).sum()) for c in cells])
     surprisal, temporal, dead = np.concatenate(cells).T
 
     def loss(weights: np.ndarray) -> float:
-        odds = weights[0] + weights[1] * surprisal + np.clip(temporal, -CLIP, CLIP)
+        odds = weights[0] + surprisal + np.clip(temporal, -CLIP, CLIP)
         return float(weight @ (np.logaddexp(0, odds) - dead * odds))
 
-    a, b = minimize(loss, [0.0, 1.0]).x.tolist()
-    return a, b
+    return float(minimize(loss, [0.0]).x[0])
 
 
 def show(name: str, cells: list[np.ndarray]) -> None:
-    a, b = fit(cells)
-    print(f"{name:28}{sum(map(len, cells)):7} cells: a = {a:.2f}, b = {b:.2f}", flush=True)
+    print(f"{name:28}{sum(map(len, cells)):7} cells: a = {fit(cells):.2f}", flush=True)
 
 
 def main() -> None:

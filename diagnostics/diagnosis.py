@@ -314,7 +314,8 @@ class SelfDiagnosis:
         present, silent = stream.present, stream.silent & ~explained
         temporal, kind = stream.temporal(), kinds(stream)
         known = spatial.scored & ~runs.moved & (reference.dead > 0)
-        log_ratio = self.calibrator_.calibrate(spatial.evidence, temporal, kind)
+        tested = _events_tell(stream, spatial.surprisal)
+        log_ratio = self.calibrator_.calibrate(spatial.evidence, temporal, kind, tested)
         stuck = self.calibrator_.probability(log_ratio, kind, spatial.scored & ~known)
         stuck[known] = reference.dead[known]
         delivers = present & ~explained & ~silent
@@ -347,7 +348,9 @@ class SelfDiagnosis:
             ),
             probability=probability,
             # A cell at rest supports a broken line by the events alone, without the prior of its value.
-            weight=np.where(known, CERTAIN_RATIO, self.calibrator_.calibrate(spatial.surprisal, temporal, kind)),
+            weight=np.where(
+                known, CERTAIN_RATIO, self.calibrator_.calibrate(spatial.surprisal, temporal, kind, tested)
+            ),
             events=np.where(intermittent, intermittency.blinks, spatial.events),
             known=known,
         )
@@ -363,7 +366,8 @@ class SelfDiagnosis:
         temporal, kind = stream.temporal(), kinds(stream)
 
         def weight_of(surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
-            more = self.calibrator_.calibrate(surprisal, temporal, kind) - found.weight
+            tested = _events_tell(stream, surprisal)
+            more = self.calibrator_.calibrate(surprisal, temporal, kind, tested) - found.weight
             return found.weight + _GROUP_SHARE * np.maximum(more, 0.0)
 
         return weight_of
@@ -415,3 +419,8 @@ def _checked(recording: ArrayLike, name: str, layout: SensorLayout) -> NDArray[A
     if given.dtype.kind in "fiu" and given.shape[1:] in (layout.shape, (layout.n_cells,)):
         return given.reshape(len(given), layout.n_cells)
     return layout.check_recording(recording, name)
+
+
+def _events_tell(stream: StreamState, surprisal: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return of which cells the events tell anything, bool ``[D]``: with a reference of all."""
+    return np.asarray((surprisal > 0) | (stream.reference.model is not None))

@@ -2,14 +2,14 @@
 
 Estimates, for each of three kinds of constant cells (never moved; came to rest; came to hold a load),
 
-    log odds = logit(prevalence) + a + b spatial + d temporal
+    log odds = logit(prevalence) + a q + b spatial + d temporal
 
 Raw ratios are overconfident, because events are few and correlated and models err at edges of objects. The reference is
 split; models of one part diagnose logs made of the other part, with known faults. Equals Platt scaling (Platt 1999),
-scikit-learn's ``CalibratedClassifierCV(method="sigmoid")``. The prevalence is not
-calibrated: it is estimated from each log by expectation maximisation (Saerens et al. 2002). The faulty set is the
-largest one whose expected false discovery rate meets the limit (:func:`faulty_at`). Faults unlike the injected ones are
-calibrated as well as these only by assumption.
+scikit-learn's ``CalibratedClassifierCV(method="sigmoid")``. q is 1; in a cold start it is 0 for cells of which no event
+tells anything: these keep their prior. The prevalence is not calibrated: it is estimated from each log by expectation
+maximisation (Saerens et al. 2002). The faulty set is the largest one whose expected false discovery rate meets the
+limit (:func:`faulty_at`). Faults unlike the injected ones are calibrated as well as these only by assumption.
 """
 
 from __future__ import annotations
@@ -173,17 +173,20 @@ class Calibrator:
         """The raw log ratio from which on a cell is excluded from the predictors, and the factor of gains."""
         return Exclusion((SUSPICIOUS - self.offset[0]) / max(self.slope[0], 1e-9), self.gains)
 
-    def calibrate(self, ratio: Floats, temporal: Floats, kind: NDArray[np.intp]) -> Floats:
+    def calibrate(
+        self, ratio: Floats, temporal: Floats, kind: NDArray[np.intp], tested: NDArray[np.bool_] | bool = True
+    ) -> Floats:
         """Return the calibrated log likelihood ratio faulty : healthy, ``[D]``.
 
         Args:
             ratio: float ``[D]``, spatial log likelihood ratio stuck : healthy.
             temporal: float ``[D]``, temporal log likelihood ratio.
             kind: int ``[D]``, see the class.
+            tested: bool ``[D]``, of which cells the events tell anything, q.
         """
         known = np.where(kind < len(self.slope), kind, 0)
         offset, slope, share = (np.array(of)[known] for of in (self.offset, self.slope, self.temporal))
-        log_ratio: Floats = offset + slope * ratio + share * temporal
+        log_ratio: Floats = offset * tested + slope * ratio + share * temporal
         return log_ratio
 
     def probability(self, log_ratio: Floats, kind: NDArray[np.intp], scored: NDArray[np.bool_]) -> Floats:

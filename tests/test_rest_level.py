@@ -63,6 +63,11 @@ def test_the_more_cells_read_0_the_less_it_counts_against_each_of_them():
     assert ratios[-1] < 1.5
 
 
+def test_a_few_cells_that_read_0_among_idle_ones_that_rest_like_the_others_are_open():
+    readings, idle = np.full((LENGTH, CELLS), 0.05), np.arange(CELLS) < 6
+    assert (resting(np.where(np.arange(CELLS) < 3, 0.0, readings), idle)[:3] > 6).all()  # log likelihood ratios
+
+
 def test_many_idle_cells_that_rest_like_the_others_are_not_suspected():
     for n in (1, 5, 20):
         assert (resting(np.zeros((LENGTH, CELLS)), np.arange(CELLS) < n) < 0.2).all()

@@ -14,9 +14,10 @@ differ. This is the predictive distribution of a Dirichlet process of concentrat
 
 Cells that nothing reached may rest elsewhere than those that moved: on another pad, or where cells that moved were
 loaded throughout. u is the probability of that, from m of the n cells of the array being constant near v: a uniform
-distribution of m against the beta-binomial distribution of the number of broken cells. For the same reason a level
-above the rail only lowers the ratio. It detects nothing where healthy cells read a constant 0 without contact, in pads
-where it would count against more than half of the cells, and where fewer than eight cells moved and rested.
+distribution of m against the beta-binomial distribution of the number of broken cells, and as unlikely beforehand as a
+fault. For the same reason a level above the rail only lowers the ratio. It detects nothing where healthy cells read a
+constant 0 without contact, in pads where it would count against more than half of the cells, and where fewer than eight
+cells moved and rested.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ class RestLevel:
         like_others = (k + p_level * np.where(exact, p_exact, 1.0)) / (len(known) + 1)
         m, n = _near(level, level, margin), np.count_nonzero(present)
         faults = betabinom.pmf(m, n, EXPECTED * EXPECTED_CELLS, (1 - EXPECTED) * EXPECTED_CELLS)
-        unlike = 1 / (1 + (n + 1) * faults)
+        unlike = 1 / (1 + (1 / EXPECTED - 1) * (n + 1) * faults)
         healthy = (1 - unlike) * like_others + unlike * np.maximum(like_others, m / n)
         rail = level <= margin
         anywhere = ANYWHERE * 2 * margin / layout.full_scale

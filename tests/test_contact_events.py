@@ -110,6 +110,15 @@ def test_cells_that_break_within_an_event_can_be_tested_on_the_rest_of_it(onset:
     assert (rest.features()[3, list(broken)] == (value > 0)).all()  # at that value all through
 
 
+@pytest.mark.parametrize("onset", range(1, 18, 4))
+def test_cells_that_break_all_at_once_do_not_hide_the_short_contacts_after(onset: int):
+    light, broken = 0.2 * HAND * [1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0], (5, 6, 7, 8, 9)
+    log = np.concatenate([np.tile(load, (4, 1)) for load in (light, np.roll(light, 8)) * 4])
+    usual = [t.first for t in events_of(log).kept]
+    log[onset:, broken] = 5.0
+    assert [t.first for t in events_of(log).kept] == usual == list(range(0, 32, 4))
+
+
 def test_cells_that_blink_at_the_edge_of_a_contact_begin_no_event():
     log = np.concatenate([held(50), idle(20), held(300)])
     usual = [t.first for t in events_of(log).kept]

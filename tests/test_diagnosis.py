@@ -201,12 +201,12 @@ def test_a_cell_whose_offset_drifts_away_is_found(fitted, log):
     assert (fault.kind, fault.cells) == (FaultKind.DRIFT, (cell,))
 
 
-@pytest.mark.parametrize("onset", [None, 2000])
-def test_a_cell_that_has_lost_most_of_its_gain_is_found_with_that_reason(fitted, grasps: Recordings, onset):
+@pytest.mark.parametrize(("which", "onset"), [(6, None), (24, 2000), (36, None)])
+def test_a_cell_that_has_lost_most_of_its_gain_is_found_with_that_reason(fitted, grasps: Recordings, which, onset):
     log = [grasps.frames[i] for i in range(1, 140, 3)]
     assert not fitted.diagnose(log).faults
     frames = np.concatenate(log)
-    cell = int(often_loaded(log)[24])
+    cell = int(often_loaded(log)[which])
     frames[onset:, cell] *= 0.15
     (fault,) = fitted.diagnose(frames).faults
     assert (fault.kind, fault.cells) == (FaultKind.DRIFT, (cell,))
@@ -382,6 +382,17 @@ def test_positions_without_a_cell_have_no_verdict():
         assert not diagnosis.fault_set & set(masked.tolist())
         assert (diagnosis.verdicts[masked] == Verdict.UNTESTED).all()
         assert not np.isin(diagnosis.coverage.untested, masked).any()
+
+
+def test_a_cell_that_no_reference_contact_loaded_and_now_holds_a_load_is_found(small_grasps: Recordings):
+    def unreached(recordings: Sequence[np.ndarray], value: float) -> list[np.ndarray]:
+        return [np.where(np.arange(n) == 0, value, np.where(r < 0.1, 0.0, r)) for r in recordings]
+
+    n = small_grasps.layout.n_cells
+    fitted = SelfDiagnosis(small_grasps.layout).fit(unreached(small_grasps.frames[::2], 0.0))
+    log = small_grasps.frames[61:69:2]
+    assert fitted.diagnose(unreached(log, 0.0)).fault_set == set()
+    assert fitted.diagnose(unreached(log, 1.0)).fault_set == {0}
 
 
 @pytest.mark.usefixtures("uncalibrated")

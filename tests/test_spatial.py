@@ -79,7 +79,7 @@ def result_of(
     runs, events = seen(log)
     accumulated = np.zeros(CELLS) if accumulated is None else accumulated
     jumps = np.full(CELLS, jump)
-    cells = CellState(runs, accumulated, jumps, jumps, ~wrong, NONE)
+    cells = CellState(runs, accumulated, jumps, ~wrong, NONE)
     return SpatialTest(events, cells, model or Copycat(), SCALE, 0.025, Exclusion(2.0)).finish()
 
 
@@ -141,7 +141,7 @@ def test_cells_that_broke_together_do_not_vouch_for_each_other():
     assert (result_of(log, model=Row()).surprisal[5:] < 0.1).all()
     runs, events = seen(log)
     zero, predictors = np.zeros(CELLS), np.ones(CELLS, bool)
-    cells = CellState(runs, zero, zero, zero, predictors, NONE)
+    cells = CellState(runs, zero, zero, predictors, NONE)
     groups = [np.array([5, 6, 7]), np.array([6])]
     together, alone = group_excluded_evidence(events, cells, Row(), SCALE, 0.025, predictors, groups)
     assert (together[5:] > 1).all()

@@ -109,6 +109,9 @@ def find_static_loads(
     if stream.reference.model is None or not faulty.any():
         return list(known)
     held = _HeldLoads.of(stream, spatial, excluded)
+    faulty = faulty & ~(
+        np.isfinite(spatial.factor) & (spatial.since < held.since)
+    )  # another gain since before the load
     blamed, loaded = faulty & (held.root > 0), _mask([cell for load in known for cell in load.cells], len(faulty))
     wires = _on_broken_wires(blamed & spatial.scored, stream)
     holding = loaded | ((held.surprisal > -np.log(_RETURNS)) & (held.root > 0) & ~wires)
@@ -233,7 +236,8 @@ class _Chain:
         predictors = self.others | _mask(chosen, len(self.root))
         log_likely = np.zeros(len(self.root))
         of_model = np.exp(self.stream.log_held(self.root, predictors, held, self.values))
-        log_likely[held] = np.log((1 - _ANY_SHAPE) * of_model + _ANY_SHAPE * _BESIDE * self.width[held])
+        any_shape = np.where(np.isnan(of_model), 1.0, _ANY_SHAPE)
+        log_likely[held] = np.log((1 - any_shape) * np.nan_to_num(of_model) + any_shape * _BESIDE * self.width[held])
         return log_likely
 
     @cached_property

@@ -247,9 +247,12 @@ class EventLog:
         """Return the frames in which a load vanishes and another appears elsewhere, as where a recording begins."""
         step = root - before
         step -= np.clip(step, -root_near, root_near)  # smaller changes are noise
-        moving = ((start >= numbers[0]) & (start > 0)).astype(np.float32)
-        exchanged = (np.abs(step) @ moving - np.abs(step @ moving)) / 2  # load that vanished here and appeared there
-        share = exchanged / np.maximum(np.maximum(root @ moving, before @ moving), np.float32(1e-9))
+        # Cells that are constant from a frame before on hold their value, or are broken.
+        moving = ((start >= numbers[:, None]) & (start > 0)).astype(np.float32)
+        step *= moving
+        exchanged = (np.abs(step).sum(axis=1) - np.abs(step.sum(axis=1))) / 2  # vanished here and appeared there
+        load = np.maximum((root * moving).sum(axis=1), (before * moving).sum(axis=1))
+        share = exchanged / np.maximum(load, np.float32(1e-9))
         at = np.flatnonzero((share >= _MIN_EXCHANGED) & (exchanged >= _MIN_AMPLITUDE))
         if not len(at):
             return []

@@ -58,7 +58,6 @@ class CellState:
         runs: the constant runs.
         accumulated: float, evidence of earlier events for the runs that still last.
         temporal: float, log likelihood ratio of the run and of the jump into it, if the cell jumped alone.
-        sudden: float, log likelihood ratio of the jump, even if the cell did not jump alone.
         eligible: bool, cells that are present and not known to be faulty.
         outlasted: bool, cells whose load is held since before an event elsewhere began.
     """
@@ -66,7 +65,6 @@ class CellState:
     runs: ConstantRuns
     accumulated: Floats
     temporal: Floats
-    sudden: Floats
     eligible: Mask
     outlasted: Mask
 
@@ -143,14 +141,9 @@ class ConditionalTest:
     ) -> ConditionalTest:
         """Prepare the test of one event or more."""
         constant, runs, values = cells.scored, cells.runs, HeldValues.now(cells, scale, tolerance)
-        # A load that appeared in one step and is still held: a quick grasp, or many cells broken at once. Until the
-        # event ends the two cannot be distinguished, so such cells are neither tested nor predictors.
-        held = constant & ~values.rests & runs.moved & (runs.start >= events[-1].since) & ~cells.outlasted
-        unsure = held & (cells.sudden >= SUDDEN_JUMP) & (cells.temporal < SUDDEN_JUMP)
-        scored = constant & ~unsure
-        features, begins, counted = _excerpts(events, runs, scored)
+        features, begins, counted = _excerpts(events, runs, constant)
         repeats = count_repeats(events, _THE_SAME, values.rests | ~constant)[begins.cumsum() - 1, None]
-        return cls(cells, model, values, scored, cells.eligible & ~unsure, features, begins, counted, repeats)
+        return cls(cells, model, values, constant, cells.eligible, features, begins, counted, repeats)
 
     def score(self, predictors: Mask) -> tuple[Prediction, Floats]:
         """Return the prediction of the ``predictors`` (bool ``[D]``), and the surprisal of each excerpt ``[n, D]``."""

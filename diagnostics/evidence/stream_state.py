@@ -296,7 +296,10 @@ class StreamState:
     def log_held(
         self, root: NDArray[np.float64], predictors: Mask, cells: Cells, values: HeldValues
     ) -> NDArray[np.float64]:
-        """Return log P(healthy ``cells`` hold their ``values``), given the root loads ``[D]`` of the ``predictors``."""
+        """Return log P(healthy ``cells`` hold their ``values``), given the root loads ``[D]`` of the ``predictors``.
+
+        NaN: cells that no reference event loaded, so that the model knows no load of them.
+        """
         features = np.stack([root, root, root > 0, root > 0]).astype(np.float32)
         likely = np.ones(len(root))
         among = np.zeros(len(root), bool)
@@ -306,7 +309,8 @@ class StreamState:
                 inputs, own = tile.inputs, tile.place[among[tile.outputs]]
                 e = self.model_of(i, self.local.of[i]).predict(features[None, :, inputs], predictors[inputs])
                 these = inputs[own]
-                likely[these] = e.always[0, own] * e.within(values.low[these], values.high[these], own)[0]
+                within = e.within(values.low[these], values.high[these], own)[0]
+                likely[these] = np.where(np.isnan(e.spread[own]), np.nan, e.always[0, own] * within)
         return np.log(np.maximum(likely[cells], np.finfo(float).tiny))
 
     def suspected(self, spatial: Spatial) -> Mask:
@@ -323,7 +327,7 @@ class StreamState:
             # What no event can tell from a broken cell is not tested; what it reads says something of the others.
             untestable = self._response.untestable(self.scale.near) & self.rests()
             runs = replace(runs, length=np.where(untestable, 0, runs.length))
-        return CellState(runs, self.accumulated, self.temporal(), self._jumps(), eligible, nothing)
+        return CellState(runs, self.accumulated, self.temporal(), eligible, nothing)
 
     def _test(self, cells: CellState, events: TiledEvents, passes: int) -> Test:
         if self.tiled:
@@ -352,9 +356,6 @@ class StreamState:
                 accumulated[tile.outputs] += evidence[tile.place]
         return replace(cells, accumulated=accumulated, outlasted=outlasted)
 
-    def _jumps(self) -> NDArray[np.float64]:
-        return self.reference.jumps_seen.size(self.runs, self.reference.scale.full_scale)
-
     def _close(self) -> None:
         """Process a segment."""
         self._drop()
@@ -375,7 +376,8 @@ class StreamState:
             self._level = self._level.extend(before, runs.start != start)
             self._response = self._response.extend(steady, scale.full_scale * root.astype(np.float64) ** 2, self.layout)
         self.touched = self.touched | root.any(axis=0)
-        jumped = (self._jumps() >= SUDDEN_JUMP) & (runs.alone | still)
+        jump = self.reference.jumps_seen.size(runs, self.reference.scale.full_scale)
+        jumped = (jump >= SUDDEN_JUMP) & (runs.alone | still)
         self.local = self.local.extend(root, numbers, scale.root_near, runs.start, jumped)
         if self.tiled:
             skin = self._skin.extend(root, numbers, scale.root_near, runs.start, jumped)

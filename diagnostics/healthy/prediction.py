@@ -44,7 +44,8 @@ class Prediction:
     ) -> NDArray[np.float64]:
         """Return P(low <= mean root load <= high), ``[n, k]``.
 
-        A contaminated Student t distribution: 0.9 F_4((x - mean) / (inflation * spread)) + 0.1 of a uniform one.
+        A contaminated Student t distribution: 0.9 F_4((x - mean) / (inflation * spread)) + 0.1 of a uniform one; a
+        uniform one alone where the spread is unknown.
 
         Args:
             low, high: root loads ``[k]``.
@@ -54,7 +55,9 @@ class Prediction:
         mean, spread = self.mean[:, cells], self.spread[cells] * np.reshape(inflation, (-1, 1))
         likely = _student_t((high - mean) / spread) - _student_t((low - mean) / spread)
         p = (1 - OUTLIERS) * likely + OUTLIERS * (np.minimum(high, 1.0) - low)
-        return np.where(np.isnan(spread), 1.0, p)
+        # Full scale has no width: a load of unknown size reaches it as often as a broken cell.
+        any_load = np.where(np.isfinite(high), high - low, 1.0)
+        return np.where(np.isnan(spread), any_load, p)
 
 
 def log_student_t(error: NDArray[Any], outliers: float) -> NDArray[Any]:

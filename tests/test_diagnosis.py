@@ -384,6 +384,7 @@ def test_positions_without_a_cell_have_no_verdict():
         assert not np.isin(diagnosis.coverage.untested, masked).any()
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_a_cell_that_no_reference_contact_loaded_and_now_holds_a_load_is_found(small_grasps: Recordings):
     def unreached(recordings: Sequence[np.ndarray], value: float) -> list[np.ndarray]:
         return [np.where(np.arange(n) == 0, value, np.where(r < 0.1, 0.0, r)) for r in recordings]

@@ -110,6 +110,15 @@ def test_how_seldom_cells_stick_to_a_value_in_between_is_charged_once():
     assert charged[1] == pytest.approx(charged[0])
 
 
+@pytest.mark.parametrize("value", [0.0, 1.0, 5.0])
+def test_a_value_held_since_the_last_event_tells_nothing(value: float):
+    log = pressed(2)
+    log[35:, 3] = value
+    found = result_of(log)
+    assert found.scored[3]
+    assert found.evidence[3] == 0
+
+
 def test_an_unexpected_value_is_weaker_evidence_in_events_with_large_errors():
     outcomes = []
     for force in (1.0, 0.1):

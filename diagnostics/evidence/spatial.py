@@ -6,6 +6,7 @@ event e after s adds to the log likelihood ratio of stuck against healthy
     sum_e  w_e * -log P(cell reads v throughout e | healthy, readings of the other cells)  +  log P(v | stuck)
 
 The prior of v counts once: broken cells mostly stick to a rail, a healthy cell under a constant load reads any value.
+Without an event the ratio is 1, whatever v is.
 The ratio equals a sequence of conditional tests as in pseudo-likelihood estimation (Besag 1975). It does not detect
 cells that no event loads and that no event leaves unloaded among loaded neighbours: they stay untested.
 
@@ -127,8 +128,7 @@ class SpatialTest:
         self._final = not events
         if not events:
             prior, known = HeldValues.now(cells, scale, tolerance).prior, self.result
-            evidence = np.where(known.surprisal > 0, prior + known.surprisal, known.evidence)
-            self.result = replace(known, evidence=evidence)
+            self.result = replace(known, evidence=_with_prior(known.surprisal, prior))
             return
         self._test = test = ConditionalTest.of(events, cells, model, scale, tolerance)
         runs = cells.runs
@@ -152,7 +152,7 @@ class SpatialTest:
         test, predictors = self._test, self._predictors & self._test.eligible
         expected, surprisal = test.score(predictors)
         summed = test.summed(surprisal)
-        evidence = np.where(test.scored, test.values.prior + summed, 0.0)
+        evidence = _with_prior(summed, test.values.prior)
         if self._initial is None:
             self._initial = summed
         self._rounds += 1
@@ -198,6 +198,11 @@ class SpatialTest:
         self._test = replace(test, eligible=test.eligible & ~more)
         self._rounds, self._agreed = 0, None
         return False
+
+
+def _with_prior(surprisal: Floats, prior: Floats) -> Floats:
+    """Return the evidence ``[D]``: where no event was surprising, the value tells nothing either."""
+    return np.where(surprisal > 0, prior + surprisal, 0.0)
 
 
 def group_excluded_evidence(

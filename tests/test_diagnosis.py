@@ -385,15 +385,16 @@ def test_positions_without_a_cell_have_no_verdict():
 
 
 @pytest.mark.usefixtures("uncalibrated")
-def test_a_cell_that_no_reference_contact_loaded_and_now_holds_a_load_is_found(small_grasps: Recordings):
-    def unreached(recordings: Sequence[np.ndarray], value: float) -> list[np.ndarray]:
-        return [np.where(np.arange(n) == 0, value, np.where(r < 0.1, 0.0, r)) for r in recordings]
+def test_cells_that_no_reference_contact_loaded_and_now_hold_a_load_are_found(small_grasps: Recordings):
+    def unreached(recordings: Sequence[np.ndarray], of: Sequence[int], value: float) -> list[np.ndarray]:
+        return [np.where(np.isin(np.arange(n), of), value, np.where(r < 0.1, 0.0, r)) for r in recordings]
 
-    n = small_grasps.layout.n_cells
-    fitted = SelfDiagnosis(small_grasps.layout).fit(unreached(small_grasps.frames[::2], 0.0))
-    log = small_grasps.frames[61:69:2]
-    assert fitted.diagnose(unreached(log, 0.0)).fault_set == set()
-    assert fitted.diagnose(unreached(log, 1.0)).fault_set == {0}
+    n, corner = small_grasps.layout.n_cells, (0, 1, 5)
+    fitted = SelfDiagnosis(small_grasps.layout).fit(unreached(small_grasps.frames[::2], corner, 0.0))
+    log = unreached(small_grasps.frames[61::4], corner, 0.0)
+    assert fitted.diagnose(log).fault_set == set()
+    assert fitted.diagnose(unreached(log, (0,), 1.0)).fault_set == {0}
+    assert fitted.diagnose(unreached(log, corner, 5.0)).fault_set == set(corner)
 
 
 @pytest.mark.usefixtures("uncalibrated")

@@ -244,7 +244,7 @@ class _Chain:
     def width(self) -> Floats:
         """Of the root loads that count as the value of each cell, ``[D]``."""
         width: Floats = np.minimum(self.values.high, 1.0) - np.minimum(self.values.low, 1.0)
-        return width
+        return np.maximum(width, P_MIN)  # full scale has none
 
     def most_likely(
         self, group: Mask, otherwise: Floats, supported: Floats, first: Sequence[int], expected: float

@@ -4,7 +4,18 @@ import numpy as np
 import pytest
 
 from adaptfault.data.recordings import Recordings
-from diagnostics import Diagnosis, Fault, FaultKind, Line, Monitor, SensorLayout, Verdict, inject, line_fault
+from diagnostics import (
+    Diagnosis,
+    Fault,
+    FaultKind,
+    Line,
+    Monitor,
+    SelfDiagnosis,
+    SensorLayout,
+    Verdict,
+    inject,
+    line_fault,
+)
 
 LAYOUT = SensorLayout.paper()
 
@@ -43,6 +54,19 @@ def test_an_object_that_lies_still_is_told_and_no_cell_is_blamed(fitted, log, ob
     assert "something lies still on pad 0, rows 0-" in str(found)
     assert (load.onset or 0) == pytest.approx(100 * onset, abs=50)
     assert Diagnosis.from_dict(found.to_dict()).static_loads == found.static_loads
+
+
+@pytest.mark.usefixtures("uncalibrated")
+def test_cells_that_hold_the_loads_of_an_object_without_their_noise_are_stuck(small_grasps: Recordings):
+    layout, rng = small_grasps.layout, np.random.default_rng(0)
+    noisy = [np.clip(r + 0.3 + 0.02 * rng.standard_normal(r.shape), 0, 5) for r in small_grasps.frames]
+    cells = [layout.cell(0, r, c) for r in range(3) for c in range(3)]
+    load = np.zeros(layout.n_cells)
+    load[cells] = 0.5 * max(noisy, key=np.sum).max(axis=0)[cells]
+    diagnoser = SelfDiagnosis(layout).fit(noisy[::2])
+    stuck = diagnoser.diagnose([np.where(load > 0, 0.3 + load, r) for r in noisy[31:90:4]])
+    assert stuck.fault_set == set(cells)
+    assert not stuck.static_loads
 
 
 def test_a_monitor_tells_of_the_same_object(fitted, log, object_):

@@ -113,8 +113,9 @@ def find_static_loads(
         np.isfinite(spatial.factor) & (spatial.since < held.since)
     )  # another gain since before the load
     blamed, loaded = faulty & (held.root > 0), _mask([cell for load in known for cell in load.cells], len(faulty))
-    wires = _on_broken_wires(blamed & spatial.scored, stream)
-    holding = loaded | ((held.surprisal > -np.log(_RETURNS)) & (held.root > 0) & ~wires)
+    broken = _on_broken_wires(blamed & spatial.scored, stream)
+    broken |= stream.without_noise() & np.isfinite(held.values.high)  # an object takes noise away at full scale only
+    holding = loaded | ((held.surprisal > -np.log(_RETURNS)) & (held.root > 0) & ~broken)
 
     def explains(cells: Mask) -> bool:
         near = stream.layout.with_neighbours(cells) if beside else cells

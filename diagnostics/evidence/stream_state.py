@@ -203,14 +203,22 @@ class StreamState:
 
     def temporal(self) -> NDArray[np.float64]:
         """Log likelihood ratio of the constant run, its level and noise, and the jump into it, ``[D]``."""
-        reference, rests = self.reference, self.rests()
-        lower = reference.least.lower(self.runs, rests & self.present)
-        cells = ConstantCells(self.layout, reference.scale.full_scale, reference.tolerance, self.runs, rests, lower)
+        reference, cells = self.reference, self._constant_cells()
         if reference.model is None:
             return self._level.evidence(cells)
         terms: tuple[Term, ...] = reference.jumps_seen, reference.least, reference.noise_loss
         jump, low, noise = (term.evidence(cells) for term in terms)
         return jump + np.where(np.abs(noise) > np.abs(low), noise, low)
+
+    def without_noise(self) -> Mask:
+        """Return the cells that have lost the noise they had in the reference, bool ``[D]``."""
+        return self.reference.noise_loss.evidence(self._constant_cells()) > 0
+
+    def _constant_cells(self) -> ConstantCells:
+        """Return what the terms of constant cells are given."""
+        reference, rests = self.reference, self.rests()
+        lower = reference.least.lower(self.runs, rests & self.present)
+        return ConstantCells(self.layout, reference.scale.full_scale, reference.tolerance, self.runs, rests, lower)
 
     def model_of(self, i: int, events: EventLog) -> Model:
         """Return the healthy model of tile i; without a reference, a model of its ``events``."""

@@ -11,7 +11,8 @@ from the share of cells that are stuck elsewhere on the array. The cells with th
 probability is the logistic function of the log odds. Cells of an object are neither faulty nor tested.
 
 Not detected: objects on fewer than three cells; objects of a shape or load that no contact of the reference had;
-objects without a reference. Cells that are stuck at values that an object could have look like one.
+objects without a reference. Cells that are stuck at values that an object could have look like one, unless they lost
+noise that they had in the reference.
 """
 
 from __future__ import annotations

@@ -110,9 +110,8 @@ def find_static_loads(
     if stream.reference.model is None or not faulty.any():
         return list(known)
     held = _HeldLoads.of(stream, spatial, excluded)
-    faulty = faulty & ~(
-        np.isfinite(spatial.factor) & (spatial.since < held.since)
-    )  # another gain since before the load
+    had_other_gain = np.isfinite(spatial.factor) & (spatial.since < held.since)  # before the load
+    faulty = faulty & ~had_other_gain
     blamed, loaded = faulty & (held.root > 0), _mask([cell for load in known for cell in load.cells], len(faulty))
     broken = _on_broken_wires(blamed & spatial.scored, stream)
     broken |= stream.without_noise() & np.isfinite(held.values.high)  # an object takes noise away at full scale only

@@ -33,7 +33,6 @@ from diagnostics.preprocessing.scale import Array, Scale
 if TYPE_CHECKING:
     from diagnostics.healthy.prediction import Prediction
 
-SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
 _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 _PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit: all cells may be dead
 _REPEATS, _THE_SAME = 0.15, 0.95  # correlation of events that load the same cells, and cosine of their mean loads
@@ -119,7 +118,6 @@ class ConditionalTest:
         cells: state of the cells.
         model: the healthy model.
         values: values of the constant cells.
-        scored: bool ``[D]``, cells to be tested.
         eligible: bool ``[D]``, cells that may be predictors.
         features, begins, counted: see :func:`_excerpts`.
         repeats: int ``[n, 1]``, r_e of each excerpt.
@@ -128,7 +126,6 @@ class ConditionalTest:
     cells: CellState
     model: Model
     values: HeldValues
-    scored: Mask
     eligible: Mask
     features: Array
     begins: Mask
@@ -143,12 +140,12 @@ class ConditionalTest:
         constant, runs, values = cells.scored, cells.runs, HeldValues.now(cells, scale, tolerance)
         features, begins, counted = _excerpts(events, runs, constant)
         repeats = count_repeats(events, _THE_SAME, values.rests | ~constant)[begins.cumsum() - 1, None]
-        return cls(cells, model, values, constant, cells.eligible, features, begins, counted, repeats)
+        return cls(cells, model, values, cells.eligible, features, begins, counted, repeats)
 
     def score(self, predictors: Mask) -> tuple[Prediction, Floats]:
         """Return the prediction of the ``predictors`` (bool ``[D]``), and the surprisal of each excerpt ``[n, D]``."""
         expected = self.model.predict(self.features, predictors)
-        held = np.flatnonzero(self.scored & ~self.values.rests)
+        held = np.flatnonzero(self.cells.scored & ~self.values.rests)
         likely = _tempered(expected.never, self.features[:, 2] == 0, predictors & self.cells.runs.moved)
         inflation = _inflation(expected, self.features, predictors)
         within = expected.within(self.values.low[held], self.values.high[held], held, inflation)
@@ -170,7 +167,7 @@ class ConditionalTest:
 
     def summed(self, surprisal: Floats) -> Floats:
         """Return the evidence ``[D]`` of all events, earlier ones included."""
-        return np.where(self.scored, self.cells.accumulated + surprisal.sum(axis=0), 0.0)
+        return np.where(self.cells.scored, self.cells.accumulated + surprisal.sum(axis=0), 0.0)
 
 
 def _excerpts(events: Sequence[ContactEvent], runs: ConstantRuns, scored: Mask) -> tuple[Array, Mask, Mask]:

@@ -21,6 +21,7 @@ from diagnostics.preprocessing.levels import SUSPICIOUS
 if TYPE_CHECKING:
     from diagnostics.evidence.term import ConstantCells
 
+SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
 _JUMPS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 1.0])  # of full scale, bin edges
 
 Floats = NDArray[np.float64]

@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.evidence.conditional_test import (
-    SUDDEN_JUMP,
     CellState,
     ConditionalTest,
     HeldValues,
@@ -34,6 +33,7 @@ from diagnostics.evidence.conditional_test import (
     Model,
 )
 from diagnostics.evidence.drift import drifting, gain_evidence, misleading, offset_evidence
+from diagnostics.evidence.jumps import SUDDEN_JUMP
 from diagnostics.preprocessing.levels import P_MIN, SUSPICIOUS, TESTED
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ class SpatialTest:
             evidence,
             summed,
             self._initial,
-            test.scored,
+            cells.scored,
             np.where(of_gain, gain.events, (surprisal > TESTED).sum(axis=0)),
             offset,
             gain.evidence,

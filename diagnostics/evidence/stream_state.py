@@ -22,9 +22,10 @@ from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import EventLog
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import Rectangle, Tile, tiles
-from diagnostics.evidence.conditional_test import SUDDEN_JUMP, CellState, HeldValues, Model
+from diagnostics.evidence.conditional_test import CellState, HeldValues, Model
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
+from diagnostics.evidence.jumps import SUDDEN_JUMP
 from diagnostics.evidence.rest_level import RestLevel
 from diagnostics.evidence.spatial import (
     Exclusion,

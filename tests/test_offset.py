@@ -1,12 +1,13 @@
 import numpy as np
 import pytest
 from conftest import without_calibration
+from scipy.stats import median_abs_deviation
 from test_baseline import events
 
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, SensorLayout, inject
 from diagnostics.preprocessing.offset import OffsetTracker, ReferenceOffset
-from diagnostics.preprocessing.scale import Scale
+from diagnostics.preprocessing.scale import Scale, usual_limit
 
 LAYOUT = SensorLayout(1, 8, 8, full_scale=1.0)
 CELLS, PRESENT = LAYOUT.n_cells, np.ones(LAYOUT.n_cells, bool)
@@ -18,6 +19,12 @@ SCALE = Scale(np.zeros(CELLS), 0.01, 1.0)
 def fitted() -> SelfDiagnosis:
     with without_calibration():
         return SelfDiagnosis(LAYOUT).fit(events(0))
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 156])
+def test_the_usual_limit_is_the_median_plus_three_of_scipys_robust_standard_deviations(n: int):
+    values = np.random.default_rng(n).standard_cauchy(n)
+    assert usual_limit(values) == np.median(values) + 3 * median_abs_deviation(values, scale="normal")
 
 
 def test_where_nothing_moved_the_scale_stays_as_it_is():

@@ -128,16 +128,18 @@ def test_monitor_and_diagnosis_agree(fitted):
     assert monitor.diagnosis().to_dict() == fitted.diagnose(frames).to_dict()
 
 
-def test_dropped_events_leave_their_evidence(fitted, monkeypatch):
+@pytest.mark.parametrize(("reference", "evidence"), [(True, 3.0), (False, 1.0)])
+def test_dropped_events_leave_their_evidence(fitted, monkeypatch, reference: bool, evidence: float):
     monkeypatch.setattr("diagnostics.evidence.stream_state.MAX_EVENTS", 3)
     monkeypatch.setattr("diagnostics.evidence.stream_state.KEPT_EVENTS", 2)
-    healthy, stream = log(SKIN, 600, 90), fitted.stream()
+    diagnosis = fitted if reference else SelfDiagnosis(SKIN)
+    healthy, stream = log(SKIN, 600, 90), diagnosis.stream()
     dead = np.argsort((healthy > 0.5).sum(axis=0))[[-1, -100, -200]]  # often loaded
     frames = inject(healthy, [Fault(FaultKind.OPEN, (int(cell),)) for cell in dead], SKIN)
     stream.extend(frames)
     assert max(len(events.kept) for events in stream.local.of) <= 5
-    assert stream.accumulated[dead].min() > 3
-    frame_by_frame = fitted.stream()
+    assert stream.accumulated[dead].min() > evidence
+    frame_by_frame = diagnosis.stream()
     for frame in frames:
         frame_by_frame.extend(frame[None])
     np.testing.assert_array_equal(frame_by_frame.complete().accumulated, stream.complete().accumulated)

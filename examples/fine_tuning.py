@@ -6,13 +6,18 @@ validation recordings, of heads fitted without them, the accuracy on test record
 
     all        every parameter, cross entropy
     norms      scale and offset of the LayerNorms alone, cross entropy
+    low rank   a product of rank 4 added to each weight matrix (LoRA, Hu et al. 2022), cross entropy
     distil     every parameter; targets are features and probabilities of the fault-free network that sees all cells of
                the same windows, so no label is used
+    masks      every parameter, cross entropy; with F a fifth of the cells beside it is dropped, others in each batch
+    through    every parameter; cross entropy of a kernel ridge regression on the features of other recordings,
+               differentiated (Bertinetto et al. 2019)
     average    mean of the weights of "all" and the fault-free ones
     two heads  mean of the probabilities of "head" and the head of "all"
+    two bases  no training; one head on the features of two fault-free networks
 
 The fault-free networks are kept in ``--out``, or read from there (base0 for split 0, as adaptation_figures.py keeps
-them). Without recordings the grasps are simulated.
+them; base1000 is the second one of split 0). Without recordings the grasps are simulated.
 """
 
 from __future__ import annotations
@@ -26,22 +31,57 @@ from pathlib import Path
 import numpy as np
 import torch
 from adaptation_figures import base, cases
+from scipy.ndimage import binary_dilation
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 import adaptfault as af
+from adaptfault.adaptation.heads import calibrate
 from adaptfault.adaptation.reduced_model import ReducedModel, reduce_windows
 from adaptfault.adaptation.stages import Run
 from adaptfault.models.network import logits_of
 from diagnostics import FaultSet
 
-RATE, NORM_RATE, BATCH = 1e-4, 1e-3, 32
+FORMS = ("head", "all", "norms", "low rank", "distil", "masks", "through", "average", "two heads", "two bases")
+RATE, FEW_RATE, BATCH = 1e-4, 1e-3, 32  # Adam's steps for all parameters and for few
+RANK = 4
+EPISODE, RIDGE = 256, 0.02  # windows of a regression that is differentiated, a quarter of them predicted
+PASSES = 3  # of such an epoch through the windows: it has few steps
+OTHER = 1000  # added to the seed of the second fault-free network
+MASKS, SHARE = 8, 0.2  # sets of cells beside F, and their share
+
+
+class LowRank(nn.Module):
+    """A weight matrix plus a product of low rank, which is zero at first."""
+
+    def __init__(self, weight: Tensor, generator: torch.Generator) -> None:
+        super().__init__()
+        rows, columns = weight.shape
+        self.left = nn.Parameter(torch.zeros(rows, RANK))
+        self.right = nn.Parameter(torch.randn(RANK, columns, generator=generator) / columns**0.5)
+
+    def forward(self, weight: Tensor) -> Tensor:
+        return weight.detach() + self.left @ self.right
+
+
+class Pair(nn.Module):
+    """Two networks as one, with the features of both."""
+
+    def __init__(self, first: nn.Module, second: nn.Module) -> None:
+        super().__init__()
+        self.first, self.second, self.layout = first, second, first.layout
+
+    def features(self, x: Tensor) -> Tensor:
+        return torch.cat([self.first.features(x), self.second.features(x)], 1)
 
 
 class Trial:
     """Forms of fine-tuning for one fault set."""
 
-    def __init__(self, adapter: af.Adapter, faults: FaultSet, test: af.Windows, epochs: int, seed: int) -> None:
-        self.adapter, self.faults, self.epochs, self.seed = adapter, faults, epochs, seed
+    def __init__(
+        self, adapter: af.Adapter, other: nn.Module, faults: FaultSet, test: af.Windows, epochs: int, seed: int
+    ) -> None:
+        self.adapter, self.other, self.faults, self.epochs, self.seed = adapter, other, faults, epochs, seed
         self.run = Run(adapter, faults, None, seed, False)
         self.test = reduce_windows(test, faults)
 
@@ -51,56 +91,111 @@ class Trial:
 
     def head(self, network: nn.Module) -> tuple[Tensor, Tensor]:
         """Return log probabilities of validation and test windows with a head on the features of a network."""
-        self.run.quick = self.adapter.compacted(network)
+        if isinstance(network, Pair):
+            quick = [self.adapter.compacted(each) for each in (network.first, network.second)]
+            self.run.quick = None if None in quick else Pair(*quick)
+        else:
+            self.run.quick = self.adapter.compacted(network)
         reduced = self.behind(network)
         reduced.head, held = self.run._head(reduced)
         return held.log_softmax(1), logits_of(reduced, self.test.x, batch_size=64).log_softmax(1)
 
+    def masks(self, form: str) -> list[tuple[FaultSet, nn.Module]]:
+        """Return the sets of cells that are dropped in turn, and what fills them."""
+        if form != "masks":
+            return [(self.faults, self.adapter.imputation.linear(self.faults))]
+        layout, rng = self.adapter.model.layout, np.random.default_rng(self.seed)
+        dead = np.isin(np.arange(layout.n_cells), list(self.faults)).reshape(layout.shape)
+        near = np.stack([binary_dilation(pad, np.ones((3, 3))) for pad in dead]) & ~dead & layout.present
+        beside, found = np.flatnonzero(near), []
+        for _ in range(MASKS):
+            more = rng.choice(beside, round(SHARE * len(beside)), replace=False)
+            faults = FaultSet((*self.faults, *more.tolist()), layout.n_cells)
+            found.append((faults, self.adapter.imputation.linear(faults)))
+        return found
+
+    def batches(self, form: str, generator: torch.Generator) -> Iterator[Tensor]:
+        """Yield the windows of each batch of an epoch, those of one recording together where a head is learned."""
+        recording = torch.from_numpy(np.unique(self.adapter.train.recording, return_inverse=True)[1])
+        if form != "through":
+            yield from torch.randperm(len(recording), generator=generator).split(BATCH)
+            return
+        size = min(EPISODE, len(recording))
+        for _ in range(PASSES):
+            order = torch.randperm(int(recording.max()) + 1, generator=generator)[recording].argsort()
+            yield from (each for each in order.split(size) if len(each) == size)
+
     def tuned(self, form: str) -> nn.Module:
         network, free = copy.deepcopy(self.adapter.model), self.adapter.model
-        reduced = self.behind(network)
-        trained = list(reduced.parameters())
+        generator = torch.Generator().manual_seed(self.seed)
+        trained, rate = list(network.parameters()), RATE
         if form == "norms":
-            trained = [
-                p for module in network.modules() if isinstance(module, nn.LayerNorm) for p in module.parameters()
-            ]
-        optimizer = torch.optim.Adam(trained, lr=NORM_RATE if form == "norms" else RATE)
+            norms = [module for module in network.modules() if isinstance(module, nn.LayerNorm)]
+            trained, rate = [p for module in norms for p in module.parameters()], FEW_RATE
+        if form == "low rank":
+            linear = [module for module in network.modules() if isinstance(module, nn.Linear)]
+            added = [LowRank(module.weight, generator) for module in linear]
+            for module, of in zip(linear, added, strict=True):
+                parametrize.register_parametrization(module, "weight", of)
+            trained, rate = [p for of in added for p in of.parameters()], FEW_RATE
+        optimizer = torch.optim.Adam(trained, lr=rate)
         whole, y = (torch.from_numpy(of) for of in (self.adapter.train.x, self.adapter.train.y))
         with torch.no_grad():
             wanted = torch.cat([free.features(x) for x in torch.split(whole, 256)])
             likely = free.head(wanted).softmax(1)
-        generator = torch.Generator().manual_seed(self.seed)
-        reduced.train()
+        masks, step = self.masks(form), 0
+        network.train()
         for _ in range(self.epochs):
-            for i in torch.randperm(len(y), generator=generator).split(BATCH):
-                features = network.features(reduced.complete(whole[i][..., self.faults.healthy]))
-                logits = network.head(network.dropout(features))
-                loss = nn.functional.cross_entropy(logits, likely[i] if form == "distil" else y[i])
+            for i in self.batches(form, generator):
+                faults, front = masks[step % len(masks)]
+                step += 1
+                features = network.features(front(whole[i][..., faults.healthy]))
+                if form == "through":
+                    loss = regression_loss(features, y[i], free.n_classes)
+                else:
+                    logits = network.head(network.dropout(features))
+                    loss = nn.functional.cross_entropy(logits, likely[i] if form == "distil" else y[i])
                 if form == "distil":
                     loss = loss + nn.functional.mse_loss(features, wanted[i]) / wanted.var()
                 optimizer.zero_grad()
                 loss.backward()
                 optimizer.step()
+        if form == "low rank":
+            for module in linear:
+                parametrize.remove_parametrizations(module, "weight")
         return network.eval()
 
     def results(self) -> Iterator[tuple[str, Tensor, Tensor, float]]:
         """Yield each form with the outputs for validation and test windows and the CPU seconds."""
-        found, networks = {}, {}
-        for form in ("head", "all", "norms", "distil", "average", "two heads"):
+        found, networks, free = {}, {}, self.adapter.model
+        for form in FORMS:
             began = time.process_time()
             if form == "two heads":
                 found[form] = tuple(torch.logaddexp(*of) for of in zip(found["head"], found["all"], strict=True))
             else:
-                free = self.adapter.model
                 match form:
                     case "head":
                         networks[form] = free
                     case "average":
                         networks[form] = averaged(free, networks["all"])
+                    case "two bases":
+                        networks[form] = Pair(free, self.other)
                     case _:
                         networks[form] = self.tuned(form)
                 found[form] = self.head(networks[form])
             yield form, *found[form], time.process_time() - began
+
+
+def regression_loss(features: Tensor, y: Tensor, n_classes: int) -> Tensor:
+    """Return the cross entropy of the last quarter of windows, by a kernel ridge regression on the others."""
+    known = len(y) * 3 // 4
+    distances = torch.cdist(features, features).square()
+    kernel = (-distances / distances.detach().median()).exp()
+    targets = nn.functional.one_hot(y[:known], n_classes) - 1 / n_classes
+    weights = torch.linalg.solve(kernel[:known, :known] + RIDGE * torch.eye(known), targets)
+    found = kernel[known:, :known] @ weights
+    scale = calibrate(found.detach(), y[known:].numpy())[0]
+    return nn.functional.cross_entropy(scale * found, y[known:])
 
 
 def averaged(first: nn.Module, second: nn.Module) -> nn.Module:
@@ -127,12 +222,15 @@ def main() -> None:
     windows = af.make_windows(recordings.frames, recordings.labels, recordings.layout)
     for split in args.splits:
         parts = af.split(windows, seed=split)
-        adapter = af.Adapter(base(args.out / f"base{split}", parts, recordings.layout, split, args), *parts[:2])
+        first, second = (
+            base(args.out / f"base{seed}", parts, recordings.layout, seed, args) for seed in (split, split + OTHER)
+        )
+        adapter = af.Adapter(first, *parts[:2])
         y, truth = torch.from_numpy(adapter.validation.y), parts[2].y
         sets = cases(recordings.layout, split, args.recordings is None)
         wanted = [name for name in sets if name in ("random 50%", "100 cells", "five rows, all pads", "one pad")]
         for name in wanted[: 1 if args.small else None]:
-            for form, held, test, seconds in Trial(adapter, sets[name], parts[2], args.tuned, split).results():
+            for form, held, test, seconds in Trial(adapter, second, sets[name], parts[2], args.tuned, split).results():
                 loss = float(nn.functional.nll_loss(held - held.logsumexp(1, keepdim=True), y))
                 accuracy, reached = (held.argmax(1) == y).double().mean(), np.mean(test.argmax(1).numpy() == truth)
                 print(

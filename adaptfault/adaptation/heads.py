@@ -16,7 +16,7 @@ of predictive distributions: Yao, Vehtari, Simpson and Gelman 2018).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import starmap
 from typing import Any
 
@@ -254,11 +254,9 @@ def fit_head(
     all_weights, all_held = [], []
     for of in _KERNELS:
         kernel = similar if of is _KERNELS[0] else _kernel(distances, widths, of)
-        sample = kernel if len(few) == m + n else kernel[few][:, few]
-        tried = [
-            task.loss(ridge_regression(sample, targets[few], folds[kept], ridge)[1].cpu(), kept) for ridge in _RIDGES
-        ]
-        weights, found = ridge_regression(kernel, targets, folds, _RIDGES[int(np.argmin(tried))])
+        weights, found = _best_ridge_regression(
+            kernel, targets, folds, few, folds[kept], lambda found: task.loss(found, kept)
+        )
         scale, outputs = task.outputs(found.cpu())
         all_weights.append(weights * scale.to(on))
         all_held.append(outputs)
@@ -275,11 +273,25 @@ def _restore(kernel: Tensor, imputed: Tensor, whole: Tensor, folds: NDArray[np.i
     if not missing.any():
         return torch.zeros_like(imputed), imputed
     few = evenly(len(folds), _SAMPLE)
-    sample = kernel[few][:, few]
-    tried = [ridge_regression(sample, missing[few], folds[few], ridge)[1] - missing[few] for ridge in _RIDGES]
-    ridge = _RIDGES[int(np.argmin([float(error.square().mean()) for error in tried]))]
-    weights, found = ridge_regression(kernel, missing, folds, ridge)
+    truth = missing[few].cpu()
+    weights, found = _best_ridge_regression(
+        kernel, missing, folds, few, folds[few], lambda found: float((found - truth).square().mean())
+    )
     return weights, imputed + found
+
+
+def _best_ridge_regression(
+    kernel: Tensor,
+    targets: Tensor,
+    folds: NDArray[np.int64],
+    few: NDArray[np.intp],
+    folds_of_few: NDArray[np.int64],
+    loss: Callable[[Tensor], float],
+) -> tuple[Tensor, Tensor]:
+    """Return :func:`ridge_regression` with the ridge that has the least ``loss`` on ``few`` of the windows."""
+    sample = kernel if len(few) == len(kernel) else kernel[few][:, few]
+    tried = [loss(ridge_regression(sample, targets[few], folds_of_few, ridge)[1].cpu()) for ridge in _RIDGES]
+    return ridge_regression(kernel, targets, folds, _RIDGES[int(np.argmin(tried))])
 
 
 class _Classes:

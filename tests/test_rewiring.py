@@ -73,6 +73,13 @@ def test_two_changes_are_found_together(fitted, small_grasps):
     np.testing.assert_array_equal(found.undo(wired), np.arange(LAYOUT.n_cells))
 
 
+def test_contacts_that_are_repeated_in_other_recordings_prove_little_more(fitted, small_grasps):
+    few = [frames[:, reverse_rows()] for frames in log(small_grasps, 0)[:4]]
+    once, often = fitted.rewiring(few), fitted.rewiring(few * 4)
+    assert once.steps == often.steps
+    assert once.gain < often.gain < 1.01 * once.gain * sum(1 / k for k in range(1, 5))  # not 4 times
+
+
 def test_healthy_logs_show_no_change(fitted, small_grasps):
     assert [fitted.rewiring(log(small_grasps, seed)) for seed in range(20)] == [None] * 20
 

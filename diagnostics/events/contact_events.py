@@ -36,6 +36,7 @@ _EXCHANGED = 0.2  # share of the load that vanishes and appears elsewhere in one
 _MIN_EXCHANGED, _OUTLYING, _QUANTILE = 0.06, 3.0, 0.9
 _PERSISTING = 0.65  # share of the loaded cells that hold their value: then the event continues
 _SAME_PLACE = 0.6  # cosine between mean loads from which on two events load the same cells
+THE_SAME = 0.95  # cosine from which on they are the same
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.special import expit, logit, softmax
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, ConstantRuns
-from diagnostics.events.contact_events import ContactEvent, count_repeats
+from diagnostics.events.contact_events import THE_SAME, ContactEvent, count_repeats
 from diagnostics.healthy.prediction import MEDIAN_ERROR
 from diagnostics.preprocessing.levels import ANYWHERE, P_MIN
 from diagnostics.preprocessing.scale import Array, Scale
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 _PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit: all cells may be dead
-_REPEATS, _THE_SAME = 0.15, 0.95  # correlation of events that load the same cells, and cosine of their mean loads
+_REPEATS = 0.15  # correlation of events that are the same
 _COLD_SCALE = 2.5  # of an event without a reference; benchmarks/cold_calibration.py fits 2.9, at less precision
 
 Floats = NDArray[np.float64]
@@ -139,7 +139,7 @@ class ConditionalTest:
         """Prepare the test of one event or more."""
         constant, runs, values = cells.scored, cells.runs, HeldValues.now(cells, scale, tolerance)
         features, begins, counted = _excerpts(events, runs, constant)
-        repeats = count_repeats(events, _THE_SAME, values.rests | ~constant)[begins.cumsum() - 1, None]
+        repeats = count_repeats(events, THE_SAME, values.rests | ~constant)[begins.cumsum() - 1, None]
         return cls(cells, model, values, cells.eligible, features, begins, counted, repeats)
 
     def score(self, predictors: Mask) -> tuple[Prediction, Floats]:

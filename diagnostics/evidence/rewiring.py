@@ -9,9 +9,10 @@ Candidates are exchanges of two rows or two columns of a pad, a pad mirrored alo
 shifted by one, and exchanged pads. The best is taken, and the search goes on from there, so that combinations are
 found. A permutation is reported if the gain sum_e w_e (l_e(P) - l_e(identity)) exceeds 24, is positive without the two
 events that favour it most, exceeds that of any other candidate by 12, and explains half of what a random order leaves
-unexplained; w_e discounts repeated events. Where the array is loaded symmetrically two wirings read alike, and nothing
-is reported. Lines that no event loads differently are not distinguished. Where loads are spread widely, as by thick
-gloves, exchanged lines may be named by mistake: the whole sensor has then changed as well.
+unexplained; w_e = 1 / (1 + k) discounts an event that repeats k earlier ones of the log. Where the array is loaded
+symmetrically two wirings read alike, and nothing is reported. Lines that no event loads differently are not
+distinguished. Where loads are spread widely, as by thick gloves, exchanged lines may be named by mistake: the whole
+sensor has then changed as well.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.contact_events import Summary, count_repeats
+from diagnostics.events.contact_events import THE_SAME, Summary, count_repeats
 from diagnostics.healthy.model import MIN_P_FLOOR, contact_events
 from diagnostics.healthy.prediction import OUTLIERS, log_student_t
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
@@ -184,17 +185,17 @@ def _log_likelihood(expected: Prediction, features: Array) -> tuple[Floats, Floa
 
 def _events(recordings: Sequence[NDArray[np.float64]], scale: Scale) -> list[_Event]:
     """Return the strongest contact events of the log."""
-    found: list[tuple[float, _Event]] = []
+    events, found = [], []
     for recording in recordings:
         frames = np.nan_to_num(held(recording, np.full(recording.shape[1], np.nan))[1:], nan=0.0)
-        events = contact_events(frames, scale)
-        for event, again in zip(events, count_repeats(events).tolist(), strict=True):
+        for event in contact_events(frames, scale):
             own = frames[event.first : event.end]
             own = own[np.linspace(0, len(own) - 1, min(len(own), _FRAMES)).astype(int)]
-            amplitude = event.amplitude(np.ones(frames.shape[1], np.float32))
-            found.append((amplitude, _Event(own, 1 / (1 + again))))
-    found.sort(key=lambda pair: -pair[0])
-    return [event for _, event in found[:_EVENTS]]
+            events.append(event)
+            found.append((event.amplitude(np.ones(frames.shape[1], np.float32)), own))
+    weights = 1 / (1 + count_repeats(events, THE_SAME))
+    strongest = sorted(range(len(events)), key=lambda i: -found[i][0])[:_EVENTS]
+    return [_Event(found[i][1], float(weights[i])) for i in strongest]
 
 
 def _candidates(layout: SensorLayout, surplus: Floats, source: Cells) -> Iterator[_Candidate]:

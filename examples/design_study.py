@@ -29,11 +29,13 @@ def after_repair(layout: SensorLayout, counts: list[int], draws: int, grasps: in
     af.train(model, training, validation, epochs=epochs, learning_rate=1e-3, progress=False)
     adapter = af.Adapter(model, training, validation)
     lines = [line for line in layout.lines if line.kind in ("row", "column")]
-    rng, curve = np.random.default_rng(0), Curve()
+    # In each draw the lines die in one order, so that a curve shows what one more line costs.
+    rng = np.random.default_rng(0)
+    orders, curve = [rng.permutation(len(lines)) for _ in range(draws)], Curve()
     for count in counts:
         curve[count] = []
-        for _ in range(draws if count else 1):
-            dead = [layout.cells_on(lines[i]) for i in rng.choice(len(lines), count, replace=False)]
+        for order in orders[: draws if count else 1]:
+            dead = [layout.cells_on(lines[i]) for i in order[:count]]
             faults = FaultSet(tuple(np.unique(np.concatenate(dead)).tolist()) if dead else (), layout.n_cells)
             repaired = adapter.adapt(faults, method="head") if count else adapter.healthy
             curve[count].append(af.evaluate(repaired, test).accuracy)

@@ -20,7 +20,7 @@ def weights(x: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
 
 
 def test_at_the_minimum_of_the_ridge_loss_the_gradient_is_0(monkeypatch):
-    monkeypatch.setattr(dual_ridge, "_STEPS", 400)
+    monkeypatch.setattr(dual_ridge, "STEPS", 400)
     x, y, own = problem()
     usual = np.float32(0.7)
     coefficients, bias = dual_ridge.logistic(x.reshape(40, -1), y, own, 0.1, usual)
@@ -35,7 +35,7 @@ def test_at_the_minimum_of_the_ridge_loss_the_gradient_is_0(monkeypatch):
 def test_the_default_number_of_steps_comes_near_the_minimum(monkeypatch):
     x, y, own = problem()
     soon = weights(x, dual_ridge.logistic(x.reshape(40, -1), y, own, 1.0, np.float32(0))[0])
-    monkeypatch.setattr(dual_ridge, "_STEPS", 400)
+    monkeypatch.setattr(dual_ridge, "STEPS", 400)
     late = weights(x, dual_ridge.logistic(x.reshape(40, -1), y, own, 1.0, np.float32(0))[0])
     assert np.linalg.norm(soon - late) < 0.1 * np.linalg.norm(late)
 
@@ -44,7 +44,7 @@ def test_the_reading_of_a_cell_does_not_change_its_own_weights(monkeypatch):
     x, y, _ = problem()
     spoiled = x.copy()
     spoiled[:, :, 2] = np.random.default_rng(1).normal(size=(40, 2))
-    monkeypatch.setattr(dual_ridge, "_STEPS", 400)
+    monkeypatch.setattr(dual_ridge, "STEPS", 400)
     said, of_spoiled = (
         dual_ridge.logistic(v.reshape(40, -1), y, v[:, :, :5], 0.1, np.float32(0)) for v in (x, spoiled)
     )

@@ -5,6 +5,7 @@ import pytest
 from scipy.special import expit
 from sklearn.linear_model import LogisticRegression
 
+from diagnostics.healthy import local_regression
 from diagnostics.healthy.local_regression import FEATURES, RIDGE, LocalRegression, Start
 
 CELLS = 6
@@ -35,14 +36,18 @@ def others(cell: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("cell", [0, 3])
-def test_each_cell_has_the_logistic_regression_of_scikit_learn_on_the_other_cells(cell: int):
+@pytest.mark.parametrize(("steps", "error"), [(12, 0.04), (400, 1e-3)])
+def test_each_cell_has_the_logistic_regression_of_scikit_learn_on_the_other_cells(
+    monkeypatch: pytest.MonkeyPatch, cell: int, steps: int, error: float
+):
+    monkeypatch.setattr(local_regression, "STEPS", steps)
     features = excerpts(300)
     fitted = fit(features)
     z = ((features - fitted.mean) / fitted.scale).reshape(300, -1)[:, others(cell)]
     for output, did in ((cell, features[:, 2, cell] == 0), (CELLS + cell, features[:, 3, cell] == 1)):
         peer = LogisticRegression(C=1 / (300 * RIDGE), tol=1e-8, max_iter=10_000).fit(z, did)
-        np.testing.assert_allclose(fitted.weight[others(cell), output], peer.coef_[0], atol=0.02)
-        assert fitted.bias[output] == pytest.approx(peer.intercept_[0], abs=0.02)
+        np.testing.assert_allclose(fitted.weight[others(cell), output], peer.coef_[0], atol=error)
+        assert fitted.bias[output] == pytest.approx(peer.intercept_[0], abs=error)
 
 
 def test_a_cell_is_no_input_of_its_own_regressions():

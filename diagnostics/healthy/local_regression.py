@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.special import expit, logit
 
-from diagnostics.healthy.dual_ridge import covariance_and_precision
+from diagnostics.healthy.dual_ridge import STEPS, covariance_and_precision
 from diagnostics.healthy.dual_ridge import logistic as dual_logistic
 from diagnostics.healthy.stacking import RegressionOutput
 from diagnostics.preprocessing.levels import FEWEST
@@ -28,7 +28,6 @@ FEATURES = 4  # per cell and event, see Summary.features
 RIDGE = 0.03  # per sample, on standardised inputs
 _BIAS_RIDGE = 1e-6  # the bias is free; above 0 so that the bound can be inverted
 _MIN_SPREAD = 0.02  # of the root load: no reading is predicted more exactly
-_STEPS = 25  # of accelerated descent: converged, thanks to the ridge
 
 
 @dataclass(frozen=True)
@@ -213,7 +212,7 @@ def _logistic(x: Array, y: Array, own: NDArray[np.intp]) -> tuple[Array, Array]:
     weight = np.zeros((d + 1, y.shape[1]), np.float32)
     weight[d] = logit((y.sum(axis=0) + 1) / (n + 2))  # Laplace smoothing keeps it finite
     ahead, column = weight, np.arange(len(own))[:, None]
-    for step in range(_STEPS):
+    for step in range(STEPS):
         odds = x @ ahead
         following = solve @ (odds / 4 + y - expit(odds))
         following -= np.matmul(projection, following[own, column][:, :, None])[:, :, 0].T

@@ -254,9 +254,7 @@ def fit_head(
     all_weights, all_held = [], []
     for of in _KERNELS:
         kernel = similar if of is _KERNELS[0] else _kernel(distances, widths, of)
-        weights, found = _best_ridge_regression(
-            kernel, targets, folds, few, folds[kept], lambda found: task.loss(found, kept)
-        )
+        weights, found = _best_ridge_regression(kernel, targets, folds, few, lambda found: task.loss(found, kept))
         scale, outputs = task.outputs(found.cpu())
         all_weights.append(weights * scale.to(on))
         all_held.append(outputs)
@@ -275,7 +273,7 @@ def _restore(kernel: Tensor, imputed: Tensor, whole: Tensor, folds: NDArray[np.i
     few = evenly(len(folds), _SAMPLE)
     truth = missing[few].cpu()
     weights, found = _best_ridge_regression(
-        kernel, missing, folds, few, folds[few], lambda found: float((found - truth).square().mean())
+        kernel, missing, folds, few, lambda found: float((found - truth).square().mean())
     )
     return weights, imputed + found
 
@@ -285,11 +283,12 @@ def _best_ridge_regression(
     targets: Tensor,
     folds: NDArray[np.int64],
     few: NDArray[np.intp],
-    folds_of_few: NDArray[np.int64],
     loss: Callable[[Tensor], float],
 ) -> tuple[Tensor, Tensor]:
     """Return :func:`ridge_regression` with the ridge that has the least ``loss`` on ``few`` of the windows."""
     sample = kernel if len(few) == len(kernel) else kernel[few][:, few]
+    held = few - (len(targets) - len(folds))  # negative: never held out
+    folds_of_few = folds[held[held >= 0]]
     tried = [loss(ridge_regression(sample, targets[few], folds_of_few, ridge)[1].cpu()) for ridge in _RIDGES]
     return ridge_regression(kernel, targets, folds, _RIDGES[int(np.argmin(tried))])
 

@@ -9,8 +9,8 @@ Candidates are exchanges of two rows or two columns of a pad, a pad mirrored alo
 shifted by one, and exchanged pads. The best is taken, and the search goes on from there, so that combinations are
 found. A permutation is reported if the gain sum_e w_e (l_e(P) - l_e(identity)) exceeds 24, is positive without the two
 events that favour it most, exceeds that of any other candidate by 12, and explains half of what a random order leaves
-unexplained; w_e = 1 / (1 + k) discounts an event that repeats k earlier ones of the log. Where the array is loaded
-symmetrically two wirings read alike, and nothing is reported. Lines that no event loads differently are not
+unexplained; w_e = 1 / (1 + k) discounts an event that repeats k earlier ones of the 32 strongest. Where the array is
+loaded symmetrically two wirings read alike, and nothing is reported. Lines that no event loads differently are not
 distinguished. Where loads are spread widely, as by thick gloves, exchanged lines may be named by mistake: the whole
 sensor has then changed as well.
 """
@@ -193,9 +193,10 @@ def _events(recordings: Sequence[NDArray[np.float64]], scale: Scale) -> list[_Ev
             own = own[np.linspace(0, len(own) - 1, min(len(own), _FRAMES)).astype(int)]
             events.append(event)
             found.append((event.amplitude(np.ones(frames.shape[1], np.float32)), own))
-    weights = 1 / (1 + count_repeats(events, THE_SAME))
-    strongest = sorted(range(len(events)), key=lambda i: -found[i][0])[:_EVENTS]
-    return [_Event(found[i][1], float(weights[i])) for i in strongest]
+    # In time order, and no more: the repeats of a whole log would be counted in a square of its events.
+    strongest = sorted(sorted(range(len(events)), key=lambda i: -found[i][0])[:_EVENTS])
+    weights = 1 / (1 + count_repeats([events[i] for i in strongest], THE_SAME))
+    return [_Event(found[i][1], weight) for i, weight in zip(strongest, weights.tolist(), strict=True)]
 
 
 def _candidates(layout: SensorLayout, surplus: Floats, source: Cells) -> Iterator[_Candidate]:

@@ -6,6 +6,7 @@ from scipy.special import expit
 from sklearn.linear_model import LogisticRegression
 
 from diagnostics.healthy import local_regression
+from diagnostics.healthy.dual_ridge import STEPS
 from diagnostics.healthy.local_regression import FEATURES, RIDGE, LocalRegression, Start
 
 CELLS = 6
@@ -36,7 +37,7 @@ def others(cell: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("cell", [0, 3])
-@pytest.mark.parametrize(("steps", "error"), [(12, 0.04), (400, 1e-3)])
+@pytest.mark.parametrize(("steps", "error"), [(STEPS, 0.02), (400, 1e-3)])
 def test_each_cell_has_the_logistic_regression_of_scikit_learn_on_the_other_cells(
     monkeypatch: pytest.MonkeyPatch, cell: int, steps: int, error: float
 ):

@@ -5,7 +5,7 @@ import pytest
 from scipy.special import logit
 
 from diagnostics import SensorLayout
-from diagnostics.healthy.stacking import N_FEATURES, RegressionOutput, Stacking, neighbourhood
+from diagnostics.healthy.stacking import N_FEATURES, Stacking, neighbourhood
 
 PRESENT = np.ones((2, 5, 6), bool)
 PRESENT[1, 0, :2] = False
@@ -22,8 +22,8 @@ def random_features(seed: int) -> np.ndarray:
     return features * LAYOUT.present.ravel()
 
 
-def regressed(value: float = 0.0) -> RegressionOutput:
-    return RegressionOutput(*np.full((4, EXCERPTS, 60), value))
+def regressed(value: float = 0.0) -> np.ndarray:
+    return np.full((4, EXCERPTS, 60), value)
 
 
 def means(features: np.ndarray, predictors: np.ndarray = ALL) -> np.ndarray:
@@ -57,7 +57,7 @@ def test_each_ring_is_the_shrunk_mean_of_its_predictors(predictors: np.ndarray):
 
 def test_features_of_some_cells_are_those_of_all():
     rng, cells = np.random.default_rng(6), np.array([1, 8, 33, 59])
-    outputs = RegressionOutput(*rng.normal(size=(4, EXCERPTS, 60)))
+    outputs = rng.normal(size=(4, EXCERPTS, 60))
     predictors = rng.random(60) < 0.7
     of_all = neighbourhood(outputs, random_features(4), predictors, LAYOUT)
     np.testing.assert_array_equal(
@@ -85,7 +85,7 @@ def test_no_feature_uses_a_cell_that_is_no_predictor():
 def test_a_cell_between_two_loaded_ones_is_enclosed_and_one_beside_them_is_not():
     features = np.zeros((1, 4, 60), np.float32)
     features[:, :2, [LAYOUT.cell(0, 2, 1), LAYOUT.cell(0, 2, 3)]] = 0.8
-    enclosed = neighbourhood(RegressionOutput(*np.zeros((4, 1, 60))), features, ALL, LAYOUT)[7, :, 0]
+    enclosed = neighbourhood(np.zeros((4, 1, 60)), features, ALL, LAYOUT)[7, :, 0]
     assert enclosed[LAYOUT.cell(0, 2, 2)] == pytest.approx(0.8)
     assert enclosed.sum() == pytest.approx(0.8)
 

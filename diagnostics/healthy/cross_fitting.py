@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.healthy.stacking import RegressionOutput, Stacking, neighbourhood
+from diagnostics.healthy.stacking import Stacking, neighbourhood
 from diagnostics.preprocessing.scale import Array
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ _SAMPLES = 100_000  # in all, about: a size
 
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
-RegressionFit = Callable[[Array, Mask], RegressionOutput]  # features [n, 4, D], predictors bool [D]
+RegressionFit = Callable[[Array, Mask], NDArray[np.float64]]  # features [n, 4, D], predictors bool [D]
 
 
 @dataclass(frozen=True)

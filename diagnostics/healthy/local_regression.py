@@ -20,7 +20,6 @@ from scipy.special import expit, logit
 
 from diagnostics.healthy.dual_ridge import STEPS, covariance_and_precision
 from diagnostics.healthy.dual_ridge import logistic as dual_logistic
-from diagnostics.healthy.stacking import RegressionOutput
 from diagnostics.preprocessing.levels import FEWEST
 from diagnostics.preprocessing.scale import Array
 
@@ -144,7 +143,7 @@ class LocalRegression:
         )  # fmt: skip
 
     def predict(self, features: Array, predictors: NDArray[np.bool_]) -> tuple[NDArray[np.float64], ...]:
-        """Return what ``RegressionOutput`` holds, of the outputs: ``[n, outputs]`` each."""
+        """Return what :func:`predict_regressions` does, of the outputs alone: four times ``[n, outputs]``."""
         z = (features[:, :, self.inputs] - self.mean) / self.scale
         known = predictors[self.inputs]
         self._fill(z, known)
@@ -176,13 +175,15 @@ class LocalRegression:
 
 def predict_regressions(
     local_regressions: Sequence[LocalRegression], features: Array, predictors: NDArray[np.bool_]
-) -> RegressionOutput:
-    """Return the outputs of all regressions, 0 for cells without one; see :meth:`HealthyModel.predict`."""
-    shape = (len(features), features.shape[2])
-    regressed = RegressionOutput(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape))
+) -> NDArray[np.float64]:
+    """Return the outputs of all regressions, ``[4, n, D]``, 0 for cells without one; see :meth:`HealthyModel.predict`.
+
+    Log odds that the cell stays unloaded, and loaded, throughout; its mean root load; and the share of the reference
+    excerpts in which it is loaded.
+    """
+    regressed = np.zeros((4, len(features), features.shape[2]))
     for regression in local_regressions:
-        of_regression = regression.predict(features, predictors)
-        for values, predicted in zip(vars(regressed).values(), of_regression, strict=True):
+        for values, predicted in zip(regressed, regression.predict(features, predictors), strict=True):
             values[:, regression.outputs] = predicted
     return regressed
 

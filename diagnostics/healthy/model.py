@@ -27,7 +27,7 @@ from diagnostics.events.contact_events import ContactEvent, EventLog, Summary, c
 from diagnostics.healthy.cross_fitting import FOLDS, CrossFitting, RegressionFit
 from diagnostics.healthy.local_regression import LocalRegression, predict_regressions
 from diagnostics.healthy.prediction import Prediction
-from diagnostics.healthy.stacking import RegressionOutput, Stacking, neighbourhood
+from diagnostics.healthy.stacking import Stacking, neighbourhood
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import FEWEST
 from diagnostics.preprocessing.readings import SEGMENT
@@ -103,14 +103,13 @@ class HealthyModel:
         spread, p_floor, known = np.ones(n_cells), self.p_floor(n_cells), np.zeros(n_cells, bool)
         for regression in self.local_regressions:
             spread[regression.outputs], known[regression.outputs] = regression.spread, True
-        never, always = expit(regressed.never), expit(regressed.always)
+        never, always = expit(regressed[:2])
         if self.stacking is not None and self.layout is not None:
             modelled = np.flatnonzero(known)
             step = max(1, _BATCH // len(modelled))
             for first in range(0, len(features), step):
                 some = slice(first, first + step)
-                of_some = RegressionOutput(*(values[some] for values in vars(regressed).values()))
-                samples = neighbourhood(of_some, features[some], predictors, self.layout, modelled)
+                samples = neighbourhood(regressed[:, some], features[some], predictors, self.layout, modelled)
                 corrected, always[some, modelled] = (p.T for p in self.stacking.predict(samples))
                 # A cell that no reference event loaded may be out of reach, whatever its neighbours read.
                 never[some, modelled] = np.where(np.isnan(spread[modelled]), never[some, modelled], corrected)
@@ -118,7 +117,7 @@ class HealthyModel:
         always_floor = p_floor if self.stacking is None else np.minimum(p_floor, p_floor_of(self.stacking.events))
         never = np.where(known, np.clip(never, p_floor, 1 - p_floor), 1.0)
         always = np.where(known, np.clip(always, always_floor, 1 - always_floor), 1.0)
-        return Prediction(never, always, regressed.mean, spread)
+        return Prediction(never, always, regressed[2], spread)
 
 
 class ReferenceEvent(NamedTuple):

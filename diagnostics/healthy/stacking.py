@@ -34,22 +34,6 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class RegressionOutput:
-    """Outputs of the local regressions for n excerpts, ``[n, D]`` each.
-
-    Attributes:
-        never, always: log odds that the cell stays unloaded, or loaded, throughout.
-        mean: expected mean root load, 0 to 1.
-        usual: share of the reference excerpts in which the cell is loaded.
-    """
-
-    never: Floats
-    always: Floats
-    mean: Floats
-    usual: Floats
-
-
-@dataclass(frozen=True)
 class Stacking:
     """The fitted second level, for k features, h hidden units, and the outputs (never, always).
 
@@ -98,7 +82,7 @@ class Stacking:
 
 
 def neighbourhood(
-    regressed: RegressionOutput,
+    regressed: Floats,
     features: Array,
     predictors: NDArray[np.bool_],
     layout: SensorLayout,
@@ -107,7 +91,7 @@ def neighbourhood(
     """Return the stacking features of k cells in n excerpts, ``[28, k, n]``; none uses the reading of the cell itself.
 
     Args:
-        regressed: outputs of the local regressions.
+        regressed: ``[4, n, D]``, see ``predict_regressions``.
         features: ``[n, 4, D]`` (see ``Summary.features``).
         predictors: bool ``[D]``, the cells whose readings may be used.
         layout: the array.
@@ -133,20 +117,11 @@ def neighbourhood(
     whole = pads.sum(axis=1, keepdims=True) - itself
     described = np.empty((N_FEATURES, *itself.shape[1:]), np.float32)
     of_cells, of_place, *rings, on_pad, overall = described.reshape(7, 4, *itself.shape[1:])
-    own = (
-        np.clip(regressed.never[:, selected], -_MAX_ODDS, _MAX_ODDS),
-        np.clip(regressed.always[:, selected], -_MAX_ODDS, _MAX_ODDS),
-        regressed.mean[:, selected],
-        logit(np.clip(regressed.usual[:, selected], RARE, 1 - RARE)),
-    )
-    for values, output in zip(of_cells, own, strict=True):
-        values[:] = output.T
-    of_place[0], of_place[1], of_place[2], of_place[3] = (
-        cross[4],
-        corners[4],
-        of(_inside(layout)),
-        of(enclosed(known[1])),
-    )
+    never, always, mean, usual = regressed[:, :, selected].transpose(0, 2, 1)
+    of_cells[0], of_cells[1] = (np.clip(odds, -_MAX_ODDS, _MAX_ODDS) for odds in (never, always))
+    of_cells[2], of_cells[3] = mean, logit(np.clip(usual, RARE, 1 - RARE))
+    of_place[0], of_place[1] = cross[4], corners[4]
+    of_place[2], of_place[3] = of(_inside(layout)), of(enclosed(known[1]))
     np.divide(whole[:4], np.maximum(whole[4:], 1), out=overall)
     np.divide(pad[:4] + _PRIOR_CELLS * overall, pad[4:] + _PRIOR_CELLS, out=on_pad)
     for total, ring in zip((cross, corners, five - three - itself), rings, strict=True):

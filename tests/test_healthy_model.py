@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from diagnostics import SensorLayout
-from diagnostics.healthy.model import HealthyModel, excerpts, p_floor_of
+from diagnostics.healthy.model import HealthyModel, contact_events, p_floor_of
 from diagnostics.healthy.prediction import Prediction
-from diagnostics.healthy.tiled_model import fit_healthy_model
+from diagnostics.healthy.tiled_model import ReferenceEvents, fit_healthy_model
+from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.preprocessing.scale import Scale
 
 LAYOUT = SensorLayout(1, 1, 12)
@@ -22,15 +23,20 @@ def blobs(seed: int, recordings: int = 150) -> list[np.ndarray]:
     return found
 
 
+def whole_events(recordings: list[np.ndarray], scale: Scale = SCALE) -> np.ndarray:
+    """Return the features of the contact events in recordings, ``[n, 4, D]``."""
+    return np.stack([e.suffixes()[0].features() for r in recordings for e in contact_events(r, scale)])
+
+
 @pytest.fixture(scope="module")
 def model() -> HealthyModel:
-    return HealthyModel.fit(blobs(0), LAYOUT, SCALE)
+    return fit_healthy_model(blobs(0), LAYOUT, SCALE)
 
 
 @pytest.fixture(scope="module")
 def unseen() -> np.ndarray:
     """Features of presses that the model was not fitted on."""
-    return excerpts(blobs(1, 100), SCALE, np.random.default_rng(1))[0]
+    return whole_events(blobs(1, 100))
 
 
 ALL = np.ones(12, bool)
@@ -50,7 +56,7 @@ def test_a_cell_between_loaded_ones_is_hardly_ever_unloaded_and_one_far_from_the
 def test_it_predicts_new_events_better_than_the_share_of_each_cell(model, unseen):
     cells = np.arange(1, 9)
     unloaded = unseen[:, 2, cells] == 0
-    seen = excerpts(blobs(0), SCALE, np.random.default_rng(0))[0]
+    seen = whole_events(blobs(0))
 
     def log_loss(p: np.ndarray) -> float:
         return float(-np.log(np.where(unloaded, p, 1 - p)).mean())
@@ -97,8 +103,8 @@ def test_a_cell_that_was_never_loaded_is_predicted_to_stay_unloaded(model, unsee
 
 def test_cells_may_rest_at_any_value():
     offset = np.linspace(0, 2, 12)
-    moved = excerpts([r + offset for r in blobs(0)], Scale(offset, 0.05, 5.0), np.random.default_rng(0))[0]
-    plain = excerpts(blobs(0), SCALE, np.random.default_rng(0))[0]
+    moved = whole_events([r + offset for r in blobs(0)], Scale(offset, 0.05, 5.0))
+    plain = whole_events(blobs(0))
     np.testing.assert_allclose(moved, plain, atol=1e-3)
 
 
@@ -126,7 +132,7 @@ def test_large_arrays_are_modelled_in_tiles_that_cover_every_cell():
     model = fit_healthy_model(recordings, layout, scale)
     assert len(model.local_regressions) > 1
     assert sorted(np.concatenate([regression.outputs for regression in model.local_regressions])) == list(range(416))
-    features = excerpts(recordings, scale, rng)[0]
+    features = whole_events(recordings, scale)
     expected = model.predict(features, np.ones(416, bool))
     assert np.isfinite(expected.spread).all()
     loaded = features[:, 2] > 0
@@ -140,17 +146,17 @@ def patted(recordings: int, times: int) -> list[np.ndarray]:
 
 
 def test_repeated_presses_count_as_one_event():
-    rng = np.random.default_rng(0)
-    *_, once = excerpts(patted(20, 1), SCALE, rng)
-    features, source, again = excerpts(patted(20, 6), SCALE, rng)
-    assert once == again == 20
+    once, again = (ReferenceEvents.of(RecordingBlocks(patted(20, times)), LAYOUT, SCALE) for times in (1, 6))
+    assert once.number(0) == again.number(0) == 20
+    features, source = again.drawn(0, 1000, np.random.default_rng(0))
     assert len(features) == len(source) > 6 * 20
-    model = HealthyModel.fit(patted(20, 6), LAYOUT, SCALE)
-    assert model.p_floor(12).max() == p_floor_of(20)
+    (regression,) = fit_healthy_model(patted(20, 6), LAYOUT, SCALE).local_regressions
+    assert regression.p_floor == p_floor_of(20)
 
 
 @pytest.mark.parametrize(("recordings", "sources"), [(20, 20), (3, 18)])
 def test_a_recording_is_one_source_unless_there_are_few(recordings: int, sources: int):
-    _, source, number = excerpts(patted(recordings, 6), SCALE, np.random.default_rng(0))
+    events = ReferenceEvents.of(RecordingBlocks(patted(recordings, 6)), LAYOUT, SCALE)
+    _, source = events.drawn(0, 1000, np.random.default_rng(0))
     assert sorted(set(source.tolist())) == list(range(sources))
-    assert number == sources
+    assert events.number(0) == sources

@@ -102,7 +102,7 @@ def test_it_weights_regressions_by_their_accuracy(events: int):
     sure = rng.normal(0, 3, 20_000)
     samples[:, 0], samples[:, 1] = sure, sure
     right, no_better_than_chance = rng.random(20_000) < 1 / (1 + np.exp(-sure)), rng.random(20_000) < 0.5
-    stacking = Stacking.fit(samples, right, no_better_than_chance, events)
+    stacking = Stacking.fit(samples, np.column_stack([right, no_better_than_chance]), events)
     never, always = stacking.predict(samples.T.astype(np.float32))
     assert np.corrcoef(logit(never), sure)[0, 1] > 0.98
     assert np.abs(logit(never) - sure).mean() < 0.4
@@ -114,7 +114,8 @@ def test_it_uses_the_rings_where_the_regressions_are_uninformative():
     samples = rng.normal(size=(4000, N_FEATURES))
     samples[:, :2] = 0
     loaded_around = samples[:, 10] > 0
-    never, _ = Stacking.fit(samples, ~loaded_around, loaded_around, 100).predict(samples.T.astype(np.float32))
+    stacking = Stacking.fit(samples, np.column_stack([~loaded_around, loaded_around]), 100)
+    never, _ = stacking.predict(samples.T.astype(np.float32))
     assert (never < 0.5)[loaded_around].mean() > 0.95
     assert (never > 0.5)[~loaded_around].mean() > 0.95
 
@@ -124,6 +125,7 @@ def test_it_learns_an_interaction_of_two_rings():
     samples = rng.normal(size=(20_000, N_FEATURES))
     samples[:, :2] = 0
     one_of_two = (samples[:, 10] > 0) ^ (samples[:, 14] > 0)
-    never, always = Stacking.fit(samples, ~one_of_two, one_of_two, 500).predict(samples.T.astype(np.float32))
+    stacking = Stacking.fit(samples, np.column_stack([~one_of_two, one_of_two]), 500)
+    never, always = stacking.predict(samples.T.astype(np.float32))
     for outputs in (1 - never, always):
         assert (outputs > 0.8)[one_of_two].mean() > 0.7

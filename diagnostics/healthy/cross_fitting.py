@@ -8,14 +8,14 @@ inputs (Chernozhukov et al. 2018 name the scheme).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.healthy.stacking import Stacking, neighbourhood
+from diagnostics.healthy.local_regression import LocalRegression, predict_regressions
+from diagnostics.healthy.stacking import neighbourhood
 from diagnostics.preprocessing.scale import Array
 
 if TYPE_CHECKING:
@@ -27,76 +27,48 @@ _SCORED = 0.12  # share of the cells, at most, that give samples in one round
 _SAMPLES = 100_000  # in all, about: a size
 
 Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
-RegressionFit = Callable[[Array, Mask], NDArray[np.float64]]  # features [n, 4, D], predictors bool [D]
 
 
-@dataclass(frozen=True)
-class CrossFitting:
-    """Samples for the stacking.
+def stacking_samples(
+    features: Array,
+    source: Indices,
+    layout: SensorLayout,
+    outputs: Indices,
+    fit: Callable[[Array], LocalRegression],
+    share: float,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Draw samples from excerpts of events.
 
-    Attributes:
-        samples: float64 ``[m, k]``, features, see ``stacking.neighbourhood``.
-        never, always: bool ``[m]``, whether the cell stayed unloaded, or loaded, throughout.
-        events: number of events behind the samples.
+    Args:
+        features: ``[n, 4, D]``.
+        source: int ``[n]``; excerpts of one source lie in one fold.
+        layout: the array.
+        outputs: the cells that have regressions.
+        fit: returns the regressions of the ``outputs``, fitted on features ``[m, 4, D]``.
+        share: of all samples that are drawn from this array.
+        rng: draws them.
+
+    Returns:
+        Features of m samples ``[m, k]``, see ``stacking.neighbourhood``, and whether the cell stayed unloaded, and
+        loaded, throughout ``[m, 2]``.
     """
-
-    samples: NDArray[np.float64]
-    never: Mask
-    always: Mask
-    events: int
-
-    @classmethod
-    def of(
-        cls,
-        features: Array,
-        source: Indices,
-        events: int,
-        layout: SensorLayout,
-        outputs: Indices,
-        fit: Callable[[Array], RegressionFit],
-        share: float,
-        rng: np.random.Generator,
-    ) -> CrossFitting:
-        """Draw samples from excerpts of events.
-
-        Args:
-            features: ``[n, 4, D]``.
-            source: int ``[n]``; excerpts of one source lie in one fold.
-            events: number of events behind the excerpts.
-            layout: the array.
-            outputs: the cells that have regressions.
-            fit: returns the regressions of the ``outputs``, fitted on features ``[m, 4, D]``.
-            share: of all samples that are drawn from this array.
-            rng: draws them.
-        """
-        present = np.flatnonzero(layout.present)
-        per_excerpt = sum(min(left, _SCORED) for left in _LEFT_OUT) * len(outputs)
-        most = max(1, round(share * _SAMPLES / (FOLDS * per_excerpt)))  # excerpts in each round
-        fold = rng.permutation(source.max() + 1)[source] % FOLDS
-        found = []
-        for k in range(FOLDS):
-            regressed, held_out = fit(features[fold != k]), features[fold == k]
-            for left in _LEFT_OUT:
-                some = held_out[np.sort(rng.permutation(len(held_out))[:most])]
-                out = rng.permutation(present)[: max(1, round(left * len(present)))]
-                predictors = np.ones(layout.n_cells, bool)
-                predictors[out] = False
-                out = out[np.isin(out, outputs)]
-                out = np.sort(out[: max(1, round(_SCORED * len(outputs)))])
-                described = neighbourhood(regressed(some, predictors), some, predictors, layout, out)
-                samples = described.reshape(len(described), -1).T.astype(np.float64)
-                found.append(cls(samples, (some[:, 2, out] == 0).T.ravel(), (some[:, 3, out] == 1).T.ravel(), 0))
-        return replace(cls.joined(found), events=events)
-
-    @classmethod
-    def joined(cls, parts: Sequence[CrossFitting]) -> CrossFitting:
-        """Concatenate the samples of several parts."""
-        samples, never, always = (
-            np.concatenate([getattr(part, name) for part in parts]) for name in ("samples", "never", "always")
-        )
-        return cls(samples, never, always, sum(part.events for part in parts))
-
-    def fit_stacking(self) -> Stacking:
-        """Return the stacking fitted to the samples."""
-        return Stacking.fit(self.samples, self.never, self.always, self.events)
+    present = np.flatnonzero(layout.present)
+    per_excerpt = sum(min(left, _SCORED) for left in _LEFT_OUT) * len(outputs)
+    most = max(1, round(share * _SAMPLES / (FOLDS * per_excerpt)))  # excerpts in each round
+    fold = rng.permutation(source.max() + 1)[source] % FOLDS
+    samples, did = [], []
+    for k in range(FOLDS):
+        regression, held_out = fit(features[fold != k]), features[fold == k]
+        for left in _LEFT_OUT:
+            some = held_out[np.sort(rng.permutation(len(held_out))[:most])]
+            out = rng.permutation(present)[: max(1, round(left * len(present)))]
+            predictors = np.ones(layout.n_cells, bool)
+            predictors[out] = False
+            out = out[np.isin(out, outputs)]
+            out = np.sort(out[: max(1, round(_SCORED * len(outputs)))])
+            regressed = predict_regressions([regression], some, predictors)
+            described = neighbourhood(regressed, some, predictors, layout, out)
+            samples.append(described.reshape(len(described), -1).T.astype(np.float64))
+            did.append(np.column_stack([(some[:, 2, out] == 0).T.ravel(), (some[:, 3, out] == 1).T.ravel()]))
+    return np.concatenate(samples), np.concatenate(did)

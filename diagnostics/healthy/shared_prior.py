@@ -75,9 +75,12 @@ class SharedPrior:
 
     @classmethod
     def fit(cls, parts: list[Samples]) -> SharedPrior:
-        """Fit to samples of many tiles."""
+        """Fit to samples of many tiles; all is 0 without any."""
         from sklearn.linear_model import LogisticRegression
 
+        side = 2 * REACH + 1
+        if not parts:
+            return cls(np.zeros((2, FEATURES, side, side)), np.zeros(2))
         x = np.concatenate([part.neighbourhoods.reshape(len(part.neighbourhoods), -1) for part in parts])[:_MOST]
         did = np.concatenate([part.did for part in parts])[:_MOST]
         weight, bias = np.zeros((2, x.shape[1])), np.zeros(2)
@@ -87,15 +90,16 @@ class SharedPrior:
                 weight[q], bias[q] = fit.coef_[0], fit.intercept_[0]
             else:  # no cell did, or all did
                 bias[q] = logit((y.sum() + 1) / (len(y) + 2))
-        side = 2 * REACH + 1
         return cls(weight.reshape(2, FEATURES, side, side), bias)
 
-    def on(self, tile: Tile, layout: SensorLayout) -> NDArray[np.float64]:
-        """Return the weights for a tile, ``[4, inputs, 2, outputs]``."""
-        rows, cols = tile.inputs // layout.cols % layout.rows, tile.inputs % layout.cols
-        down, across = (of[:, None] - of[tile.place] for of in (rows, cols))  # (inputs, outputs)
+    def weights(self, down: NDArray[np.intp], across: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Return the weights for a tile, ``[4, inputs, 2, outputs]``.
+
+        Args:
+            down, across: int ``[inputs, outputs]``, rows and columns from each output to each input.
+        """
         near = (np.abs(down) <= REACH) & (np.abs(across) <= REACH)
-        found = np.zeros((FEATURES, len(tile.inputs), 2, len(tile.outputs)))
+        found = np.zeros((FEATURES, len(down), 2, down.shape[1]))
         i, j = np.nonzero(near)
         found[:, i, :, j] = self.weight[:, :, down[i, j] + REACH, across[i, j] + REACH].transpose(2, 1, 0)
         return found

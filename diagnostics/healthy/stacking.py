@@ -55,20 +55,18 @@ class Stacking:
     events: int
 
     @classmethod
-    def fit(
-        cls, samples: NDArray[np.float64], never: NDArray[np.bool_], always: NDArray[np.bool_], events: int
-    ) -> Stacking:
+    def fit(cls, samples: Floats, did: NDArray[np.bool_], events: int) -> Stacking:
         """Fit to samples of cells that were no predictors.
 
         Args:
             samples: ``[m, k]``, see :func:`neighbourhood`.
-            never, always: bool ``[m]``, whether the cell stayed unloaded, or loaded, throughout.
+            did: bool ``[m, 2]``, whether the cell stayed unloaded, and loaded, throughout.
             events: number of events behind the samples.
         """
         from sklearn.preprocessing import StandardScaler
 
         scaler = StandardScaler().fit(samples)
-        hidden, threshold, out, bias = _network(scaler.transform(samples), np.stack([never, always], axis=1))
+        hidden, threshold, out, bias = _network(scaler.transform(samples), did)
         return cls(scaler.mean_, scaler.scale_, bias, hidden, threshold, out, events)
 
     def predict(self, samples: Array) -> tuple[Floats, Floats]:

@@ -44,7 +44,7 @@ class RecordingBlocks(Sequence[Recording]):
             return RecordingBlocks(self._given[which])
         return np.asarray(self._given[which], dtype=np.float64)
 
-    def piece(self, which: int, frames: slice, cells: NDArray[np.intp]) -> Recording:
+    def piece(self, which: int, frames: slice, cells: NDArray[np.intp] | slice) -> Recording:
         """Return some frames of some cells of one recording."""
         return np.asarray(self._given[which][frames][:, cells], dtype=np.float64)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,9 +37,9 @@ class Scale:
         root: Array = np.sqrt(np.where(load > np.float32(self.near / self.full_scale), load, np.float32(0)))
         return root
 
-    def of(self, cells: NDArray[np.intp]) -> Scale:
+    def of(self, cells: NDArray[np.intp] | slice) -> Scale:
         """Return the scale of some cells."""
-        return Scale(self.baseline[cells], self.near, self.full_scale)
+        return replace(self, baseline=self.baseline[cells])
 
     @property
     def root_near(self) -> float:

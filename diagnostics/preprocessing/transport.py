@@ -137,43 +137,34 @@ class TransportState:
         arrived = ~missing.all(axis=1, where=present) if missing.any() else np.ones(len(frames), bool)
         arrived_at = np.flatnonzero(arrived)
         missed = len(frames) - len(arrived_at)
-        lost, first_lost = self.lost + missed, self.first_lost
-        if missed and first_lost < 0:
-            first_lost = self.seen + int((~arrived).argmax())
+        state = self.without(missed, int((~arrived).argmax())) if missed else self
+        state = replace(state, seen=self.seen + len(frames))
         if not len(arrived_at):
-            return replace(self, seen=self.seen + len(frames), lost=lost, first_lost=first_lost), arrived_at
+            return state, arrived_at
         received = frames[arrived_at] if missed else frames
-        same = np.zeros(len(received), bool)
-        if self.last is not None:
-            same[0] = np.array_equal(received[0], self.last, equal_nan=True)
-        same[1:] = _as_before(received)
-        counts = np.arange(1, len(received) + 1)
-        fresh = np.maximum.accumulate(np.where(same, 0, counts))
-        repeats = np.where(fresh > 0, counts - fresh, self.repeats + counts)
-        repetitions = list(self.repetitions)
-        # A repetition is recorded once it exceeds patience, and extended while it continues.
-        numbers = self.seen + arrived_at
-        since = np.where(fresh > 0, numbers[fresh - 1], self.since)
+        before = np.full_like(received[:1], np.nan) if self.last is None else self.last[None]
+        again = repetitions(np.concatenate([before, received]))[1:]
+        index, numbers = np.arange(len(received)), self.seen + arrived_at
+        ongoing = again > index  # a repetition that began before these frames
+        repeats = again + np.where(ongoing, self.repeats, 0)
+        since = np.where(ongoing, self.since, numbers[index - again])
         limit = np.full(len(received), patience.loaded)
         some = np.flatnonzero(repeats > patience.loaded)
         limit[some] = patience.of(received[some])
         beyond = repeats > limit
-        for i in np.flatnonzero(np.append(~same[1:], True) & beyond).tolist():
-            known = repetitions[-1] if repetitions and fresh[i] == 0 and self.repeats > limit[i] else None
-            if known is not None:
-                repetitions[-1] = replace(known, frames=int(repeats[i]) + 1)
+        # A repetition is recorded once it exceeds patience, and extended while it continues.
+        recorded = list(self.repetitions)
+        for i in np.flatnonzero(np.append(again[1:] == 0, True) & beyond).tolist():
+            if recorded and ongoing[i] and self.repeats > limit[i]:
+                recorded[-1] = replace(recorded[-1], frames=int(repeats[i]) + 1)
             else:
-                repetitions.append(Repetition(int(since[i]), int(repeats[i]) + 1, received[i].copy()))
-        state = TransportState(
-            seen=self.seen + len(frames),
-            lost=lost,
-            first_lost=first_lost,
+                recorded.append(Repetition(int(since[i]), int(repeats[i]) + 1, received[i].copy()))
+        state = replace(
+            state,
             last=received[-1].copy(),
             repeats=int(repeats[-1]),
             since=int(since[-1]),
-            repetitions=tuple(repetitions[-_KEPT:]),
-            invalid=self.invalid,
-            first_invalid=self.first_invalid,
+            repetitions=tuple(recorded[-_KEPT:]),
         )
         return state, arrived_at[~beyond]
 
@@ -182,10 +173,10 @@ class TransportState:
         first = self.seen + int(invalid.any(axis=1).argmax()) if self.first_invalid < 0 else self.first_invalid
         return replace(self, invalid=self.invalid + int(invalid.sum()), first_invalid=first)
 
-    def without(self, frames: int) -> TransportState:
-        """Return the state after ``frames`` more frames were lost."""
-        first = self.seen if self.first_lost < 0 else self.first_lost
-        return replace(self, lost=self.lost + frames, first_lost=first)
+    def without(self, frames: int, first: int = 0) -> TransportState:
+        """Return the state with ``frames`` more frames lost, the ``first`` of them that many frames from now."""
+        first_lost = self.seen + first if self.first_lost < 0 else self.first_lost
+        return replace(self, lost=self.lost + frames, first_lost=first_lost)
 
     def faults(
         self, loaded_from: NDArray[np.float64], working: NDArray[np.bool_], rate: float, moved: bool = True
@@ -206,19 +197,13 @@ class TransportState:
             text = f"{_count(self.invalid, 'reading')} outside what a converter gives, the first in frame"
             text += f" {self.first_invalid}: counted as missing; check the converter and the link to the sensor"
             found.append(TransportFault("invalid", self.first_invalid, self.invalid, text))
+        cells, why = ("working cells", "not the cells") if moved else ("cells", "or these cells are stuck")
         for r in self.repetitions:
             loaded = int((r.frame > loaded_from)[working].sum())
             if loaded >= _LOADED_CELLS:
-                cells = f"{loaded} working cells" if moved else f"{loaded} cells"
-                text = f"frame {r.onset}, in which {cells} are loaded, was received {r.frames} times"
-                text += f" in a row ({r.frames / rate:.1f} s)"
-                why = (
-                    "the stream was frozen, not the cells"
-                    if moved
-                    else "the stream was frozen, or these cells are stuck"
-                )
-                text += f": {why}; check the link to the sensor"
-                found.append(TransportFault("frozen", r.onset, r.frames, text))
+                text = f"frame {r.onset}, in which {loaded} {cells} are loaded, was received {r.frames} times"
+                text += f" in a row ({r.frames / rate:.1f} s): the stream was frozen, {why}"
+                found.append(TransportFault("frozen", r.onset, r.frames, f"{text}; check the link to the sensor"))
         return tuple(found)
 
 
@@ -238,16 +223,10 @@ def invalid(frames: NDArray[Any], full_scale: float) -> NDArray[np.bool_] | None
 
 
 def repetitions(frames: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Return how many times in a row each frame of ``[T, D]`` was received before, int ``[T]``."""
-    same = np.append(False, _as_before(frames))[: len(frames)]
-    counts = np.arange(len(same))
-    return counts - np.maximum.accumulate(np.where(same, 0, counts))
-
-
-def _as_before(frames: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether each frame but the first equals the one before, bool ``[T - 1]``; NaN equals NaN."""
+    """Return how many times in a row each frame of ``[T, D]`` was received before, int ``[T]``; NaN equals NaN."""
     equal, missing = frames[1:] == frames[:-1], np.isnan(frames)
     if missing.any():
         equal |= missing[1:] & missing[:-1]
-    same: NDArray[np.bool_] = equal.all(axis=1)
-    return same
+    same = np.append(False, equal.all(axis=1))[: len(frames)]
+    counts = np.arange(len(same))
+    return counts - np.maximum.accumulate(np.where(same, 0, counts))

@@ -41,7 +41,8 @@ def find_reference_faults(
         diagnose: a cold-start diagnosis of the candidate cells (bool ``[D]``) with known baselines (float ``[D]``).
     """
     present = layout.present.ravel()
-    never_moved = present & _constant(recordings, 2 * tolerance)
+    low, high = recordings.extremes()
+    never_moved = present & (high - low <= 2 * tolerance)  # False without any reading
     candidates = _enclosed_groups(never_moved, layout)
     if not candidates.any() or never_moved[present].mean() > MAJORITY:
         return np.zeros(layout.n_cells)
@@ -52,12 +53,6 @@ def find_reference_faults(
     found = diagnose(_sample(recordings), candidates, rest, layout)
     dead = never_moved & found.fault_set.mask & (found.probability >= 1 - RARE)
     return np.where(dead, found.probability, 0.0)
-
-
-def _constant(recordings: RecordingBlocks, most: float) -> NDArray[np.bool_]:
-    """Return the cells whose readings span at most ``most``, bool ``[D]``; False without any reading."""
-    low, high = recordings.extremes()
-    return np.asarray(high - low <= most)
 
 
 def _enclosed_groups(never_moved: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.bool_]:
@@ -72,7 +67,5 @@ def _sample(recordings: RecordingBlocks) -> RecordingBlocks:
     """Return evenly spread pieces of the recordings: more add little to a cold start."""
     pieces = [(i, first) for i in range(len(recordings)) for first in range(0, len(recordings[i]), _FRAMES)]
     chosen = np.unique(np.linspace(0, len(pieces) - 1, _PIECES).round().astype(int))
-    every = np.arange(recordings[0].shape[1])
-    return RecordingBlocks(
-        [recordings.piece(i, slice(first, first + _FRAMES), every) for i, first in map(pieces.__getitem__, chosen)]
-    )
+    some = (pieces[k] for k in chosen)
+    return RecordingBlocks([recordings.piece(i, slice(first, first + _FRAMES), slice(None)) for i, first in some])

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, RARE
-from diagnostics.preprocessing.readings import CELLS, SEGMENT, RecordingBlocks
+from diagnostics.preprocessing.readings import CELLS, SEGMENT, RecordingBlocks, spread
 
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
 
@@ -48,17 +48,17 @@ def baseline(recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance
         tolerance: a constant run stays within +- this; smaller drift is covered by it.
         full_scale: of the layout.
     """
-    low, last, peaks = _low(recordings)
-    cells, some = RecordingBlocks.of(recordings).sample(present)
+    readings, cells = RecordingBlocks.of(recordings), spread(np.flatnonzero(present))
+    low, last, peaks = _low(readings)
     offsets, curvatures = [], []
-    for frames in some:
+    for i in readings.some:
+        frames = readings.piece(i, slice(None), cells)
         received = ~np.isnan(frames).any(axis=0)
         if len(frames) > 2 and received.any():
             whole = frames[:, received]
             offsets.append(np.quantile(whole, LOW, axis=0) - low[cells[received]])
-            curvatures.append(
-                np.median(np.abs(np.diff(whole, 2, axis=0)), axis=0)
-            )  # a load changes slowly: its second difference is small
+            # A load changes slowly: its second difference is small.
+            curvatures.append(np.median(np.abs(np.diff(whole, 2, axis=0)), axis=0))
     if not offsets:
         return Baseline(low, low, np.nan, last, peaks)
     offset = np.concatenate(offsets)
@@ -80,12 +80,12 @@ def _highest(offset: Floats) -> float:
     return usual + min(max(below, usual), 2 * usual)
 
 
-def _low(recordings: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
+def _low(readings: RecordingBlocks) -> tuple[Floats, Floats, Floats]:
     """Return the low quantile of the readings of each cell, and its last reading and lowest peak in each recording.
 
     Shapes: ``[D]`` (0 without any reading), and twice ``[recordings, D]``.
     """
-    readings, n_cells = RecordingBlocks.of(recordings), recordings[0].shape[1]
+    n_cells = readings.given[0].shape[1]
     low, (last, peaks) = np.zeros(n_cells), np.full((2, len(readings), n_cells), np.nan)
     for first in range(0, n_cells, CELLS):
         cells = np.arange(first, min(first + CELLS, n_cells))

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import iqr
 
 from diagnostics.preprocessing.levels import MAJORITY, SLIGHT
 from diagnostics.preprocessing.readings import CELLS, RecordingBlocks, spread
@@ -58,19 +59,16 @@ class LoadDirection:
     @classmethod
     def fit(cls, recordings: Sequence[NDArray[Any]], layout: SensorLayout) -> LoadDirection | None:
         """Learn what the layout leaves open from fault-free recordings, ``[T, D]`` each; None: readings are loads."""
-        if layout.rest in ("low", "high"):
-            return cls.declared(layout)
         readings = RecordingBlocks.of(recordings)
-        both_ways = layout.rest == "middle" or layout.axes > 1
-        direction = "middle" if both_ways else _learned(readings, layout)
-        if direction != "middle":
-            return cls.declared(replace(layout, rest=direction))
-        cells, rest = np.arange(layout.n_cells), np.full(layout.n_cells, 0.5 * layout.full_scale)
-        for some in np.split(cells, range(CELLS, len(cells), CELLS)):
-            sample = readings.thinned(some)
-            received = ~np.isnan(sample).all(axis=0)
-            rest[some[received]] = np.nanmedian(sample[:, received], axis=0)
-        return cls(direction, rest, layout.full_scale)
+        if layout.rest == "learn" and layout.axes == 1:
+            layout = replace(layout, rest=_learned(readings, layout))
+        found = cls.declared(layout)
+        if found is not None and found.direction == "middle":
+            for some in np.split(np.arange(layout.n_cells), range(CELLS, layout.n_cells, CELLS)):
+                sample = readings.thinned(some)
+                received = ~np.isnan(sample).all(axis=0)
+                found.rest[some[received]] = np.nanmedian(sample[:, received], axis=0)
+        return found
 
     def check(self, layout: SensorLayout) -> None:
         """Raise ValueError unless this is a direction of ``layout``."""
@@ -102,10 +100,6 @@ def _learned(readings: RecordingBlocks, layout: SensorLayout) -> Rest:
     up = float(np.median((high - rest) / (high - low)))
     quiet = float(np.median((np.abs(sample - rest) <= SLIGHT * layout.full_scale).mean(axis=0)))
     # Where a load is held most of the time, it differs between cells more than the readings without it do.
-    if up >= 1 - _ASIDE or quiet < MAJORITY or _spread(rest) > _spread(low):
+    if up >= 1 - _ASIDE or quiet < MAJORITY or iqr(rest) > iqr(low):
         return "low"
     return "high" if up <= _ASIDE else "middle" if abs(up - 0.5) <= _ASIDE else "low"
-
-
-def _spread(values: Floats) -> float:
-    return float(np.subtract(*np.quantile(values, (0.75, 0.25))))

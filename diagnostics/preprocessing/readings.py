@@ -21,19 +21,14 @@ class RecordingBlocks(Sequence[Recording]):
     """A sequence of recordings; each item is converted to float64 ``[T, D]``.
 
     Args:
-        given: arrays ``[T, D]`` of numbers, not copied.
+        given: arrays ``[T, D]`` of numbers, not copied; kept in their own dtype.
     """
 
     def __init__(self, given: Sequence[NDArray[Any]]) -> None:
-        self._given = list(given)
-
-    @property
-    def given(self) -> list[NDArray[Any]]:
-        """The recordings in their own dtype."""
-        return self._given
+        self.given = list(given)
 
     def __len__(self) -> int:
-        return len(self._given)
+        return len(self.given)
 
     @overload
     def __getitem__(self, which: int) -> Recording: ...
@@ -41,38 +36,33 @@ class RecordingBlocks(Sequence[Recording]):
     def __getitem__(self, which: slice) -> RecordingBlocks: ...
     def __getitem__(self, which: int | slice) -> Recording | RecordingBlocks:
         if isinstance(which, slice):
-            return RecordingBlocks(self._given[which])
-        return np.asarray(self._given[which], dtype=np.float64)
+            return RecordingBlocks(self.given[which])
+        return np.asarray(self.given[which], dtype=np.float64)
 
     def piece(self, which: int, frames: slice, cells: NDArray[np.intp] | slice) -> Recording:
         """Return some frames of some cells of one recording."""
-        return np.asarray(self._given[which][frames][:, cells], dtype=np.float64)
+        return np.asarray(self.given[which][frames][:, cells], dtype=np.float64)
 
     def blocks(self) -> Iterator[Recording]:
         """Yield all frames in order, in blocks of limited size."""
-        for given in self._given:
+        for given in self.given:
             step = max(1, _MOST_VALUES // given.shape[1])
             for first in range(0, len(given), step):
                 yield np.asarray(given[first : first + step], dtype=np.float64)
 
-    def sample(self, present: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Iterator[Recording]]:
-        """Return evenly spread indices of ``present`` cells (bool ``[D]``), and recordings of these cells."""
-        cells = spread(np.flatnonzero(present))
-        return cells, (self.piece(i, slice(None), cells) for i in self._some)
-
-    def thinned(self, cells: NDArray[np.intp]) -> Recording:
-        """Return evenly spread readings of some cells, ``[n, cells]``."""
-        steps = ((i, max(1, len(self._given[i]) // _FRAMES)) for i in self._some)
-        return np.concatenate([self.piece(i, slice(None, None, step), cells) for i, step in steps])
-
     @property
-    def _some(self) -> range:
+    def some(self) -> range:
         """Evenly spread recordings."""
         return range(0, len(self), max(1, len(self) // _RECORDINGS))
 
+    def thinned(self, cells: NDArray[np.intp]) -> Recording:
+        """Return evenly spread readings of some cells, ``[n, cells]``."""
+        steps = ((i, max(1, len(self.given[i]) // _FRAMES)) for i in self.some)
+        return np.concatenate([self.piece(i, slice(None, None, step), cells) for i, step in steps])
+
     def extremes(self) -> tuple[Recording, Recording]:
         """Return the lowest and the highest reading of each cell, ``[D]``; NaN for a cell without any reading."""
-        low = high = np.full(self._given[0].shape[1], np.nan)
+        low = high = np.full(self.given[0].shape[1], np.nan)
         for frames in self.blocks():
             low, high = np.fmin(low, np.fmin.reduce(frames)), np.fmax(high, np.fmax.reduce(frames))
         return low, high
@@ -80,7 +70,7 @@ class RecordingBlocks(Sequence[Recording]):
     def valid(self, full_scale: float) -> RecordingBlocks:
         """Return the recordings with readings that no converter gives as missing, see ``transport.invalid``."""
         checked = []
-        for given in self._given:
+        for given in self.given:
             wrong = invalid(given, full_scale) if len(given) else None
             checked.append(given if wrong is None else np.where(wrong, np.nan, given))
         return RecordingBlocks(checked)
@@ -94,7 +84,7 @@ class RecordingBlocks(Sequence[Recording]):
         Raises:
             ValueError: no frame with a reading.
         """
-        whole = [recording for recording in (_whole(given, present) for given in self._given) if len(recording)]
+        whole = [recording for recording in (_whole(given, present) for given in self.given) if len(recording)]
         if not whole:
             raise ValueError("the recordings hold no frame with a reading: nothing to learn from")
         return RecordingBlocks(whole)

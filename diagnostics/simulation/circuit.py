@@ -286,19 +286,20 @@ class _Pad:
         rows, cols = layout.rows, layout.cols
         row_wire, column_wire = (w.copy() for w in np.indices((rows, cols)))
         column_wire += rows
-        beyond = 0
         stuck = np.where(layout.present[pad], np.nan, 0.0)
         drive, listen = np.arange(rows), np.arange(cols)
-        joined: list[tuple[int, int]] = []
-        grounded: list[int] = []
-        supplied: list[int] = []
+        cuts = sum(isinstance(fault, CutLine) for fault in circuit.faults)
+        held = np.repeat([circuit._grounds("row"), circuit._grounds("column"), False], [rows, cols, cuts])
+        static = np.diag(1 / circuit.leak_ohms + held / circuit.switch_ohms)
+        source = np.zeros(len(held))
+        beyond = rows + cols
         for fault in circuit.faults:
             if isinstance(fault, StuckCell):
                 where, row, col = layout.position(fault.cell)
                 if where == pad and layout.present[pad, row, col]:
                     stuck[row, col] = 1 / max(fault.ohms, circuit.short_ohms)
                 continue
-            number = rows + cols + beyond
+            number = beyond
             beyond += isinstance(fault, CutLine)
             if fault.line.pad != pad:
                 continue
@@ -306,29 +307,19 @@ class _Pad:
             match fault:
                 case CutLine(line, before, end):
                     part = slice(before, None) if end == "first" else slice(None, before)
-                    if line.kind == "row":
-                        row_wire[line.index, part] = number
-                    else:
-                        column_wire[part, line.index] = number
+                    of_line = row_wire[line.index] if line.kind == "row" else column_wire[:, line.index]
+                    of_line[part] = number
                 case ShortedLine(to=to):
-                    (supplied if to == "supply" else grounded).append(wire)
+                    static[wire, wire] += short
+                    source[wire] += short if to == "supply" else 0.0
                 case BridgedLines():
-                    joined.append((wire, wire + 1))
+                    pair = np.array([wire, wire + 1])
+                    static[pair, pair] += short
+                    static[pair, pair[::-1]] -= short
                 case StuckBit(line, level) if line.kind == "row_address":
                     drive = _stick(drive, line.index, level)
                 case StuckBit(line, level):
                     listen = _stick(listen, line.index, level)
-        n = rows + cols + beyond
-        source = np.zeros(n)
-        diagonal = np.full(n, 1 / circuit.leak_ohms)
-        diagonal[:rows] += 1 / circuit.switch_ohms if circuit._grounds("row") else 0.0
-        diagonal[rows : rows + cols] += 1 / circuit.switch_ohms if circuit._grounds("column") else 0.0
-        diagonal[grounded + supplied] += short
-        source[supplied] = short
-        static = np.diag(diagonal)
-        for a, b in joined:
-            static[[a, b], [a, b]] += short
-            static[[a, b], [b, a]] -= short
         drive, listen = np.where(drive < rows, drive, -1), np.where(listen < cols, listen, -1)
         return cls(rows, static, source, row_wire.ravel(), column_wire.ravel(), stuck, drive, listen)
 
@@ -349,11 +340,8 @@ def _check(fault: NetlistFault, layout: SensorLayout) -> None:
     line = fault.line
     if line not in layout.lines:
         raise ValueError(f"{fault}: {line} is not a wire of {layout}")
-    kinds: tuple[str, ...] = ("row", "column")
-    if isinstance(fault, StuckBit):
-        kinds = ("row_address", "column_address")
-    elif isinstance(fault, StuckConverter):
-        kinds = ("converter",)
+    special = {StuckBit: ("row_address", "column_address"), StuckConverter: ("converter",)}
+    kinds = special.get(type(fault), ("row", "column"))
     if line.kind not in kinds:
         raise ValueError(f"{fault}: this fault sits on a {' or '.join(kinds)}, not on a {line.kind}")
     along = layout.cols if line.kind == "row" else layout.rows

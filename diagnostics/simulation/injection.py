@@ -190,31 +190,25 @@ def line_fault(
             behind the break.
         IndexError: the layout has no such wire.
     """
+    state = str(kind)
     if break_at is not None:
-        return _broken_line(layout, line, FaultKind(kind), value, onset, break_at, driven_from)
-    if kind is FaultKind.ALIAS and line.kind in ("row_address", "column_address"):
-        cells, _ = layout.misaddressed(line, int(value or 0))
-        return Fault(
-            kind, tuple(cells.tolist()), line=line, value=int(value or 0), onset=onset, reason=f"{line} is stuck"
-        )
-    return Fault(
-        kind, tuple(layout.cells_on(line).tolist()), line=line, value=value, onset=onset, reason=f"{line} is {kind}"
-    )
+        cells, where = _beyond(layout, line, kind, break_at, driven_from)
+        state += f" {where}"
+    elif kind is FaultKind.ALIAS and line.kind in ("row_address", "column_address"):
+        value, state = int(value or 0), "stuck"
+        cells, _ = layout.misaddressed(line, value)
+    else:
+        cells = layout.cells_on(line)
+    return Fault(kind, tuple(cells.tolist()), line=line, value=value, onset=onset, reason=f"{line} is {state}")
 
 
-def _broken_line(
-    layout: SensorLayout,
-    line: Line,
-    kind: FaultKind,
-    value: float | None,
-    onset: int | None,
-    break_at: int,
-    driven_from: str,
-) -> Fault:
-    """Return the fault of the cells behind a break."""
+def _beyond(
+    layout: SensorLayout, line: Line, kind: FaultKind, break_at: int, driven_from: str
+) -> tuple[NDArray[np.intp], str]:
+    """Return the cells behind a break, and where these are, as text."""
     if line.kind not in ("row", "column"):
         raise ValueError(f"break_at is a position along a row or column; {line} has no positions")
-    if kind is FaultKind.ALIAS:
+    if kind == FaultKind.ALIAS:
         raise ValueError("break_at goes with a fault of the cells behind the break, not with an alias of a whole wire")
     along, positions = ("column", layout.cols) if line.kind == "row" else ("row", layout.rows)
     if not 0 <= break_at <= positions:
@@ -229,10 +223,7 @@ def _broken_line(
             f"{line} has no cell behind a break at {break_at} when driven from its {driven_from} position:"
             " move the break, or drive the wire from the other end"
         )
-    side = f"from {along} {break_at} on" if driven_from == "first" else f"up to {along} {break_at - 1}"
-    return Fault(
-        kind, tuple(cells[beyond].tolist()), line=line, value=value, onset=onset, reason=f"{line} is {kind} {side}"
-    )
+    return cells[beyond], f"from {along} {break_at} on" if driven_from == "first" else f"up to {along} {break_at - 1}"
 
 
 def bridge(layout: SensorLayout, line: Line, *, onset: int | None = None) -> Fault:

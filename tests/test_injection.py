@@ -41,7 +41,9 @@ def test_dither_stays_within_its_share_of_full_scale_and_moves(recording):
 
 @pytest.mark.parametrize(("level", "row", "read"), [(0, 6, 2), (1, 2, 6)])
 def test_a_stuck_address_bit_makes_rows_exact_copies(recording, level, row, read):
-    fault = line_fault(LAYOUT, Line(1, "row_address", 2), FaultKind.ALIAS, value=level)
+    bit = Line(1, "row_address", 2)
+    fault = line_fault(LAYOUT, bit, FaultKind.ALIAS, value=level)
+    assert line_fault(LAYOUT, bit, "alias", value=level) == fault
     grid = LAYOUT.grid(inject(recording, [fault], LAYOUT))
     np.testing.assert_array_equal(grid[:, 1, row], LAYOUT.grid(recording)[:, 1, read])
     np.testing.assert_array_equal(grid[:, 1, read], LAYOUT.grid(recording)[:, 1, read])

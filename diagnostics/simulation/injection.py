@@ -190,6 +190,7 @@ def line_fault(
             behind the break.
         IndexError: the layout has no such wire.
     """
+    kind = FaultKind(kind)
     state = str(kind)
     if break_at is not None:
         cells, where = _beyond(layout, line, kind, break_at, driven_from)
@@ -208,7 +209,7 @@ def _beyond(
     """Return the cells behind a break, and where these are, as text."""
     if line.kind not in ("row", "column"):
         raise ValueError(f"break_at is a position along a row or column; {line} has no positions")
-    if kind == FaultKind.ALIAS:
+    if kind is FaultKind.ALIAS:
         raise ValueError("break_at goes with a fault of the cells behind the break, not with an alias of a whole wire")
     along, positions = ("column", layout.cols) if line.kind == "row" else ("row", layout.rows)
     if not 0 <= break_at <= positions:

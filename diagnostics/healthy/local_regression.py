@@ -112,24 +112,24 @@ class LocalRegression:
         place = np.searchsorted(inputs, outputs)
         targets = np.concatenate([x[:, 2, place] == 0, x[:, 3, place] == 1], axis=1).astype(np.float32)
         own = np.arange(FEATURES) * len(inputs) + np.tile(place, 2)[:, None]
-        flat = z.reshape(len(z), -1)
+        flat, z1 = z.reshape(len(z), -1), z[:, 1].astype(np.float64)
         if start is None:
             weight, bias = _logistic(flat, targets, own)
-            estimate = LedoitWolf().fit(z[:, 1].astype(np.float64))
+            estimate = LedoitWolf().fit(z1)
             covariance, precision = estimate.covariance_, estimate.precision_
         else:
             shared = start.weight.reshape(flat.shape[1], -1).astype(np.float32)
-            shared_odds = x.reshape(len(z), -1) @ shared + np.repeat(start.bias, len(outputs)).astype(np.float32)
+            shared_bias = np.repeat(start.bias, len(outputs)).astype(np.float32)
+            shared_odds = x.reshape(len(z), -1) @ shared + shared_bias
             y = targets.reshape(len(z), 2, -1)
             of_samples, own_bias = dual_logistic(flat, y, z[:, :, place], start.ridge, shared_odds.reshape(y.shape))
             weight, bias = flat.T @ of_samples.reshape(len(z), -1), own_bias.ravel()
             weight[own, np.arange(len(own))[:, None]] = 0
             weight += shared * scale.reshape(-1, 1)
-            bias += mean.reshape(-1) @ shared + np.repeat(start.bias, len(outputs)).astype(np.float32)
-            covariance, precision = covariance_and_precision(z[:, 1].astype(np.float64), start.taper)
-        if not z[:, 1].any():  # no event in this tile: cells count as independent
+            bias += mean.reshape(-1) @ shared + shared_bias
+            covariance, precision = covariance_and_precision(z1, start.taper)
+        if not z1.any():  # no event in this tile: cells count as independent
             covariance = precision = np.eye(len(inputs))
-        z1 = z[:, 1].astype(np.float64)
         error = (z1 @ precision / np.diag(precision))[:, place] * np.where(np.isfinite(scale[1]), scale[1], 0)[place]
         # An unloaded cell is predicted almost exactly: only excerpts in which the cell is loaded count.
         loaded = x[:, 2, place] > 0

@@ -10,7 +10,7 @@ represent differences between places on the array.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ _MOST, _UNLOADED = 20_000, 0.2  # samples; share of them without any load around
 _RIDGE = 1e-3  # per sample: the weights of correlated neighbours are not determined without it
 
 
-@dataclass(frozen=True)
-class Samples:
+class Samples(NamedTuple):
     """Training samples.
 
     Attributes:
@@ -81,12 +80,12 @@ class SharedPrior:
         side = 2 * REACH + 1
         if not parts:
             return cls(np.zeros((2, FEATURES, side, side)), np.zeros(2))
-        x = np.concatenate([part.neighbourhoods.reshape(len(part.neighbourhoods), -1) for part in parts])[:_MOST]
-        did = np.concatenate([part.did for part in parts])[:_MOST]
+        neighbourhoods, did = (np.concatenate(of_tiles)[:_MOST] for of_tiles in zip(*parts, strict=True))
+        x = neighbourhoods.reshape(len(did), -1).astype(np.float64)
         weight, bias = np.zeros((2, x.shape[1])), np.zeros(2)
         for q, y in enumerate(did.T):
             if np.ptp(y):
-                fit = LogisticRegression(C=1 / (len(x) * _RIDGE), solver="newton-cholesky").fit(x.astype(np.float64), y)
+                fit = LogisticRegression(C=1 / (len(x) * _RIDGE), solver="newton-cholesky").fit(x, y)
                 weight[q], bias[q] = fit.coef_[0], fit.intercept_[0]
             else:  # no cell did, or all did
                 bias[q] = logit((y.sum() + 1) / (len(y) + 2))

@@ -93,13 +93,11 @@ def _faulty_readings(
             return value + dither * full_scale * rng.uniform(-1.0, 1.0, own.shape)
         case FaultKind.ALIAS:
             partners = _bridge_partners(fault, cells, layout)
-            if partners is not None:
-                # Two cells in parallel: their conductances add, and so do their forces.
-                bridged: NDArray[np.float64] = np.where(partners >= 0, healthy[:, np.maximum(partners, 0)], 0.0)
-                return own + bridged
-            sources = _alias_sources(fault, cells, layout)
-            # Nothing is connected to that address: no current flows.
-            return np.where(sources >= 0, healthy[:, np.maximum(sources, 0)], 0.0)
+            sources = _alias_sources(fault, cells, layout) if partners is None else partners
+            # Where nothing is connected, no current flows.
+            others: NDArray[np.float64] = np.where(sources >= 0, healthy[:, np.maximum(sources, 0)], 0.0)
+            # Two cells in parallel: their conductances add, and so do their forces.
+            return others if partners is None else own + others
         case FaultKind.INTERMITTENT:
             # One contact serves all the cells of the fault: they blink together, each only while it is loaded.
             closed = _blinking(len(own), rng)[:, None]

@@ -56,7 +56,6 @@ class NearestNeighbours:
 
     def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
         """See ``HealthyModel.predict``. P(never loaded) is 1 for a cell that no two opposite predictors enclose."""
-
         shape = (len(features), features.shape[2])
         never, always, mean = np.ones(shape), np.ones(shape), np.zeros(shape)
         spread = np.full(shape[1], np.nan)
@@ -124,9 +123,8 @@ class NearestNeighbours:
 
 def _describe(features: Array, predictors: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.float64]:
     """Return the surroundings of each cell in each excerpt, ``[n, D, 8]``; NaN without two opposite predictors."""
-    grid = layout.grid(
-        np.where(predictors & layout.present.ravel(), features[:, :2], np.nan)
-    )  # (n, 2, pads, rows, cols)
+    # (n, 2, pads, rows, cols)
+    grid = layout.grid(np.where(predictors & layout.present.ravel(), features[:, :2], np.nan))
     padded = np.pad(grid, ((0, 0), (0, 0), (0, 0), (2, 2), (2, 2)), constant_values=np.nan)
     rows, cols = layout.rows, layout.cols
 
@@ -147,6 +145,5 @@ def _describe(features: Array, predictors: NDArray[np.bool_], layout: SensorLayo
 
 def _mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return ``np.nanmean(values, axis=0)`` without its warning for columns of NaN."""
-    count = (~np.isnan(values)).sum(axis=0)
-    total = np.nansum(values, axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.nansum(values, axis=0) / np.count_nonzero(~np.isnan(values), axis=0))

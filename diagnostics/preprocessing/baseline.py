@@ -77,7 +77,7 @@ def _highest(offset: Floats) -> float:
         return 0.0
     usual = max(0.0, float(np.median(offset)))
     below = usual - float(np.quantile(offset, RARE, method="lower"))
-    return usual + min(max(below, usual), 2 * usual)
+    return usual + float(np.clip(below, usual, 2 * usual))
 
 
 def _low(readings: RecordingBlocks) -> tuple[Floats, Floats, Floats]:

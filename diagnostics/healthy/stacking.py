@@ -118,8 +118,9 @@ def neighbourhood(
     never, always, mean, usual = regressed[:, :, selected].transpose(0, 2, 1)
     of_cells[0], of_cells[1] = (np.clip(odds, -_MAX_ODDS, _MAX_ODDS) for odds in (never, always))
     of_cells[2], of_cells[3] = mean, logit(np.clip(usual, RARE, 1 - RARE))
+    beside = layout.beside[selected][:, [1, 3, 4, 6]]  # on the row and the column
     of_place[0], of_place[1] = cross[4], corners[4]
-    of_place[2], of_place[3] = of(_inside(layout)), of(enclosed(known[1]))
+    of_place[2], of_place[3] = np.all(beside >= 0, axis=1, keepdims=True), of(enclosed(known[1]))
     np.divide(whole[:4], np.maximum(whole[4:], 1), out=overall)
     np.divide(pad[:4] + _PRIOR_CELLS * overall, pad[4:] + _PRIOR_CELLS, out=on_pad)
     for total, ring in zip((cross, corners, five - three - itself), rings, strict=True):
@@ -149,13 +150,6 @@ def _windows(known: Array) -> tuple[Array, Array, Array]:
     wide = in_row + pair(padded, 3, cols, 2)
     five = wide[:, :, inner] + pair(wide, 2, rows, 1) + pair(wide, 2, rows, 2)
     return cross, three, five
-
-
-def _inside(layout: SensorLayout) -> Array:
-    """Return 1 for cells with four neighbours, 0 at the border of the array, ``[pads, rows, cols, 1]``."""
-    present = np.pad(layout.present, ((0, 0), (1, 1), (1, 1)))
-    inside = present[:, 2:, 1:-1] & present[:, :-2, 1:-1] & present[:, 1:-1, 2:] & present[:, 1:-1, :-2]
-    return inside[..., None].astype(np.float32)
 
 
 def enclosed(load: NDArray[Any]) -> NDArray[Any]:

@@ -151,13 +151,11 @@ def _bridge_partners(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout
 
 def _blinking(frames: int, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Return ``[frames]`` bool, True while a loose contact is closed: a two-state Markov chain, closed at first."""
-    draws = rng.random(frames)
-    closed = np.empty(frames, bool)
-    state = True
-    for t in range(frames):
-        state = draws[t] >= _OPENS if state else draws[t] < _CLOSES
-        closed[t] = state
-    return closed
+    state, closed = True, []
+    for draw in rng.random(frames).tolist():
+        state = draw >= _OPENS if state else draw < _CLOSES
+        closed.append(state)
+    return np.array(closed, bool)
 
 
 def line_fault(

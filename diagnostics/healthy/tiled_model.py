@@ -45,13 +45,13 @@ def fit_healthy_model(recordings: Sequence[NDArray[np.float64]], layout: SensorL
     rng = np.random.default_rng(0)
     events_of = ReferenceEvents.of(RecordingBlocks.of(recordings), layout, scale)
     if len(events_of.tiles) == 1:
-        return _fit_small(events_of, layout, rng)
-    shared_prior = _shared_prior(events_of, layout, rng)
+        return _fit_small(events_of, rng)
+    shared_prior = _shared_prior(events_of, rng)
     local_regressions = []
     for k, tile in enumerate(events_of.tiles):
         features, _ = events_of.drawn(k, _TILE_SAMPLES, rng)
         local_regressions.append(_fit_tile(features, events_of.number(k), tile, shared_prior, layout).at(tile.inputs))
-    return HealthyModel(tuple(local_regressions), layout, _stacking(events_of, shared_prior, layout, rng))
+    return HealthyModel(tuple(local_regressions), layout, _stacking(events_of, shared_prior, rng))
 
 
 class ReferenceEvent(NamedTuple):
@@ -76,12 +76,14 @@ class ReferenceEvents:
 
     Attributes:
         readings: the recordings.
+        layout: the array.
         scale: baseline and full scale.
         tiles: the tiles of the array.
         seen: the events of each tile.
     """
 
     readings: RecordingBlocks
+    layout: SensorLayout
     scale: Scale
     tiles: tuple[Tile, ...]
     seen: list[list[ReferenceEvent]]
@@ -99,7 +101,7 @@ class ReferenceEvents:
             for k, of_tile in events.kept():
                 again = (count_repeats(of_tile.kept) > 0).tolist()
                 seen[k] += [ReferenceEvent(i, e.first, e.n, a) for e, a in zip(of_tile.kept, again, strict=True)]
-        return cls(readings, scale, every, seen)
+        return cls(readings, layout, scale, every, seen)
 
     def number(self, k: int) -> int:
         """Return the number of distinct events of tile k; with few recordings repeated ones count too."""
@@ -136,9 +138,10 @@ def _few_recordings(seen: Sequence[ReferenceEvent]) -> bool:
     return len({event.recording for event in seen}) < FEWEST
 
 
-def _fit_small(events_of: ReferenceEvents, layout: SensorLayout, rng: np.random.Generator) -> HealthyModel:
+def _fit_small(events_of: ReferenceEvents, rng: np.random.Generator) -> HealthyModel:
     """Fit the model of an array that is one tile."""
-    (features, source), number = events_of.drawn(0, _SAMPLES, rng), events_of.number(0)
+    layout, number = events_of.layout, events_of.number(0)
+    features, source = events_of.drawn(0, _SAMPLES, rng)
     every = np.flatnonzero(layout.present)
     fit = partial(LocalRegression.fit, inputs=every, outputs=every, p_floor=p_floor_of(number))
     stacking = None
@@ -147,8 +150,9 @@ def _fit_small(events_of: ReferenceEvents, layout: SensorLayout, rng: np.random.
     return HealthyModel((fit(features),), layout, stacking)
 
 
-def _shared_prior(events_of: ReferenceEvents, layout: SensorLayout, rng: np.random.Generator) -> SharedPrior:
+def _shared_prior(events_of: ReferenceEvents, rng: np.random.Generator) -> SharedPrior:
     """Return the shared prior."""
+    layout = events_of.layout
     some = rng.permutation(np.flatnonzero([bool(of) for of in events_of.seen]))[:_PRIOR_TILES].tolist()
     return SharedPrior.fit(
         [
@@ -170,29 +174,22 @@ def _fit_tile(
     return LocalRegression.fit(features, np.arange(len(tile.inputs)), tile.place, p_floor_of(events), start)
 
 
-def _stacking(
-    events_of: ReferenceEvents, shared_prior: SharedPrior, layout: SensorLayout, rng: np.random.Generator
-) -> Stacking | None:
+def _stacking(events_of: ReferenceEvents, shared_prior: SharedPrior, rng: np.random.Generator) -> Stacking | None:
     """Return the stacking fitted on the tiles with the most events; None if all have too few."""
     number = [events_of.number(k) for k in range(len(events_of.tiles))]
     busiest = [k for k in np.argsort(number)[::-1][:_STACKING_TILES].tolist() if number[k] >= FOLDS]
     if not busiest:
         return None
-    parts = [_samples(events_of, k, shared_prior, layout, 1 / len(busiest), rng) for k in busiest]
+    parts = [_samples(events_of, k, shared_prior, 1 / len(busiest), rng) for k in busiest]
     samples, did = (np.concatenate(of_tiles) for of_tiles in zip(*parts, strict=True))
     return Stacking.fit(samples, did, sum(number[k] for k in busiest))
 
 
 def _samples(
-    events_of: ReferenceEvents,
-    k: int,
-    shared_prior: SharedPrior,
-    layout: SensorLayout,
-    share: float,
-    rng: np.random.Generator,
+    events_of: ReferenceEvents, k: int, shared_prior: SharedPrior, share: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the stacking samples of tile k."""
-    tile = events_of.tiles[k]
+    layout, tile = events_of.layout, events_of.tiles[k]
     own = tile.rectangle(layout)
     features, source = events_of.drawn(k, _TILE_SAMPLES, rng)
     training_events = events_of.number(k) * (FOLDS - 1) // FOLDS

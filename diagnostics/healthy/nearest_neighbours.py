@@ -60,13 +60,14 @@ class NearestNeighbours:
         never, always, mean = np.ones(shape), np.ones(shape), np.zeros(shape)
         spread = np.full(shape[1], np.nan)
         present = self.layout.present.ravel()
-        known, scored = (_describe(of, predictors, self.layout) for of in (self.log, features))
+        usable = predictors & present
+        known, scored = (_describe(of, usable, self.layout) for of in (self.log, features))
         enclosed = np.isfinite(scored).all(axis=(0, 2)) & present
         # A held load beside unloaded cells is unlikely anywhere; an unloaded cell at the border tells nothing.
         border = np.isfinite(scored[..., _MEANS]).all(axis=(0, 2)) & present & ~enclosed
         border &= (features[:, 1] > self.rest).all(axis=0)
         for cells, described in ((enclosed, slice(None)), (border, _MEANS)):
-            found = self._predict(known[..., described], scored[..., described], predictors & present, cells)
+            found = self._predict(known[..., described], scored[:, cells, described], usable)
             if found is None:
                 continue
             if cells is enclosed:
@@ -75,31 +76,27 @@ class NearestNeighbours:
         return Prediction(never, always, mean, spread, own=False)
 
     def _predict(
-        self,
-        known: NDArray[np.float64],
-        scored: NDArray[np.float64],
-        predictors: NDArray[np.bool_],
-        cells: NDArray[np.bool_],
+        self, known: NDArray[np.float64], scored: NDArray[np.float64], usable: NDArray[np.bool_]
     ) -> Prediction | None:
-        """Return the prediction of some ``cells`` (bool ``[D]``); None without any to learn from.
+        """Return the prediction of some cells; None without any, or without any to learn from.
 
         Args:
-            known, scored: surroundings in the log and in the excerpts, ``[n, D, k]``.
-            predictors: bool ``[D]``, the cells whose readings may be used.
-            cells: the cells whose loads are predicted.
+            known: surroundings of all cells in the log, ``[n, D, k]``.
+            scored: surroundings of the predicted cells in the excerpts, ``[n, cells, k]``.
+            usable: bool ``[D]``, the cells whose readings may be used.
         """
         from scipy.spatial import cKDTree
 
-        usable = np.flatnonzero(predictors & np.isfinite(known).all(axis=(0, 2)))
-        if not len(usable) or not cells.any():
+        described = np.flatnonzero(usable & np.isfinite(known).all(axis=(0, 2)))
+        if not len(described) or not scored.size:
             return None
-        samples = known[:, usable].reshape(-1, known.shape[2])
-        targets = np.moveaxis(self.log[:, :, usable], 1, -1).reshape(-1, self.log.shape[1])
+        samples = known[:, described].reshape(-1, known.shape[2])
+        targets = np.moveaxis(self.log[:, :, described], 1, -1).reshape(-1, self.log.shape[1])
         kept = np.linspace(0, len(samples) - 1, min(len(samples), _MOST_SAMPLES)).astype(int)
         tree, targets = cKDTree(samples[kept]), targets[kept]
         neighbours = min(_NEIGHBOURS, len(targets))
         # Most cells lie far from any load and have the same surroundings, which are searched for once, as the first.
-        neighbourhood = scored[:, cells].reshape(-1, scored.shape[2])
+        neighbourhood = scored.reshape(-1, scored.shape[2])
         loaded = neighbourhood.any(axis=1)
         which = np.where(loaded, np.cumsum(loaded), 0).reshape(len(scored), -1)
         unloaded = np.zeros((1, scored.shape[2]))
@@ -116,15 +113,14 @@ class NearestNeighbours:
             never=share(near[..., 2] == 0, targets[:, 2] == 0),
             always=share(near[..., 3] == 1, targets[:, 3] == 1),
             mean=near[..., 1].mean(axis=1)[which],
-            spread=np.full(np.count_nonzero(cells), spread),
+            spread=np.full(scored.shape[1], spread),
             own=False,
         )
 
 
-def _describe(features: Array, predictors: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.float64]:
-    """Return the surroundings of each cell in each excerpt, ``[n, D, 8]``; NaN without two opposite predictors."""
-    # (n, 2, pads, rows, cols)
-    grid = layout.grid(np.where(predictors & layout.present.ravel(), features[:, :2], np.nan))
+def _describe(features: Array, usable: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.float64]:
+    """Return the surroundings of each cell in each excerpt, ``[n, D, 8]``; NaN without two opposite usable cells."""
+    grid = layout.grid(np.where(usable, features[:, :2], np.nan))  # (n, 2, pads, rows, cols)
     padded = np.pad(grid, ((0, 0), (0, 0), (0, 0), (2, 2), (2, 2)), constant_values=np.nan)
     rows, cols = layout.rows, layout.cols
 

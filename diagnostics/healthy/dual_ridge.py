@@ -51,12 +51,12 @@ def logistic(x: Array, y: Array, own: Array, ridge: float, usual: Array) -> tupl
 
 
 def covariance_and_precision(
-    z: NDArray[np.float64], taper: NDArray[np.float64]
+    z: NDArray[np.float64], taper: NDArray[np.float64] | float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the covariance of samples ``[n, inputs]`` and its inverse.
 
-    Shrunk (Ledoit and Wolf 2004) and multiplied by ``taper`` (``[inputs, inputs]``, falling with distance): few
-    samples produce spurious correlations at a distance (Houtekamer and Mitchell 2001).
+    Shrunk (Ledoit and Wolf 2004) and multiplied by ``taper`` (``[inputs, inputs]``, falling with distance; 1: none):
+    few samples produce spurious correlations at a distance (Houtekamer and Mitchell 2001).
     """
     from sklearn.covariance import LedoitWolf
 

@@ -100,8 +100,6 @@ class LocalRegression:
             p_floor: lower limit of the probabilities.
             start: the shared prior of a tile of a large array, which has fewer samples than inputs.
         """
-        from sklearn.covariance import LedoitWolf
-
         x = features[:, :, inputs]
         mean, scale = x.mean(axis=0), x.std(axis=0)
         if start is None:
@@ -115,8 +113,6 @@ class LocalRegression:
         flat, z1 = z.reshape(len(z), -1), z[:, 1].astype(np.float64)
         if start is None:
             weight, bias = _logistic(flat, targets, own)
-            estimate = LedoitWolf().fit(z1)
-            covariance, precision = estimate.covariance_, estimate.precision_
         else:
             shared = start.weight.reshape(flat.shape[1], -1).astype(np.float32)
             shared_bias = np.repeat(start.bias, len(outputs)).astype(np.float32)
@@ -127,7 +123,7 @@ class LocalRegression:
             weight[own, np.arange(len(own))[:, None]] = 0
             weight += shared * scale.reshape(-1, 1)
             bias += mean.reshape(-1) @ shared + shared_bias
-            covariance, precision = covariance_and_precision(z1, start.taper)
+        covariance, precision = covariance_and_precision(z1, 1.0 if start is None else start.taper)
         if not z1.any():  # no event in this tile: cells count as independent
             covariance = precision = np.eye(len(inputs))
         error = (z1 @ precision / np.diag(precision))[:, place] * np.where(np.isfinite(scale[1]), scale[1], 0)[place]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
 REACH = 3  # rows and columns
-_MOST, _UNLOADED = 20_000, 0.2  # samples; share of them without any load around, which are all equal
+_UNLOADED = 0.2  # share of the samples without any load around, which are all equal
 _RIDGE = 1e-3  # per sample: the weights of correlated neighbours are not determined without it
 
 
@@ -80,7 +80,7 @@ class SharedPrior:
         side = 2 * REACH + 1
         if not parts:
             return cls(np.zeros((2, FEATURES, side, side)), np.zeros(2))
-        neighbourhoods, did = (np.concatenate(of_tiles)[:_MOST] for of_tiles in zip(*parts, strict=True))
+        neighbourhoods, did = (np.concatenate(of_tiles) for of_tiles in zip(*parts, strict=True))
         x = neighbourhoods.reshape(len(did), -1).astype(np.float64)
         weight, bias = np.zeros((2, x.shape[1])), np.zeros(2)
         for q, y in enumerate(did.T):

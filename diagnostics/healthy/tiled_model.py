@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _SAMPLES, _TILE_SAMPLES = 3000, 256  # excerpts for the model of a small array, and of one of several tiles: sizes
 _MOST_DRAWS = 8  # excerpts of one event: more of them are nearly the same
 _RIDGE = 30.0  # towards the shared prior, divided by the number of events of the tile
-_PRIOR_TILES, _EXCERPTS, _PRIOR_SAMPLES = 100, 64, 600  # tiles of the shared prior; excerpts and samples of each: sizes
+_PRIOR_TILES, _EXCERPTS, _PRIOR_SAMPLES = 28, 64, 600  # tiles of the shared prior; excerpts and samples of each: sizes
 _STACKING_TILES = 12  # tiles with the most events, from which the stacking is fitted: a size
 
 

@@ -3,8 +3,8 @@ import pytest
 
 from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, Summary
-from diagnostics.evidence.conditional_test import CellState, Model
-from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, group_excluded_evidence
+from diagnostics.evidence.conditional_test import CellState, ConditionalTest, Model
+from diagnostics.evidence.spatial import Exclusion, Spatial, finished, spatial_test
 from diagnostics.healthy.prediction import Prediction
 from diagnostics.preprocessing.scale import Array, Scale
 
@@ -79,8 +79,8 @@ def result_of(
     runs, events = seen(log)
     accumulated = np.zeros(CELLS) if accumulated is None else accumulated
     jumps = np.full(CELLS, jump)
-    cells = CellState(runs, accumulated, jumps, ~wrong, NONE)
-    return SpatialTest(events, cells, model or Copycat(), SCALE, 0.025, Exclusion(2.0)).finish()
+    cells = CellState(runs, SCALE, 0.025, accumulated, jumps, ~wrong)
+    return finished(spatial_test(events, cells, model or Copycat(), Exclusion(2.0)))
 
 
 def pressed(events: int) -> np.ndarray:
@@ -149,10 +149,9 @@ def test_cells_that_broke_together_do_not_vouch_for_each_other():
     log[:, 5:] = 0
     assert (result_of(log, model=Row()).surprisal[5:] < 0.1).all()
     runs, events = seen(log)
-    zero, predictors = np.zeros(CELLS), np.ones(CELLS, bool)
-    cells = CellState(runs, zero, zero, predictors, NONE)
-    groups = [np.array([5, 6, 7]), np.array([6])]
-    together, alone = group_excluded_evidence(events, cells, Row(), SCALE, 0.025, predictors, groups)
+    zero = np.zeros(CELLS)
+    test = ConditionalTest.of(events, CellState(runs, SCALE, 0.025, zero, zero, ~NONE), Row())
+    together, alone = (test.summed(test.score(~np.isin(np.arange(CELLS), group))[1]) for group in ([5, 6, 7], [6]))
     assert (together[5:] > 1).all()
     assert alone[6] < 0.1  # the others of its row are predictors
 

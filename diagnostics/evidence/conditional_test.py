@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -55,27 +56,36 @@ class CellState:
 
     Attributes:
         runs: the constant runs.
+        scale: baseline and full scale.
+        tolerance: a reading within 2 tolerances of a value counts as that value.
         accumulated: float, evidence of earlier events for the runs that still last.
         temporal: float, log likelihood ratio of the run and of the jump into it, if the cell jumped alone.
         eligible: bool, cells that are present and not known to be faulty.
-        outlasted: bool, cells whose load is held since before an event elsewhere began.
     """
 
     runs: ConstantRuns
+    scale: Scale
+    tolerance: float
     accumulated: Floats
     temporal: Floats
     eligible: Mask
-    outlasted: Mask
 
     def of(self, cells: NDArray[np.intp]) -> CellState:
         """Return the state of some cells."""
-        rest = (values[cells] for name, values in vars(self).items() if name != "runs")
-        return CellState(self.runs.of(cells), *rest)
+        runs, scale = self.runs.of(cells), self.scale.of(cells)
+        accumulated, temporal, eligible = self.accumulated[cells], self.temporal[cells], self.eligible[cells]
+        return CellState(runs, scale, self.tolerance, accumulated, temporal, eligible)
 
     @property
     def scored(self) -> Mask:
         """bool ``[D]``, constant cells that are not known to be faulty."""
         return self.eligible & (self.runs.length >= SHORTEST_RUN)
+
+    @cached_property
+    def values(self) -> HeldValues:
+        """The values of the ``scored`` cells; those of the others count as 0."""
+        value = np.where(self.scored, np.nan_to_num(self.runs.value), 0.0)
+        return HeldValues.of(value, self.scale, self.tolerance)
 
 
 @dataclass(frozen=True)
@@ -92,12 +102,6 @@ class HeldValues:
     low: Floats
     high: Floats
     prior: Floats
-
-    @classmethod
-    def now(cls, cells: CellState, scale: Scale, tolerance: float) -> HeldValues:
-        """Return the values of the constant cells; those of the others count as 0."""
-        constant = cells.scored
-        return cls.of(np.where(constant, np.nan_to_num(cells.runs.value), 0.0), scale, tolerance)
 
     @classmethod
     def of(cls, value: Floats, scale: Scale, tolerance: float) -> HeldValues:
@@ -117,7 +121,6 @@ class ConditionalTest:
     Attributes:
         cells: state of the cells.
         model: the healthy model.
-        values: values of the constant cells.
         eligible: bool ``[D]``, cells that may be predictors.
         features, begins, counted: see :func:`_excerpts`.
         repeats: int ``[n, 1]``, r_e of each excerpt.
@@ -125,7 +128,6 @@ class ConditionalTest:
 
     cells: CellState
     model: Model
-    values: HeldValues
     eligible: Mask
     features: Array
     begins: Mask
@@ -133,22 +135,19 @@ class ConditionalTest:
     repeats: NDArray[np.intp]
 
     @classmethod
-    def of(
-        cls, events: Sequence[ContactEvent], cells: CellState, model: Model, scale: Scale, tolerance: float
-    ) -> ConditionalTest:
+    def of(cls, events: Sequence[ContactEvent], cells: CellState, model: Model) -> ConditionalTest:
         """Prepare the test of one event or more."""
-        constant, runs, values = cells.scored, cells.runs, HeldValues.now(cells, scale, tolerance)
-        features, begins, counted = _excerpts(events, runs, constant)
-        repeats = count_repeats(events, THE_SAME, values.rests | ~constant)[begins.cumsum() - 1, None]
-        return cls(cells, model, values, cells.eligible, features, begins, counted, repeats)
+        features, begins, counted = _excerpts(events, cells.runs, cells.scored)
+        repeats = count_repeats(events, THE_SAME, cells.values.rests | ~cells.scored)[begins.cumsum() - 1, None]
+        return cls(cells, model, cells.eligible, features, begins, counted, repeats)
 
     def score(self, predictors: Mask) -> tuple[Prediction, Floats]:
         """Return the prediction of the ``predictors`` (bool ``[D]``), and the surprisal of each excerpt ``[n, D]``."""
-        expected = self.model.predict(self.features, predictors)
-        held = np.flatnonzero(self.cells.scored & ~self.values.rests)
+        expected, values = self.model.predict(self.features, predictors), self.cells.values
+        held = np.flatnonzero(self.cells.scored & ~values.rests)
         likely = _tempered(expected.never, self.features[:, 2] == 0, predictors & self.cells.runs.moved)
         inflation = _inflation(expected, self.features, predictors)
-        within = expected.within(self.values.low[held], self.values.high[held], held, inflation)
+        within = expected.within(values.low[held], values.high[held], held, inflation)
         likely[:, held] = expected.always[:, held] * within
         surprisal = -self._weights(expected.own) * np.log(np.maximum(likely, P_MIN))
         return expected, np.where(self.counted, surprisal, 0.0)
@@ -163,7 +162,7 @@ class ConditionalTest:
         if own:
             return weights
         scale = _COLD_SCALE / (1 + _REPEATS * (weights[self.begins].sum() - 1))
-        return weights * np.where(self.values.rests, scale, 1.0)
+        return weights * np.where(self.cells.values.rests, scale, 1.0)
 
     def summed(self, surprisal: Floats) -> Floats:
         """Return the evidence ``[D]`` of all events, earlier ones included."""

@@ -13,38 +13,32 @@ cells that no event loads and that no event leaves unloaded among loaded neighbo
 Which cells may serve as predictors depends on which cells are faulty, so the test is iterated: cells that moved are
 the first predictors; then constant cells whose value is plausible join them, and cells that look stuck leave, until
 nothing changes. Cells that failed together corroborate each other as predictors, so groups that one broken line would
-explain are scored once more with the whole group excluded (:func:`group_excluded_evidence`).
+explain are scored once more with the whole group excluded.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.evidence.conditional_test import (
-    CellState,
-    ConditionalTest,
-    HeldValues,
-    Mask,
-    Model,
-)
-from diagnostics.evidence.drift import drifting, gain_evidence, misleading, offset_evidence
+from diagnostics.evidence.conditional_test import CellState, ConditionalTest, Mask, Model
+from diagnostics.evidence.drift import Gain, drifting, gain_evidence, misleading, offset_evidence
 from diagnostics.evidence.jumps import SUDDEN_JUMP
 from diagnostics.preprocessing.levels import P_MIN, SUSPICIOUS, TESTED
 
 if TYPE_CHECKING:
     from diagnostics.events.contact_events import ContactEvent
     from diagnostics.healthy.prediction import Prediction
-    from diagnostics.preprocessing.scale import Scale
 
 _ONE_LOAD = 0.5  # correlation of the evidence that events elsewhere give about one held load
 _MOST_ROUNDS = 16  # of scoring and updating the predictors, and of excluding drifting cells: a size
 
 Floats = NDArray[np.float64]
+T = TypeVar("T")
 
 
 class Exclusion(NamedTuple):
@@ -95,109 +89,85 @@ class Spatial:
         """Return the result without any event since earlier events were accumulated."""
         scored, d = cells.scored, len(cells.scored)
         accumulated, nothing, none = np.where(scored, cells.accumulated, 0.0), np.zeros(d), np.zeros(d, np.intp)
-        unknown = np.full(d, np.nan)
-        return cls(accumulated, accumulated, accumulated, scored, none, nothing, nothing, unknown, none)
+        evidence, unknown = _with_prior(accumulated, cells.values.prior), np.full(d, np.nan)
+        return cls(evidence, accumulated, accumulated, scored, none, nothing, nothing, unknown, none)
 
 
-class SpatialTest:
-    """The iterated test; each :meth:`step` is one round, so that a control loop can spread it over frames.
+def spatial_test(
+    events: Sequence[ContactEvent], cells: CellState, model: Model, exclusion: Exclusion
+) -> Generator[None, None, Spatial]:
+    """Yield between the rounds of the iterated test, for a control loop; return the result.
 
     Args:
         events: the contact events, in time order.
         cells: state of each cell.
         model: the healthy model.
-        scale: baseline and full scale.
-        tolerance: a reading within 2 tolerances of v counts as v.
         exclusion: when a cell is excluded from the predictors.
-
-    Attributes:
-        result: of the rounds so far.
     """
+    if not events:
+        yield
+        return Spatial.before(cells)
+    test = ConditionalTest.of(events, cells, model)
+    yield
+    # First predictors: cells that moved, unless their load outlasts an event, or they jumped alone. Few of the cells at
+    # rest are broken.
+    fresh = cells.runs.start >= events[-1].since
+    plausible = cells.values.rests | (fresh & (cells.temporal < SUDDEN_JUMP))
+    predictors, drifts = cells.eligible & cells.runs.moved & plausible, np.zeros(len(plausible), bool)
+    summed: list[Floats] = []  # surprisal of each round
+    for _ in range(_MOST_ROUNDS):
+        for _ in range(_MOST_ROUNDS):
+            before = predictors & test.eligible
+            expected, surprisal = test.score(before)
+            summed.append(test.summed(surprisal))
+            evidence = _with_prior(summed[-1], cells.values.prior)
+            predictors = test.eligible & (evidence + cells.temporal < exclusion.threshold)
+            yield
+            if (predictors == before).all():
+                break
+        offset, gain = _drift(events, test, expected, exclusion.gains)
+        more = misleading(offset, gain.evidence, drifts)
+        if not more.any():
+            break
+        drifts = drifts | more
+        test = replace(test, eligible=test.eligible & ~more)
+        yield
+    of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
+    first = np.array([event.first for event in events])
+    return Spatial(
+        evidence,
+        summed[-1],
+        summed[0],
+        cells.scored,
+        np.where(of_gain, gain.events, (surprisal > TESTED).sum(axis=0)),
+        offset,
+        gain.evidence,
+        factor=np.where(of_gain, gain.factor, np.nan),
+        since=np.where(of_gain & (gain.since > 0), first[gain.since], 0),
+    )
 
-    def __init__(
-        self,
-        events: Sequence[ContactEvent],
-        cells: CellState,
-        model: Model,
-        scale: Scale,
-        tolerance: float,
-        exclusion: Exclusion,
-    ) -> None:
-        self.result = Spatial.before(cells)
-        self._events, self._cells, self._scale, self._exclusion = events, cells, scale, exclusion
-        self._final = not events
-        if not events:
-            prior, known = HeldValues.now(cells, scale, tolerance).prior, self.result
-            self.result = replace(known, evidence=_with_prior(known.surprisal, prior))
-            return
-        self._test = test = ConditionalTest.of(events, cells, model, scale, tolerance)
-        runs = cells.runs
-        # First predictors: cells that moved, unless their load outlasts an event, or they jumped alone. Few of the
-        # cells at rest are broken.
-        fresh = runs.start >= events[-1].since
-        plausible = test.values.rests | (fresh & (cells.temporal < SUDDEN_JUMP))
-        self._predictors: Mask = test.eligible & runs.moved & plausible
-        self._drifts = np.zeros(len(plausible), bool)
-        self._initial: Floats | None = None
-        self._rounds = self._exclusions = 0
-        self._agreed: tuple[Prediction, Floats, Floats, Floats] | None = None  # scores with the final predictors
 
-    def step(self) -> bool:
-        """Score all cells once and update the predictors, or look for drift. Return whether the result is final."""
-        if self._final:
-            return True
-        if self._agreed is not None:
-            self._final = self._drift(*self._agreed)
-            return self._final
-        test, predictors = self._test, self._predictors & self._test.eligible
-        expected, surprisal = test.score(predictors)
-        summed = test.summed(surprisal)
-        evidence = _with_prior(summed, test.values.prior)
-        if self._initial is None:
-            self._initial = summed
-        self._rounds += 1
-        self._predictors = test.eligible & (evidence + self._cells.temporal < self._exclusion.threshold)
-        if self._rounds == _MOST_ROUNDS or (self._predictors == predictors).all():
-            self._agreed = expected, surprisal, summed, evidence
-        return False
+def _drift(
+    events: Sequence[ContactEvent], test: ConditionalTest, expected: Prediction, counts: float
+) -> tuple[Floats, Gain]:
+    """Return the evidence ``[D]`` of an offset, and that of a changed gain; ``counts``: factor on the latter."""
+    runs, first = test.cells.runs, np.array([event.first for event in events])
+    moved = test.cells.eligible & runs.moved & (first[:, None] <= runs.start)
+    whole, on_whole = test.features[test.begins], expected.on(test.begins)
+    novelty = test.novelty(expected.own)[test.begins]
+    moving = moved[-1] & np.isfinite(on_whole.spread)
+    offset = offset_evidence(whole, on_whole.always, moving, 1.0 if expected.own else novelty)
+    return offset, gain_evidence(whole, on_whole, moved, test.cells.scale.root_near, counts * novelty)
 
-    def finish(self) -> Spatial:
-        """Run all rounds and return the result."""
-        while not self.step():
-            pass
-        return self.result
 
-    def _drift(self, expected: Prediction, surprisal: Floats, summed: Floats, evidence: Floats) -> bool:
-        """Look for cells with another offset or gain; exclude them and start again if there are new ones."""
-        test, cells = self._test, self._cells
-        first = np.array([event.first for event in self._events])
-        moved = cells.eligible & cells.runs.moved & (first[:, None] <= cells.runs.start)
-        whole, on_whole = test.features[test.begins], expected.on(test.begins)
-        novelty = test.novelty(expected.own)[test.begins]
-        moving = moved[-1] & np.isfinite(on_whole.spread)
-        offset = offset_evidence(whole, on_whole.always, moving, 1.0 if expected.own else novelty)
-        gain = gain_evidence(whole, on_whole, moved, self._scale.root_near, self._exclusion.gains * novelty)
-        of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
-        assert self._initial is not None
-        self.result = Spatial(
-            evidence,
-            summed,
-            self._initial,
-            cells.scored,
-            np.where(of_gain, gain.events, (surprisal > TESTED).sum(axis=0)),
-            offset,
-            gain.evidence,
-            factor=np.where(of_gain, gain.factor, np.nan),
-            since=np.where(of_gain & (gain.since > 0), first[gain.since], 0),
-        )
-        more = misleading(offset, gain.evidence, self._drifts)
-        self._exclusions += 1
-        if not more.any() or self._exclusions >= _MOST_ROUNDS:
-            return True
-        self._drifts = self._drifts | more
-        self._test = replace(test, eligible=test.eligible & ~more)
-        self._rounds, self._agreed = 0, None
-        return False
+def finished(steps: Generator[None, None, T]) -> T:
+    """Do all steps, and return their result."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            result: T = end.value
+            return result
 
 
 def _with_prior(surprisal: Floats, prior: Floats) -> Floats:
@@ -205,50 +175,20 @@ def _with_prior(surprisal: Floats, prior: Floats) -> Floats:
     return np.where(surprisal > 0, prior + surprisal, 0.0)
 
 
-def group_excluded_evidence(
-    events: Sequence[ContactEvent],
-    cells: CellState,
-    model: Model,
-    scale: Scale,
-    tolerance: float,
-    predictors: Mask,
-    groups: Sequence[NDArray[np.intp]],
-) -> Floats:
-    """Return the summed surprisal with each group of cells excluded from the predictors, ``[groups, D]``.
-
-    Args:
-        events, cells, model, scale, tolerance: as for :class:`SpatialTest`.
-        predictors: bool ``[D]``, the final predictors.
-        groups: cell indices of each group that one fault would explain.
-    """
-    test = ConditionalTest.of(events, cells, model, scale, tolerance)
-    summed = np.zeros((len(groups), len(predictors)))
-    for i, group in enumerate(groups):
-        others = predictors & test.eligible
-        others[group] = False
-        _, surprisal = test.score(others)
-        summed[i] = test.summed(surprisal)
-    return summed
-
-
-def held_load_evidence(
-    cells: CellState, outlasted: NDArray[np.intp], model: Model, scale: Scale, tolerance: float
-) -> Floats:
+def held_load_evidence(cells: CellState, outlasted: NDArray[np.intp], model: Model) -> Floats:
     """Return the log likelihood ratio ``[D]`` of loads that are held where nothing moves.
 
     All cells are predictors here, so an object that rests on the skin is no fault: its cells support each other.
 
     Args:
         cells: state of each cell.
-        outlasted: int ``[D]``, number of events elsewhere on the skin that each load has outlasted.
-        model, scale, tolerance: as for :class:`SpatialTest`.
+        outlasted: int ``[D]``, number of events elsewhere on the skin that each constant load has outlasted.
+        model: the healthy model.
     """
-    value = np.nan_to_num(cells.runs.value)
-    values, root = HeldValues.of(value, scale, tolerance), scale.root_load(value)
-    held = np.flatnonzero(outlasted)
-    loaded = (root > scale.root_near).astype(np.float32)
+    held, root = np.flatnonzero(outlasted), cells.scale.root_load(np.nan_to_num(cells.runs.value))
+    loaded = (root > cells.scale.root_near).astype(np.float32)
     expected = model.predict(np.stack([root, root, loaded, loaded])[None], cells.eligible)
-    likely = expected.always[0, held] * expected.within(values.low[held], values.high[held], held)[0]
+    likely = expected.always[0, held] * expected.within(cells.values.low[held], cells.values.high[held], held)[0]
     # One load is tested, however many events there were elsewhere.
     evidence = np.zeros(len(outlasted))
     evidence[held] = -np.log(np.maximum(likely, P_MIN)) * outlasted[held] / (1 + _ONE_LOAD * (outlasted[held] - 1))

@@ -10,10 +10,10 @@ first with the moving cells as predictors, then without the cells that their own
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,18 +22,12 @@ from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import EventLog
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import Rectangle, Tile, tiles
-from diagnostics.evidence.conditional_test import CellState, HeldValues, Model
+from diagnostics.evidence.conditional_test import CellState, ConditionalTest, HeldValues, Model
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.evidence.jumps import SUDDEN_JUMP
 from diagnostics.evidence.rest_level import RestLevel
-from diagnostics.evidence.spatial import (
-    Exclusion,
-    Spatial,
-    SpatialTest,
-    group_excluded_evidence,
-    held_load_evidence,
-)
+from diagnostics.evidence.spatial import Exclusion, Spatial, finished, held_load_evidence, spatial_test
 from diagnostics.evidence.term import ConstantCells, Term
 from diagnostics.evidence.weak_response import WeakResponse
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
@@ -58,18 +52,6 @@ _STEPS = 8  # in which one pass over all tiles is split: a monitor does one step
 
 Mask = NDArray[np.bool_]
 Cells = NDArray[np.intp]
-
-
-class Test(Protocol):
-    """A test in steps, so that a control loop can spread it over frames."""
-
-    result: Spatial
-
-    def step(self) -> bool:
-        """Do a part of the work; return whether the result is final."""
-
-    def finish(self) -> Spatial:
-        """Do all that is left, and return the result."""
 
 
 class StreamState:
@@ -126,7 +108,7 @@ class StreamState:
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
         self._filled = 0
-        self._dropping: tuple[Test, TiledEvents] | None = None  # the test of old events, and the events to keep
+        self._dropping: Generator[None, None, None] | None = None  # scores old events in steps, and drops them
         self._models: dict[int, Model] = {}
 
     @property
@@ -148,12 +130,11 @@ class StreamState:
         before = self.transport.seen
         self.transport, new = self.transport.receive(frames, self.present, self._patience)
         completed, taken = False, 0
-        if self._dropping and self._dropping[0].step():
-            self._drop()
+        if self._dropping is not None:
+            next(self._dropping, None)
         while taken < len(new):
             if self._filled == _PAUSE and self._crowded and self._dropping is None:
-                old, kept = self.local.split(MAX_EVENTS, KEPT_EVENTS)
-                self._dropping = self._test(self.cells(None), old, passes=1), kept
+                self._dropping = self._dropped(*self.local.split(MAX_EVENTS, KEPT_EVENTS))
             n = min((_PAUSE if self._filled < _PAUSE else SEGMENT) - self._filled, len(new) - taken)
             chosen = new[taken : taken + n]
             self._buffer[self._filled : self._filled + n] = frames[chosen]
@@ -256,8 +237,8 @@ class StreamState:
             if suffixes:
                 yield np.stack(suffixes), tile.inputs, tile.place, self.model_of(i, events)
 
-    def spatial(self, explained: Mask | None = None) -> Test:
-        """Return the spatial test of all constant cells; cells already ``explained`` (bool ``[D]``) are left out."""
+    def spatial(self, explained: Mask | None = None) -> Generator[None, None, Spatial]:
+        """Test all constant cells in steps, see ``spatial_test``; ``explained`` cells (bool ``[D]``) are left out."""
         cells = self.cells(explained)
         return self._test(self._with_held_loads(cells) if self.tiled else cells, self.local, passes=2)
 
@@ -275,12 +256,9 @@ class StreamState:
         for i, events in self.local.kept():
             tile = self.local.tiles[i]
             if among[tile.outputs].any():
-                cells = tile.inputs
-                (summed,) = group_excluded_evidence(
-                    events.kept, every.of(cells), self.model_of(i, events), self.scale.of(cells),
-                    self.reference.tolerance, predictors[cells], [np.flatnonzero(among[cells])],
-                )  # fmt: skip
-                total[tile.outputs] = summed[tile.place]
+                test = ConditionalTest.of(events.kept, every.of(tile.inputs), self.model_of(i, events))
+                _, surprisal = test.score(test.eligible & (predictors & ~among)[tile.inputs])
+                total[tile.outputs] = test.summed(surprisal)[tile.place]
         return total
 
     def least_loads(self) -> tuple[NDArray[np.float64], Cells, Cells]:
@@ -330,21 +308,37 @@ class StreamState:
         """Return the state of the cells before the spatial test; ``explained`` cells (bool ``[D]``) are left out."""
         explained = self.intermittency.intermittent | self.intermittency.excess | (explained is not None and explained)
         eligible = self.present & self.received & ~self.silent & ~explained
-        nothing = np.zeros_like(eligible)
         runs = self.runs
         if self.reference.model is None:
             # What no event can tell from a broken cell is not tested; what it reads says something of the others.
             untestable = self._response.untestable(self.scale.near) & self.rests()
             runs = replace(runs, length=np.where(untestable, 0, runs.length))
-        return CellState(runs, self.accumulated, self.temporal(), eligible, nothing)
+        return CellState(runs, self.scale, self.reference.tolerance, self.accumulated, self.temporal(), eligible)
 
-    def _test(self, cells: CellState, events: TiledEvents, passes: int) -> Test:
+    def _test(self, cells: CellState, events: TiledEvents, passes: int) -> Generator[None, None, Spatial]:
         if self.tiled:
-            return _TiledTest(self, cells, events, passes)
+            return self._tiled_test(cells, events, passes)
         (only,) = events.of
-        return SpatialTest(
-            only.kept, cells, self.model_of(0, only), self.scale, self.reference.tolerance, self.exclusion
-        )
+        return spatial_test(only.kept, cells, self.model_of(0, only), self.exclusion)
+
+    def _tiled_test(self, cells: CellState, events: TiledEvents, passes: int) -> Generator[None, None, Spatial]:
+        """Yield before each of about eight steps of a pass, see the module; return the result."""
+        result, queue = Spatial.before(cells), list(events.kept())
+        each = max(1, -(-len(queue) // _STEPS))
+        for k in range(passes):
+            outside = ~self.suspected(result) if k else self.runs.moved  # predictors of each tile outside its outputs
+            result = Spatial(*(np.array(values) for values in vars(Spatial.before(cells)).values()))
+            for first in range(0, max(1, len(queue)), each):
+                yield
+                for i, of_tile in queue[first : first + each]:
+                    tile = events.tiles[i]
+                    allowed = outside[tile.inputs]
+                    allowed[tile.place] = True
+                    model = _Restricted(self.model_of(i, of_tile), allowed)
+                    found = finished(spatial_test(of_tile.kept, cells.of(tile.inputs), model, self.exclusion))
+                    for name, values in vars(found).items():
+                        getattr(result, name)[tile.outputs] = values[tile.place]
+        return result
 
     def _with_held_loads(self, cells: CellState) -> CellState:
         """Return the cells with the evidence of loads that are held where nothing has moved for some events."""
@@ -352,18 +346,15 @@ class StreamState:
             return cells  # held loads cannot be predicted from one log alone
         loaded = cells.scored & (self.scale.root_load(self.runs.value) > self.scale.root_near)
         begun = np.array([event.first for event in self.events.kept])
-        outlasted, accumulated = np.zeros(len(loaded), bool), cells.accumulated.copy()
+        accumulated = cells.accumulated.copy()
         for i in self.local.holding(loaded):
             tile, own = self.local.tiles[i], self.local.of[i].kept
             since = np.maximum(self.runs.start[tile.inputs], own[-1].end if own else 0)
             many = np.where(loaded[tile.inputs], len(begun) - np.searchsorted(begun, since), 0)
-            outlasted[tile.outputs] = many[tile.place] > 0
-            if outlasted[tile.outputs].any():
-                state, scale = cells.of(tile.inputs), self.scale.of(tile.inputs)
-                model = self.model_of(i, self.local.of[i])
-                evidence = held_load_evidence(state, many, model, scale, self.reference.tolerance)
+            if many[tile.place].any():
+                evidence = held_load_evidence(cells.of(tile.inputs), many, self.model_of(i, self.local.of[i]))
                 accumulated[tile.outputs] += evidence[tile.place]
-        return replace(cells, accumulated=accumulated, outlasted=outlasted)
+        return replace(cells, accumulated=accumulated)
 
     def _close(self) -> None:
         """Process a segment."""
@@ -403,11 +394,15 @@ class StreamState:
     def _crowded(self) -> bool:
         return any(len(events.kept) > MAX_EVENTS for events in self.local.of)
 
+    def _dropped(self, old: TiledEvents, kept: TiledEvents) -> Generator[None, None, None]:
+        """Score the ``old`` events in steps, then drop them."""
+        spatial = yield from self._test(self.cells(None), old, passes=1)
+        self.accumulated, self.local, self._dropping = spatial.surprisal, kept, None
+
     def _drop(self) -> None:
-        """Finish the test of old events, and drop them."""
-        if self._dropping is not None:
-            test, kept = self._dropping
-            self.accumulated, self.local, self._dropping = test.finish().surprisal, kept, None
+        """Do all steps that are left."""
+        for _ in self._dropping or ():
+            pass
 
 
 @dataclass(frozen=True)
@@ -433,56 +428,6 @@ class _Restricted:
     def predict(self, features: Array, predictors: Mask) -> Prediction:
         """See ``HealthyModel.predict``."""
         return self.model.predict(features, predictors & self.allowed)
-
-
-class _TiledTest:
-    """The spatial test of several tiles, in one or two passes, see the module."""
-
-    def __init__(self, stream: StreamState, cells: CellState, events: TiledEvents, passes: int) -> None:
-        self._stream, self._cells, self._events, self._passes = stream, cells, events, passes
-        self._outside = stream.runs.moved  # predictors of each tile outside its outputs
-        self._begin()
-
-    def _begin(self) -> None:
-        self.result = Spatial(*(np.array(values) for values in vars(Spatial.before(self._cells)).values()))
-        self._queue = [
-            (i, events)
-            for i, events in enumerate(self._events.of)
-            if events.kept or self._cells.outlasted[self._events.tiles[i].outputs].any()
-        ]
-        self._each = max(1, -(-len(self._queue) // _STEPS))
-
-    def step(self) -> bool:
-        """Score some tiles."""
-        if self._passes == 0:
-            return True
-        now, self._queue = self._queue[: self._each], self._queue[self._each :]
-        for i, events in now:
-            self._score(i, events)
-        if self._queue:
-            return False
-        self._passes -= 1
-        if self._passes == 0:
-            return True
-        self._outside = ~self._stream.suspected(self.result)
-        self._begin()
-        return False
-
-    def finish(self) -> Spatial:
-        """Score all tiles that are left."""
-        while not self.step():
-            pass
-        return self.result
-
-    def _score(self, i: int, events: EventLog) -> None:
-        stream, tile = self._stream, self._events.tiles[i]
-        allowed = self._outside[tile.inputs]
-        allowed[tile.place] = True
-        model = _Restricted(stream.model_of(i, events), allowed)
-        cells, scale = self._cells.of(tile.inputs), stream.scale.of(tile.inputs)
-        test = SpatialTest(events.kept, cells, model, scale, stream.reference.tolerance, stream.exclusion)
-        for name, values in vars(test.finish()).items():
-            getattr(self.result, name)[tile.outputs] = values[tile.place]
 
 
 def _known(frames: NDArray[np.float64], last: NDArray[np.float64]) -> NDArray[np.float64]:

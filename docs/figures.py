@@ -34,9 +34,8 @@ from diagnostics import (
     inject,
     line_fault,
 )
-from diagnostics.events.constant_runs import segments
-from diagnostics.events.contact_events import ContactEvent, EventLog
-from diagnostics.preprocessing.readings import SEGMENT
+from diagnostics.events.contact_events import ContactEvent
+from diagnostics.healthy.model import contact_events
 
 Floats = NDArray[np.float64]
 
@@ -85,10 +84,7 @@ def root_load(frames: Floats) -> Floats:
 
 def events_of(frames: Floats) -> tuple[ContactEvent, ...]:
     """Return the contact events of healthy frames ``[T, D]``."""
-    scale, events = reference().reference_.scale, EventLog()
-    for part, numbers, start in segments(frames, SEGMENT, scale.near / 2):
-        events = events.extend(scale.root_load(part), numbers, scale.root_near, start, np.zeros(LAYOUT.n_cells, bool))
-    return events.kept
+    return contact_events(frames, reference().reference_.scale)
 
 
 def panels(*widths: float, height: float = 2.5) -> tuple[Figure, list[Axes]]:

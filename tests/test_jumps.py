@@ -5,6 +5,7 @@ from test_constant_runs import FULL_SCALE, TOLERANCE, runs_of
 from diagnostics import SensorLayout
 from diagnostics.evidence.jumps import JumpHistogram
 from diagnostics.evidence.term import ConstantCells
+from diagnostics.preprocessing.scale import Scale
 
 
 def cells_of(log: np.ndarray) -> ConstantCells:
@@ -22,7 +23,7 @@ def gentle() -> list[np.ndarray]:
 
 
 def test_a_cell_that_jumps_further_than_healthy_ones_do_is_suspect_and_one_released_gradually_is_not(gentle):
-    jumps_seen = JumpHistogram.fit(gentle, TOLERANCE, FULL_SCALE)
+    jumps_seen = JumpHistogram.fit(gentle, Scale(np.zeros(20), 2 * TOLERANCE, FULL_SCALE))
     log = gentle[0][:60].copy()
     log[30:, 4] = 5.0
     evidence = jumps_seen.evidence(cells_of(log))
@@ -32,7 +33,7 @@ def test_a_cell_that_jumps_further_than_healthy_ones_do_is_suspect_and_one_relea
 
 
 def test_jumps_in_company_and_cells_that_never_moved_are_no_evidence(gentle):
-    jumps_seen = JumpHistogram.fit(gentle, TOLERANCE, FULL_SCALE)
+    jumps_seen = JumpHistogram.fit(gentle, Scale(np.zeros(20), 2 * TOLERANCE, FULL_SCALE))
     released = np.tile(np.linspace(1, 2, 20)[:, None], 10)
     released[12:] = 0.0
     released[:, 3] = 2.5

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.preprocessing.readings import held
+from diagnostics.preprocessing.readings import SEGMENT, held
+from diagnostics.preprocessing.scale import Scale
 
 Floats = NDArray[np.float64]
 
@@ -172,12 +173,12 @@ def _in_each(which: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 def segments(
-    recording: Floats, length: int, tolerance: float
-) -> Iterator[tuple[Floats, NDArray[np.intp], NDArray[np.intp]]]:
-    """Yield pieces of a recording ``[T, D]``: frames, their numbers, and the start of each constant run ``[D]``."""
+    recording: Floats, scale: Scale, length: int = SEGMENT
+) -> Iterator[tuple[Floats, NDArray[np.intp], ConstantRuns]]:
+    """Yield pieces of a healthy recording ``[T, D]``: frames, their numbers, and the constant runs at their end."""
     runs = ConstantRuns.begin(recording.shape[1])
     for first in range(0, len(recording), length):
         frames = recording[first : first + length]
         numbers = np.arange(first, first + len(frames))
-        runs = runs.extend(frames, numbers, tolerance)
-        yield frames, numbers, runs.start
+        runs = runs.extend(frames, numbers, scale.near / 2, scale.baseline)
+        yield frames, numbers, runs

@@ -102,8 +102,8 @@ class HealthyRates:
         intermittency = Intermittency.begin(layout)
         reached = np.stack([intermittency.blinking, intermittency.noisy])
         for recording in recordings:
-            for frames, numbers, start in segments(recording, SEGMENT, scale.near / 2):
-                constant = start <= numbers[0]
+            for frames, numbers, runs in segments(recording, scale):
+                constant = runs.start <= numbers[0]
                 intermittency = intermittency.extend(
                     frames, scale.root_load(frames), numbers, scale, usual, constant, np.inf
                 )

@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.constant_runs import SHORTEST_RUN, ConstantRuns
+from diagnostics.events.constant_runs import SHORTEST_RUN, ConstantRuns, segments
 from diagnostics.preprocessing.levels import SUSPICIOUS
 
 if TYPE_CHECKING:
     from diagnostics.evidence.term import ConstantCells
+    from diagnostics.preprocessing.scale import Scale
 
 SUDDEN_JUMP = 1.0  # log ratio of a jump from which on a cell is no predictor
 _JUMPS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 1.0])  # of full scale, bin edges
@@ -38,20 +39,15 @@ class JumpHistogram:
     log_ratio: Floats
 
     @classmethod
-    def fit(
-        cls, recordings: Sequence[Floats], tolerance: float, full_scale: float, baseline: Floats | float = 0.0
-    ) -> JumpHistogram:
-        """Count the jumps in fault-free recordings, ``[T, D]`` each, with ``baseline`` (``[D]``) without contact."""
+    def fit(cls, recordings: Sequence[Floats], scale: Scale) -> JumpHistogram:
+        """Count the jumps in fault-free recordings, ``[T, D]`` each."""
         healthy = np.ones((2, len(_JUMPS) - 1))
         for recording in recordings:
-            runs = ConstantRuns.begin(recording.shape[1])
-            for first in range(0, len(recording), SHORTEST_RUN):
-                frames = recording[first : first + SHORTEST_RUN]
-                runs = runs.extend(frames, np.arange(first, first + len(frames)), tolerance, baseline)
+            for _, _, runs in segments(recording, scale, SHORTEST_RUN):
                 fresh = runs.moved & (runs.length >= SHORTEST_RUN) & (runs.length < 2 * SHORTEST_RUN) & runs.alone
                 for up in (0, 1):
                     jumps = runs.jump[fresh & ((runs.jump > 0) == up)]
-                    healthy[up] += np.histogram(np.abs(jumps) / full_scale, _JUMPS)[0]
+                    healthy[up] += np.histogram(np.abs(jumps) / scale.full_scale, _JUMPS)[0]
         ratio = np.diff(_JUMPS) / (healthy / healthy.sum(axis=1, keepdims=True))
         # A cell that was unloaded when it broke did not jump: half of the faults look healthy. A jump proves no fault.
         return cls(np.minimum(np.log(0.5 + 0.5 * ratio), SUSPICIOUS))

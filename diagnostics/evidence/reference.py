@@ -97,7 +97,7 @@ class Reference:
         # The baseline of a dead cell is unknown.
         rest = np.where(dead > 0, np.median(readings.highest[present]), readings.highest)
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
-        jumps_seen = JumpHistogram.fit(recordings, tolerance, layout.full_scale, rest)
+        jumps_seen = JumpHistogram.fit(recordings, scale)
         patience = Patience.fit(recordings, np.where(present, rest + scale.near, np.inf), SEGMENT)
         model = fit_healthy_model(recordings, layout, scale)
         return cls(
@@ -163,7 +163,8 @@ def _usual_duplicates(recordings: Sequence[NDArray[np.float64]], layout: SensorL
     most = 0
     for recording in recordings:
         duplicates = DuplicateLines.begin(layout)
-        for frames, numbers, start in segments(recording, SEGMENT, scale.near / 2):
-            duplicates = duplicates.extend(frames, numbers, informative(frames, start <= numbers[0], scale), scale.near)
+        for frames, numbers, runs in segments(recording, scale):
+            moving = informative(frames, runs.start <= numbers[0], scale)
+            duplicates = duplicates.extend(frames, numbers, moving, scale.near)
         most = max(most, duplicates.most)
     return most + max(0, int(np.ceil(np.log2(_MANY / len(recordings)))))

@@ -26,7 +26,6 @@ from diagnostics.healthy.local_regression import LocalRegression, predict_regres
 from diagnostics.healthy.prediction import Prediction
 from diagnostics.healthy.stacking import Stacking, neighbourhood
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.readings import SEGMENT
 
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Array, Scale
@@ -98,6 +97,7 @@ def p_floor_of(n_events: int) -> float:
 def contact_events(recording: NDArray[np.float64], scale: Scale) -> tuple[ContactEvent, ...]:
     """Return the contact events of a recording ``[T, D]`` of the whole skin."""
     events = EventLog()
-    for frames, numbers, start in segments(recording, SEGMENT, scale.near / 2):
-        events = events.extend(scale.root_load(frames), numbers, scale.root_near, start, np.zeros(len(start), bool))
+    none = np.zeros(recording.shape[1], bool)
+    for frames, numbers, runs in segments(recording, scale):
+        events = events.extend(scale.root_load(frames), numbers, scale.root_near, runs.start, none)
     return events.kept

@@ -27,7 +27,7 @@ from diagnostics.healthy.model import HealthyModel, p_floor_of
 from diagnostics.healthy.shared_prior import REACH, Samples, SharedPrior
 from diagnostics.healthy.stacking import Stacking
 from diagnostics.preprocessing.levels import FEWEST
-from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks
+from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.preprocessing.scale import Array, Scale
 
 if TYPE_CHECKING:
@@ -95,9 +95,9 @@ class ReferenceEvents:
         seen: list[list[ReferenceEvent]] = [[] for _ in every]
         for i, recording in enumerate(readings):
             events = TiledEvents.begin(every)
-            for frames, numbers, start in segments(recording, SEGMENT, scale.near / 2):
-                none = np.zeros(len(start), bool)
-                events = events.extend(scale.root_load(frames), numbers, scale.root_near, start, none)
+            none = np.zeros(layout.n_cells, bool)
+            for frames, numbers, runs in segments(recording, scale):
+                events = events.extend(scale.root_load(frames), numbers, scale.root_near, runs.start, none)
             for k, of_tile in events.kept():
                 again = (count_repeats(of_tile.kept) > 0).tolist()
                 seen[k] += [ReferenceEvent(i, e.first, e.n, a) for e, a in zip(of_tile.kept, again, strict=True)]

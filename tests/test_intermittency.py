@@ -39,7 +39,7 @@ def cells(mask: np.ndarray) -> list[int]:
 
 @pytest.mark.parametrize("seed", range(20, 25))
 def test_healthy_cells_neither_blink_nor_are_noisy(usual, seed: int):
-    for reference in (usual, HealthyRates.unknown(SCALE)):
+    for reference in (usual, HealthyRates.unknown()):
         intermittency = evidence_of(healthy(seed), reference)
         assert cells(intermittency.intermittent | intermittency.excess) == []
 
@@ -132,7 +132,7 @@ def test_a_few_recordings_do_not_lower_the_noise_limit(recordings: int):
 def test_a_load_that_saturates_now_and_then_does_not_blink(usual):
     log = healthy(35)
     log[:, 3] = np.minimum(4.6 + 0.6 * np.sin(np.arange(len(log))), 5.0)
-    for reference in (usual, HealthyRates.unknown(SCALE)):
+    for reference in (usual, HealthyRates.unknown()):
         assert cells(evidence_of(log, reference).intermittent) == []
 
 
@@ -166,7 +166,7 @@ def test_neighbours_are_compared_only_where_healthy_changes_are_shared(usual):
 
 @pytest.mark.parametrize("finger", [[6, 7, 11, 12], [0, 1], [4, 9], [7, 13]])
 def test_a_tapping_finger_is_no_loose_contact(blinking_reference, finger: list[int]):
-    for reference in (blinking_reference, HealthyRates.unknown(SCALE)):
+    for reference in (blinking_reference, HealthyRates.unknown()):
         intermittency = evidence_of(tapped(40, finger), reference)
         assert cells(intermittency.intermittent | intermittency.excess) == []
 
@@ -209,7 +209,7 @@ def test_weak_loads_that_a_threshold_hides_do_not_blink(fitted: bool):
         return np.where(load < 0.7, 0.0, load)
 
     reference = (
-        HealthyRates.fit([thresholded(s) for s in range(5)], SCALE, LAYOUT) if fitted else HealthyRates.unknown(SCALE)
+        HealthyRates.fit([thresholded(s) for s in range(5)], SCALE, LAYOUT) if fitted else HealthyRates.unknown()
     )
     assert cells(evidence_of(thresholded(9), reference).intermittent) == []
     broken = inject(thresholded(9), [Fault("intermittent", (7,), value=0.0)], LAYOUT, seed=0)

@@ -112,7 +112,7 @@ class HealthyRates:
         return replace(usual, blinks_count=float(counts[0]), noise_counts=float(counts[1]))
 
     @classmethod
-    def unknown(cls, scale: Scale) -> HealthyRates:
+    def unknown(cls) -> HealthyRates:
         """Return the rates of a cold start, at which only gross faults count."""
         return cls(_RARE, np.full(len(_LEVELS), LIGHT))
 

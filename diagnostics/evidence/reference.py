@@ -129,7 +129,7 @@ class Reference:
             NoiseLoss.unknown(layout.n_cells),
             ReferenceOffset(0.0, tolerance),
             2 * SEGMENT,
-            HealthyRates.unknown(scale),
+            HealthyRates.unknown(),
             _DUPLICATES,
             None,
             np.zeros(layout.n_cells),

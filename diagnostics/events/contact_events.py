@@ -21,7 +21,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.running_extremes import highest_so_far, lowest_so_far
 from diagnostics.preprocessing.readings import SEGMENT
 from diagnostics.preprocessing.scale import Array
 
@@ -210,7 +209,7 @@ class EventLog:
                 releasing = ongoing = False
             edges = [edge for edge in edges if edge > begin]
             ahead = root[begin : edges[0]]
-            lowest, highest = lowest_so_far(ahead), highest_so_far(ahead)
+            lowest, highest = so_far(np.minimum, ahead), so_far(np.maximum, ahead)
             if begin in begins:
                 ongoing = False
                 # The load of this event rose in one frame, from the frame before.
@@ -294,6 +293,18 @@ def count_repeats(
     sizes = np.linalg.norm(means, axis=1)
     similar = means @ means.T >= least * np.maximum(sizes[:, None] * sizes, _MIN_AMPLITUDE**2)
     return np.asarray(np.tril(similar, -1).sum(axis=1))
+
+
+def so_far(extreme: np.ufunc, frames: Array) -> Array:
+    """Return ``extreme.accumulate(frames)``, ``[t, D]``, of np.minimum or np.maximum, in half its time."""
+    # Parallel prefix scan over 1, 2, 4, ... frames (Hillis and Steele, Data parallel algorithms, 1986).
+    running, reach = frames, 1
+    while reach < len(frames):
+        further = np.empty_like(running)
+        further[:reach] = running[:reach]
+        extreme(running[reach:], running[:-reach], out=further[reach:])
+        running, reach = further, 2 * reach
+    return running
 
 
 def _release(load: Array, lowest: Array, highest: Array, weakest: float) -> int:

@@ -164,18 +164,11 @@ def _contacts(load: Floats, limit: float) -> tuple[NDArray[np.intp], Floats, NDA
 
 def _medians(cells: NDArray[np.intp], values: Floats, d: int) -> Floats:
     """Return the median of the values of each cell; NaN for fewer than 5."""
-    found = np.full(d, np.nan)
-    order = np.argsort(cells, kind="stable")
-    for cell, group in zip(*_groups(cells[order], values[order]), strict=True):
-        if len(group) >= _CONTACTS:
-            found[cell] = np.median(group)
+    count = np.bincount(cells, minlength=d)
+    ordered, first = values[np.lexsort((values, cells))], count.cumsum() - count
+    found, some = np.full(d, np.nan), np.flatnonzero(count >= _CONTACTS)
+    found[some] = (ordered[(first + (count - 1) // 2)[some]] + ordered[(first + count // 2)[some]]) / 2
     return found
-
-
-def _groups(cells: NDArray[np.intp], values: Floats) -> tuple[NDArray[np.intp], list[Floats]]:
-    """Return the distinct cells of sorted ones, and the values of each."""
-    distinct, first = np.unique(cells, return_index=True)
-    return distinct, np.split(values, first[1:]) if len(distinct) else []
 
 
 def _noise(load: Floats, limit: float) -> Floats:

@@ -140,19 +140,11 @@ def find_recalibration(
 
 def _correlation(offset: Floats, on: Mask, layout: SensorLayout) -> tuple[float, float]:
     """Return the correlation of the offsets (``[D]``) of neighbouring cells of a pad (bool ``[D]``), and its error."""
-    values, known = layout.grid(offset), layout.grid(on)
-    pairs = [
-        np.stack([a[both], b[both]])
-        for axis in (1, 2)
-        for a, b, both in [
-            (
-                np.delete(values, -1, axis),
-                np.delete(values, 0, axis),
-                np.delete(known, -1, axis) & np.delete(known, 0, axis),
-            )
-        ]
-    ]
+    known = layout.grid(np.where(on, offset, np.nan))
+    pairs = [[np.delete(known, end, axis).ravel() for end in (-1, 0)] for axis in (1, 2)]
     a, b = np.concatenate(pairs, axis=1)
+    both = ~np.isnan(a) & ~np.isnan(b)
+    a, b = a[both], b[both]
     if len(a) < _FEWEST or not a.std() or not b.std():
         return 0.0, np.inf
     return float(np.corrcoef(a, b)[0, 1]), 1 / np.sqrt(len(a))

@@ -19,24 +19,6 @@ Cells = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class _Inputs:
-    """The inputs of all tiles, concatenated: ``cells[starts[i]:starts[i + 1]]`` are those of tile i."""
-
-    cells: Cells
-    starts: Cells
-
-    @classmethod
-    def of(cls, all_tiles: Sequence[Tile]) -> _Inputs:
-        sizes = [len(tile.inputs) for tile in all_tiles]
-        return cls(np.concatenate([tile.inputs for tile in all_tiles]), np.concatenate([[0], np.cumsum(sizes)]))
-
-    def with_any(self, mask: NDArray[np.bool_]) -> list[int]:
-        """Return the tiles that have an input in ``mask`` (bool ``[D]``)."""
-        found: list[int] = np.flatnonzero(np.logical_or.reduceat(mask[self.cells], self.starts[:-1])).tolist()
-        return found
-
-
-@dataclass(frozen=True, eq=False)
 class TiledEvents:
     """The contact events of each tile so far.
 
@@ -47,14 +29,13 @@ class TiledEvents:
 
     tiles: tuple[Tile, ...]
     of: tuple[EventLog, ...]
-    _inputs: _Inputs
-    _needed: tuple[bool, ...]
+    _needed: tuple[int, ...]
 
     @classmethod
     def begin(cls, all_tiles: tuple[Tile, ...], needed: NDArray[np.bool_] | None = None) -> TiledEvents:
         """Return the state before any frame. Tiles without a ``needed`` output (bool ``[D]``) are skipped."""
-        of_each = tuple(needed is None or bool(needed[tile.outputs].any()) for tile in all_tiles)
-        return cls(all_tiles, (EventLog(),) * len(all_tiles), _Inputs.of(all_tiles), of_each)
+        scored = (i for i, tile in enumerate(all_tiles) if needed is None or needed[tile.outputs].any())
+        return cls(all_tiles, (EventLog(),) * len(all_tiles), tuple(scored))
 
     def extend(
         self,
@@ -67,10 +48,10 @@ class TiledEvents:
         """Return the events after more frames, see ``EventLog.extend``; tiles in which nothing moves do not change."""
         if len(self.tiles) == 1:
             return self.replaced([self.of[0].extend(root, numbers, root_near, start, jumped)])
-        of = list(self.of)
-        for i in self._inputs.with_any(start > numbers[0]):
-            if self._needed[i]:
-                cells = self.tiles[i].inputs
+        of, moving = list(self.of), start > numbers[0]
+        for i in self._needed:
+            cells = self.tiles[i].inputs
+            if moving[cells].any():
                 of[i] = of[i].extend(root[:, cells], numbers, root_near, start[cells], jumped[cells])
         return self.replaced(of)
 
@@ -86,9 +67,7 @@ class TiledEvents:
 
     def holding(self, cells: NDArray[np.bool_]) -> Iterator[int]:
         """Yield the needed tiles that have one of the ``cells`` (bool ``[D]``) among their outputs."""
-        for i in self._inputs.with_any(cells):
-            if self._needed[i] and cells[self.tiles[i].outputs].any():
-                yield i
+        return (i for i in self._needed if cells[self.tiles[i].outputs].any())
 
     def kept(self) -> Iterator[tuple[int, EventLog]]:
         """Yield the tiles with events, and these."""

@@ -50,11 +50,11 @@ def differences(a: StreamState, b: StreamState) -> list[str]:
         for name in ("since", "seen_by", "coincidences", "sums"):
             pairs[f"duplicates.{kind}.{name}"] = [getattr(state.duplicates.of[kind], name) for state in (a, b)]
     pairs["repetitions"] = [[(r.onset, r.frames) for r in state.transport.repetitions] for state in (a, b)]
-    pairs["parts"] = [[[(p.first, p.n) for p in event.parts] for event in state.events.kept] for state in (a, b)]
+    pairs["parts"] = [[[(p.first, p.n) for p in event.parts] for event in state.local.of[0].kept] for state in (a, b)]
     found = [name for name, (of_a, of_b) in pairs.items() if name != "parts" and not equal(of_a, of_b)]
     if pairs["parts"][0] != pairs["parts"][1]:
         return [*found, "parts"]
-    events = zip(a.events.kept, b.events.kept, strict=True)
+    events = zip(a.local.of[0].kept, b.local.of[0].kept, strict=True)
     alike = [equal(t.suffixes()[0].features(), u.suffixes()[0].features()) for t, u in events]
     return found if all(alike) else [*found, "features"]
 
@@ -82,7 +82,7 @@ def test_it_is_the_same_however_the_frames_come_in(size: int):
     log = broken()
     at_once = remembered(log)
     assert differences(remembered(log, size), at_once) == []
-    assert len(at_once.events.kept) > 10
+    assert len(at_once.local.of[0].kept) > 10
     assert at_once.transport.repetitions
     assert at_once.intermittency.blinks[12] > 0
 
@@ -119,11 +119,11 @@ def test_it_stays_of_constant_size_over_a_long_log():
     stream, most = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0)), []
     for _ in range(20):
         stream.extend(log)
-        most.append(len(stream.events.kept))
+        most.append(len(stream.local.of[0].kept))
     assert stream.transport.seen == 20 * len(log)
     assert max(most) < 100
     assert max(most[10:]) <= max(most[:10]) + 5
-    assert all(len(event.parts) <= 4 for event in stream.events.kept)
+    assert all(len(event.parts) <= 4 for event in stream.local.of[0].kept)
     assert len(stream.transport.repetitions) < 100
 
 
@@ -131,9 +131,9 @@ def test_evidence_of_dropped_events_still_counts():
     cell = LAYOUT.cell(0, 2, 2)
     log = inject(pressed(200), [Fault("open", (cell,))], LAYOUT)
     stream = remembered(log)
-    assert stream.events.kept[0].first > 1000
+    assert stream.local.of[0].kept[0].first > 1000
     assert stream.accumulated[cell] > 10
-    few = remembered(log[stream.events.kept[0].first :])
+    few = remembered(log[stream.local.of[0].kept[0].first :])
     evidence, without = (finished(m.spatial()).surprisal[cell] for m in (stream, few))
     assert evidence > without + 5
 

@@ -171,8 +171,7 @@ class _HeldLoads:
         value = np.minimum(np.nan_to_num(runs.value), scale.baseline + scale.full_scale)
         root = np.where(spatial.scored, scale.root_load(value), least)
         since = np.where(spatial.scored, np.where(least > 0, np.minimum(runs.start, since), runs.start), since)
-        events = stream.events.kept
-        root[since >= (events[-1].first if events else 0)] = 0.0  # the load of the last contact, which may still go on
+        root[since >= max(stream.begun, default=0)] = 0.0  # the load of the last contact, which may still go on
         root[excluded | ~stream.present | (stream.reference.dead > 0) | (root**2 < SLIGHT)] = 0.0
         values = HeldValues.of(scale.baseline + root**2 * scale.full_scale, scale, stream.reference.tolerance)
         # A healthy cell that contacts load without a pause does not return to the same load.

@@ -263,15 +263,6 @@ class EventLog:
         begins: list[int] = at[persists.sum(axis=1) <= _PERSISTING * own.sum(axis=1)].tolist()
         return begins
 
-    def without_loads(self) -> EventLog:
-        """Return the log without the loads of completed events: only their frames."""
-        nothing = np.zeros(0, np.float32)
-        completed = (
-            ContactEvent((Summary(t.first, t.end - t.first, nothing, nothing, nothing),), nothing, nothing, t.since)
-            for t in self.kept[:-1]
-        )
-        return replace(self, kept=(*completed, *self.kept[-1:]))
-
     def split(self, keep: int) -> tuple[EventLog, EventLog]:
         """Return (all but the last ``keep`` events, the last ``keep``)."""
         return replace(self, kept=self.kept[:-keep]), replace(self, kept=self.kept[-keep:])

@@ -101,7 +101,7 @@ class StreamState:
         self.duplicates = DuplicateLines.begin(layout)
         self.touched = np.zeros(layout.n_cells, bool)
         self.scale: Scale = reference.scale
-        self._skin = EventLog()  # events of the whole skin, if there are several tiles
+        self._skin, self._begun = EventLog(), list[int]()  # of the whole skin, if there are several tiles
         self._offsets = OffsetTracker.begin(layout.n_cells)
         self._rest, self._response = RestOfLog(), WeakResponse.begin(layout.n_cells)
         self._level = RestLevel.begin(layout.n_cells)
@@ -112,9 +112,9 @@ class StreamState:
         self._models: dict[int, Model] = {}
 
     @property
-    def events(self) -> EventLog:
-        """The last contact events of the skin as a whole."""
-        return self._skin if self.tiled else self.local.of[0]
+    def begun(self) -> list[int]:
+        """First frames of the last contact events of the skin as a whole."""
+        return self._begun if self.tiled else [event.first for event in self.local.of[0].kept]
 
     def extend(self, frames: NDArray[np.float64]) -> bool:
         """Take in frames ``[t, D]`` of readings; return whether a segment was completed."""
@@ -345,12 +345,11 @@ class StreamState:
         if self.reference.model is None:
             return cells  # held loads cannot be predicted from one log alone
         loaded = cells.scored & (self.scale.root_load(self.runs.value) > self.scale.root_near)
-        begun = np.array([event.first for event in self.events.kept])
         accumulated = cells.accumulated.copy()
         for i in self.local.holding(loaded):
             tile, own = self.local.tiles[i], self.local.of[i].kept
             since = np.maximum(self.runs.start[tile.inputs], own[-1].end if own else 0)
-            many = np.where(loaded[tile.inputs], len(begun) - np.searchsorted(begun, since), 0)
+            many = np.where(loaded[tile.inputs], len(self.begun) - np.searchsorted(self.begun, since), 0)
             if many[tile.place].any():
                 evidence = held_load_evidence(cells.of(tile.inputs), many, self.model_of(i, self.local.of[i]))
                 accumulated[tile.outputs] += evidence[tile.place]
@@ -381,7 +380,8 @@ class StreamState:
         self.local = self.local.extend(root, numbers, scale.root_near, runs.start, jumped)
         if self.tiled:
             skin = self._skin.extend(root, numbers, scale.root_near, runs.start, jumped)
-            self._skin = skin.split(KEPT_EVENTS)[1].without_loads()
+            self._begun = [*self._begun[:-1], *(event.first for event in skin.kept)][-KEPT_EVENTS:]
+            _, self._skin = skin.split(1)
             # On long lines some cell is always dead: cells that never moved are no difference between two lines.
             frames = np.where(runs.moved, frames, np.nan)
         self.intermittency = self.intermittency.extend(known, root, numbers, plain, self.reference.usual, still)

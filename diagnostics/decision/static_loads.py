@@ -235,7 +235,7 @@ class _Chain:
         held = np.flatnonzero(self.root > 0)
         predictors = self.others | _mask(chosen, len(self.root))
         log_likely = np.zeros(len(self.root))
-        of_model = np.exp(self.stream.log_held(self.root, predictors, held, self.values))
+        of_model = np.exp(self.stream.log_held(self.root, predictors, self.values)[held])
         any_shape = np.where(np.isnan(of_model), 1.0, _ANY_SHAPE)
         log_likely[held] = np.log((1 - any_shape) * np.nan_to_num(of_model) + any_shape * _BESIDE * self.width[held])
         return log_likely

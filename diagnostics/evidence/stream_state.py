@@ -280,25 +280,21 @@ class StreamState:
             returns[tile.outputs] = (lasting & (lowest**2 <= of_tile**2 + same)).sum(axis=0)
         return least, since, returns
 
-    def log_held(
-        self, root: NDArray[np.float64], predictors: Mask, cells: Cells, values: HeldValues
-    ) -> NDArray[np.float64]:
-        """Return log P(healthy ``cells`` hold their ``values``), given the root loads ``[D]`` of the ``predictors``.
+    def log_held(self, root: NDArray[np.float64], predictors: Mask, values: HeldValues) -> NDArray[np.float64]:
+        """Return log P(a healthy cell holds its value) ``[D]``, given the root loads ``[D]`` of the ``predictors``.
 
-        NaN: cells that no reference event loaded, so that the model knows no load of them.
+        0: cells without load; NaN: cells that no reference event loaded, so that the model knows no load of them.
         """
         features = np.stack([root, root, root > 0, root > 0]).astype(np.float32)
-        likely = np.ones(len(root))
-        among = np.zeros(len(root), bool)
-        among[cells] = True
+        likely, loaded = np.ones(len(root)), root > 0
         for i, tile in enumerate(self.local.tiles):
-            if among[tile.outputs].any():
-                inputs, own = tile.inputs, tile.place[among[tile.outputs]]
+            if loaded[tile.outputs].any():
+                inputs, own = tile.inputs, tile.place[loaded[tile.outputs]]
                 e = self.model_of(i, self.local.of[i]).predict(features[None, :, inputs], predictors[inputs])
                 these = inputs[own]
                 within = e.within(values.low[these], values.high[these], own)[0]
                 likely[these] = np.where(np.isnan(e.spread[own]), np.nan, e.always[0, own] * within)
-        return np.log(np.maximum(likely[cells], np.finfo(float).tiny))
+        return np.log(np.maximum(likely, np.finfo(float).tiny))
 
     def suspected(self, spatial: Spatial) -> Mask:
         """Return the cells that are no predictors after a test, bool ``[D]``."""

@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-def offset_evidence(whole: Array, always: Floats, moving: Mask, counts: Floats | float = 1.0) -> Floats:
+def offset_evidence(whole: Array, always: Floats, moving: Mask, counts: Floats | float) -> Floats:
     """Return the log likelihood ratio ``[D]`` that a moving cell never returns to its baseline.
 
     Args:

@@ -33,6 +33,7 @@ from diagnostics.preprocessing.readings import held
 
 if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
+    from diagnostics.healthy.model import HealthyModel
     from diagnostics.healthy.prediction import Prediction
     from diagnostics.layout import SensorLayout
     from diagnostics.preprocessing.scale import Array, Scale
@@ -48,6 +49,7 @@ _MOST_STEPS = 4  # permutations that are combined
 
 Floats = NDArray[np.float64]
 Cells = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -81,13 +83,6 @@ class _Candidate(NamedTuple):
     text: str
 
 
-class _Event(NamedTuple):
-    """Frames ``[t, D]`` of one event, and its weight."""
-
-    frames: Floats
-    weight: float
-
-
 def find_rewiring(
     recordings: Sequence[NDArray[np.float64]],
     reference: Reference,
@@ -102,13 +97,13 @@ def find_rewiring(
     """
     if reference.model is None:
         return None
-    events = _events(recordings, reference.scale)
+    events, weight = _events(recordings, reference.scale)
     if len(events) < _FEWEST:
         return None
     # Constant cells may be broken, those that are never at rest loaded by a strap: neither scored nor predictors.
-    moved = np.ptp(np.concatenate([event.frames for event in events]), axis=0) > reference.scale.near
+    moved = np.ptp(np.concatenate(events), axis=0) > reference.scale.near
     rested = np.any([((reference.scale.root_load(r) == 0) & ~np.isnan(r)).any(axis=0) for r in recordings], axis=0)
-    test = _Test(events, reference, layout, moved & rested)
+    test = _Test(events, weight, reference.model, reference.scale, layout.present.ravel(), moved & rested)
     source, total = np.arange(layout.n_cells), 0.0
     steps: list[str] = []
     now = test.score(source)
@@ -144,31 +139,36 @@ class _Score(NamedTuple):
     surplus: Floats
 
 
+@dataclass(frozen=True)
 class _Test:
-    """Scores permutations on the same events."""
+    """Scores permutations on the same events.
 
-    def __init__(
-        self, events: Sequence[_Event], reference: Reference, layout: SensorLayout, moved: NDArray[np.bool_]
-    ) -> None:
-        assert reference.model is not None
-        self._events, self._model, self._scale = events, reference.model, reference.scale
-        self._present, self._moved = layout.present.ravel(), moved
-        self.weight = np.array([event.weight for event in events])
+    Attributes:
+        events: frames ``[t, D]`` of each event.
+        weight: float ``[n]``, of each event.
+        model, scale: of the reference.
+        present: bool ``[D]``, where there is a cell.
+        moved: bool ``[D]``, indices whose readings move.
+    """
+
+    events: Sequence[Floats]
+    weight: Floats
+    model: HealthyModel
+    scale: Scale
+    present: Mask
+    moved: Mask
 
     def score(self, source: Cells) -> _Score:
         """Return the score of one permutation."""
-        features = np.stack([self._features(event, source) for event in self._events])
-        predictors = self._moved[source] & self._present
-        expected = self._model.predict(features, predictors)
+        near = self.scale.root_near
+        roots = (self.scale.root_load(frames[:, source]) for frames in self.events)
+        features = np.stack([Summary.of(root, 0, near).features() for root in roots])
+        expected = self.model.predict(features, self.moved[source] & self.present)
         likely, usual = _log_likelihood(expected, features)
         # The same readings count for each permutation; a load where no cell is, is as good as impossible.
-        likely = np.where(self._present, likely, np.where(features[:, 2] > 0, np.log(MIN_P_FLOOR), 0.0))
-        likely, usual = (np.where(self._moved[source], of, 0.0) for of in (likely, usual * self._present))
+        likely = np.where(self.present, likely, np.where(features[:, 2] > 0, np.log(MIN_P_FLOOR), 0.0))
+        likely, usual = (np.where(self.moved[source], of, 0.0) for of in (likely, usual * self.present))
         return _Score(self.weight * likely.sum(axis=1), (self.weight[:, None] * (likely - usual)).sum(axis=0))
-
-    def _features(self, event: _Event, source: Cells) -> Array:
-        root = self._scale.root_load(event.frames[:, source])
-        return Summary.of(root, 0, self._scale.root_near).features()
 
 
 def _log_likelihood(expected: Prediction, features: Array) -> tuple[Floats, Floats]:
@@ -183,8 +183,8 @@ def _log_likelihood(expected: Prediction, features: Array) -> tuple[Floats, Floa
     return state + load, (p * logs).sum(axis=0)
 
 
-def _events(recordings: Sequence[NDArray[np.float64]], scale: Scale) -> list[_Event]:
-    """Return the strongest contact events of the log."""
+def _events(recordings: Sequence[NDArray[np.float64]], scale: Scale) -> tuple[list[Floats], Floats]:
+    """Return frames ``[t, D]`` of each of the strongest contact events of the log, and the weights ``[n]``."""
     events, found = [], []
     for recording in recordings:
         frames = np.nan_to_num(held(recording, np.full(recording.shape[1], np.nan))[1:], nan=0.0)
@@ -192,45 +192,40 @@ def _events(recordings: Sequence[NDArray[np.float64]], scale: Scale) -> list[_Ev
             own = frames[event.first : event.end]
             own = own[np.linspace(0, len(own) - 1, min(len(own), _FRAMES)).astype(int)]
             events.append(event)
-            found.append((event.amplitude(np.ones(frames.shape[1], np.float32)), own))
+            found.append(own)
+    amplitudes = [event.amplitude(np.ones(len(event.lowest), np.float32)) for event in events]
     # In time order, and no more: the repeats of a whole log would be counted in a square of its events.
-    strongest = sorted(sorted(range(len(events)), key=lambda i: -found[i][0])[:_EVENTS])
-    weights = 1 / (1 + count_repeats([events[i] for i in strongest], THE_SAME))
-    return [_Event(found[i][1], weight) for i, weight in zip(strongest, weights.tolist(), strict=True)]
+    strongest = np.sort(np.argsort(np.negative(amplitudes), kind="stable")[:_EVENTS]).tolist()
+    return [found[i] for i in strongest], 1 / (1 + count_repeats([events[i] for i in strongest], THE_SAME))
 
 
 def _candidates(layout: SensorLayout, surplus: Floats, source: Cells) -> Iterator[_Candidate]:
     """Yield the permutations that are tried, each on top of ``source``; with declared wiring only exchanged pads."""
     grid, score = layout.grid(np.arange(layout.n_cells)), layout.grid(surplus)
     most = int(np.clip(_WORK // layout.n_cells, _FEW_LINES, _LINES))  # fewer on large arrays, where each costs more
-
-    def on_top(changed: NDArray[np.intp], text: str) -> _Candidate:
-        return _Candidate(source[changed.ravel()], text)
-
     for pad in range(layout.pads) if layout.is_matrix else ():
         for axis, kind in enumerate(("row", "column")):
             size = grid.shape[axis + 1]
-            of_line = score[pad].sum(axis=1 - axis)
-            worst = np.sort(np.argsort(of_line)[:most]).tolist()
-            for a, b in combinations(worst, 2):
-                order = np.arange(size)
-                order[[a, b]] = b, a
-                yield on_top(_reordered(grid, pad, axis, order), f"{kind}s {a} and {b} of pad {pad} are exchanged")
+            worst = np.sort(np.argsort(score[pad].sum(axis=1 - axis))[:most]).tolist()
+            orders = [
+                (_exchanged(size, a, b), f"{kind}s {a} and {b} of pad {pad} are exchanged")
+                for a, b in combinations(worst, 2)
+            ]
             if size > 2:
-                order = np.arange(size)[::-1]
-                yield on_top(_reordered(grid, pad, axis, order), f"the {kind}s of pad {pad} are in reverse order")
+                orders.append((np.arange(size)[::-1], f"the {kind}s of pad {pad} are in reverse order"))
             if size > 3:
                 for by in (1, -1):
-                    order = np.roll(np.arange(size), -by)
-                    text = f"the {kind}s of pad {pad} are shifted by {by:+d}"
-                    yield on_top(_reordered(grid, pad, axis, order), text)
+                    orders.append((np.roll(np.arange(size), -by), f"the {kind}s of pad {pad} are shifted by {by:+d}"))
+            for order, text in orders:
+                changed = grid.copy()
+                changed[pad] = np.take(grid[pad], order, axis=axis)
+                yield _Candidate(source[changed.ravel()], text)
     for a, b in combinations(range(layout.pads), 2):
-        order = np.arange(layout.pads)
-        order[[a, b]] = b, a
-        yield on_top(grid[order], f"pads {a} and {b} are exchanged")
+        yield _Candidate(source[grid[_exchanged(layout.pads, a, b)].ravel()], f"pads {a} and {b} are exchanged")
 
 
-def _reordered(grid: NDArray[np.intp], pad: int, axis: int, order: NDArray[np.intp]) -> NDArray[np.intp]:
-    changed = grid.copy()
-    changed[pad] = np.take(grid[pad], order, axis=axis)
-    return changed
+def _exchanged(size: int, a: int, b: int) -> NDArray[np.intp]:
+    """Return the order of ``size`` lines or pads with two of them exchanged."""
+    order = np.arange(size)
+    order[[a, b]] = b, a
+    return order

@@ -80,7 +80,7 @@ def result_of(
     accumulated = np.zeros(CELLS) if accumulated is None else accumulated
     jumps = np.full(CELLS, jump)
     cells = CellState(runs, SCALE, 0.025, accumulated, jumps, ~wrong)
-    return finished(spatial_test(events, cells, model or Copycat(), Exclusion(2.0)))
+    return finished(spatial_test(events, cells, model or Copycat().predict, Exclusion(2.0)))
 
 
 def pressed(events: int) -> np.ndarray:
@@ -124,7 +124,7 @@ def test_an_unexpected_value_is_weaker_evidence_in_events_with_large_errors():
     for force in (1.0, 0.1):
         log = force * pressed(4)
         log[:, 3] = 4.5
-        outcomes.append(result_of(log, model=Holder()).surprisal[3])
+        outcomes.append(result_of(log, model=Holder().predict).surprisal[3])
     assert 0 < outcomes[1] < outcomes[0] - 2
 
 
@@ -147,10 +147,10 @@ def test_cells_that_move_are_not_scored_and_have_no_evidence():
 def test_cells_that_broke_together_do_not_vouch_for_each_other():
     log = pressed(1)
     log[:, 5:] = 0
-    assert (result_of(log, model=Row()).surprisal[5:] < 0.1).all()
+    assert (result_of(log, model=Row().predict).surprisal[5:] < 0.1).all()
     runs, events = seen(log)
     zero = np.zeros(CELLS)
-    test = ConditionalTest.of(events, CellState(runs, SCALE, 0.025, zero, zero, ~NONE), Row())
+    test = ConditionalTest.of(events, CellState(runs, SCALE, 0.025, zero, zero, ~NONE), Row().predict)
     together, alone = (test.summed(test.score(~np.isin(np.arange(CELLS), group))[1]) for group in ([5, 6, 7], [6]))
     assert (together[5:] > 1).all()
     assert alone[6] < 0.1  # the others of its row are predictors
@@ -202,7 +202,7 @@ def test_an_event_that_surprises_the_moving_cells_is_weak_evidence_about_the_oth
         log = pressed(2) * np.repeat([slope, slope[::-1]], FRAMES, axis=0)  # no event repeats the other
         log[:, 3] = 0.0
         log[FRAMES:, 4 : 4 + surprised] = 0.0
-        outcomes.append(result_of(log, model=Presser()).surprisal[3])
+        outcomes.append(result_of(log, model=Presser().predict).surprisal[3])
     assert outcomes[0] > outcomes[1] + 0.4 > outcomes[2] + 0.6
 
 

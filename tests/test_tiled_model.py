@@ -60,7 +60,7 @@ def test_a_tile_is_predicted_as_a_small_array_of_the_same_cells(fitted: SelfDiag
     padded, scored = np.full((9, 4, small.n_cells), 0.5, np.float32), np.ones(small.n_cells, bool)
     padded[:, :, cells], scored[cells] = features, predictors
     expected = alone.predict(padded, scored)
-    predicted = fitted.stream().model_of(i, EventLog()).predict(features, predictors)
+    predicted = fitted.stream().model_of(i, EventLog())(features, predictors)
     for name in ("never", "always", "mean"):
         expected_values = getattr(expected, name)[:, cells[regression.place]]
         np.testing.assert_allclose(

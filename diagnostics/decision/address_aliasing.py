@@ -142,7 +142,7 @@ def _level_ratio(line: Line, onset: int, stream: StreamState) -> float:
         for features, cells, modelled, model in stream.views(onset):
             scored = modelled[np.isin(cells[modelled], intact)]
             if len(scored):
-                ratio += sign * _plausible(features, model.predict(features, predictors[cells]), scored)
+                ratio += sign * _plausible(features, model(features, predictors[cells]), scored)
             loaded |= bool((features[:, 2, np.isin(cells, empty)] > 0).any())
         # An address without a line never reads a load.
         if loaded:

@@ -16,10 +16,9 @@ recognised.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +26,9 @@ from scipy.special import expit, logit, softmax
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, ConstantRuns
 from diagnostics.events.contact_events import THE_SAME, ContactEvent, count_repeats
-from diagnostics.healthy.prediction import MEDIAN_ERROR
+from diagnostics.healthy.prediction import MEDIAN_ERROR, Prediction
 from diagnostics.preprocessing.levels import ANYWHERE, P_MIN
 from diagnostics.preprocessing.scale import Array, Scale
-
-if TYPE_CHECKING:
-    from diagnostics.healthy.prediction import Prediction
 
 _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 _PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit: all cells may be dead
@@ -41,13 +37,7 @@ _COLD_SCALE = 2.5  # of an event without a reference; benchmarks/cold_calibratio
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-
-class Model(Protocol):
-    """A healthy model."""
-
-    def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
-        """See ``HealthyModel.predict``."""
+Model = Callable[[Array, Mask], Prediction]  # the method ``predict`` of a healthy model
 
 
 @dataclass(frozen=True)
@@ -143,7 +133,7 @@ class ConditionalTest:
 
     def score(self, predictors: Mask) -> tuple[Prediction, Floats]:
         """Return the prediction of the ``predictors`` (bool ``[D]``), and the surprisal of each excerpt ``[n, D]``."""
-        expected, values = self.model.predict(self.features, predictors), self.cells.values
+        expected, values = self.model(self.features, predictors), self.cells.values
         held = np.flatnonzero(self.cells.scored & ~values.rests)
         likely = _tempered(expected.never, self.features[:, 2] == 0, predictors & self.cells.runs.moved)
         inflation = _inflation(expected, self.features, predictors)

@@ -187,7 +187,7 @@ def held_load_evidence(cells: CellState, outlasted: NDArray[np.intp], model: Mod
     """
     held, root = np.flatnonzero(outlasted), cells.scale.root_load(np.nan_to_num(cells.runs.value))
     loaded = (root > cells.scale.root_near).astype(np.float32)
-    expected = model.predict(np.stack([root, root, loaded, loaded])[None], cells.eligible)
+    expected = model(np.stack([root, root, loaded, loaded])[None], cells.eligible)
     likely = expected.always[0, held] * expected.within(cells.values.low[held], cells.values.high[held], held)[0]
     # One load is tested, however many events there were elsewhere.
     evidence = np.zeros(len(outlasted))

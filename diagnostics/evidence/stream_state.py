@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -206,14 +206,14 @@ class StreamState:
         """Return the healthy model of tile i; without a reference, a model of its ``events``."""
         known = self.reference.model
         if not self.tiled:
-            return known or NearestNeighbours.of(events.kept, self.layout, self.scale.root_near)
+            return (known or NearestNeighbours.of(events.kept, self.layout, self.scale.root_near)).predict
         if i in self._models:
             return self._models[i]
         own = self.local.tiles[i].rectangle(self.layout)
         if known is None:
             model = NearestNeighbours.of(events.kept, own.layout, self.scale.root_near)
-            return _Rectangular(replace(model, log=own.on(model.log)), own)
-        return self._models.setdefault(i, _Rectangular(known.of_tile(i, own.cells, own.layout), own))
+            return _on_rectangle(replace(model, log=own.on(model.log)).predict, own)
+        return self._models.setdefault(i, _on_rectangle(known.of_tile(i, own.cells, own.layout).predict, own))
 
     def _scale_of_log(self, plain: Scale, frames: NDArray[np.float64]) -> Scale:
         """Return the scale of a cold start after ``frames``."""
@@ -290,7 +290,7 @@ class StreamState:
         for i, tile in enumerate(self.local.tiles):
             if loaded[tile.outputs].any():
                 inputs, own = tile.inputs, tile.place[loaded[tile.outputs]]
-                e = self.model_of(i, self.local.of[i]).predict(features[None, :, inputs], predictors[inputs])
+                e = self.model_of(i, self.local.of[i])(features[None, :, inputs], predictors[inputs])
                 these = inputs[own]
                 within = e.within(values.low[these], values.high[these], own)[0]
                 likely[these] = np.where(np.isnan(e.spread[own]), np.nan, e.always[0, own] * within)
@@ -330,7 +330,7 @@ class StreamState:
                     tile = events.tiles[i]
                     allowed = outside[tile.inputs]
                     allowed[tile.place] = True
-                    model = _Restricted(self.model_of(i, of_tile), allowed)
+                    model = _restricted(self.model_of(i, of_tile), allowed)
                     found = finished(spatial_test(of_tile.kept, cells.of(tile.inputs), model, self.exclusion))
                     for name, values in vars(found).items():
                         getattr(result, name)[tile.outputs] = values[tile.place]
@@ -401,29 +401,19 @@ class StreamState:
             pass
 
 
-@dataclass(frozen=True)
-class _Rectangular:
-    """The model of a tile's bounding rectangle, applied to the inputs of the tile."""
+def _on_rectangle(model: Model, own: Rectangle) -> Model:
+    """Return the model of the inputs of a tile; ``model`` is that of their bounding rectangle."""
 
-    model: Model
-    own: Rectangle
+    def predict(features: Array, predictors: Mask) -> Prediction:
+        e = model(own.on(features), own.on(predictors))
+        return e if own.full else e.on(slice(None), own.cells)
 
-    def predict(self, features: Array, predictors: Mask) -> Prediction:
-        """See ``HealthyModel.predict``."""
-        e = self.model.predict(self.own.on(features), self.own.on(predictors))
-        return e if self.own.full else e.on(slice(None), self.own.cells)
+    return predict
 
 
-@dataclass(frozen=True)
-class _Restricted:
-    """A model whose predictors are restricted to some of the inputs, bool ``[inputs]``."""
-
-    model: Model
-    allowed: Mask
-
-    def predict(self, features: Array, predictors: Mask) -> Prediction:
-        """See ``HealthyModel.predict``."""
-        return self.model.predict(features, predictors & self.allowed)
+def _restricted(model: Model, allowed: Mask) -> Model:
+    """Return the model with some of the inputs (bool ``[inputs]``) as its only predictors."""
+    return lambda features, predictors: model(features, predictors & allowed)
 
 
 def _known(frames: NDArray[np.float64], last: NDArray[np.float64]) -> NDArray[np.float64]:

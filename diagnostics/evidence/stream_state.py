@@ -215,12 +215,6 @@ class StreamState:
             return _on_rectangle(replace(model, log=own.on(model.log)).predict, own)
         return self._models.setdefault(i, _on_rectangle(known.of_tile(i, own.cells, own.layout).predict, own))
 
-    def _scale_of_log(self, plain: Scale, frames: NDArray[np.float64]) -> Scale:
-        """Return the scale of a cold start after ``frames``."""
-        moved = self.runs.moved & self.received & self.present
-        self._rest = self._rest.extend(frames[:, moved], self.lowest[moved], plain.full_scale)
-        return self._rest.scale(plain, self.lowest, moved)
-
     @property
     def lowest(self) -> NDArray[np.float64]:
         """The lowest reading of each cell so far, ``[D]``; inf: none."""
@@ -359,17 +353,21 @@ class StreamState:
         self._offsets = self._offsets.extend(frames, self.reference.scale, self.present, self.reference.offset)
         self.scale = scale = plain = self._offsets.on(self.reference.scale)
         if self.reference.model is None:
-            self.scale = scale = self._scale_of_log(plain, frames)
+            moved = self.runs.moved & self.received & self.present
+            self._rest = self._rest.extend(frames[:, moved], self.lowest[moved], plain.full_scale)
+            self.scale = scale = self._rest.scale(plain, self.lowest, moved)
         start, known = self.runs.start, _known(frames, self.runs.last)
         before, self.runs = self.runs, self.runs.extend(frames, numbers, self.reference.tolerance, scale.baseline)
         runs = self.runs
         # Evidence belongs to a constant run, and ends with it.
         self.accumulated = np.where(runs.start == start, self.accumulated, 0.0)
         steady = self._offsets.off(known)
-        root, still = scale.root_load(steady), runs.start <= numbers[0]
+        root, still, clear = scale.root_load(steady), runs.start <= numbers[0], plain
         if self.reference.model is None:
             self._level = self._level.extend(before, runs.start != start)
             self._response = self._response.extend(steady, scale.full_scale * root.astype(np.float64) ** 2, self.layout)
+            # How often healthy lines with light loads agree is unknown.
+            clear = replace(plain, near=max(scale.near, _CLEAR * plain.near))
         self.touched = self.touched | root.any(axis=0)
         jump = self.reference.jumps_seen.size(runs, self.reference.scale.full_scale)
         jumped = (jump >= SUDDEN_JUMP) & (runs.alone | still)
@@ -381,9 +379,6 @@ class StreamState:
             # On long lines some cell is always dead: cells that never moved are no difference between two lines.
             frames = np.where(runs.moved, frames, np.nan)
         self.intermittency = self.intermittency.extend(known, root, numbers, plain, self.reference.usual, still)
-        clear = plain
-        if self.reference.model is None:  # how often healthy lines with light loads agree is unknown
-            clear = replace(plain, near=max(scale.near, _CLEAR * plain.near))
         self.duplicates = self.duplicates.extend(frames, numbers, informative(frames, still, clear), plain.near)
 
     @property

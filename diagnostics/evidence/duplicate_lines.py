@@ -89,7 +89,7 @@ class _Pairs:
     @classmethod
     def begin(cls, present: Mask) -> _Pairs:
         """Return the state before any frame, for cells ``present`` (bool ``[pads, lines, positions]``)."""
-        first, second = np.array(pairs(present.shape[1]) or np.empty((0, 2)), dtype=np.intp).reshape(-1, 2).T
+        first, second = np.array(pairs(present.shape[1]), dtype=np.intp).reshape(-1, 2).T
         there = present[:, first] & present[:, second]
         nothing = np.zeros(there.shape[:2], np.intp)
         return cls(first, second, there, nothing, nothing, nothing, np.zeros((4, *there.shape), np.float32))
@@ -176,9 +176,8 @@ class DuplicateLines:
         """
         if not self.of:
             return self
-        some = slice(
-            (len(frames) - 1) % _EVERY, None, _EVERY
-        )  # includes the last frame, in which informative cells are loaded
+        # With the last frame, in which informative cells are loaded.
+        some = slice((len(frames) - 1) % _EVERY, None, _EVERY)
         grid, loaded = self.layout.grid(frames[some].astype(np.float32)), self.layout.grid(informative)
         of: dict[LineKind, _Pairs] = {
             "row": self.of["row"].extend(grid, numbers[some], loaded, tolerance),
@@ -190,14 +189,12 @@ class DuplicateLines:
     def duplicate_pairs(self, usual: int) -> list[DuplicatePair]:
         """Return the pairs that differ by noise and have more coincidences than healthy ones (``usual``)."""
         needed = usual + _MOST_AT_ONCE
-        return [
-            DuplicatePair(
-                pad, kind, int(each.first[i]), int(each.second[i]),
-                *(int(values[pad, i]) for values in (each.since, each.seen_by, each.coincidences)),
-            )
-            for kind, each in self.of.items()
-            for pad, i in each.matching(needed)
-        ]  # fmt: skip
+        found = []
+        for kind, each in self.of.items():
+            for pad, i in each.matching(needed):
+                counts = (int(values[pad, i]) for values in (each.since, each.seen_by, each.coincidences))
+                found.append(DuplicatePair(pad, kind, int(each.first[i]), int(each.second[i]), *counts))
+        return found
 
     def apart_since(self, pad: int, kind: LineKind, first: int, second: int) -> int:
         """Return the first frame from which on two lines did not differ."""

@@ -19,7 +19,6 @@ from rows import STUCK_KINDS, Bench, broken, draw_faults, kind_of_cells
 from scipy.optimize import minimize
 
 from diagnostics import SelfDiagnosis
-from diagnostics.evidence.spatial import finished
 
 SIMULATED = ("grasps, 1 x 12 x 12", "grasps, 2 x 11 x 10", "posture, seat", "posture, rests at 5 %")
 SHARES = (0.04, 0.08, 0.16, 0.16)
@@ -36,7 +35,7 @@ def cells_at_rest(bench: Bench) -> np.ndarray:
             for frames in given:
                 stream.extend(frames)
             stream = stream.complete()
-            spatial = finished(stream.spatial())
+            spatial = stream.spatial().finish()
             still = stream.present & stream.rests() & spatial.scored & ~stream.runs.moved
             cells = np.flatnonzero(still & (spatial.surprisal > 0))
             found.append(

@@ -19,7 +19,7 @@ from diagnostics.decision.serialization import Arrays, from_state, to_state
 from diagnostics.decision.static_loads import StaticLoad, find_static_loads
 from diagnostics.evidence.reference import Reference, highest_reading, living, tolerance_of
 from diagnostics.evidence.rewiring import Rewiring, find_rewiring
-from diagnostics.evidence.spatial import Exclusion, Spatial, finished
+from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
@@ -205,7 +205,13 @@ class SelfDiagnosis:
         Raises:
             ValueError: no frame with a reading was received yet.
         """
-        return finished(self.steps(stream, n_recordings=n_recordings))
+        steps = self.steps(stream, n_recordings=n_recordings)
+        while True:
+            try:
+                next(steps)
+            except StopIteration as end:
+                diagnosis: Diagnosis = end.value
+                return diagnosis
 
     def steps(self, stream: StreamState, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
         """Yield between steps of a few milliseconds of :meth:`evaluate`, for a control loop; return the diagnosis."""
@@ -280,7 +286,11 @@ class SelfDiagnosis:
         self, stream: StreamState, explained: NDArray[np.bool_]
     ) -> Generator[None, None, tuple[Spatial, CellFindings]]:
         """Yield between steps of the spatial test without ``explained`` cells (bool ``[D]``); return its findings."""
-        spatial = yield from stream.spatial(explained)
+        test = stream.spatial(explained)
+        yield
+        while not test.step():
+            yield
+        spatial = test.finish()
         yield
         return spatial, self._found(stream, spatial, explained)
 

@@ -4,7 +4,7 @@ import pytest
 from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import ContactEvent, Summary
 from diagnostics.evidence.conditional_test import CellState, ConditionalTest, Model
-from diagnostics.evidence.spatial import Exclusion, Spatial, finished, spatial_test
+from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest
 from diagnostics.healthy.prediction import Prediction
 from diagnostics.preprocessing.scale import Array, Scale
 
@@ -80,7 +80,7 @@ def result_of(
     accumulated = np.zeros(CELLS) if accumulated is None else accumulated
     jumps = np.full(CELLS, jump)
     cells = CellState(runs, SCALE, 0.025, accumulated, jumps, ~wrong)
-    return finished(spatial_test(events, cells, model or Copycat().predict, Exclusion(2.0)))
+    return SpatialTest(events, cells, model or Copycat().predict, Exclusion(2.0)).finish()
 
 
 def pressed(events: int) -> np.ndarray:

@@ -4,7 +4,7 @@ import pytest
 from adaptfault.data.recordings import Recordings
 from diagnostics import FaultKind, Line, SensorLayout, bridge, freeze_stream, inject, line_fault, lose_frames
 from diagnostics.evidence.reference import Reference
-from diagnostics.evidence.spatial import Exclusion, finished
+from diagnostics.evidence.spatial import Exclusion
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault
 
@@ -100,7 +100,7 @@ def test_looking_at_it_in_between_changes_nothing():
     stream = StreamState(LAYOUT, UNKNOWN, Exclusion(2.0))
     for first in range(0, 1800, 29):
         stream.extend(log[first : first + 29])
-        finished(stream.complete().spatial())
+        stream.complete().spatial().finish()
     assert differences(stream.complete(), remembered(log)) == []
 
 
@@ -134,7 +134,7 @@ def test_evidence_of_dropped_events_still_counts():
     assert stream.local.of[0].kept[0].first > 1000
     assert stream.accumulated[cell] > 10
     few = remembered(log[stream.local.of[0].kept[0].first :])
-    evidence, without = (finished(m.spatial()).surprisal[cell] for m in (stream, few))
+    evidence, without = (m.spatial().finish().surprisal[cell] for m in (stream, few))
     assert evidence > without + 5
 
 

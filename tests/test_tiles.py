@@ -6,7 +6,6 @@ import pytest
 from diagnostics import Fault, FaultKind, Line, Monitor, SelfDiagnosis, SensorLayout, inject, line_fault
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import HALO, TILE, tiles
-from diagnostics.evidence.spatial import finished
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.preprocessing.scale import Scale
@@ -59,7 +58,7 @@ def test_a_row_across_several_tiles_is_excluded_from_the_predictors_as_a_group(f
     stream = fitted.stream()
     stream.extend(inject(log(SKIN, 100, 40), [line_fault(SKIN, Line(0, "row", 11), FaultKind.OPEN)], SKIN))
     stream = stream.complete()
-    spatial, none = finished(stream.spatial()), np.zeros(SKIN.n_cells, bool)
+    spatial, none = stream.spatial().finish(), np.zeros(SKIN.n_cells, bool)
     of_row, of_one = (stream.group_excluded(spatial, none, group) for group in (row, row[:1]))
     assert len({i for i, tile in enumerate(tiles(SKIN)) if np.isin(row, tile.outputs).any()}) > 1
     assert of_row[row].sum() > spatial.surprisal[row].sum() + 3

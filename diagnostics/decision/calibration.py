@@ -25,7 +25,7 @@ from scipy.special import expit, logit
 from diagnostics.events.tiles import MOST_CELLS
 from diagnostics.evidence.drift import gains_count
 from diagnostics.evidence.reference import Reference
-from diagnostics.evidence.spatial import Exclusion, finished
+from diagnostics.evidence.spatial import Exclusion
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.calibration_subset import calibration_subset
@@ -263,7 +263,7 @@ def _trial(
     stream = StreamState(layout, reference, exclusion)
     stream.extend(inject(log, faults, layout))
     stream = stream.complete()
-    spatial = finished(stream.spatial())
+    spatial = stream.spatial().finish()
     broken = np.zeros(layout.n_cells, bool)
     broken[[c for fault in faults for c in fault.cells]] = True
     scored, gain = spatial.scored, float(np.where(broken, 0.0, spatial.gain).max())

@@ -18,9 +18,9 @@ explain are scored once more with the whole group excluded.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,6 @@ _ONE_LOAD = 0.5  # correlation of the evidence that events elsewhere give about 
 _MOST_ROUNDS = 16  # of scoring and updating the predictors, and of excluding drifting cells: a size
 
 Floats = NDArray[np.float64]
-T = TypeVar("T")
 
 
 class Exclusion(NamedTuple):
@@ -93,81 +92,97 @@ class Spatial:
         return cls(evidence, accumulated, accumulated, scored, none, nothing, nothing, unknown, none)
 
 
-def spatial_test(
-    events: Sequence[ContactEvent], cells: CellState, model: Model, exclusion: Exclusion
-) -> Generator[None, None, Spatial]:
-    """Yield between the rounds of the iterated test, for a control loop; return the result.
+class SpatialTest:
+    """The iterated test; each :meth:`step` is one round, so that a control loop can spread it over frames.
 
     Args:
         events: the contact events, in time order.
         cells: state of each cell.
         model: the healthy model.
         exclusion: when a cell is excluded from the predictors.
+
+    Attributes:
+        result: None before the last step.
     """
-    if not events:
-        yield
-        return Spatial.before(cells)
-    test = ConditionalTest.of(events, cells, model)
-    yield
-    # First predictors: cells that moved, unless their load outlasts an event, or they jumped alone. Few of the cells at
-    # rest are broken.
-    fresh = cells.runs.start >= events[-1].since
-    plausible = cells.values.rests | (fresh & (cells.temporal < SUDDEN_JUMP))
-    predictors, drifts = cells.eligible & cells.runs.moved & plausible, np.zeros(len(plausible), bool)
-    summed: list[Floats] = []  # surprisal of each round
-    for _ in range(_MOST_ROUNDS):
-        for _ in range(_MOST_ROUNDS):
-            before = predictors & test.eligible
-            expected, surprisal = test.score(before)
-            summed.append(test.summed(surprisal))
-            evidence = _with_prior(summed[-1], cells.values.prior)
-            predictors = test.eligible & (evidence + cells.temporal < exclusion.threshold)
-            yield
-            if (predictors == before).all():
-                break
-        offset, gain = _drift(events, test, expected, exclusion.gains)
-        more = misleading(offset, gain.evidence, drifts)
-        if not more.any():
-            break
-        drifts = drifts | more
-        test = replace(test, eligible=test.eligible & ~more)
-        yield
-    of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
-    first = np.array([event.first for event in events])
-    return Spatial(
-        evidence,
-        summed[-1],
-        summed[0],
-        cells.scored,
-        np.where(of_gain, gain.events, (surprisal > TESTED).sum(axis=0)),
-        offset,
-        gain.evidence,
-        factor=np.where(of_gain, gain.factor, np.nan),
-        since=np.where(of_gain & (gain.since > 0), first[gain.since], 0),
-    )
+
+    def __init__(self, events: Sequence[ContactEvent], cells: CellState, model: Model, exclusion: Exclusion) -> None:
+        self.result = None if events else Spatial.before(cells)
+        if not events:
+            return
+        self._events, self._cells, self._exclusion = events, cells, exclusion
+        self._test = ConditionalTest.of(events, cells, model)
+        # First predictors: cells that moved, unless their load outlasts an event, or they jumped alone. Few of the
+        # cells at rest are broken.
+        fresh = cells.runs.start >= events[-1].since
+        plausible = cells.values.rests | (fresh & (cells.temporal < SUDDEN_JUMP))
+        self._predictors: Mask = cells.eligible & cells.runs.moved & plausible
+        self._summed: list[Floats] = []  # surprisal of each round
+        self._agreed: tuple[Prediction, Floats] | None = None  # score with the final predictors
+        self._rounds = self._exclusions = 0
+
+    def step(self) -> bool:
+        """Score all cells once and update the predictors, or look for drift. Return whether there is a result."""
+        if self.result is None and self._agreed is None:
+            self._update()
+        elif self.result is None and self._agreed is not None:
+            self._look_for_drift(*self._agreed)
+        return self.result is not None
+
+    def finish(self) -> Spatial:
+        """Do all steps that are left, and return the result."""
+        while self.result is None:
+            self.step()
+        return self.result
+
+    def _update(self) -> None:
+        test, before = self._test, self._predictors & self._test.eligible
+        expected, surprisal = test.score(before)
+        self._summed.append(test.summed(surprisal))
+        evidence = _with_prior(self._summed[-1], self._cells.values.prior)
+        self._predictors = test.eligible & (evidence + self._cells.temporal < self._exclusion.threshold)
+        self._rounds += 1
+        if self._rounds == _MOST_ROUNDS or (self._predictors == before).all():
+            self._agreed = expected, surprisal
+
+    def _look_for_drift(self, expected: Prediction, surprisal: Floats) -> None:
+        """Exclude cells with another offset or gain and start again, or set the result if there is no new one."""
+        test, first = self._test, np.array([event.first for event in self._events])
+        offset, gain = _drift(first, test, expected, self._exclusion.gains)
+        more = misleading(offset, gain.evidence, ~test.eligible)
+        self._exclusions += 1
+        if more.any() and self._exclusions < _MOST_ROUNDS:
+            self._test, self._agreed, self._rounds = replace(test, eligible=test.eligible & ~more), None, 0
+            return
+        of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
+        self.result = Spatial(
+            _with_prior(self._summed[-1], self._cells.values.prior),
+            self._summed[-1],
+            self._summed[0],
+            self._cells.scored,
+            np.where(of_gain, gain.events, (surprisal > TESTED).sum(axis=0)),
+            offset,
+            gain.evidence,
+            factor=np.where(of_gain, gain.factor, np.nan),
+            since=np.where(of_gain & (gain.since > 0), first[gain.since], 0),
+        )
 
 
-def _drift(
-    events: Sequence[ContactEvent], test: ConditionalTest, expected: Prediction, counts: float
-) -> tuple[Floats, Gain]:
-    """Return the evidence ``[D]`` of an offset, and that of a changed gain; ``counts``: factor on the latter."""
-    runs, first = test.cells.runs, np.array([event.first for event in events])
+def _drift(first: NDArray[np.intp], test: ConditionalTest, expected: Prediction, counts: float) -> tuple[Floats, Gain]:
+    """Return the evidence ``[D]`` of an offset, and that of a changed gain.
+
+    Args:
+        first: int ``[n]``, first frame of each event.
+        test: of these events.
+        expected: prediction for their excerpts.
+        counts: factor on the evidence of a changed gain.
+    """
+    runs = test.cells.runs
     moved = test.cells.eligible & runs.moved & (first[:, None] <= runs.start)
     whole, on_whole = test.features[test.begins], expected.on(test.begins)
     novelty = test.novelty(expected.own)[test.begins]
     moving = moved[-1] & np.isfinite(on_whole.spread)
     offset = offset_evidence(whole, on_whole.always, moving, 1.0 if expected.own else novelty)
     return offset, gain_evidence(whole, on_whole, moved, test.cells.scale.root_near, counts * novelty)
-
-
-def finished(steps: Generator[None, None, T]) -> T:
-    """Do all steps, and return their result."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: T = end.value
-            return result
 
 
 def _with_prior(surprisal: Floats, prior: Floats) -> Floats:

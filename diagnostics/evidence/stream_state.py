@@ -10,7 +10,7 @@ first with the moving cells as predictors, then without the cells that their own
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -27,7 +27,7 @@ from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.evidence.jumps import SUDDEN_JUMP
 from diagnostics.evidence.rest_level import RestLevel
-from diagnostics.evidence.spatial import Exclusion, Spatial, finished, held_load_evidence, spatial_test
+from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, held_load_evidence
 from diagnostics.evidence.term import ConstantCells, Term
 from diagnostics.evidence.weak_response import WeakResponse
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
@@ -108,7 +108,7 @@ class StreamState:
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
         self._filled = 0
-        self._dropping: Generator[None, None, None] | None = None  # scores old events in steps, and drops them
+        self._dropping: tuple[Test, TiledEvents] | None = None  # the test of old events, and the events to keep
         self._models: dict[int, Model] = {}
 
     @property
@@ -130,11 +130,12 @@ class StreamState:
         before = self.transport.seen
         self.transport, new = self.transport.receive(frames, self.present, self._patience)
         completed, taken = False, 0
-        if self._dropping is not None:
-            next(self._dropping, None)
+        if self._dropping is not None and self._dropping[0].step():
+            self._drop()
         while taken < len(new):
             if self._filled == _PAUSE and self._crowded and self._dropping is None:
-                self._dropping = self._dropped(*self.local.split(MAX_EVENTS, KEPT_EVENTS))
+                old, kept = self.local.split(MAX_EVENTS, KEPT_EVENTS)
+                self._dropping = self._test(self.cells(None), old, passes=1), kept
             n = min((_PAUSE if self._filled < _PAUSE else SEGMENT) - self._filled, len(new) - taken)
             chosen = new[taken : taken + n]
             self._buffer[self._filled : self._filled + n] = frames[chosen]
@@ -231,8 +232,8 @@ class StreamState:
             if suffixes:
                 yield np.stack(suffixes), tile.inputs, tile.place, self.model_of(i, events)
 
-    def spatial(self, explained: Mask | None = None) -> Generator[None, None, Spatial]:
-        """Test all constant cells in steps, see ``spatial_test``; ``explained`` cells (bool ``[D]``) are left out."""
+    def spatial(self, explained: Mask | None = None) -> Test:
+        """Return the spatial test of all constant cells; cells already ``explained`` (bool ``[D]``) are left out."""
         cells = self.cells(explained)
         return self._test(self._with_held_loads(cells) if self.tiled else cells, self.local, passes=2)
 
@@ -305,30 +306,11 @@ class StreamState:
             runs = replace(runs, length=np.where(untestable, 0, runs.length))
         return CellState(runs, self.scale, self.reference.tolerance, self.accumulated, self.temporal(), eligible)
 
-    def _test(self, cells: CellState, events: TiledEvents, passes: int) -> Generator[None, None, Spatial]:
+    def _test(self, cells: CellState, events: TiledEvents, passes: int) -> Test:
         if self.tiled:
-            return self._tiled_test(cells, events, passes)
+            return _TiledTest(self, cells, events, passes)
         (only,) = events.of
-        return spatial_test(only.kept, cells, self.model_of(0, only), self.exclusion)
-
-    def _tiled_test(self, cells: CellState, events: TiledEvents, passes: int) -> Generator[None, None, Spatial]:
-        """Yield before each of about eight steps of a pass, see the module; return the result."""
-        result, queue = Spatial.before(cells), list(events.kept())
-        each = max(1, -(-len(queue) // _STEPS))
-        for k in range(passes):
-            outside = ~self.suspected(result) if k else self.runs.moved  # predictors of each tile outside its outputs
-            result = Spatial(*(np.array(values) for values in vars(Spatial.before(cells)).values()))
-            for first in range(0, max(1, len(queue)), each):
-                yield
-                for i, of_tile in queue[first : first + each]:
-                    tile = events.tiles[i]
-                    allowed = outside[tile.inputs]
-                    allowed[tile.place] = True
-                    model = _restricted(self.model_of(i, of_tile), allowed)
-                    found = finished(spatial_test(of_tile.kept, cells.of(tile.inputs), model, self.exclusion))
-                    for name, values in vars(found).items():
-                        getattr(result, name)[tile.outputs] = values[tile.place]
-        return result
+        return SpatialTest(only.kept, cells, self.model_of(0, only), self.exclusion)
 
     def _with_held_loads(self, cells: CellState) -> CellState:
         """Return the cells with the evidence of loads that are held where nothing has moved for some events."""
@@ -385,15 +367,58 @@ class StreamState:
     def _crowded(self) -> bool:
         return any(len(events.kept) > MAX_EVENTS for events in self.local.of)
 
-    def _dropped(self, old: TiledEvents, kept: TiledEvents) -> Generator[None, None, None]:
-        """Score the ``old`` events in steps, then drop them."""
-        spatial = yield from self._test(self.cells(None), old, passes=1)
-        self.accumulated, self.local, self._dropping = spatial.surprisal, kept, None
-
     def _drop(self) -> None:
-        """Do all steps that are left."""
-        for _ in self._dropping or ():
+        """Finish the test of old events, and drop them."""
+        if self._dropping is not None:
+            test, kept = self._dropping
+            self.accumulated, self.local, self._dropping = test.finish().surprisal, kept, None
+
+
+class _TiledTest:
+    """The spatial test of several tiles, in one or two passes, see the module."""
+
+    def __init__(self, stream: StreamState, cells: CellState, events: TiledEvents, passes: int) -> None:
+        self._stream, self._cells, self._events, self._passes = stream, cells, events, passes
+        self._outside = stream.runs.moved  # predictors of each tile outside its outputs
+        self._begin()
+
+    def _begin(self) -> None:
+        self._result = Spatial(*(np.array(values) for values in vars(Spatial.before(self._cells)).values()))
+        self._queue = list(self._events.kept())
+        self._each = max(1, -(-len(self._queue) // _STEPS))
+
+    def step(self) -> bool:
+        """Score some tiles; return whether all passes are done."""
+        if self._passes == 0:
+            return True
+        now, self._queue = self._queue[: self._each], self._queue[self._each :]
+        for i, events in now:
+            self._score(i, events)
+        if self._queue:
+            return False
+        self._passes -= 1
+        if self._passes:
+            self._outside = ~self._stream.suspected(self._result)
+            self._begin()
+        return self._passes == 0
+
+    def finish(self) -> Spatial:
+        """Score all tiles that are left, and return the result."""
+        while not self.step():
             pass
+        return self._result
+
+    def _score(self, i: int, events: EventLog) -> None:
+        stream, tile = self._stream, self._events.tiles[i]
+        cells, allowed = self._cells.of(tile.inputs), self._outside[tile.inputs]
+        allowed[tile.place] = True
+        cells = replace(cells, eligible=cells.eligible & allowed)
+        test = SpatialTest(events.kept, cells, stream.model_of(i, events), stream.exclusion)
+        for name, values in vars(test.finish()).items():
+            getattr(self._result, name)[tile.outputs] = values[tile.place]
+
+
+Test = SpatialTest | _TiledTest
 
 
 def _on_rectangle(model: Model, own: Rectangle) -> Model:
@@ -404,11 +429,6 @@ def _on_rectangle(model: Model, own: Rectangle) -> Model:
         return e if own.full else e.on(slice(None), own.cells)
 
     return predict
-
-
-def _restricted(model: Model, allowed: Mask) -> Model:
-    """Return the model with some of the inputs (bool ``[inputs]``) as its only predictors."""
-    return lambda features, predictors: model(features, predictors & allowed)
 
 
 def _known(frames: NDArray[np.float64], last: NDArray[np.float64]) -> NDArray[np.float64]:

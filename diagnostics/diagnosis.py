@@ -218,10 +218,8 @@ class SelfDiagnosis:
         stream = stream.complete()
         if not stream.received.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
-        aliased = find_aliasing(stream)
+        aliases, copies = find_aliasing(stream)
         yield
-        copies = np.zeros(self.layout.n_cells, bool)
-        copies[[cell for aliasing in aliased for cell in (*aliasing.cells, *aliasing.doubtful)]] = True
         explained, still = copies, list[StaticLoad]()
         spatial, found = yield from self._tested(stream, explained)
         for beside in (False, True):
@@ -247,7 +245,7 @@ class SelfDiagnosis:
         yield
         every = np.arange(self.layout.n_cells) if self._order is None else np.argsort(self._order)
         found = found.of(every)
-        causes, possible = root_causes(found, aliased, self.layout)
+        causes, possible = root_causes(found, aliases, self.layout)
         probability, inferred = found.probability.copy(), np.zeros(self.layout.n_cells, bool)
         if self._order is not None:
             still = [load.of(self._order, self.layout) for load in still]

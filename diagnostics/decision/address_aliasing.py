@@ -8,15 +8,16 @@ under the healthy model; below 3 both levels are reported. Lines that nothing lo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.model import MIN_P_FLOOR
 from diagnostics.healthy.prediction import OUTLIERS, log_student_t
-from diagnostics.layout import Line, LineKind, address_bits
+from diagnostics.layout import Line, address_bits
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, SUSPICIOUS
 
 if TYPE_CHECKING:
@@ -24,105 +25,91 @@ if TYPE_CHECKING:
     from diagnostics.evidence.stream_state import StreamState
     from diagnostics.healthy.prediction import Prediction
 
-
-@dataclass(frozen=True)
-class Aliasing:
-    """Lines that read the same.
-
-    Attributes:
-        line: the address bit, or the first of two lines.
-        value: the level of the bit, or the index of the other line.
-        cells: indices of the cells that are misread.
-        onset: number of the first frame; 0: from the start.
-        coincidences: number of moving loads on which the lines agreed.
-        copies: pairs (line, line that is read instead; -1: none is connected).
-        alternatives: other causes that the data permit.
-        doubtful: indices of the cells that may be the misread ones instead.
-    """
-
-    line: Line
-    value: int
-    cells: tuple[int, ...]
-    onset: int
-    coincidences: int
-    copies: tuple[tuple[int, int], ...]
-    alternatives: tuple[str, ...]
-    doubtful: tuple[int, ...] = ()
+Cells = NDArray[np.intp]
 
 
-def find_aliasing(stream: StreamState) -> tuple[Aliasing, ...]:
-    """Return the causes of all lines that read the same."""
+def find_aliasing(stream: StreamState) -> tuple[list[Fault], NDArray[np.bool_]]:
+    """Return the causes of all lines that read the same, and the cells that are or may be misread, bool ``[D]``."""
     pairs = stream.duplicates.duplicate_pairs(stream.reference.duplicates)
-    found: list[Aliasing] = []
-    for pad, kind in sorted({(pair.pad, pair.kind) for pair in pairs}):
-        found += _on_pad([pair for pair in pairs if (pair.pad, pair.kind) == (pad, kind)], stream)
-    return tuple(found)
+    faults, misread = list[Fault](), np.zeros(stream.layout.n_cells, bool)
+    for of in sorted({(pair.pad, pair.kind) for pair in pairs}):
+        for fault, cells in _on_pad([pair for pair in pairs if (pair.pad, pair.kind) == of], stream):
+            faults.append(fault)
+            misread[cells] = True
+    return faults, misread
 
 
-def _on_pad(pairs: list[DuplicatePair], stream: StreamState) -> list[Aliasing]:
+def _on_pad(pairs: list[DuplicatePair], stream: StreamState) -> Iterator[tuple[Fault, Cells]]:
+    """Yield the causes of pairs of rows, or of columns, of one pad, each with the cells that it may misread."""
     layout, pad, kind = stream.layout, pairs[0].pad, pairs[0].kind
     count = layout.rows if kind == "row" else layout.cols
-    found = []
-    remaining = list(pairs)
     for bit in range(address_bits(count)):
-        by_bit = [pair for pair in remaining if pair.second - pair.first == 1 << bit and not pair.first & 1 << bit]
+        joined = [(i, i | 1 << bit) for i in range(count) if not i & 1 << bit and (i | 1 << bit) < count]
+        by_bit = [pair for pair in pairs if (pair.first, pair.second) in joined]
         if not by_bit:
             continue
-        others = [(i, i | 1 << bit) for i in range(count) if not i & 1 << bit and (i | 1 << bit) < count]
-        differ_since = [stream.duplicates.apart_since(pad, kind, a, b) for a, b in others]
+        onset = max(stream.duplicates.apart_since(pad, kind, first, second) for first, second in joined)
         # The bit was stuck when the first pair agreed, so no other pair of this bit may differ after that.
-        refuted = max(differ_since) > min(pair.seen_by for pair in by_bit)
+        refuted = onset > min(pair.seen_by for pair in by_bit)
         # A single pair of neighbours is rather bridged: bit 0 would join all of them.
-        if refuted or (len(by_bit) == 1 and bit == 0 and len(others) > 1):
+        if refuted or (len(by_bit) == 1 and bit == 0 and len(joined) > 1):
             continue
-        remaining = [pair for pair in remaining if pair not in by_bit]
-        found.append(_stuck_bit(Line(pad, _address(kind), bit), by_bit, max(differ_since), stream))
-    for pair in remaining:
-        line = Line(pad, kind, pair.first)
-        other = Line(pad, kind, pair.second)
+        pairs = [pair for pair in pairs if pair not in by_bit]
+        yield _stuck_bit(Line(pad, "row_address" if kind == "row" else "column_address", bit), by_bit, onset, stream)
+    for pair in pairs:
+        line, other = Line(pad, kind, pair.first), Line(pad, kind, pair.second)
         cells = np.concatenate([layout.cells_on(line), layout.cells_on(other)])
+        text = f"{line} and {kind} {other.index} are bridged: both always read the same"
+        check = f"the solder and the flex cable between {kind}s {line.index} and {other.index}"
         also = (f"{line} reads {other}, or the other way round: an address fault of this one line",)
-        found.append(
-            Aliasing(
-                line,
-                pair.second,
-                tuple(cells.tolist()),
-                pair.since,
-                pair.coincidences,
-                ((pair.first, pair.second),),
-                also,
-            )
-        )
-    return found
+        yield _fault(line, other.index, cells, pair.since, pair.coincidences, text, check, also, layout.rate), cells
 
 
-def _address(kind: LineKind) -> LineKind:
-    return "row_address" if kind == "row" else "column_address"
-
-
-def _stuck_bit(line: Line, pairs: list[DuplicatePair], onset: int, stream: StreamState) -> Aliasing:
+def _stuck_bit(line: Line, pairs: list[DuplicatePair], onset: int, stream: StreamState) -> tuple[Fault, Cells]:
+    """Return the fault of an address bit, and the cells that it may misread: at either level if that is in doubt."""
     layout = stream.layout
     ratio = _level_ratio(line, onset, stream)
     level = int(ratio > 0)
     cells, sources = layout.misaddressed(line, level)
-    across = 1 if line.kind == "row_address" else 2
-    copies: dict[int, int] = {}
+    across, name = (1, "row") if line.kind == "row_address" else (2, "column")
+    copies: dict[int, int] = {}  # line that is read instead, by line; -1: none is connected
     for cell, source in zip(cells.tolist(), sources.tolist(), strict=True):
         read = layout.position(source)[across] if source >= 0 else -1
         moved = layout.position(cell)[across]
-        copies[moved] = max(
-            read, copies.get(moved, -1)
-        )  # a position without a cell reads nothing, its line is read still
+        # A position without a cell reads nothing, its line is read still.
+        copies[moved] = max(read, copies.get(moved, -1))
+    reads = ", ".join(f"{name} {i} reads {f'{name} {j}' if j >= 0 else 'nothing'}" for i, j in sorted(copies.items()))
     clear = abs(ratio) >= SUSPICIOUS
-    return Aliasing(
-        line,
-        level,
+    also = () if clear else (f"{line} is stuck at {1 - level}",)
+    misread = cells if clear else np.union1d(cells, layout.misaddressed(line, 1 - level)[0])
+    coincidences = sum(pair.coincidences for pair in pairs)
+    text, check = f"{line} is stuck at {level}: {reads}", f"the {name} multiplexer and its address wires"
+    return _fault(line, level, cells, onset, coincidences, text, check, also, layout.rate), misread
+
+
+def _fault(
+    line: Line,
+    value: int,
+    cells: Cells,
+    onset: int,
+    coincidences: int,
+    text: str,
+    check: str,
+    alternatives: tuple[str, ...],
+    rate: float,
+) -> Fault:
+    """Return the fault with its reason: ``text``, since when, how often the lines agreed, and what to ``check``."""
+    since = "" if onset == 0 else f" from frame {onset} on ({onset / rate:.1f} s)"
+    return Fault(
+        FaultKind.ALIAS,
         tuple(cells.tolist()),
-        onset,
-        sum(pair.coincidences for pair in pairs),
-        tuple(sorted(copies.items())),
-        () if clear else (f"{line} is stuck at {1 - level}",),
-        () if clear else tuple(layout.misaddressed(line, 1 - level)[0].tolist()),
+        line=line,
+        value=value,
+        onset=onset or None,
+        probability=1.0 - 0.5 ** min(coincidences, 30),
+        reason=f"{text}{since}; they agreed on {coincidences} moving loads; check {check}",
+        evidence=coincidences,
+        alternatives=alternatives,
     )
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +20,6 @@ from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import Line, LineKind, SensorLayout
 from diagnostics.preprocessing.levels import ANYWHERE, SLIGHT, SUSPICIOUS
 from diagnostics.wiring import action, counted
-
-if TYPE_CHECKING:
-    from diagnostics.decision.address_aliasing import Aliasing
-
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -74,21 +69,22 @@ class CellFindings:
 
 
 def root_causes(
-    found: CellFindings, aliasings: Sequence[Aliasing], layout: SensorLayout
+    found: CellFindings, aliases: Sequence[Fault], layout: SensorLayout
 ) -> tuple[tuple[Fault, ...], tuple[Fault, ...]]:
-    """Return the root causes of the faulty cells, one fault each, the one with most cells first; and possible wires."""
+    """Return the root causes of the faulty cells, one fault each, the one with most cells first; and possible wires.
+
+    The cells of ``aliases``, the faults of lines that read the same, have no other cause.
+    """
     aliased = np.zeros(layout.n_cells, bool)
-    for aliasing in aliasings:
-        aliased[list(aliasing.cells)] = True
-    faults = [_aliased(aliasing, layout) for aliasing in aliasings]
+    aliased[[cell for fault in aliases for cell in fault.cells]] = True
     causes = _causes(found, aliased, layout, 0.0)
     singles = sum(cause.line is None for _, _, cause in causes)
     if 0 < singles < sum(cause.proven for _, _, cause in causes):
         # With many single faults, some are neighbours on a wire by chance: solve again with a higher prevalence.
         common = (1 - ANYWHERE) / 2 * singles / int((found.alive | found.faulty).sum())
         causes = _causes(found, aliased, layout, common)
-    faults += [_fault(kind, value, cause, found, layout) for kind, value, cause in causes if cause.proven]
-    faults = _addresses_of_dead_rows(faults, found, layout)
+    proven = [_fault(kind, value, cause, found, layout) for kind, value, cause in causes if cause.proven]
+    faults = _addresses_of_dead_rows([*aliases, *proven], found, layout)
     possible = [_fault(kind, value, cause, found, layout) for kind, value, cause in causes if not cause.proven]
     return tuple(sorted(faults, key=lambda fault: (-len(fault.cells), fault.cells))), tuple(possible)
 
@@ -178,31 +174,6 @@ def _fault(kind: FaultKind, value: float | None, cause: Cause, found: CellFindin
     if cause.proven and cause.line is not None and cause.line.kind in ("row", "column"):
         fault = replace(fault, alternatives=_alternatives(fault, cause, found, layout))
     return fault
-
-
-def _aliased(a: Aliasing, layout: SensorLayout) -> Fault:
-    across = "row" if a.line.kind in ("row", "row_address") else "column"
-    if a.line.kind in ("row", "column"):
-        other = Line(a.line.pad, a.line.kind, a.value)
-        text = f"{a.line} and {across} {a.value} are bridged: both always read the same"
-        check = f"the solder and the flex cable between {across}s {a.line.index} and {other.index}"
-    else:
-        copies = ", ".join(f"{across} {i} reads {f'{across} {j}' if j >= 0 else 'nothing'}" for i, j in a.copies)
-        text = f"{a.line} is stuck at {a.value}: {copies}"
-        check = f"the {across} multiplexer and its address wires"
-    since = "" if a.onset == 0 else f" from frame {a.onset} on ({a.onset / layout.rate:.1f} s)"
-    reason = f"{text}{since}; they agreed on {a.coincidences} moving loads; check {check}"
-    return Fault(
-        FaultKind.ALIAS,
-        a.cells,
-        line=a.line,
-        value=a.value,
-        onset=a.onset or None,
-        probability=1.0 - 0.5 ** min(a.coincidences, 30),
-        reason=reason,
-        evidence=a.coincidences,
-        alternatives=a.alternatives,
-    )
 
 
 _DOING = {

@@ -18,8 +18,7 @@ broken as a whole. Of those that explain the same cells the innermost is named.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,18 +89,13 @@ def solve(
         layout: the array.
         common: lower limit of the prevalence of single faults of one kind.
     """
-    if consistent.sum() < 2:  # too few for a wire
-        return tuple(Cause(None, (cell,), (cell,), 1.0) for cell in np.flatnonzero(faulty).tolist())
     causes: list[Cause] = []
-    if not layout.is_matrix:  # a group may extend over several pads
-        return tuple(_explain_pad(faulty, consistent, contradicting, weight, layout, common))
-    pads = layout.grid(consistent).any(axis=(1, 2))
-    for pad in np.flatnonzero(pads).tolist():
-        own = _one_pad(layout.rows, layout.cols, layout.present[pad].tobytes())
-        first = pad * own.n_cells
-        on = slice(first, first + own.n_cells)
-        of_pad = _explain_pad(faulty[on], consistent[on], contradicting[on], weight[on], own, common)
-        causes += [_moved(cause, pad, first) for cause in of_pad]
+    # Pads are independent of each other; a group may extend over several.
+    part = layout.pad_of if layout.is_matrix else np.zeros(layout.n_cells, np.intp)
+    for i in np.unique(part[consistent]).tolist():
+        on = layout.present.ravel() & (part == i)
+        lines = [line for line in layout.lines if line.pad == i or not layout.is_matrix]
+        causes += _explain(faulty & on, consistent & on, contradicting & on, weight, layout, lines, common)
     return tuple(causes)
 
 
@@ -117,17 +111,14 @@ def candidate_groups(
         weight: float ``[D]``, an upper estimate of the log likelihood ratio.
         layout: the array.
     """
-    supporting, groups = consistent & (weight >= SUSPICIOUS), []
-    pads = set(np.flatnonzero(layout.grid(supporting).sum(axis=(1, 2)) >= _MIN_SUPPORT).tolist())
-    enough = bool(pads) if layout.is_matrix else supporting.sum() >= _MIN_SUPPORT
-    for line in layout.lines if enough else ():
-        if line.pad in pads or not layout.is_matrix:
-            groups += [
-                cells[consistent[cells]]
-                for cells in _silenced(line, contradicting, layout)
-                if supporting[cells].sum() >= _MIN_SUPPORT
-            ]
-    return groups
+    supporting = consistent & (weight >= SUSPICIOUS)
+    return [
+        cells[consistent[cells]]
+        for line in layout.lines
+        if supporting[layout.cells_on(line)].sum() >= _MIN_SUPPORT
+        for cells in _silenced(line, contradicting, layout)
+        if supporting[cells].sum() >= _MIN_SUPPORT
+    ]
 
 
 def _silenced(line: Line, contradicting: Mask, layout: SensorLayout) -> Sequence[NDArray[np.intp]]:
@@ -150,40 +141,27 @@ def _ends(line: Line, cells: NDArray[np.intp], contradicting: Mask) -> tuple[NDA
     return cells[alive[-1] + 1 :], cells[: alive[0]][::-1]
 
 
-@lru_cache(maxsize=64)
-def _one_pad(rows: int, cols: int, present: bytes) -> SensorLayout:
-    """Return one pad as an array of its own; pads of the same shape share it."""
-    return SensorLayout(1, rows, cols, present=np.frombuffer(present, bool))
-
-
-def _moved(cause: Cause, pad: int, first: int) -> Cause:
-    """Return a cause found on a single pad as one on ``pad``, whose first cell is ``first``."""
-    cells, seen = (tuple(first + cell for cell in those) for those in (cause.cells, cause.seen))
-    line = None if cause.line is None else replace(cause.line, pad=pad)
-    return replace(cause, line=line, cells=cells, seen=seen)
-
-
-def _explain_pad(
+def _explain(
     faulty: NDArray[np.bool_],
     consistent: NDArray[np.bool_],
     contradicting: NDArray[np.bool_],
     weight: NDArray[np.float64],
     layout: SensorLayout,
+    lines: Sequence[Line],
     common: float,
 ) -> list[Cause]:
+    """Return the causes of cells served by ``lines``; see :func:`solve`."""
     weight = np.where(consistent, weight, 0.0)
     supporting = consistent & (faulty | (weight >= SUSPICIOUS))
     tested_cells = consistent & (faulty | (weight > TESTED))
     candidates = []
-    lines = layout.lines if supporting.sum() >= 2 else ()
-    for line in lines:
+    for line in lines if supporting.sum() >= _MIN_SUPPORT else ():
         if line.kind in _WIRES:
             candidates += _candidates(line, layout.cells_on(line), contradicting, supporting, faulty)
     if not layout.is_matrix:  # of groups that explain the same cells, the innermost: it comes first
         candidates = list({tuple(c.cells[supporting[c.cells]].tolist()): c for c in candidates[::-1]}.values())
-    present = layout.present.ravel()
-    found = np.flatnonzero(faulty & present)
-    tested = int((contradicting & present).sum()) + len(found)
+    found = np.flatnonzero(faulty)
+    tested = int(contradicting.sum()) + len(found)
     chosen_wires: list[_Candidate] = []
     discount = _discount(candidates, tested_cells & ~faulty)
     support, cell_cost = weight, float(_LINE_COST)
@@ -212,7 +190,7 @@ def _explain_pad(
         explained[list(causes[-1].cells)] = True
     causes += [Cause(None, (cell,), (cell,), 1.0) for cell in found.tolist() if not explained[cell]]
     left, support = faulty & ~explained, np.where(explained, 0.0, support)
-    more = _cheapest(candidates, np.flatnonzero(left & present), left, support, cell_cost, 0.0)
+    more = _cheapest(candidates, np.flatnonzero(left), left, support, cell_cost, 0.0)
     return causes + [cause(c, _gain(c, left, support, cell_cost), False) for c in more]
 
 
@@ -304,14 +282,12 @@ def cheapest_of_many(cost: NDArray[np.float64], covers: NDArray[np.bool_], saves
 
     n, cells = covers.shape
     wires = sparse.csr_array(covers.T.astype(float))
-    which, cell = sparse.csr_array(covers.astype(float)).nonzero()
-    of_wire = sparse.csr_array((np.ones(len(which)), (np.arange(len(which)), which)), (len(which), n))
-    of_cell = sparse.csr_array((np.ones(len(cell)), (np.arange(len(cell)), cell)), (len(cell), cells))
+    which, cell = np.nonzero(covers)
+    of_wire, of_cell = sparse.eye_array(n, format="csr")[which], sparse.eye_array(cells, format="csr")[cell]
     # A cell is covered if and only if a wire through it is chosen.
     only_if = LinearConstraint(sparse.hstack([wires, -sparse.eye_array(cells)]), lb=0)
     if_ = LinearConstraint(sparse.hstack([-of_wire, of_cell]), lb=0)
     objective = np.concatenate([cost, -saves])
-    integral = np.ones(len(objective), dtype=int)
-    solution = milp(objective, constraints=[only_if, if_], integrality=integral, bounds=Bounds(0, 1))
+    solution = milp(objective, constraints=[only_if, if_], integrality=np.ones(n + cells), bounds=Bounds(0, 1))
     chosen: Mask = np.asarray(solution.x)[:n] > 0.5  # feasible by construction: no wire at all is a solution
     return chosen

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence, Sized
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -69,43 +70,35 @@ def coverage(
 
 
 def _advice(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple[str, ...]:
-    """Return one sentence per connected region of untested cells, the largest first."""
-    from scipy import ndimage
-
-    regions: list[tuple[int, str]] = []
-    if not layout.is_matrix:
-        return _advice_by_group(untested, layout)
-    region_of = layout.connected(untested)
-    sizes = np.bincount(region_of).tolist()
-    for i, (pad, rows, cols) in enumerate(ndimage.find_objects(layout.grid(region_of)), start=1):
-        where = f"pad {pad.start}, {_span('row', rows)}, {_span('column', cols)}"
-        regions.append((sizes[i], f"press {where} ({sizes[i]} {'cell' if sizes[i] == 1 else 'cells'} untested)"))
-    return tuple(text for _, text in sorted(regions, key=lambda region: -region[0]))
+    """Return one sentence per connected region of untested cells, or per group or pad, the largest first."""
+    if layout.is_matrix:
+        region_of = layout.connected(untested)
+        regions = np.split(np.argsort(region_of, kind="stable"), np.cumsum(np.bincount(region_of)))[1:-1]
+        found = [(len(cells), f"{where(cells, layout)} ({len(cells)} {_cells(cells)} untested)") for cells in regions]
+    else:
+        groups: dict[str, list[str]] = {}
+        for cell in np.flatnonzero(untested).tolist():
+            groups.setdefault(layout.place(cell).rpartition(", ")[0], []).append(str(cell))
+        found = [(len(of), f"{group}, {_cells(of)} {_listed(of)} ({len(of)} untested)") for group, of in groups.items()]
+    return tuple(f"press {text}" for _, text in sorted(found, key=lambda region: -region[0]))
 
 
 def where(cells: NDArray[np.intp], layout: SensorLayout) -> str:
     """Return the place of neighbouring cells of one pad in words: the rows and columns around them, or their names."""
     if not layout.is_matrix:
-        named = [layout.place(cell) for cell in cells.tolist()]
-        return ", ".join(named[:_NAMED]) + ", ..." * (len(named) > _NAMED)
-    pad, row, col = np.array([layout.position(cell) for cell in cells.tolist()]).T
-    rows, cols = (slice(int(at.min()), int(at.max()) + 1) for at in (row, col))
-    return f"pad {pad[0]}, {_span('row', rows)}, {_span('column', cols)}"
+        return _listed([layout.place(cell) for cell in cells.tolist()])
+    pad, row, col = np.unravel_index(cells, layout.shape)
+    return f"pad {pad[0]}, {_span('row', row)}, {_span('column', col)}"
 
 
-def _advice_by_group(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple[str, ...]:
-    """Return one sentence per group, or pad, with untested cells, the one with most first."""
-    cells: dict[str, list[int]] = {}
-    for cell in np.flatnonzero(untested).tolist():
-        cells.setdefault(layout.place(cell).rpartition(", ")[0], []).append(cell)
-    named = {
-        where: ", ".join(map(str, some[:_NAMED])) + ", ..." * (len(some) > _NAMED) for where, some in cells.items()
-    }
-    return tuple(
-        f"press {where}, {'cell' if len(cells[where]) == 1 else 'cells'} {named[where]} ({len(cells[where])} untested)"
-        for where in sorted(cells, key=lambda where: -len(cells[where]))
-    )
+def _cells(cells: Sized) -> str:
+    return "cell" if len(cells) == 1 else "cells"
 
 
-def _span(name: str, span: slice) -> str:
-    return f"{name} {span.start}" if span.stop - span.start == 1 else f"{name}s {span.start}-{span.stop - 1}"
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:_NAMED]) + ", ..." * (len(names) > _NAMED)
+
+
+def _span(name: str, at: NDArray[np.intp]) -> str:
+    first, last = at.min(), at.max()
+    return f"{name} {first}" if first == last else f"{name}s {first}-{last}"

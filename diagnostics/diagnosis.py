@@ -30,8 +30,10 @@ from diagnostics.preprocessing.readings import RecordingBlocks
 SCHEMA = "adaptfault.diagnoser/10"
 
 _CERTAIN = 1 - RARE  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
-_GROUP_SHARE = 0.5  # share of the evidence added with a group excluded, see _weight_of_groups
+_GROUP_SHARE = 0.5  # share of the evidence added with a group excluded, see SelfDiagnosis.steps
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
+
+LogRatio = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class SelfDiagnosis:
         self.layout = layout
         self.load_ = LoadDirection.declared(layout)
         self._planes, self._order = axis_planes(layout)
+        self._place = np.argsort(self._order)  # of each cell among the planes
         self.false_discovery_rate = false_discovery_rate
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
@@ -115,7 +118,7 @@ class SelfDiagnosis:
         progress(0.0)
         healthy = _recordings(recordings, self.layout).valid(self.layout.full_scale).whole(self.layout.present.ravel())
         layout = self._planes
-        if self._order is not None:
+        if self.layout.axes > 1:
             healthy = RecordingBlocks([given[:, self._order] for given in healthy.given])
         self.load_ = LoadDirection.fit(healthy, layout)
         if self.load_ is not None:
@@ -151,7 +154,7 @@ class SelfDiagnosis:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
         log = _recordings(recordings, self.layout).valid(self.layout.full_scale)
-        if self.reference_ is None or self._order is not None:
+        if self.reference_ is None or self.layout.axes > 1:
             return None
         if self.load_ is not None:
             if self.load_.direction == "middle":
@@ -197,7 +200,8 @@ class SelfDiagnosis:
         """Return the state before any frame. Only tiles with a ``needed`` cell (bool ``[D]``; None: all) are scored."""
         reference = self.reference_ or Reference.unknown(self._planes)
         exclusion = self.calibrator_.exclusion if reference.model else Exclusion()
-        return StreamState(self._planes, reference, exclusion, needed, self.load_, self._order)
+        order = self._order if self.layout.axes > 1 else None
+        return StreamState(self._planes, reference, exclusion, needed, self.load_, order)
 
     def evaluate(self, stream: StreamState, *, n_recordings: int = 1) -> Diagnosis:
         """Return the diagnosis of the log behind ``stream``.
@@ -220,8 +224,8 @@ class SelfDiagnosis:
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
         aliases, copies = find_aliasing(stream)
         yield
-        explained, still = copies, list[StaticLoad]()
-        spatial, found = yield from self._tested(stream, explained)
+        explained, still, log_ratio = copies, list[StaticLoad](), self._log_ratio(stream)
+        spatial, found = yield from self._tested(stream, explained, log_ratio)
         for beside in (False, True):
             while True:
                 faulty = found.probability >= _DOUBTED if beside else found.faulty
@@ -231,24 +235,27 @@ class SelfDiagnosis:
                 if (others == explained).all():
                     break
                 yield
-                tested = yield from self._tested(stream, others)
+                tested = yield from self._tested(stream, others, log_ratio)
                 if tested[1].probability.sum() >= found.probability.sum():  # it explains nothing
                     break
                 still, explained, (spatial, found) = loads, others, tested
-        weight = found.weight.copy()
-        weight_of = self._weight_of_groups(found, stream)
-        for group in self._groups(found, stream, weight_of(spatial.initial), explained):
+        alone, weight = found.weight, found.weight.copy()
+
+        def together(surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
+            # By the chain rule of probability each cell of a group is conditioned on those before it: on half of them,
+            # about the mean of conditioning on all and on none.
+            return alone + _GROUP_SHARE * np.maximum(log_ratio(surprisal, surprisal) - alone, 0.0)
+
+        for group in self._groups(found, stream, together(spatial.initial), explained):
             yield
-            of_group = weight_of(stream.group_excluded(spatial, explained, group))
-            weight[group] = np.maximum(weight[group], of_group[group])
+            of_group = together(stream.group_excluded(spatial, explained, group))[group]
+            weight[group] = np.maximum(weight[group], of_group)
         found = replace(found, weight=weight)
         yield
-        every = np.arange(self.layout.n_cells) if self._order is None else np.argsort(self._order)
-        found = found.of(every)
+        found = found.of(self._place)
         causes, possible = root_causes(found, aliases, self.layout)
         probability, inferred = found.probability.copy(), np.zeros(self.layout.n_cells, bool)
-        if self._order is not None:
-            still = [load.of(self._order, self.layout) for load in still]
+        still = [load.of(self._order, self.layout) for load in still]
         for load in still:
             probability[list(load.cells)] = 1 - load.probability
         for fault in causes:
@@ -258,22 +265,21 @@ class SelfDiagnosis:
         scale, intermittency = stream.scale, stream.intermittency
         working = np.empty_like(inferred)
         moved = bool((stream.runs.moved & stream.present).any())
-        working[every] = ~inferred & (found.alive if moved else self.layout.present.ravel())
+        working[self._place] = ~inferred & (found.alive if moved else self.layout.present.ravel())
         # Where cells moved, loads of a frozen frame come or go: other cells have another offset.
         rest = np.maximum(scale.baseline, stream.lowest) if moved else scale.baseline
+        evidence = {
+            "spatial": spatial.evidence + spatial.offset + spatial.gain,
+            "temporal": np.where(spatial.scored, stream.temporal(), intermittency.blinking + intermittency.noisy),
+            "events": spatial.events.astype(np.float64),
+        }
         return Diagnosis(
             layout=self.layout,
             faults=causes,
             probability=probability,
-            tested=(found.alive & stream.touched[every]) | inferred,  # noise alone is no test
+            tested=(found.alive & stream.touched[self._place]) | inferred,  # noise alone is no test
             transport=stream.transport.faults(rest + scale.near, working, self.layout.rate, moved),
-            evidence={
-                "spatial": (spatial.evidence + spatial.offset + spatial.gain)[every],
-                "temporal": np.where(spatial.scored, stream.temporal(), intermittency.blinking + intermittency.noisy)[
-                    every
-                ],
-                "events": spatial.events.astype(np.float64)[every],
-            },
+            evidence={name: values[self._place] for name, values in evidence.items()},
             n_frames=stream.transport.seen,
             n_recordings=n_recordings,
             possible=possible,
@@ -281,7 +287,7 @@ class SelfDiagnosis:
         )
 
     def _tested(
-        self, stream: StreamState, explained: NDArray[np.bool_]
+        self, stream: StreamState, explained: NDArray[np.bool_], log_ratio: LogRatio
     ) -> Generator[None, None, tuple[Spatial, CellFindings]]:
         """Yield between steps of the spatial test without ``explained`` cells (bool ``[D]``); return its findings."""
         test = stream.spatial(explained)
@@ -290,7 +296,7 @@ class SelfDiagnosis:
             yield
         spatial = test.finish()
         yield
-        return spatial, self._found(stream, spatial, explained)
+        return spatial, self._found(stream, spatial, explained, log_ratio)
 
     def _diagnosed(self, log: RecordingBlocks, needed: NDArray[np.bool_] | None = None) -> Diagnosis:
         stream = self.stream(needed)
@@ -307,15 +313,15 @@ class SelfDiagnosis:
         cold.reference_ = Reference.unknown(layout, rest)
         return cold._diagnosed(log, needed)
 
-    def _found(self, stream: StreamState, spatial: Spatial, explained: NDArray[np.bool_]) -> CellFindings:
+    def _found(
+        self, stream: StreamState, spatial: Spatial, explained: NDArray[np.bool_], log_ratio: LogRatio
+    ) -> CellFindings:
         """Return the findings about each cell; ``explained`` cells (bool ``[D]``) are left out."""
         reference, runs, intermittency = stream.reference, stream.runs, stream.intermittency
         present, silent = stream.present, stream.silent & ~explained
-        temporal, kind = stream.temporal(), kinds(stream)
         known = spatial.scored & ~runs.moved & (reference.dead > 0)
-        tested = _events_tell(stream, spatial.surprisal)
-        log_ratio = self.calibrator_.calibrate(spatial.evidence, temporal, kind, tested)
-        stuck = self.calibrator_.probability(log_ratio, kind, spatial.scored & ~known)
+        odds = log_ratio(spatial.evidence, spatial.surprisal)
+        stuck = self.calibrator_.probability(odds, kinds(stream), spatial.scored & ~known)
         stuck[known] = reference.dead[known]
         delivers = present & ~explained & ~silent
         intermittent, noisy = intermittency.intermittent & delivers, intermittency.excess & delivers
@@ -347,29 +353,18 @@ class SelfDiagnosis:
             ),
             probability=probability,
             # A cell at rest supports a broken line by the events alone, without the prior of its value.
-            weight=np.where(
-                known, CERTAIN_RATIO, self.calibrator_.calibrate(spatial.surprisal, temporal, kind, tested)
-            ),
+            weight=np.where(known, CERTAIN_RATIO, log_ratio(spatial.surprisal, spatial.surprisal)),
             events=np.where(intermittent, intermittency.blinks, spatial.events),
             known=known,
         )
 
-    def _weight_of_groups(
-        self, found: CellFindings, stream: StreamState
-    ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-        """Return the function from a summed surprisal with a group excluded to the weights ``[D]`` for the line cover.
+    def _log_ratio(self, stream: StreamState) -> LogRatio:
+        """Return the function from evidence and summed surprisal to the calibrated log likelihood ratio, ``[D]`` each.
 
-        By the chain rule of probability each cell of a group is conditioned on those before it: on half of them, about
-        the mean of conditioning on all and on none.
+        The events tell something of cells with a surprisal, and with a reference of all.
         """
-        temporal, kind = stream.temporal(), kinds(stream)
-
-        def weight_of(surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
-            tested = _events_tell(stream, surprisal)
-            more = self.calibrator_.calibrate(surprisal, temporal, kind, tested) - found.weight
-            return found.weight + _GROUP_SHARE * np.maximum(more, 0.0)
-
-        return weight_of
+        temporal, kind, known = stream.temporal(), kinds(stream), stream.reference.model is not None
+        return lambda evidence, surprisal: self.calibrator_.calibrate(evidence, temporal, kind, (surprisal > 0) | known)
 
     def _groups(
         self, found: CellFindings, stream: StreamState, weight: NDArray[np.float64], explained: NDArray[np.bool_]
@@ -379,28 +374,24 @@ class SelfDiagnosis:
             return []
         consistent = found.rests & ~found.known & ~explained
         contradicting = found.alive | ~(found.rests | found.silent) & stream.present
-        if self._order is None:
-            return candidate_groups(consistent, contradicting, weight, self.layout)
-        every = np.argsort(self._order)
-        groups = candidate_groups(consistent[every], contradicting[every], weight[every], self.layout)
-        return [every[group] for group in groups]
+        place = self._place
+        groups = candidate_groups(consistent[place], contradicting[place], weight[place], self.layout)
+        return [place[group] for group in groups]
 
 
-def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp] | None]:
+def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:
     """Return the array in which each axis of a pad is a pad of its own, and which cell each of its cells is.
 
-    The neighbours of a cell are then cells of the same axis. With one axis: the layout itself, and None.
+    The neighbours of a cell are then cells of the same axis. With one axis: the layout itself.
     """
-    if layout.axes == 1:
-        return layout, None
     cells = np.arange(layout.n_cells).reshape(layout.pads, layout.rows, layout.cols, layout.axes)
     order = np.moveaxis(cells, 3, 1).ravel()
-    planes = SensorLayout(
-        layout.pads * layout.axes, layout.rows, layout.cols, full_scale=layout.full_scale, unit=layout.unit,
-        rate=layout.rate, present=layout.present.ravel()[order], wiring="bus",
-        rest="middle" if layout.rest == "learn" else layout.rest,
-    )  # fmt: skip
-    return planes, order
+    if layout.axes == 1:
+        return layout, order
+    rest = "middle" if layout.rest == "learn" else layout.rest
+    present = layout.present.ravel()[order]
+    pads = layout.pads * layout.axes
+    return replace(layout, pads=pads, axes=1, present=present, wiring="bus", groups=None, rest=rest), order
 
 
 def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> RecordingBlocks:
@@ -418,8 +409,3 @@ def _checked(recording: ArrayLike, name: str, layout: SensorLayout) -> NDArray[A
     if given.dtype.kind in "fiu" and given.shape[1:] in (layout.shape, (layout.n_cells,)):
         return given.reshape(len(given), layout.n_cells)
     return layout.check_recording(recording, name)
-
-
-def _events_tell(stream: StreamState, surprisal: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return of which cells the events tell anything, bool ``[D]``: with a reference of all."""
-    return np.asarray((surprisal > 0) | (stream.reference.model is not None))

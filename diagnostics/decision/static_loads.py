@@ -109,17 +109,16 @@ def find_static_loads(
     """
     if stream.reference.model is None or not faulty.any():
         return list(known)
-    held = _HeldLoads.of(stream, spatial, excluded)
-    had_other_gain = np.isfinite(spatial.factor) & (spatial.since < held.since)  # before the load
-    faulty = faulty & ~had_other_gain
-    blamed, loaded = faulty & (held.root > 0), _mask([cell for load in known for cell in load.cells], len(faulty))
+    held = _HeldLoads.of(stream, spatial, faulty, excluded)
+    blamed = held.faulty & (held.root > 0)
     broken = _on_broken_wires(blamed & spatial.scored, stream)
     broken |= stream.without_noise() & np.isfinite(held.values.high)  # an object takes noise away at full scale only
+    loaded = _mask([cell for load in known for cell in load.cells], len(faulty))
     holding = loaded | ((held.surprisal > -np.log(_RETURNS)) & (held.root > 0) & ~broken)
 
     def explains(cells: Mask) -> bool:
         near = stream.layout.with_neighbours(cells) if beside else cells
-        return bool((near & faulty).any())
+        return bool((near & held.faulty).any())
 
     group_of = stream.layout.connected(holding)
     groups = [group_of == i for i in range(1, group_of.max() + 1)]
@@ -127,9 +126,7 @@ def find_static_loads(
     found = [load for load in known if not any(group[list(load.cells)].any() for group in new)]
     if not new:
         return found
-    others = stream.present & ~stream.suspected(spatial) & ~faulty & ~excluded & (held.root == 0)
-    chain = _Chain(stream, held.root, held.values, others)
-    supported = chain.log_likely(np.flatnonzero(np.any(new, axis=0)))
+    supported = held.with_object(np.flatnonzero(np.any(new, axis=0)))
     for group in new:
         own = [load for load in known if group[list(load.cells)].any()]
         expected = np.log(_EXPECTED_OBJECTS / stream.present.sum())
@@ -137,7 +134,7 @@ def find_static_loads(
             expected = logit(min(*(load.probability for load in own), 1 - P_MIN))
         first = [cell for load in own for cell in load.cells]
         otherwise = held.without_object(blamed & ~group)
-        cells, odds = chain.most_likely(group, otherwise, supported, first, float(expected))
+        cells, odds = held.most_likely(group, otherwise, supported, first, float(expected))
         if own or (odds > PROVEN and len(cells) >= _FEWEST and explains(_mask(cells, len(faulty)))):
             found.append(StaticLoad.on(cells, float(expit(odds)), int(np.median(held.since[cells])), stream.layout))
     return found
@@ -149,23 +146,27 @@ class _HeldLoads:
 
     Attributes:
         stream: the log.
+        spatial: the result of the spatial test.
+        faulty: bool, cells that look faulty, except those with another gain before the load.
+        excluded: bool, cells that are explained otherwise.
         root: float, root load; 0: none.
         since: int, the frame since which it is held.
         surprisal: float, -log P(these readings | healthy, no object).
         values: the loads as values.
-        constant: bool, cells that do not move.
     """
 
     stream: StreamState
+    spatial: Spatial
+    faulty: Mask
+    excluded: Mask
     root: Floats
     since: Cells
     surprisal: Floats
     values: HeldValues
-    constant: Mask
 
     @classmethod
-    def of(cls, stream: StreamState, spatial: Spatial, excluded: Mask) -> _HeldLoads:
-        """Return the loads of a log; those of ``excluded`` cells (bool ``[D]``) do not count."""
+    def of(cls, stream: StreamState, spatial: Spatial, faulty: Mask, excluded: Mask) -> _HeldLoads:
+        """Return the loads of a log; the arguments are those of :func:`find_static_loads`."""
         scale, runs = stream.scale, stream.runs
         least, since, returns = stream.least_loads()
         value = np.minimum(np.nan_to_num(runs.value), scale.baseline + scale.full_scale)
@@ -177,11 +178,12 @@ class _HeldLoads:
         # A healthy cell that contacts load without a pause does not return to the same load.
         again = np.maximum(returns - 1, 0) * -np.log(_RETURNS)
         surprisal = np.maximum(spatial.surprisal + spatial.offset + np.maximum(spatial.gain, 0.0), again)
-        return cls(stream, root, since, surprisal, values, spatial.scored)
+        faulty = faulty & ~(np.isfinite(spatial.factor) & (spatial.since < since))
+        return cls(stream, spatial, faulty, excluded, root, since, surprisal, values)
 
     def without_object(self, blamed: Mask) -> Floats:
         """Return the log likelihood without an object, ``[D]``; ``blamed`` (bool ``[D]``) are the faults elsewhere."""
-        full, constant, present = np.isinf(self.values.high), self.constant, self.stream.present
+        full, constant, present = np.isinf(self.values.high), self.spatial.scored, self.stream.present
         anywhere = 4 * self.stream.reference.tolerance / self.stream.scale.full_scale
         alternatives = (
             (full, (1 - ANYWHERE) / 2, 1.0),
@@ -194,44 +196,8 @@ class _HeldLoads:
         log_likely: Floats = np.logaddexp(np.log(stuck), -self.surprisal)
         return log_likely
 
-
-def _mask(cells: Cells | Sequence[int], n: int) -> Mask:
-    on = np.zeros(n, bool)
-    on[list(cells)] = True
-    return on
-
-
-def _on_broken_wires(blamed: Mask, stream: StreamState) -> Mask:
-    """Return the ``blamed`` cells (bool ``[D]``) that read the same as most cells on one of their wires do."""
-    explained, value = np.zeros(len(blamed), bool), stream.runs.value
-    for line in stream.layout.lines:
-        cells = stream.layout.cells_on(line)
-        held = cells[blamed[cells]]
-        if len(held) > max(2, len(cells) / 2):
-            same = held[np.abs(value[held] - np.median(value[held])) <= stream.reference.tolerance / 2]
-            if len(same) > max(2, len(cells) / 2):
-                explained[same] = True
-    return explained
-
-
-@dataclass(frozen=True)
-class _Chain:
-    """The likelihood of an object, cell by cell.
-
-    Attributes:
-        stream: the log.
-        root: float ``[D]``, held root loads.
-        values: the same as values.
-        others: bool ``[D]``, cells that hold no load.
-    """
-
-    stream: StreamState
-    root: Floats
-    values: HeldValues
-    others: Mask
-
-    def log_likely(self, chosen: Sequence[int] | Cells) -> Floats:
-        """Return log P(value) of each cell, ``[D]``, with an object on it and the ``chosen`` cells."""
+    def with_object(self, chosen: Sequence[int] | Cells) -> Floats:
+        """Return the log likelihood of each load, ``[D]``, with an object on it and the ``chosen`` cells."""
         held = np.flatnonzero(self.root > 0)
         predictors = self.others | _mask(chosen, len(self.root))
         log_likely = np.zeros(len(self.root))
@@ -239,6 +205,13 @@ class _Chain:
         any_shape = np.where(np.isnan(of_model), 1.0, _ANY_SHAPE)
         log_likely[held] = np.log((1 - any_shape) * np.nan_to_num(of_model) + any_shape * _BESIDE * self.width[held])
         return log_likely
+
+    @cached_property
+    def others(self) -> Mask:
+        """Cells that hold no load and may be predictors, bool ``[D]``."""
+        doubtful = self.stream.suspected(self.spatial) | self.faulty | self.excluded
+        others: Mask = self.stream.present & ~doubtful & (self.root == 0)
+        return others
 
     @cached_property
     def width(self) -> Floats:
@@ -270,7 +243,7 @@ class _Chain:
         while len(chosen) < group.sum():
             on = _mask(chosen, len(group))
             beside = self.stream.layout.with_neighbours(on) & ~on & group
-            gain = np.where(beside, self.log_likely(chosen) - otherwise, -np.inf)
+            gain = np.where(beside, self.with_object(chosen) - otherwise, -np.inf)
             # As many again as are known: few predictions, and cells that join together do not support each other.
             more = np.argsort(-gain, kind="stable")[: min(len(chosen), int(beside.sum()))]
             if not len(more):
@@ -279,3 +252,22 @@ class _Chain:
             sums += (sums[-1] + np.cumsum(gain[more])).tolist()
         most = int(np.argmax(sums))
         return np.array(sorted(chosen[: known + most])), sums[most]
+
+
+def _mask(cells: Cells | Sequence[int], n: int) -> Mask:
+    on = np.zeros(n, bool)
+    on[list(cells)] = True
+    return on
+
+
+def _on_broken_wires(blamed: Mask, stream: StreamState) -> Mask:
+    """Return the ``blamed`` cells (bool ``[D]``) that read the same as most cells on one of their wires do."""
+    explained, value = np.zeros(len(blamed), bool), stream.runs.value
+    for line in stream.layout.lines:
+        cells = stream.layout.cells_on(line)
+        held = cells[blamed[cells]]
+        if len(held) > max(2, len(cells) / 2):
+            same = held[np.abs(value[held] - np.median(value[held])) <= stream.reference.tolerance / 2]
+            if len(same) > max(2, len(cells) / 2):
+                explained[same] = True
+    return explained

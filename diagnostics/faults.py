@@ -96,32 +96,20 @@ class Fault:
             ValueError: a field is missing, unknown or of a wrong kind.
         """
         try:
-            return cls._from_dict(d)
+            for name, kinds in _KINDS.items():
+                if not isinstance(d.get(name), kinds) or isinstance(d.get(name), bool):
+                    raise TypeError(f"field {name!r} is {str(d.get(name))[:30]!r}")
+            numbers = [d[name] for name in ("value", "probability") if d.get(name) is not None]
+            if not all(np.isfinite(float(number)) for number in numbers):
+                raise TypeError("value and probability must be finite")
+            alternatives = tuple(d.get("alternatives") or ())
+            if not all(isinstance(text, str) for text in alternatives):
+                raise TypeError("alternatives must be text")
+            line = Line(**d["line"]) if d.get("line") else None
+            lists = {"cells": tuple(d["cells"]), "alternatives": alternatives}
+            return cls(**{**d, "line": line, "reason": d.get("reason") or "", **lists})
         except (TypeError, KeyError, AttributeError, OverflowError) as error:
             raise ValueError(f"expected a fault with kind and cells, got {str(d)[:60]} ({error})") from None
-
-    @classmethod
-    def _from_dict(cls, d: Mapping[str, Any]) -> Fault:
-        for name, kinds in _KINDS.items():
-            if not isinstance(d.get(name), kinds) or isinstance(d.get(name), bool):
-                raise TypeError(f"field {name!r} is {str(d.get(name))[:30]!r}")
-        numbers = [d[name] for name in ("value", "probability") if d.get(name) is not None]
-        if not all(np.isfinite(float(number)) for number in numbers):
-            raise TypeError("value and probability must be finite")
-        if not all(isinstance(text, str) for text in d.get("alternatives") or ()):
-            raise TypeError("alternatives must be text")
-        line = Line(**d["line"]) if d.get("line") else None
-        alternatives = tuple(d.get("alternatives") or ())
-        return cls(
-            **{
-                **d,
-                "kind": FaultKind(d["kind"]),
-                "cells": tuple(d["cells"]),
-                "line": line,
-                "reason": d.get("reason") or "",
-                "alternatives": alternatives,
-            }
-        )
 
 
 _NONE = type(None)

@@ -94,7 +94,11 @@ class Monitor:
 
     def _changes(self, diagnosis: Diagnosis) -> tuple[Fault, ...]:
         now = {(fault.line, fault.cells[0] if fault.line is None else -1): fault for fault in diagnosis.faults}
-        changes = [fault for key, fault in now.items() if self._differs(self._known.get(key), fault)]
+        changes = []
+        for key, fault in now.items():
+            before = self._known.get(key)
+            if before is None or (before.kind, before.cells) != (fault.kind, fault.cells):
+                changes.append(fault)
         faulty = diagnosis.fault_set
         for key, fault in self._known.items():
             # A cell that is now part of the fault of a wire has not recovered.
@@ -103,7 +107,3 @@ class Monitor:
                 changes.append(replace(fault, probability=0.0, reason=text))
         self._known = now
         return tuple(changes)
-
-    @staticmethod
-    def _differs(before: Fault | None, now: Fault) -> bool:
-        return before is None or (before.kind, before.cells) != (now.kind, now.cells)

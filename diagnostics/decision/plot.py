@@ -6,12 +6,14 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from diagnostics.decision.result import Diagnosis
+    from diagnostics.faults import FaultKind
     from diagnostics.layout import SensorLayout
 
 PAGE = 10.0
@@ -23,27 +25,20 @@ _WIDE = 5.0
 _ALIVE, _FAULTY, _UNTESTED, _ABSENT = "#8fbf8f", "#c0392b", "#d9d9d9", "#ffffff"
 
 
-def draw(
-    layout: SensorLayout,
-    verdicts: NDArray[np.intp],
-    letters: Mapping[int, str],
-    kinds: Mapping[str, str],
-    page: float = PAGE,
-) -> Figure:
+def draw(diagnosis: Diagnosis, letters: Mapping[FaultKind, str], page: float) -> Figure:
     """Draw each pad: green alive, red faulty, grey untested; the legend explains the letters that are on the map.
 
     Args:
-        layout: the array.
-        verdicts: int ``[D]``, 0 alive, 1 faulty, 2 untested, as :class:`~diagnostics.Verdict` counts.
-        letters: letter of the fault kind, by cell.
-        kinds: name of the fault kind, by letter.
+        diagnosis: what is drawn.
+        letters: letter of each fault kind.
         page: width of the page, in inches.
     """
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
+    layout = diagnosis.layout
     figure, ((*axes,),) = pads_figure(layout, n_rows=1, scale=False, page=page)
-    colours = np.where(layout.present.ravel(), verdicts, 3)
+    colours = np.where(layout.present.ravel(), diagnosis.verdicts.astype(np.intp), 3)
     palette = ListedColormap([_ALIVE, _FAULTY, _UNTESTED, _ABSENT])
     cell_points = 72 * _cell(layout, page)
     for pad, ax in enumerate(axes):
@@ -55,11 +50,12 @@ def draw(
         ax.grid(which="minor", color="white", linewidth=min(1.5, 0.1 * cell_points))
         ax.tick_params(which="minor", length=0)
         ax.spines[:].set_visible(False)
-    for cell, letter in letters.items():
+    kind_of = {cell: fault.kind for fault in diagnosis.faults for cell in fault.cells}
+    size = min(8.0, 0.6 * cell_points)
+    for cell, kind in kind_of.items():
         pad, row, col = (int(i) for i in np.unravel_index(cell, layout.shape))
-        size = min(8.0, 0.6 * cell_points)
-        axes[pad].text(col, row, letter, ha="center", va="center", color="white", fontsize=size)
-    shown = ", ".join(f"{letter} {name}" for letter, name in kinds.items() if letter in letters.values())
+        axes[pad].text(col, row, letters[kind], ha="center", va="center", color="white", fontsize=size)
+    shown = ", ".join(f"{letter} {kind.value}" for kind, letter in letters.items() if kind in kind_of.values())
     legend = {"alive": _ALIVE, f"faulty: {shown}" if shown else "faulty": _FAULTY, "untested": _UNTESTED}
     figure.legend(
         handles=[Patch(color=colour, label=name) for name, colour in legend.items()],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import IntEnum
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -156,9 +156,7 @@ class Diagnosis:
         """Return the verdict map as a matplotlib Figure; pads that do not fit ``page`` inches side by side go below."""
         from diagnostics.decision.plot import draw
 
-        letters = {cell: LETTERS[fault.kind] for fault in self.faults for cell in fault.cells}
-        kinds = {letter: kind.value for kind, letter in LETTERS.items()}
-        return draw(self.layout, self.verdicts.astype(np.intp), letters, kinds, page)
+        return draw(self, LETTERS, page)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict (no NaN) that :meth:`from_dict` reads."""
@@ -176,8 +174,7 @@ class Diagnosis:
             "n_frames": self.n_frames,
             "n_recordings": self.n_recordings,
             "coverage": {
-                "fault_coverage": self.coverage.fault_coverage,
-                "test_coverage": self.coverage.test_coverage,
+                **asdict(self.coverage),
                 "untested": self.coverage.untested.tolist(),
                 "advice": list(self.coverage.advice),
             },
@@ -194,7 +191,18 @@ class Diagnosis:
             found = repr(d.get("schema")) if isinstance(d, Mapping) else str(d)[:60]
             raise ValueError(f"expected a diagnosis with schema {SCHEMA!r}, got {found}")
         try:
-            diagnosis = cls._from_dict(d)
+            diagnosis = cls(
+                layout=SensorLayout.from_dict(d["layout"]),
+                faults=tuple(Fault.from_dict(f) for f in d["faults"]),
+                probability=np.asarray(d["probability"], dtype=np.float64),
+                tested=np.asarray([v != Verdict.UNTESTED.name for v in d["verdicts"]]),
+                n_frames=d["n_frames"],
+                n_recordings=d["n_recordings"],
+                evidence={kind: np.asarray(values, dtype=np.float64) for kind, values in d.get("evidence", {}).items()},
+                transport=tuple(TransportFault.from_dict(f) for f in d.get("transport", ())),
+                possible=tuple(Fault.from_dict(f) for f in d.get("possible", ())),
+                static_loads=tuple(StaticLoad.from_dict(load) for load in d.get("static_loads", ())),
+            )
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"the diagnosis is damaged: {type(error).__name__} {error}") from None
         size = (diagnosis.layout.n_cells,)
@@ -214,18 +222,3 @@ class Diagnosis:
             raise ValueError("the diagnosis is damaged: evidence must be finite")
         _ = diagnosis.statically_loaded, diagnosis.fault_set  # raise ValueError for cells of another layout
         return diagnosis
-
-    @classmethod
-    def _from_dict(cls, d: Mapping[str, Any]) -> Diagnosis:
-        return cls(
-            layout=SensorLayout.from_dict(d["layout"]),
-            faults=tuple(Fault.from_dict(f) for f in d["faults"]),
-            probability=np.asarray(d["probability"], dtype=np.float64),
-            tested=np.asarray([v != Verdict.UNTESTED.name for v in d["verdicts"]]),
-            n_frames=d["n_frames"],
-            n_recordings=d["n_recordings"],
-            evidence={kind: np.asarray(values, dtype=np.float64) for kind, values in d.get("evidence", {}).items()},
-            transport=tuple(TransportFault.from_dict(f) for f in d.get("transport", ())),
-            possible=tuple(Fault.from_dict(f) for f in d.get("possible", ())),
-            static_loads=tuple(StaticLoad.from_dict(load) for load in d.get("static_loads", ())),
-        )

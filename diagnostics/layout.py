@@ -265,9 +265,9 @@ class SensorLayout:
 
     @cached_property
     def beside(self) -> NDArray[np.intp]:
-        """The eight neighbours of each cell on its pad, row by row, int ``[D, 8]``; -1: none."""
-        index = np.full((self.pads, self.rows + 2, self.cols + 2), -1, dtype=np.intp)
-        index[:, 1:-1, 1:-1] = np.where(self.present, self._grid, -1)
+        """The eight neighbours of each cell, of its axis and on its pad, row by row, int ``[D, 8]``; -1: none."""
+        index = np.full((self.pads, self.rows + 2, self.cols + 2, self.axes), -1, dtype=np.intp)
+        index[:, 1:-1, 1:-1] = np.where(self.present, self._grid, -1).reshape(self.pads, self.rows, self.cols, -1)
         steps = [(down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1)]
         around = [index[:, down : down + self.rows, across : across + self.cols] for down, across in steps]
         return np.stack(around, axis=-1).reshape(self.n_cells, len(steps))

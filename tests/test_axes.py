@@ -1,10 +1,12 @@
 """Positions with several readings each, as 3-axis magnetic taxels."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import without_calibration
 
-from diagnostics import Diagnosis, FaultKind, Line, Monitor, SelfDiagnosis, SensorLayout
+from diagnostics import Diagnosis, FaultKind, Line, Monitor, SelfDiagnosis, SensorLayout, StaticLoad
 
 TAXELS = SensorLayout(1, 6, 6, full_scale=1000, unit="count", axes=3)
 
@@ -55,6 +57,20 @@ def test_a_mask_of_positions_holds_for_their_axes():
 def test_frames_may_come_as_positions_and_axes():
     frames = recordings(1, 1)[0]
     np.testing.assert_array_equal(TAXELS.check_recording(frames.reshape(60, 1, 6, 6, 3)), frames)
+
+
+def test_the_neighbours_of_a_cell_are_those_of_its_axis():
+    cell = TAXELS.cell(0, 2, 3, axis=1)
+    around = [TAXELS.cell(0, row, col, axis=1) for row in (1, 2, 3) for col in (2, 3, 4) if (row, col) != (2, 3)]
+    assert TAXELS.beside[cell].tolist() == around
+    corner = TAXELS.beside[TAXELS.cell(0, 0, 0, axis=2)]
+    assert corner[corner >= 0].tolist() == [TAXELS.cell(0, row, col, axis=2) for row, col in ((0, 1), (1, 0), (1, 1))]
+
+
+def test_cells_beside_an_object_are_disturbed(fitted: SelfDiagnosis):
+    load = StaticLoad((43, 46), 0.99, None, "")
+    diagnosis = replace(fitted.diagnose(recordings(8, 7)), static_loads=(load,))
+    assert diagnosis.disturbed == {*load.cells, *TAXELS.beside[list(load.cells)].ravel().tolist()}
 
 
 def test_healthy_taxels_have_no_fault(fitted: SelfDiagnosis):

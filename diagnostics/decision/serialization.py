@@ -1,7 +1,7 @@
 """Writes any dataclass of numbers and arrays as JSON and named arrays, and reads it back bit for bit. No pickle.
 
-The types of the fields say how each value is read: numbers, booleans, arrays, other dataclasses and named tuples,
-tuples of these, and ``| None``. A :class:`~diagnostics.layout.SensorLayout` is written by its own ``to_dict``.
+The types of the fields say how each value is read: numbers, booleans, arrays, other dataclasses, tuples of these, and
+``| None``. A :class:`~diagnostics.layout.SensorLayout` is written by its own ``to_dict``.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Arrays = dict[str, NDArray[Any]]
 T = TypeVar("T")
 
 
-def to_state(value: object, name: str = "") -> tuple[Any, Arrays]:
+def to_state(value: object) -> tuple[Any, Arrays]:
     """Return a JSON-safe description of ``value``, and its arrays by dotted name, as :func:`from_state` reads them."""
     arrays: Arrays = {}
-    return _packed(value, name, arrays), arrays
+    return _packed(value, "", arrays), arrays
 
 
 def from_state(cls: type[T], about: Any, arrays: Mapping[str, ArrayLike]) -> T:
@@ -37,19 +37,6 @@ def from_state(cls: type[T], about: Any, arrays: Mapping[str, ArrayLike]) -> T:
     return value
 
 
-def _names(cls: Any) -> list[str]:
-    return [field.name for field in fields(cls)] if is_dataclass(cls) else list(cls._fields)
-
-
-def _newer(cls: Any) -> set[str]:
-    """Return the fields that a file of an earlier version may lack."""
-    return {field.name for field in fields(cls) if "newer" in field.metadata} if is_dataclass(cls) else set()
-
-
-def _structured(cls: Any) -> bool:
-    return is_dataclass(cls) or hasattr(cls, "_fields")
-
-
 def _packed(value: Any, name: str, arrays: Arrays) -> Any:
     if isinstance(value, SensorLayout):
         return value.to_dict()
@@ -57,9 +44,9 @@ def _packed(value: Any, name: str, arrays: Arrays) -> Any:
         arrays[name] = np.array(value, order="C")
         finite = bool(np.isfinite(value).all())
         return {"array": name, "dtype": str(value.dtype), "shape": list(value.shape), "finite": finite}
-    if _structured(value):
+    if is_dataclass(value):
         prefix = f"{name}." if name else ""
-        return {key: _packed(getattr(value, key), f"{prefix}{key}", arrays) for key in _names(type(value))}
+        return {f.name: _packed(getattr(value, f.name), f"{prefix}{f.name}", arrays) for f in fields(value)}
     if isinstance(value, tuple):
         return [_packed(item, f"{name}.{i}", arrays) for i, item in enumerate(value)]
     if isinstance(value, np.generic):
@@ -79,11 +66,12 @@ def _read(kind: Any, about: Any, arrays: Mapping[str, ArrayLike], name: str) -> 
     if origin is tuple:
         item = get_args(kind)[0]
         return tuple(_read(item, each, arrays, f"{name}.{i}") for i, each in enumerate(about))
-    if _structured(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         if not isinstance(about, Mapping):
             raise TypeError(f"expected the fields of {name}, got {about!r}")
         hints = get_type_hints(kind)
-        given = [key for key in _names(kind) if key in about or key not in _newer(kind)]
+        # A file of an earlier version may lack newer fields.
+        given = [f.name for f in fields(kind) if f.name in about or "newer" not in f.metadata]
         return kind(**{key: _read(hints[key], about[key], arrays, key) for key in given})
     if isinstance(about, bool) != (kind is bool) or not isinstance(about, int | float | str):
         raise TypeError(f"expected {kind.__name__} for {name}, got {about!r}")

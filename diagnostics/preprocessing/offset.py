@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 
-class ReferenceOffset(NamedTuple):
+@dataclass(frozen=True)
+class ReferenceOffset:
     """Common offsets in the reference, in the layout's unit.
 
     Attributes:

@@ -8,7 +8,6 @@ wiring the wires are buses and nested groups, see :mod:`~diagnostics.wiring`.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from diagnostics.decision.line_cover import Cause, solve
 from diagnostics.faults import Fault, FaultKind
-from diagnostics.layout import Line, LineKind, SensorLayout
+from diagnostics.layout import LineKind, SensorLayout
 from diagnostics.preprocessing.levels import ANYWHERE, SLIGHT, SUSPICIOUS
 from diagnostics.wiring import action, counted
 
@@ -224,9 +223,10 @@ def _reason(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayou
         also = f"; {inferred} of the cells, not tested, {are} inferred" if inferred else ""
         return f"{action(fault.line)}: {_behind(fault, layout)} {silent}{since}{already}{also}"
     also = f"; {inferred} more, not tested, {are} inferred from the wire" if inferred else ""
-    where = _where(fault, cause, layout)
     seen = f"each of {len(cause.seen)} cells on it {does}{since}{already}{also}"
-    return f"{fault.line} is {fault.kind}{where}: {seen}; check {_wire(fault.line)}"
+    of_converter = fault.line.kind == "converter"
+    check = "the converter channel and its cable" if of_converter else f"the {fault.line.kind} wire and its address"
+    return f"{fault.line} is {fault.kind}{_where(fault, cause, layout)}: {seen}; check {check}"
 
 
 def _behind(fault: Fault, layout: SensorLayout) -> str:
@@ -271,48 +271,42 @@ def _alternatives(fault: Fault, cause: Cause, found: CellFindings, layout: Senso
     return tuple(others)
 
 
-def _wire(line: Line) -> str:
-    return (
-        "the converter channel and its cable" if line.kind == "converter" else f"the {line.kind} wire and its address"
-    )
-
-
 def _addresses_of_dead_rows(faults: list[Fault], found: CellFindings, layout: SensorLayout) -> list[Fault]:
     """Merge dead lines that one stuck address bit would explain: it selects lines without contact instead."""
-    open_lines = Counter((f.line.pad, f.line.kind) for f in faults if f.line and f.kind is FaultKind.OPEN)
     for line in layout.lines:
         if line.kind not in ("row_address", "column_address"):
             continue
         kind: LineKind = "row" if line.kind == "row_address" else "column"
-        if open_lines[line.pad, kind] < 2:
+        whole = {
+            f.line.index: f
+            for f in faults
+            if f.kind is FaultKind.OPEN and f.line and (f.line.pad, f.line.kind) == (line.pad, kind)
+            if len(f.cells) == len(layout.cells_on(f.line))
+        }
+        if len(whole) < 2:
             continue
         for level in (0, 1):
             cells, sources = layout.misaddressed(line, level)
             moved = _index(cells, kind, layout)
-            dead = [
-                f for f in faults
-                if f.kind is FaultKind.OPEN and f.line is not None and (f.line.pad, f.line.kind) == (line.pad, kind)
-                and f.line.index in moved and set(layout.cells_on(f.line).tolist()) == set(f.cells)
-            ]  # fmt: skip
+            dead = {index: whole[index] for index in moved if index in whole}
             # One stuck bit is likelier than two broken wires. All lines that it moves must be dead or untested.
             if len(dead) < max(2, len(moved) / 2) or found.alive[[*cells, *sources[sources >= 0]]].any():
                 continue
             reads = _index(sources[sources >= 0], kind, layout)
             instead = f"untouched {_named(kind, reads)}" if reads else f"addresses without a {kind}"
-            wires = _named(kind, [f.line.index for f in dead if f.line])
             text = f"{line} is stuck at {level}: {_named(kind, moved)} read nothing, as {instead} would"
             merged = Fault(
                 FaultKind.ALIAS,
                 tuple(cells.tolist()),
                 line=line,
                 value=level,
-                onset=max((f.onset or 0) for f in dead) or None,
-                probability=min(f.probability or 0.0 for f in dead),
+                onset=max((f.onset or 0) for f in dead.values()) or None,
+                probability=min(f.probability or 0.0 for f in dead.values()),
                 reason=f"{text}; check the {kind} multiplexer and its address wires",
-                evidence=sum(f.evidence or 0 for f in dead),
-                alternatives=(f"the wires of {wires} are open, independently of each other",),
+                evidence=sum(f.evidence or 0 for f in dead.values()),
+                alternatives=(f"the wires of {_named(kind, list(dead))} are open, independently of each other",),
             )
-            faults = [f for f in faults if f not in dead] + [merged]
+            faults = [f for f in faults if f not in dead.values()] + [merged]
     return faults
 
 

@@ -30,7 +30,6 @@ from diagnostics.preprocessing.readings import RecordingBlocks
 SCHEMA = "adaptfault.diagnoser/10"
 
 _CERTAIN = 1 - RARE  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
-_GROUP_SHARE = 0.5  # share of the evidence added with a group excluded, see SelfDiagnosis.steps
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
 
 LogRatio = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -244,7 +243,7 @@ class SelfDiagnosis:
         def together(surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
             # By the chain rule of probability each cell of a group is conditioned on those before it: on half of them,
             # about the mean of conditioning on all and on none.
-            return alone + _GROUP_SHARE * np.maximum(log_ratio(surprisal, surprisal) - alone, 0.0)
+            return alone + np.maximum(log_ratio(surprisal, surprisal) - alone, 0.0) / 2
 
         for group in self._groups(found, stream, together(spatial.initial), explained):
             yield

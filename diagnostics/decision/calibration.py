@@ -93,14 +93,13 @@ class Calibrator:
         recordings: Sequence[Floats],
         layout: SensorLayout,
         *,
-        seed: int = 0,
         progress: Callable[[float], None] = lambda share: None,
     ) -> Calibrator:
         """Fit to fault-free recordings, ``[T, D]`` each; fewer than 8 give the defaults.
 
         ``progress`` receives the share of the work that is done, 0 to 1.
         """
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         n_logs = _LOGS if layout.present.sum() <= MOST_CELLS else _LOGS_OF_LARGE
         recordings, layout = calibration_subset(recordings, layout)
         cuts = -(-_FEW // len(recordings)) if recordings else 0

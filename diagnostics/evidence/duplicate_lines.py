@@ -5,10 +5,10 @@ while informative cells (loaded, moving, not saturated) support the agreement: a
 has 3 coincidences more than any healthy pair, and when its difference d is white noise around zero, as of one cell read
 twice:
 
-    mean over cells of (sum d)^2 / sum d^2 <= 5        and        sqrt(n) sum d_t d_{t-1} / sum d^2 <= 3
+    sqrt(n) sum d_t d_{t-1} / sum d^2 <= 3
 
-The second is a one-sided test of the lag-1 autocorrelation (Box and Pierce 1970). Two cells
-under equal loads differ by a constant or a slow difference. Lines that nothing loads are not detected.
+This is a one-sided test of the lag-1 autocorrelation (Box and Pierce 1970). Two cells under equal loads differ by a
+constant or a slow difference, which is correlated with itself. Lines that nothing loads are not detected.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 _EVERY = 4  # every fourth frame is compared: faults last longer
 _MOST_AT_ONCE = 3  # coincidences counted in one segment: neighbours under one object are correlated
-_STEADY = 5.0  # mean squared z value of a difference; 1 for noise around zero
 _SMOOTH = 3.0  # standard deviations of the lag-1 autocorrelation of a difference; 0 for noise
 _STEP = 0.1  # of the tolerance: smaller differences are none
 
@@ -74,8 +73,8 @@ class _Pairs:
         first, second: int ``[pairs]``, indices of the lines.
         there: bool ``[pads, pairs, positions]``, where both lines have a cell.
         since, seen_by, coincidences: int ``[pads, pairs]``, see :class:`DuplicatePair`.
-        sums: float ``[4, pads, pairs, positions]``, sums over informative frames of the difference, its square, its
-            product with the one before, and of 1; the squares are above 0 where there were coincidences.
+        sums: float ``[3, pads, pairs]``, over the informative cells and frames since: the square of the difference,
+            its product with the one before, and 1.
     """
 
     first: NDArray[np.intp]
@@ -92,7 +91,7 @@ class _Pairs:
         first, second = np.array(pairs(present.shape[1]), dtype=np.intp).reshape(-1, 2).T
         there = present[:, first] & present[:, second]
         nothing = np.zeros(there.shape[:2], np.intp)
-        return cls(first, second, there, nothing, nothing, nothing, np.zeros((4, *there.shape), np.float32))
+        return cls(first, second, there, nothing, nothing, nothing, np.zeros((3, *nothing.shape), np.float32))
 
     def extend(
         self, lines: NDArray[np.float32], numbers: NDArray[np.intp], informative: Mask, tolerance: float
@@ -114,31 +113,25 @@ class _Pairs:
         if agree.any() or (ever & (coincidences > 0)).any():
             coincidences = np.where(ever, 0, coincidences + np.minimum(both.sum(axis=2), _MOST_AT_ONCE))
             seen_by = np.where(agree & (self.coincidences == 0), numbers[-1], seen_by)
-            sums = self._summed(lines, both & ~ever[..., None], ever, tolerance)
+            sums = np.where(ever, np.float32(0), sums) + self._summed(lines, both & ~ever[..., None], tolerance)
         return _Pairs(self.first, self.second, self.there, since, seen_by, coincidences, sums)
 
-    def _summed(self, lines: NDArray[np.float32], both: Mask, anew: Mask, tolerance: float) -> NDArray[np.float32]:
-        """Return the sums with the informative cells (``both``) added; sums of pairs that differ begin ``anew``."""
-        after = np.where(anew[..., None], np.float32(0), self.sums)
+    def _summed(self, lines: NDArray[np.float32], both: Mask, tolerance: float) -> NDArray[np.float32]:
+        """Return the sums over the informative cells (``both``) in more frames, ``[3, pads, pairs]``."""
         pad, pair, position = np.nonzero(both)
         difference = lines[:, pad, self.first[pair], position] - lines[:, pad, self.second[pair], position]
         difference[np.isnan(difference)] = 0
-        after[0, pad, pair, position] += difference.sum(axis=0)
-        after[1, pad, pair, position] += (difference**2).sum(axis=0) + len(lines) * np.float32(_STEP * tolerance) ** 2
-        after[2, pad, pair, position] += (difference[1:] * difference[:-1]).sum(axis=0)
-        after[3, pad, pair, position] += len(lines) - 1
-        return after
+        least, more = np.float32(_STEP * tolerance), np.zeros_like(self.sums)
+        products = difference[1:] * difference[:-1]
+        for total, values in zip(more, (difference**2 + least**2, products, np.ones_like(products)), strict=True):
+            np.add.at(total, (pad, pair), values.sum(axis=0))
+        return more
 
     def matching(self, needed: int) -> list[tuple[int, int]]:
         """Return (pad, pair) of the pairs with at least ``needed`` coincidences that differ by noise only."""
-        return [(pad, i) for pad, i in np.argwhere(self.coincidences >= needed).tolist() if not self._steady(pad, i)]
-
-    def _steady(self, pad: int, pair: int) -> bool:
-        """Return whether the difference of two lines is constant or slow rather than noise, see the module."""
-        difference, squares, products, count = self.sums[:, pad, pair]
-        coinciding = squares > 0
-        smooth = products[coinciding].sum() / squares[coinciding].sum() * np.sqrt(count[coinciding].sum())
-        return bool((difference[coinciding] ** 2 / squares[coinciding]).mean() > _STEADY or smooth > _SMOOTH)
+        squares, products, count = self.sums
+        noise = products * np.sqrt(count) <= _SMOOTH * squares
+        return [(pad, i) for pad, i in np.argwhere((self.coincidences >= needed) & noise).tolist()]
 
 
 @dataclass(frozen=True)

@@ -15,15 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.faults import Fault, FaultKind
-from diagnostics.healthy.model import MIN_P_FLOOR
-from diagnostics.healthy.prediction import OUTLIERS, log_student_t
 from diagnostics.layout import Line, address_bits
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, SUSPICIOUS
 
 if TYPE_CHECKING:
     from diagnostics.evidence.duplicate_lines import DuplicatePair
     from diagnostics.evidence.stream_state import StreamState
-    from diagnostics.healthy.prediction import Prediction
 
 Cells = NDArray[np.intp]
 
@@ -129,19 +126,10 @@ def _level_ratio(line: Line, onset: int, stream: StreamState) -> float:
         for features, cells, modelled, model in stream.views(onset):
             scored = modelled[np.isin(cells[modelled], intact)]
             if len(scored):
-                ratio += sign * _plausible(features, model(features, predictors[cells]), scored)
+                likely = model(features, predictors[cells]).log_likelihood(features)
+                ratio += sign * float(likely[:, scored].mean(axis=0).sum())
             loaded |= bool((features[:, 2, np.isin(cells, empty)] > 0).any())
         # An address without a line never reads a load.
         if loaded:
             ratio -= sign * CERTAIN_RATIO
     return ratio
-
-
-def _plausible(features: NDArray[np.float32], expected: Prediction, cells: NDArray[np.intp]) -> float:
-    """Return the log likelihood of being loaded, and of the load, summed over cells and averaged over events."""
-    loaded = features[:, 2, cells] > 0
-    p = np.where(loaded, 1 - expected.never[:, cells], expected.never[:, cells])
-    # 0 where the spread is unknown.
-    error = np.where(loaded, (features[:, 1, cells] - expected.mean[:, cells]) / expected.spread[cells], 0.0)
-    load = log_student_t(np.nan_to_num(error), OUTLIERS)
-    return float((np.log(np.maximum(p, MIN_P_FLOOR)) + load).mean(axis=0).sum())

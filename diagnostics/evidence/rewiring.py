@@ -26,17 +26,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.contact_events import THE_SAME, Summary, count_repeats
-from diagnostics.healthy.model import MIN_P_FLOOR, contact_events
-from diagnostics.healthy.prediction import OUTLIERS, log_student_t
+from diagnostics.healthy.model import contact_events
+from diagnostics.healthy.prediction import MIN_P_FLOOR
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
 from diagnostics.preprocessing.readings import held
 
 if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
     from diagnostics.healthy.model import HealthyModel
-    from diagnostics.healthy.prediction import Prediction
     from diagnostics.layout import SensorLayout
-    from diagnostics.preprocessing.scale import Array, Scale
+    from diagnostics.preprocessing.scale import Scale
 
 _EVENTS = 32  # contact events that are scored: a size
 _FRAMES = 64  # of an event, evenly spread: a size
@@ -164,23 +163,12 @@ class _Test:
         roots = (self.scale.root_load(frames[:, source]) for frames in self.events)
         features = np.stack([Summary.of(root, 0, near).features() for root in roots])
         expected = self.model.predict(features, self.moved[source] & self.present)
-        likely, usual = _log_likelihood(expected, features)
+        likely, states = expected.log_likelihood(features), expected.states
+        usual = (states * np.log(states)).sum(axis=0)
         # The same readings count for each permutation; a load where no cell is, is as good as impossible.
         likely = np.where(self.present, likely, np.where(features[:, 2] > 0, np.log(MIN_P_FLOOR), 0.0))
         likely, usual = (np.where(self.moved[source], of, 0.0) for of in (likely, usual * self.present))
         return _Score(self.weight * likely.sum(axis=1), (self.weight[:, None] * (likely - usual)).sum(axis=0))
-
-
-def _log_likelihood(expected: Prediction, features: Array) -> tuple[Floats, Floats]:
-    """Return the log likelihood ``[n, D]`` of what each cell did, and its expectation under the model."""
-    never, always = expected.never, expected.always
-    p = np.clip(np.stack([never, always, 1 - never - always]), MIN_P_FLOOR, 1.0)
-    did = np.where(features[:, 2] == 0, 0, np.where(features[:, 3] == 1, 1, 2))
-    logs = np.log(p)
-    state = np.take_along_axis(logs, did[None], axis=0)[0]
-    error = np.nan_to_num((features[:, 1] - expected.mean) / expected.spread, nan=np.inf)  # never loaded
-    load = np.where(did > 0, log_student_t(error, OUTLIERS), 0.0)
-    return state + load, (p * logs).sum(axis=0)
 
 
 def _events(recordings: Sequence[NDArray[np.float64]], scale: Scale) -> tuple[list[Floats], Floats]:

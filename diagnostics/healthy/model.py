@@ -23,14 +23,13 @@ from scipy.special import expit
 from diagnostics.events.constant_runs import segments
 from diagnostics.events.contact_events import ContactEvent, EventLog
 from diagnostics.healthy.local_regression import LocalRegression, predict_regressions
-from diagnostics.healthy.prediction import Prediction
+from diagnostics.healthy.prediction import MIN_P_FLOOR, Prediction
 from diagnostics.healthy.stacking import Stacking, neighbourhood
 from diagnostics.layout import SensorLayout
 
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Array, Scale
 
-MIN_P_FLOOR = 0.002  # lower limit of the probabilities, however many events there are: models err
 _BATCH = 6144  # cells times excerpts in one batch: bounds memory
 
 

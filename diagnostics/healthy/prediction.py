@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 OUTLIERS = 0.1  # share of events in which any load is equally likely (contamination)
 MEDIAN_ERROR = 0.741  # median of |t| with 4 degrees of freedom
+MIN_P_FLOOR = 0.002  # lower limit of the probabilities, however many events there are: models err
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,26 @@ class Prediction:
         # Full scale has no width: a load of unknown size reaches it as often as a broken cell.
         any_load = np.where(np.isfinite(high), high - low, 1.0)
         return np.where(np.isnan(spread), any_load, p)
+
+    @property
+    def states(self) -> NDArray[np.float64]:
+        """P(never loaded), P(always loaded) and P(sometimes loaded), each at least 0.002, ``[3, n, D]``."""
+        return np.clip(np.stack([self.never, self.always, 1 - self.never - self.always]), MIN_P_FLOOR, 1.0)
+
+    def log_likelihood(self, features: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Return the log likelihood of what each cell did, ``[n, D]``, up to a constant.
+
+        log P(its state) + log t_4(mean root load) where it was loaded: summed over cells, the pseudo-likelihood of the
+        excerpts (Besag 1975). A load of a cell whose loads are unknown is an outlier.
+
+        Args:
+            features: ``[n, 4, D]``, of the excerpts (see ``Summary.features``).
+        """
+        did = np.where(features[:, 2] == 0, 0, np.where(features[:, 3] == 1, 1, 2))
+        state = np.take_along_axis(np.log(self.states), did[None], axis=0)[0]
+        error = np.nan_to_num((features[:, 1] - self.mean) / self.spread, nan=np.inf)
+        log_likely: NDArray[np.float64] = state + np.where(did > 0, log_student_t(error, OUTLIERS), 0.0)
+        return log_likely
 
 
 def log_student_t(error: NDArray[Any], outliers: float) -> NDArray[Any]:

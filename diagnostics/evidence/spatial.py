@@ -122,10 +122,11 @@ class SpatialTest:
 
     def step(self) -> bool:
         """Score all cells once and update the predictors, or look for drift. Return whether there is a result."""
-        if self.result is None and self._agreed is None:
-            self._update()
-        elif self.result is None and self._agreed is not None:
-            self._look_for_drift(*self._agreed)
+        if self.result is None:
+            if self._agreed is None:
+                self._update()
+            else:
+                self._look_for_drift(*self._agreed)
         return self.result is not None
 
     def finish(self) -> Spatial:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,7 @@ class Prediction:
         any_load = np.where(np.isfinite(high), high - low, 1.0)
         return np.where(np.isnan(spread), any_load, p)
 
-    @property
+    @cached_property
     def states(self) -> NDArray[np.float64]:
         """P(never loaded), P(always loaded) and P(sometimes loaded), each at least 0.002, ``[3, n, D]``."""
         return np.clip(np.stack([self.never, self.always, 1 - self.never - self.always]), MIN_P_FLOOR, 1.0)

@@ -126,7 +126,7 @@ ARRAYS = [
         Array(f"posture, {name}", SKIN, simulated(skin.recordings), 20, 1, 12 * (name == "seat"))
         for name, skin in static_holds.SKINS.items()
     ),
-    Array("grasps, 2 x 11 x 10", (*MAIN, "lines", "cold"), simulated(grasps(SensorLayout.paper())), 30),
+    Array("grasps, 2 x 11 x 10", SKIN, simulated(grasps(SensorLayout.paper())), 30),
     Array(
         "grasps, 1 x 12 x 12", (*MAIN, "lines", "address", "rewired"), simulated(grasps(SensorLayout(1, 12, 12))), 30
     ),

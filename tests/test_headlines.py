@@ -34,6 +34,7 @@ LIMITS: dict[str, dict[str, float]] = {
     "simulated grasps": {
         "16 % dead: precision": 0.9869,  # 0.9883, 0.9946, 0.9937
         "16 % dead: recall": 0.9621,  # 0.9913, 0.9698, 0.9839
+        "static loads told where nothing lies": 0.06455,  # 0, 0, 0
         "16 % dead from 60 % of the log on: precision": 0.9864,  # 0.9938, 0.9933, 1
         "16 % dead from 60 % of the log on: recall": 0.6574,  # 0.8883, 0.8231, 0.7238
         "healthy: false alarms": 25.25,  # 0, 0, 0
@@ -46,6 +47,7 @@ LIMITS: dict[str, dict[str, float]] = {
     "hand": {
         "16 % dead: precision": 0.9928,  # 0.9957, 0.9957, 1, 0.9989
         "16 % dead: recall": 0.9715,  # 0.9839, 0.9765, 0.9791, 0.9878
+        "static loads told where nothing lies": 0.06455,  # 0, 0
         "16 % dead from 60 % of the log on: precision": 0.9909,  # 0.9953, .9988, .9988, .9976; .9919, .9953, 1, .9941
         "16 % dead from 60 % of the log on: recall": 0.9543,  # 0.9679, 0.9574, 0.9651, 0.9686
         "healthy: false alarms": 50.57,  # 0, 0, 0, 0
@@ -59,12 +61,14 @@ LIMITS: dict[str, dict[str, float]] = {
     "hand, each +0 to 2 %": {
         "16 % dead: precision": 0.9887,  # 0.993, 0.9964
         "16 % dead: recall": 0.9692,  # 0.9842, 0.9771
+        "static loads told where nothing lies": 0.06455,  # 0, 0
         "16 % dead from 60 % of the log on: precision": 0.9875,  # 0.9962, 0.9921
         "16 % dead from 60 % of the log on: recall": 0.9413,  # 0.9682, 0.9541
     },
     "fingertips": {
         "16 % dead: precision": 0.9865,  # 1, 0.9933, 0.9983, 0.9898
         "16 % dead: recall": 0.9737,  # 0.9825, 0.9865, 0.9882, 0.9767
+        "static loads told where nothing lies": 0.06455,  # 0, 0
         "16 % dead from 60 % of the log on: precision": 0.9845,  # 1, 0.9913, 1, 0.9944
         "16 % dead from 60 % of the log on: recall": 0.1614,  # 0.2286, 0.1975, 0.2729, 0.2975
         "healthy: false alarms": 2903,  # 0, 2145, 183.7, 1487
@@ -76,6 +80,7 @@ LIMITS: dict[str, dict[str, float]] = {
     "soles": {
         "16 % dead: precision": 0.9784,  # 0.9827, 0.9872, 0.9835, 0.9903
         "16 % dead: recall": 0.7773,  # 0.9185, 0.9988, 0.9958, 0.8072
+        "static loads told where nothing lies": 0.117,  # 0.03333, 0.03333, 0.1, 0
         "16 % dead from 60 % of the log on: precision": 0.9801,  # 0.9838, 0.9895, 0.9873, 0.9937
         "16 % dead from 60 % of the log on: recall": 0.9714,  # 0.9875, 0.9824, 0.9752, 0.9908
         "healthy: false alarms": 266.9,  # 203.9, 176.4, 159.8, 88.18

@@ -100,3 +100,19 @@ def test_single_stuck_cells_are_no_objects(fitted, log):
     found = fitted.diagnose([inject(r, faults, LAYOUT) for r in log])
     assert set(cells) <= set(found.fault_set)
     assert not found.static_loads
+
+
+@pytest.mark.parametrize("seed", [10, 11, 14, 23, 25])
+def test_faults_in_grasps_that_never_let_go_are_no_objects(fitted, grasps: Recordings, seed: int):
+    """Cells that each grasp presses to its last frame return to about the same load by chance."""
+    rng = np.random.default_rng(seed)
+    middle = [LAYOUT.cell(pad, row, col) for pad in range(2) for row in range(3, 8) for col in range(3, 7)]
+    cells = rng.choice(middle, 3, replace=False).tolist()
+    kinds = (FaultKind.SHORT, FaultKind.OPEN, FaultKind.STUCK)
+    faults = [Fault(kind, (cell,), value=2.5 * (kind == "stuck")) for kind, cell in zip(kinds, cells, strict=True)]
+    assert grasps.labels is not None
+    pressed = [i for i in range(1, len(grasps), 2) if grasps.labels[i]]  # class 0: nothing is grasped
+    order = np.insert(rng.choice(pressed, 19, replace=False), 6, 1)
+    found = fitted.diagnose([inject(grasps.frames[i], faults, LAYOUT) for i in order])
+    assert not found.static_loads
+    assert set(found.fault_set) == set(cells)

@@ -29,7 +29,7 @@ from scipy.special import expit, logit
 from diagnostics.decision.coverage import where
 from diagnostics.decision.line_cover import PROVEN
 from diagnostics.evidence.conditional_test import HeldValues
-from diagnostics.preprocessing.levels import ANYWHERE, EXPECTED, P_MIN, SLIGHT
+from diagnostics.preprocessing.levels import ANYWHERE, EXPECTED, P_MIN, SLIGHT, TESTED
 
 if TYPE_CHECKING:
     from diagnostics.evidence.spatial import Spatial
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 
 _FEWEST = 3  # cells of an object
 _EXPECTED_OBJECTS = 0.1  # prior probability of an object in a log
-_RETURNS = 0.1  # probability that a healthy cell returns to the same load, other than none
 _ANY_SHAPE = 0.05  # share of objects of a shape and load that the healthy model does not know
 _BESIDE = 0.3  # probability that such an object loads the cell beside a loaded one
 
@@ -114,7 +113,7 @@ def find_static_loads(
     broken = _on_broken_wires(blamed & spatial.scored, stream)
     broken |= stream.without_noise() & np.isfinite(held.values.high)  # an object takes noise away at full scale only
     loaded = _mask([cell for load in known for cell in load.cells], len(faulty))
-    holding = loaded | ((held.surprisal > -np.log(_RETURNS)) & (held.root > 0) & ~broken)
+    holding = loaded | ((held.surprisal > TESTED) & (held.root > 0) & ~broken)
 
     def explains(cells: Mask) -> bool:
         near = stream.layout.with_neighbours(cells) if beside else cells
@@ -151,7 +150,6 @@ class _HeldLoads:
         excluded: bool, cells that are explained otherwise.
         root: float, root load; 0: none.
         since: int, the frame since which it is held.
-        surprisal: float, -log P(these readings | healthy, no object).
         values: the loads as values.
     """
 
@@ -161,25 +159,27 @@ class _HeldLoads:
     excluded: Mask
     root: Floats
     since: Cells
-    surprisal: Floats
     values: HeldValues
 
     @classmethod
     def of(cls, stream: StreamState, spatial: Spatial, faulty: Mask, excluded: Mask) -> _HeldLoads:
         """Return the loads of a log; the arguments are those of :func:`find_static_loads`."""
         scale, runs = stream.scale, stream.runs
-        least, since, returns = stream.least_loads()
+        least, since = stream.least_loads()
         value = np.minimum(np.nan_to_num(runs.value), scale.baseline + scale.full_scale)
         root = np.where(spatial.scored, scale.root_load(value), least)
         since = np.where(spatial.scored, np.where(least > 0, np.minimum(runs.start, since), runs.start), since)
         root[since >= max(stream.begun, default=0)] = 0.0  # the load of the last contact, which may still go on
         root[excluded | ~stream.present | (stream.reference.dead > 0) | (root**2 < SLIGHT)] = 0.0
         values = HeldValues.of(scale.baseline + root**2 * scale.full_scale, scale, stream.reference.tolerance)
-        # A healthy cell that contacts load without a pause does not return to the same load.
-        again = np.maximum(returns - 1, 0) * -np.log(_RETURNS)
-        surprisal = np.maximum(spatial.surprisal + spatial.offset + np.maximum(spatial.gain, 0.0), again)
         faulty = faulty & ~(np.isfinite(spatial.factor) & (spatial.since < since))
-        return cls(stream, spatial, faulty, excluded, root, since, surprisal, values)
+        return cls(stream, spatial, faulty, excluded, root, since, values)
+
+    @cached_property
+    def surprisal(self) -> Floats:
+        """-log P(these readings | healthy, no object), ``[D]``: as a value, as a drift, or as unbroken contacts."""
+        drift = self.spatial.offset + np.maximum(self.spatial.gain, 0.0)
+        return np.maximum(self.spatial.surprisal + drift, self.stream.never_unloaded(self.others))
 
     def without_object(self, blamed: Mask) -> Floats:
         """Return the log likelihood without an object, ``[D]``; ``blamed`` (bool ``[D]``) are the faults elsewhere."""

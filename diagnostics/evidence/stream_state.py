@@ -23,6 +23,7 @@ from diagnostics.events.contact_events import EventLog
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import Rectangle, Tile, tiles
 from diagnostics.evidence.conditional_test import CellState, ConditionalTest, HeldValues, Model
+from diagnostics.evidence.drift import offset_evidence
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.evidence.jumps import SUDDEN_JUMP
@@ -31,6 +32,7 @@ from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, held_l
 from diagnostics.evidence.term import ConstantCells, Term
 from diagnostics.evidence.weak_response import WeakResponse
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
+from diagnostics.healthy.prediction import OUTLIERS
 from diagnostics.preprocessing.levels import SUSPICIOUS
 from diagnostics.preprocessing.offset import OffsetTracker
 from diagnostics.preprocessing.readings import SEGMENT, held
@@ -256,24 +258,34 @@ class StreamState:
                 total[tile.outputs] = test.summed(surprisal)[tile.place]
         return total
 
-    def least_loads(self) -> tuple[NDArray[np.float64], Cells, Cells]:
+    def least_loads(self) -> tuple[NDArray[np.float64], Cells]:
         """Return the least root load of each cell since an event last left it unloaded, ``[D]``; 0: the last one did.
 
-        With it the first frame of these events, 0 where these are all that are kept, and in how many of them the cell
-        returned to that load.
+        With it the first frame of these events, 0 where these are all that are kept.
         """
-        least = np.zeros(self.layout.n_cells)
-        since, returns = np.zeros(len(least), np.intp), np.zeros(len(least), np.intp)
-        same = 4 * self.reference.tolerance / self.scale.full_scale
+        least, since = np.zeros(self.layout.n_cells), np.zeros(self.layout.n_cells, np.intp)
         for i, events in self.local.kept():
             tile = self.local.tiles[i]
             lowest = np.stack([event.lowest[tile.place] for event in events.kept])
             lasting = np.logical_and.accumulate((lowest > self.scale.root_near)[::-1])[::-1]
             first = np.array([event.first for event in events.kept])[lasting.argmax(axis=0)]
-            least[tile.outputs] = of_tile = np.where(lasting[-1], np.where(lasting, lowest, 1.0).min(axis=0), 0.0)
+            least[tile.outputs] = np.where(lasting[-1], np.where(lasting, lowest, 1.0).min(axis=0), 0.0)
             since[tile.outputs] = np.where(lasting[-1] & ~lasting[0], first, 0)
-            returns[tile.outputs] = (lasting & (lowest**2 <= of_tile**2 + same)).sum(axis=0)
-        return least, since, returns
+        return least, since
+
+    def never_unloaded(self, predictors: Mask) -> NDArray[np.float64]:
+        """Return -log P(a healthy cell stays loaded in all events since one last left it unloaded) ``[D]``.
+
+        Given the readings of the ``predictors`` (bool ``[D]``) alone: cells on one object would support each other.
+        """
+        surprisal = np.zeros(self.layout.n_cells)
+        for i, events in self.local.kept():
+            tile = self.local.tiles[i]
+            whole = np.stack([event.suffixes()[0].features() for event in events.kept])
+            always = self.model_of(i, events)(whole, predictors[tile.inputs]).always
+            likely = np.maximum(always, OUTLIERS)
+            surprisal[tile.outputs] = offset_evidence(whole, likely, self.present[tile.inputs], 1.0)[tile.place]
+        return surprisal
 
     def log_held(self, root: NDArray[np.float64], predictors: Mask, values: HeldValues) -> NDArray[np.float64]:
         """Return log P(a healthy cell holds its value) ``[D]``, given the root loads ``[D]`` of the ``predictors``.

@@ -73,6 +73,7 @@ RULES = {
         "excess <= np.maximum(shortfall, 0.0)",
         "excess <= 0.0",
     ),
+    "first, rough calibration": ("decision/calibration.py", "for n in stages:", "for n in stages[1:]:"),
     "second line cover": (
         "decision/root_causes.py",
         "if 0 < singles < sum(cause.proven for _, _, cause in causes):",

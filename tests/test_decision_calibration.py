@@ -110,7 +110,7 @@ def test_no_log_is_diagnosed_with_a_reference_fitted_on_its_own_recordings(monke
         kept.append(reference)
         return reference
 
-    def trial(log: np.ndarray, faults: object, layout: object, reference: object) -> None:
+    def trial(log: np.ndarray, faults: object, layout: object, reference: object, exclusion: object) -> None:
         used.append((set(np.unique(log[:, 8] // 1).astype(int).tolist()), trained_on[id(reference)], len(log)))
         if len(used) == 20:
             raise Stop

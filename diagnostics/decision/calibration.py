@@ -117,11 +117,13 @@ class Calibrator:
         # Repeated splits, more with fewer recordings: so unusual events are held out at least once.
         turns = max(2, min(len(order), _ENOUGH) // held_out)
         parts = [np.split(np.roll(order, k * held_out), [n_training]) for k in range(turns)]
-        n_steps = _REFERENCE_TIME * turns + n_logs
-        references, trials = [], []
+        stages = (n_logs // 3, n_logs)
+        n_steps = _REFERENCE_TIME * turns + sum(stages)
+        references = []
         for k, (those, _) in enumerate(parts, 1):
             references.append(Reference.fit([recordings[i] for i in those], layout))
             progress(_REFERENCE_TIME * k / n_steps)
+        logs = []
         for i in range(n_logs):
             turn = (i + i // len(_LOG_SIZES)) % turns
             size = min(int(_LOG_SIZES[i % len(_LOG_SIZES)]), held_out)
@@ -129,9 +131,17 @@ class Calibrator:
             log = np.concatenate([_excerpt(recordings[j], rng) for j in drawn])
             share = float(_DEAD_SHARES[i // len(_LOG_SIZES) % len(_DEAD_SHARES)])
             onset = int(rng.uniform(0, 0.8) * len(log)) if i % 2 else None
-            trials.append(_trial(log, _random_faults(layout, share, onset, rng), layout, references[turn]))
-            progress((_REFERENCE_TIME * turns + i + 1) / n_steps)
-        weights, default = cls._of(trials), cls()
+            logs.append((log, _random_faults(layout, share, onset, rng), layout, references[turn]))
+        # Evidence depends on the exclusion threshold and that on the calibration: fit roughly, then with all logs.
+        weights = default = cls()
+        done = _REFERENCE_TIME * turns
+        for n in stages:
+            trials = []
+            for simulated in logs[:n]:
+                trials.append(_trial(*simulated, weights.exclusion._replace(gains=1.0)))
+                done += 1
+                progress(done / n_steps)
+            weights = cls._of(trials)
         # Few held-out recordings contain few unusual events; repeated splits are correlated and count for less.
         counts = 1 - _MAX_DISCOUNT / (1 + turns * (held_out / _HALF_DISCOUNT) ** 2)
         measured = np.array(weights.slope) != default.slope
@@ -245,9 +255,11 @@ def kinds(stream: StreamState) -> NDArray[np.intp]:
     return np.where(stream.runs.moved, np.where(rests, 1, 2), np.where(rests, 0, 3))
 
 
-def _trial(log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference) -> _Trial:
-    """Return the evidence of a log with ``faults`` injected; cells are excluded as without a calibration."""
-    stream = StreamState(layout, reference, Calibrator().exclusion)
+def _trial(
+    log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference, exclusion: Exclusion
+) -> _Trial:
+    """Return the evidence of a log with ``faults`` injected."""
+    stream = StreamState(layout, reference, exclusion)
     stream.extend(inject(log, faults, layout))
     stream = stream.complete()
     spatial = stream.spatial().finish()

@@ -68,7 +68,6 @@ class Tally:
     testable: int = 0
     hit: int = 0
     right_kind: int = 0
-    logs: int = 0
     objects: int = 0  # static loads in logs without one
     late: list[int] = field(default_factory=list)  # observable frames between the true and the reported onset
     probability: list[np.ndarray] = field(default_factory=list)
@@ -83,7 +82,7 @@ class Tally:
         told = {cell: fault for fault in diagnosis.faults for cell in fault.cells}
         self.true, self.false = self.true + len(found & kinds.keys()), self.false + len(found - kinds.keys())
         self.testable, self.hit = self.testable + len(can), self.hit + len(found & can)
-        self.logs, self.objects = self.logs + 1, self.objects + len(diagnosis.static_loads)
+        self.objects += len(diagnosis.static_loads)
         self.right_kind += sum(kinds.get(cell) == fault.kind for cell, fault in told.items())
         for cell in found & can:
             between = slice(*sorted((start, told[cell].onset or 0)))
@@ -189,7 +188,7 @@ def kind_of_cells(faults: Sequence[Fault]) -> dict[int, FaultKind]:
 def cells(bench: Bench) -> Iterator[Count]:
     tally = bench.case(0.16)
     yield from tally.counts("16 % dead")
-    yield Count("  static loads told where nothing lies", tally.objects, tally.logs, higher=False)
+    yield Count("  static loads told where nothing lies", tally.objects, bench.count, higher=False)
 
 
 def onset(bench: Bench) -> Iterator[Count]:

@@ -37,7 +37,7 @@ def events_of(log: np.ndarray, size: int = 32, stuck: tuple[int, ...] = ()) -> E
 
 def loaded(events: EventLog) -> list[set[int]]:
     """Return the cells that each event loaded."""
-    return [set(np.flatnonzero(t.suffixes()[0].loaded).tolist()) for t in events.kept]
+    return [set(np.flatnonzero(t.whole.loaded).tolist()) for t in events.kept]
 
 
 @pytest.mark.parametrize("frames", [60, 300, 3000])
@@ -154,7 +154,7 @@ def test_an_event_keeps_at_most_6_parts_and_they_add_up_to_all_its_frames():
     assert 1 < len(event.parts) <= 6
     assert sum(part.n for part in event.parts) == 495
     assert [part.first for part in event.parts][1:] == np.cumsum([part.n for part in event.parts])[:-1].tolist()
-    whole, at_once = event.suffixes()[0], Summary.of(SCALE.root_load(hold), 0, SCALE.root_near)
+    whole, at_once = event.whole, Summary.of(SCALE.root_load(hold), 0, SCALE.root_near)
     np.testing.assert_allclose(whole.features(), at_once.features(), atol=1e-5)
 
 

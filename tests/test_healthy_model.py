@@ -25,7 +25,7 @@ def blobs(seed: int, recordings: int = 150) -> list[np.ndarray]:
 
 def whole_events(recordings: list[np.ndarray], scale: Scale = SCALE) -> np.ndarray:
     """Return the features of the contact events in recordings, ``[n, 4, D]``."""
-    return np.stack([e.suffixes()[0].features() for r in recordings for e in contact_events(r, scale)])
+    return np.stack([e.whole.features() for r in recordings for e in contact_events(r, scale)])
 
 
 @pytest.fixture(scope="module")

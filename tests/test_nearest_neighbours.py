@@ -28,7 +28,7 @@ def events() -> list[ContactEvent]:
 
 @pytest.fixture(scope="module")
 def features(events) -> np.ndarray:
-    return np.stack([t.suffixes()[0].features() for t in events])
+    return np.stack([t.whole.features() for t in events])
 
 
 def test_a_cell_enclosed_by_loaded_ones_is_expected_to_be_loaded_and_one_far_from_them_not(events, features):

@@ -55,7 +55,7 @@ def differences(a: StreamState, b: StreamState) -> list[str]:
     if pairs["parts"][0] != pairs["parts"][1]:
         return [*found, "parts"]
     events = zip(a.local.of[0].kept, b.local.of[0].kept, strict=True)
-    alike = [equal(t.suffixes()[0].features(), u.suffixes()[0].features()) for t, u in events]
+    alike = [equal(t.whole.features(), u.whole.features()) for t, u in events]
     return found if all(alike) else [*found, "features"]
 
 

@@ -177,9 +177,9 @@ class _HeldLoads:
 
     @cached_property
     def surprisal(self) -> Floats:
-        """-log P(these readings | healthy, no object), ``[D]``: as a value, as a drift, or as unbroken contacts."""
+        """-log P(these readings | healthy, no object) of cells with a load: as a value, drift or unbroken contacts."""
         drift = self.spatial.offset + np.maximum(self.spatial.gain, 0.0)
-        return np.maximum(self.spatial.surprisal + drift, self.stream.never_unloaded(self.others))
+        return np.maximum(self.spatial.surprisal + drift, self.stream.never_unloaded(self.root > 0, self.others))
 
     def without_object(self, blamed: Mask) -> Floats:
         """Return the log likelihood without an object, ``[D]``; ``blamed`` (bool ``[D]``) are the faults elsewhere."""

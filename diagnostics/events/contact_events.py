@@ -111,6 +111,11 @@ class ContactEvent:
         """Return the range of the root load, summed over the cells with weights ``[D]``."""
         return float((self.highest - self.lowest) @ weights)
 
+    @property
+    def whole(self) -> Summary:
+        """The summary of the whole event."""
+        return self.suffixes()[0]
+
     def suffixes(self) -> list[Summary]:
         """Return the summaries from the start of each part to the end of the event, the whole event first."""
         ends = [self.parts[-1]]

@@ -219,7 +219,7 @@ class _Fit:
         """Return the features ``[n, 4, D]`` of the events with the readings corrected, and the recording of each."""
         rest, gain, top = self.reference.scale.baseline, np.exp(log_gain), self.layout.full_scale
         found = [
-            (event.suffixes()[0].features(), i)
+            (event.whole.features(), i)
             for i, recording in enumerate(recordings)
             for event in contact_events(
                 np.clip((recording - rest - offset) / gain + rest, 0.0, top), self.reference.scale

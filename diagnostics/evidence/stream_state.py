@@ -273,15 +273,18 @@ class StreamState:
             since[tile.outputs] = np.where(lasting[-1] & ~lasting[0], first, 0)
         return least, since
 
-    def never_unloaded(self, predictors: Mask) -> NDArray[np.float64]:
+    def never_unloaded(self, cells: Mask, predictors: Mask) -> NDArray[np.float64]:
         """Return -log P(a healthy cell stays loaded in all events since one last left it unloaded) ``[D]``.
 
         Given the readings of the ``predictors`` (bool ``[D]``) alone: cells on one object would support each other.
+        Tiles without one of the ``cells`` (bool ``[D]``) are left out.
         """
         surprisal = np.zeros(self.layout.n_cells)
         for i, events in self.local.kept():
             tile = self.local.tiles[i]
-            whole = np.stack([event.suffixes()[0].features() for event in events.kept])
+            if not cells[tile.outputs].any():
+                continue
+            whole = np.stack([event.whole.features() for event in events.kept])
             always = self.model_of(i, events)(whole, predictors[tile.inputs]).always
             likely = np.maximum(always, OUTLIERS)
             surprisal[tile.outputs] = offset_evidence(whole, likely, self.present[tile.inputs], 1.0)[tile.place]

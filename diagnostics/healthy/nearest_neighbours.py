@@ -51,7 +51,7 @@ class NearestNeighbours:
     @classmethod
     def of(cls, events: Sequence[ContactEvent], layout: SensorLayout, rest: float = 0.0) -> NearestNeighbours:
         """Build the model from the events of a log and from each of their parts."""
-        parts = [part.features() for event in events for part in (*event.parts, event.suffixes()[0])]
+        parts = [part.features() for event in events for part in (*event.parts, event.whole)]
         return cls(np.stack(parts), layout, rest)
 
     def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:

@@ -202,6 +202,13 @@ def test_where_healthy_cells_blink_in_bursts_it_takes_more_to_be_faulty():
     assert HealthyRates.fit(calm, SCALE, LAYOUT).blinks_count == 1
 
 
+def test_a_cell_that_always_blinked_is_healthy_and_no_other_is_forgiven():
+    edge = HealthyRates.fit([tapped(seed, [3]) for seed in range(10)], SCALE, LAYOUT)
+    log = inject(tapped(30, [3]), [Fault("intermittent", (7,), onset=320)], LAYOUT, seed=0)
+    assert edge.blinks_count == 1
+    assert cells(evidence_of(log, edge).intermittent) == [7]
+
+
 @pytest.mark.parametrize("fitted", [True, False])
 def test_weak_loads_that_a_threshold_hides_do_not_blink(fitted: bool):
     def thresholded(seed: int) -> np.ndarray:

@@ -8,10 +8,12 @@ whenever it begins, and cleared when it has gone:
     noise:   g = log(0.8 / 0.002) if noisier than the limit of its load, else log(0.2 / 0.998)       Bernoulli
 
 A blink leaves a load in one step and returns to it in one step within 6 frames. The load must exceed 1.5 times the
-lowest load that any cell shows: where a threshold hides small loads, weak ones come and go in one step. Noise is the
-median absolute second difference. The factor c <= 1 keeps all but 1 % of healthy cells below 14 / 1.5 (overdispersion,
-as in a quasi-likelihood: McCullagh and Nelder 1989). Segments in which many cells blink or are noisy together do not
-count: the contact moves. Blinks without load, and noise of constant cells, are not detected.
+lowest load that any cell shows: where a threshold hides small loads, weak ones come and go in one step. Cells at the
+edge of most contacts blink more often than others: r is the posterior mean of a cell under a gamma prior with the mean
+of the array and shape 1/2, that of Jeffreys' prior of a Poisson rate (1946). Noise is the median absolute second
+difference. The factor c <= 1 keeps all but 1 % of healthy cells below 14 / 1.5 (overdispersion, as in a
+quasi-likelihood: McCullagh and Nelder 1989). Segments in which many cells blink or are noisy together do not count: the
+contact moves. Blinks without load, and noise of constant cells, are not detected.
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ _BLINK_RATE = 0.05  # blinks per loaded frame of a loose contact
 LONGEST_BLINK = 6  # frames
 _ON_ROW, _ON_COLUMN = [3, 4], [1, 6]  # neighbours on the same row and column, see SensorLayout.beside
 ALIKE = 0.3  # of a load: largest change during a blink; and of its change: a neighbour that changes as much shares it
+_PRIOR_BLINKS = 0.5  # shape of the gamma prior of the rates
 _RARE = 0.002  # healthy blinks per loaded frame, in a cold start; share of healthy segments above the limit of noise
 _NOISY_SHARE = 0.8  # share of the segments of a noisy cell above the limit
 _LEVELS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8])  # of the mean root load, bin edges: noise grows with load
@@ -51,11 +54,12 @@ class HealthyRates:
     """Rates of blinks and noise of healthy cells.
 
     Attributes:
-        blinks: blinks per loaded frame, r.
+        blinks: blinks per loaded frame, mean of the array.
         noise: float ``[levels]``, limit of the noise by load, as a share of full scale.
         blinks_count, noise_counts: factor c of either evidence.
         alone: count only changes that no neighbour shares, as needed where fingers slide.
         lowest: lowest load that is no noise, in the layout's unit; inf: unknown.
+        of_cells: float ``[D]``, blinks per loaded frame of each cell, r; None: all have the mean.
     """
 
     blinks: float
@@ -64,6 +68,7 @@ class HealthyRates:
     noise_counts: float = 1.0
     alone: bool = True
     lowest: float = field(default=np.inf, metadata={"newer": True})
+    of_cells: Floats | None = field(default=None, metadata={"newer": True})
 
     @classmethod
     def fit(cls, recordings: Sequence[Floats], scale: Scale, layout: SensorLayout) -> HealthyRates:
@@ -78,7 +83,7 @@ class HealthyRates:
     def _counted(cls, recordings: Sequence[Floats], scale: Scale, layout: SensorLayout, alone: bool) -> HealthyRates:
         every = np.arange(layout.n_cells)
         lowest = min((_lowest_load(recording, scale) for recording in recordings), default=np.inf)
-        blinks = loaded = 0.0
+        blinks, loaded = np.zeros((2, layout.n_cells))
         noise: list[list[Floats]] = [[] for _ in _LEVELS]
         for recording in recordings:
             for first in range(0, len(recording), SEGMENT):
@@ -86,8 +91,8 @@ class HealthyRates:
                 low, high, under_load, noise_level, level = _measure(
                     frames, scale.root_load(frames), scale, every, layout, alone, lowest
                 )
-                blinks += float((low + high).sum())
-                loaded += float(under_load.sum())
+                blinks += low + high
+                loaded += under_load
                 if len(frames) >= SHORTEST_RUN:
                     for k in range(len(_LEVELS)):
                         noise[k].append(noise_level[level == k])
@@ -98,7 +103,9 @@ class HealthyRates:
         # Readings within +- tolerance (near / 2) have second differences up to 2 near.
         limit = np.maximum.accumulate(np.maximum(limit, 2 * scale.near / scale.full_scale))
         # One pseudo-blink, in as many frames as it takes at the rate of a cold start.
-        usual = cls(max(0.1 * _RARE, (blinks + 1) / (loaded + 1 / _RARE)), limit, alone=alone, lowest=lowest)
+        mean = max(0.1 * _RARE, (float(blinks.sum()) + 1) / (float(loaded.sum()) + 1 / _RARE))
+        of_cells = np.maximum(0.1 * _RARE, (blinks + _PRIOR_BLINKS) / (loaded + _PRIOR_BLINKS / mean))
+        usual = cls(mean, limit, alone=alone, lowest=lowest, of_cells=of_cells)
         intermittency = Intermittency.begin(layout)
         reached = np.stack([intermittency.blinking, intermittency.noisy])
         for recording in recordings:
@@ -178,7 +185,8 @@ class Intermittency:
         crowd = max(1.0, _CROWD * float((loaded > 0).sum()))
         if (events > 0).sum() > crowd:
             events = np.zeros_like(events)
-        gain = events * np.log(_BLINK_RATE / usual.blinks) - loaded * (_BLINK_RATE - usual.blinks)
+        rate = usual.blinks if usual.of_cells is None else usual.of_cells[moving]
+        gain = events * np.log(_BLINK_RATE / rate) - loaded * (_BLINK_RATE - rate)
         blinking = self.blinking.copy()
         blinking[moving] = np.clip(blinking[moving] + usual.blinks_count * gain, 0.0, full)
         noisier = self._noisier(noise_level, usual.noise[level], moving, usual.alone)

@@ -161,14 +161,12 @@ def test_candidate_groups_are_the_cells_that_one_wire_would_explain():
     assert candidate_groups(consistent, ~consistent, np.where(mask(row[:1], column[-1:]), 3.0, NOTHING), LAYOUT) == []
 
 
-def test_lines_that_a_stuck_address_would_move_are_one_group_if_none_works():
+def test_the_lines_of_an_address_bit_are_no_group():
+    # Without half of a pad as predictors, contacts on the other half seem to be missing there.
     moved, _ = LAYOUT.misaddressed(Line(0, "row_address", 3), 0)
     consistent = mask(moved)
     weight = np.where(mask(moved[[0, 15]]), 3.0, NOTHING)  # one cell each of two rows: no row is a group
-    (group,) = candidate_groups(consistent, ~consistent, weight, LAYOUT)
-    assert group.tolist() == moved.tolist()
-    contradicting = ~consistent | mask(moved[-1:])
-    assert all(len(g) < len(moved) for g in candidate_groups(consistent, contradicting, weight, LAYOUT))
+    assert candidate_groups(consistent, ~consistent, weight, LAYOUT) == []
 
 
 def test_cells_of_a_pad_with_a_working_one_are_no_group():
@@ -180,9 +178,7 @@ def test_cells_of_a_pad_with_a_working_one_are_no_group():
     groups = [group.tolist() for group in candidate_groups(consistent, mask([60]), weight, LAYOUT)]
     assert pad[:60] not in groups
     assert pad[61:] not in groups
-    addresses = [line for line in LAYOUT.lines if line.kind.endswith("address")]
-    moved = [LAYOUT.misaddressed(line, level)[0].tolist() for line in addresses for level in (0, 1)]
-    assert max(len(group) for group in groups if group not in moved) == 11  # no more than a column
+    assert max(len(group) for group in groups) == 11  # no more than a column
 
 
 def test_a_few_uncertain_cells_do_not_prove_a_broken_wire():

@@ -104,7 +104,7 @@ def candidate_groups(
 ) -> list[NDArray[np.intp]]:
     """Return the groups of cells that one fault would explain, where enough of them support it.
 
-    The fault is a wire broken as a whole or at one end, or a stuck address wire, which may select unloaded lines.
+    The fault is a wire broken as a whole or at one end.
 
     Args:
         consistent, contradicting: as for :func:`solve`.
@@ -115,19 +115,16 @@ def candidate_groups(
     return [
         cells[consistent[cells]]
         for line in layout.lines
-        if supporting[layout.cells_on(line)].sum() >= _MIN_SUPPORT
+        if line.kind in _WIRES and supporting[layout.cells_on(line)].sum() >= _MIN_SUPPORT
         for cells in _silenced(line, contradicting, layout)
         if supporting[cells].sum() >= _MIN_SUPPORT
     ]
 
 
 def _silenced(line: Line, contradicting: Mask, layout: SensorLayout) -> Sequence[NDArray[np.intp]]:
-    """Return the cells that each possible fault of a wire would make dead, where none of them is alive."""
-    if line.kind in _WIRES:
-        cells = layout.cells_on(line)
-        return _ends(line, cells, contradicting) if contradicting[cells].any() else (cells,)
-    moved = [layout.misaddressed(line, level)[0] for level in (0, 1)]
-    return [cells for cells in moved if not contradicting[cells].any()]
+    """Return the cells that each possible break of a wire would make dead, where none of them is alive."""
+    cells = layout.cells_on(line)
+    return _ends(line, cells, contradicting) if contradicting[cells].any() else (cells,)
 
 
 def _ends(line: Line, cells: NDArray[np.intp], contradicting: Mask) -> tuple[NDArray[np.intp], ...]:

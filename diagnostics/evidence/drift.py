@@ -1,7 +1,7 @@
 """Drift: cells that move, but never return to their baseline (offset), or scale every load wrongly (gain).
 
 The evidence of an offset is the sum of -log P(loaded throughout | other cells) over the last events, as far as the cell
-is loaded throughout each; in a cold start repeated events tell nothing new (``ConditionalTest.novelty``). That of a
+is loaded throughout each; repeated events count for less (``ConditionalTest.novelty``). That of a
 gain g is the log likelihood ratio
 
     log sum_{g, s} P(g) P(s) L_s(g) / max_{1/1.3 <= h <= 1.3} L_s(h),    L_s(g) = prod_{e >= s} t_4(y_e; sqrt(g) m_e)

@@ -182,7 +182,7 @@ def _drift(first: NDArray[np.intp], test: ConditionalTest, expected: Prediction,
     whole, on_whole = test.features[test.begins], expected.on(test.begins)
     novelty = test.novelty(expected.own)[test.begins]
     moving = moved[-1] & np.isfinite(on_whole.spread)
-    offset = offset_evidence(whole, on_whole.always, moving, 1.0 if expected.own else novelty)
+    offset = offset_evidence(whole, on_whole.always, moving, novelty)
     return offset, gain_evidence(whole, on_whole, moved, test.cells.scale.root_near, counts * novelty)
 
 

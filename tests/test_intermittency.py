@@ -202,6 +202,13 @@ def test_where_healthy_cells_blink_in_bursts_it_takes_more_to_be_faulty():
     assert HealthyRates.fit(calm, SCALE, LAYOUT).blinks_count == 1
 
 
+def test_bursts_that_a_few_recordings_show_on_other_cells_are_healthy_on_any():
+    few = [tapped(seed, [seed], 96, rate=8.0) for seed in range(8)]
+    bursts = HealthyRates.fit([*few, *(healthy(seed, 96) for seed in range(100, 108))], SCALE, LAYOUT)
+    for seed in range(50, 60):
+        assert cells(evidence_of(tapped(seed, [8 + seed % 12], 96, rate=8.0), bursts).intermittent) == []
+
+
 def test_a_cell_that_always_blinked_is_healthy_and_no_other_is_forgiven():
     edge = HealthyRates.fit([tapped(seed, [3]) for seed in range(10)], SCALE, LAYOUT)
     log = inject(tapped(30, [3]), [Fault("intermittent", (7,), onset=320)], LAYOUT, seed=0)

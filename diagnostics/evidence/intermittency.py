@@ -11,21 +11,22 @@ A blink leaves a load in one step and returns to it in one step within 6 frames.
 lowest load that any cell shows: where a threshold hides small loads, weak ones come and go in one step. Cells at the
 edge of most contacts blink more often than others: r is the posterior mean of a cell under a gamma prior with the mean
 of the array and shape 1/2, that of Jeffreys' prior of a Poisson rate (1946). Noise is the median absolute second
-difference. The factor c <= 1 keeps all but 1 % of healthy cells below 14 / 1.5 (overdispersion, as in a
-quasi-likelihood: McCullagh and Nelder 1989). Segments in which many cells blink or are noisy together do not count: the
-contact moves. Blinks without load, and noise of constant cells, are not detected.
+difference. The factor c <= 1 keeps all but 1 % of healthy cells below 14 / 1.5, at the rates of other recordings
+(overdispersion, as in a quasi-likelihood: McCullagh and Nelder 1989). Segments in which many cells blink or are noisy
+together do not count: the contact moves. Blinks without load, and noise of constant cells, are not detected.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import SHORTEST_RUN, segments
+from diagnostics.healthy.cross_fitting import FOLDS
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import LIGHT, MARGIN
 from diagnostics.preprocessing.readings import SEGMENT
@@ -47,6 +48,31 @@ _CROWD = 0.25  # share of the loaded cells, and of all, that may be noisy togeth
 _THRESHOLD = 14.0  # of the CUSUM: a prior of one in a thousand, and P(faulty) = 0.999
 _MAX = 40.0  # upper limit of the CUSUM, so that a repaired cell is cleared soon
 _HEALTHY = 0.99  # quantile of the cells, of the largest CUSUM in the reference
+
+
+class _Counts(NamedTuple):
+    """Blinks and loaded frames of each cell in one recording, ``[D]``; noise and load level by segment, ``[n]``."""
+
+    blinks: Floats
+    loaded: Floats
+    noise: Floats
+    level: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, recording: Floats, scale: Scale, layout: SensorLayout, alone: bool, lowest: float) -> _Counts:
+        """Count; ``alone``, ``lowest``: see :func:`_measure`."""
+        every, blinks, loaded = np.arange(layout.n_cells), np.zeros(layout.n_cells), np.zeros(layout.n_cells)
+        noise, levels = [np.zeros(0)], [np.zeros(0, np.intp)]
+        for first in range(0, len(recording), SEGMENT):
+            frames = recording[first : first + SEGMENT]
+            low, high, under_load, noise_level, level = _measure(
+                frames, scale.root_load(frames), scale, every, layout, alone, lowest
+            )
+            blinks, loaded = blinks + low + high, loaded + under_load
+            if len(frames) >= SHORTEST_RUN:
+                noise.append(noise_level)
+                levels.append(level)
+        return cls(blinks, loaded, np.concatenate(noise), np.concatenate(levels))
 
 
 @dataclass(frozen=True)
@@ -81,42 +107,41 @@ class HealthyRates:
 
     @classmethod
     def _counted(cls, recordings: Sequence[Floats], scale: Scale, layout: SensorLayout, alone: bool) -> HealthyRates:
-        every = np.arange(layout.n_cells)
         lowest = min((_lowest_load(recording, scale) for recording in recordings), default=np.inf)
-        blinks, loaded = np.zeros((2, layout.n_cells))
-        noise: list[list[Floats]] = [[] for _ in _LEVELS]
-        for recording in recordings:
-            for first in range(0, len(recording), SEGMENT):
-                frames = recording[first : first + SEGMENT]
-                low, high, under_load, noise_level, level = _measure(
-                    frames, scale.root_load(frames), scale, every, layout, alone, lowest
-                )
-                blinks += low + high
-                loaded += under_load
-                if len(frames) >= SHORTEST_RUN:
-                    for k in range(len(_LEVELS)):
-                        noise[k].append(noise_level[level == k])
+        counts = [_Counts.of(recording, scale, layout, alone, lowest) for recording in recordings]
+        # Cross-fitting: new recordings may exceed the rates of few others.
+        reached = np.zeros((2, layout.n_cells))
+        every = np.random.default_rng(0).permutation(len(recordings))
+        for fold in np.array_split(every, min(FOLDS, len(every))):
+            others = np.setdiff1d(every, fold) if len(fold) < len(every) else fold
+            usual = cls._of([counts[i] for i in others], scale, alone, lowest)
+            intermittency = Intermittency.begin(layout)
+            for i in fold.tolist():
+                for frames, numbers, runs in segments(recordings[i], scale):
+                    constant = runs.start <= numbers[0]
+                    intermittency = intermittency.extend(
+                        frames, scale.root_load(frames), numbers, scale, usual, constant, np.inf
+                    )
+                    reached = np.maximum(reached, [intermittency.blinking, intermittency.noisy])
+        factors = _THRESHOLD / np.maximum(_THRESHOLD, MARGIN * np.quantile(reached, _HEALTHY, axis=1))
+        usual = cls._of(counts, scale, alone, lowest)
+        return replace(usual, blinks_count=float(factors[0]), noise_counts=float(factors[1]))
+
+    @classmethod
+    def _of(cls, counts: Sequence[_Counts], scale: Scale, alone: bool, lowest: float) -> HealthyRates:
+        """Return the rates in some recordings."""
         limit = np.zeros(len(_LEVELS))
-        for k, of_level in enumerate(noise):
+        for k in range(len(_LEVELS)):
             # One pseudo-sample with the noise of a cold start: rare noise is not seen in few samples.
-            limit[k] = np.quantile(np.concatenate([*of_level, [LIGHT]]), 1 - _RARE)
+            samples = [c.noise[c.level == k] for c in counts]
+            limit[k] = np.quantile(np.concatenate([*samples, [LIGHT]]), 1 - _RARE)
         # Readings within +- tolerance (near / 2) have second differences up to 2 near.
         limit = np.maximum.accumulate(np.maximum(limit, 2 * scale.near / scale.full_scale))
+        blinks, loaded = sum(c.blinks for c in counts), sum(c.loaded for c in counts)
         # One pseudo-blink, in as many frames as it takes at the rate of a cold start.
-        mean = max(0.1 * _RARE, (float(blinks.sum()) + 1) / (float(loaded.sum()) + 1 / _RARE))
+        mean = max(0.1 * _RARE, (float(np.sum(blinks)) + 1) / (float(np.sum(loaded)) + 1 / _RARE))
         of_cells = np.maximum(0.1 * _RARE, (blinks + _PRIOR_BLINKS) / (loaded + _PRIOR_BLINKS / mean))
-        usual = cls(mean, limit, alone=alone, lowest=lowest, of_cells=of_cells)
-        intermittency = Intermittency.begin(layout)
-        reached = np.stack([intermittency.blinking, intermittency.noisy])
-        for recording in recordings:
-            for frames, numbers, runs in segments(recording, scale):
-                constant = runs.start <= numbers[0]
-                intermittency = intermittency.extend(
-                    frames, scale.root_load(frames), numbers, scale, usual, constant, np.inf
-                )
-                reached = np.maximum(reached, [intermittency.blinking, intermittency.noisy])
-        counts = _THRESHOLD / np.maximum(_THRESHOLD, MARGIN * np.quantile(reached, _HEALTHY, axis=1))
-        return replace(usual, blinks_count=float(counts[0]), noise_counts=float(counts[1]))
+        return cls(mean, limit, alone=alone, lowest=lowest, of_cells=of_cells)
 
     @classmethod
     def unknown(cls) -> HealthyRates:

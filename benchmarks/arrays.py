@@ -9,6 +9,7 @@ from pathlib import Path
 import gestures
 import static_holds
 from other_sensors import DRIFTS, SENSORS, remade
+from random_sensors import draw
 from rows import Bench
 
 from adaptfault.data.recordings import Recordings, load
@@ -92,6 +93,12 @@ def on_buses(split: int, repeat: int, logs: int) -> Bench:
     return Bench(replace(recordings, layout=replace(recordings.layout, wiring="bus")), split, logs, repeat)
 
 
+def random_sensor(split: int, repeat: int, logs: int) -> Bench:
+    """Return a sensor of its own for each split and repeat."""
+    real = [lambda file=file: load(DATA / file).recordings for file in (HAND, FINGERTIPS, SOLES)]
+    return Bench(draw(1000 * split + repeat, real), split, logs, repeat)
+
+
 def wired(layout: SensorLayout) -> Callable[[int, int], Recordings]:
     """Return simulated grasps of an array with declared wiring."""
     plain = grasps(replace(layout, groups=None))
@@ -117,6 +124,7 @@ ARRAYS = [
         ),
         real(SOLES), 30, 2, 12, (*MAIN, "cold"), SOLES,
     ),
+    Array("random sensors", MAIN, random_sensor, 10, 20, file=HAND),
     *(Array(f"hand, {name}", MAIN, sensor(name), 30, file=HAND) for name in (*SENSORS, *DRIFTS) if name != "as it is"),
     *(
         Array(f"fabric, {name}", SKIN, simulated(skin.recordings), 30, 1, 12 * (name == "10 x 10"))

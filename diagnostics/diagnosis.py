@@ -115,7 +115,8 @@ class SelfDiagnosis:
             ValueError: recordings that do not fit the layout, or hold no frame with a reading.
         """
         progress(0.0)
-        healthy = _recordings(recordings, self.layout).valid(self.layout.full_scale).whole(self.layout.present.ravel())
+        present = self.layout.present.ravel()
+        healthy = _recordings(recordings, self.layout).valid(self.layout.full_scale, present).whole(present)
         layout = self._planes
         if self.layout.axes > 1:
             healthy = RecordingBlocks([given[:, self._order] for given in healthy.given])
@@ -152,7 +153,7 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
-        log = _recordings(recordings, self.layout).valid(self.layout.full_scale)
+        log = _recordings(recordings, self.layout).valid(self.layout.full_scale, self.layout.present.ravel())
         if self.reference_ is None or self.layout.axes > 1:
             return None
         if self.load_ is not None:

@@ -1,10 +1,14 @@
-"""Readings that no converter gives (infinite, or far outside its range) count as missing, and are counted."""
+"""Readings that no converter gives (infinite, or far outside its range) count as missing, and are counted.
+
+Readings of positions without a cell count as missing too.
+"""
 
 import numpy as np
 import pytest
 
 from adaptfault.data.recordings import Recordings
-from diagnostics import Diagnosis, Fault, Monitor, SelfDiagnosis, inject
+from adaptfault.data.simulated_grasps import simulate
+from diagnostics import Diagnosis, Fault, Monitor, SelfDiagnosis, SensorLayout, inject
 
 IMPOSSIBLE = [np.inf, -np.inf, 1e308, 1e30, -1e30]
 
@@ -53,3 +57,32 @@ def test_a_reference_with_impossible_readings_is_fitted_as_one_with_missing_read
     fits = [SelfDiagnosis(small_grasps.layout).fit([*frames[:3], r, *frames[4:]]) for r in (spoiled, missing)]
     first, second = (fit.diagnose(small_grasps.frames[20]).probability for fit in fits)
     assert (first == second).all()
+
+
+def read_there(frames: np.ndarray, layout: SensorLayout, what: str) -> np.ndarray:
+    """Return ``frames`` ``[T, D]`` with readings at the positions without a cell."""
+    absent, seen = ~layout.present.ravel(), frames.copy()
+    rng = np.random.default_rng(len(frames))
+    value = {
+        "a copy of all": 2 * frames[:, ~absent].mean(axis=1, keepdims=True),
+        "noise": rng.uniform(0, layout.full_scale, (len(frames), int(absent.sum()))),
+        "too much": np.inf,
+    }[what]
+    seen[:, absent] = value
+    return seen
+
+
+@pytest.mark.usefixtures("uncalibrated")
+@pytest.mark.parametrize("what", ["a copy of all", "noise", "too much"])
+def test_what_a_position_without_a_cell_reads_changes_nothing(what: str):
+    present = np.ones((1, 6, 7), bool)
+    present[0, :2, :3] = False
+    layout = SensorLayout(1, 6, 7, present=present)
+    plain = [np.where(present.ravel(), r, 0.0) for r in simulate(6, layout, n_frames=40, seed=4).frames]
+    log = [inject(r, [Fault("short", (25,)), Fault("open", (31,))], layout) for r in plain[::7]]
+    floating = [read_there(r, layout, what) for r in plain]
+    expected = SelfDiagnosis(layout).fit(plain[1::2]).diagnose(log).to_dict()
+    found = SelfDiagnosis(layout).fit(floating[1::2]).diagnose([read_there(r, layout, what) for r in log])
+    assert found.to_dict() == expected
+    cold = SelfDiagnosis(layout)
+    assert cold.diagnose([read_there(r, layout, what) for r in log]).to_dict() == cold.diagnose(log).to_dict()

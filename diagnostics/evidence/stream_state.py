@@ -126,6 +126,8 @@ class StreamState:
             side = np.where(np.isnan(frames), self.below, frames < self.load.rest)
             self.below = side[-1].astype(bool) if len(side) else self.below
             frames = self.load.loads(frames)
+        if not self.present.all():  # a position without a cell may read anything
+            frames = np.where(self.present, frames, np.nan)
         wrong = invalid(frames, self.layout.full_scale)
         if wrong is not None:
             frames, self.transport = np.where(wrong, np.nan, frames), self.transport.dropped(wrong)

@@ -67,10 +67,16 @@ class RecordingBlocks(Sequence[Recording]):
             low, high = np.fmin(low, np.fmin.reduce(frames)), np.fmax(high, np.fmax.reduce(frames))
         return low, high
 
-    def valid(self, full_scale: float) -> RecordingBlocks:
-        """Return the recordings with readings that no converter gives as missing, see ``transport.invalid``."""
+    def valid(self, full_scale: float, present: NDArray[np.bool_]) -> RecordingBlocks:
+        """Return the recordings with some readings as missing.
+
+        These are readings that no converter gives, see ``transport.invalid``, and those of positions without a cell,
+        not ``present`` (bool ``[D]``): they may read anything.
+        """
         checked = []
         for given in self.given:
+            if given[:, ~present].any():
+                given = np.where(present, given, np.nan)
             wrong = invalid(given, full_scale) if len(given) else None
             checked.append(given if wrong is None else np.where(wrong, np.nan, given))
         return RecordingBlocks(checked)

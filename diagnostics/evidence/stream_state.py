@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.events.constant_runs import ConstantRuns
-from diagnostics.events.contact_events import EventLog
+from diagnostics.events.contact_events import THE_SAME, EventLog, count_repeats
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import Rectangle, Tile, tiles
-from diagnostics.evidence.conditional_test import CellState, ConditionalTest, HeldValues, Model
+from diagnostics.evidence.conditional_test import REPEATS, CellState, ConditionalTest, HeldValues, Model
 from diagnostics.evidence.drift import offset_evidence
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
@@ -289,7 +289,8 @@ class StreamState:
             whole = np.stack([event.whole.features() for event in events.kept])
             always = self.model_of(i, events)(whole, predictors[tile.inputs]).always
             likely = np.maximum(always, OUTLIERS)
-            surprisal[tile.outputs] = offset_evidence(whole, likely, self.present[tile.inputs], 1.0)[tile.place]
+            novelty = 1 / (1 + REPEATS * count_repeats(events.kept, THE_SAME)[:, None])
+            surprisal[tile.outputs] = offset_evidence(whole, likely, self.present[tile.inputs], novelty)[tile.place]
         return surprisal
 
     def log_held(self, root: NDArray[np.float64], predictors: Mask, values: HeldValues) -> NDArray[np.float64]:

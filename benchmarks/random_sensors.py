@@ -8,18 +8,17 @@ The number of recordings is drawn too, from few to many.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import gestures
 import numpy as np
 import static_holds
+from other_sensors import Change, Frames, remade
 from scipy.signal import lfilter
 
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.simulated_grasps import CLASS_NAMES, simulate
 from diagnostics import SensorLayout
 
-Frames = np.ndarray
 FEWEST_FRAMES = 20  # of a recording at a lower frame rate
 
 
@@ -29,7 +28,8 @@ def draw(seed: int, real: list[Callable[[], Recordings]]) -> Recordings:
     kinds = fabric, posture, grasps, *(lambda rng, seed, load=load: some(load(), rng) for load in real)
     kind = int(rng.integers(len(kinds)))
     recordings = kinds[kind](rng, seed)
-    return recordings if kind < 2 else remade(recordings, rng)
+    # Fabric skins and seats have a noise and a baseline of their own.
+    return recordings if kind < 2 else remade(recordings, reading(rng, recordings.layout.n_cells))
 
 
 def fabric(rng: np.random.Generator, seed: int) -> Recordings:
@@ -74,9 +74,8 @@ def some(recordings: Recordings, rng: np.random.Generator) -> Recordings:
     return recordings.select(rng.choice(len(recordings), count, replace=False))
 
 
-def remade(recordings: Recordings, rng: np.random.Generator) -> Recordings:
-    """Return what another sensor, of full scale 1, would have recorded."""
-    n_cells, full_scale = recordings.layout.n_cells, recordings.layout.full_scale
+def reading(rng: np.random.Generator, n_cells: int) -> Change:
+    """Return how a sensor drawn at random reads, of which ``rng`` draws the noise too."""
     noise, steps = rng.choice([0.0, 0.001, 0.004, 0.01]), rng.choice([100, 255, 1023, 4095])
     rest = rng.choice([0.0, 0.0, 0.03, 0.1]) * rng.uniform(0.5, 1.5, n_cells)
     gain = 1 + rng.choice([0.0, 0.3, 0.6]) * rng.uniform(-1, 1, n_cells)
@@ -84,8 +83,8 @@ def remade(recordings: Recordings, rng: np.random.Generator) -> Recordings:
     wander, crosstalk = rng.choice([0.0, 0.0, 0.01]), rng.choice([0.0, 0.0, 0.05])
     every = int(rng.choice([1, 1, 2, 3]))
 
-    def read(frames: Frames) -> Frames:
-        load = np.nan_to_num(np.asarray(frames, dtype=np.float64) / full_scale)
+    def read(frames: Frames, _: np.random.Generator) -> Frames:
+        load = np.nan_to_num(frames)
         if len(load) >= FEWEST_FRAMES * every:
             load = load[::every]
         load = np.maximum(lfilter([1 - lag], [1, -lag], load, axis=0), 0) ** power * gain
@@ -93,5 +92,4 @@ def remade(recordings: Recordings, rng: np.random.Generator) -> Recordings:
         value = load * (1 - 1.5 * rest.max()) + rest + rng.uniform(0, wander) + noise * rng.standard_normal(load.shape)
         return np.clip(np.round(value * steps) / steps, 0, 1)
 
-    layout = replace(recordings.layout, full_scale=1.0)
-    return replace(recordings, frames=tuple(map(read, recordings.frames)), layout=layout)
+    return read

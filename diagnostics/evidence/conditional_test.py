@@ -32,7 +32,7 @@ from diagnostics.preprocessing.scale import Array, Scale
 
 _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
 _PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit: all cells may be dead
-REPEATS = 0.15  # correlation of events that are the same
+_REPEATS = 0.15  # correlation of events that are the same
 _COLD_SCALE = 2.5  # of an event without a reference; benchmarks/cold_calibration.py fits 2.9, at less precision
 
 Floats = NDArray[np.float64]
@@ -144,19 +144,24 @@ class ConditionalTest:
 
     def novelty(self, own: bool) -> Floats:
         """Return the weight w_e of each excerpt, ``[n, 1]``; ``own``: whether predictions are specific to each cell."""
-        return np.asarray(1 / (1 + (REPEATS if own else 1.0) * self.repeats))
+        return novelty(self.repeats, own)
 
     def _weights(self, own: bool) -> Floats:
         """Return the weight of each excerpt for each cell, ``[n, D]`` or ``[n, 1]``, see the module."""
         weights = self.novelty(own)
         if own:
             return weights
-        scale = _COLD_SCALE / (1 + REPEATS * (weights[self.begins].sum() - 1))
+        scale = _COLD_SCALE / (1 + _REPEATS * (weights[self.begins].sum() - 1))
         return weights * np.where(self.cells.values.rests, scale, 1.0)
 
     def summed(self, surprisal: Floats) -> Floats:
         """Return the evidence ``[D]`` of all events, earlier ones included."""
         return np.where(self.cells.scored, self.cells.accumulated + surprisal.sum(axis=0), 0.0)
+
+
+def novelty(repeats: NDArray[np.intp], own: bool = True) -> Floats:
+    """Return the weight w_e of events with so many ``repeats`` before them; ``own``: predictions are of each cell."""
+    return np.asarray(1 / (1 + (_REPEATS if own else 1.0) * repeats))
 
 
 def _excerpts(events: Sequence[ContactEvent], runs: ConstantRuns, scored: Mask) -> tuple[Array, Mask, Mask]:

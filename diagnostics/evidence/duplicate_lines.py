@@ -108,7 +108,6 @@ class _Pairs:
         since = np.where(ever, numbers[last] + 1, self.since)
         both: Mask = np.take(informative, self.first, axis=1)  # [pads, pairs, positions]
         both &= np.take(informative, self.second, axis=1)
-        both &= self.there
         seen_by, coincidences, sums = self.seen_by, self.coincidences, self.sums
         agree = both.any(axis=2) & ~ever
         if agree.any() or (ever & (coincidences > 0)).any():

@@ -22,7 +22,7 @@ from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import THE_SAME, EventLog, count_repeats
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import Rectangle, Tile, tiles
-from diagnostics.evidence.conditional_test import REPEATS, CellState, ConditionalTest, HeldValues, Model
+from diagnostics.evidence.conditional_test import CellState, ConditionalTest, HeldValues, Model, novelty
 from diagnostics.evidence.drift import offset_evidence
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
@@ -279,6 +279,7 @@ class StreamState:
         """Return -log P(a healthy cell stays loaded in all events since one last left it unloaded) ``[D]``.
 
         Given the readings of the ``predictors`` (bool ``[D]``) alone: cells on one object would support each other.
+        Repeated events count for less.
         Tiles without one of the ``cells`` (bool ``[D]``) are left out.
         """
         surprisal = np.zeros(self.layout.n_cells)
@@ -289,8 +290,8 @@ class StreamState:
             whole = np.stack([event.whole.features() for event in events.kept])
             always = self.model_of(i, events)(whole, predictors[tile.inputs]).always
             likely = np.maximum(always, OUTLIERS)
-            novelty = 1 / (1 + REPEATS * count_repeats(events.kept, THE_SAME)[:, None])
-            surprisal[tile.outputs] = offset_evidence(whole, likely, self.present[tile.inputs], novelty)[tile.place]
+            counts = novelty(count_repeats(events.kept, THE_SAME))[:, None]
+            surprisal[tile.outputs] = offset_evidence(whole, likely, self.present[tile.inputs], counts)[tile.place]
         return surprisal
 
     def log_held(self, root: NDArray[np.float64], predictors: Mask, values: HeldValues) -> NDArray[np.float64]:

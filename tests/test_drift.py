@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from diagnostics.evidence.drift import drifting, gain_evidence, gains_count, misleading
+from diagnostics import FaultKind, SelfDiagnosis, SensorLayout
+from diagnostics.evidence.drift import drift_counts, drifting, gain_evidence, misleading
 from diagnostics.healthy.prediction import Prediction
 
 CELLS, NEAR = 30, 0.1
@@ -92,7 +93,35 @@ def test_what_counts_for_less_proves_less_and_what_healthy_cells_reached_proves_
     )
     assert full > some > none
     assert none < 0
-    assert gains_count(0.0) == gains_count(3.0) == 1
-    for reached in (8.0, 30.0):
-        assert not drifting(np.zeros(1), np.array([reached * gains_count(reached)])).any()
-        assert drifting(np.zeros(1), np.array([2 * reached * gains_count(reached)])).all()
+    assert drift_counts(0.0, 0.0) == drift_counts(3.0, 3.0) == (1, 1)
+    for reached in (10.0, 30.0):
+        offset, gain = drift_counts(reached, reached)
+        for evidence in ((reached * offset, 0.0), (0.0, reached * gain)):
+            assert not drifting(*np.array([evidence]).T).any()
+            assert drifting(*2 * np.array([evidence]).T).all()
+
+
+def held_beside_contacts(count: int, share: float, seed: int) -> list[np.ndarray]:
+    """Contacts on 4 x 6 cells; in a ``share`` of the recordings a hand holds a cell of the left column throughout."""
+    rng, recordings = np.random.default_rng(seed), []
+    for _ in range(count):
+        load = np.zeros((160, 4, 6))
+        for first in range(2, 160, 20):
+            row, column = rng.integers(0, 3), rng.integers(0, 5)
+            load[first : first + 16, row : row + 2, column : column + 2] += 0.6 * np.hanning(16)[:, None, None]
+        if rng.random() < share:
+            load[:, rng.integers(4), 0] += rng.uniform(0.3, 0.5) + 0.005 * rng.standard_normal(160).cumsum()
+        readings = load.reshape(160, 24) + 0.002 * rng.standard_normal((160, 24))
+        recordings.append(np.clip(np.round(readings * 255) / 255, 0, 1))
+    return recordings
+
+
+def test_loads_that_outlast_contacts_are_no_offsets_where_healthy_cells_hold_them_too():
+    fitted = SelfDiagnosis(SensorLayout(1, 4, 6)).fit(held_beside_contacts(40, 0.15, 0))
+    for log in held_beside_contacts(10, 1.0, 100):
+        assert not fitted.diagnose(log).fault_set
+    broken = held_beside_contacts(6, 0.0, 200)
+    for recording in broken:
+        recording[:, 9] += 0.1
+    (found,) = fitted.diagnose(broken).faults
+    assert (found.kind, found.cells) == (FaultKind.DRIFT, (9,))

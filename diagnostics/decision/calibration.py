@@ -15,7 +15,7 @@ limit (:func:`faulty_at`). Faults unlike the injected ones are calibrated as wel
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.special import expit, logit
 
 from diagnostics.events.tiles import MOST_CELLS
-from diagnostics.evidence.drift import gains_count
+from diagnostics.evidence.drift import drift_counts
 from diagnostics.evidence.reference import Reference
 from diagnostics.evidence.spatial import Exclusion
 from diagnostics.evidence.stream_state import StreamState
@@ -52,13 +52,14 @@ Floats = NDArray[np.float64]
 
 
 class _Trial(NamedTuple):
-    """Evidence of the constant cells of a simulated log, ``[n]`` each, and of the gains of the working cells."""
+    """Evidence of the constant cells of a simulated log, ``[n]`` each, and of drift of the working cells."""
 
     kind: NDArray[np.intp]
     ratio: Floats
     temporal: Floats
     broken: NDArray[np.bool_]
-    gain: float  # the highest log evidence of another gain
+    offset: float  # the highest log evidence of an offset
+    gain: float  # the same, of another gain
 
 
 @dataclass(frozen=True)
@@ -72,12 +73,14 @@ class Calibrator:
         slope: b, by kind.
         temporal: d, by kind.
         gains: factor on the evidence of a changed gain.
+        baselines: the same, of an offset.
     """
 
     offset: tuple[float, ...] = (0.0, -1.0, -1.0)
     slope: tuple[float, ...] = (0.6, 0.6, 0.6)
     temporal: tuple[float, ...] = (1.0, 0.5, 0.5)
     gains: float = 1.0
+    baselines: float = field(default=1.0, metadata={"newer": True})
 
     @classmethod
     def cold(cls) -> Calibrator:
@@ -138,7 +141,7 @@ class Calibrator:
         for n in stages:
             trials = []
             for simulated in logs[:n]:
-                trials.append(_trial(*simulated, weights.exclusion._replace(gains=1.0)))
+                trials.append(_trial(*simulated, weights.exclusion._replace(offsets=1.0, gains=1.0)))
                 done += 1
                 progress(done / n_steps)
             weights = cls._of(trials)
@@ -151,7 +154,7 @@ class Calibrator:
     @classmethod
     def _of(cls, trials: Sequence[_Trial]) -> Calibrator:
         """Fit to simulated logs; a kind with too few broken or healthy cells keeps the defaults."""
-        *measured, gain = zip(*trials, strict=True)
+        *measured, offset_reached, gain_reached = zip(*trials, strict=True)
         kind, ratio, temporal, dead = (np.concatenate(column) for column in measured)
         kind = np.where(kind == 3, 0, kind)
         evidence = np.column_stack([np.clip(ratio, -_CLIP, _CLIP), temporal])
@@ -165,12 +168,13 @@ class Calibrator:
                 if fitted[1] > 0:
                     found[k] = fitted
         offset, slope, temporal_share = zip(*found, strict=True)
-        return cls(offset, slope, temporal_share, gains_count(max(gain)))
+        baselines, gains = drift_counts(max(offset_reached), max(gain_reached))
+        return cls(offset, slope, temporal_share, gains, baselines)
 
     @property
     def exclusion(self) -> Exclusion:
-        """The raw log ratio from which on a cell is excluded from the predictors, and the factor of gains."""
-        return Exclusion((SUSPICIOUS - self.offset[0]) / max(self.slope[0], 1e-9), self.gains)
+        """The raw log ratio from which on a cell is excluded from the predictors, and the factors of drift."""
+        return Exclusion((SUSPICIOUS - self.offset[0]) / max(self.slope[0], 1e-9), self.baselines, self.gains)
 
     def calibrate(
         self, ratio: Floats, temporal: Floats, kind: NDArray[np.intp], tested: NDArray[np.bool_] | bool = True
@@ -265,8 +269,10 @@ def _trial(
     spatial = stream.spatial().finish()
     broken = np.zeros(layout.n_cells, bool)
     broken[[c for fault in faults for c in fault.cells]] = True
-    scored, gain = spatial.scored, float(np.where(broken, 0.0, spatial.gain).max())
-    return _Trial(kinds(stream)[scored], spatial.evidence[scored], stream.temporal()[scored], broken[scored], gain)
+    scored = spatial.scored
+    offset, gain = (float(np.where(broken, 0.0, evidence).max()) for evidence in (spatial.offset, spatial.gain))
+    constant = kinds(stream)[scored], spatial.evidence[scored], stream.temporal()[scored], broken[scored]
+    return _Trial(*constant, offset, gain)
 
 
 def faulty_at(probability: Floats, false_discovery_rate: float) -> NDArray[np.bool_]:

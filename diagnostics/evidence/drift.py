@@ -45,7 +45,7 @@ def offset_evidence(whole: Array, always: Floats, moving: Mask, counts: Floats |
         whole: features ``[n, 4, D]`` of n events (see ``Summary.features``), in time order.
         always: ``[n, D]``, P(loaded throughout) of a healthy cell.
         moving: bool ``[D]``, cells that move.
-        counts: ``[n, 1]``, weight of each event.
+        counts: ``[n, 1]``, weight of each event, see :func:`drift_counts`.
     """
     loaded = (whole[:, 3] == 1) & (whole[:, 1] ** 2 >= SLIGHT)
     lasting = np.logical_and.accumulate(loaded[::-1])[::-1]  # unbroken up to the end
@@ -82,7 +82,7 @@ def gain_evidence(
         expected: prediction for healthy cells.
         moved: bool ``[n, D]``, events before the constant run of each cell.
         root_near: the root load from which on a cell counts as loaded.
-        counts: ``[n, 1]``, weight of each event, see :func:`gains_count`.
+        counts: ``[n, 1]``, weight of each event, see :func:`drift_counts`.
     """
     informative = (
         moved & np.isfinite(expected.spread) & expected.own & (whole[:, 2] > 0) & (expected.mean > MARGIN * root_near)
@@ -117,12 +117,13 @@ def gain_evidence(
     return result
 
 
-def gains_count(reached: float) -> float:
-    """Return the factor on the evidence of gains that keeps ``reached``, the most of healthy cells, below 7 / 1.5.
+def drift_counts(offset: float, gain: float) -> tuple[float, float]:
+    """Return the factors on the evidence that keep ``offset`` and ``gain``, the most of healthy cells, below a limit.
 
-    Events may be correlated, or contacts so small that the neighbours do not determine the load of a cell.
+    That is the threshold / 1.5. Events may be correlated, contacts so small that the neighbours do not determine the
+    load of a cell, and cells always loaded where those beside them are not.
     """
-    return _GAIN / max(_GAIN, MARGIN * reached)
+    return _OFFSET / max(_OFFSET, MARGIN * offset), _GAIN / max(_GAIN, MARGIN * gain)
 
 
 def drifting(offset: Floats, gain: Floats | float = 0.0) -> Mask:

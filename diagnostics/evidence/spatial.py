@@ -45,10 +45,12 @@ class Exclusion(NamedTuple):
 
     Attributes:
         threshold: log evidence from which on a cell is excluded.
-        gains: factor on the evidence of a changed gain, see :func:`~diagnostics.evidence.drift.gains_count`.
+        offsets, gains: factor on the evidence of an offset, and of a changed gain, see
+            :func:`~diagnostics.evidence.drift.drift_counts`.
     """
 
     threshold: float = SUSPICIOUS
+    offsets: float = 1.0
     gains: float = 1.0
 
 
@@ -148,7 +150,7 @@ class SpatialTest:
     def _look_for_drift(self, expected: Prediction, surprisal: Floats) -> None:
         """Exclude cells with another offset or gain and start again, or set the result if there is no new one."""
         test, first = self._test, np.array([event.first for event in self._events])
-        offset, gain = _drift(first, test, expected, self._exclusion.gains)
+        offset, gain = _drift(first, test, expected, self._exclusion)
         more = misleading(offset, gain.evidence, ~test.eligible)
         self._exclusions += 1
         if more.any() and self._exclusions < _MOST_ROUNDS:
@@ -168,22 +170,24 @@ class SpatialTest:
         )
 
 
-def _drift(first: NDArray[np.intp], test: ConditionalTest, expected: Prediction, counts: float) -> tuple[Floats, Gain]:
+def _drift(
+    first: NDArray[np.intp], test: ConditionalTest, expected: Prediction, counts: Exclusion
+) -> tuple[Floats, Gain]:
     """Return the evidence ``[D]`` of an offset, and that of a changed gain.
 
     Args:
         first: int ``[n]``, first frame of each event.
         test: of these events.
         expected: prediction for their excerpts.
-        counts: factor on the evidence of a changed gain.
+        counts: has the factors on the evidence.
     """
     runs = test.cells.runs
     moved = test.cells.eligible & runs.moved & (first[:, None] <= runs.start)
     whole, on_whole = test.features[test.begins], expected.on(test.begins)
     novelty = test.novelty(expected.own)[test.begins]
     moving = moved[-1] & np.isfinite(on_whole.spread)
-    offset = offset_evidence(whole, on_whole.always, moving, novelty)
-    return offset, gain_evidence(whole, on_whole, moved, test.cells.scale.root_near, counts * novelty)
+    offset = offset_evidence(whole, on_whole.always, moving, counts.offsets * novelty)
+    return offset, gain_evidence(whole, on_whole, moved, test.cells.scale.root_near, counts.gains * novelty)
 
 
 def _with_prior(surprisal: Floats, prior: Floats) -> Floats:

@@ -74,6 +74,27 @@ def test_offsets_that_each_cell_changes_for_itself_from_one_recording_to_the_nex
     assert most.max() < 0.14
 
 
+@pytest.mark.parametrize(("noise", "loaded"), [(0.0, 1e-3), (0.002, 4e-3)])  # 0.047 of them without the estimate
+def test_offsets_of_which_a_rest_at_0_hides_the_lower_half_are_no_load(noise: float, loaded: float):
+    rng = np.random.default_rng(2)
+    wander = 0.006 * rng.standard_normal((60, CELLS))
+    recordings = [
+        np.clip(r + w + noise * rng.standard_normal(r.shape), 0, 1) for r, w in zip(events(0, 60), wander, strict=True)
+    ]
+    most, _ = highest_and_limit(recordings, PRESENT, TOLERANCE, 1.0)
+    later = 0.006 * np.random.default_rng(3).standard_normal((1000, CELLS))
+    assert (later > most + 2 * TOLERANCE).mean() < loaded
+    assert most.max() < 0.04
+
+
+def test_light_loads_that_are_released_once_do_not_look_like_offsets_of_a_rest_at_0():
+    held = events(0, 60)
+    for i, recording in enumerate(held):
+        recording[1:, i % 3 :: 3] += 0.02
+    most, _ = highest_and_limit(held, PRESENT, TOLERANCE, 1.0)
+    np.testing.assert_array_equal(most, np.zeros(CELLS))
+
+
 def test_cells_that_are_always_loaded_do_not_make_others_rest_higher():
     held = events(0)
     for recording in held:

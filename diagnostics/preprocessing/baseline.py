@@ -1,7 +1,8 @@
 """Baseline: the reading of each cell without contact, its noise and its drift.
 
 Estimates per cell ``q05(readings) + max(0, drift + 6 sigma - tolerance)``: the 0.05 quantile, plus the upward drift of
-the baseline between recordings (mirrored from the downward drift, which loads do not hide), plus noise. The noise sigma
+the baseline between recordings (mirrored from the downward drift, which loads do not hide; of a baseline of 0, from the
+frame with the least total load in each recording), plus noise. The noise sigma
 is a robust estimate from second differences, median(|x_{t+1} - 2 x_t + x_{t-1}|) / (0.6745 sqrt 6), as
 ``scipy.stats.median_abs_deviation(scale="normal")`` of a series without trend.
 """
@@ -13,11 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, RARE
 from diagnostics.preprocessing.readings import CELLS, SEGMENT, RecordingBlocks, spread
 
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
+_QUARTER = 0.25  # of the frames, and of the cells above: quartiles
 
 Floats = NDArray[np.float64]
 
@@ -50,33 +53,44 @@ def baseline(recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance
     """
     readings, cells = RecordingBlocks.of(recordings), spread(np.flatnonzero(present))
     low, last, peaks = _low(readings)
-    offsets, curvatures = [], []
+    offsets, unloaded, curvatures = [], [], []
     for i in readings.some:
         frames = readings.piece(i, slice(None), cells)
         received = ~np.isnan(frames).any(axis=0)
         if len(frames) > 2 and received.any():
             whole = frames[:, received]
             offsets.append(np.quantile(whole, LOW, axis=0) - low[cells[received]])
+            least_loaded = whole[whole.sum(axis=1).argmin()]
+            unloaded.append(np.minimum(least_loaded, np.quantile(whole, _QUARTER, axis=0)) - low[cells[received]])
             # A load changes slowly: its second difference is small.
             curvatures.append(np.median(np.abs(np.diff(whole, 2, axis=0)), axis=0))
     if not offsets:
         return Baseline(low, low, np.nan, last, peaks)
     offset = np.concatenate(offsets)
-    light = offset[offset < LIGHT * full_scale]
+    light = offset < LIGHT * full_scale
+    drift = _highest(offset[light], np.concatenate(unloaded)[light])
     noise = float(np.quantile(np.concatenate(curvatures), LEAST_LOADED)) / (0.6745 * np.sqrt(6))
-    highest = low + max(0.0, _highest(light) + _NOISE * noise - tolerance)
+    highest = low + max(0.0, drift + _NOISE * noise - tolerance)
     return Baseline(low, highest, noise, last, peaks)
 
 
-def _highest(offset: Floats) -> float:
+def _highest(offset: Floats, unloaded: Floats) -> float:
     """Return the upward drift of unloaded cells, mirrored from the downward drift: light loads hide the upper end.
 
-    Equals twice the median minus the 0.001 quantile, between two and three times the median.
+    Equals twice the median minus the 0.001 quantile, between two and three times the median. Where rest at 0 hides
+    the downward drift, it is the 0.999 quantile of a normal distribution with the upper quartile of ``unloaded``.
+
+    Args:
+        offset: low quantiles of the readings of a cell in a recording, ``[n]``.
+        unloaded: readings of these cells with hardly any load on the array, ``[n]``.
     """
     if not len(offset):
         return 0.0
     usual = max(0.0, float(np.median(offset)))
     below = usual - float(np.quantile(offset, RARE, method="lower"))
+    if below <= usual:  # no cell ever read less than its baseline
+        above = float(np.quantile(unloaded, 1 - _QUARTER)) - usual
+        return usual + max(usual, above * float(ndtri(RARE) / ndtri(_QUARTER)))
     return usual + float(np.clip(below, usual, 2 * usual))
 
 

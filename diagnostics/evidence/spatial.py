@@ -171,7 +171,7 @@ class SpatialTest:
 
 
 def _drift(
-    first: NDArray[np.intp], test: ConditionalTest, expected: Prediction, counts: Exclusion
+    first: NDArray[np.intp], test: ConditionalTest, expected: Prediction, exclusion: Exclusion
 ) -> tuple[Floats, Gain]:
     """Return the evidence ``[D]`` of an offset, and that of a changed gain.
 
@@ -179,15 +179,15 @@ def _drift(
         first: int ``[n]``, first frame of each event.
         test: of these events.
         expected: prediction for their excerpts.
-        counts: has the factors on the evidence.
+        exclusion: has the factors on the evidence.
     """
     runs = test.cells.runs
     moved = test.cells.eligible & runs.moved & (first[:, None] <= runs.start)
     whole, on_whole = test.features[test.begins], expected.on(test.begins)
     novelty = test.novelty(expected.own)[test.begins]
     moving = moved[-1] & np.isfinite(on_whole.spread)
-    offset = offset_evidence(whole, on_whole.always, moving, counts.offsets * novelty)
-    return offset, gain_evidence(whole, on_whole, moved, test.cells.scale.root_near, counts.gains * novelty)
+    offset = offset_evidence(whole, on_whole.always, moving, exclusion.offsets * novelty)
+    return offset, gain_evidence(whole, on_whole, moved, test.cells.scale.root_near, exclusion.gains * novelty)
 
 
 def _with_prior(surprisal: Floats, prior: Floats) -> Floats:

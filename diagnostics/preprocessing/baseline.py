@@ -1,10 +1,11 @@
 """Baseline: the reading of each cell without contact, its noise and its drift.
 
 Estimates per cell ``q05(readings) + max(0, drift + 6 sigma - tolerance)``: the 0.05 quantile, plus the upward drift of
-the baseline between recordings (mirrored from the downward drift, which loads do not hide; of a baseline of 0, from the
-frame with the least total load in each recording), plus noise. The noise sigma
-is a robust estimate from second differences, median(|x_{t+1} - 2 x_t + x_{t-1}|) / (0.6745 sqrt 6), as
-``scipy.stats.median_abs_deviation(scale="normal")`` of a series without trend.
+the baseline between recordings, plus noise. The drift is mirrored from the downward drift, which loads do not hide, but
+a baseline of 0 does: there it comes from the frame with the least total load in each recording. The noise sigma is a
+robust estimate from second differences, median(|x_{t+1} - 2 x_t + x_{t-1}|) / (0.6745 sqrt 6), as
+``scipy.stats.median_abs_deviation(scale="normal")`` of a series without trend. There, drift that less
+than a quarter of the cells show is not found.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, RARE
 from diagnostics.preprocessing.readings import CELLS, SEGMENT, RecordingBlocks, spread
 
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
-_QUARTER = 0.25  # of the frames, and of the cells above: quartiles
 
 Floats = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ def baseline(recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance
             whole = frames[:, received]
             offsets.append(np.quantile(whole, LOW, axis=0) - low[cells[received]])
             least_loaded = whole[whole.sum(axis=1).argmin()]
-            unloaded.append(np.minimum(least_loaded, np.quantile(whole, _QUARTER, axis=0)) - low[cells[received]])
+            unloaded.append(np.minimum(least_loaded, np.quantile(whole, LEAST_LOADED, axis=0)) - low[cells[received]])
             # A load changes slowly: its second difference is small.
             curvatures.append(np.median(np.abs(np.diff(whole, 2, axis=0)), axis=0))
     if not offsets:
@@ -77,8 +77,8 @@ def baseline(recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance
 def _highest(offset: Floats, unloaded: Floats) -> float:
     """Return the upward drift of unloaded cells, mirrored from the downward drift: light loads hide the upper end.
 
-    Equals twice the median minus the 0.001 quantile, between two and three times the median. Where rest at 0 hides
-    the downward drift, it is the 0.999 quantile of a normal distribution with the upper quartile of ``unloaded``.
+    Equals twice the median minus the 0.001 quantile, between two and three times the median. Where a baseline of 0
+    hides the downward drift, it is the 0.999 quantile of a normal distribution with the upper quartile of ``unloaded``.
 
     Args:
         offset: low quantiles of the readings of a cell in a recording, ``[n]``.
@@ -89,8 +89,8 @@ def _highest(offset: Floats, unloaded: Floats) -> float:
     usual = max(0.0, float(np.median(offset)))
     below = usual - float(np.quantile(offset, RARE, method="lower"))
     if below <= usual:  # no cell ever read less than its baseline
-        above = float(np.quantile(unloaded, 1 - _QUARTER)) - usual
-        return usual + max(usual, above * float(ndtri(RARE) / ndtri(_QUARTER)))
+        above = float(np.quantile(unloaded, 1 - LEAST_LOADED)) - usual
+        return usual + max(usual, above * float(ndtri(RARE) / ndtri(LEAST_LOADED)))
     return usual + float(np.clip(below, usual, 2 * usual))
 
 

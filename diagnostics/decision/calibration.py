@@ -141,7 +141,7 @@ class Calibrator:
         for n in stages:
             trials = []
             for simulated in logs[:n]:
-                trials.append(_trial(*simulated, weights.exclusion._replace(offsets=1.0, gains=1.0)))
+                trials.append(_trial(*simulated, weights.exclusion._replace(baselines=1.0, gains=1.0)))
                 done += 1
                 progress(done / n_steps)
             weights = cls._of(trials)

@@ -45,12 +45,12 @@ class Exclusion(NamedTuple):
 
     Attributes:
         threshold: log evidence from which on a cell is excluded.
-        offsets, gains: factor on the evidence of an offset, and of a changed gain, see
+        baselines, gains: factor on the evidence of an offset, and of a changed gain, see
             :func:`~diagnostics.evidence.drift.drift_counts`.
     """
 
     threshold: float = SUSPICIOUS
-    offsets: float = 1.0
+    baselines: float = 1.0
     gains: float = 1.0
 
 
@@ -186,7 +186,7 @@ def _drift(
     whole, on_whole = test.features[test.begins], expected.on(test.begins)
     novelty = test.novelty(expected.own)[test.begins]
     moving = moved[-1] & np.isfinite(on_whole.spread)
-    offset = offset_evidence(whole, on_whole.always, moving, exclusion.offsets * novelty)
+    offset = offset_evidence(whole, on_whole.always, moving, exclusion.baselines * novelty)
     return offset, gain_evidence(whole, on_whole, moved, test.cells.scale.root_near, exclusion.gains * novelty)
 
 

@@ -2,10 +2,10 @@
 
 Estimates per cell ``q05(readings) + max(0, drift + 6 sigma - tolerance)``: the 0.05 quantile, plus the upward drift of
 the baseline between recordings, plus noise. The drift is mirrored from the downward drift, which loads do not hide, but
-a baseline of 0 does: there it comes from the frame with the least total load in each recording. The noise sigma is a
-robust estimate from second differences, median(|x_{t+1} - 2 x_t + x_{t-1}|) / (0.6745 sqrt 6), as
-``scipy.stats.median_abs_deviation(scale="normal")`` of a series without trend. There, drift that less
-than a quarter of the cells show is not found.
+a baseline of 0 does: there it comes from the frame with the least total load in each recording, and drift that less
+than a quarter of the cells show is not found. The noise sigma is a robust estimate from second differences,
+median(|x_{t+1} - 2 x_t + x_{t-1}|) / (0.6745 sqrt 6), as ``scipy.stats.median_abs_deviation(scale="normal")`` of a
+series without trend.
 """
 
 from __future__ import annotations

@@ -228,6 +228,7 @@ class SelfDiagnosis:
         spatial, found = yield from self._tested(stream, explained, log_ratio)
         for beside in (False, True):
             while True:
+                yield
                 faulty = found.probability >= _DOUBTED if beside else found.faulty
                 loads = find_static_loads(stream, spatial, faulty, copies, still, beside=beside)
                 others = copies.copy()
@@ -246,13 +247,12 @@ class SelfDiagnosis:
             # about the mean of conditioning on all and on none.
             return alone + np.maximum(log_ratio(surprisal, surprisal) - alone, 0.0) / 2
 
-        for group in self._groups(found, stream, together(spatial.initial), explained):
-            yield
-            of_group = together(stream.group_excluded(spatial, explained, group))[group]
-            weight[group] = np.maximum(weight[group], of_group)
-        found = replace(found, weight=weight)
+        groups = self._groups(found, stream, together(spatial.initial), explained)
         yield
-        found = found.of(self._place)
+        for group, surprisal in stream.each_excluded(spatial, explained, groups):
+            weight[group] = np.maximum(weight[group], together(surprisal)[group])
+            yield
+        found = replace(found, weight=weight).of(self._place)
         causes, possible = root_causes(found, aliases, self.layout)
         probability, inferred = found.probability.copy(), np.zeros(self.layout.n_cells, bool)
         still = [load.of(self._order, self.layout) for load in still]

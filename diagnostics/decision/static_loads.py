@@ -113,15 +113,19 @@ def find_static_loads(
     broken = _on_broken_wires(blamed & spatial.scored, stream)
     broken |= stream.without_noise() & np.isfinite(held.values.high)  # an object takes noise away at full scale only
     loaded = _mask([cell for load in known for cell in load.cells], len(faulty))
-    holding = loaded | ((held.surprisal > TESTED) & (held.root > 0) & ~broken)
+    holding = (held.root > 0) & ~broken
 
     def explains(cells: Mask) -> bool:
         near = stream.layout.with_neighbours(cells) if beside else cells
         return bool((near & held.faulty).any())
 
-    group_of = stream.layout.connected(holding)
-    groups = [group_of == i for i in range(1, group_of.max() + 1)]
-    new = [group for group in groups if group.sum() >= _FEWEST and explains(group)]
+    def groups(cells: Mask) -> list[Mask]:
+        group_of = stream.layout.connected(cells)
+        every = (group_of == i for i in range(1, group_of.max() + 1))
+        return [group for group in every if group.sum() >= _FEWEST and explains(group)]
+
+    # The surprisal asks the model: only where there can be a load.
+    new = groups(loaded | (holding & (held.surprisal > TESTED))) if groups(loaded | holding) else []
     found = [load for load in known if not any(group[list(load.cells)].any() for group in new)]
     if not new:
         return found

@@ -131,7 +131,9 @@ class ConstantRuns:
     @property
     def value(self) -> Floats:
         """float ``[D]``, centre of the readings in the run; NaN without any reading."""
-        return np.where(np.isfinite(self.high), (np.nan_to_num(self.high) + np.nan_to_num(self.low)) / 2, np.nan)
+        value = np.full(len(self.high), np.nan)
+        np.add(self.high, self.low, out=value, where=np.isfinite(self.high))
+        return value / 2
 
     @property
     def moved(self) -> NDArray[np.bool_]:

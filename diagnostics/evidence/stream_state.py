@@ -10,7 +10,7 @@ first with the moving cells as predictors, then without the cells that their own
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -107,6 +107,7 @@ class StreamState:
         self._offsets = OffsetTracker.begin(layout.n_cells)
         self._rest, self._response = RestOfLog(), WeakResponse.begin(layout.n_cells)
         self._level = RestLevel.begin(layout.n_cells)
+        self._full = bool(self.present.all())
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
         self._filled = 0
@@ -126,8 +127,8 @@ class StreamState:
             side = np.where(np.isnan(frames), self.below, frames < self.load.rest)
             self.below = side[-1].astype(bool) if len(side) else self.below
             frames = self.load.loads(frames)
-        if not self.present.all():  # a position without a cell may read anything
-            frames = np.where(self.present, frames, np.nan)
+        if not self._full:  # a position without a cell may read anything
+            frames = np.where(self.present, frames, self.reference.scale.baseline)
         wrong = invalid(frames, self.layout.full_scale)
         if wrong is not None:
             frames, self.transport = np.where(wrong, np.nan, frames), self.transport.dropped(wrong)
@@ -177,7 +178,7 @@ class StreamState:
     @property
     def received(self) -> Mask:
         """Cells that delivered a reading at least once, bool ``[D]``."""
-        return np.isfinite(self.runs.last)
+        return self.present & np.isfinite(self.runs.last)
 
     @property
     def silent(self) -> Mask:
@@ -241,24 +242,29 @@ class StreamState:
         cells = self.cells(explained)
         return self._test(self._with_held_loads(cells) if self.tiled else cells, self.local, passes=2)
 
-    def group_excluded(self, spatial: Spatial, explained: Mask, group: Cells) -> NDArray[np.float64]:
-        """Return the summed surprisal ``[D]`` with a group of cells excluded from the predictors.
+    def each_excluded(
+        self, spatial: Spatial, explained: Mask, groups: Sequence[Cells]
+    ) -> Iterator[tuple[Cells, NDArray[np.float64]]]:
+        """Yield each group, and the summed surprisal ``[D]`` with its cells excluded from the predictors.
 
         Args:
             spatial: the result of the test with all cells that are not suspected as predictors.
             explained: bool ``[D]``, cells already explained.
-            group: cells that one fault would explain.
+            groups: cells that one fault would explain, int ``[k]`` each.
         """
-        every, predictors = self.cells(explained), ~self.suspected(spatial)
-        total, among = self.accumulated.copy(), np.zeros(len(predictors), bool)
-        among[group] = True
-        for i, events in self.local.kept():
-            tile = self.local.tiles[i]
-            if among[tile.outputs].any():
-                test = ConditionalTest.of(events.kept, every.of(tile.inputs), self.model_of(i, events))
-                _, surprisal = test.score(test.eligible & (predictors & ~among)[tile.inputs])
-                total[tile.outputs] = test.summed(surprisal)[tile.place]
-        return total
+        every, predictors, tests = self.cells(explained), ~self.suspected(spatial), dict[int, ConditionalTest]()
+        for group in groups:
+            total, among = self.accumulated.copy(), np.zeros(len(predictors), bool)
+            among[group] = True
+            for i, events in self.local.kept():
+                tile = self.local.tiles[i]
+                if among[tile.outputs].any():
+                    if i not in tests:
+                        tests[i] = ConditionalTest.of(events.kept, every.of(tile.inputs), self.model_of(i, events))
+                    test = tests[i]
+                    _, surprisal = test.score(test.eligible & (predictors & ~among)[tile.inputs])
+                    total[tile.outputs] = test.summed(surprisal)[tile.place]
+            yield group, total
 
     def least_loads(self) -> tuple[NDArray[np.float64], Cells]:
         """Return the least root load of each cell since an event last left it unloaded, ``[D]``; 0: the last one did.

@@ -86,13 +86,7 @@ class OffsetTracker:
             usual: common offsets of the reference.
         """
         lowest = np.fmin(self.lowest, np.fmin.reduce(frames) - scale.baseline)
-        own = np.zeros(len(lowest))
-        if (lowest > scale.near / 2).any():
-            shared = usual.excess(_least_loaded(lowest[present]))
-            beyond = lowest - np.where(shared < LIGHT * scale.full_scale, shared, 0.0)
-            usual_own = usual_limit(beyond[present & np.isfinite(beyond)]) / scale.full_scale
-            limit = min(max(usual_own, SLIGHT), LIGHT) * scale.full_scale
-            own = np.where((beyond > scale.near / 2) & (beyond < limit), beyond, 0.0)
+        own = self.own if np.array_equal(lowest, self.lowest) else _own_offsets(lowest, scale, present, usual)
         # Usually there is no common offset: enough cells stay at their baseline throughout.
         calm = present & (np.fmax.reduce(frames) - scale.baseline - own <= usual.most)
         if np.count_nonzero(calm) > LEAST_LOADED * np.count_nonzero(present):
@@ -112,6 +106,17 @@ class OffsetTracker:
         """Return the last frames ``[t, D]`` with changes of the common offset removed."""
         drift = self.common - self.common[-1]
         return frames - drift[:, None] if drift.any() else frames
+
+
+def _own_offsets(lowest: Floats, scale: Scale, present: NDArray[np.bool_], usual: ReferenceOffset) -> Floats:
+    """Return the offset of each cell in addition to the common one, ``[D]``, of its ``lowest`` reading."""
+    if not (lowest > scale.near / 2).any():
+        return np.zeros(len(lowest))
+    shared = usual.excess(_least_loaded(lowest[present]))
+    beyond = lowest - np.where(shared < LIGHT * scale.full_scale, shared, 0.0)
+    usual_own = usual_limit(beyond[present & np.isfinite(beyond)]) / scale.full_scale
+    limit = min(max(usual_own, SLIGHT), LIGHT) * scale.full_scale
+    return np.where((beyond > scale.near / 2) & (beyond < limit), beyond, 0.0)
 
 
 def _least_loaded(above: Floats) -> float:

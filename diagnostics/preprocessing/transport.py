@@ -138,9 +138,8 @@ class TransportState:
         arrived_at = np.flatnonzero(arrived)
         missed = len(frames) - len(arrived_at)
         state = self.without(missed, int((~arrived).argmax())) if missed else self
-        state = replace(state, seen=self.seen + len(frames))
         if not len(arrived_at):
-            return state, arrived_at
+            return replace(state, seen=self.seen + len(frames)), arrived_at
         received = frames[arrived_at] if missed else frames
         before = np.full_like(received[:1], np.nan) if self.last is None else self.last[None]
         again = repetitions(np.concatenate([before, received]))[1:]
@@ -148,6 +147,15 @@ class TransportState:
         ongoing = again > index  # a repetition that began before these frames
         repeats = again + np.where(ongoing, self.repeats, 0)
         since = np.where(ongoing, self.since, numbers[index - again])
+        state = replace(
+            state,
+            seen=self.seen + len(frames),
+            last=received[-1].copy(),
+            repeats=int(repeats[-1]),
+            since=int(since[-1]),
+        )
+        if repeats.max() <= patience.loaded:
+            return state, arrived_at
         limit = np.full(len(received), patience.loaded)
         some = np.flatnonzero(repeats > patience.loaded)
         limit[some] = patience.of(received[some])
@@ -159,14 +167,7 @@ class TransportState:
                 recorded[-1] = replace(recorded[-1], frames=int(repeats[i]) + 1)
             else:
                 recorded.append(Repetition(int(since[i]), int(repeats[i]) + 1, received[i].copy()))
-        state = replace(
-            state,
-            last=received[-1].copy(),
-            repeats=int(repeats[-1]),
-            since=int(since[-1]),
-            repetitions=tuple(recorded[-_KEPT:]),
-        )
-        return state, arrived_at[~beyond]
+        return replace(state, repetitions=tuple(recorded[-_KEPT:])), arrived_at[~beyond]
 
     def dropped(self, invalid: NDArray[np.bool_]) -> TransportState:
         """Return the state with the ``invalid`` readings of the next frames, bool ``[t, D]``, counted."""
@@ -227,6 +228,6 @@ def repetitions(frames: NDArray[np.float64]) -> NDArray[np.intp]:
     equal, missing = frames[1:] == frames[:-1], np.isnan(frames)
     if missing.any():
         equal |= missing[1:] & missing[:-1]
-    same = np.append(False, equal.all(axis=1))[: len(frames)]
-    counts = np.arange(len(same))
+    same, counts = np.zeros(len(frames), bool), np.arange(len(frames))
+    same[1:] = equal.all(axis=1)
     return counts - np.maximum.accumulate(np.where(same, 0, counts))

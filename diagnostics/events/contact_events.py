@@ -261,7 +261,8 @@ class EventLog:
         at = np.flatnonzero((share >= _MIN_EXCHANGED) & (exchanged >= _MIN_AMPLITUDE))
         if not len(at):
             return []
-        at = at[share[at] >= min(_EXCHANGED, _OUTLYING * float(np.quantile(share, _QUANTILE)))]
+        if share[at].min() < _EXCHANGED:
+            at = at[share[at] >= min(_EXCHANGED, _OUTLYING * float(np.quantile(share, _QUANTILE)))]
         # A cell that is constant for longer than the last event lasts is not held by it.
         own = (before[at] > root_near) & (start >= (self.kept[-1].since if self.kept else 0))
         persists = own & (start < numbers[at, None])

@@ -129,9 +129,12 @@ class _Pairs:
 
     def matching(self, needed: int) -> list[tuple[int, int]]:
         """Return (pad, pair) of the pairs with at least ``needed`` coincidences that differ by noise only."""
+        often = self.coincidences >= needed
+        if not often.any():
+            return []
         squares, products, count = self.sums
         noise = products * np.sqrt(count) <= _SMOOTH * squares
-        return [(pad, i) for pad, i in np.argwhere((self.coincidences >= needed) & noise).tolist()]
+        return [(pad, i) for pad, i in np.argwhere(often & noise).tolist()]
 
 
 @dataclass(frozen=True)

@@ -265,7 +265,7 @@ def _measure(
 
     With ``alone``, blinks that a neighbour shares do not count.
     """
-    every, frames, root, scale = frames, frames[:, cells], root[:, cells], scale.of(cells)
+    every, frames, root, scale = frames, frames.take(cells, axis=1), root.take(cells, axis=1), scale.of(cells)
     x = (frames - scale.baseline).astype(np.float32)
     if np.isnan(x).any():
         x = np.nan_to_num(x)

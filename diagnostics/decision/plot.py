@@ -96,7 +96,8 @@ def pads_figure(layout: SensorLayout, *, n_rows: int, scale: bool = True, page: 
     rows = -(-layout.pads // columns)
     across = max(columns * width, 3.0) + beside
     below = 0.6 if scale else 0.5 if across > _WIDE else 0.9
-    figure = Figure(figsize=(across, n_rows * rows * height + below), layout="constrained")
+    figure = Figure(figsize=(across, n_rows * rows * height + below))
+    figure.set_layout_engine("constrained", h_pad=0.08)  # inches: the first layout lets titles stick out a little
     axes = figure.subplots(n_rows * rows, columns, squeeze=False).reshape(n_rows, rows * columns)
     for ax in axes[:, layout.pads :].ravel():
         ax.set_visible(False)

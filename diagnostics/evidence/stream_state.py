@@ -107,7 +107,7 @@ class StreamState:
         self._offsets = OffsetTracker.begin(layout.n_cells)
         self._rest, self._response = RestOfLog(), WeakResponse.begin(layout.n_cells)
         self._level = RestLevel.begin(layout.n_cells)
-        self._full = bool(self.present.all())
+        self._absent = not self.present.all()  # whether some position has no cell
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
         self._filled = 0
@@ -127,7 +127,7 @@ class StreamState:
             side = np.where(np.isnan(frames), self.below, frames < self.load.rest)
             self.below = side[-1].astype(bool) if len(side) else self.below
             frames = self.load.loads(frames)
-        if not self._full:  # a position without a cell may read anything
+        if self._absent:  # such a position may read anything
             frames = np.where(self.present, frames, self.reference.scale.baseline)
         wrong = invalid(frames, self.layout.full_scale)
         if wrong is not None:

@@ -85,7 +85,7 @@ def elsewhere(request) -> torch.device:
 
 
 def rounding(device: torch.device) -> float:
-    """How far probabilities may lie from the CPU's: a GPU multiplies with 10 bits (TF32) in convolutions."""
+    """How far probabilities may lie from the CPU's: a GPU may multiply with 10 bits (TF32) in convolutions."""
     return 2e-3 if device.type == "cuda" else 1e-5
 
 
@@ -100,7 +100,7 @@ def test_another_device_refuses_the_tensors_of_this_one(elsewhere):
     there, here = torch.ones(3).to(elsewhere), torch.ones(3)
     assert (there + 1).device == elsewhere
     assert there.cpu().device.type == "cpu"
-    with pytest.raises(RuntimeError, match=r"two devices|same device"):
+    with pytest.raises(RuntimeError, match="same device" if elsewhere.type == "cuda" else "two devices"):
         there + here
     with pytest.raises(TypeError, match="numpy"):
         there.numpy()
@@ -159,4 +159,6 @@ def test_the_papers_networks_are_trained_there_and_answer_as_those_trained_here(
     for device in ("cpu", elsewhere):
         bench = Bench(Setup(grasps, data, settings, tmp_path / str(device), device, False, lambda text: None), 0)
         answers.append(np.concatenate([bench.predict(task) for task in tasks]))
-    assert (answers[0] == answers[1]).mean() > 0.9  # rounding may decide close calls
+    assert (answers[0] == answers[1]).mean() > (
+        0.9 if elsewhere.type == "cuda" else 0.95
+    )  # rounding may decide a close call

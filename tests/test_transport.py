@@ -125,6 +125,7 @@ def test_patience_is_twice_the_longest_repetition_with_load_and_without(log):
     assert (patience.idle, patience.loaded) == (2 * 39, 2 * 14)
     patience = Patience.fit([log], LOADED_FROM, 5)
     assert (patience.idle, patience.loaded) == (5, 5)
+    np.testing.assert_array_equal(patience.loaded_from, LOADED_FROM)
 
 
 def test_each_frame_is_counted_how_often_it_came_again(log):

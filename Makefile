@@ -71,7 +71,7 @@ test-pythons:
 		test -e .venv-$$version/tested && continue; echo "Python $$version ($$python)"; \
 		$$python -m venv .venv-$$version && \
 		.venv-$$version/bin/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' && \
-		OMP_NUM_THREADS=1 .venv-$$version/bin/python -m pytest -n 2 --dist worksteal -m 'not slow' && \
+		$(MAKE) --no-print-directory BIN=.venv-$$version/bin quick-tests && \
 		touch .venv-$$version/tested || exit 1; \
 	done; rm -f .venv-*/tested
 

@@ -32,10 +32,7 @@ def step_ms(device: str, x: np.ndarray, y: np.ndarray, steps: int) -> float:
     for _ in range(WARM_UP + steps):
         began = time.perf_counter()
         loss = F.cross_entropy(model(windows), labels)
-        run.optimizer.zero_grad()
-        loss.backward()
-        run.optimizer.step()
-        run.follow()
+        run.step(loss)
         loss.item()  # waits for the device
         taken.append(1000 * (time.perf_counter() - began))
     return statistics.median(taken[WARM_UP:])

@@ -249,7 +249,7 @@ class SelfDiagnosis:
 
         groups = self._groups(found, stream, together(spatial.initial), explained)
         yield
-        for group, surprisal in stream.each_excluded(spatial, explained, groups):
+        for group, surprisal in zip(groups, stream.each_excluded(spatial, explained, groups), strict=True):
             weight[group] = np.maximum(weight[group], together(surprisal)[group])
             yield
         found = replace(found, weight=weight).of(self._place)

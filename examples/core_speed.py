@@ -109,10 +109,7 @@ def step_of(model: nn.Module, x: Tensor, y: Tensor) -> Callable[[], object]:
 
     def step() -> float:
         loss = F.cross_entropy(model(x), y)
-        run.optimizer.zero_grad()
-        loss.backward()
-        run.optimizer.step()
-        run.follow()
+        run.step(loss)
         return loss.item()
 
     return step

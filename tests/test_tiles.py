@@ -59,7 +59,7 @@ def test_a_row_across_several_tiles_is_excluded_from_the_predictors_as_a_group(f
     stream.extend(inject(log(SKIN, 100, 40), [line_fault(SKIN, Line(0, "row", 11), FaultKind.OPEN)], SKIN))
     stream = stream.complete()
     spatial, none = stream.spatial().finish(), np.zeros(SKIN.n_cells, bool)
-    of_row, of_one = (total for _, total in stream.each_excluded(spatial, none, [row, row[:1]]))
+    of_row, of_one = stream.each_excluded(spatial, none, [row, row[:1]])
     assert len({i for i, tile in enumerate(tiles(SKIN)) if np.isin(row, tile.outputs).any()}) > 1
     assert of_row[row].sum() > spatial.surprisal[row].sum() + 3
     assert of_one[row[0]] == pytest.approx(spatial.surprisal[row[0]], abs=0.5)

@@ -219,10 +219,7 @@ def _pass(
         x, y = source.take(index), source.y[index]  # copies
         x = x if augment is None else augment(x, generator)
         loss = run.loss(run.model(x.to(device)), y.to(device))
-        run.optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        run.optimizer.step()
-        run.follow()
+        run.step(loss)
         total, seen = total + loss.item() * len(index), seen + len(index)
         if not math.isfinite(total):
             raise ValueError(f"the loss became {loss.item()} in epoch {run.history.epochs + 1}: lower learning_rate")
@@ -261,8 +258,15 @@ class Optimisation:
         self.average = {name: p.detach().clone() for name, p in self.trained.items()}
         self.steps = 0
 
+    def step(self, loss: Tensor) -> None:
+        """Make one step down the gradient of ``loss``."""
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
+        self._follow()
+
     @torch.no_grad()
-    def follow(self) -> None:
+    def _follow(self) -> None:
         """Update the average after a step."""
         self.steps += 1
         kept = min(self.averaging, self.steps / (self.steps + 10))  # at first over the last tenth of few steps

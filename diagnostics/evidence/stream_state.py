@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -244,27 +245,31 @@ class StreamState:
 
     def each_excluded(
         self, spatial: Spatial, explained: Mask, groups: Sequence[Cells]
-    ) -> Iterator[tuple[Cells, NDArray[np.float64]]]:
-        """Yield each group, and the summed surprisal ``[D]`` with its cells excluded from the predictors.
+    ) -> Iterator[NDArray[np.float64]]:
+        """Yield, for each group of cells, the summed surprisal ``[D]`` with these excluded from the predictors.
 
         Args:
             spatial: the result of the test with all cells that are not suspected as predictors.
             explained: bool ``[D]``, cells already explained.
             groups: cells that one fault would explain, int ``[k]`` each.
         """
-        every, predictors, tests = self.cells(explained), ~self.suspected(spatial), dict[int, ConditionalTest]()
+        every, predictors = self.cells(explained), ~self.suspected(spatial)
+
+        @cache  # no group changes it
+        def prepared(i: int) -> ConditionalTest:
+            events = self.local.of[i]
+            return ConditionalTest.of(events.kept, every.of(self.local.tiles[i].inputs), self.model_of(i, events))
+
         for group in groups:
             total, among = self.accumulated.copy(), np.zeros(len(predictors), bool)
             among[group] = True
-            for i, events in self.local.kept():
+            for i, _ in self.local.kept():
                 tile = self.local.tiles[i]
                 if among[tile.outputs].any():
-                    if i not in tests:
-                        tests[i] = ConditionalTest.of(events.kept, every.of(tile.inputs), self.model_of(i, events))
-                    test = tests[i]
+                    test = prepared(i)
                     _, surprisal = test.score(test.eligible & (predictors & ~among)[tile.inputs])
                     total[tile.outputs] = test.summed(surprisal)[tile.place]
-            yield group, total
+            yield total
 
     def least_loads(self) -> tuple[NDArray[np.float64], Cells]:
         """Return the least root load of each cell since an event last left it unloaded, ``[D]``; 0: the last one did.
@@ -323,7 +328,7 @@ class StreamState:
     def cells(self, explained: Mask | None) -> CellState:
         """Return the state of the cells before the spatial test; ``explained`` cells (bool ``[D]``) are left out."""
         explained = self.intermittency.intermittent | self.intermittency.excess | (explained is not None and explained)
-        eligible = self.present & self.received & ~self.silent & ~explained
+        eligible = self.received & ~self.silent & ~explained
         runs = self.runs
         if self.reference.model is None:
             # What no event can tell from a broken cell is not tested; what it reads says something of the others.
@@ -360,7 +365,7 @@ class StreamState:
         self._offsets = self._offsets.extend(frames, self.reference.scale, self.present, self.reference.offset)
         self.scale = scale = plain = self._offsets.on(self.reference.scale)
         if self.reference.model is None:
-            moved = self.runs.moved & self.received & self.present
+            moved = self.runs.moved & self.received
             self._rest = self._rest.extend(frames[:, moved], self.lowest[moved], plain.full_scale)
             self.scale = scale = self._rest.scale(plain, self.lowest, moved)
         start, known = self.runs.start, _known(frames, self.runs.last)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import gestures
+import numpy as np
 import static_holds
 from other_sensors import DRIFTS, SENSORS, remade
 from random_sensors import draw
@@ -18,7 +19,9 @@ from diagnostics import SensorLayout
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 HAND, FINGERTIPS, SOLES = "sdh2x13x6_grasps36.npz", "icub5x1x12_grasps11.npz", "insole2x33x15.npz"
+FABRIC = "fabric4x4_slides7.npz"
 MAIN = ("cells", "onset", "healthy")
+LIFE = ("moving", "proven")
 SKIN = (*MAIN, "lines", "cold", "static")
 EVERY = (
     "cells", "onset", "dither", "missing", "many", "cold", "reference_faults", "lines", "cut", "address", "healthy",
@@ -55,6 +58,15 @@ class Array:
 
 def real(file: str) -> Callable[[int, int, int], Bench]:
     return lambda split, repeat, logs: Bench(load(DATA / file).recordings, split, logs, repeat)
+
+
+def slides(split: int, repeat: int, logs: int) -> Bench:
+    """Return the finger that slides over fabrics: 16 cells on one bus."""
+    with np.load(DATA / FABRIC) as stored:
+        frames = np.split(stored["frames"].astype(np.float32), np.cumsum(stored["lengths"])[:-1])
+        labels = stored["labels"].astype(np.int64)
+    layout = SensorLayout(1, 4, 4, full_scale=4095, unit="count", rate=35.7, wiring="bus")
+    return Bench(Recordings(tuple(frames), layout, labels), split, logs, repeat)
 
 
 def sensor(name: str) -> Callable[[int, int, int], Bench]:
@@ -114,6 +126,16 @@ ARRAYS = [
             "specimen", "static", "transport",
         ),
         real(FINGERTIPS), 60, 2, 40, (*MAIN, "cold"), FINGERTIPS,
+    ),
+    Array("sliding finger", MAIN, slides, 30, 1, 12, MAIN, FABRIC),
+    *(
+        Array(f"{name}, long logs", LIFE, bench, logs, 1, quick, LIFE, file)
+        for name, bench, logs, quick, file in (
+            ("hand", real(HAND), 10, 3, HAND),
+            ("fingertips", real(FINGERTIPS), 20, 6, FINGERTIPS),
+            ("soles", real(SOLES), 10, 2, SOLES),
+            ("sliding finger", slides, 30, 9, FABRIC),  # one dead cell a log
+        )
     ),
     Array("fingertips, buses", (*MAIN, "groups"), on_buses, 60, 1, 40, (*MAIN, "groups"), FINGERTIPS),
     Array(

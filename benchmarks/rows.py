@@ -45,6 +45,10 @@ UNDER = 20  # recordings of a log in which an object lies still
 SPECIMEN = 48  # recordings from which a new specimen is learned
 REPLACED = 12  # recordings with a new specimen of a pad
 LONG, LOADED = 30, 8  # recordings of a log that shows a gain; in so many of them the cell is loaded
+IN_USE = 40  # recordings of a log in which dead cells move
+MOVING_SHARE = 0.08  # share of its cells that are dead
+USED = 3  # recordings that load a cell: then the log tests it
+DOUBTED = 0.1  # P(faulty) below which a cell counts as called alive
 DEAD_BEFORE = 0.04  # share of the cells that were dead when the reference was recorded
 
 
@@ -466,6 +470,151 @@ def wirings(layout: SensorLayout) -> dict[str, list[np.ndarray]]:
     return found
 
 
+def highest(bench: Bench) -> float:
+    """Return the highest reading of the reference: the range of sensors that never come near full scale."""
+    return max(float(np.nanmax(bench.recordings.frames[i])) for i in bench.reference)
+
+
+def rest_levels(bench: Bench) -> np.ndarray:
+    """Return the low quantile of the readings of each cell in the reference, ``[D]``."""
+    return np.quantile(np.concatenate([bench.recordings.frames[i] for i in bench.reference]), 0.05, axis=0)
+
+
+def per_recording(log: Log, fault: Callable[[int], Fault | None], layout: SensorLayout, seed: int) -> Log:
+    """Return the log with another fault, or none, in each recording."""
+    seen = []
+    for i, frames in enumerate(log):
+        found = fault(i)
+        seen.append(inject(frames, [] if found is None else [found], layout, seed=seed + i))
+    return seen
+
+
+def in_one_piece(log: Log, fault: Fault, layout: SensorLayout, seed: int, dither: float = 0.0) -> Log:
+    """Return the log with a fault that goes on from recording to recording."""
+    return parted(inject(np.concatenate(log), [fault], layout, seed=seed, dither=dither), log)
+
+
+def moving_cases(bench: Bench) -> dict[str, Callable[[Log, Log, int, np.random.Generator], Log]]:
+    """Return by name what a dead cell that moves reads: from log, another log, cell and generator to the log seen."""
+    layout, span, rest = bench.layout, highest(bench), rest_levels(bench)
+
+    def seed_of(rng: np.random.Generator) -> int:
+        return int(rng.integers(1 << 30))
+
+    def swings(share: float):
+        def case(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
+            return in_one_piece(log, Fault(FaultKind.FLOATING, (cell,), value=share * span), layout, seed_of(rng))
+
+        return case
+
+    def noise(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
+        at_rest = in_one_piece(log, Fault(FaultKind.OPEN, (cell,), value=rest[cell]), layout, 0)
+        sigma = rng.uniform(0.004, 0.008) * span
+        return in_one_piece(at_rest, Fault(FaultKind.NOISY, (cell,), value=sigma), layout, seed_of(rng))
+
+    def dead_every(k: int):
+        def case(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
+            open_at_rest = Fault(FaultKind.OPEN, (cell,), value=rest[cell])
+            return per_recording(log, lambda i: open_at_rest if i % k == k - 1 else None, layout, 0)
+
+        return case
+
+    def floats(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
+        half = 45 / 4095 * span
+        fault = Fault(FaultKind.OPEN, (cell,), value=half)
+        return in_one_piece(log, fault, layout, seed_of(rng), dither=half / layout.full_scale)
+
+    def late(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
+        return in_one_piece(log, Fault(FaultKind.LATE, (cell,), value=10), layout, 0)
+
+    def repeats(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
+        source = int(rng.choice(neighbours(layout, cell)))
+        return in_one_piece(log, Fault(FaultKind.COPY, (cell,), value=source), layout, 0)
+
+    def mean_of_neighbours(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
+        return in_one_piece(log, Fault(FaultKind.COPY, (cell,)), layout, 0)
+
+    def latched(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
+        levels = rng.uniform(0.0, 0.9, len(log)) * span
+        return per_recording(log, lambda i: Fault(FaultKind.STUCK, (cell,), value=float(levels[i])), layout, 0)
+
+    def clamped(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
+        fault = Fault(FaultKind.CLAMPED, (cell,), value=rest[cell] + 0.1 * span)
+        return in_one_piece(log, fault, layout, 0)
+
+    def keeps_peak(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
+        seen = [frames.copy() for frames in log]
+        for frames in seen:
+            frames[:, cell] = np.maximum.accumulate(frames[:, cell])
+        return seen
+
+    def of_another(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
+        elsewhere = np.concatenate(other)[:, cell]
+        whole = np.concatenate(log)
+        whole[:, cell] = np.resize(elsewhere, len(whole))
+        return parted(whole, log)
+
+    return {
+        "swings by 20 %": swings(0.2),
+        "swings by 10 %": swings(0.1),
+        "swings by 5 %": swings(0.05),
+        "noise of 0.4 to 0.8 %": noise,
+        "dead in every 2nd recording": dead_every(2),
+        "dead in every 3rd recording": dead_every(3),
+        "floats by 90 of 4095": floats,
+        "10 frames late": late,
+        "repeats a neighbour": repeats,
+        "mean of the neighbours": mean_of_neighbours,
+        "latched at another level": latched,
+        "clamped at 10 %": clamped,
+        "keeps its peak": keeps_peak,
+        "load of another recording": of_another,
+    }
+
+
+def moving(bench: Bench) -> Iterator[Count]:
+    """Dead cells that move; testable is what reads otherwise by more than 5 % of the range in use in 10 frames."""
+    layout, span = bench.layout, highest(bench)
+    for case, seen_by in moving_cases(bench).items():
+        hit = true = false = testable = alive = 0
+        for _, log, rng in bench.logs(IN_USE):
+            other = [np.asarray(bench.recordings.frames[i], dtype=np.float64) for i in rng.permutation(bench.rest)]
+            present = np.flatnonzero(layout.present)
+            dead = rng.choice(present, max(1, round(MOVING_SHARE * len(present))), replace=False)
+            seen = [frames.copy() for frames in log]
+            for cell in dead.tolist():
+                for frames, broke in zip(seen, seen_by(log, other, cell, rng), strict=True):
+                    frames[:, cell] = broke[:, cell]
+            wrong = np.abs(np.concatenate(seen) - np.concatenate(log)) > VISIBLE * span
+            can = np.intersect1d(dead, np.flatnonzero(wrong.sum(axis=0) >= TESTABLE))
+            diagnosis = bench.fitted.diagnose(seen)
+            found = np.flatnonzero(diagnosis.fault_set.mask)
+            called = (diagnosis.verdicts == Verdict.ALIVE) & (diagnosis.probability < DOUBTED)
+            testable += len(can)
+            hit += len(np.intersect1d(found, can))
+            true += len(np.intersect1d(found, dead))
+            false += len(np.setdiff1d(found, dead))
+            alive += int(called[can].sum())
+        yield Count(f"{case}: recall", hit, testable)
+        yield Count(f"{case}: precision", true, true + false)
+        yield Count(f"{case}: called alive", alive, testable, higher=False)
+
+
+def proven(bench: Bench) -> Iterator[Count]:
+    """Long healthy logs: who is blamed, and who is shown to be alive of those that are loaded in 3 recordings."""
+    span, rest = highest(bench), rest_levels(bench)
+    blamed = alive = used = 0
+    for _, log, _ in bench.logs(IN_USE):
+        loaded = [(frames - rest > VISIBLE * span).any(axis=0) for frames in log]
+        tested = (np.sum(loaded, axis=0) >= USED) & bench.layout.present.ravel()
+        diagnosis = bench.fitted.diagnose(log)
+        blamed += len(diagnosis.fault_set)
+        used += int(tested.sum())
+        alive += int((diagnosis.verdicts[tested] == Verdict.ALIVE).sum())
+    yield Count("healthy, 40 recordings: cells blamed in a log", blamed, bench.count, higher=False)
+    yield Count("  alive of the cells in use", alive, used)
+
+
 def rewired(bench: Bench) -> Iterator[Count]:
     """Wirings that change a visible number of readings; told right: put back as they were."""
     layout, choice = bench.layout, wirings(bench.layout)
@@ -689,6 +838,7 @@ ROWS: dict[str, Callable[[Bench], Iterator[Count]]] = {
     row.__name__: row
     for row in (
         cells, onset, dither, missing, many, cold, reference_faults, lines, cut, address, healthy, holds, untouched,
-        kind, calibration, changing, gain, rewired, groups, replaced, specimen, static, transport, speed,
+        kind, calibration, changing, gain, moving, proven, rewired, groups, replaced, specimen, static, transport,
+        speed,
     )
 }  # fmt: skip

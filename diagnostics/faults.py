@@ -31,6 +31,16 @@ class FaultKind(str, Enum):
     """Reads its load plus excess noise."""
     DRIFT = "drift"
     """Its offset or its gain drifts."""
+    FLOATING = "floating"
+    """Moves by itself, whatever touches it: a broken wire of high impedance, another signal."""
+    LATE = "late"
+    """Reads its load some frames late: a stuck buffer."""
+    COPY = "copy"
+    """Repeats another cell, or the mean of those beside it."""
+    CLAMPED = "clamped"
+    """Reads its load up to a limit."""
+    WEAK = "weak"
+    """Reads a share of its load."""
 
     __str__ = str.__str__
 
@@ -48,7 +58,9 @@ class Fault:
             much the offset moves in one second (a drift of the gain is given to ``inject``, as a share per second).
             ALIAS: the level (0 or 1) of the stuck address bit in ``line``; with a row or column line, the index of the
             row or column read instead, or, where ``cells`` holds the cells of both lines, of the one that ``line``
-            touches (a bridge: both read the sum); without a line, the cell read instead.
+            touches (a bridge: both read the sum); without a line, the cell read instead. FLOATING: the range of its
+            own movement. LATE: the delay in frames. COPY: the cell that it repeats (None: the mean of the cells beside
+            it). CLAMPED: the highest reading. WEAK: the share of the load that it reads.
         onset: first faulty frame; None: from the first frame on.
         probability: P(the fault exists), 0..1; None: known, not inferred.
         reason: one sentence: what was observed, and what to check.

@@ -80,6 +80,36 @@ def test_noise_has_the_given_spread_and_drift_the_given_rate(recording):
     assert drifting[-1, 0] - drifting[9, 0] == pytest.approx(0.5 * 40 / LAYOUT.rate)
 
 
+def test_a_floating_cell_moves_within_its_range_whatever_touches_it(recording):
+    fault = Fault("floating", (0, 7), value=1.0)
+    floating = inject(recording, [fault], LAYOUT, seed=0)[:, [0, 7]]
+    lowest = recording[:, [0, 7]].min(axis=0)
+    assert (floating >= lowest).all()
+    assert (floating <= lowest + 1.0).all()
+    assert (np.ptp(floating, axis=0) > 0.3).all()
+    np.testing.assert_array_equal(inject(recording, [fault], LAYOUT, seed=0)[:, [0, 7]], floating)
+
+
+def test_a_late_cell_reads_what_it_read_before(recording):
+    late = inject(recording, [Fault("late", (4,), value=6)], LAYOUT)[:, 4]
+    np.testing.assert_array_equal(late[6:], recording[:-6, 4])
+    assert (late[:6] == recording[0, 4]).all()
+
+
+def test_a_copying_cell_reads_another_cell_or_the_mean_of_those_beside_it(recording):
+    copied = inject(recording, [Fault("copy", (15,), value=3), Fault("copy", (0,))], LAYOUT)
+    np.testing.assert_array_equal(copied[:, 15], recording[:, 3])
+    np.testing.assert_allclose(copied[:, 0], recording[:, [1, 10, 11]].mean(axis=1))
+
+
+def test_a_clamped_cell_reads_at_most_its_limit_and_a_weak_one_a_share_of_its_load(recording):
+    limited = inject(recording, [Fault("clamped", (2,), value=1.0)], LAYOUT)[:, 2]
+    np.testing.assert_array_equal(limited, np.minimum(recording[:, 2], 1.0))
+    weak = inject(recording, [Fault("weak", (2,), value=0.25)], LAYOUT)[:, 2]
+    lowest = recording[:, 2].min()
+    np.testing.assert_allclose(weak - lowest, 0.25 * (recording[:, 2] - lowest))
+
+
 def test_missing_readings_stay_missing(recording):
     recording[5] = np.nan
     broken = inject(recording, [Fault("short", (1,))], LAYOUT)
@@ -103,7 +133,7 @@ def test_a_fault_that_starts_after_the_end_changes_nothing(recording):
     np.testing.assert_array_equal(inject(recording, [Fault("short", (2,), onset=99)], LAYOUT), recording)
 
 
-@pytest.mark.parametrize("kind", ["open", "stuck", "alias", "intermittent", "noisy", "drift"])
+@pytest.mark.parametrize("kind", sorted(set(FaultKind) - {FaultKind.SHORT}))
 def test_faults_end_before_the_frame_until_and_the_cells_recover(recording, kind):
     fault = Fault(kind, (3, 150), value=1.0, onset=20)
     broken = inject(recording, [fault], LAYOUT, seed=0, until=30)

@@ -30,6 +30,11 @@ LETTERS = {
     FaultKind.INTERMITTENT: "I",
     FaultKind.NOISY: "N",
     FaultKind.DRIFT: "D",
+    FaultKind.FLOATING: "F",
+    FaultKind.LATE: "L",
+    FaultKind.COPY: "C",
+    FaultKind.CLAMPED: "M",
+    FaultKind.WEAK: "W",
 }
 
 
@@ -129,7 +134,8 @@ class Diagnosis:
     def map(self) -> str:
         """Return the verdicts drawn as text, the pads side by side.
 
-        ``.`` alive, ``?`` untested, O open, S short, K stuck, A alias, I intermittent, N noisy, D drift.
+        ``.`` alive, ``?`` untested, O open, S short, K stuck, A alias, I intermittent, N noisy, D drift,
+        F floating, L late, C copy, M clamped, W weak.
         """
         signs = np.where(self.verdicts == Verdict.UNTESTED, "?", ".")
         for fault in self.faults:

@@ -18,6 +18,11 @@ from diagnostics.preprocessing.levels import LIGHT
 # Defaults of ``Fault.value`` and thresholds, as shares of full scale.
 _NOISE = 0.05  # NOISY: standard deviation of the added noise
 _DRIFT = 0.01  # DRIFT: offset gained per second
+_SWING = 0.2  # FLOATING: range of the movement
+_CLAMP = 0.1  # CLAMPED: highest reading
+_PERIODS = (12.0, 100.0)  # FLOATING: frames of one swing, drawn between these
+_DELAY = 10  # LATE: frames
+_WEAK = 0.35  # WEAK: share of the load that is left
 # INTERMITTENT: probability per frame that a closed contact opens, and that an open one closes.
 _OPENS, _CLOSES = 0.2, 0.4
 
@@ -41,7 +46,7 @@ def inject(
         recording: ``[T, D]`` or ``[T, pads, rows, cols]``, in the layout's unit.
         faults: root causes; empty leaves the values as they are.
         layout: the array.
-        seed: for the kinds that draw (INTERMITTENT, NOISY) and for dither; None draws anew each time.
+        seed: for the kinds that draw (INTERMITTENT, NOISY, FLOATING) and for dither; None draws anew each time.
         dither: noise of the converter on OPEN, SHORT and STUCK cells: uniform within +- this share of full scale.
         until: the faults end before this frame; None: they last.
         gain: change of the gain of a DRIFT cell per second, as a share of its reading, in addition to its offset.
@@ -110,6 +115,46 @@ def _faulty_readings(
             frames = np.arange(1, len(own) + 1)[:, None]
             drifted: NDArray[np.float64] = own * (1.0 + gain / layout.rate * frames) + rate / layout.rate * frames
             return drifted
+        case FaultKind.FLOATING:
+            swing = _SWING * full_scale if fault.value is None else fault.value
+            return np.fmin.reduce(own, initial=np.inf) + swing * _swinging(own.shape, rng)
+        case FaultKind.LATE:
+            delay = _DELAY if fault.value is None else int(fault.value)
+            return own[np.maximum(np.arange(len(own)) - delay, 0)]
+        case FaultKind.COPY:
+            return _copied(fault, cells, healthy, layout)
+        case FaultKind.CLAMPED:
+            return np.minimum(own, _CLAMP * full_scale if fault.value is None else fault.value)
+        case FaultKind.WEAK:
+            share = _WEAK if fault.value is None else fault.value
+            lowest = np.fmin.reduce(own, initial=np.inf)
+            weakened: NDArray[np.float64] = lowest + share * (own - lowest)
+            return weakened
+
+
+def _swinging(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return a sine from 0 to 1 for each cell, ``[t, cells]``, each with a period and a phase of its own."""
+    period = rng.uniform(*_PERIODS, shape[1])
+    phase = rng.uniform(0.0, 1.0, shape[1])
+    turns = np.arange(shape[0])[:, None] / period + phase
+    swing: NDArray[np.float64] = (1.0 + np.sin(2 * np.pi * turns)) / 2
+    return swing
+
+
+def _copied(
+    fault: Fault, cells: NDArray[np.intp], healthy: NDArray[np.float64], layout: SensorLayout
+) -> NDArray[np.float64]:
+    """Return what the cells of a COPY fault read, ``[t, cells]``."""
+    if fault.value is not None:
+        source = layout.cell(*layout.position(int(fault.value)))  # IndexError names a cell that is not there
+        return np.repeat(healthy[:, [source]], len(cells), axis=1)
+    copied = healthy[:, cells].copy()
+    for i, cell in enumerate(cells.tolist()):
+        beside = layout.beside[cell]
+        beside = beside[beside >= 0]
+        if len(beside):
+            copied[:, i] = healthy[:, beside].mean(axis=1)
+    return copied
 
 
 def _alias_sources(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) -> NDArray[np.intp]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import expit, logit
 
 from diagnostics.decision import earlier_versions
 from diagnostics.decision.address_aliasing import find_aliasing
@@ -17,13 +18,16 @@ from diagnostics.decision.result import Diagnosis
 from diagnostics.decision.root_causes import CellFindings, root_causes
 from diagnostics.decision.serialization import Arrays, from_state, to_state
 from diagnostics.decision.static_loads import StaticLoad, find_static_loads
+from diagnostics.events.constant_runs import SHORTEST_RUN
+from diagnostics.evidence.life import Life
+from diagnostics.evidence.life_record import PIECE
 from diagnostics.evidence.reference import Reference, highest_reading, living, tolerance_of
 from diagnostics.evidence.rewiring import Rewiring, find_rewiring
 from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.levels import CERTAIN_RATIO, RARE
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED, RARE
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
 
@@ -126,7 +130,7 @@ class SelfDiagnosis:
         # Fractions of full scale refer to the range that was seen: a stated one may be too high.
         layout = replace(layout, full_scale=min(layout.full_scale, highest_reading(healthy, layout)))
         dead = find_reference_faults(healthy, layout, tolerance_of(healthy, layout), self._diagnosed_cold)
-        self.reference_ = Reference.fit(healthy, layout, dead)
+        self.reference_ = Reference.fit(healthy, layout, dead).with_life(healthy, layout)
         self.calibrator_ = Calibrator.fit(healthy, living(layout, dead), progress=progress)
         progress(1.0)
         return self
@@ -224,8 +228,20 @@ class SelfDiagnosis:
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
         aliases, copies = find_aliasing(stream)
         yield
-        explained, still, log_ratio = copies, list[StaticLoad](), self._log_ratio(stream)
-        spatial, found = yield from self._tested(stream, explained, log_ratio)
+        explained, still, life = copies, list[StaticLoad](), Life.assumed(stream.layout.n_cells)
+        log_ratio = self._log_ratio(stream, life)
+        spatial, found = yield from self._tested(stream, explained, log_ratio, life)
+        if stream.reference.life is not None:
+            suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
+            life = yield from self._proof_of_life(stream, copies, suspected)
+            log_ratio = self._log_ratio(stream, life)
+            if (life.certain & (stream.runs.length < SHORTEST_RUN)).any():
+                # They misled the spatial test, and its suspects the proof of life: once more without them.
+                spatial, found = yield from self._tested(stream, explained, log_ratio, life)
+                suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
+                life = yield from self._proof_of_life(stream, copies, suspected)
+                log_ratio = self._log_ratio(stream, life)
+            found = self._found(stream, spatial, explained, log_ratio, life)
         for beside in (False, True):
             while True:
                 yield
@@ -236,7 +252,7 @@ class SelfDiagnosis:
                 if (others == explained).all():
                     break
                 yield
-                tested = yield from self._tested(stream, others, log_ratio)
+                tested = yield from self._tested(stream, others, log_ratio, life)
                 if tested[1].probability.sum() >= found.probability.sum():  # it explains nothing
                     break
                 still, explained, (spatial, found) = loads, others, tested
@@ -277,26 +293,43 @@ class SelfDiagnosis:
             layout=self.layout,
             faults=causes,
             probability=probability,
-            tested=(found.alive & stream.touched[self._place]) | inferred,  # noise alone is no test
+            # Noise alone is no test; nor is movement, where the reference tells how cells depend on each other.
+            tested=(found.alive & (stream.touched & life.shown)[self._place]) | inferred,
             transport=stream.transport.faults(rest + scale.near, working, self.layout.rate, moved),
             evidence={name: values[self._place] for name, values in evidence.items()},
             n_frames=stream.transport.seen,
             n_recordings=n_recordings,
             possible=possible,
             static_loads=tuple(still),
+            contradicting=life.contradicting,
         )
 
+    def _proof_of_life(
+        self, stream: StreamState, explained: NDArray[np.bool_], suspected: NDArray[np.bool_]
+    ) -> Generator[None, None, Life]:
+        """Yield between steps of the proof of life, see ``StreamState.proof_of_life``; return its result."""
+        test = stream.proof_of_life(explained, suspected)
+        assert test is not None
+        yield
+        while not test.step():
+            yield
+        return test.finish()
+
     def _tested(
-        self, stream: StreamState, explained: NDArray[np.bool_], log_ratio: LogRatio
+        self, stream: StreamState, explained: NDArray[np.bool_], log_ratio: LogRatio, life: Life
     ) -> Generator[None, None, tuple[Spatial, CellFindings]]:
-        """Yield between steps of the spatial test without ``explained`` cells (bool ``[D]``); return its findings."""
-        test = stream.spatial(explained)
+        """Yield between steps of the spatial test without ``explained`` cells (bool ``[D]``); return its findings.
+
+        Moving cells that are refuted predict no others.
+        """
+        moving = stream.runs.length < SHORTEST_RUN
+        test = stream.spatial(explained | (life.certain & moving))
         yield
         while not test.step():
             yield
         spatial = test.finish()
         yield
-        return spatial, self._found(stream, spatial, explained, log_ratio)
+        return spatial, self._found(stream, spatial, explained, log_ratio, life)
 
     def _diagnosed(self, log: RecordingBlocks, needed: NDArray[np.bool_] | None = None) -> Diagnosis:
         stream = self.stream(needed)
@@ -314,7 +347,12 @@ class SelfDiagnosis:
         return cold._diagnosed(log, needed)
 
     def _found(
-        self, stream: StreamState, spatial: Spatial, explained: NDArray[np.bool_], log_ratio: LogRatio
+        self,
+        stream: StreamState,
+        spatial: Spatial,
+        explained: NDArray[np.bool_],
+        log_ratio: LogRatio,
+        life: Life,
     ) -> CellFindings:
         """Return the findings about each cell; ``explained`` cells (bool ``[D]``) are left out."""
         reference, runs, intermittency = stream.reference, stream.runs, stream.intermittency
@@ -327,12 +365,21 @@ class SelfDiagnosis:
         intermittent, noisy = intermittency.intermittent & delivers, intermittency.excess & delivers
         drifting = delivers & ~intermittent & ~noisy & spatial.drifting
         certain = silent | intermittent | noisy | drifting
-        probability = np.where(present, np.where(certain, _CERTAIN, stuck), 0.0)
+        judged = delivers & runs.moved & ~certain
+        # The factors of the evidence hold for this prior: many doubtful cells do not make each other faulty.
+        refuted = np.where(judged, expit(life.evidence + logit(EXPECTED)), 0.0)
+        by_life = judged & (refuted > stuck)
+        probability = np.where(present, np.where(certain, _CERTAIN, np.maximum(stuck, refuted)), 0.0)
         faulty = faulty_at(np.where(certain, 0.0, probability), self.false_discovery_rate)
         faulty = (faulty | certain) & present & ~explained
         value, rests = runs.value, spatial.scored & stream.rests()
         blinks_to = np.where(2 * intermittency.high > intermittency.blinks, self.layout.full_scale, 0.0)
         held, beyond = stream.reading(value), spatial.scored & ~rests
+        kind = np.where(by_life & faulty, life.kind, -1)
+        of_life = np.stack(
+            [held, stream.reading(stream.scale.baseline), life.lag * PIECE, self._order[life.source], life.highest]
+        )
+        weight = log_ratio(spatial.surprisal, spatial.surprisal)
         return CellFindings(
             faulty=faulty,
             # A cell that moved is alive, unless it is suspected since.
@@ -345,26 +392,38 @@ class SelfDiagnosis:
             noisy=noisy,
             drifting=drifting,
             gain=np.where(drifting, spatial.factor, np.nan),
-            value=np.where(intermittent, stream.reading(blinks_to), held),
+            value=np.where(
+                kind >= 0, of_life[kind, np.arange(len(kind))], np.where(intermittent, stream.reading(blinks_to), held)
+            ),
             since=np.select(
-                [silent, intermittent, noisy, drifting],
-                [runs.missed_since, intermittency.blinks_since, intermittency.noisy_since, spatial.since],
+                [silent, intermittent, noisy, drifting, kind >= 0],
+                [runs.missed_since, intermittency.blinks_since, intermittency.noisy_since, spatial.since, life.since],
                 runs.start,
             ),
             probability=probability,
             # A cell at rest supports a broken line by the events alone, without the prior of its value.
-            weight=np.where(known, CERTAIN_RATIO, log_ratio(spatial.surprisal, spatial.surprisal)),
-            events=np.where(intermittent, intermittency.blinks, spatial.events),
+            weight=np.where(known, CERTAIN_RATIO, np.where(kind >= 0, life.evidence, weight)),
+            events=np.where(intermittent, intermittency.blinks, np.where(kind >= 0, life.units, spatial.events)),
             known=known,
+            refuted=kind,
+            share=life.share,
         )
 
-    def _log_ratio(self, stream: StreamState) -> LogRatio:
+    def _log_ratio(self, stream: StreamState, life: Life) -> LogRatio:
         """Return the function from evidence and summed surprisal to the calibrated log likelihood ratio, ``[D]`` each.
 
-        The events tell something of cells with a surprisal, and with a reference of all.
+        The events tell something of cells with a surprisal, and with a reference of all. Faulty cells that move mislead
+        the search for events: then these say no more of cells at rest than the proof of life does.
         """
         temporal, kind, known = stream.temporal(), kinds(stream), stream.reference.model is not None
-        return lambda evidence, surprisal: self.calibrator_.calibrate(evidence, temporal, kind, (surprisal > 0) | known)
+        misled = bool((life.certain & (stream.runs.length < SHORTEST_RUN)).any()) & stream.rests()
+        most = np.where(misled, np.maximum(life.evidence, 0.0), np.inf)
+
+        def log_ratio(evidence: NDArray[np.float64], surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
+            tested = (surprisal > 0) | known
+            return np.minimum(self.calibrator_.calibrate(evidence, temporal, kind, tested), most)
+
+        return log_ratio
 
     def _groups(
         self, found: CellFindings, stream: StreamState, weight: NDArray[np.float64], explained: NDArray[np.bool_]

@@ -89,7 +89,8 @@ class Fault:
     def describe(self, layout: SensorLayout) -> str:
         """Return place and kind in a few words: "pad 0, row 4, column 5: stuck at 2.5 N"."""
         where = str(self.line) if self.line is not None else "; ".join(layout.place(cell) for cell in self.cells)
-        at = "" if self.value is None or self.kind is FaultKind.ALIAS else f" at {self.value:.4g} {layout.unit}"
+        no_reading = (FaultKind.ALIAS, FaultKind.LATE, FaultKind.COPY, FaultKind.WEAK)
+        at = "" if self.value is None or self.kind in no_reading else f" at {self.value:.4g} {layout.unit}"
         return f"{where}: {self.kind}{at}"
 
     def to_dict(self) -> dict[str, Any]:

@@ -78,6 +78,7 @@ class Diagnosis:
     evidence: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     possible: tuple[Fault, ...] = ()
     static_loads: tuple[StaticLoad, ...] = ()
+    contradicting: float = 0.0
 
     @cached_property
     def fault_set(self) -> FaultSet:
@@ -176,6 +177,7 @@ class Diagnosis:
             "probability": self.probability.tolist(),
             "evidence": {kind: values.tolist() for kind, values in self.evidence.items()},
             "static_loads": [load.to_dict() for load in self.static_loads],
+            "contradicting": self.contradicting,
             "transport": [fault.to_dict() for fault in self.transport],
             "n_frames": self.n_frames,
             "n_recordings": self.n_recordings,
@@ -208,6 +210,7 @@ class Diagnosis:
                 transport=tuple(TransportFault.from_dict(f) for f in d.get("transport", ())),
                 possible=tuple(Fault.from_dict(f) for f in d.get("possible", ())),
                 static_loads=tuple(StaticLoad.from_dict(load) for load in d.get("static_loads", ())),
+                contradicting=float(d.get("contradicting", 0.0)),
             )
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"the diagnosis is damaged: {type(error).__name__} {error}") from None

@@ -20,6 +20,9 @@ from diagnostics.layout import LineKind, SensorLayout
 from diagnostics.preprocessing.levels import ANYWHERE, SLIGHT, SUSPICIOUS
 from diagnostics.wiring import action, counted
 
+# Of the cells that are refuted, in the order of ``evidence.life.FAULTS``.
+REFUTED_KINDS = (FaultKind.FLOATING, FaultKind.INTERMITTENT, FaultKind.LATE, FaultKind.COPY, FaultKind.CLAMPED)
+
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -43,6 +46,9 @@ class CellFindings:
         weight: float, log likelihood ratio faulty : healthy.
         events: int, number of events that tested the cell, or number of its blinks.
         known: cells that were dead in the reference already.
+        refuted: int, number of the fault in ``evidence.life.FAULTS`` of cells that move and are proved not to be alive;
+            -1: others.
+        share: float, of the contacts in which such a cell was dead.
     """
 
     faulty: Mask
@@ -60,6 +66,8 @@ class CellFindings:
     weight: Floats
     events: NDArray[np.intp]
     known: Mask
+    refuted: NDArray[np.intp]
+    share: Floats
     zero: Mask | None = None
 
     def of(self, cells: NDArray[np.intp]) -> CellFindings:
@@ -128,7 +136,7 @@ def _explained(
 def _groups(found: CellFindings, full_scale: float) -> list[tuple[FaultKind, Mask, Mask, float | None]]:
     """Return (kind, certainly faulty cells, all consistent cells, value) of each group that may share a cause."""
     faulty, value = found.faulty, found.value
-    moving = found.intermittent | found.noisy | found.drifting
+    moving = found.intermittent | found.noisy | found.drifting | (found.refuted >= 0)
     constant = faulty & ~found.silent & ~moving
     of_gain = found.drifting & np.isfinite(found.gain)
     of_offset = found.drifting & ~of_gain
@@ -141,6 +149,9 @@ def _groups(found: CellFindings, full_scale: float) -> list[tuple[FaultKind, Mas
         (FaultKind.NOISY, faulty & found.noisy, found.noisy, None),
         *((FaultKind.DRIFT, faulty & drifting, drifting, None) for drifting in (of_offset, of_gain)),
     ]
+    for number, kind in enumerate(REFUTED_KINDS):
+        refuted = found.refuted == number
+        groups.append((kind, faulty & refuted, refuted, None))
     at_an_end = found.full if found.zero is None else found.full | found.zero
     intermediate = np.flatnonzero(constant & ~found.rests & ~at_an_end)
     intermediate = intermediate[np.argsort(value[intermediate])]
@@ -154,7 +165,8 @@ def _groups(found: CellFindings, full_scale: float) -> list[tuple[FaultKind, Mas
 
 def _fault(kind: FaultKind, value: float | None, cause: Cause, found: CellFindings, layout: SensorLayout) -> Fault:
     seen = list(cause.seen)
-    if kind in (FaultKind.STUCK, FaultKind.OPEN, FaultKind.INTERMITTENT) and not found.silent[seen[0]]:
+    own = (FaultKind.STUCK, FaultKind.OPEN, FaultKind.INTERMITTENT, FaultKind.LATE, FaultKind.COPY, FaultKind.CLAMPED)
+    if kind in own and not found.silent[seen[0]]:
         value = float(np.median(found.value[seen]))
         if found.zero is not None and kind is FaultKind.OPEN:  # at rest, which is not the lower end
             low, high = SLIGHT * layout.full_scale, (1 - SLIGHT) * layout.full_scale
@@ -179,6 +191,9 @@ _DOING = {
     FaultKind.INTERMITTENT: "blinks between its load and {value:.4g} {unit}",
     FaultKind.NOISY: "is far noisier than a healthy cell under the same load",
     FaultKind.DRIFT: "moves, but never returns to its baseline",
+    FaultKind.FLOATING: "moves by itself, whatever the cells around it read",
+    FaultKind.LATE: "follows the cells around it about {value:.0f} frames late",
+    FaultKind.CLAMPED: "never reads more than {value:.4g} {unit}, however much the cells around it are loaded",
 }
 
 
@@ -187,6 +202,10 @@ _CHECKS = {
     FaultKind.INTERMITTENT: "its solder joint and trace for a loose contact",
     FaultKind.NOISY: "its connection and shielding",
     FaultKind.DRIFT: "the cell for wear or dirt, and calibrate it again",
+    FaultKind.FLOATING: "its trace for a break: an open input picks up what is around it",
+    FaultKind.LATE: "the converter and the buffer that it is read from",
+    FaultKind.COPY: "the multiplexer and the order in which cells are read",
+    FaultKind.CLAMPED: "its amplifier and supply",
 }
 
 
@@ -194,6 +213,11 @@ def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
     gain = found.gain[list(fault.cells)]
     if fault.kind is FaultKind.DRIFT and np.isfinite(gain).any():
         return f"is loaded when the others are, but reads about {np.nanmedian(gain):.2g} times what it should"
+    if fault.kind is FaultKind.COPY:
+        return f"repeats {layout.place(int(fault.value or 0))}"
+    if fault.kind is FaultKind.INTERMITTENT and found.refuted[fault.cells[0]] >= 0:
+        share = float(np.median(found.share[list(fault.cells)]))
+        return f"reads nothing in {share:.0%} of the contacts that load the cells around it, and its load in the others"
     if fault.kind in _DOING:
         return _DOING[fault.kind].format(value=fault.value or 0.0, unit=layout.unit)
     if found.silent[fault.cells[0]]:

@@ -13,6 +13,7 @@ from diagnostics.events.constant_runs import segments
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import HealthyRates
 from diagnostics.evidence.jumps import JumpHistogram
+from diagnostics.evidence.life import LifeModel
 from diagnostics.evidence.lower_limit import LowerLimit
 from diagnostics.evidence.noise_loss import NoiseLoss
 from diagnostics.healthy.model import HealthyModel
@@ -49,6 +50,7 @@ class Reference:
         model: the healthy model; None: the k-NN spatial model of the log (cold start).
         dead: float ``[D]``, P(dead) of the reference faults, 0 for all other cells.
         loaded_patience: the same of a frame with load; 0: as ``patience``.
+        life: how cells depend on each other; None: unknown.
     """
 
     tolerance: float
@@ -63,6 +65,7 @@ class Reference:
     model: HealthyModel | None
     dead: NDArray[np.float64]
     loaded_patience: int = field(default=0, metadata={"newer": True})
+    life: LifeModel | None = field(default=None, metadata={"newer": True})
 
     def repeats(self, layout: SensorLayout) -> Patience:
         """Return how often healthy frames repeat."""
@@ -82,6 +85,8 @@ class Reference:
             raise ValueError(f"expected positive tolerance, near, recording, patience and rates, got {positive}")
         if self.model is not None:
             self.model.check(living(layout, self.dead))
+        if self.life is not None:
+            self.life.check(living(layout, self.dead))
 
     @classmethod
     def fit(
@@ -114,6 +119,11 @@ class Reference:
             dead,
             patience.loaded,
         )
+
+    def with_life(self, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> Reference:
+        """Return the reference with the model of the proof of life, fitted to the same recordings."""
+        layout = living(layout, self.dead)
+        return replace(self, life=LifeModel.fit(recordings, layout, self.scale, self.offset, self.tolerance))
 
     @classmethod
     def unknown(cls, layout: SensorLayout, rest: NDArray[np.float64] | None = None) -> Reference:
@@ -159,12 +169,13 @@ def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout
 
 
 def _usual_duplicates(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale) -> int:
-    """Return how many coincidences two healthy lines may have: the largest count seen, plus log2(250 / recordings)."""
-    most = 0
+    """Return how many coincidences two healthy lines may have: the largest count seen, plus log2(250 / recordings).
+
+    They add up over the recordings, as in a log.
+    """
+    duplicates = DuplicateLines.begin(layout)
     for recording in recordings:
-        duplicates = DuplicateLines.begin(layout)
         for frames, numbers, runs in segments(recording, scale):
             moving = informative(frames, runs.start <= numbers[0], scale)
             duplicates = duplicates.extend(frames, numbers, moving, scale.near)
-        most = max(most, duplicates.most)
-    return most + max(0, int(np.ceil(np.log2(_MANY / len(recordings)))))
+    return duplicates.most + max(0, int(np.ceil(np.log2(_MANY / len(recordings)))))

@@ -28,6 +28,8 @@ from diagnostics.evidence.drift import offset_evidence
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.evidence.jumps import SUDDEN_JUMP
+from diagnostics.evidence.life import LifeTest
+from diagnostics.evidence.life_record import LifeRecord
 from diagnostics.evidence.rest_level import RestLevel
 from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, held_load_evidence
 from diagnostics.evidence.term import ConstantCells, Term
@@ -78,6 +80,7 @@ class StreamState:
         touched: bool ``[D]``, cells that were loaded at least once.
         scale: baseline with the present offsets, and full scale.
         below: bool ``[D]``, cells that last read less than at rest.
+        life: the record for the proof of life; empty without a model of it.
     """
 
     def __init__(
@@ -108,6 +111,7 @@ class StreamState:
         self._offsets = OffsetTracker.begin(layout.n_cells)
         self._rest, self._response = RestOfLog(), WeakResponse.begin(layout.n_cells)
         self._level = RestLevel.begin(layout.n_cells)
+        self.life = LifeRecord()
         self._absent = not self.present.all()  # whether some position has no cell
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
@@ -237,6 +241,16 @@ class StreamState:
             suffixes = [s.features() for e in events.kept for s in e.suffixes() if s.first >= onset]
             if suffixes:
                 yield np.stack(suffixes), tile.inputs, tile.place, self.model_of(i, events)
+
+    def proof_of_life(self, explained: Mask, suspected: Mask) -> LifeTest | None:
+        """Return the test whether cells depend on each other as healthy ones do; None: the reference tells nothing.
+
+        Cells that are ``explained`` (bool ``[D]``) are left out; those ``suspected`` to be constant predict no others.
+        """
+        if self.reference.life is None:
+            return None
+        eligible = self.received & ~self.silent & ~explained & (self.reference.dead == 0)
+        return LifeTest(self.life, self.reference.life, self.layout, eligible, suspected)
 
     def spatial(self, explained: Mask | None = None) -> Test:
         """Return the spatial test of all constant cells; cells already ``explained`` (bool ``[D]``) are left out."""
@@ -381,6 +395,8 @@ class StreamState:
             # How often healthy lines with light loads agree is unknown.
             clear = replace(plain, near=max(scale.near, _CLEAR * plain.near))
         self.touched = self.touched | root.any(axis=0)
+        if self.reference.life is not None:
+            self.life = self.life.extend(root, known, int(numbers[0]) // SEGMENT)
         jump = self.reference.jumps_seen.size(runs, self.reference.scale.full_scale)
         jumped = (jump >= SUDDEN_JUMP) & (runs.alone | still)
         self.local = self.local.extend(root, numbers, scale.root_near, runs.start, jumped)

@@ -117,7 +117,8 @@ def _faulty_readings(
             return drifted
         case FaultKind.FLOATING:
             swing = _SWING * full_scale if fault.value is None else fault.value
-            return np.fmin.reduce(own, initial=np.inf) + swing * _swinging(own.shape, rng)
+            floating: NDArray[np.float64] = np.fmin.reduce(own, initial=np.inf) + swing * _swinging(own.shape, rng)
+            return floating
         case FaultKind.LATE:
             delay = _DELAY if fault.value is None else int(fault.value)
             return own[np.maximum(np.arange(len(own)) - delay, 0)]

@@ -1,0 +1,109 @@
+"""Proof of life: cells that move by themselves are no healthy cells."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from adaptfault.data.recordings import Recordings
+from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, Verdict, inject
+from diagnostics.evidence.life import LifeTest
+from diagnostics.evidence.life_record import KEPT, LifeRecord
+
+
+@pytest.fixture(scope="module")
+def log(grasps: Recordings) -> list[np.ndarray]:
+    """Forty grasps that the reference does not hold."""
+    return [np.asarray(frames, dtype=np.float64) for frames in grasps.frames[1::2][:40]]
+
+
+@pytest.fixture(scope="module")
+def used(log: list[np.ndarray]) -> np.ndarray:
+    """The cells by their load, the one that carries most first."""
+    return np.argsort(-np.mean([frames.max(axis=0) for frames in log], axis=0), kind="stable")
+
+
+def broken(log: list[np.ndarray], fault: Fault, diagnoser: SelfDiagnosis) -> list[np.ndarray]:
+    whole = inject(np.concatenate(log), [fault], diagnoser.layout, seed=1)
+    return np.split(whole, np.cumsum([len(frames) for frames in log])[:-1])
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [(FaultKind.FLOATING, 1.0), (FaultKind.FLOATING, 0.25), (FaultKind.LATE, 10), (FaultKind.CLAMPED, 0.5)],
+)
+def test_a_dead_cell_that_moves_is_found_named_by_how_it_fails_and_no_other_cell_is(fitted, log, used, kind, value):
+    cell = int(used[0])
+    found = fitted.diagnose(broken(log, Fault(kind, (cell,), value=value), fitted))
+    assert [(fault.kind, fault.cells) for fault in found.faults] == [(kind, (cell,))]
+
+
+def test_of_two_cells_that_read_the_same_the_one_that_contradicts_the_others_is_the_copy(fitted, log, used):
+    cell = int(used[0])
+    copied = broken(log, Fault(FaultKind.COPY, (cell,), value=cell + 1), fitted)
+    (fault,) = fitted.diagnose(copied).faults
+    assert (fault.kind, fault.cells, fault.value) == (FaultKind.COPY, (cell,), cell + 1)
+    assert fitted.layout.place(cell + 1) in fault.reason
+
+
+def test_a_cell_that_is_dead_in_every_second_recording_is_not_called_alive(fitted, log, used):
+    cell = int(used[0])
+    dead = Fault(FaultKind.OPEN, (cell,))
+    seen = [inject(frames, [dead], fitted.layout) if i % 2 else frames for i, frames in enumerate(log)]
+    found = fitted.diagnose(seen)
+    assert found.verdicts[cell] != Verdict.ALIVE or found.probability[cell] >= 0.1
+
+
+def test_healthy_cells_in_use_are_shown_to_be_alive_and_none_is_blamed(fitted, log, used):
+    found = fitted.diagnose(log)
+    assert not found.faults
+    assert found.contradicting == 0
+    assert (found.verdicts[used[:100]] == Verdict.ALIVE).mean() >= 0.95
+
+
+def test_where_many_cells_contradict_at_once_the_sensor_is_disturbed_and_no_cell_is_floating(fitted, log):
+    some = np.random.default_rng(0).choice(fitted.layout.n_cells, 110, replace=False)
+    found = fitted.diagnose(broken(log, Fault(FaultKind.FLOATING, tuple(some.tolist()), value=1.5), fitted))
+    assert found.contradicting > 1 / 3
+    assert not [fault for fault in found.faults if fault.kind is FaultKind.FLOATING]
+    assert type(found).from_dict(found.to_dict()).contradicting == found.contradicting
+
+
+def test_a_reference_without_a_model_of_life_takes_a_cell_that_moves_for_alive(fitted, log, used):
+    without = SelfDiagnosis(fitted.layout)
+    without.calibrator_ = fitted.calibrator_
+    without.reference_ = replace(fitted.reference_, life=None)
+    cell = int(used[0])
+    floating = broken(log, Fault(FaultKind.FLOATING, (cell,), value=1.0), fitted)
+    assert without.diagnose(floating).verdicts[cell] == Verdict.ALIVE
+    assert fitted.diagnose(floating).verdicts[cell] == Verdict.FAULTY
+
+
+def test_frame_by_frame_a_floating_cell_is_told_as_in_batch(fitted, log, used):
+    cell = int(used[0])
+    frames = np.concatenate(broken(log, Fault(FaultKind.FLOATING, (cell,), value=1.0), fitted))
+    monitor, told = Monitor(fitted), set[FaultKind]()
+    for frame in frames:
+        told |= {fault.kind for fault in monitor.update(frame) if fault.cells == (cell,) and fault.probability}
+    assert FaultKind.FLOATING in told
+    assert monitor.diagnosis().to_dict() | {"n_recordings": 1} == fitted.diagnose(frames).to_dict()
+
+
+def test_the_record_keeps_the_last_segments_with_load_and_no_others():
+    record = LifeRecord()
+    for number in range(2 * KEPT):
+        root = np.full((32, 3), 0.1 * (number % 2), np.float32)
+        record = record.extend(root, root.astype(np.float64), number)
+    assert record.number == tuple(range(1, 2 * KEPT, 2))[-KEPT:]
+    assert record.loads.shape == (4 * KEPT, 3)
+
+
+def test_a_log_without_contact_proves_nothing(fitted):
+    idle = [np.zeros((50, fitted.layout.n_cells))]
+    stream = fitted.stream()
+    stream.extend(idle[0])
+    life = LifeTest(stream.life, fitted.reference_.life, fitted.layout, np.ones(220, bool)).finish()
+    assert not life.shown.any()
+    assert not life.evidence.any()

@@ -29,12 +29,14 @@ from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED, RARE
 from diagnostics.preprocessing.load import LoadDirection
-from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks
 
 SCHEMA = "adaptfault.diagnoser/10"
 
 _CERTAIN = 1 - RARE  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
+
+_LONG_BEFORE = 8 * SEGMENT  # frames
 
 LogRatio = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
@@ -235,7 +237,7 @@ class SelfDiagnosis:
             suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
             life = yield from self._proof_of_life(stream, copies, suspected)
             log_ratio = self._log_ratio(stream, life)
-            if (life.certain & (stream.runs.length < SHORTEST_RUN)).any():
+            if self._misleading(stream, life).any():
                 # They misled the spatial test, and its suspects the proof of life: once more without them.
                 spatial, found = yield from self._tested(stream, explained, log_ratio, life)
                 suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
@@ -304,6 +306,13 @@ class SelfDiagnosis:
             contradicting=life.contradicting,
         )
 
+    @staticmethod
+    def _misleading(stream: StreamState, life: Life) -> NDArray[np.bool_]:
+        """Return the cells that are refuted and move, or did so long before they came to hold a value, bool ``[D]``."""
+        runs = stream.runs
+        before = runs.moved & (runs.start - life.since > _LONG_BEFORE)
+        return life.certain & ((runs.length < SHORTEST_RUN) | before)
+
     def _proof_of_life(
         self, stream: StreamState, explained: NDArray[np.bool_], suspected: NDArray[np.bool_]
     ) -> Generator[None, None, Life]:
@@ -322,8 +331,7 @@ class SelfDiagnosis:
 
         Moving cells that are refuted predict no others.
         """
-        moving = stream.runs.length < SHORTEST_RUN
-        test = stream.spatial(explained | (life.certain & moving))
+        test = stream.spatial(explained | self._misleading(stream, life))
         yield
         while not test.step():
             yield
@@ -416,7 +424,7 @@ class SelfDiagnosis:
         the search for events: then these say no more of cells at rest than the proof of life does.
         """
         temporal, kind, known = stream.temporal(), kinds(stream), stream.reference.model is not None
-        misled = bool((life.certain & (stream.runs.length < SHORTEST_RUN)).any()) & stream.rests()
+        misled = bool(self._misleading(stream, life).any()) & stream.rests()
         most = np.where(misled, np.maximum(life.evidence, 0.0), np.inf)
 
         def log_ratio(evidence: NDArray[np.float64], surprisal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -55,6 +55,7 @@ SLOW = {  # they take long, or a test of the library proves the same
     "fleet_scaling.py",
     "forecast_intervals.py",
     "attack.py",
+    "io_errors.py",
     "kill_maintenance.py",
     "own_model.py",
     "picture.py",

@@ -222,7 +222,7 @@ def test_a_robot_that_moved_since_the_kill_is_done_again(worked, tmp_path):
 
 
 def test_two_processes_do_not_maintain_the_same_fleet(worked, tmp_path):
-    with locked(tmp_path / "run.lock", wait=False), pytest.raises(Busy, match="another process"):
+    with locked(tmp_path / "run.lock", patience=0), pytest.raises(Busy, match="another process"):
         maintain_fleet(robots(1), tmp_path, jobs=1)
 
 

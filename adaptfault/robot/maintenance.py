@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from adaptfault.data.printable import printable
 from adaptfault.data.windows import recordings_of
 from adaptfault.evaluation.scores import chance
 from adaptfault.robot.ageing import encode
@@ -20,6 +21,7 @@ from adaptfault.robot.bundle import Bundle, now
 from adaptfault.robot.checksummed_json import Damaged
 from adaptfault.robot.converter_range import within_range
 from adaptfault.robot.deployment_test import Judgement, compare_candidate, with_faults
+from adaptfault.robot.journal import Entry
 from adaptfault.robot.known_faults import KnownFaults
 from adaptfault.robot.maintenance_report import Decision, MaintenanceReport
 from adaptfault.robot.plausibility import contradiction, implausible
@@ -100,7 +102,7 @@ def _checked(
 ) -> list[_InputRecording]:
     incoming = []
     for i, recording in enumerate(bundle.layout.recordings(recordings)):
-        name = names[i] if i < len(names) else f"recording {i}"
+        name = printable(names[i]) if i < len(names) else f"recording {i}"
         raw = np.ascontiguousarray(recording, dtype=np.float64)
         digest = hashlib.sha256(repr(raw.shape).encode() + raw.tobytes()).hexdigest()
         try:
@@ -127,6 +129,7 @@ class _Maintenance:
     warnings: tuple[str, ...] = field(default=(), init=False)
     judged: dict[str, Any] | None = field(default=None, init=False)
     condition: bytes | None = field(default=None, init=False)
+    next: int | None = field(default=None, init=False)  # number of the version that runs after this run, if another
 
     def run(self, incoming: Sequence[_InputRecording]) -> MaintenanceReport:
         """Diagnose recordings that no earlier run used, decide, and journal the run unless it is a dry run."""
@@ -215,7 +218,7 @@ class _Maintenance:
         self.say(reason)
         about = {**self.version.about, "reason": reason, **self.version.readings, **readings}
         self.version = self.bundle.write_version(Adaptation.load(self.version.folder), about)
-        self.bundle.deploy(self.version.number)
+        self.next = self.version.number
 
     def _with_new_readings(self, report: MaintenanceReport, reason: str, **found: Any) -> MaintenanceReport:
         """Return the report with changed wires or replaced pads, which a deployed version undoes."""
@@ -396,7 +399,7 @@ class _Maintenance:
             )
             return self._report("kept", code, reason, known, accuracy=judgement.running, **found)
         if not self.dry_run:
-            self.bundle.deploy(earlier.number)
+            self.next = earlier.number
         code = self._code(known.fault_set, judgement.candidate, free)
         number = self.version.number if self.dry_run else earlier.number
         reason = f"{recovered} cells recovered; version {earlier.number} uses them again ({accuracies})"
@@ -412,18 +415,21 @@ class _Maintenance:
             "chance": chance(self.bundle.parts.check_windows().y)[1],
         }
         version = self.bundle.write_version(adaptation, about)
-        self.bundle.deploy(version.number)
+        self.next = version.number
         return version.number
 
     def _write(self, report: MaintenanceReport, usable: Sequence[_InputRecording]) -> None:
-        """Journal the run. After a crash before this the recordings are diagnosed again, with the same result."""
-        self.bundle.journal.add(
-            now(),
-            report.decision,
-            {**report.to_dict(), "knowledge": self.known.to_dict(), "judged": self._judgement_of(report)},
-            [(r.digest, r.name) for r in usable] if report.used else [],  # refused ones are diagnosed again
-            self.condition,
-        )
+        """Deploy and journal the run in one step.
+
+        After a crash before this the recordings are diagnosed again, with the same result.
+        """
+        document = {**report.to_dict(), "knowledge": self.known.to_dict(), "judged": self._judgement_of(report)}
+        used = [(r.digest, r.name) for r in usable] if report.used else []  # refused ones are diagnosed again
+        entry = Entry(now(), report.decision, document, used, self.condition)
+        if self.next is None:
+            self.bundle.journal.add(entry)
+        else:
+            self.bundle.deploy(self.next, entry)
 
     def _judgement_of(self, report: MaintenanceReport) -> dict[str, Any] | None:
         """Return what the next run needs so that it does not repeat the same comparison."""

@@ -24,6 +24,7 @@ class Pointer:
         starts: number of starts on probation.
         starter: identifies the last starter.
         rejected: fault sets of versions that failed or were rolled back; they are not deployed again.
+        entry: key of the journal's entry about this switch, see :class:`~adaptfault.robot.journal.Journal`.
     """
 
     active: int
@@ -32,6 +33,7 @@ class Pointer:
     starts: int = 0
     starter: str = ""
     rejected: tuple[tuple[int, ...], ...] = ()
+    entry: str = ""
 
     @classmethod
     def read(cls, bundle: Path) -> Pointer:
@@ -40,7 +42,15 @@ class Pointer:
         with decoding(bundle / NAME):
             rejected = tuple(tuple(map(int, cells)) for cells in d["rejected"])
             fallbacks = tuple(map(int, d["fallbacks"]))
-            return cls(int(d["active"]), fallbacks, bool(d["probation"]), int(d["starts"]), str(d["starter"]), rejected)
+            return cls(
+                active=int(d["active"]),
+                fallbacks=fallbacks,
+                probation=bool(d["probation"]),
+                starts=int(d["starts"]),
+                starter=str(d["starter"]),
+                rejected=rejected,
+                entry=str(d["entry"]),
+            )
 
     def write(self, bundle: Path) -> None:
         """Write the pointer; replacing the file switches the version."""

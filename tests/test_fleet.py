@@ -108,7 +108,7 @@ def test_a_robot_that_is_being_maintained_is_waited_for(fleet, monkeypatch):
     assert maintain_robot(fleet.robots[0], dry_run=True).decision == "unchanged"
     with Bundle.open(fleet.robots[0].bundle).maintenance():
         monkeypatch.setattr(working, "_PATIENCE", 0)
-        outcome = maintain_robot(fleet.robots[0], dry_run=True)
+        outcome = maintain_robot(fleet.robots[0])
     assert outcome.decision == "error"
     assert "being maintained by another process" in outcome.reason
 

@@ -149,7 +149,9 @@ def test_without_evidence_the_log_ratio_is_not_positive_however_few_healthy_cell
     rng = np.random.default_rng(0)
     dead = np.arange(200) >= 6  # healthy cells that hold a load are rare in a small reference
     evidence = np.column_stack([np.where(dead, 4, -4) + rng.normal(0, 3, 200), rng.normal(0, 1, 200) + 2 * dead])
-    offset, slope, jump = _bounded_logistic(evidence, dead, base=-1.0, expected=(0.0, 0.0))  # as if faults were rarer elsewhere
+    offset, slope, jump = _bounded_logistic(
+        evidence, dead, base=-1.0, expected=(0.0, 0.0)
+    )  # as if faults were rarer elsewhere
     assert offset <= 0
     assert slope > 0
     assert 0 <= jump <= 1

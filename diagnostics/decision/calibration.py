@@ -6,10 +6,11 @@ Estimates, for each of three kinds of constant cells (never moved; came to rest;
 
 Raw ratios are overconfident, because events are few and correlated and models err at edges of objects. The reference is
 split; models of one part diagnose logs made of the other part, with known faults. Equals Platt scaling (Platt 1999),
-scikit-learn's ``CalibratedClassifierCV(method="sigmoid")``. q is 1; in a cold start it is 0 for cells of which no event
-tells anything: these keep their prior. The prevalence is not calibrated: it is estimated from each log by expectation
-maximisation (Saerens et al. 2002). The faulty set is the largest one whose expected false discovery rate meets the
-limit (:func:`faulty_at`). Faults unlike the injected ones are calibrated as well as these only by assumption.
+scikit-learn's ``CalibratedClassifierCV(method="sigmoid")``, with the default weights as prior means of b and d. q is 1;
+in a cold start it is 0 for cells of which no event tells anything: these keep their prior. The prevalence is not
+calibrated: it is estimated from each log by expectation maximisation (Saerens et al. 2002). The faulty set is the
+largest one whose expected false discovery rate meets the limit (:func:`faulty_at`). Faults unlike the injected ones are
+calibrated as well as these only by assumption.
 """
 
 from __future__ import annotations

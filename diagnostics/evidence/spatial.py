@@ -6,7 +6,7 @@ event e after s adds to the log likelihood ratio of stuck against healthy
     sum_e  w_e * -log P(cell reads v throughout e | healthy, readings of the other cells)  +  log P(v | stuck)
 
 The prior of v counts once: broken cells mostly stick to a rail, a healthy cell under a constant load reads any value.
-Without an event the ratio is 1, whatever v is.
+Without an event the ratio of a load is 1; that of a rest is its prior, as any healthy cell may be at rest.
 The ratio equals a sequence of conditional tests as in pseudo-likelihood estimation (Besag 1975). It does not detect
 cells that no event loads and that no event leaves unloaded among loaded neighbours: they stay untested.
 

@@ -15,6 +15,7 @@ from diagnostics.evidence.intermittency import HealthyRates
 from diagnostics.evidence.jumps import JumpHistogram
 from diagnostics.evidence.lower_limit import LowerLimit
 from diagnostics.evidence.noise_loss import NoiseLoss
+from diagnostics.evidence.pad_level import PadLimit
 from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.baseline import baseline
@@ -49,6 +50,7 @@ class Reference:
         model: the healthy model; None: the k-NN spatial model of the log (cold start).
         dead: float ``[D]``, P(dead) of the reference faults, 0 for all other cells.
         loaded_patience: the same of a frame with load; 0: as ``patience``.
+        beside: lower limit of the readings of healthy cells, relative to their pad; None: unknown.
     """
 
     tolerance: float
@@ -63,6 +65,7 @@ class Reference:
     model: HealthyModel | None
     dead: NDArray[np.float64]
     loaded_patience: int = field(default=0, metadata={"newer": True})
+    beside: PadLimit | None = field(default=None, metadata={"newer": True})
 
     def repeats(self, layout: SensorLayout) -> Patience:
         """Return how often healthy frames repeat."""
@@ -113,6 +116,7 @@ class Reference:
             model,
             dead,
             patience.loaded,
+            PadLimit.fit(recordings, readings, layout, tolerance),
         )
 
     @classmethod

@@ -118,6 +118,14 @@ def test_where_there_are_no_rows_none_are_exchanged(fitted, small_grasps):
     assert buses.rewiring([frames[:, wired] for frames in log(small_grasps, 0)]) is None
 
 
+@pytest.mark.parametrize("wiring", [{"wiring": "bus"}, {"groups": {"triangle": range(30)}}])
+def test_one_pad_without_rows_and_columns_has_no_wiring_to_change(small_grasps, wiring):
+    recordings = [frames[:, :30] for frames in small_grasps.frames]
+    with without_calibration():
+        one_pad = SelfDiagnosis(SensorLayout(1, 6, 5, **wiring)).fit(recordings[:60])
+    assert one_pad.rewiring(recordings[60:]) is None
+
+
 def test_exchanged_rows_of_a_sensor_that_rests_high_are_named(fitted, small_grasps):
     wired = exchanged_rows(0, 1, 4)
     high = SelfDiagnosis(replace(LAYOUT, rest="high"))

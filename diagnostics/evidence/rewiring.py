@@ -108,6 +108,8 @@ def find_rewiring(
     now = test.score(source)
     for _ in range(_MOST_STEPS):
         candidates = list(_candidates(layout, now.surplus, source))
+        if not candidates:  # one pad without rows and columns
+            break
         scores = [test.score(candidate.source) for candidate in candidates]
         gains = np.array([score.by_event - now.by_event for score in scores])
         sums = gains.sum(axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -81,3 +82,12 @@ class Pointer:
             raise ValueError(f"version {self.active} is the first: there is no version to fall back to")
         first, *rest = self.fallbacks
         return Pointer(first, tuple(rest), rejected=(*self.rejected, rejected))
+
+
+def file_stamp(path: Path) -> tuple[int, int, int] | None:
+    """Return values that change when a file is replaced; None while it does not exist."""
+    try:
+        stat = os.stat(path)
+    except OSError:
+        return None
+    return stat.st_ino, stat.st_mtime_ns, stat.st_size

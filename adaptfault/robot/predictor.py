@@ -20,6 +20,7 @@ from adaptfault.models.inference import Inference
 from adaptfault.robot.bundle import PROCESS
 from adaptfault.robot.checksummed_json import Damaged, decoding
 from adaptfault.robot.converter_range import within_range
+from adaptfault.robot.pointer import file_stamp
 from diagnostics import Fault, FaultSet, Monitor, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ class Predictor:
         self._open, self._accumulate = open_bundle, accumulate
         bundle = open_bundle()
         self._pointer = bundle.pointer
-        self._stamp = _stamp(self._pointer)
+        self._stamp = file_stamp(self._pointer)
         self._running = _start_any(bundle)
         self._next_look = monotonic() + _POLL
         self._loading: threading.Thread | None = None
@@ -250,7 +251,7 @@ class Predictor:
         if now < self._next_look:
             return
         self._next_look = now + _POLL
-        stamp = _stamp(self._pointer)
+        stamp = file_stamp(self._pointer)
         if stamp is not None and stamp != self._stamp:
             self._stamp = stamp
             self._loading = threading.Thread(target=self._load_new, name="adaptfault-load", daemon=True)
@@ -340,12 +341,3 @@ def _reference(bundle: Bundle) -> SelfDiagnosis:
     except (OSError, Damaged) as error:
         _log.warning("monitoring without the healthy reference: %s", error)
         return SelfDiagnosis(bundle.layout)
-
-
-def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return values that change when a file is replaced; None while it does not exist."""
-    try:
-        stat = os.stat(path)
-    except OSError:
-        return None
-    return stat.st_ino, stat.st_mtime_ns, stat.st_size

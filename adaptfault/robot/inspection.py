@@ -9,10 +9,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from adaptfault.robot.changed_readings import ChangedReadings, find_changed_readings
 from adaptfault.robot.converter_range import within_range
 from adaptfault.robot.sensor_state import UNTESTED
-from diagnostics import Diagnosis, FaultKind, SelfDiagnosis, SensorLayout
-from diagnostics.evidence.recalibration import Recalibration, find_recalibration
+from diagnostics import Diagnosis, SelfDiagnosis, SensorLayout
+from diagnostics.evidence.recalibration import Recalibration
 from diagnostics.evidence.rewiring import Rewiring
 from diagnostics.evidence.sensor_change import find_change
 from diagnostics.sensor.disturbance import (
@@ -51,8 +52,6 @@ NAMES: tuple[str, ...] = get_args(Name)
 """Names of findings; they never change, because programs ask for them."""
 
 _SERIOUS = ("normalised", "silent_array")  # no reading means anything
-_DEAD = (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK, FaultKind.ALIAS)  # no predictors of how a pad reads
-_COST = 4.0  # faults that a disturbance must explain away, as one wire or one cell each
 
 
 @dataclass(frozen=True)
@@ -136,27 +135,19 @@ def inspect(
     if not any(np.isfinite(frames[:, layout.present.ravel()]).any() for frames in log):
         return _unreadable(log, layout, sentinel)
     disturbances = [] if sentinel is None else [sentinel]
-    if healthy:
-        disturbances += find_disturbances(log, healthy, layout)
+    disturbances += find_disturbances(log, healthy, layout)
     if any(one.name == "silent_array" for one in disturbances):
         return Inspection(_untold(log, layout), tuple(_finding(one) for one in disturbances))
-    rewiring = diagnoser.rewiring(log)
-    if rewiring is not None:
-        log = [rewiring.undo(frames) for frames in log]
-    diagnosis, common, log = _judged(log, healthy, diagnoser)
-    recalibration = None if rewiring is not None else _recalibration(log, healthy, diagnoser, diagnosis)
-    if recalibration is not None:
-        log = [recalibration.undo(frames, layout.full_scale) for frames in log]
-        diagnosis = diagnoser.diagnose(log)
+    changed, common = _judged(log, healthy, diagnoser)
     if common is not None:
         disturbances.append(common.disturbance)
     findings = [
-        *_of_wiring(rewiring, recalibration),
+        *_of_readings(changed),
         *(_finding(one) for one in disturbances),
-        *_of_change(log, healthy, diagnoser, diagnosis, disturbances),
-        *_of_diagnosis(diagnosis),
+        *_of_change(changed, healthy, diagnoser, disturbances),
+        *_of_diagnosis(changed.diagnosis),
     ]
-    return Inspection(diagnosis, tuple(findings), rewiring, recalibration, common)
+    return Inspection(changed.diagnosis, tuple(findings), changed.rewiring, changed.recalibration, common)
 
 
 def _checked(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> list[NDArray[np.float64]]:
@@ -171,65 +162,49 @@ def _checked(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) 
 
 def _judged(
     log: list[NDArray[np.float64]], healthy: list[NDArray[np.float64]], diagnoser: SelfDiagnosis
-) -> tuple[Diagnosis, CommonMode | None, list[NDArray[np.float64]]]:
-    """Return the diagnosis, the common mode that it does without, and the log that it is of.
+) -> tuple[ChangedReadings, CommonMode | None]:
+    """Return the diagnosis of a log, and the common mode that it does without; None: the log as it is.
 
-    A common mode is one explanation beside the faults that it explains away: it is taken out where it spares more than
-    four faults, or blames none.
+    A common mode is one explanation beside the faults that it explains away.
     """
-    diagnosis = diagnoser.diagnose(log)
+    as_it_is = find_changed_readings(diagnoser, log, lambda: healthy)
     common = find_common_mode(log, healthy, diagnoser.layout) if healthy else None
     if common is None:
-        return diagnosis, None, log
-    cleaned = common.undo(log, diagnoser.layout)
-    without = diagnoser.diagnose(cleaned)
-    spared = len(diagnosis.faults) - len(without.faults)
-    if spared >= _COST or (len(without.fault_set) <= len(diagnosis.fault_set) and not _is_dead(diagnosis)):
-        return without, common, cleaned
-    return diagnosis, None, log
+        return as_it_is, None
+    without = find_changed_readings(diagnoser, common.undo(log, diagnoser.layout), lambda: healthy)
+    explanations = len(without.diagnosis.faults) + 1
+    if explanations > len(as_it_is.diagnosis.faults) and _is_converter(as_it_is.diagnosis):
+        return as_it_is, None
+    if len(without.diagnosis.fault_set) > len(as_it_is.diagnosis.fault_set):
+        return as_it_is, None
+    return without, common
 
 
-def _is_dead(diagnosis: Diagnosis) -> bool:
-    """Return whether a whole converter or address line is among the faults: its cells share what they read."""
+def _is_converter(diagnosis: Diagnosis) -> bool:
+    """Return whether a converter is among the faults: its cells share what they read, as those of a common mode."""
     return any(fault.line is not None and fault.line.kind == "converter" for fault in diagnosis.faults)
 
 
-def _recalibration(
-    log: list[NDArray[np.float64]],
-    healthy: list[NDArray[np.float64]],
-    diagnoser: SelfDiagnosis,
-    diagnosis: Diagnosis,
-) -> Recalibration | None:
-    """Return how replaced pads read; None where none is replaced."""
-    if not healthy or diagnoser.load_ is not None or diagnoser.reference_ is None:
-        return None
-    faulty = np.zeros(diagnoser.layout.n_cells, bool)
-    faulty[[cell for fault in diagnosis.faults if fault.kind in _DEAD for cell in fault.cells]] = True
-    held = diagnosis.statically_loaded.mask
-    return find_recalibration(log, healthy, diagnoser.reference_, diagnoser.layout, faulty, held)
-
-
-def _of_wiring(rewiring: Rewiring | None, recalibration: Recalibration | None) -> list[Finding]:
-    findings = []
-    if rewiring is not None:
-        findings.append(Finding("rewired", 2, rewiring.reason))
-    if recalibration is not None:
-        findings.append(Finding("replaced_pad", 1, recalibration.reason))
-    return findings
+def _of_readings(changed: ChangedReadings) -> list[Finding]:
+    """Return exchanged wires, or replaced pads."""
+    if changed.rewiring is not None:
+        return [Finding("rewired", 2, changed.reason)]
+    return [Finding("replaced_pad", 1, changed.reason)] if changed.recalibration is not None else []
 
 
 def _of_change(
-    log: list[NDArray[np.float64]],
+    changed: ChangedReadings,
     healthy: list[NDArray[np.float64]],
     diagnoser: SelfDiagnosis,
-    diagnosis: Diagnosis,
     disturbances: list[Disturbance],
 ) -> list[Finding]:
     """Return what changed of a pad or of the sensor, unless a disturbance explains it."""
     if not healthy or any(one.name in ("normalised", "ramp", "hum", "crosstalk") for one in disturbances):
         return []
-    load = diagnoser.load_
-    new, old = (log, healthy) if load is None else ([*map(load.loads, log)], [*map(load.loads, healthy)])
+    diagnosis, load = changed.diagnosis, diagnoser.load_
+    new, old = changed.frames, healthy
+    if load is not None:
+        new, old = [load.loads(frames) for frames in new], [load.loads(frames) for frames in old]
     change = find_change(new, old, diagnoser.layout, diagnosis.fault_set | diagnosis.disturbed)
     if change is None:
         return []
@@ -239,15 +214,10 @@ def _of_change(
 def _of_diagnosis(diagnosis: Diagnosis) -> list[Finding]:
     """Return the faults, wires, static loads, lost frames and what was not tested."""
     worst = diagnosis.exit_code
-    findings = []
-    for fault in diagnosis.faults:
-        findings.append(Finding("fault" if fault.line is None else "wire", worst, fault.reason))
+    findings = [Finding("fault" if f.line is None else "wire", worst, f.reason) for f in diagnosis.faults]
     findings += [Finding("static_load", 1, load.reason) for load in diagnosis.static_loads]
-    for fault in diagnosis.transport:
-        if fault.kind == "frozen":
-            findings.append(Finding("frozen", 1, fault.reason))
-        elif fault.kind == "lost":
-            findings.append(Finding("lost_frames", 0, fault.reason))
+    findings += [Finding("frozen", 1, frozen.reason) for frozen in diagnosis.frozen]
+    findings += [Finding("lost_frames", 0, link.reason) for link in diagnosis.transport if link.kind == "lost"]
     share = diagnosis.coverage.test_coverage
     if share < UNTESTED:
         reason = f"only {share:.0%} of the cells were tested, so faults may be hidden"

@@ -5,10 +5,10 @@ statistic of a recording, compared between the log and the reference by the test
 (``scipy.stats.ks_2samp``, p < 1e-4) and by its size, as a change of the sensor is
 (:mod:`diagnostics.evidence.sensor_change`).
 
-- **Common mode** (hum, ramp, crosstalk): c_t, the median over the cells of a pad of reading less rest. The excess is
-  c_t beyond the range that it has in the reference. It can be taken out of every cell that follows it: over pairs of
-  frames with different excess, the median of the ratio of both differences is above one half. A cell that is stuck does
-  not follow it and keeps its readings.
+- **Common mode** (hum, ramp, crosstalk): c_t, the lower quartile over the cells of a pad of reading less rest; more
+  cells than that are unloaded. Its extremes in a recording are compared. The excess is c_t beyond its range in the
+  reference. It can be taken out of every cell that follows it: over pairs of frames with different excess, the median
+  of the ratio of both differences is above one half. A cell that is stuck does not follow it and keeps its readings.
 - **Noise**: the robust standard deviation from second differences, median over cells.
 - **Quantised**: the smallest difference of two readings.
 - **Saturated**: the share of readings that equal the highest one of all cells, below full scale.
@@ -16,8 +16,8 @@ statistic of a recording, compared between the log and the reference by the test
 - **Sentinel**: one number outside the converter's range, again and again.
 - **Silent**: no reading of any cell ever changes, although those of the reference do.
 
-Not detected: a common mode where a contact loads half of the cells of a pad, changes of gain that come and go, and
-what fewer than five recordings show.
+Not detected: a common mode where contacts load three quarters of the cells of a pad, one within the range of the
+reference, changes of gain that come and go, and what fewer than five recordings show.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from scipy.special import ndtri
 from scipy.stats import ks_2samp
 
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.levels import LOW, MAJORITY, MARGIN, P_MIN, RARE
+from diagnostics.preprocessing.levels import LEAST_LOADED, LOW, MAJORITY, MARGIN, P_MIN, RARE, SLIGHT
 
 Name = Literal["hum", "ramp", "crosstalk", "noise", "quantised", "saturated", "normalised", "sentinel", "silent_array"]
 
@@ -43,6 +43,8 @@ Recordings = Sequence[Floats]
 _FEWEST = 5  # recordings
 _PAIRS = 4000  # of frames, that tell whether a cell follows the common mode: a size
 _TIMES = 2.0  # by which a statistic must differ
+_LEAST = 0.005  # of full scale: readings that differ by less agree
+_DECILES = np.linspace(0.1, 0.9, 9)
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class CommonMode:
 
 
 def find_common_mode(recordings: Recordings, reference: Recordings, layout: SensorLayout) -> CommonMode | None:
-    """Return the common mode of a log; None where it stays within the range of the reference.
+    """Return the common mode of a log; None where it is as in the reference.
 
     Args:
         recordings: ``[T, D]`` each, in the layout's unit; NaN = missing.
@@ -93,31 +95,49 @@ def find_common_mode(recordings: Recordings, reference: Recordings, layout: Sens
         layout: the array.
     """
     rest = _rest(reference, layout)
-    usual = np.concatenate([_common(frames, rest, layout) for frames in reference])
-    low, high = np.nanquantile(usual, [RARE, 1 - RARE], axis=0)
-    margin = _step(reference, layout) / 2
-    common = [_common(frames, rest, layout) for frames in recordings]
-    excess = [np.nan_to_num(c - np.clip(c, low - margin, high + margin)) for c in common]
-    share = np.mean([(np.abs(one) > 0).any() for one in excess])
-    if share <= LOW:
+    usual = [_common(frames, rest, layout) for frames in reference]
+    # A cell that reads one number throughout the log, and not its rest, is stuck: it tells nothing of the others.
+    low, high = _extremes(recordings)
+    stuck = (low == high) & ~(np.abs(low - rest) <= SLIGHT * layout.full_scale)
+    common = [_common(frames, np.where(stuck, np.nan, rest), layout) for frames in recordings]
+    telling = [pad for pad in range(layout.pads) if _is_unusual([c[:, pad] for c in common], usual, pad, layout)]
+    if not telling:
         return None
+    lowest, highest = np.nanquantile(np.concatenate(usual), [RARE, 1 - RARE], axis=0)
+    excess = []
+    for one in common:
+        beyond = np.nan_to_num(one - np.clip(one, lowest, highest))
+        beyond[:, [pad not in telling for pad in range(layout.pads)]] = 0.0
+        excess.append(beyond)
     every = np.concatenate(excess)
     size = float(np.ptp(every, axis=0).max())
+    if size == 0:
+        return None
     follows = _follows(np.concatenate(recordings), every, layout)
-    name, what = _told(recordings, excess, common, rest, layout)
-    reason = f"{what} of {size:.3g} {layout.unit}, which the cells of a pad share, in {share:.0%} of the recordings"
+    pad = int(np.abs(every).max(axis=0).argmax())
+    name, what = _told(recordings, [one[:, pad] for one in excess], rest, layout.pad_of == pad)
+    reason = f"{what} of {size:.3g} {layout.unit}, which the cells of a pad share"
     return CommonMode(tuple(excess), follows, Disturbance(name, size, reason))
 
 
+def _is_unusual(common: list[Floats], usual: list[Floats], pad: int, layout: SensorLayout) -> bool:
+    """Return whether the extremes of the common mode of a pad are those of the reference no more."""
+    for extreme in (np.fmin.reduce, np.fmax.reduce):
+        new = np.array([extreme(one) for one in common])
+        old = np.array([extreme(one[:, pad]) for one in usual])
+        new, old = new[np.isfinite(new)], old[np.isfinite(old)]
+        if min(len(new), len(old)) < _FEWEST or ks_2samp(new, old).pvalue >= P_MIN:
+            continue
+        if np.abs(np.quantile(new, _DECILES) - np.quantile(old, _DECILES)).max() > _LEAST * layout.full_scale:
+            return True
+    return False
+
+
 def find_disturbances(recordings: Recordings, reference: Recordings, layout: SensorLayout) -> list[Disturbance]:
-    """Return the other disturbances of a log; arguments as of :func:`find_common_mode`."""
-    found = [
-        _normalised(recordings, layout),
-        _silent(recordings, reference, layout),
-        _noise(recordings, reference, layout),
-        _quantised(recordings, reference, layout),
-        _saturated(recordings, reference, layout),
-    ]
+    """Return the other disturbances of a log; arguments as of :func:`find_common_mode`, the reference may be empty."""
+    found = [_normalised(recordings, layout)]
+    if reference:
+        found += [test(recordings, reference, layout) for test in (_silent, _noise, _quantised, _saturated)]
     return [one for one in found if one is not None]
 
 
@@ -148,24 +168,37 @@ def find_sentinel(recordings: Recordings, layout: SensorLayout) -> Disturbance |
 
 def _rest(reference: Recordings, layout: SensorLayout) -> Floats:
     """Return the reading of each cell without contact, ``[D]``: the median over recordings of its low quantile."""
-    low: Floats = np.nanmedian([np.nanquantile(frames, LOW, axis=0) for frames in reference], axis=0)
-    return np.where(layout.present.ravel(), low, np.nan)
+    lows = np.stack([_low(frames) for frames in reference])
+    rest = np.full(layout.n_cells, np.nan)
+    read = layout.present.ravel() & ~np.isnan(lows).all(axis=0)
+    rest[read] = np.nanmedian(lows[:, read], axis=0)
+    return rest
+
+
+def _low(frames: Floats) -> Floats:
+    """Return a low quantile of the readings of each cell, ``[D]``; NaN for a cell without any."""
+    low = np.full(frames.shape[1], np.nan)
+    read = ~np.isnan(frames).all(axis=0)
+    low[read] = np.nanquantile(frames[:, read], LOW, axis=0)
+    return low
+
+
+def _extremes(recordings: Recordings) -> tuple[Floats, Floats]:
+    """Return the lowest and the highest reading of each cell, ``[D]``; NaN for a cell without any."""
+    lowest = np.fmin.reduce([np.fmin.reduce(frames) for frames in recordings])
+    highest = np.fmax.reduce([np.fmax.reduce(frames) for frames in recordings])
+    return lowest, highest
 
 
 def _common(frames: Floats, rest: Floats, layout: SensorLayout) -> Floats:
-    """Return the median over the cells of each pad of reading less rest, ``[T, pads]``."""
-    above = frames - rest
-    of_pad = [above[:, (layout.pad_of == pad) & ~np.isnan(rest)] for pad in range(layout.pads)]
-    return np.stack([_median(one) for one in of_pad], axis=1)
-
-
-def _median(values: Floats) -> Floats:
-    """Return the median of each row; NaN where nothing was read."""
-    read = ~np.isnan(values).all(axis=1)
-    median = np.full(len(values), np.nan)
-    if values.shape[1]:
-        median[read] = np.nanmedian(values[read], axis=1)
-    return median
+    """Return the lower quartile over the cells of each pad of reading less rest, ``[T, pads]``; NaN without a cell."""
+    common = np.full((len(frames), layout.pads), np.nan)
+    for pad in range(layout.pads):
+        above = frames[:, (layout.pad_of == pad) & ~np.isnan(rest)] - rest[(layout.pad_of == pad) & ~np.isnan(rest)]
+        read = ~np.isnan(above).all(axis=1)
+        if above.shape[1] and read.any():
+            common[read, pad] = np.nanquantile(above[read], LEAST_LOADED, axis=1)
+    return common
 
 
 def _follows(frames: Floats, excess: Floats, layout: SensorLayout) -> NDArray[np.bool_]:
@@ -183,25 +216,27 @@ def _follows(frames: Floats, excess: Floats, layout: SensorLayout) -> NDArray[np
         first, second, difference = first[large][:_PAIRS], second[large][:_PAIRS], difference[large][:_PAIRS]
         cells = layout.pad_of == pad
         ratios = (frames[first][:, cells] - frames[second][:, cells]) / difference[:, None]
-        follows[cells] = np.nan_to_num(np.nanmedian(ratios, axis=0)) > MAJORITY
+        follows[cells] = np.median(np.nan_to_num(ratios), axis=0) > MAJORITY  # a missing reading follows nothing
     return follows
 
 
-def _told(
-    recordings: Recordings, excess: list[Floats], common: list[Floats], rest: Floats, layout: SensorLayout
-) -> tuple[Name, str]:
-    """Return the name of a common mode, and what it is in words."""
-    every = np.concatenate(excess)
-    load = np.concatenate([np.nanmean(frames - rest, axis=1) for frames in recordings])[:, None]
-    load = load - np.concatenate(common)  # of the cells that a contact loads
-    strongest = int(np.ptp(every, axis=0).argmax())
-    of_pad = every[:, strongest]
-    if np.ptp(of_pad) > 0 and np.ptp(load[:, strongest]) > 0:
-        together = np.corrcoef(of_pad, np.nan_to_num(load[:, strongest]))[0, 1]
-        if together > 1 - MAJORITY / 2:
-            return "crosstalk", "a reading that grows with the load of the pad"
-    within = np.mean([one[:, strongest].std() for one in excess])
-    between = np.std([one[:, strongest].mean() for one in excess])
+def _told(recordings: Recordings, excess: list[Floats], rest: Floats, of_pad: NDArray[np.bool_]) -> tuple[Name, str]:
+    """Return the name of a common mode, and what it is in words.
+
+    Args:
+        recordings, excess: ``[T, D]`` and ``[T]`` each.
+        rest: ``[D]``.
+        of_pad: bool ``[D]``, the cells of the pad.
+    """
+    cells = of_pad & ~np.isnan(rest)
+    above = np.nan_to_num(np.concatenate(recordings)[:, cells] - rest[cells])
+    quiet, loaded = np.quantile(above, [LEAST_LOADED, 1 - LOW], axis=1)  # what all share is in both
+    every = np.abs(np.concatenate(excess))
+    idle = loaded - quiet < np.quantile(loaded - quiet, LEAST_LOADED)
+    if idle.any() and every[idle].mean() < LOW * every.mean():
+        return "crosstalk", "a reading that comes and goes with the load of the pad"
+    within = np.mean([one.std() for one in excess])
+    between = np.std([one.mean() for one in excess])
     return ("hum", "an oscillation") if within > between else ("ramp", "a shift")
 
 
@@ -233,7 +268,8 @@ def _deviation(frames: Floats, layout: SensorLayout) -> float:
     received = ~np.isnan(curvature).all(axis=0)
     if not received.any():
         return np.nan
-    return float(np.median(np.nanmedian(curvature[:, received], axis=0))) / (float(ndtri(0.75)) * np.sqrt(6))
+    typical = float(np.median(np.nanmedian(curvature[:, received], axis=0)))
+    return typical / (float(ndtri(0.75)) * 6**0.5)
 
 
 def _step(recordings: Recordings, layout: SensorLayout) -> float:
@@ -254,28 +290,28 @@ def _quantised(recordings: Recordings, reference: Recordings, layout: SensorLayo
 
 
 def _saturated(recordings: Recordings, reference: Recordings, layout: SensorLayout) -> Disturbance | None:
-    rest = _rest(reference, layout)
-    near = 0.02 * layout.full_scale
-    every = np.concatenate(recordings)
-    moving = layout.present.ravel() & (np.nanmax(every, axis=0) - np.nanmin(every, axis=0) > near)
+    rest, near = _rest(reference, layout), SLIGHT * layout.full_scale
+    low, high = _extremes(recordings)
+    moving = layout.present.ravel() & (high - low > near)
     if not moving.any():
         return None
-    top = float(np.nanmax(every[:, moving]))
-
-    def share(given: Recordings, level: float) -> Floats:
-        shares = []
-        for frames in given:
-            loaded = (frames - rest > near)[:, moving]
-            shares.append((loaded & (frames[:, moving] >= level)).sum() / max(1, loaded.sum()))
-        return np.array(shares)
-
-    before = float(max(np.nanmax(frames[:, moving]) for frames in reference))
-    new, old = share(recordings, top), share(reference, min(before, layout.full_scale))
-    cells = int((every[:, moving] >= top).any(axis=0).sum())
-    if not _differs(new, old) or np.median(new) < MARGIN * LOW or cells < 3:
+    top = float(high[moving].max())
+    at_top = high[moving] >= top
+    before = float(np.nanmax(_extremes(reference)[1][moving]))
+    new, old = (
+        np.array([_share(frames[:, moving], rest[moving] + near, level) for frames in given])
+        for given, level in ((recordings, top), (reference, before))
+    )
+    if not _differs(new, old) or np.median(new) < MARGIN * LOW or at_top.mean() < LEAST_LOADED:
         return None
     size = float(np.median(new))
     return Disturbance("saturated", size, f"{size:.0%} of the loaded readings are at the end of the range, {top:g}")
+
+
+def _share(frames: Floats, loaded_from: Floats, level: float) -> float:
+    """Return the share of loaded readings at ``level``, 0 without any."""
+    loaded = frames > loaded_from
+    return float((frames[loaded] >= level).mean()) if loaded.any() else 0.0
 
 
 def _normalised(recordings: Recordings, layout: SensorLayout) -> Disturbance | None:
@@ -299,7 +335,7 @@ def _silent(recordings: Recordings, reference: Recordings, layout: SensorLayout)
 
     def changes(frames: Floats) -> bool:
         given = frames[:, present]
-        return bool((np.nanmax(given, axis=0, initial=-np.inf) > np.nanmin(given, axis=0, initial=np.inf)).any())
+        return bool((np.fmax.reduce(given) > np.fmin.reduce(given)).any())
 
     if any(changes(frames) for frames in recordings):
         return None

@@ -163,7 +163,8 @@ class _Pairs:
     def chance(self) -> NDArray[np.float64]:
         """Probability that two lines agree which are not joined (Laplace), at least 1/2, ``[pads, pairs]``."""
         could, did = self.others
-        return np.maximum((did + 1) / (could + 2), _LEAST_CHANCE)
+        chance: NDArray[np.float64] = np.maximum((did + 1) / (could + 2), _LEAST_CHANCE)
+        return chance
 
     def _summed(self, lines: NDArray[np.float32], both: Mask, tolerance: float) -> NDArray[np.float32]:
         """Return the sums over the informative cells (``both``) in more frames, ``[3, pads, pairs]``."""
@@ -179,7 +180,7 @@ class _Pairs:
     @property
     def counted(self) -> NDArray[np.intp]:
         """What the coincidences count, rounded down, int ``[pads, pairs]``; see the module."""
-        return (self.coincidences * -np.log2(self.chance)).astype(np.intp)
+        return np.asarray(self.coincidences * -np.log2(self.chance), dtype=np.intp)
 
     def matching(self, needed: int) -> list[tuple[int, int]]:
         """Return (pad, pair) of the pairs that count at least ``needed`` and differ by noise only."""
@@ -254,9 +255,18 @@ class DuplicateLines:
         found = []
         for kind, each in self.of.items():
             for pad, i in each.matching(needed):
-                counts = (int(values[pad, i]) for values in (each.since, each.seen_by, each.coincidences))
-                chance = float(each.chance[pad, i])
-                found.append(DuplicatePair(pad, kind, int(each.first[i]), int(each.second[i]), *counts, chance))
+                found.append(
+                    DuplicatePair(
+                        pad=pad,
+                        kind=kind,
+                        first=int(each.first[i]),
+                        second=int(each.second[i]),
+                        since=int(each.since[pad, i]),
+                        seen_by=int(each.seen_by[pad, i]),
+                        coincidences=int(each.coincidences[pad, i]),
+                        chance=float(each.chance[pad, i]),
+                    )
+                )
         return found
 
     def apart_since(self, pad: int, kind: LineKind, first: int, second: int) -> int:

@@ -15,8 +15,9 @@ scored again with those of its best rival.
 Candidates are exchanges of two rows or two columns of a pad, a pad mirrored along either axis, its rows or columns
 shifted by one, and exchanged pads. The best is taken, and the search goes on from there, so that combinations are
 found. A permutation is reported if the gain l(P) - l(identity) exceeds 24, is positive without the two events that
-favour it most, exceeds by 12 that of any other candidate that moves some of the same cells, and explains half of what a
-random order leaves unexplained; w_e = 1 / (1 + k) discounts an event that repeats k earlier ones of the 32 strongest.
+favour it most, exceeds by 12 that of any other candidate that moves some of the same cells, is as large for the working
+channels alone, and explains half of what a random order leaves unexplained; w_e = 1 / (1 + k) discounts an event that
+repeats k earlier ones of the 32 strongest.
 Where the array is loaded symmetrically two wirings read alike, and nothing is reported. Lines that no event loads
 differently are not distinguished. Where loads are spread widely, as by thick gloves, exchanged lines may be named by
 mistake: the whole sensor has then changed as well.
@@ -140,6 +141,10 @@ def find_rewiring(
         rivals = [sums[i] for i, of in enumerate(candidates) if i != best and (moves & (of.source != source)).any()]
         if not _certain(gain) or sums[best] - max(rivals, default=-np.inf) < _LIMIT / 2:
             break
+        # The channels that work say so by themselves: no permutation is due to the faulty ones.
+        working = test.of_working(candidates[best].source, found.faulty) - test.of_working(source, found.faulty)
+        if not _certain(working):
+            break
         source = candidates[best].source
         total += float(gain.sum())
         steps.append(candidates[best].text)
@@ -212,6 +217,18 @@ class _Test:
                 break
         return score
 
+    def of_working(self, source: Cells, faulty: Mask) -> Floats:
+        """Return the weighted log likelihood of each event, ``[n]``, of channels that are not ``faulty`` (``[D]``).
+
+        That of :meth:`Prediction.log_likelihood`, which trusts the size of a load less.
+        """
+        features = self._features(source)
+        counted = (self.used & ~faulty)[source]
+        likely = self.model.predict(features, counted & self.present).log_likelihood(features)
+        likely = np.where(self.present, likely, np.where(features[:, 2] > 0, np.log(MIN_P_FLOOR), 0.0))
+        by_event: Floats = self.weight * np.where(counted, likely, 0.0).sum(axis=1)
+        return by_event
+
     def score(self, source: Cells, faulty: Mask) -> _Score:
         """Return the score of one permutation; ``faulty`` channels (bool ``[D]``) are no predictors."""
         features = self._features(source)
@@ -234,7 +251,8 @@ class _Test:
 def _log_likelihood(features: NDArray[np.float32], expected: Prediction) -> Floats:
     """Return the log likelihood of what each cell did, given the others, ``[n, D]``."""
     state = np.take_along_axis(np.log(expected.states), _state(features)[None], axis=0)[0]
-    return state + _log_load(features, expected.mean, expected.spread)
+    log_likely: Floats = state + _log_load(features, expected.mean, expected.spread)
+    return log_likely
 
 
 def _log_likelihood_alone(features: NDArray[np.float32]) -> Floats:

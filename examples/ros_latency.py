@@ -18,6 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import psutil
 from relay import make_bundle
 
 import adaptfault as af
@@ -67,12 +68,15 @@ def measure(bundle: af.Bundle, frames: np.ndarray, rate: float, reliable: bool) 
             time.sleep(0.1)
         time.sleep(1.0)
         came.clear()
+        process = psutil.Process(node.pid)
+        before = sum(process.cpu_times()[:2])
         began = time.perf_counter()
         for number, message in enumerate(messages):
             time.sleep(max(0.0, began + number / rate - time.perf_counter()))
             sent[number] = time.perf_counter()
             publisher.publish(message)
         time.sleep(3.0)
+        share = (sum(process.cpu_times()[:2]) - before) / (time.perf_counter() - began)
     finally:
         node.terminate()
         node.wait()
@@ -83,7 +87,7 @@ def measure(bundle: af.Bundle, frames: np.ndarray, rate: float, reliable: bool) 
     name = "reliable" if reliable else "best effort"
     print(
         f"| {name} | {rate:g} | {len(sent)} | {len(came)} | {len(sent) - len(set(numbers.tolist()))} "
-        f"| {np.median(latency):.1f} | {np.quantile(latency, 0.99):.1f} |",
+        f"| {np.median(latency):.1f} | {np.quantile(latency, 0.99):.1f} | {100 * share:.0f} % |",
         flush=True,
     )
     return bool((np.diff(numbers) > 0).all())
@@ -107,7 +111,8 @@ def main() -> int:
         layout = bundle.layout
         frames = bundle.parts.check_windows().x.reshape(-1, layout.n_cells) * layout.full_scale
         broken = inject(frames.astype(float), [line_fault(layout, Line(0, "row", layout.rows // 2), "short")], layout)
-        print("| QoS | frames a second | sent | received | lost | median ms | 99 % ms |\n|---|---|---|---|---|---|---|")
+        print("| QoS | frames a second | sent | received | lost | median ms | 99 % ms | of a core |")
+        print("|---|---|---|---|---|---|---|---|")
         for reliable in (False, True):
             for rate in args.rates:
                 count = round(args.seconds * rate)

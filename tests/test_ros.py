@@ -20,7 +20,7 @@ from adaptfault.imputation.restorer import Restorer
 from adaptfault.ros2 import parameters
 from adaptfault.ros2.parameters import DEFAULTS, Parameters, quoted
 from adaptfault.ros2.sensor import Follower, Sensor
-from adaptfault.ros2.watch import Watch
+from adaptfault.ros2.watch import WAITING, Watch
 from diagnostics import Fault, FaultKind, FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault, lose_frames
 
 LAYOUT = SensorLayout.paper()
@@ -154,7 +154,7 @@ def test_the_node_takes_its_array_from_its_parameters(tmp_path):
     with pytest.raises(ValueError, match="give the parameter bundle, or the parameter layout"):
         Sensor.from_parameters(Parameters())
     with pytest.raises(ValueError, match=f"frames of 7 values come, expected {LAYOUT.n_cells}"):
-        watch_of(SelfDiagnosis(LAYOUT)).take(np.zeros(7))
+        watch_of(SelfDiagnosis(LAYOUT)).put(np.zeros(7))
 
 
 @pytest.mark.parametrize(
@@ -204,6 +204,11 @@ def watch_of(diagnoser, clock=lambda: 1000.0, **sensor) -> Watch:
     return Watch(Sensor(diagnoser, **{"known": FaultSet((), diagnoser.layout.n_cells), **sensor}), clock=clock)
 
 
+def take(watch: Watch, frame: np.ndarray) -> None:
+    watch.put(frame)
+    watch.work()
+
+
 def test_silence_is_a_warning_before_the_first_frame_then_stale_and_ends_with_a_frame(log):
     now = [1000.0]
     watch = watch_of(SelfDiagnosis(LAYOUT), clock=lambda: now[0])
@@ -212,7 +217,7 @@ def test_silence_is_a_warning_before_the_first_frame_then_stale_and_ends_with_a_
     now[0] += 6
     assert set(levels(watch.diagnostics(5.0)).values()) == {Level.STALE}
     for frame in log[:40]:
-        watch.take(frame)
+        take(watch, frame)
         now[0] += 0.1
     assert set(levels(watch.diagnostics(5.0)).values()) == {Level.OK}
     assert watch.diagnostics(1004.25)["header"]["stamp"] == {"sec": 1004, "nanosec": 250_000_000}
@@ -220,7 +225,7 @@ def test_silence_is_a_warning_before_the_first_frame_then_stale_and_ends_with_a_
     stale = watch.diagnostics(5.0)
     assert set(levels(stale).values()) == {Level.STALE}
     assert stale["status"][0]["message"] == "no frame for 5 s"
-    watch.take(log[40])
+    take(watch, log[40])
     assert set(levels(watch.diagnostics(5.0)).values()) == {Level.OK}
 
 
@@ -228,14 +233,14 @@ def test_frames_below_the_declared_rate_are_a_warning_of_the_stream_and_a_slow_s
     now = [1000.0]
     watch = watch_of(SelfDiagnosis(LAYOUT), clock=lambda: now[0])
     for frame in log[:40]:
-        watch.take(frame)
+        take(watch, frame)
         now[0] += 0.2
     found = watch.diagnostics(5.0)
     assert {name for name, level in levels(found).items() if level} == {"stream"}
     assert found["status"][-1]["message"] == "5 frames a second, 10 are declared"
     slow = watch_of(SelfDiagnosis(replace(LAYOUT, rate=0.5)), clock=lambda: now[0])
     for frame in log[:20]:
-        slow.take(frame)
+        take(slow, frame)
         now[0] += 2.0
     now[0] += 5.0
     assert set(levels(slow.diagnostics(5.0)).values()) == {Level.OK}
@@ -244,8 +249,23 @@ def test_frames_below_the_declared_rate_are_a_warning_of_the_stream_and_a_slow_s
 def test_frames_of_another_sensor_are_told_as_such():
     watch = watch_of(SelfDiagnosis(LAYOUT))
     with pytest.raises(ValueError, match="frames of 7 values"):
-        watch.take(np.zeros(7))
+        watch.put(np.zeros(7))
     assert watch.diagnostics(5.0)["status"][0]["message"] == "frames of 7 values come, expected 220"
+
+
+def test_frames_that_wait_to_be_monitored_are_diagnosed_later_and_counted_where_too_many_wait(log):
+    watch = watch_of(SelfDiagnosis(LAYOUT))
+    for frame in log[:3]:
+        watch.put(frame)
+    assert watch.diagnostics(5.0)["status"][-1]["values"][0] == {"key": "frames", "value": "1"}
+    watch.work()
+    assert watch.waiting
+    watch.work()
+    assert not watch.waiting
+    assert watch.work() == ()
+    for frame in np.resize(log, (WAITING + 2, 220)):
+        watch.put(frame)
+    assert watch.left_out == 2
 
 
 def test_the_node_restores_known_faults_and_those_that_its_monitor_finds(fitted, grasps, log):
@@ -257,7 +277,7 @@ def test_the_node_restores_known_faults_and_those_that_its_monitor_finds(fitted,
     assert np.flatnonzero(first != broken[0]).tolist() in ([], [115])
     assert first[row.cells[0]] == broken[0, row.cells[0]]
     for frame in broken:
-        watch.take(frame)
+        take(watch, frame)
     whole = np.array([watch.restore(frame) for frame in broken])
     cells, others = list(row.cells), np.setdiff1d(np.arange(LAYOUT.n_cells), [*watch.repair.fault_set])
     assert set(cells) <= set(watch.repair.fault_set)
@@ -309,7 +329,7 @@ def test_the_node_puts_exchanged_wires_back_as_the_version_that_the_bundle_runs(
     row = line_fault(bundle.layout, Line(0, "row", 1), FaultKind.SHORT)
     frames = inject(np.concatenate(small_grasps.frames[::3]).astype(float), [row], bundle.layout)
     for frame in frames[:, wired]:
-        watch.take(frame)
+        take(watch, frame)
     assert np.flatnonzero(watch.faulty).tolist() == list(row.cells)
     others = np.flatnonzero(~watch.faulty)
     np.testing.assert_array_equal(watch.restore(frames[5][wired])[others], frames[5][others])

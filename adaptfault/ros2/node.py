@@ -23,8 +23,7 @@ from adaptfault.ros2.watch import Watch
 
 NAME = "tactile_diagnostics"
 
-_WAITING = 16_000_000  # bytes of frames that may wait while a diagnosis is computed
-_FEWEST, _MOST = 10, 1000  # and so many frames
+_DEPTH = 50  # frames that may wait to be restored; a longer queue would only make them late
 
 
 class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
@@ -44,6 +43,7 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
         self._publishers_made: list[Any] = []
         self._subscription: Any = None
         self._timer: Any = None
+        self._taken = False  # whether a frame came in the last step
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open the bundle, and make the publishers."""
@@ -63,21 +63,19 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
         self._follower = Follower(given)
         sensor = self._follower.sensor
         self.watch = Watch(sensor, name=given.name, hardware_id=given.hardware_id)
-        waiting = _WAITING // (8 * sensor.layout.n_cells)
-        self._depth = min(max(waiting, _FEWEST), _MOST)
         self._diagnostics = self.create_lifecycle_publisher(DiagnosticArray, "/diagnostics", 1)
         self._publishers_made.append(self._diagnostics)
         self._whole = None
         if sensor.restorer is not None:
             if self.resolve_topic_name(given.restored) == topic:
                 raise ValueError(f"topic and restored are both {given.topic}: restored frames would come back")
-            self._whole = self.create_lifecycle_publisher(self._type, given.restored, QoSProfile(depth=self._depth))
+            self._whole = self.create_lifecycle_publisher(self._type, given.restored, QoSProfile(depth=_DEPTH))
             self._publishers_made.append(self._whole)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Subscribe."""
         done = super().on_activate(state)  # from now on publishers publish
-        qos = QoSProfile(depth=self._depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+        qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.watch.begin()
         self._timer = self.create_timer(1.0, self._each_second)
         self._subscription = self.create_subscription(self._type, self.parameters.topic, self._take, qos)
@@ -114,23 +112,35 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
         try:
             arrays = arrays_at(message, self._field)
             received = join(arrays, np.float64)
-            # Published first: monitoring takes longer.
             whole = self.watch.restore(received)
             if whole is not None and self._whole is not None:
                 put(arrays, whole)
                 self._whole.publish(message)
-            faults = self.watch.take(received, stamp_of(message))
+            self.watch.put(received, stamp_of(message))
         except ValueError as error:
             self.get_logger().warning(f"frame dropped: {error}", throttle_duration_sec=5.0)
-            return
-        for fault in faults:
-            self.get_logger().warning(fault.reason)
+        self._taken = True
+
+    def spin(self) -> None:
+        """Restore frames as they come, and monitor them in between; raises ExternalShutdownException at the end."""
+        executor = rclpy.get_global_executor()
+        executor.add_node(self)
+        while True:
+            waits = self._subscription is not None and self.watch.waiting
+            self._taken = False
+            executor.spin_once(timeout_sec=0.0 if waits else None)
+            if waits and not self._taken:
+                for fault in self.watch.work():
+                    self.get_logger().warning(fault.reason)
 
     def _each_second(self) -> None:
         sensor = self._follower.poll()
         if sensor is not None:
             self.watch.switch(sensor)
             self.get_logger().info(f"{sensor.version} of the bundle, {len(sensor.known)} known faulty cells")
+        if self.watch.left_out:
+            what = f"monitoring is behind: {self.watch.left_out} frames were restored and not monitored"
+            self.get_logger().warning(what, throttle_duration_sec=10.0)
         now = self.get_clock().now().nanoseconds / 1e9
         self._diagnostics.publish(diagnostics_message(self.watch.diagnostics(now)))
 
@@ -149,7 +159,7 @@ def run(arguments: Sequence[str]) -> int:
                 return 3
             if node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
                 return 3
-        rclpy.spin(node)
+        node.spin()
     except ExternalShutdownException:
         pass
     except Exception:

@@ -19,6 +19,8 @@ from diagnostics import Diagnosis, Fault, FaultSet, Monitor
 GRACE = 5.0  # seconds after the start in which no frame is a WARN, and STALE afterwards
 SILENCE = 2.0  # seconds without a frame, after which everything is STALE; at least so many periods:
 _PERIODS = 5
+WAITING = 1000  # most frames that wait to be monitored; fewer of large arrays:
+_BYTES = 16_000_000
 DIAGNOSED = 10.0  # seconds between two diagnoses of all cells; the last one is published every second
 _RATED = 5.0  # seconds over which the rate is counted, at least so many frames:
 _FEWEST = 10
@@ -46,7 +48,9 @@ class Watch:
         self.layout = sensor.layout
         self.faulty = np.zeros(self.layout.n_cells, bool)  # as the monitor finds
         self.monitor = Monitor(sensor.diagnoser)
+        self._monitored = False  # whether the monitor has a frame
         self.repair = self._repair()
+        self._most_waiting = min(WAITING, max(1, _BYTES // (8 * self.layout.n_cells)))
         self._silence = max(SILENCE, _PERIODS / self.layout.rate)
         self.begin()
 
@@ -55,6 +59,8 @@ class Watch:
         self.started = self.clock()
         self.last: float | None = None  # frame of this sensor
         self.refused = ""  # why the last frame was not taken, where none was taken after it
+        self.left_out = 0  # frames that were never monitored, because too many waited
+        self._waiting: deque[tuple[NDArray[np.float64], float | None]] = deque()
         self._times: deque[float] = deque(maxlen=max(_FEWEST, round(_RATED * self.layout.rate)) + 1)
         self._diagnosis: Diagnosis | None = None
         self._diagnosed = -np.inf
@@ -66,6 +72,7 @@ class Watch:
         if before.parts != sensor.parts or before.readings != sensor.readings:  # the frames so far read otherwise
             self.faulty[:] = False
             self.monitor = Monitor(sensor.diagnoser)
+            self._monitored = False
             self._diagnosis = None
         self.repair = self._repair()
         self._tell_repair()
@@ -82,8 +89,8 @@ class Watch:
         whole, _, _ = self.repair.in_place(received, readings, self.sensor.version, self.sensor.calibration)
         return whole
 
-    def take(self, received: NDArray[np.float64], time: float | None = None) -> tuple[Fault, ...]:
-        """Take in one frame ``[D]``; return the faults that are new, changed or gone.
+    def put(self, received: NDArray[np.float64], time: float | None = None) -> None:
+        """Take in one frame ``[D]``, to be monitored later: that takes longer than to restore it.
 
         Args:
             received: as it came.
@@ -98,9 +105,25 @@ class Watch:
         self.refused = ""
         self.last = self.clock()
         self._times.append(self.last)
+        self._waiting.append((received, time))
+        if len(self._waiting) > self._most_waiting:
+            self._waiting.popleft()
+            self.left_out += 1
+
+    @property
+    def waiting(self) -> bool:
+        """Whether frames wait to be monitored."""
+        return bool(self._waiting)
+
+    def work(self) -> tuple[Fault, ...]:
+        """Monitor the frame that waits longest, if one waits; return the faults that are new, changed or gone."""
+        if not self._waiting:
+            return ()
+        received, time = self._waiting.popleft()
         readings = self._readings(received)
         version = self.sensor.version
         faults = self.monitor.update(readings if version is None else version.undo(readings), time)
+        self._monitored = True
         if faults:
             for fault in faults:
                 self.faulty[list(fault.cells)] = fault.probability != 0
@@ -128,6 +151,10 @@ class Watch:
             self._times.clear()
             message = self.refused or f"no frame for {now - self.last:.0f} s"
             return stale_array(self.layout, message, **about)
+        if not self._monitored and not self._waiting:  # after a switch
+            return stale_array(self.layout, "no frame yet", level=Level.WARN, **about)
+        if not self._monitored:
+            self.work()
         if self._diagnosis is None or now - self._diagnosed > DIAGNOSED:
             self._diagnosis = self.monitor.diagnosis()
             self._diagnosed = now

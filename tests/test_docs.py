@@ -91,6 +91,7 @@ def test_the_python_on_a_page_runs(page, place, later_grasps, capsys):
     diagnoser = Bundle.open("robot.bundle").diagnoser()
     frames = np.concatenate(later_grasps)
     given = {"af": af, "diagnoser": diagnoser, "frames": frames, "frame": frames[0], "recordings": later_grasps}
+    given["healthy"] = later_grasps
     found = blocks(page, "python")
     assert len(found) == page.read_text().count("```python") > 0
     for code in found:

@@ -114,8 +114,8 @@ def find_common_mode(recordings: Recordings, reference: Recordings, layout: Sens
     if size == 0:
         return None
     follows = _follows(np.concatenate(recordings), every, layout)
-    pad = int(np.abs(every).max(axis=0).argmax())
-    name, what = _told(recordings, [one[:, pad] for one in excess], rest, layout.pad_of == pad)
+    largest = int(np.abs(every).max(axis=0).argmax())
+    name, what = _told(recordings, [one[:, largest] for one in excess], rest, layout.pad_of == largest)
     reason = f"{what} of {size:.3g} {layout.unit}, which the cells of a pad share"
     return CommonMode(tuple(excess), follows, Disturbance(name, size, reason))
 

@@ -125,7 +125,8 @@ def _is_unusual(common: list[Floats], usual: list[Floats], pad: int, layout: Sen
     for extreme in (np.fmin.reduce, np.fmax.reduce):
         new = np.array([extreme(one) for one in common])
         old = np.array([extreme(one[:, pad]) for one in usual])
-        new, old = new[np.isfinite(new)], old[np.isfinite(old)]
+        new = new[np.isfinite(new)]
+        old = old[np.isfinite(old)]
         if min(len(new), len(old)) < _FEWEST or ks_2samp(new, old).pvalue >= P_MIN:
             continue
         if np.abs(np.quantile(new, _DECILES) - np.quantile(old, _DECILES)).max() > _LEAST * layout.full_scale:
@@ -153,8 +154,8 @@ def find_sentinel(recordings: Recordings, layout: SensorLayout) -> Disturbance |
     for frames in recordings:
         given = np.asarray(frames, dtype=np.float64)[:, layout.present.ravel()]
         outside = np.isfinite(given) & (np.abs(given - layout.full_scale / 2) > 1.5 * layout.full_scale)
-        values, times = np.unique(given[outside], return_counts=True)
-        counts.update(dict(zip(values.tolist(), times.tolist(), strict=True)))
+        values, how_often = np.unique(given[outside], return_counts=True)
+        counts.update(dict(zip(values.tolist(), how_often.tolist(), strict=True)))
         readings += given.size
     if not counts:
         return None

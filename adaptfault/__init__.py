@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from adaptfault.models.store import load_healthy, load_model, save_model
     from adaptfault.models.training import train
     from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.inspection import Finding, Inspection, inspect
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.maintenance_report import MaintenanceReport
     from adaptfault.robot.predictor import Predictor, Reading
@@ -56,11 +57,13 @@ __all__ = [
     "CellImputer",
     "FaultTolerantClassifier",
     "FaultTolerantRegressor",
+    "Finding",
     "Fleet",
     "FleetReport",
     "Forecast",
     "History",
     "Inference",
+    "Inspection",
     "MaintenanceReport",
     "NotAuthentic",
     "Predictor",
@@ -86,6 +89,7 @@ __all__ = [
     "correct",
     "diagnostic_array",
     "evaluate",
+    "inspect",
     "load",
     "load_adapter",
     "load_healthy",
@@ -118,11 +122,13 @@ _HOMES = {
     "CellImputer": "imputation.scikit_learn",
     "FaultTolerantClassifier": "imputation.scikit_learn",
     "FaultTolerantRegressor": "imputation.scikit_learn",
+    "Finding": "robot.inspection",
     "Fleet": "fleet.listing",
     "FleetReport": "fleet.summary",
     "Forecast": "adaptation.forecast",
     "History": "models.history",
     "Inference": "models.inference",
+    "Inspection": "robot.inspection",
     "MaintenanceReport": "robot.maintenance_report",
     "NotAuthentic": "acquisition",
     "Predictor": "robot.predictor",
@@ -148,6 +154,7 @@ _HOMES = {
     "correct": "adaptation.baselines.correction",
     "diagnostic_array": "acquisition.ros",
     "evaluate": "evaluation.scores",
+    "inspect": "robot.inspection",
     "load": "data.recordings",
     "load_adapter": "adaptation.adapter_files",
     "load_healthy": "models.store",

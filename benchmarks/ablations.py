@@ -30,6 +30,12 @@ RULES = {
         "return np.clip(half / MEDIAN_ERROR, 1.0, _MAX_INFLATION)",
         "return np.ones(len(half))",
     ),
+    "prior of a rest": (
+        "evidence/spatial.py",
+        "cells.scored & (cells.values.rests | (surprisal > 0))",
+        "cells.scored & (surprisal > 0)",
+    ),
+    "pad level": ("evidence/stream_state.py", "if reference.beside is not None:", "if False:"),
     "first predictors": (
         "evidence/spatial.py",
         "cells.eligible & cells.runs.moved & plausible",

@@ -32,6 +32,24 @@ def of_each(spread: float, frames: Frames) -> Frames:
     return np.random.default_rng(1).uniform(0, spread, frames.shape[1])  # the same in all recordings
 
 
+def one_supply(moves: float = 0.0) -> Change:
+    """Read two pads on one supply, which rest at 26 % and 5 %, with noise of 0.2 % and a converter of 10 bits.
+
+    The rest of a pad falls by up to 0.6 % while the other one is loaded, and lies elsewhere in each recording, with a
+    standard deviation of ``moves``.
+    """
+
+    def change(frames: Frames, rng: np.random.Generator) -> Frames:
+        load = 0.45 * frames.reshape(len(frames), 2, -1)
+        drawn = load.sum(axis=2)
+        share = np.minimum(drawn / (np.quantile(drawn, 0.95) + 1e-3), 1)
+        rest = np.array([0.26, 0.05]) + moves * rng.standard_normal(2) - 0.006 * share[:, ::-1]
+        read = (load + rest[:, :, None]).reshape(frames.shape) + 0.002 * rng.standard_normal(frames.shape)
+        return np.clip(np.round(read * 1023) / 1023, 0, 1)
+
+    return change
+
+
 SENSORS: dict[str, Change] = {
     "as it is": lambda x, rng: x,
     "noise 0.2 %, rest 5 %": read_with(0.002, 0.05),
@@ -42,6 +60,8 @@ SENSORS: dict[str, Change] = {
     "every second frame": lambda x, rng: x[::2],
     "all wander, 0 to 2 %": lambda x, rng: np.minimum(x + rng.uniform(0, 0.02), 1),
     "each wanders, 0 to 2 %": lambda x, rng: np.minimum(x + rng.uniform(0, 0.02, x.shape[1]), 1),
+    "supply sags": one_supply(),
+    "supply sags, pads wander by 2 %": one_supply(0.02),
 }
 DRIFTS: dict[str, Change] = {
     "all +0.7 %": lambda x, rng: np.minimum(x + 0.007, 1),

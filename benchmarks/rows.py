@@ -132,6 +132,12 @@ class Bench:
         frames = (self.trained or self.recordings).frames
         return SelfDiagnosis(self.layout).fit([frames[i] for i in self.reference])
 
+    @cached_property
+    def proving(self) -> SelfDiagnosis:
+        """The same with the proof of life."""
+        fitted = SelfDiagnosis(self.layout, proof_of_life=True)
+        return fitted.fit([self.recordings.frames[i] for i in self.reference])
+
     def logs(self, length: int = 6) -> Iterator[tuple[int, Log, np.random.Generator]]:
         """Yield seed, log and a generator for its faults."""
         for seed in range(10_000 * self.repeat, 10_000 * self.repeat + self.count):
@@ -587,7 +593,7 @@ def moving(bench: Bench) -> Iterator[Count]:
                     frames[:, cell] = broke[:, cell]
             wrong = np.abs(np.concatenate(seen) - np.concatenate(log)) > VISIBLE * span
             can = np.intersect1d(dead, np.flatnonzero(wrong.sum(axis=0) >= TESTABLE))
-            diagnosis = bench.fitted.diagnose(seen)
+            diagnosis = bench.proving.diagnose(seen)
             found = np.flatnonzero(diagnosis.fault_set.mask)
             called = (diagnosis.verdicts == Verdict.ALIVE) & (diagnosis.probability < DOUBTED)
             testable += len(can)
@@ -607,7 +613,7 @@ def proven(bench: Bench) -> Iterator[Count]:
     for _, log, _ in bench.logs(IN_USE):
         loaded = [(frames - rest > VISIBLE * span).any(axis=0) for frames in log]
         tested = (np.sum(loaded, axis=0) >= USED) & bench.layout.present.ravel()
-        diagnosis = bench.fitted.diagnose(log)
+        diagnosis = bench.proving.diagnose(log)
         blamed += len(diagnosis.fault_set)
         used += int(tested.sum())
         alive += int((diagnosis.verdicts[tested] == Verdict.ALIVE).sum())

@@ -58,6 +58,9 @@ class SelfDiagnosis:
     Args:
         layout: the array.
         false_discovery_rate: expected share of healthy cells in F.
+        proof_of_life: with a reference, a cell that moves is ALIVE only where it depends on the others as a healthy
+            cell does (:mod:`diagnostics.evidence.life`), so that dead cells that move are found. Off by default: it
+            blames a healthy cell now and then (benchmark, rows ``moving`` and ``proven``).
 
     Attributes:
         reference_: the healthy reference, after :meth:`fit`; None: cold start.
@@ -68,8 +71,11 @@ class SelfDiagnosis:
     reference_: Reference | None = None
     calibrator_: Calibrator = Calibrator.cold()
 
-    def __init__(self, layout: SensorLayout, *, false_discovery_rate: float = 0.006) -> None:
+    def __init__(
+        self, layout: SensorLayout, *, false_discovery_rate: float = 0.006, proof_of_life: bool = False
+    ) -> None:
         self.layout = layout
+        self.proof_of_life = proof_of_life
         self.load_ = LoadDirection.declared(layout)
         self._planes, self._order = axis_planes(layout)
         self._place = np.argsort(self._order)  # of each cell among the planes
@@ -77,7 +83,11 @@ class SelfDiagnosis:
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
         """Return the arguments of the constructor, for ``sklearn.base.clone`` and pipelines."""
-        return {"layout": self.layout, "false_discovery_rate": self.false_discovery_rate}
+        return {
+            "layout": self.layout,
+            "false_discovery_rate": self.false_discovery_rate,
+            "proof_of_life": self.proof_of_life,
+        }
 
     def set_params(self, **params: Any) -> SelfDiagnosis:
         """Set arguments of the constructor and discard the fit.
@@ -132,7 +142,9 @@ class SelfDiagnosis:
         # Fractions of full scale refer to the range that was seen: a stated one may be too high.
         layout = replace(layout, full_scale=min(layout.full_scale, highest_reading(healthy, layout)))
         dead = find_reference_faults(healthy, layout, tolerance_of(healthy, layout), self._diagnosed_cold)
-        self.reference_ = Reference.fit(healthy, layout, dead).with_life(healthy, layout)
+        self.reference_ = Reference.fit(healthy, layout, dead)
+        if self.proof_of_life:
+            self.reference_ = self.reference_.with_life(healthy, layout)
         self.calibrator_ = Calibrator.fit(healthy, living(layout, dead), progress=progress)
         progress(1.0)
         return self
@@ -196,6 +208,7 @@ class SelfDiagnosis:
                 fitted.load.check(fitted.layout)
             if fitted.reference is not None:
                 fitted.reference.check(diagnoser._planes)
+                diagnoser.proof_of_life = fitted.reference.life is not None
         except KeyError as error:
             raise ValueError(f"the stored diagnosis is damaged: {error} is missing") from None
         except (TypeError, ValueError, AttributeError) as error:

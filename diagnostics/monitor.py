@@ -6,7 +6,7 @@ from collections.abc import Generator
 from contextlib import nullcontext
 from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,6 +45,18 @@ class Monitor:
         self._work: Generator[None, None, Diagnosis] | None = None
         self._known: dict[Key, Fault] = {}
         self._time: float | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy or a pickle holds; an evaluation under way begins anew after the copy's next segment."""
+        state = {**vars(self), "_work": None}
+        del state["_threads"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        from threadpoolctl import ThreadpoolController
+
+        vars(self).update(state)
+        self._threads = ThreadpoolController()
 
     def update(self, frame: ArrayLike, time: float | None = None) -> tuple[Fault, ...]:
         """Process one frame; return the faults that are new, changed, or gone.

@@ -8,7 +8,7 @@ from sklearn.linear_model import LogisticRegression
 from adaptfault.data.recordings import Recordings
 from diagnostics import Fault, SelfDiagnosis, SensorLayout, inject
 from diagnostics.decision import calibration
-from diagnostics.decision.calibration import Calibrator, _bounded_logistic, faulty_at
+from diagnostics.decision.calibration import Calibrator, _bounded_logistic, _Trial, faulty_at
 
 SCORED = np.ones(100, bool)
 EARLY = np.zeros(100, int)  # of the kind that never moved
@@ -149,7 +149,9 @@ def test_without_evidence_the_log_ratio_is_not_positive_however_few_healthy_cell
     rng = np.random.default_rng(0)
     dead = np.arange(200) >= 6  # healthy cells that hold a load are rare in a small reference
     evidence = np.column_stack([np.where(dead, 4, -4) + rng.normal(0, 3, 200), rng.normal(0, 1, 200) + 2 * dead])
-    offset, slope, jump = _bounded_logistic(evidence, dead, base=-1.0)  # as if faults were rarer elsewhere
+    offset, slope, jump = _bounded_logistic(
+        evidence, dead, base=-1.0, expected=(0.0, 0.0)
+    )  # as if faults were rarer elsewhere
     assert offset <= 0
     assert slope > 0
     assert 0 <= jump <= 1
@@ -164,4 +166,23 @@ def test_within_the_bounds_it_is_a_logistic_regression():
     dead = rng.random(5000) < expit(-1.5 + 1.2 * evidence[:, 0] + 0.4 * evidence[:, 1] - 0.5)
     free = LogisticRegression(C=10.0).fit(evidence, dead)
     expected = (free.intercept_[0] + 0.5, *free.coef_[0])
-    assert _bounded_logistic(evidence, dead, base=-0.5) == pytest.approx(expected, abs=2e-3)
+    found = _bounded_logistic(evidence, dead, base=-0.5, expected=(0.0, 0.0))
+    assert found == pytest.approx(expected, abs=2e-3)
+
+
+def came_to_rest(ratio: np.ndarray, temporal: np.ndarray, broken: np.ndarray) -> Calibrator:
+    """Calibrate on one log whose cells all came to rest in it."""
+    return Calibrator._of([_Trial(np.ones(len(broken), np.intp), ratio, temporal, broken, 0.0, 0.0)])
+
+
+def test_where_events_do_not_tell_broken_cells_apart_they_do_not_count_and_the_temporal_evidence_keeps_its_weight():
+    broken = np.arange(400) >= 300
+    found = came_to_rest(np.where(broken, -0.9, 0.0), np.where(broken, 12.0, -3.0), broken)
+    assert found.slope[1] == pytest.approx(0, abs=0.05)
+    assert found.temporal[1] > 0.9
+
+
+def test_where_the_temporal_evidence_tells_all_cells_apart_events_keep_their_usual_weight():
+    broken = np.arange(400) >= 300
+    found = came_to_rest(np.zeros(400), np.where(broken, 12.0, -12.0), broken)
+    assert found.slope[1] == pytest.approx(Calibrator().slope[1], abs=0.05)

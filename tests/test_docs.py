@@ -91,6 +91,7 @@ def test_the_python_on_a_page_runs(page, place, later_grasps, capsys):
     diagnoser = Bundle.open("robot.bundle").diagnoser()
     frames = np.concatenate(later_grasps)
     given = {"af": af, "diagnoser": diagnoser, "frames": frames, "frame": frames[0], "recordings": later_grasps}
+    given["healthy"] = later_grasps
     found = blocks(page, "python")
     assert len(found) == page.read_text().count("```python") > 0
     for code in found:
@@ -195,8 +196,8 @@ def test_files_that_a_page_names_exist(page):
 
 
 @pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.name)
-def test_a_guide_has_at_most_900_words(page):
-    assert len(page.read_text().split()) <= 900
+def test_a_guide_has_at_most_1000_words(page):
+    assert len(page.read_text().split()) <= 1000
 
 
 @pytest.mark.parametrize("page", sorted((HOME / "docs" / "methods").glob("*.md")), ids=lambda page: page.stem)

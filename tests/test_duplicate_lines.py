@@ -67,6 +67,21 @@ def test_healthy_lines_are_no_duplicates(seed: int):
     assert duplicate_pairs(pressed(seed)) == []
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("step", [0.0, 0.005])
+def test_what_moves_all_cells_alike_joins_no_lines(seed: int, step: float):
+    rng = np.random.default_rng(seed)
+    level = 1.2 + np.cumsum(rng.normal(0, 0.002, (2000, 1)), axis=0)
+    log = level + rng.normal(0, 0.0015, (2000, 60))
+    assert duplicate_pairs(np.round(log / step) * step if step else log) == []
+
+
+def test_a_bridge_is_found_beside_a_common_drift():
+    drift = np.cumsum(np.random.default_rng(0).normal(0, 0.002, (600, 1)), axis=0)
+    log = inject(pressed(1)[:600] + 0.5 + drift, [bridge(LAYOUT, Line(1, "row", 2))], LAYOUT)
+    assert [(pair.pad, pair.kind, pair.first, pair.second) for pair in duplicate_pairs(log)] == [(1, "row", 2, 3)]
+
+
 def test_unloaded_lines_are_no_duplicates():
     assert duplicate_pairs(np.zeros((300, 60))) == []
 

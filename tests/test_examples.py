@@ -37,6 +37,7 @@ LESS = {  # they take minutes
     "fine_tuning.py": ["--small"],
     "forecast_intervals.py": ["--small"],
     "restore_speed.py": ["--grasps", "1", "--repeats", "5"],
+    "ros_latency.py": ["--seconds", "1", "--rates", "100"],
     "soak.py": ["--hours", "12", "--frames", "500"],
     "any_model.py": ["--small"],
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
@@ -55,6 +56,7 @@ SLOW = {  # they take long, or a test of the library proves the same
     "fleet_scaling.py",
     "forecast_intervals.py",
     "attack.py",
+    "io_errors.py",
     "kill_maintenance.py",
     "own_model.py",
     "picture.py",
@@ -62,6 +64,7 @@ SLOW = {  # they take long, or a test of the library proves the same
     "relay.py",
     "repair.py",
     "restore_speed.py",
+    "ros_latency.py",
     "scale_curves.py",
     "simulated_vs_real.py",
     "soak.py",
@@ -77,14 +80,15 @@ SLOW_ON_RECORDINGS = {
     "forecast_intervals.py",
     "wrong_fault_set.py",
 }
-NEEDS = {"deploy_speed.py": "onnxruntime"}  # others do without, and say so
+NEEDS = {"deploy_speed.py": "onnxruntime", "ros_latency.py": "rclpy"}  # others do without, and say so
 
 
 def run(example: Path, folder: Path, *arguments: str | Path) -> str:
     """Run an example without a warning; return what it prints."""
     if (package := NEEDS.get(example.name)) and importlib.util.find_spec(package) is None:
         pytest.skip(f"{example.name} needs {package}")
-    environment = {**os.environ, "PYTHONWARNINGS": "error"}
+    # rclpy brings a parser that imports sre_parse.
+    environment = {**os.environ, "PYTHONWARNINGS": "error,ignore:module 'sre_:DeprecationWarning"}
     command = [sys.executable, example, *arguments]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

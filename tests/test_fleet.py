@@ -108,7 +108,7 @@ def test_a_robot_that_is_being_maintained_is_waited_for(fleet, monkeypatch):
     assert maintain_robot(fleet.robots[0], dry_run=True).decision == "unchanged"
     with Bundle.open(fleet.robots[0].bundle).maintenance():
         monkeypatch.setattr(working, "_PATIENCE", 0)
-        outcome = maintain_robot(fleet.robots[0], dry_run=True)
+        outcome = maintain_robot(fleet.robots[0])
     assert outcome.decision == "error"
     assert "being maintained by another process" in outcome.reason
 
@@ -222,7 +222,7 @@ def test_a_robot_that_moved_since_the_kill_is_done_again(worked, tmp_path):
 
 
 def test_two_processes_do_not_maintain_the_same_fleet(worked, tmp_path):
-    with locked(tmp_path / "run.lock", wait=False), pytest.raises(Busy, match="another process"):
+    with locked(tmp_path / "run.lock", patience=0), pytest.raises(Busy, match="another process"):
         maintain_fleet(robots(1), tmp_path, jobs=1)
 
 

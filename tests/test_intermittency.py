@@ -24,12 +24,14 @@ def usual() -> HealthyRates:
     return HealthyRates.fit([healthy(seed) for seed in range(10)], SCALE, LAYOUT)
 
 
-def evidence_of(log: np.ndarray, usual: HealthyRates, still: np.ndarray = CONSTANT) -> Intermittency:
+def evidence_of(
+    log: np.ndarray, usual: HealthyRates, still: np.ndarray = CONSTANT, scale: Scale = SCALE
+) -> Intermittency:
     intermittency = Intermittency.begin(LAYOUT)
     for first in range(0, len(log), 32):
         frames = log[first : first + 32]
         numbers = np.arange(first, first + len(frames))
-        intermittency = intermittency.extend(frames, SCALE.root_load(frames), numbers, SCALE, usual, still)
+        intermittency = intermittency.extend(frames, scale.root_load(frames), numbers, scale, usual, still)
     return intermittency
 
 
@@ -134,6 +136,14 @@ def test_a_load_that_saturates_now_and_then_does_not_blink(usual):
     log[:, 3] = np.minimum(4.6 + 0.6 * np.sin(np.arange(len(log))), 5.0)
     for reference in (usual, HealthyRates.unknown()):
         assert cells(evidence_of(log, reference).intermittent) == []
+
+
+def test_a_load_that_saturates_now_and_then_above_a_high_rest_does_not_blink(usual):
+    log = 1.5 + 0.8 * healthy(41)
+    flickers = np.random.default_rng(0).random((640, 2)) < 0.3
+    log[:, [3, 7]] = np.where(flickers, 4.97, 4.9)
+    found = evidence_of(log, usual, scale=Scale(np.full(CELLS, 1.5), 0.05, 5.0))
+    assert cells(found.intermittent) == []
 
 
 def tapped(seed: int, cells: list[int], frames: int = 640, rate: float = 5.0) -> np.ndarray:

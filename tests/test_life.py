@@ -14,6 +14,17 @@ from diagnostics.evidence.life_record import KEPT, LifeRecord
 
 
 @pytest.fixture(scope="module")
+def fitted(fitted: SelfDiagnosis, grasps: Recordings) -> SelfDiagnosis:
+    """The fitted diagnosis, with the proof of life learned from the same grasps."""
+    healthy = [np.asarray(frames, dtype=np.float64) for frames in grasps.frames[::2]]
+    about, arrays = fitted.state()
+    proving = SelfDiagnosis.from_state(about, arrays)
+    proving.reference_ = proving.reference_.with_life(healthy, fitted.layout)
+    proving.proof_of_life = True
+    return proving
+
+
+@pytest.fixture(scope="module")
 def log(grasps: Recordings) -> list[np.ndarray]:
     """Forty grasps that the reference does not hold."""
     return [np.asarray(frames, dtype=np.float64) for frames in grasps.frames[1::2][:40]]
@@ -107,3 +118,12 @@ def test_a_log_without_contact_proves_nothing(fitted):
     life = LifeTest(stream.life, fitted.reference_.life, fitted.layout, np.ones(220, bool)).finish()
     assert not life.shown.any()
     assert not life.evidence.any()
+
+
+def test_the_proof_of_life_is_off_unless_it_is_asked_for_and_is_stored_with_the_fit(fitted, log):
+    assert SelfDiagnosis(fitted.layout).proof_of_life is False
+    assert SelfDiagnosis(fitted.layout).get_params()["proof_of_life"] is False
+    about, arrays = fitted.state()
+    again = SelfDiagnosis.from_state(about, arrays)
+    assert again.proof_of_life
+    assert again.diagnose(log).to_dict() == fitted.diagnose(log).to_dict()

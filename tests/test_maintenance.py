@@ -308,6 +308,20 @@ def exchanged_rows(recordings, bundle):
     return [recording[:, grid.ravel()] for recording in recordings]
 
 
+def judged(monkeypatch, gain):
+    """Let every comparison find this gain: of a network of five epochs, rows hardly change the accuracy."""
+    import adaptfault.robot.maintenance as module
+
+    found = Judgement(running=0.5, candidate=0.5 + gain, gain=gain, low=gain - 0.05, high=gain + 0.05, collapsed=())
+    monkeypatch.setattr(module, "compare_candidate", lambda running, candidate, windows: found)
+
+
+@pytest.fixture
+def worthwhile(monkeypatch):
+    judged(monkeypatch, 0.1)
+
+
+@pytest.mark.usefixtures("worthwhile")
 def test_exchanged_rows_are_undone_in_software_and_the_robot_predicts_as_before(bundle, later_grasps):
     x = make_windows(later_grasps, np.zeros(len(later_grasps), int), bundle.layout).x
     before = Predictor.load(bundle.path).predict(x)
@@ -325,6 +339,7 @@ def test_exchanged_rows_are_undone_in_software_and_the_robot_predicts_as_before(
     assert label == Predictor.load(bundle.path).predict(scale(swapped[0][-10:], bundle.layout)[None])[0]
 
 
+@pytest.mark.usefixtures("worthwhile")
 def test_the_next_run_starts_from_the_undone_wiring(bundle, later_grasps, broken_row):
     maintain(bundle, exchanged_rows(later_grasps[:12], bundle))
     again = maintain(bundle, exchanged_rows(broken(later_grasps[12:], broken_row), bundle))
@@ -335,12 +350,41 @@ def test_the_next_run_starts_from_the_undone_wiring(bundle, later_grasps, broken
     np.testing.assert_array_equal(bundle.active().source, np.arange(bundle.layout.n_cells))
 
 
+@pytest.mark.usefixtures("worthwhile")
 def test_a_dry_run_tells_of_exchanged_rows_and_changes_nothing(bundle, later_grasps):
     before = files(bundle)
     report = maintain(bundle, exchanged_rows(later_grasps, bundle), dry_run=True)
     assert (report.decision, report.version, report.exit_code) == ("deployed", 1, 1)
     assert "a new version would undo it" in report.reason
     assert files(bundle) == before
+
+
+def test_exchanged_rows_that_cost_no_accuracy_are_told_and_nothing_is_deployed(bundle, later_grasps, monkeypatch):
+    judged(monkeypatch, 0.0)
+    report = maintain(bundle, exchanged_rows(later_grasps, bundle))
+    assert (report.decision, report.version, report.exit_code, report.used) == ("kept", 1, 2, ())
+    assert report.reason.startswith(
+        "wiring changed: rows 1 and 4 of pad 0 are exchanged; check the connectors; not undone"
+    )
+    assert bundle.versions.numbers == [1]
+
+
+def test_a_wiring_that_was_rolled_back_is_not_deployed_again(bundle, later_grasps, worthwhile):
+    assert maintain(bundle, exchanged_rows(later_grasps[:12], bundle)).decision == "deployed"
+    bundle.rollback()
+    report = maintain(bundle, exchanged_rows(later_grasps[12:], bundle))
+    assert (report.decision, report.version) == ("kept", 1)
+    assert "rolled back before" in report.reason
+
+
+def test_what_was_deployed_is_never_called_refused(bundle, later_grasps, worthwhile, monkeypatch):
+    import adaptfault.robot.maintenance as module
+
+    monkeypatch.setattr(module, "contradiction", lambda *given: 2.0)
+    report = maintain(bundle, exchanged_rows(later_grasps, bundle))
+    assert (report.decision, report.version, report.exit_code) == ("refused", 1, 2)
+    assert "residual variance ratio" in report.reason
+    assert bundle.versions.numbers == [1]
 
 
 def test_a_report_counts_the_cells_that_exist():

@@ -1,3 +1,6 @@
+import copy
+import pickle
+
 import numpy as np
 import pytest
 
@@ -221,3 +224,18 @@ def test_a_time_that_is_not_finite_is_refused_and_a_clock_that_is_set_loses_no_f
     assert diagnosis.n_frames == 8  # those that were refused are not among them
     assert np.isfinite(diagnosis.probability).all()
     assert monitor._stream.transport.lost == 1
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda monitor: pickle.loads(pickle.dumps(monitor))])
+def test_a_copy_of_a_monitor_goes_on_as_the_monitor_does_and_apart_from_it(fitted, log, middle, duplicate):
+    broken = inject(log, [Fault("short", (middle[3],), onset=200)], LAYOUT)
+    monitor = Monitor(fitted)
+    for frame in broken[:140]:
+        monitor.update(frame)
+    twin = duplicate(monitor)
+    found = [fault for frame in broken[140:600] for fault in twin.update(frame)]
+    assert middle[3] in {cell for fault in found for cell in fault.cells}
+    assert monitor.diagnosis().n_frames == 140
+    for frame in broken[140:600]:
+        monitor.update(frame)
+    assert twin.diagnosis().to_dict() == monitor.diagnosis().to_dict()

@@ -110,13 +110,22 @@ def test_how_seldom_cells_stick_to_a_value_in_between_is_charged_once():
     assert charged[1] == pytest.approx(charged[0])
 
 
-@pytest.mark.parametrize("value", [0.0, 1.0, 5.0])
-def test_a_value_held_since_the_last_event_tells_nothing(value: float):
+@pytest.mark.parametrize("value", [1.0, 5.0])
+def test_a_load_held_since_the_last_event_tells_nothing(value: float):
     log = pressed(2)
     log[35:, 3] = value
     found = result_of(log)
     assert found.scored[3]
     assert found.evidence[3] == 0
+
+
+def test_a_cell_at_rest_is_as_likely_broken_without_an_event_as_after_one_that_left_all_cells_unloaded():
+    untested = pressed(2)
+    untested[35:, 3] = 0.0
+    unloaded = np.concatenate([untested, np.zeros((FRAMES, CELLS))])
+    evidence = result_of(untested).evidence[3]
+    assert evidence < 0
+    assert result_of(unloaded).evidence[3] == pytest.approx(evidence, abs=0.05)
 
 
 def test_an_unexpected_value_is_weaker_evidence_in_events_with_large_errors():

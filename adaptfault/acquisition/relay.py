@@ -73,6 +73,36 @@ class FrameRepair:
         self._last = np.where(restored, self._last, frame)
         return self.restorer.update(frame, self.fault_set) + 0.0, restored  # + 0.0: no minus sign before a zero
 
+    def in_place(
+        self,
+        received: NDArray[np.float64],
+        values: NDArray[np.float64],
+        version: Version | None = None,
+        calibration: Calibration | None = None,
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return the whole frame as the sensor would have sent it, each cell at its place.
+
+        Args:
+            received: ``[D]`` as they came.
+            values: ``[D]`` in the layout's unit; NaN = missing.
+            version: undoes exchanged wires and replaced pads; None: readings stay where they came from.
+            calibration: from received values to the layout's unit; None: they are in that unit.
+
+        Returns:
+            The frame ``[D]`` in the unit in which it came, which cells are restored, and which values are others than
+            those received: restored ones and those of a replaced pad, both bool ``[D]``.
+        """
+        source = np.arange(len(values)) if version is None else version.source
+        given = values[source]
+        readings = given if version is None else version.undo(values)
+        whole, restored = self(readings)
+        other = restored | (np.isfinite(readings) & (readings != given))
+        if calibration is not None and other.any():
+            as_received = np.zeros(len(whole))
+            as_received[source] = whole
+            whole = calibration.invert(as_received)[source]
+        return np.where(other, whole, received[source]), restored, other
+
 
 class Relay:
     """Sends repaired packets to one address over UDP, in the format in which they came.
@@ -133,32 +163,19 @@ class Relay:
             values: ``[D]`` in the layout's unit; NaN = missing.
             version: of the model that runs; None: readings are sent where they came from.
         """
-        source = np.arange(len(values)) if version is None else version.source
-        received, given = received[source], values[source]
-        values = given if version is None else version.undo(values)
-        recalibrated = np.isfinite(values) & (values != given)
         repair = self._repairs.setdefault(device, FrameRepair(self.restorer, self.known))
-        frame, restored = repair(values)
-        whole = self._whole.get(device, True) and not np.any(received[~restored] % 1)
+        frame, restored, other = repair.in_place(received, values, version, self.calibration)
+        whole = self._whole.get(device, True) and not np.any(frame[~other] % 1)
         self._whole[device] = whole
         self.relayed.restored += bool(restored.any())
-        if (other := restored | recalibrated).any():
-            back = frame if self.calibration is None else self._counts(frame, source)
-            received = np.where(other, np.rint(back) if whole else back, received)
-        data = format_packet(device, time, received, ticks=self.ticks, restored=restored, digits=_DIGITS)
+        if whole:
+            frame = np.where(other, np.rint(frame), frame)
+        data = format_packet(device, time, frame, ticks=self.ticks, restored=restored, digits=_DIGITS)
         try:
             self._socket.sendto(data, self._to)
             self.relayed.sent += 1
         except OSError:
             self.relayed.failed += 1
-
-    def _counts(self, frame: NDArray[np.float64], source: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Return the counts that the received cells would have sent."""
-        assert self.calibration is not None
-        as_received = np.zeros(len(frame))
-        as_received[source] = frame
-        counts: NDArray[np.float64] = self.calibration.invert(as_received)[source]
-        return counts
 
     def found(self, device: str, faulty: FaultSet) -> None:
         """Restore these cells of a device too, from its next frame on."""

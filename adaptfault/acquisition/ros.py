@@ -1,7 +1,7 @@
 """Converts a diagnosis into ``diagnostic_msgs/DiagnosticArray``, as plain dicts, and writes it into a bag.
 
-No ROS is needed. Publish the dicts with rclpy (``examples/ros2``) once a second; ROS marks a status as stale when it is
-not repeated for some seconds.
+No ROS is needed. Publish the dicts with rclpy (:mod:`adaptfault.ros2` does) once a second; ROS marks a status as stale
+when it is not repeated for some seconds.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from diagnostics.decision.coverage import percent
 TOPIC = "/diagnostics"
 
 _SHARE = 0.1  # share of faulty cells of a pad that is an ERROR even without a faulty wire, as for exit codes
+_SLOW = 0.9  # of the declared rate; below it the stream is a WARN, the tolerance of diagnostic_updater
 _LISTED = 20  # most cells named in one value
 _GROUPS = {
     "rows": ("row",),
@@ -40,20 +41,27 @@ class Level(IntEnum):
 
 
 def diagnostic_array(
-    diagnosis: Diagnosis, *, stamp: float = 0.0, name: str = "tactile", hardware_id: str = "tactile"
+    diagnosis: Diagnosis,
+    *,
+    stamp: float = 0.0,
+    name: str = "tactile",
+    hardware_id: str = "tactile",
+    rate: float | None = None,
 ) -> dict[str, Any]:
     """Return a DiagnosticArray: one status for each pad, each group of its wires, and the stream of frames.
 
     The names depend on the layout only: "tactile: pad 0", "tactile: pad 0 rows" (``columns``, ``addresses``,
     ``converter``; with declared wiring ``groups``), ..., "tactile: stream". Single faulty cells of
     a pad are a WARN; a tenth of its cells, or a wire, is an ERROR, also of the wire's group. Lost or frozen frames are
-    a WARN of the stream. Untested cells are counted in the values and do not change the level.
+    a WARN of the stream, and so is a rate below 90 % of the layout's. Untested cells are counted in the values and do
+    not change the level.
 
     Args:
         diagnosis: to convert.
         stamp: seconds since 1970.
         name: prefix of all names.
         hardware_id: of the sensor.
+        rate: at which frames come, per second; None: unknown.
     """
     layout = diagnosis.layout
     statuses = []
@@ -63,7 +71,7 @@ def diagnostic_array(
         for group, kinds in _groups(layout).items():
             faults = [f for f in on_pad if f.line is not None and f.line.kind in kinds]
             statuses.append(_wires(layout, pad, group, kinds, faults))
-    statuses.append(_stream(diagnosis))
+    statuses.append(_stream(diagnosis, rate))
     return _array(statuses, stamp, name, hardware_id)
 
 
@@ -74,14 +82,15 @@ def stale_array(
     stamp: float = 0.0,
     name: str = "tactile",
     hardware_id: str = "tactile",
+    level: Level = Level.STALE,
 ) -> dict[str, Any]:
-    """Return the same statuses, all STALE with this message, for a sensor that sends no frames."""
+    """Return the same statuses, all STALE (or of another level) with this message, for a sensor without frames."""
     names = [
         one
         for pad in range(layout.pads)
         for one in (f"pad {pad}", *(f"pad {pad} {group}" for group in _groups(layout)))
     ]
-    statuses = [_status(one, Level.STALE, message, {}) for one in (*names, "stream")]
+    statuses = [_status(one, level, message, {}) for one in (*names, "stream")]
     return _array(statuses, stamp, name, hardware_id)
 
 
@@ -143,10 +152,16 @@ def _wires(layout: SensorLayout, pad: int, group: str, kinds: tuple[str, ...], f
     return _status(f"pad {pad} {group}", Level.OK, "no fault found", values)
 
 
-def _stream(diagnosis: Diagnosis) -> dict[str, Any]:
+def _stream(diagnosis: Diagnosis, rate: float | None) -> dict[str, Any]:
     counts = {kind: sum(t.frames for t in diagnosis.transport if t.kind == kind) for kind in ("lost", "frozen")}
-    values = {"frames": diagnosis.n_frames, "recordings": diagnosis.n_recordings, **counts}
-    message = "; ".join(f"{count} frames {kind}" for kind, count in counts.items() if count)
+    values: dict[str, Any] = {"frames": diagnosis.n_frames, "recordings": diagnosis.n_recordings, **counts}
+    messages = [f"{count} frames {kind}" for kind, count in counts.items() if count]
+    declared = diagnosis.layout.rate
+    if rate is not None:
+        values |= {"rate": f"{rate:.3g}", "declared rate": f"{declared:g}"}
+        if rate < _SLOW * declared:
+            messages.append(f"{rate:.3g} frames a second, {declared:g} are declared")
+    message = "; ".join(messages)
     return _status("stream", Level.WARN if message else Level.OK, message or "frames come as they should", values)
 
 

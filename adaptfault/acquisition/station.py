@@ -21,6 +21,7 @@ from adaptfault.acquisition.recorder import Recorder
 from adaptfault.acquisition.relay import Relay, parse_address
 from adaptfault.acquisition.session import Event, Session, StreamingPredictor
 from adaptfault.acquisition.switch import Rule, parse_when
+from adaptfault.data.printable import printable
 from adaptfault.robot.converter_range import within_range
 from diagnostics import Monitor, SelfDiagnosis, SensorLayout
 
@@ -246,11 +247,11 @@ class Station:
             self.on_event(event)
 
     def _print(self, event: Event) -> None:
-        print(json.dumps(event.to_dict(), allow_nan=False) if self.as_json else event, flush=True)
+        print(json.dumps(event.to_dict(), allow_nan=False) if self.as_json else printable(str(event)), flush=True)
 
     def _say(self, text: str) -> None:
         if not self.quiet:
-            print(text, file=sys.stderr, flush=True)
+            print(printable(text), file=sys.stderr, flush=True)
 
     def _end(self) -> None:
         counters = self.receiver.counters

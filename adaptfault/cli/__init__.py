@@ -32,6 +32,7 @@ from adaptfault.cli import (
     train,
 )
 from adaptfault.cli.options import LogAboveBars, refuse_missing
+from adaptfault.data.printable import printable
 
 COMMANDS = (
     info,
@@ -113,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         refuse_missing(args)
         return int(args.run(args))
     except (ValueError, OSError) as error:
-        print(f"adaptfault {args.command}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"adaptfault {args.command}: error: {printable(' '.join(str(error).split()))}", file=sys.stderr)
         return BAD_INPUT
     except MemoryError as error:
         print(f"adaptfault {args.command}: error: not enough memory ({error})", file=sys.stderr)

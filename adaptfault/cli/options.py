@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from adaptfault.data.printable import printable
+
 if TYPE_CHECKING:
     from adaptfault.data.recordings import Loaded, Recordings
     from adaptfault.data.recordings.blocks import Stream
@@ -375,6 +377,7 @@ def say(args: argparse.Namespace, text: str) -> None:
 
 def above_bars(text: str) -> None:
     """Print on stderr, above a progress bar if one is shown."""
+    text = printable(text)
     if "tqdm" in sys.modules:
         from tqdm import tqdm
 
@@ -393,4 +396,4 @@ class LogAboveBars(logging.Handler):
 
 def emit(args: argparse.Namespace, result: dict[str, Any], text: str) -> None:
     """Print the result on stdout."""
-    print(json.dumps(result, indent=1, allow_nan=False) if args.json else text)
+    print(json.dumps(result, indent=1, allow_nan=False) if args.json else printable(text))

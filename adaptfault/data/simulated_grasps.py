@@ -157,7 +157,7 @@ def simulate(
         ``n_per_class * len(classes)`` recordings float32 ``[n_frames, D]`` in the layout's unit, named "void/0003".
 
     Raises:
-        ValueError: a number below its least, a class unknown or named twice, none at all.
+        ValueError: a number below its least, a class unknown or named twice, none at all, a layout with several axes.
     """
     for name, number, least in (
         ("n_per_class", n_per_class, 1),
@@ -171,6 +171,8 @@ def simulate(
     if not named or len(set(named)) < len(named) or set(named) - set(CLASS_NAMES):
         raise ValueError(f"classes must name some of {', '.join(CLASS_NAMES)}, each once; got {classes!r}")
     layout = SensorLayout.paper() if layout is None else layout
+    if layout.axes > 1:
+        raise ValueError(f"simulate presses on cells of one axis; got a layout with {layout.axes} axes")
     readout = Readout.draw(layout, sensor_seed)
     batch = max(1, BATCH_READINGS // (n_frames * layout.n_cells))
     frames: list[Array] = []

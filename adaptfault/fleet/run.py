@@ -78,7 +78,7 @@ def maintain_fleet(
         raise ValueError("sign needs keys: only a bundle that a trusted key signed is signed again")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder / "run.lock", wait=False):
+    with locked(folder / "run.lock", patience=0):
         lines = Lines(folder / LEDGER)
         options: dict[str, Any] = {"dry_run": dry_run, "budget": budget, "least_serial": least_serial, "sign": sign}
         options["keys"] = None if keys is None else list(map(str, keys))

@@ -7,8 +7,9 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
+from dataclasses import replace
 from datetime import datetime, timezone
 from functools import partial
 from pathlib import Path
@@ -22,13 +23,14 @@ from adaptfault.robot.checksummed_json import (
     decoding,
     hash_files,
     read_with_copy,
+    reading,
     sync,
     sync_tree,
     write_with_copy,
 )
-from adaptfault.robot.journal import Journal
+from adaptfault.robot.journal import Entry, Journal
 from adaptfault.robot.known_faults import KnownFaults
-from adaptfault.robot.lock import locked
+from adaptfault.robot.lock import PATIENCE, locked
 from adaptfault.robot.parts import Parts, split_validation
 from adaptfault.robot.pointer import NAME as POINTER
 from adaptfault.robot.pointer import SCHEMA as POINTER_SCHEMA
@@ -54,6 +56,7 @@ PROCESS = uuid4().hex  # identifies this process in the count of starts
 _log = logging.getLogger(__name__)
 _TEMPORARY = re.compile(r"\.(bundle|current|journal)\..*\.[a-z0-9_]{8}")  # names that atomic_write makes
 _ABANDONED = 3600  # seconds
+_IN_LOOP = 0.1  # seconds that a confirmation, which runs in the robot's loop, waits for another process
 _KEPT = 5  # latest versions that stay on the disk, besides the fault-free one
 
 
@@ -91,7 +94,9 @@ class Bundle:
         self, path: str | Path, *, keys: Sequence[str | os.PathLike[str]] | None = None, least_serial: int = 0
     ) -> None:
         self.path = Path(path)
-        if not any((self.path / name).is_file() for name in (_ABOUT, "bundle.copy.json")):
+        with reading(self.path):
+            there = any((self.path / name).is_file() for name in (_ABOUT, "bundle.copy.json"))
+        if not there:
             raise FileNotFoundError(
                 f"{self.path}: expected a bundle, a folder with {_ABOUT}; adaptfault train --out X.bundle makes one"
             )
@@ -183,15 +188,22 @@ class Bundle:
         Raises:
             Damaged: no version can be read.
         """
-        pointer = Pointer.read(self.path)
-        before = [n for n in reversed(self.versions.numbers) if n < pointer.active]
         problems = []
-        for number in dict.fromkeys((pointer.active, *pointer.fallbacks, *before)):
+        for number in self._candidates():
             try:
                 return self.versions[number]
             except (FileNotFoundError, Damaged) as error:
                 problems.append(str(error))
         raise Damaged(f"{self.path} holds no version that can be read: {problems[0]}")
+
+    def _candidates(self) -> Iterator[int]:
+        """Yield the number of the active version, then those that replace it, the best first."""
+        pointer = Pointer.read(self.path)
+        first = dict.fromkeys((pointer.active, *pointer.fallbacks))
+        yield from first
+        for number in reversed(self.versions.numbers):
+            if number < pointer.active and number not in first:
+                yield number
 
     def begin(self, starter: str = PROCESS) -> Version:
         """Return the version to run and count the start while that version is on probation.
@@ -203,49 +215,72 @@ class Bundle:
                 serve several devices.
         """
         try:
-            with locked(self.path / _STATE_LOCK, wait=True):
+            with locked(self.path / _STATE_LOCK):
                 pointer = Pointer.read(self.path)
                 after = pointer.started(starter)
                 if after.starts > STARTS and pointer.fallbacks:
                     self._fall_back(pointer, f"version {pointer.active} was started {STARTS} times and never confirmed")
                 elif after != pointer:
                     after.write(self.path)
-        except OSError as error:  # a full or read-only disk must not stop the prediction
+        except OSError as error:  # a full or read-only disk, or a stopped process, must not stop the prediction
             _log.warning("%s cannot be written, so this start is not counted: %s", self.path, error)
         return self.active()
 
     def confirm(self) -> None:
-        """End the probation of the active version; raises OSError where the bundle cannot be written."""
+        """End the probation of the active version.
+
+        Raises:
+            OSError: the bundle cannot be written, or another process holds it; the version stays on probation.
+        """
         if not Pointer.read(self.path).probation:
             return
-        with locked(self.path / _STATE_LOCK, wait=True):
+        with locked(self.path / _STATE_LOCK, patience=_IN_LOOP):
             pointer = Pointer.read(self.path)
             if pointer.probation:
-                pointer.confirmed().write(self.path)
-                self.journal.add(now(), "confirmed", {"version": pointer.active})
+                entry = Entry(now(), "confirmed", {"version": pointer.active})
+                self._switch(pointer, pointer.confirmed(), entry, patience=_IN_LOOP)
 
-    def deploy(self, number: int) -> None:
-        """Make a version the active one, on probation."""
-        with locked(self.path / _STATE_LOCK, wait=True):
-            Pointer.read(self.path).deployed(number).write(self.path)
+    def deploy(self, number: int, entry: Entry | None = None) -> None:
+        """Make a version the active one, on probation, and journal it: both, or neither.
+
+        Args:
+            number: of the version.
+            entry: of the journal; None: it is not journalled.
+
+        Raises:
+            OSError: the bundle cannot be written, or another process holds it.
+        """
+        with locked(self.path / _STATE_LOCK):
+            pointer = Pointer.read(self.path)
+            if entry is None:
+                pointer.deployed(number).write(self.path)
+            else:
+                self._switch(pointer, pointer.deployed(number), entry)
 
     def rollback(self) -> Version:
         """Return to the previous version. The fault set of the rejected one is not deployed again.
 
         Raises:
             ValueError: there is no previous version.
+            OSError: the bundle cannot be written, or another process holds it.
         """
-        with locked(self.path / _STATE_LOCK, wait=True):
+        with locked(self.path / _STATE_LOCK):
             pointer = Pointer.read(self.path)
             self._fall_back(pointer, f"version {pointer.active} was rolled back")
         return self.active()
 
     def problems(self, *, repair: bool = True) -> list[str]:
-        """Check every file and return the damage; ``repair`` restores what has a copy."""
+        """Check every file and return the damage; ``repair`` restores what has a copy.
+
+        Raises:
+            OSError: a file cannot be read or written now.
+        """
         problems = damage(self.pointer, POINTER_SCHEMA, repair=repair) + damage(
             self.path / _ABOUT, SCHEMA, repair=repair
         )
         problems += self.journal.damage(repair=repair)
+        if repair:
+            self._settle()
         try:
             self.parts.check(repair=repair)
         except Damaged as error:
@@ -270,8 +305,20 @@ class Bundle:
         except (FileNotFoundError, Damaged):
             rejected = ()
         after = pointer.fallen_back(rejected)
-        after.write(self.path)
-        self.journal.add(now(), "rollback", {"from": pointer.active, "to": after.active, "reason": reason})
+        document = {"from": pointer.active, "to": after.active, "reason": reason}
+        self._switch(pointer, after, Entry(now(), "rollback", document))
+
+    def _switch(self, before: Pointer, after: Pointer, entry: Entry, patience: float = PATIENCE) -> None:
+        """Replace the pointer and journal the entry: both, or neither. Needs the lock of the state."""
+        self.journal.prepare(entry, before.entry)
+        replace(after, entry=entry.key).write(self.path)
+        self.journal.settle(entry.key, patience=patience)
+
+    def _settle(self) -> None:
+        """Move entries that wait into the journal, as after a crash."""
+        if self.journal.waits:
+            with locked(self.path / _STATE_LOCK):
+                self.journal.settle(Pointer.read(self.path).entry)
 
     def diagnoser(self) -> SelfDiagnosis:
         """Return the fitted self-diagnosis; raises Damaged. Needs no torch."""
@@ -297,8 +344,8 @@ class Bundle:
             return KnownFaults.from_dict(known)
 
     def maintenance(self, *, dry_run: bool = False) -> AbstractContextManager[None]:
-        """Hold the maintenance lock, one run at a time; raises Busy. A dry run needs no write access."""
-        return locked(self.path / _MAINTENANCE_LOCK, wait=False, optional=dry_run)
+        """Hold the maintenance lock, one run at a time; raises Busy. A dry run goes on without it."""
+        return locked(self.path / _MAINTENANCE_LOCK, patience=0, needed=not dry_run)
 
     def write_version(self, adaptation: Adaptation, about: dict[str, Any]) -> Version:
         """Write an adaptation as a new version without activating it."""

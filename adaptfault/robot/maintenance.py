@@ -13,22 +13,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from adaptfault.data.printable import printable
 from adaptfault.data.windows import recordings_of
 from adaptfault.evaluation.scores import chance
 from adaptfault.robot.ageing import encode
 from adaptfault.robot.bundle import Bundle, now
+from adaptfault.robot.changed_readings import ChangedReadings, find_changed_readings
 from adaptfault.robot.checksummed_json import Damaged
 from adaptfault.robot.converter_range import within_range
 from adaptfault.robot.deployment_test import Judgement, compare_candidate, with_faults
+from adaptfault.robot.journal import Entry
 from adaptfault.robot.known_faults import KnownFaults
 from adaptfault.robot.maintenance_report import Decision, MaintenanceReport
 from adaptfault.robot.plausibility import contradiction, implausible
 from adaptfault.robot.pointer import Pointer
 from adaptfault.robot.sensor_state import TECHNICIAN_BELOW, UNTESTED, judged_before, unhandled_cells
 from adaptfault.robot.versions import Version
-from diagnostics import Diagnosis, FaultKind, FaultSet, SelfDiagnosis
+from diagnostics import Diagnosis, FaultSet, SelfDiagnosis
 from diagnostics.evidence.ageing import cell_condition
-from diagnostics.evidence.recalibration import Recalibration, find_recalibration
 from diagnostics.evidence.sensor_change import find_change
 
 if TYPE_CHECKING:
@@ -39,7 +41,6 @@ if TYPE_CHECKING:
 
 _CONTRADICTORY = 1.0  # residual variance ratio at which other cells predict no better than the mean
 _UNKNOWN = 3
-_DEAD = (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK, FaultKind.ALIAS)  # no predictors of how a pad reads
 
 
 def maintain(
@@ -100,7 +101,7 @@ def _checked(
 ) -> list[_InputRecording]:
     incoming = []
     for i, recording in enumerate(bundle.layout.recordings(recordings)):
-        name = names[i] if i < len(names) else f"recording {i}"
+        name = printable(names[i]) if i < len(names) else f"recording {i}"
         raw = np.ascontiguousarray(recording, dtype=np.float64)
         digest = hashlib.sha256(repr(raw.shape).encode() + raw.tobytes()).hexdigest()
         try:
@@ -127,6 +128,7 @@ class _Maintenance:
     warnings: tuple[str, ...] = field(default=(), init=False)
     judged: dict[str, Any] | None = field(default=None, init=False)
     condition: bytes | None = field(default=None, init=False)
+    next: int | None = field(default=None, init=False)  # number of the version that runs after this run, if another
 
     def run(self, incoming: Sequence[_InputRecording]) -> MaintenanceReport:
         """Diagnose recordings that no earlier run used, decide, and journal the run unless it is a dry run."""
@@ -147,32 +149,13 @@ class _Maintenance:
             return self._report("refused", _UNKNOWN, "no recording is usable", self.before)
         self.say(f"diagnosing {len(usable)} new recordings")
         frames = [self.version.undo(r.frames) for r in usable if r.frames is not None]
-        rewiring = self.diagnoser.rewiring(frames)
-        if rewiring is not None:
-            frames = [rewiring.undo(recording) for recording in frames]
-            readings = self.version.readings.items()
-            self._deploy_readings(
-                rewiring.reason, **{name: [of[i] for i in rewiring.source.tolist()] for name, of in readings}
-            )
-        diagnosis = self.diagnoser.diagnose(frames)
-        recalibration = None if rewiring is not None else self._recalibration(frames, diagnosis)
-        if recalibration is not None:
-            frames = [recalibration.undo(recording, bundle.layout.full_scale) for recording in frames]
-            self.before = self.before.without(recalibration.on(bundle.layout))
-            gain = self.version.gain * recalibration.gain
-            offset = self.version.offset + self.version.gain * recalibration.offset
-            self._deploy_readings(recalibration.reason, gain=gain.tolist(), offset=offset.tolist())
-            diagnosis = self.diagnoser.diagnose(frames)
-        report = self._decide(diagnosis, frames, tuple(r.name for r in usable))
-        loads, healthy = self._loads(frames)
+        changed = find_changed_readings(self.diagnoser, frames, lambda: self.healthy)
+        report = self._decide_readings(changed, frames, tuple(r.name for r in usable))
+        loads, healthy = self._loads(frames if report.diagnosis is changed.as_found else changed.frames)
         report = self._with_change(self._with_coverage(_with_transport(report)), loads, healthy)
         report = self._with_chance(self._with_static_loads(report))
-        if report.used:
-            self.condition = encode(cell_condition(loads, healthy, bundle.layout), diagnosis.verdicts)
-        if rewiring is not None:
-            report = self._with_new_readings(report, rewiring.reason, rewiring=rewiring.steps)
-        if recalibration is not None:
-            report = self._with_new_readings(report, recalibration.reason, replaced_pads=recalibration.pads)
+        if report.used and report.diagnosis is not None:
+            self.condition = encode(cell_condition(loads, healthy, bundle.layout), report.diagnosis.verdicts)
         if not self.dry_run:
             self._write(report, usable)
         return report
@@ -197,35 +180,86 @@ class _Maintenance:
         load, healthy = self.diagnoser.load_, self.healthy
         return (frames, healthy) if load is None else ([*map(load.loads, frames)], [*map(load.loads, healthy)])
 
-    def _recalibration(self, frames: list[NDArray[np.float64]], diagnosis: Diagnosis) -> Recalibration | None:
-        """Return how replaced pads read; None where none is replaced."""
-        if self.diagnoser.load_ is not None or self.diagnoser.reference_ is None:
-            return None
-        faulty = np.zeros(self.bundle.layout.n_cells, bool)
-        faulty[[cell for f in diagnosis.faults if f.kind in _DEAD for cell in f.cells]] = True
-        held = diagnosis.statically_loaded.mask
-        return find_recalibration(frames, self.healthy, self.diagnoser.reference_, self.bundle.layout, faulty, held)
+    def _decide_readings(
+        self, changed: ChangedReadings, frames: list[NDArray[np.float64]], used: tuple[str, ...]
+    ) -> MaintenanceReport:
+        """Decide about exchanged wires or replaced pads first, as about any version, then about the faults.
 
-    def _deploy_readings(self, reason: str, **readings: list[Any]) -> None:
-        """Deploy the running model as a version that puts the readings back; a dry run changes nothing."""
+        Nothing is deployed where the recordings are refused, or where the running version is as good without it.
+        """
+        if not changed.reason:
+            return self._decide(changed.diagnosis, changed.frames, used)
+        before = self.before
+        if changed.recalibration is not None:
+            self.before = before.without(changed.recalibration.on(self.bundle.layout))
+        known = self.before.merged(changed.diagnosis)
+        refusal = self._refusal(changed.diagnosis, changed.frames, known)
+        judgement = None
+        if refusal is not None:
+            decision: Decision = "refused"
+            why = f"not undone: {refusal}"
+        else:
+            judgement = self._judged_readings(changed, known)
+            decision = "kept"
+            why = f"not undone: version {self.version.number} is as good without it, {judgement}"
+            if self._rolled_back(changed):
+                why = "not undone: a version that undid it was rolled back before"
+            elif judgement.better and not judgement.collapsed:
+                decision = "deployed"
+        if decision == "deployed":
+            self._deploy_readings(changed)
+            return self._with_new_readings(self._decide(changed.diagnosis, changed.frames, used), changed, judgement)
+        self.before = before
+        if changed.as_found is not None and refusal is None:  # pads are used as they read now
+            report = self._decide(changed.as_found, frames, used)
+            return replace(
+                report, exit_code=max(1, report.exit_code), reason=f"{changed.reason}; {why}; {report.reason}"
+            )
+        found: dict[str, Any] = {"diagnosis": changed.diagnosis, **changed.told}
+        return self._report(decision, 2, f"{changed.reason}; {why}", before, **found)
+
+    def _judged_readings(self, changed: ChangedReadings, known: KnownFaults) -> Judgement:
+        """Compare the running version with and without the change undone, on windows that are changed likewise."""
+        from adaptfault.adaptation.result import Adaptation
+
+        model, top = Adaptation.load(self.version.folder), self.bundle.layout.full_scale
+        windows = with_faults(self.bundle.parts.check_windows(), known.faults, self.bundle.layout)
+        windows = replace(windows, x=changed.changed(windows.x, top))
+        return compare_candidate(model.predict, lambda x: model.predict(changed.undone(x, top)), windows)
+
+    def _rolled_back(self, changed: ChangedReadings) -> bool:
+        """Return whether a version that undid the same change was rolled back, or never confirmed."""
+        runs = self.bundle.journal.runs()
+        left = {run["from"] for run in runs if run["what"] == "rollback"}
+        told = {name: list(values) for name, values in changed.told.items()}
+        return any(
+            run["what"] == "deployed" and run["version"] in left and {name: run.get(name) for name in told} == told
+            for run in runs
+        )
+
+    def _deploy_readings(self, changed: ChangedReadings) -> None:
+        """Deploy the running model as a version that undoes the change; a dry run changes nothing."""
         from adaptfault.adaptation.result import Adaptation
 
         if self.dry_run:
             return
-        self.say(reason)
-        about = {**self.version.about, "reason": reason, **self.version.readings, **readings}
+        self.say(changed.reason)
+        about = {**self.version.about, "reason": changed.reason, **changed.readings(self.version)}
         self.version = self.bundle.write_version(Adaptation.load(self.version.folder), about)
-        self.bundle.deploy(self.version.number)
+        self.next = self.version.number
 
-    def _with_new_readings(self, report: MaintenanceReport, reason: str, **found: Any) -> MaintenanceReport:
-        """Return the report with changed wires or replaced pads, which a deployed version undoes."""
+    def _with_new_readings(
+        self, report: MaintenanceReport, changed: ChangedReadings, judgement: Judgement | None
+    ) -> MaintenanceReport:
+        """Return the report with a change that a deployed version undoes."""
         undone = "a new version would undo it" if self.dry_run else f"version {self.version.number} undoes it"
         return replace(
             report,
-            decision="deployed" if report.decision == "unchanged" else report.decision,
+            decision="deployed",
             exit_code=max(1, report.exit_code),
-            reason=f"{reason}; {undone}; {report.reason}",
-            **found,
+            reason=f"{changed.reason}; {undone}; {report.reason}",
+            judgement=report.judgement or judgement,
+            **changed.told,
         )
 
     def _with_coverage(self, report: MaintenanceReport) -> MaintenanceReport:
@@ -289,18 +323,11 @@ class _Maintenance:
         faulty = known.fault_set
         found: dict[str, Any] = {"diagnosis": diagnosis, "used": used}
         adapter = self.adapter
-        present = FaultSet(tuple(np.flatnonzero(self.bundle.layout.present).tolist()), faulty.n_cells)
-        if not present - faulty:
-            reason = "no healthy cell is left to predict from: replace the sensor"
-            return self._report("refused", 2, reason, known, **found)
-        untrue = faulty | diagnosis.statically_loaded  # neither says what the other cells should read
-        strange = contradiction(frames, untrue, adapter.statistics, self.bundle.layout)
-        if strange > _CONTRADICTORY:
-            reason = (
-                f"residual variance ratio {strange:.2f} of the cells taken as healthy exceeds {_CONTRADICTORY:g}:"
-                " wrong sensor, or changed wiring"
-            )
-            return self._report("refused", 2, reason, self.before, **{**found, "used": ()})
+        refusal = self._refusal(diagnosis, frames, known)
+        if refusal is not None:
+            working = bool(self._present - faulty)  # recordings that contradict the sensor teach nothing of its faults
+            found["used"] = () if working else used
+            return self._report("refused", 2, refusal, self.before if working else known, **found)
         if faulty == self.version.fault_set:
             reason = f"version {self.version.number} excludes these cells already" if faulty else "no faulty cell"
             return self._report("unchanged", self._code(faulty), reason, known, **found)
@@ -315,6 +342,25 @@ class _Maintenance:
             )
             return self._report("kept", self._code(faulty), reason, known, **found)
         return self._adapt(adapter, known, found)
+
+    def _refusal(self, diagnosis: Diagnosis, frames: list[NDArray[np.float64]], known: KnownFaults) -> str | None:
+        """Return why no version can be made from these recordings; None where one can."""
+        faulty = known.fault_set
+        if not self._present - faulty:
+            return "no healthy cell is left to predict from: replace the sensor"
+        untrue = faulty | diagnosis.statically_loaded  # neither says what the other cells should read
+        strange = contradiction(frames, untrue, self.adapter.statistics, self.bundle.layout)
+        if strange <= _CONTRADICTORY:
+            return None
+        return (
+            f"residual variance ratio {strange:.2f} of the cells taken as healthy exceeds {_CONTRADICTORY:g}:"
+            " wrong sensor, or changed wiring"
+        )
+
+    @cached_property
+    def _present(self) -> FaultSet:
+        layout = self.bundle.layout
+        return FaultSet(tuple(np.flatnonzero(layout.present).tolist()), layout.n_cells)
 
     def _adapt(self, adapter: Adapter, known: KnownFaults, found: dict[str, Any]) -> MaintenanceReport:
         """Adapt and compare: method "auto" first; where a class collapses, imputation alone."""
@@ -396,7 +442,7 @@ class _Maintenance:
             )
             return self._report("kept", code, reason, known, accuracy=judgement.running, **found)
         if not self.dry_run:
-            self.bundle.deploy(earlier.number)
+            self.next = earlier.number
         code = self._code(known.fault_set, judgement.candidate, free)
         number = self.version.number if self.dry_run else earlier.number
         reason = f"{recovered} cells recovered; version {earlier.number} uses them again ({accuracies})"
@@ -412,18 +458,21 @@ class _Maintenance:
             "chance": chance(self.bundle.parts.check_windows().y)[1],
         }
         version = self.bundle.write_version(adaptation, about)
-        self.bundle.deploy(version.number)
+        self.next = version.number
         return version.number
 
     def _write(self, report: MaintenanceReport, usable: Sequence[_InputRecording]) -> None:
-        """Journal the run. After a crash before this the recordings are diagnosed again, with the same result."""
-        self.bundle.journal.add(
-            now(),
-            report.decision,
-            {**report.to_dict(), "knowledge": self.known.to_dict(), "judged": self._judgement_of(report)},
-            [(r.digest, r.name) for r in usable] if report.used else [],  # refused ones are diagnosed again
-            self.condition,
-        )
+        """Deploy and journal the run in one step.
+
+        After a crash before this the recordings are diagnosed again, with the same result.
+        """
+        document = {**report.to_dict(), "knowledge": self.known.to_dict(), "judged": self._judgement_of(report)}
+        used = [(r.digest, r.name) for r in usable] if report.used else []  # refused ones are diagnosed again
+        entry = Entry(now(), report.decision, document, used, self.condition)
+        if self.next is None:
+            self.bundle.journal.add(entry)
+        else:
+            self.bundle.deploy(self.next, entry)
 
     def _judgement_of(self, report: MaintenanceReport) -> dict[str, Any] | None:
         """Return what the next run needs so that it does not repeat the same comparison."""

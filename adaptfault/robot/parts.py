@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from adaptfault.data.atomic import atomic_write
 from adaptfault.models.store import load_arrays, save_arrays
-from adaptfault.robot.checksummed_json import Damaged, check_files, decoding
+from adaptfault.robot.checksummed_json import Damaged, check_files, decoding, reading
 from diagnostics import SelfDiagnosis
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class Parts:
         """Return the fitted self-diagnosis, from its copy where the part is damaged. Needs no torch."""
         try:
             return _diagnoser(self._verified(_REFERENCE))
-        except Damaged:
+        except (FileNotFoundError, Damaged):
             if not any(PurePosixPath(file).parts[0] == _COPY for file in self.hashes):
                 raise
         return _diagnoser(self._verified(_COPY))
@@ -119,13 +119,16 @@ class Parts:
     def calibration(self) -> Path | None:
         """Path of the calibration table from raw counts to the layout's unit; None without one."""
         path = self._verified(_CALIBRATION)
-        return path if path.is_file() else None
+        with reading(path):
+            return path if path.is_file() else None
 
     @property
     def graph(self) -> bytes | None:
         """ONNX graph of the network with a head in closed form; None without one, or where it is damaged."""
         with suppress(Damaged, FileNotFoundError):
-            return self._verified(_GRAPH).read_bytes()
+            path = self._verified(_GRAPH)
+            with reading(path):
+                return path.read_bytes()
         return None
 
 

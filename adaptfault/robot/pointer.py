@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ class Pointer:
         starts: number of starts on probation.
         starter: identifies the last starter.
         rejected: fault sets of versions that failed or were rolled back; they are not deployed again.
+        entry: key of the journal's entry about this switch, see :class:`~adaptfault.robot.journal.Journal`.
     """
 
     active: int
@@ -32,6 +34,7 @@ class Pointer:
     starts: int = 0
     starter: str = ""
     rejected: tuple[tuple[int, ...], ...] = ()
+    entry: str = ""
 
     @classmethod
     def read(cls, bundle: Path) -> Pointer:
@@ -40,7 +43,15 @@ class Pointer:
         with decoding(bundle / NAME):
             rejected = tuple(tuple(map(int, cells)) for cells in d["rejected"])
             fallbacks = tuple(map(int, d["fallbacks"]))
-            return cls(int(d["active"]), fallbacks, bool(d["probation"]), int(d["starts"]), str(d["starter"]), rejected)
+            return cls(
+                active=int(d["active"]),
+                fallbacks=fallbacks,
+                probation=bool(d["probation"]),
+                starts=int(d["starts"]),
+                starter=str(d["starter"]),
+                rejected=rejected,
+                entry=str(d["entry"]),
+            )
 
     def write(self, bundle: Path) -> None:
         """Write the pointer; replacing the file switches the version."""
@@ -71,3 +82,12 @@ class Pointer:
             raise ValueError(f"version {self.active} is the first: there is no version to fall back to")
         first, *rest = self.fallbacks
         return Pointer(first, tuple(rest), rejected=(*self.rejected, rejected))
+
+
+def file_stamp(path: Path) -> tuple[int, int, int] | None:
+    """Return values that change when a file is replaced; None while it does not exist."""
+    try:
+        stat = os.stat(path)
+    except OSError:
+        return None
+    return stat.st_ino, stat.st_mtime_ns, stat.st_size

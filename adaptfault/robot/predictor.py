@@ -20,6 +20,7 @@ from adaptfault.models.inference import Inference
 from adaptfault.robot.bundle import PROCESS
 from adaptfault.robot.checksummed_json import Damaged, decoding
 from adaptfault.robot.converter_range import within_range
+from adaptfault.robot.pointer import file_stamp
 from diagnostics import Fault, FaultSet, Monitor, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
@@ -89,12 +90,13 @@ class Predictor:
         self._open, self._accumulate = open_bundle, accumulate
         bundle = open_bundle()
         self._pointer = bundle.pointer
-        self._stamp = _stamp(self._pointer)
+        self._stamp = file_stamp(self._pointer)
         self._running = _start_any(bundle)
         self._next_look = monotonic() + _POLL
         self._loading: threading.Thread | None = None
         self._ready: _Running | None = None
         self._failed: int | None = None  # number of the version that could not be loaded
+        self._told: set[str] = set()  # problems that were logged
         self._monitor = Monitor(_reference(bundle))
         self.layout = bundle.layout
         self.class_names = tuple(bundle.class_names)
@@ -215,12 +217,12 @@ class Predictor:
             cannot be written (logged).
         """
         bundle = self._running.bundle
-        if bundle.active().number != self.version:
-            return False
         try:
+            if bundle.active().number != self.version:
+                return False
             bundle.confirm()
-        except OSError as error:
-            _log.warning("version %d stays on probation: %s", self.version, error)
+        except (OSError, Damaged) as error:
+            self._tell(f"version {self.version} stays on probation: {error}")
             return False
         return True
 
@@ -249,14 +251,17 @@ class Predictor:
         if now < self._next_look:
             return
         self._next_look = now + _POLL
-        stamp = _stamp(self._pointer)
+        stamp = file_stamp(self._pointer)
         if stamp is not None and stamp != self._stamp:
             self._stamp = stamp
             self._loading = threading.Thread(target=self._load_new, name="adaptfault-load", daemon=True)
             self._loading.start()
 
     def _load_new(self) -> None:
-        """Load the active version if it differs from the running one; runs in a thread and never raises."""
+        """Load the active version if it differs from the running one; runs in a thread and never raises.
+
+        After an error of the system, as too many open files, it is tried again. A version that is damaged is not.
+        """
         number = None
         try:
             bundle = self._open()
@@ -267,11 +272,18 @@ class Predictor:
             if number != self.version:
                 self._ready = _start(bundle, version, self.layout)
         except Exception as error:  # a failed load must not stop the robot's loop
-            if number is None:  # may be temporary
+            if number is None or _passes(error):
                 self._stamp, self._next_look = None, monotonic() + _RETRY
-            self._failed = number
+            else:
+                self._failed = number
             what = "the bundle could not be read" if number is None else f"version {number} could not be loaded"
-            _log.warning("%s, version %d goes on: %s", what, self.version, error)
+            self._tell(f"{what}, version {self.version} goes on: {error}")
+
+    def _tell(self, text: str) -> None:
+        """Log a problem once, however often it comes again."""
+        if text not in self._told:
+            _log.warning("%s", text)
+        self._told.add(text)
 
 
 def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
@@ -300,31 +312,32 @@ def _finite(x: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def _start_any(bundle: Bundle) -> _Running:
-    """Start the active version; repeat on failure, until the bundle falls back to an earlier version."""
+    """Start the active version; repeat on failure, until the bundle falls back to an earlier version.
+
+    An attempt that fails by an error of the system, as too many open files, does not count against the version.
+    """
+    failures = 0
     for left in reversed(range(_STARTS)):
-        version = bundle.begin(f"{PROCESS}, {left} tries left")
+        version = bundle.begin(f"{PROCESS}, {failures} failures")
         try:
             return _start(bundle, version, bundle.layout)
-        except (OSError, ImportError, ValueError) as error:
+        except (OSError, MemoryError, ImportError, ValueError) as error:
             if not left:
                 raise
+            failures += not _passes(error)
             _log.warning("version %d could not be loaded: %s", version.number, error)
     raise AssertionError("unreachable")
 
 
+def _passes(error: Exception) -> bool:
+    """Return whether the same call may succeed later: the system had too little of something, the files are whole."""
+    return isinstance(error, OSError | MemoryError) and not isinstance(error, FileNotFoundError)
+
+
 def _reference(bundle: Bundle) -> SelfDiagnosis:
-    """Return the bundle's diagnoser; where it is damaged, one without a reference, so that prediction goes on."""
+    """Return the bundle's diagnoser; where it cannot be read, one without a reference, so that prediction goes on."""
     try:
         return bundle.diagnoser()
-    except Damaged as error:
+    except (OSError, Damaged) as error:
         _log.warning("monitoring without the healthy reference: %s", error)
         return SelfDiagnosis(bundle.layout)
-
-
-def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return values that change when a file is replaced; None while it does not exist."""
-    try:
-        stat = os.stat(path)
-    except OSError:
-        return None
-    return stat.st_ino, stat.st_mtime_ns, stat.st_size

@@ -20,6 +20,7 @@ from adaptfault.robot.checksummed_json import (
     hash_file,
     hash_files,
     read_checksummed,
+    reading,
     sync,
     sync_tree,
     write_checksummed,
@@ -118,7 +119,7 @@ class Version:
 
         Raises:
             FileNotFoundError: the folder holds no version.
-            Damaged: a file fails its checksum.
+            Damaged: a file fails its checksum, or cannot be read.
         """
         document = read_checksummed(folder / ABOUT, SCHEMA)
         with decoding(folder / ABOUT):
@@ -161,7 +162,9 @@ class Versions:
 
     def hash(self, number: int) -> str:
         """Return the hash of the description of a version, which holds the hash of each of its files."""
-        return hash_file(self.path(number) / ABOUT)
+        path = self.path(number) / ABOUT
+        with reading(path):
+            return hash_file(path)
 
     def path(self, number: int) -> Path:
         """Return the folder of a version."""

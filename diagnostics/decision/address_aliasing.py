@@ -59,7 +59,7 @@ def _on_pad(pairs: list[DuplicatePair], stream: StreamState) -> Iterator[tuple[F
         text = f"{line} and {kind} {other.index} are bridged: both always read the same"
         check = f"the solder and the flex cable between {kind}s {line.index} and {other.index}"
         also = (f"{line} reads {other}, or the other way round: an address fault of this one line",)
-        yield _fault(line, other.index, cells, pair.since, pair.coincidences, text, check, also, layout.rate), cells
+        yield _fault(line, other.index, cells, pair.since, [pair], text, check, also, layout.rate), cells
 
 
 def _stuck_bit(line: Line, pairs: list[DuplicatePair], onset: int, stream: StreamState) -> tuple[Fault, Cells]:
@@ -79,9 +79,8 @@ def _stuck_bit(line: Line, pairs: list[DuplicatePair], onset: int, stream: Strea
     clear = abs(ratio) >= SUSPICIOUS
     also = () if clear else (f"{line} is stuck at {1 - level}",)
     misread = cells if clear else np.union1d(cells, layout.misaddressed(line, 1 - level)[0])
-    coincidences = sum(pair.coincidences for pair in pairs)
     text, check = f"{line} is stuck at {level}: {reads}", f"the {name} multiplexer and its address wires"
-    return _fault(line, level, cells, onset, coincidences, text, check, also, layout.rate), misread
+    return _fault(line, level, cells, onset, pairs, text, check, also, layout.rate), misread
 
 
 def _fault(
@@ -89,13 +88,15 @@ def _fault(
     value: int,
     cells: Cells,
     onset: int,
-    coincidences: int,
+    pairs: list[DuplicatePair],
     text: str,
     check: str,
     alternatives: tuple[str, ...],
     rate: float,
 ) -> Fault:
     """Return the fault with its reason: ``text``, since when, how often the lines agreed, and what to ``check``."""
+    coincidences = sum(pair.coincidences for pair in pairs)
+    by_chance = -sum(pair.coincidences * np.log2(pair.chance) for pair in pairs)  # in bits
     since = "" if onset == 0 else f" from frame {onset} on ({onset / rate:.1f} s)"
     return Fault(
         FaultKind.ALIAS,
@@ -103,7 +104,7 @@ def _fault(
         line=line,
         value=value,
         onset=onset or None,
-        probability=1.0 - 0.5 ** min(coincidences, 30),
+        probability=1.0 - 0.5 ** float(min(by_chance, 30.0)),
         reason=f"{text}{since}; they agreed on {coincidences} moving loads; check {check}",
         evidence=coincidences,
         alternatives=alternatives,

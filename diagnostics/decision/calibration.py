@@ -6,10 +6,11 @@ Estimates, for each of three kinds of constant cells (never moved; came to rest;
 
 Raw ratios are overconfident, because events are few and correlated and models err at edges of objects. The reference is
 split; models of one part diagnose logs made of the other part, with known faults. Equals Platt scaling (Platt 1999),
-scikit-learn's ``CalibratedClassifierCV(method="sigmoid")``. q is 1; in a cold start it is 0 for cells of which no event
-tells anything: these keep their prior. The prevalence is not calibrated: it is estimated from each log by expectation
-maximisation (Saerens et al. 2002). The faulty set is the largest one whose expected false discovery rate meets the
-limit (:func:`faulty_at`). Faults unlike the injected ones are calibrated as well as these only by assumption.
+scikit-learn's ``CalibratedClassifierCV(method="sigmoid")``, with the default weights as prior means of b and d. q is 1;
+in a cold start it is 0 for cells of which no event tells anything: these keep their prior. The prevalence is not
+calibrated: it is estimated from each log by expectation maximisation (Saerens et al. 2002). The faulty set is the
+largest one whose expected false discovery rate meets the limit (:func:`faulty_at`). Faults unlike the injected ones are
+calibrated as well as these only by assumption.
 """
 
 from __future__ import annotations
@@ -164,9 +165,7 @@ class Calibrator:
             of, same_origin = kind == k, (kind > 0) == (k > 0)
             if min(dead[of].sum(), (~dead[of]).sum()) >= FEWEST:
                 base = float(logit(dead[same_origin].mean()))
-                fitted = _bounded_logistic(evidence[of], dead[of], base)
-                if fitted[1] > 0:
-                    found[k] = fitted
+                found[k] = _bounded_logistic(evidence[of], dead[of], base, found[k][1:])
         offset, slope, temporal_share = zip(*found, strict=True)
         baselines, gains = drift_counts(max(offset_reached), max(gain_reached))
         return cls(offset, slope, temporal_share, gains, baselines)
@@ -222,25 +221,31 @@ def _posterior(log_ratio: Floats, expected: float, cells: float) -> Floats:
     return probability
 
 
-def _bounded_logistic(evidence: Floats, dead: NDArray[np.bool_], base: float) -> tuple[float, float, float]:
+def _bounded_logistic(
+    evidence: Floats, dead: NDArray[np.bool_], base: float, expected: Sequence[float]
+) -> tuple[float, float, float]:
     """Return a, b and d of a logistic regression with a <= 0, b >= 0, 0 <= d <= 1.
 
     Without evidence the log ratio is never above 0, however few healthy cells a small reference has in this state.
+    Where one kind of evidence tells all cells apart, the other keeps about its expected weight.
 
     Args:
         evidence: ``[n, 2]``, spatial and temporal log ratio.
         dead: bool ``[n]``.
         base: log odds of a fault in these logs.
+        expected: b and d beforehand.
     """
     from scipy.optimize import minimize
 
     x = np.column_stack([np.ones(len(evidence)), evidence])
+    beforehand = np.array([0.0, *expected])
 
     def loss(weights: Floats) -> tuple[float, Floats]:
         odds = base + x @ weights
         residual = expit(odds) - dead
-        value = np.logaddexp(0, odds).sum() - odds[dead].sum() + 0.5 * (weights[1:] @ weights[1:]) / _PRIOR_VARIANCE
-        return float(value), x.T @ residual + np.array([0, *weights[1:]]) / _PRIOR_VARIANCE
+        differs = np.where([False, True, True], weights - beforehand, 0.0)
+        value = np.logaddexp(0, odds).sum() - odds[dead].sum() + 0.5 * (differs @ differs) / _PRIOR_VARIANCE
+        return float(value), x.T @ residual + differs / _PRIOR_VARIANCE
 
     bounds = [(None, 0.0), (0.0, None), (0.0, 1.0)]  # a jump alone proves no fault
     offset, slope, temporal = minimize(loss, [0.0, 1.0, 0.5], jac=True, bounds=bounds).x.tolist()

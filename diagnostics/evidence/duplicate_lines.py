@@ -1,9 +1,11 @@
 """Duplicate lines: pairs of rows or columns that read the same, as with a stuck address bit or a bridge.
 
 Detects, among the pairs that one address bit or one bridge can join, those that agree within a tolerance in every frame
-while informative cells (loaded, moving, not saturated) support the agreement: a *coincidence*. A pair counts when it
-has 3 coincidences more than any healthy pair, and when its difference d is white noise around zero, as of one cell read
-twice:
+while informative cells (loaded, moving, not saturated) support the agreement: a *coincidence*. With p the chance that
+two lines agree, n coincidences count n log2(1 / p), and at most n: models err. p is the share of the other pairs on the
+pad, rows and columns, that agreed where they could, in the same frames; what moves all cells alike is no evidence. A
+pair is found when it counts 3 more than any healthy pair, and when its difference d is white noise around zero, as of
+one cell read twice:
 
     sqrt(n) sum d_t d_{t-1} / sum d^2 <= 3
 
@@ -17,7 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 _EVERY = 4  # every fourth frame is compared: faults last longer
 _MOST_AT_ONCE = 3  # coincidences counted in one segment: neighbours under one object are correlated
 _SMOOTH = 3.0  # standard deviations of the lag-1 autocorrelation of a difference; 0 for noise
+_LEAST_CHANCE = 0.5  # of agreement: models err
 _STEP = 0.1  # of the tolerance: smaller differences are none
 
 Mask = NDArray[np.bool_]
@@ -46,6 +49,7 @@ class DuplicatePair:
         since: number of the first frame from which on they did not differ.
         seen_by: number of the frame of the first coincidence.
         coincidences: number of coincidences since.
+        chance: probability of one of them where the lines are not joined, at least 1/2.
     """
 
     pad: int
@@ -55,6 +59,26 @@ class DuplicatePair:
     since: int
     seen_by: int
     coincidences: int
+    chance: float
+
+
+class _Comparison(NamedTuple):
+    """What some frames say of pairs of lines.
+
+    Attributes:
+        ever: bool ``[pads, pairs]``, whether they differ in one of the frames.
+        since: int ``[pads, pairs]``, number of the frame after the last in which they do.
+        both: bool ``[pads, pairs, positions]``, where the cells of both lines are informative.
+    """
+
+    ever: Mask
+    since: NDArray[np.intp]
+    both: Mask
+
+    @property
+    def supported(self) -> Mask:
+        """Pairs with informative cells, bool ``[pads, pairs]``."""
+        return np.asarray(self.both.any(axis=2))
 
 
 @cache
@@ -75,6 +99,7 @@ class _Pairs:
         since, seen_by, coincidences: int ``[pads, pairs]``, see :class:`DuplicatePair`.
         sums: float ``[3, pads, pairs]``, over the informative cells and frames since: the square of the difference,
             its product with the one before, and 1.
+        others: int ``[2, pads, pairs]``, how many other pairs could agree when these did, and how many of them agreed.
     """
 
     first: NDArray[np.intp]
@@ -84,6 +109,7 @@ class _Pairs:
     seen_by: NDArray[np.intp]
     coincidences: NDArray[np.intp]
     sums: NDArray[np.float32]
+    others: NDArray[np.intp]
 
     @classmethod
     def begin(cls, present: Mask) -> _Pairs:
@@ -91,12 +117,13 @@ class _Pairs:
         first, second = np.array(pairs(present.shape[1]), dtype=np.intp).reshape(-1, 2).T
         there = present[:, first] & present[:, second]
         nothing = np.zeros(there.shape[:2], np.intp)
-        return cls(first, second, there, nothing, nothing, nothing, np.zeros((3, *nothing.shape), np.float32))
+        sums, others = np.zeros((3, *nothing.shape), np.float32), np.zeros((2, *nothing.shape), np.intp)
+        return cls(first, second, there, nothing, nothing, nothing, sums, others)
 
-    def extend(
+    def compare(
         self, lines: NDArray[np.float32], numbers: NDArray[np.intp], informative: Mask, tolerance: float
-    ) -> _Pairs:
-        """Return the pairs after readings ``[t, pads, lines, positions]`` of frames ``numbers``."""
+    ) -> _Comparison:
+        """Compare readings ``[t, pads, lines, positions]`` of frames ``numbers``."""
         # Missing readings and positions without a cell do not differ from anything.
         difference = np.take(lines, self.first, axis=2)
         difference -= np.take(lines, self.second, axis=2)
@@ -105,16 +132,39 @@ class _Pairs:
         differ = np.asarray(differ.any(axis=3))  # [t, pads, pairs]
         ever = np.asarray(differ.any(axis=0))
         last = len(differ) - 1 - differ[::-1].argmax(axis=0)
-        since = np.where(ever, numbers[last] + 1, self.since)
         both: Mask = np.take(informative, self.first, axis=1)  # [pads, pairs, positions]
         both &= np.take(informative, self.second, axis=1)
-        seen_by, coincidences, sums = self.seen_by, self.coincidences, self.sums
-        agree = both.any(axis=2) & ~ever
+        return _Comparison(ever, numbers[last] + 1, both)
+
+    def extend(
+        self,
+        lines: NDArray[np.float32],
+        number: int,
+        compared: _Comparison,
+        totals: NDArray[np.intp],
+        tolerance: float,
+    ) -> _Pairs:
+        """Return the pairs after readings ``[t, pads, lines, positions]``, the last of them in frame ``number``.
+
+        ``totals``, int ``[2, pads]``: pairs of the pad that could agree in these frames, and those that did.
+        """
+        ever, both = compared.ever, compared.both
+        since = np.where(ever, compared.since, self.since)
+        seen_by, coincidences, sums, others = self.seen_by, self.coincidences, self.sums, self.others
+        agree = compared.supported & ~ever
         if agree.any() or (ever & (coincidences > 0)).any():
             coincidences = np.where(ever, 0, coincidences + np.minimum(both.sum(axis=2), _MOST_AT_ONCE))
-            seen_by = np.where(agree & (self.coincidences == 0), numbers[-1], seen_by)
+            seen_by = np.where(agree & (self.coincidences == 0), number, seen_by)
             sums = np.where(ever, np.float32(0), sums) + self._summed(lines, both & ~ever[..., None], tolerance)
-        return _Pairs(self.first, self.second, self.there, since, seen_by, coincidences, sums)
+            others = np.where(ever, 0, others + agree * (totals[..., None] - 1))
+        return _Pairs(self.first, self.second, self.there, since, seen_by, coincidences, sums, others)
+
+    @property
+    def chance(self) -> NDArray[np.float64]:
+        """Probability that two lines agree which are not joined (Laplace), at least 1/2, ``[pads, pairs]``."""
+        could, did = self.others
+        chance: NDArray[np.float64] = np.maximum((did + 1) / (could + 2), _LEAST_CHANCE)
+        return chance
 
     def _summed(self, lines: NDArray[np.float32], both: Mask, tolerance: float) -> NDArray[np.float32]:
         """Return the sums over the informative cells (``both``) in more frames, ``[3, pads, pairs]``."""
@@ -127,9 +177,14 @@ class _Pairs:
             np.add.at(total, (pad, pair), values.sum(axis=0))
         return more
 
+    @property
+    def counted(self) -> NDArray[np.intp]:
+        """What the coincidences count, rounded down, int ``[pads, pairs]``; see the module."""
+        return np.asarray(self.coincidences * -np.log2(self.chance), dtype=np.intp)
+
     def matching(self, needed: int) -> list[tuple[int, int]]:
-        """Return (pad, pair) of the pairs with at least ``needed`` coincidences that differ by noise only."""
-        often = self.coincidences >= needed
+        """Return (pad, pair) of the pairs that count at least ``needed`` and differ by noise only."""
+        often = self.counted >= needed
         if not often.any():
             return []
         squares, products, count = self.sums
@@ -144,7 +199,7 @@ class DuplicateLines:
     Attributes:
         layout: the array.
         of: the pairs of rows and of columns.
-        most: largest number of coincidences of any pair that differed by noise only.
+        most: the most that any pair counted which differed by noise only.
     """
 
     layout: SensorLayout
@@ -175,21 +230,43 @@ class DuplicateLines:
         # With the last frame, in which informative cells are loaded.
         some = slice((len(frames) - 1) % _EVERY, None, _EVERY)
         grid, loaded = self.layout.grid(frames[some].astype(np.float32)), self.layout.grid(informative)
-        of: dict[LineKind, _Pairs] = {
-            "row": self.of["row"].extend(grid, numbers[some], loaded, tolerance),
-            "column": self.of["column"].extend(grid.swapaxes(2, 3), numbers[some], loaded.swapaxes(1, 2), tolerance),
+        lines: dict[LineKind, tuple[NDArray[np.float32], Mask]] = {
+            "row": (grid, loaded),
+            "column": (grid.swapaxes(2, 3), loaded.swapaxes(1, 2)),
         }
-        more = [int(each.coincidences[place]) for each in of.values() for place in each.matching(self.most + 1)]
+        compared = {
+            kind: self.of[kind].compare(readings, numbers[some], moving, tolerance)
+            for kind, (readings, moving) in lines.items()
+        }
+        totals = np.zeros((2, self.layout.pads), np.intp)
+        for each in compared.values():
+            supported = each.supported
+            totals += np.stack([supported.sum(axis=1), (supported & ~each.ever).sum(axis=1)])
+        of: dict[LineKind, _Pairs] = {
+            kind: self.of[kind].extend(readings, int(numbers[some][-1]), compared[kind], totals, tolerance)
+            for kind, (readings, _) in lines.items()
+        }
+        more = [int(each.counted[place]) for each in of.values() for place in each.matching(self.most + 1)]
         return DuplicateLines(self.layout, of, max([self.most, *more]))
 
     def duplicate_pairs(self, usual: int) -> list[DuplicatePair]:
-        """Return the pairs that differ by noise and have more coincidences than healthy ones (``usual``)."""
+        """Return the pairs that differ by noise and count more than healthy ones (``usual``)."""
         needed = usual + _MOST_AT_ONCE
         found = []
         for kind, each in self.of.items():
             for pad, i in each.matching(needed):
-                counts = (int(values[pad, i]) for values in (each.since, each.seen_by, each.coincidences))
-                found.append(DuplicatePair(pad, kind, int(each.first[i]), int(each.second[i]), *counts))
+                found.append(
+                    DuplicatePair(
+                        pad=pad,
+                        kind=kind,
+                        first=int(each.first[i]),
+                        second=int(each.second[i]),
+                        since=int(each.since[pad, i]),
+                        seen_by=int(each.seen_by[pad, i]),
+                        coincidences=int(each.coincidences[pad, i]),
+                        chance=float(each.chance[pad, i]),
+                    )
+                )
         return found
 
     def apart_since(self, pad: int, kind: LineKind, first: int, second: int) -> int:

@@ -303,7 +303,7 @@ def _measure(
     noise_level = _median(curvature) / scale.full_scale
     level = np.searchsorted(_LEVELS, root.sum(axis=0) / np.float32(len(root)), side="right") - 1
     # A load near full scale may reach it without a fault.
-    far = moderate & ((1 + ALIKE) * x < np.float32(top))
+    far = moderate & ((1 + ALIKE) * x < (top - scale.baseline).astype(np.float32))
     low, high = blinks(moderate, rests), blinks(far, full)
     return low, high, loaded.sum(axis=0, dtype=np.float64), noise_level, np.maximum(level, 0)
 

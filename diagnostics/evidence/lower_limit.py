@@ -52,16 +52,14 @@ class LowerLimit:
             return cls.unknown(len(low))
         if noise > tolerance:
             return cls(np.full(len(low), full_scale), -np.inf)
-        peak_values = peaks[:, present]
-        reading = np.full(
-            len(low), np.quantile(peak_values[np.isfinite(peak_values)], RARE, method="lower") - 2 * tolerance
-        )
+        highest = peaks[:, present]
+        reading = np.full(len(low), np.quantile(highest[np.isfinite(highest)], RARE, method="lower") - 2 * tolerance)
         # Where most cells rest at 0, a cell that always reads more is loaded.
-        if len(peaks) >= FEWEST and np.median(low[present]) > tolerance:
-            peak = peaks - low
-            unloaded = peak < LIGHT * full_scale
+        peak = peaks - low
+        unloaded = peak < LIGHT * full_scale
+        peak_values = peak[unloaded & present]
+        if len(peaks) >= FEWEST and np.median(low[present]) > tolerance and len(peak_values):
             often = np.count_nonzero(unloaded, axis=0) >= MAJORITY * len(peaks)
-            peak_values = peak[unloaded & present]
             rare = float(np.quantile(peak_values, RARE, method="lower"))
             margin = max((MARGIN - 1) * (float(np.median(peak_values)) - rare), tolerance)
             reading = np.where(often, np.maximum(reading, low + rare - margin), reading)

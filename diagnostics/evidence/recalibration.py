@@ -9,10 +9,11 @@ its root load y_e and the mean m_e that the healthy model expects from the other
 the means computed again, until they agree (Gauss-Seidel). Cells of one pad share a normal prior of log g, with mean and
 variance estimated from them (random-effects model, DerSimonian and Laird 1986), so that cells with few events take the
 gain of their pad. A pad was replaced where its cells differ from each other: either half of the recordings gives them
-the same gains or offsets, with a standard deviation over the cells (the root of the covariance of the halves) of half
-of log 1.3 or 1 % of full scale. Another task changes the loads of all cells alike; a strap gives
-neighbours alike offsets, those of a new pad are independent. The correction must also raise the
-pseudo-likelihood of recordings that it was not learned from, by more than four standard errors over these recordings.
+the same gains or offsets, with a standard deviation over the cells (the root of the comedian of the halves, which a few
+faulty cells do not raise; Falk 1997) of half of log 1.3 or 1 % of full scale. Another task changes the loads of all
+cells alike; a strap gives neighbours alike offsets, those of a new pad are independent. The correction must also raise
+the pseudo-likelihood of recordings that it was not learned from, by more than four standard errors over these
+recordings.
 
 Not detected: other noise, other thresholds, and gains of cells that no event loads: these take the mean of their pad.
 """
@@ -42,6 +43,7 @@ _FEWEST = 12  # recordings
 _ERRORS = 4.0  # standard errors of the gain in pseudo-likelihood
 _ROUNDS, _STEP = 4, 0.6  # of the correction; share of each correction that is applied: neighbours err together
 _LEAST_VARIANCE = 0.02  # of 2 log(y / m) in one event: events of a log are similar
+_MEDIAN_DEVIATION = 0.6745  # of a normal distribution, in standard deviations
 _WIDE = 1.5  # standardised errors beyond this count less (Huber 1964)
 
 Floats = NDArray[np.float64]
@@ -151,9 +153,14 @@ def _correlation(offset: Floats, on: Mask, layout: SensorLayout) -> tuple[float,
 
 
 def _common_spread(one: Floats, other: Floats, on: Mask) -> float:
-    """Return the standard deviation over some cells of what two estimates (``[D]``) have in common."""
-    covariance = np.mean((one[on] - one[on].mean()) * (other[on] - other[on].mean())) if on.any() else 0.0
-    return float(np.sqrt(max(covariance, 0.0)))
+    """Return the standard deviation over some cells of what two estimates (``[D]``) have in common.
+
+    The root of the comedian (Falk 1997), a median of products: a few faulty cells differ from the others in both.
+    """
+    if not on.any():
+        return 0.0
+    products = (one[on] - np.median(one[on])) * (other[on] - np.median(other[on]))
+    return float(np.sqrt(max(np.median(products), 0.0))) / _MEDIAN_DEVIATION
 
 
 def _certain(gained: Floats) -> bool:

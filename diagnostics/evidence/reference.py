@@ -16,6 +16,7 @@ from diagnostics.evidence.jumps import JumpHistogram
 from diagnostics.evidence.life import LifeModel
 from diagnostics.evidence.lower_limit import LowerLimit
 from diagnostics.evidence.noise_loss import NoiseLoss
+from diagnostics.evidence.pad_level import PadLimit
 from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.baseline import baseline
@@ -50,6 +51,7 @@ class Reference:
         model: the healthy model; None: the k-NN spatial model of the log (cold start).
         dead: float ``[D]``, P(dead) of the reference faults, 0 for all other cells.
         loaded_patience: the same of a frame with load; 0: as ``patience``.
+        beside: lower limit of the readings of healthy cells, relative to their pad; None: unknown.
         life: how cells depend on each other; None: unknown.
     """
 
@@ -65,6 +67,7 @@ class Reference:
     model: HealthyModel | None
     dead: NDArray[np.float64]
     loaded_patience: int = field(default=0, metadata={"newer": True})
+    beside: PadLimit | None = field(default=None, metadata={"newer": True})
     life: LifeModel | None = field(default=None, metadata={"newer": True})
 
     def repeats(self, layout: SensorLayout) -> Patience:
@@ -118,6 +121,7 @@ class Reference:
             model,
             dead,
             patience.loaded,
+            PadLimit.fit(recordings, readings, layout, tolerance),
         )
 
     def with_life(self, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> Reference:
@@ -169,13 +173,12 @@ def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout
 
 
 def _usual_duplicates(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale) -> int:
-    """Return how many coincidences two healthy lines may have: the largest count seen, plus log2(250 / recordings).
-
-    They add up over the recordings, as in a log.
-    """
-    duplicates = DuplicateLines.begin(layout)
+    """Return how many coincidences two healthy lines may have: the largest count seen, plus log2(250 / recordings)."""
+    most = 0
     for recording in recordings:
+        duplicates = DuplicateLines.begin(layout)
         for frames, numbers, runs in segments(recording, scale):
             moving = informative(frames, runs.start <= numbers[0], scale)
             duplicates = duplicates.extend(frames, numbers, moving, scale.near)
-    return duplicates.most + max(0, int(np.ceil(np.log2(_MANY / len(recordings)))))
+        most = max(most, duplicates.most)
+    return most + max(0, int(np.ceil(np.log2(_MANY / len(recordings)))))

@@ -1,24 +1,33 @@
 """Swapped, mirrored or shifted wiring: rows, columns or pads that answer in each other's place after a repair.
 
-Every cell works, so no cell is faulty; the readings arrive at the wrong index. A permutation of the wiring is scored by
-the pseudo-likelihood (Besag 1975) of the contact events under the healthy model, with the readings put back,
+The cells work, but their readings arrive at the wrong index. A permutation P of the wiring is scored by the
+pseudo-likelihood (Besag 1975) of the contact events under the healthy model, with the readings put back. A channel j,
+the readings at one index, may also be faulty:
 
-    l_e(P) = sum_i log P(what cell i did in event e | other cells),    never, sometimes or always loaded, and its load
+    l(P) = sum_j max[ sum_e w_e log P(what j did in event e | channels that are not faulty),
+                      sum_e w_e log P(what j did in event e | what j did in the other events) - 12 ]
+
+what it did: never, sometimes or always loaded, and its load. A faulty channel (the second term is larger) says the same
+of each permutation, and it is no predictor. Which channels are faulty is found for each permutation, since those of
+exchanged lines contradict their neighbours until they are put back. It is found step by step, and the present order is
+scored again with those of its best rival.
 
 Candidates are exchanges of two rows or two columns of a pad, a pad mirrored along either axis, its rows or columns
 shifted by one, and exchanged pads. The best is taken, and the search goes on from there, so that combinations are
-found. A permutation is reported if the gain sum_e w_e (l_e(P) - l_e(identity)) exceeds 24, is positive without the two
-events that favour it most, exceeds that of any other candidate by 12, and explains half of what a random order leaves
-unexplained; w_e = 1 / (1 + k) discounts an event that repeats k earlier ones of the 32 strongest. Where the array is
-loaded symmetrically two wirings read alike, and nothing is reported. Lines that no event loads differently are not
-distinguished. Where loads are spread widely, as by thick gloves, exchanged lines may be named by mistake: the whole
-sensor has then changed as well.
+found. A permutation is reported if the gain l(P) - l(identity) exceeds 24, is positive without the two events that
+favour it most, exceeds by 12 that of any other candidate that moves some of the same cells, is as large for the working
+channels alone, and explains half of what a random order leaves unexplained; w_e = 1 / (1 + k) discounts an event that
+repeats k earlier ones of the 32 strongest.
+Where the array is loaded symmetrically two wirings read alike, and nothing is reported. Lines that no event loads
+differently are not distinguished. Where loads are spread widely, as by thick gloves, exchanged lines may be named by
+mistake: the whole sensor has then changed as well.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,13 +36,14 @@ from numpy.typing import NDArray
 
 from diagnostics.events.contact_events import THE_SAME, Summary, count_repeats
 from diagnostics.healthy.model import contact_events
-from diagnostics.healthy.prediction import MIN_P_FLOOR
+from diagnostics.healthy.prediction import MIN_P_FLOOR, OUTLIERS, log_student_t
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
 from diagnostics.preprocessing.readings import held
 
 if TYPE_CHECKING:
     from diagnostics.evidence.reference import Reference
     from diagnostics.healthy.model import HealthyModel
+    from diagnostics.healthy.prediction import Prediction
     from diagnostics.layout import SensorLayout
     from diagnostics.preprocessing.scale import Scale
 
@@ -44,7 +54,11 @@ _LINES, _FEW_LINES = 16, 4  # of one kind on a pad, the least expected, whose ex
 _WORK = 6400  # lines times cells, about: a size
 _LIMIT = 2 * CERTAIN_RATIO  # log likelihood gained, all events together
 _WITHOUT = 2  # events without which there must be a gain too: one odd contact proves nothing
-_MOST_STEPS = 4  # permutations that are combined
+_MOST_STEPS = 6  # in which permutations are combined, or the faulty channels found anew: a size
+_FAULTY = CERTAIN_RATIO  # log ratio from which on a channel is faulty: of what only a fault explains
+_T4_AT_0 = 0.375  # density of Student's t with 4 degrees of freedom at 0
+_LEAST_SPREAD = 0.01  # of a root load: half a converter step of the coarsest
+_ROUNDS = 4  # in which the faulty channels of a permutation are found, at most: a size
 
 Floats = NDArray[np.float64]
 Cells = NDArray[np.intp]
@@ -102,26 +116,45 @@ def find_rewiring(
     # Constant cells may be broken, those that are never at rest loaded by a strap: neither scored nor predictors.
     moved = np.ptp(np.concatenate(events), axis=0) > reference.scale.near
     rested = np.any([((reference.scale.root_load(r) == 0) & ~np.isnan(r)).any(axis=0) for r in recordings], axis=0)
-    test = _Test(events, weight, reference.model, reference.scale, layout.present.ravel(), moved & rested)
-    source, total = np.arange(layout.n_cells), 0.0
+    used = moved & rested
+    test = _Test(events, weight, reference.model, reference.scale, layout.present.ravel(), used)
+    source = np.arange(layout.n_cells)
+    total = 0.0
     steps: list[str] = []
-    now = test.score(source)
+    now = test.settled(source, test.score(source, ~used))
     for _ in range(_MOST_STEPS):
         candidates = list(_candidates(layout, now.surplus, source))
-        scores = [test.score(candidate.source) for candidate in candidates]
-        gains = np.array([score.by_event - now.by_event for score in scores])
-        sums = gains.sum(axis=1)
-        best = int(sums.argmax())
-        rivals = np.delete(sums, best)
-        if not _certain(gains[best]) or (len(rivals) and sums[best] - rivals.max() < _LIMIT / 2):
+        if not candidates:  # one pad without rows and columns
             break
-        source, total = candidates[best].source, total + float(sums[best])
+        scores = [test.score(candidate.source, now.faulty & (candidate.source == source)) for candidate in candidates]
+        sums = np.array([score.by_event.sum() for score in scores])
+        best = int(sums.argmax())
+        found = test.settled(candidates[best].source, scores[best])
+        # The present order may be as good once the channels that are faulty in the other one are left out.
+        again = test.settled(source, test.score(source, found.faulty))
+        if again.by_event.sum() > now.by_event.sum():
+            now = again
+            continue
+        gain = found.by_event - now.by_event
+        # Where it was exchanged, two lines elsewhere may be exchanged as well.
+        moves = candidates[best].source != source
+        rivals = [sums[i] for i, of in enumerate(candidates) if i != best and (moves & (of.source != source)).any()]
+        if not _certain(gain) or sums[best] - max(rivals, default=-np.inf) < _LIMIT / 2:
+            break
+        # The channels that work say so by themselves: no permutation is due to the faulty ones.
+        working = test.of_working(candidates[best].source, found.faulty) - test.of_working(source, found.faulty)
+        if not _certain(working):
+            break
+        source = candidates[best].source
+        total += float(gain.sum())
         steps.append(candidates[best].text)
-        now = scores[best]
+        now = found
     if not steps:
         return None
-    at_random = test.score(np.random.default_rng(0).permutation(layout.n_cells))
-    if now.surplus.sum() < MAJORITY * at_random.surplus.sum():
+    anywhere = np.random.default_rng(0).permutation(layout.n_cells)
+    at_random = test.score(anywhere, now.faulty)
+    left = now.surplus[~now.faulty[source]].sum()
+    if left < MAJORITY * at_random.surplus[~now.faulty[anywhere]].sum():
         return None  # another sensor
     return Rewiring(source, tuple(steps), total, len(events))
 
@@ -132,10 +165,17 @@ def _certain(gain: Floats) -> bool:
 
 
 class _Score(NamedTuple):
-    """Log likelihood of each event, ``[n]``, and by how much that of each cell exceeds its expectation, ``[D]``."""
+    """The score of one permutation.
+
+    Attributes:
+        by_event: float ``[n]``, weighted log likelihood of each event.
+        surplus: float ``[D]``, by how much the log likelihood at each place exceeds its expectation.
+        faulty: bool ``[D]``, channels that their own readings explain better than those of the others do.
+    """
 
     by_event: Floats
     surplus: Floats
+    faulty: Mask
 
 
 @dataclass(frozen=True)
@@ -147,7 +187,7 @@ class _Test:
         weight: float ``[n]``, of each event.
         model, scale: of the reference.
         present: bool ``[D]``, where there is a cell.
-        moved: bool ``[D]``, indices whose readings move.
+        used: bool ``[D]``, channels that are scored: their readings move.
     """
 
     events: Sequence[Floats]
@@ -155,20 +195,99 @@ class _Test:
     model: HealthyModel
     scale: Scale
     present: Mask
-    moved: Mask
+    used: Mask
 
-    def score(self, source: Cells) -> _Score:
-        """Return the score of one permutation."""
+    @cached_property
+    def alone(self) -> Floats:
+        """Log likelihood of what each channel did, given its own other events alone, ``[n, D]``."""
+        return _log_likelihood_alone(self._features(np.arange(len(self.used))))
+
+    def _features(self, source: Cells) -> NDArray[np.float32]:
+        """Return the features of the events with the readings put back, ``[n, 4, D]``."""
         near = self.scale.root_near
         roots = (self.scale.root_load(frames[:, source]) for frames in self.events)
-        features = np.stack([Summary.of(root, 0, near).features() for root in roots])
-        expected = self.model.predict(features, self.moved[source] & self.present)
-        likely, states = expected.log_likelihood(features), expected.states
+        return np.stack([Summary.of(root, 0, near).features() for root in roots])
+
+    def settled(self, source: Cells, score: _Score) -> _Score:
+        """Return the score of one permutation once its faulty channels are no predictors; ``score``: the one before."""
+        for _ in range(_ROUNDS):
+            before = score.faulty
+            score = self.score(source, before)
+            if (score.faulty == before).all():
+                break
+        return score
+
+    def of_working(self, source: Cells, faulty: Mask) -> Floats:
+        """Return the weighted log likelihood of each event, ``[n]``, of channels that are not ``faulty`` (``[D]``).
+
+        That of :meth:`Prediction.log_likelihood`, which trusts the size of a load less.
+        """
+        features = self._features(source)
+        counted = (self.used & ~faulty)[source]
+        likely = self.model.predict(features, counted & self.present).log_likelihood(features)
+        likely = np.where(self.present, likely, np.where(features[:, 2] > 0, np.log(MIN_P_FLOOR), 0.0))
+        by_event: Floats = self.weight * np.where(counted, likely, 0.0).sum(axis=1)
+        return by_event
+
+    def score(self, source: Cells, faulty: Mask) -> _Score:
+        """Return the score of one permutation; ``faulty`` channels (bool ``[D]``) are no predictors."""
+        features = self._features(source)
+        used = self.used[source]
+        expected = self.model.predict(features, used & self.present & ~faulty[source])
+        states = expected.states
         usual = (states * np.log(states)).sum(axis=0)
+        surplus = np.where(used, self.weight @ (expected.log_likelihood(features) - usual), 0.0)
+        likely = _log_likelihood(features, expected)
         # The same readings count for each permutation; a load where no cell is, is as good as impossible.
         likely = np.where(self.present, likely, np.where(features[:, 2] > 0, np.log(MIN_P_FLOOR), 0.0))
-        likely, usual = (np.where(self.moved[source], of, 0.0) for of in (likely, usual * self.present))
-        return _Score(self.weight * likely.sum(axis=1), (self.weight[:, None] * (likely - usual)).sum(axis=0))
+        alone = self.alone[:, source]
+        refuted = used & (self.weight @ (alone - likely) > _FAULTY)
+        explained = np.where(used, np.where(refuted, alone, likely), 0.0)
+        now = np.zeros(len(source), bool)
+        now[source] = refuted
+        return _Score(self.weight * explained.sum(axis=1) - _FAULTY * refuted.sum() / len(explained), surplus, now)
+
+
+def _log_likelihood(features: NDArray[np.float32], expected: Prediction) -> Floats:
+    """Return the log likelihood of what each cell did, given the others, ``[n, D]``."""
+    state = np.take_along_axis(np.log(expected.states), _state(features)[None], axis=0)[0]
+    log_likely: Floats = state + _log_load(features, expected.mean, expected.spread)
+    return log_likely
+
+
+def _log_likelihood_alone(features: NDArray[np.float32]) -> Floats:
+    """Return the log likelihood of what each channel did, given what it did in the other events, ``[n, D]``.
+
+    Shares of the states by Laplace's rule of succession; loads with the mean and deviation of the others.
+    """
+    did = _state(features)
+    same = np.zeros(did.shape)
+    for state in range(3):
+        among = did == state
+        same += among * (among.sum(axis=0) - 1)
+    load = np.where(did > 0, features[:, 1], 0.0).astype(np.float64)
+    others = (did > 0).sum(axis=0) - (did > 0)
+    some = np.maximum(others, 1)
+    mean = (load.sum(axis=0) - load) / some
+    variance = ((load**2).sum(axis=0) - load**2) / some - mean**2
+    deviation = np.where(others > 1, np.sqrt(np.maximum(variance, 0.0) * (some + 1) / some), np.nan)
+    return np.log((same + 1) / (len(did) + 2)) + _log_load(features, mean, deviation)
+
+
+def _state(features: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Return 0: never, 1: always, 2: sometimes loaded, ``[n, D]``, of features ``[n, 4, D]``."""
+    return np.where(features[:, 2] == 0, 0, np.where(features[:, 3] == 1, 1, 2))
+
+
+def _log_load(features: NDArray[np.float32], mean: Floats, spread: Floats) -> Floats:
+    """Return the log density of the mean root load of the loaded cells, 0 for the others, ``[n, D]``.
+
+    Student's t with 4 degrees of freedom, contaminated by a uniform one; where ``spread`` is NaN, uniform alone.
+    """
+    width = np.maximum(np.nan_to_num(spread, nan=np.inf), _LEAST_SPREAD)
+    density = np.exp(log_student_t((features[:, 1] - mean) / width, 0.0)) * _T4_AT_0 / width
+    contaminated = np.where(np.isfinite(width), (1 - OUTLIERS) * density + OUTLIERS, 1.0)
+    return np.where(features[:, 2] > 0, np.log(contaminated), 0.0)
 
 
 def _events(recordings: Sequence[NDArray[np.float64]], scale: Scale) -> tuple[list[Floats], Floats]:

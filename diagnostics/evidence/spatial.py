@@ -6,7 +6,7 @@ event e after s adds to the log likelihood ratio of stuck against healthy
     sum_e  w_e * -log P(cell reads v throughout e | healthy, readings of the other cells)  +  log P(v | stuck)
 
 The prior of v counts once: broken cells mostly stick to a rail, a healthy cell under a constant load reads any value.
-Without an event the ratio is 1, whatever v is.
+Without an event the ratio of a load is 1; that of a rest is its prior, as any healthy cell may be at rest.
 The ratio equals a sequence of conditional tests as in pseudo-likelihood estimation (Besag 1975). It does not detect
 cells that no event loads and that no event leaves unloaded among loaded neighbours: they stay untested.
 
@@ -90,7 +90,7 @@ class Spatial:
         """Return the result without any event since earlier events were accumulated."""
         scored, d = cells.scored, len(cells.scored)
         accumulated, nothing, none = np.where(scored, cells.accumulated, 0.0), np.zeros(d), np.zeros(d, np.intp)
-        evidence, unknown = _with_prior(accumulated, cells.values.prior), np.full(d, np.nan)
+        evidence, unknown = _with_prior(accumulated, cells), np.full(d, np.nan)
         return cls(evidence, accumulated, accumulated, scored, none, nothing, nothing, unknown, none)
 
 
@@ -141,7 +141,7 @@ class SpatialTest:
         test, before = self._test, self._predictors & self._test.eligible
         expected, surprisal = test.score(before)
         self._summed.append(test.summed(surprisal))
-        evidence = _with_prior(self._summed[-1], self._cells.values.prior)
+        evidence = _with_prior(self._summed[-1], self._cells)
         self._predictors = test.eligible & (evidence + self._cells.temporal < self._exclusion.threshold)
         self._rounds += 1
         if self._rounds == _MOST_ROUNDS or (self._predictors == before).all():
@@ -158,7 +158,7 @@ class SpatialTest:
             return
         of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
         self.result = Spatial(
-            _with_prior(self._summed[-1], self._cells.values.prior),
+            _with_prior(self._summed[-1], self._cells),
             self._summed[-1],
             self._summed[0],
             self._cells.scored,
@@ -190,9 +190,10 @@ def _drift(
     return offset, gain_evidence(whole, on_whole, moved, test.cells.scale.root_near, exclusion.gains * novelty)
 
 
-def _with_prior(surprisal: Floats, prior: Floats) -> Floats:
-    """Return the evidence ``[D]``: where no event was surprising, the value tells nothing either."""
-    return np.where(surprisal > 0, prior + surprisal, 0.0)
+def _with_prior(surprisal: Floats, cells: CellState) -> Floats:
+    """Return the evidence ``[D]``: a load that no event tests tells nothing, while any healthy cell may be at rest."""
+    tells = cells.scored & (cells.values.rests | (surprisal > 0))
+    return np.where(tells, cells.values.prior + surprisal, 0.0)
 
 
 def held_load_evidence(cells: CellState, outlasted: NDArray[np.intp], model: Model) -> Floats:

@@ -30,6 +30,7 @@ from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.evidence.jumps import SUDDEN_JUMP
 from diagnostics.evidence.life import LifeTest
 from diagnostics.evidence.life_record import LifeRecord
+from diagnostics.evidence.pad_level import PadLevel
 from diagnostics.evidence.rest_level import RestLevel
 from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, held_load_evidence
 from diagnostics.evidence.term import ConstantCells, Term
@@ -112,6 +113,7 @@ class StreamState:
         self._rest, self._response = RestOfLog(), WeakResponse.begin(layout.n_cells)
         self._level = RestLevel.begin(layout.n_cells)
         self.life = LifeRecord()
+        self._of_pad = PadLevel.begin(layout.n_cells)
         self._absent = not self.present.all()  # whether some position has no cell
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
@@ -201,6 +203,8 @@ class StreamState:
             return self._level.evidence(cells)
         terms: tuple[Term, ...] = reference.jumps_seen, reference.least, reference.noise_loss
         jump, low, noise = (term.evidence(cells) for term in terms)
+        if reference.beside is not None:
+            low = np.maximum(low, reference.beside.evidence(cells, reference.scale.baseline, self._of_pad.level))
         return jump + np.where(np.abs(noise) > np.abs(low), noise, low)
 
     def without_noise(self) -> Mask:
@@ -387,6 +391,9 @@ class StreamState:
         runs = self.runs
         # Evidence belongs to a constant run, and ends with it.
         self.accumulated = np.where(runs.start == start, self.accumulated, 0.0)
+        if self.reference.beside is not None:
+            baseline = self.reference.scale.baseline
+            self._of_pad = self._of_pad.extend(frames, runs, int(numbers[0]), baseline, self.layout)
         steady = self._offsets.off(known)
         root, still, clear = scale.root_load(steady), runs.start <= numbers[0], plain
         if self.reference.model is None:

@@ -2,7 +2,8 @@
 
 A term returns log P(constant run | faulty) - log P(constant run | healthy) of each cell, 0 where it does not tell.
 Terms with a reference: :mod:`~diagnostics.evidence.jumps`, :mod:`~diagnostics.evidence.lower_limit`,
-:mod:`~diagnostics.evidence.noise_loss`; without one: :mod:`~diagnostics.evidence.rest_level`.
+:mod:`~diagnostics.evidence.noise_loss`, :mod:`~diagnostics.evidence.pad_level`; without one:
+:mod:`~diagnostics.evidence.rest_level`.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ class ReferenceOffset:
         """Fit to fault-free recordings, ``[T, D]`` each."""
         cells = spread(np.flatnonzero(present))
         above = RecordingBlocks.of(recordings).thinned(cells) - scale.baseline[cells]
-        common = [_least_loaded(frame) for frame in above]
+        common = [least_loaded(frame) for frame in above]
         mostly = min(0.0, float(np.median(common)))
         return cls(mostly, max(mostly + scale.near / 2, float(np.quantile(common, 1 - LOW))))
 
@@ -91,7 +91,7 @@ class OffsetTracker:
         calm = present & (np.fmax.reduce(frames) - scale.baseline - own <= usual.most)
         if np.count_nonzero(calm) > LEAST_LOADED * np.count_nonzero(present):
             return OffsetTracker(lowest, own, np.zeros(len(frames)))
-        common = usual.excess([_least_loaded(frame) for frame in (frames - scale.baseline - own)[:, present]])
+        common = usual.excess([least_loaded(frame) for frame in (frames - scale.baseline - own)[:, present]])
         last = self.common[-1]
         for t in np.flatnonzero(common >= LIGHT * scale.full_scale):  # nearly all cells are loaded: keep the last one
             common[t] = common[t - 1] if t else last
@@ -112,14 +112,14 @@ def _own_offsets(lowest: Floats, scale: Scale, present: NDArray[np.bool_], usual
     """Return the offset of each cell in addition to the common one, ``[D]``, of its ``lowest`` reading."""
     if not (lowest > scale.near / 2).any():
         return np.zeros(len(lowest))
-    shared = usual.excess(_least_loaded(lowest[present]))
+    shared = usual.excess(least_loaded(lowest[present]))
     beyond = lowest - np.where(shared < LIGHT * scale.full_scale, shared, 0.0)
     usual_own = usual_limit(beyond[present & np.isfinite(beyond)]) / scale.full_scale
     limit = min(max(usual_own, SLIGHT), LIGHT) * scale.full_scale
     return np.where((beyond > scale.near / 2) & (beyond < limit), beyond, 0.0)
 
 
-def _least_loaded(above: Floats) -> float:
+def least_loaded(above: Floats) -> float:
     """Return the 0.25 quantile of the readings above baseline, ``[n]``; 0 without any reading."""
     received = above[np.isfinite(above)]
     k = int(LEAST_LOADED * (len(received) - 1))

@@ -15,6 +15,7 @@ from adaptfault.data.recordings.bag_salvage import Salvage
 from adaptfault.data.recordings.content import Content, Shape
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.labels import natural_key
+from adaptfault.data.recordings.message_arrays import join
 
 STORAGES = (".mcap", ".db3")
 
@@ -148,10 +149,10 @@ def _salvaged(
 
 
 def _taker(extractor: Extractor) -> Callable[[int, bytes], Message]:
-    counts = extractor.counts
-
     def take(time: int, data: Any) -> Message:
         message = extractor.deserialize(data)
-        return Message(int(time), extractor(message), counts, extractor.shape(message))
+        arrays = extractor.arrays_of(message)
+        counts = all(array.dtype.kind in "iu" for array in arrays)
+        return Message(int(time), join(arrays, np.float32), counts, extractor.shape(message))
 
     return take

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.content import Shape
 from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.message_arrays import arrays_at
 
 _TACTILE = re.compile(r"std_msgs/.*MultiArray|.*tactile.*", re.IGNORECASE)
 _FLOATS = ("float32", "float64")
@@ -77,26 +78,15 @@ class Extractor:
     topic: Topic
     field: str
 
-    @property
-    def counts(self) -> bool:
-        """Whether the readings are whole numbers by their type."""
-        return self.topic.arrays[self.field] not in _FLOATS
-
     @cached_property
     def deserialize(self) -> Callable[[bytes], Any]:
         """Turn a message's bytes into an object."""
         store, msgtype = self.topic.store, self.topic.msgtype
         return lambda data: store.deserialize_cdr(data, msgtype)
 
-    def __call__(self, message: Any) -> NDArray[np.float32]:
-        """Return the readings of one message, ``[D]``."""
-        values = [message]
-        for name in self.field.split("."):
-            values = [getattr(value, name) for value in values]
-            values = [one for value in values for one in (value if isinstance(value, list) else [value])]
-        with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is missing
-            parts = [np.asarray(value, dtype=np.float32).ravel() for value in values]
-        return np.concatenate(parts) if parts else np.empty(0, np.float32)
+    def arrays_of(self, message: Any) -> list[NDArray[Any]]:
+        """Return the arrays of one message; their numbers, one after another, are its readings."""
+        return arrays_at(message, self.field)
 
     def shape(self, message: Any) -> Shape | None:
         """Return ``(pads, rows, cols)`` where a MultiArray states three dimensions."""

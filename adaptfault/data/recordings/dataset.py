@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.printable import printable
 from diagnostics import SensorLayout
 
 
@@ -20,7 +21,7 @@ class Recordings:
         layout: the array they come from.
         labels: int ``[n]``, the class of each recording (an index into ``class_names``); None where there are none.
         class_names: one name a class.
-        names: where each recording came from ("normal/0001.csv"), for messages.
+        names: where each recording came from ("normal/0001.csv"), for messages; what cannot be printed is escaped.
 
     Raises:
         ValueError: a recording that does not fit the layout; labels, class names or names of another number.
@@ -33,7 +34,7 @@ class Recordings:
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        names = tuple(self.names) or tuple(f"recording {i}" for i in range(len(self.frames)))
+        names = tuple(map(printable, self.names)) or tuple(f"recording {i}" for i in range(len(self.frames)))
         frames = tuple(
             self.layout.check_recording(f, name).astype(np.float32) for f, name in zip(self.frames, names, strict=True)
         )
@@ -44,7 +45,8 @@ class Recordings:
         labels = np.asarray(self.labels, dtype=np.int64)
         if labels.shape != (len(frames),):
             raise ValueError(f"{len(frames)} recordings need as many labels, got an array of shape {labels.shape}")
-        class_names = tuple(self.class_names) or tuple(str(i) for i in range(int(labels.max(initial=-1)) + 1))
+        numbers = range(int(labels.max(initial=-1)) + 1)
+        class_names = tuple(map(printable, self.class_names)) or tuple(map(str, numbers))
         if labels.size and (labels.min() < 0 or labels.max() >= len(class_names)):
             raise ValueError(
                 f"labels run from {labels.min()} to {labels.max()}, but there are {len(class_names)} class names"

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Literal
 
+from adaptfault.data.printable import printable
+
 
 class InputError(ValueError):
     """A file or an option of the user is unusable. One line: ``<file>[, where]: what came; the remedy``."""
@@ -30,5 +32,4 @@ class Problem:
 def located(path: str | PathLike[str], what: str, where: str = "") -> str:
     """Return ``<file>[, where]: what`` as one printable line, whatever characters the file's name holds."""
     line = f"{path}, {where}: {what}" if where else f"{path}: {what}"
-    line = line.replace("\n", "\\n").replace("\r", "\\r")
-    return line.encode("utf-8", "backslashreplace").decode("utf-8")  # names that are not UTF-8 could not be printed
+    return printable(line).replace("\n", "\\n")

@@ -1,1 +1,1 @@
-"""ROS 2 node that publishes the diagnosis of a tactile array."""
+"""The ROS 2 package of the node in ``adaptfault.ros2``."""

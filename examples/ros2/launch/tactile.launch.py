@@ -8,6 +8,8 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 PARAMETERS = {
     "topic": ("/tactile", str),
+    "topic_type": ("std_msgs/msg/Float32MultiArray", str),
+    "field": ("", str),
     "bundle": ("", str),
     "trust": ("", str),
     "restored": ("/tactile/restored", str),
@@ -15,6 +17,9 @@ PARAMETERS = {
     "full_scale": ("0.0", float),
     "unit": ("", str),
     "rate": ("0.0", float),
+    "name": ("tactile", str),
+    "hardware_id": ("tactile", str),
+    "autostart": ("true", bool),
 }
 
 

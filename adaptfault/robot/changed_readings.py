@@ -1,0 +1,117 @@
+"""Changed readings: exchanged wires and replaced pads of a log, and the log with both undone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics import Diagnosis, FaultKind, SelfDiagnosis
+from diagnostics.evidence.recalibration import Recalibration, find_recalibration, recalibrated
+from diagnostics.evidence.rewiring import Rewiring
+
+if TYPE_CHECKING:
+    from adaptfault.robot.versions import Version
+
+Frames = list[NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class ChangedReadings:
+    """What changed between cells and readings; at most one of the two.
+
+    Attributes:
+        rewiring: exchanged wires; None: none.
+        recalibration: replaced pads; None: none.
+        frames: recordings ``[T, D]`` with the change undone.
+        diagnosis: of these.
+        as_found: diagnosis of the recordings as they came; None where wires were exchanged.
+    """
+
+    rewiring: Rewiring | None
+    recalibration: Recalibration | None
+    frames: Frames
+    diagnosis: Diagnosis
+    as_found: Diagnosis | None
+
+    @property
+    def reason(self) -> str:
+        """One sentence; empty: nothing changed."""
+        found = self.rewiring or self.recalibration
+        return "" if found is None else found.reason
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """What a report says of it."""
+        return {
+            "rewiring": () if self.rewiring is None else self.rewiring.steps,
+            "replaced_pads": () if self.recalibration is None else self.recalibration.pads,
+        }
+
+    def readings(self, version: Version) -> dict[str, list[Any]]:
+        """Return how a version undoes the change, on top of what ``version`` undoes; see ``Version.readings``."""
+        if self.rewiring is not None:
+            order = self.rewiring.source.tolist()
+            return {name: [values[i] for i in order] for name, values in version.readings.items()}
+        if self.recalibration is None:
+            return version.readings
+        gain = version.gain * self.recalibration.gain
+        offset = version.offset + version.gain * self.recalibration.offset
+        return {**version.readings, "gain": gain.tolist(), "offset": offset.tolist()}
+
+    def changed(self, x: NDArray[np.float32], full_scale: float) -> NDArray[np.float32]:
+        """Return scaled windows ``[N, T, D]`` of the unchanged sensor as the changed one reads them."""
+        if self.rewiring is not None:
+            return x[..., np.argsort(self.rewiring.source)]
+        if self.recalibration is None:
+            return x
+        gain, offset = self.recalibration.gain, self.recalibration.offset / full_scale
+        return np.clip(gain * x + offset, 0.0, 1.0).astype(np.float32)
+
+    def undone(self, x: NDArray[np.float32], full_scale: float) -> NDArray[np.float32]:
+        """Return scaled windows ``[N, T, D]`` of the changed sensor with the change undone."""
+        if self.rewiring is not None:
+            return self.rewiring.undo(x)
+        if self.recalibration is None:
+            return x
+        return recalibrated(x, self.recalibration.gain, self.recalibration.offset / full_scale, 1.0)
+
+
+def find_changed_readings(
+    diagnoser: SelfDiagnosis, frames: Frames, healthy: Callable[[], Sequence[NDArray[Any]]]
+) -> ChangedReadings:
+    """Return what changed between cells and readings, and the diagnosis with it undone.
+
+    Args:
+        diagnoser: fitted, or not: then nothing is found.
+        frames: recordings ``[T, D]``, as the running version undoes them.
+        healthy: returns those of the reference; called where pads are compared with them.
+    """
+    rewiring = diagnoser.rewiring(frames)
+    if rewiring is not None:
+        put_back = [rewiring.undo(recording) for recording in frames]
+        return ChangedReadings(rewiring, None, put_back, diagnoser.diagnose(put_back), None)
+    diagnosis = diagnoser.diagnose(frames)
+    recalibration = _recalibration(diagnoser, frames, healthy, diagnosis)
+    if recalibration is None:
+        return ChangedReadings(None, None, frames, diagnosis, diagnosis)
+    undone = [recalibration.undo(recording, diagnoser.layout.full_scale) for recording in frames]
+    return ChangedReadings(None, recalibration, undone, diagnoser.diagnose(undone), diagnosis)
+
+
+def _recalibration(
+    diagnoser: SelfDiagnosis, frames: Frames, healthy: Callable[[], Sequence[NDArray[Any]]], diagnosis: Diagnosis
+) -> Recalibration | None:
+    """Return how replaced pads read; None where none is replaced."""
+    if diagnoser.load_ is not None or diagnoser.reference_ is None:
+        return None
+    # Cells of a new pad have other gains and offsets, as those that drift; other faulty cells tell nothing of a pad.
+    faulty = np.zeros(diagnoser.layout.n_cells, bool)
+    for fault in diagnosis.faults:
+        if fault.kind is not FaultKind.DRIFT:
+            faulty[list(fault.cells)] = True
+    held = diagnosis.statically_loaded.mask
+    return find_recalibration(frames, healthy(), diagnoser.reference_, diagnoser.layout, faulty, held)

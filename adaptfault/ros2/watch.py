@@ -1,0 +1,184 @@
+"""The work of the node: restores frames, monitors them, and states their diagnosis. Needs no ROS."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.acquisition import FrameRepair
+from adaptfault.acquisition.ros import Level, diagnostic_array, stale_array
+from adaptfault.robot.converter_range import within_range
+from adaptfault.ros2.sensor import Sensor
+from diagnostics import Diagnosis, Fault, FaultSet, Monitor
+
+GRACE = 5.0  # seconds after the start in which no frame is a WARN, and STALE afterwards
+SILENCE = 2.0  # seconds without a frame, after which everything is STALE; at least so many periods:
+_PERIODS = 5
+WAITING = 1000  # most frames that wait to be monitored; fewer of large arrays:
+_BYTES = 16_000_000
+DIAGNOSED = 10.0  # seconds between two diagnoses of all cells; the last one is published every second
+_RATED = 5.0  # seconds over which the rate is counted, at least so many frames:
+_FEWEST = 10
+
+
+class Watch:
+    """Takes frames in, and states the diagnosis to publish.
+
+    Args:
+        sensor: as the bundle or the layout states it.
+        name, hardware_id: of :func:`~adaptfault.acquisition.ros.diagnostic_array`.
+        clock: seconds, never set back.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        *,
+        name: str = "tactile",
+        hardware_id: str = "tactile",
+        clock: Callable[[], float] = monotonic,
+    ) -> None:
+        self.name, self.hardware_id, self.clock = name, hardware_id, clock
+        self.sensor = sensor
+        self.layout = sensor.layout
+        self.faulty = np.zeros(self.layout.n_cells, bool)  # as the monitor finds
+        self.monitor = Monitor(sensor.diagnoser)
+        self._monitored = False  # whether the monitor has a frame
+        self.repair = self._repair()
+        self._most_waiting = min(WAITING, max(1, _BYTES // (8 * self.layout.n_cells)))
+        self._silence = max(SILENCE, _PERIODS / self.layout.rate)
+        self.begin()
+
+    def begin(self) -> None:
+        """Wait for the first frame from now on, as after a pause in which none was asked for."""
+        self.started = self.clock()
+        self.last: float | None = None  # frame of this sensor
+        self.refused = ""  # why the last frame was not taken, where none was taken after it
+        self.left_out = 0  # frames that were never monitored, because too many waited
+        self._waiting: deque[tuple[NDArray[np.float64], float | None]] = deque()
+        self._times: deque[float] = deque(maxlen=max(_FEWEST, round(_RATED * self.layout.rate)) + 1)
+        self._diagnosis: Diagnosis | None = None
+        self._diagnosed = -np.inf
+
+    def switch(self, sensor: Sensor) -> None:
+        """Go on with what a maintenance run wrote: known faults, and how readings reach their cells."""
+        before = self.sensor
+        self.sensor = sensor
+        if before.parts != sensor.parts or before.readings != sensor.readings:  # the frames so far read otherwise
+            self.faulty[:] = False
+            self.monitor = Monitor(sensor.diagnoser)
+            self._monitored = False
+            self._diagnosis = None
+        self.repair = self._repair()
+        self._tell_repair()
+
+    def restore(self, received: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return the whole frame in the unit in which it came; None where nothing restores it.
+
+        Args:
+            received: ``[D]``; a frame of another length is not restored.
+        """
+        if self.repair is None or received.size != self.layout.n_cells:
+            return None
+        readings = within_range(self._readings(received), self.layout)[0]
+        whole, _, _ = self.repair.in_place(received, readings, self.sensor.version, self.sensor.calibration)
+        return whole
+
+    def put(self, received: NDArray[np.float64], time: float | None = None) -> None:
+        """Take in one frame ``[D]``, to be monitored later: that takes longer than to restore it.
+
+        Args:
+            received: as it came.
+            time: of the frame, seconds; None: unknown.
+
+        Raises:
+            ValueError: another number of values than cells.
+        """
+        if received.size != self.layout.n_cells:
+            self.refused = f"frames of {received.size} values come, expected {self.layout.n_cells}"
+            raise ValueError(self.refused)
+        self.refused = ""
+        self.last = self.clock()
+        self._times.append(self.last)
+        self._waiting.append((received, time))
+        if len(self._waiting) > self._most_waiting:
+            self._waiting.popleft()
+            self.left_out += 1
+
+    @property
+    def waiting(self) -> bool:
+        """Whether frames wait to be monitored."""
+        return bool(self._waiting)
+
+    def work(self) -> tuple[Fault, ...]:
+        """Monitor the frame that waits longest, if one waits; return the faults that are new, changed or gone."""
+        if not self._waiting:
+            return ()
+        received, time = self._waiting.popleft()
+        readings = self._readings(received)
+        version = self.sensor.version
+        faults = self.monitor.update(readings if version is None else version.undo(readings), time)
+        self._monitored = True
+        if faults:
+            for fault in faults:
+                self.faulty[list(fault.cells)] = fault.probability != 0
+            self._tell_repair()
+            self._diagnosis = None
+        return faults
+
+    def diagnostics(self, stamp: float) -> dict[str, Any]:
+        """Return the content of the DiagnosticArray to publish now.
+
+        Before the first frame everything is WARN in a time of grace, then STALE. Later everything is STALE after 2 s
+        without a frame.
+
+        Args:
+            stamp: seconds since 1970.
+        """
+        now = self.clock()
+        about: dict[str, Any] = {"stamp": stamp, "name": self.name, "hardware_id": self.hardware_id}
+        if self.last is None:
+            waited = now - self.started
+            level = Level.WARN if waited < max(GRACE, self._silence) else Level.STALE
+            return stale_array(self.layout, self.refused or "no frame yet", level=level, **about)
+        if now - self.last > self._silence:
+            self._diagnosis = None
+            self._times.clear()
+            message = self.refused or f"no frame for {now - self.last:.0f} s"
+            return stale_array(self.layout, message, **about)
+        if not self._monitored and not self._waiting:  # after a switch
+            return stale_array(self.layout, "no frame yet", level=Level.WARN, **about)
+        if not self._monitored:
+            self.work()
+        if self._diagnosis is None or now - self._diagnosed > DIAGNOSED:
+            self._diagnosis = self.monitor.diagnosis()
+            self._diagnosed = now
+        return diagnostic_array(self._diagnosis, rate=self._rate(now), **about)
+
+    def _rate(self, now: float) -> float | None:
+        """Return the frames a second of late; None until enough of them came."""
+        times = self._times
+        if len(times) < _FEWEST or (len(times) < (times.maxlen or 0) and now - times[0] < _RATED):
+            return None
+        return (len(times) - 1) / max(times[-1] - times[0], 1e-9)
+
+    def _readings(self, received: NDArray[np.float64]) -> NDArray[np.float64]:
+        calibration = self.sensor.calibration
+        return received if calibration is None else calibration.apply(received)[0].astype(np.float64)
+
+    def _repair(self) -> FrameRepair | None:
+        restorer = self.sensor.restorer
+        if restorer is None:
+            return None
+        restorer.deviation(self.sensor.known)  # before the first frame
+        return FrameRepair(restorer, self.sensor.known)
+
+    def _tell_repair(self) -> None:
+        if self.repair is not None:
+            cells = np.flatnonzero(self.faulty).tolist()
+            self.repair.found(FaultSet(tuple(cells), self.faulty.size))

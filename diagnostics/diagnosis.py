@@ -386,7 +386,7 @@ class SelfDiagnosis:
         intermittent, noisy = intermittency.intermittent & delivers, intermittency.excess & delivers
         drifting = delivers & ~intermittent & ~noisy & spatial.drifting
         certain = silent | intermittent | noisy | drifting
-        judged = delivers & runs.moved & ~certain
+        judged = delivers & runs.moved & ~certain & (reference.life is not None)
         # The factors of the evidence hold for this prior: many doubtful cells do not make each other faulty.
         refuted = np.where(judged, expit(life.evidence + logit(EXPECTED)), 0.0)
         by_life = judged & (refuted > stuck)

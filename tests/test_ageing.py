@@ -12,7 +12,7 @@ from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.robot.ageing import AgeingTable
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.checksummed_json import Damaged
-from adaptfault.robot.journal import Journal
+from adaptfault.robot.journal import Entry
 from adaptfault.robot.trend import trends
 from diagnostics import SensorLayout
 from diagnostics.evidence.ageing import cell_condition
@@ -166,22 +166,9 @@ def test_runs_of_a_robot_show_the_cell_that_weakens_and_when_it_will_be_too_weak
     assert main(["history", str(path), "--picture", "x.png"]) == 3
 
 
-def test_a_journal_of_an_earlier_version_has_no_conditions_and_takes_them(tmp_path, linear_bundle):
-    import sqlite3
-    from contextlib import closing
-
-    journal = Journal(tmp_path)
-    journal.add("2026-01-01T00:00:00+00:00", "unchanged", {"version": 1})
-    with closing(sqlite3.connect(journal.path)) as connection, connection:
-        connection.execute("DROP TABLE conditions")
-    assert journal.conditions() == []
-    run = journal.add("2026-01-02T00:00:00+00:00", "unchanged", {"version": 1}, condition=b"abc")
-    assert journal.conditions() == [(run, "2026-01-02T00:00:00+00:00", b"abc")]
-
-
 def test_a_row_of_a_wrong_size_is_damage(linear_bundle, tmp_path):
     shutil.copytree(linear_bundle, tmp_path / "robot.bundle")
     bundle = Bundle.open(tmp_path / "robot.bundle")
-    bundle.journal.add("2026-01-01T00:00:00+00:00", "unchanged", {"version": 1}, condition=b"abc")
+    bundle.journal.add(Entry("2026-01-01T00:00:00+00:00", "unchanged", {"version": 1}, condition=b"abc"))
     with pytest.raises(Damaged, match="wrong size"):
         AgeingTable.of(bundle)

@@ -324,7 +324,7 @@ def test_between_two_looks_the_disk_is_left_alone(carried, monkeypatch):
     monkeypatch.setattr(module, "_POLL", 1000.0)
     predictor = running(carried)
     looked = []
-    monkeypatch.setattr(module, "_stamp", looked.append)
+    monkeypatch.setattr(module, "file_stamp", looked.append)
     readings = [predictor.stream(frame) for frame in presses(59, 30)]
     assert readings[-1].label is not None
     assert looked == []

@@ -22,7 +22,7 @@ from adaptfault.robot.checksummed_json import (
     write_checksummed,
     write_with_copy,
 )
-from adaptfault.robot.journal import Journal
+from adaptfault.robot.journal import Entry, Journal
 from adaptfault.robot.pointer import Pointer
 from diagnostics import Fault, FaultKind, FaultSet, SensorLayout, inject, line_fault
 
@@ -321,7 +321,7 @@ def test_a_journal_returns_its_runs_in_order_and_the_recordings_that_they_saw(do
     with TemporaryDirectory() as folder:
         journal = Journal(Path(folder))
         for i, document in enumerate(documents):
-            journal.add(f"t{i}", "deployed", document, [(digest, "a.npz") for digest in digests])
+            journal.add(Entry(f"t{i}", "deployed", document, [(digest, "a.npz") for digest in digests]))
         added = [{**d, "id": i + 1, "time": f"t{i}", "what": "deployed"} for i, d in enumerate(documents)]
         assert Journal(Path(folder)).runs() == added
         assert journal.seen([*digests, "never seen"]) == (digests if documents else set())

@@ -10,6 +10,7 @@ import pytest
 from adaptfault.cli import main
 from adaptfault.fleet.survival import Lifetimes, Survival
 from adaptfault.robot.bundle import Bundle
+from adaptfault.robot.journal import Entry
 from diagnostics import Fault, FaultKind, Line, line_fault
 
 SHAPE, SCALE = 1.8, 3000.0
@@ -87,7 +88,7 @@ def test_the_command_line_reads_lifetimes_from_journals_and_names_whom_to_servic
         faults = {"a": [[], [row], [row, cell]], "b": [[], [], []], "new": []}[name]
         for month, known in enumerate(faults, 1):
             document = {"version": 1, "reason": "", "used": ["log"], "faults": [fault.to_dict() for fault in known]}
-            bundle.journal.add((created + timedelta(days=100 * month)).isoformat(), "unchanged", document)
+            bundle.journal.add(Entry((created + timedelta(days=100 * month)).isoformat(), "unchanged", document))
     (tmp_path / "f.toml").write_text(listed)
     arguments = ["fleet", "survival", str(tmp_path / "f.toml")]
     assert main([*arguments, "--json", "--picture", str(tmp_path / "s.png")]) == 0

@@ -14,6 +14,7 @@ import pytest
 from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.robot.bundle import Bundle
+from adaptfault.robot.journal import Entry
 from adaptfault.robot.maintenance import maintain
 from adaptfault.robot.parts import Parts
 from adaptfault.robot.technician_report import robot_name, write_report
@@ -89,7 +90,9 @@ class Links(HTMLParser):
 
 def test_the_page_needs_nothing_else_and_escapes_what_it_shows(repaired, capsys, tmp_path):
     bundle = repaired
-    bundle.journal.add("2026-01-01T00:00:00+00:00", "kept", {"version": 2, "reason": "<script>alert(1)</script>"})
+    bundle.journal.add(
+        Entry("2026-01-01T00:00:00+00:00", "kept", {"version": 2, "reason": "<script>alert(1)</script>"})
+    )
     code, out = told(capsys, "report", bundle.path, "--out", tmp_path / "sub" / "page.html")
     assert (code, out) == (0, f"report: {tmp_path / 'sub' / 'page.html'}\n")
     text = (tmp_path / "sub" / "page.html").read_text()
@@ -170,9 +173,9 @@ def test_the_page_of_a_dry_run_shows_what_the_run_found(bundle, log, capsys, tmp
 
 def test_a_model_that_repairs_to_more_than_the_healthy_accuracy_is_shown_as_weak(bundle, broken_row, tmp_path):
     measured = {"accuracy": 0.8, "fault_free_accuracy": 0.7, "exit_code": 1, "reason": "as good", "version": 1}
-    bundle.journal.add("2026-01-01T00:00:00+00:00", "kept", measured)
+    bundle.journal.add(Entry("2026-01-01T00:00:00+00:00", "kept", measured))
     assert "Weak base model" in write_report(tmp_path / "page.html", bundle).read_text()
-    bundle.journal.add("2026-01-02T00:00:00+00:00", "kept", {**measured, "accuracy": 0.69})
+    bundle.journal.add(Entry("2026-01-02T00:00:00+00:00", "kept", {**measured, "accuracy": 0.69}))
     assert "Weak base model" not in write_report(tmp_path / "page.html", bundle).read_text()
 
 

@@ -344,6 +344,20 @@ def test_exchanged_rows_are_told_and_the_log_is_diagnosed_with_them_put_back(
     assert "wiring changed: rows 1 and 4 of pad 0 are exchanged" in capsys.readouterr().out
 
 
+def test_a_replaced_pad_is_told_by_diagnose_as_by_maintain(bundle, later_grasps, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(SelfDiagnosis, "rewiring", lambda *given: None)  # on 30 cells, gains look like exchanged rows
+    rng, on = np.random.default_rng(0), SMALL.pad_of == 1
+    gain = np.where(on, np.exp(rng.uniform(np.log(0.5), np.log(2), SMALL.n_cells)), 1.0)
+    offset = np.where(on, rng.uniform(0, 0.008, SMALL.n_cells) * SMALL.full_scale, 0.0)
+    recordings = tuple(np.clip(gain * frames + offset, 0, SMALL.full_scale) for frames in later_grasps)
+    save_npz(tmp_path / "log.npz", Recordings(recordings, SMALL))
+    log = str(tmp_path / "log.npz")
+    main(["diagnose", log, "--reference", str(bundle.path), "--json", "--quiet"])
+    assert json.loads(capsys.readouterr().out)["replaced_pads"] == [1]
+    main(["maintain", str(bundle.path), log, "--quiet", "--dry-run"])
+    assert "pad 1 replaced" in capsys.readouterr().out
+
+
 def test_exchanged_rows_that_the_version_undoes_are_put_back_in_a_log_too_large_for_the_memory(
     bundle, later_grasps, broken_row, tmp_path, capsys, monkeypatch
 ):

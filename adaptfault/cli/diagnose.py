@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from adaptfault.data.recordings import Recordings
     from adaptfault.data.recordings.blocks import Stream
     from adaptfault.robot.bundle import Bundle
+    from adaptfault.robot.changed_readings import ChangedReadings
     from diagnostics import Diagnosis, SelfDiagnosis
-    from diagnostics.evidence.rewiring import Rewiring
     from diagnostics.evidence.sensor_change import SensorChange
 
 _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.json --html diagnosis.html
@@ -81,18 +81,25 @@ def run(args: argparse.Namespace) -> int:
         diagnoser = fit_diagnoser(args, healthy)
     running: Undo = np.asarray if bundle is None else bundle.active().undo
     reference = bundle if healthy is None else list(healthy)
-    rewiring = _rewiring(log, diagnoser, running)
-    undo: Undo = running if rewiring is None else lambda frames: rewiring.undo(running(frames))
-    diagnosis, change = _diagnosed(args, diagnoser, log, undo, reference)
+    changed = _changed_readings(log, diagnoser, running, reference)
+    change = None
+    if changed is None:
+        diagnosis = _diagnosed(args, diagnoser, log, running)
+    else:
+        diagnosis = changed.diagnosis
+        if diagnoser is not None and reference is not None:
+            change = _change(diagnosis, diagnoser, changed.frames, reference)
     code, notes = _severity(diagnosis, bundle, args.untested_code)
     if change is not None:
         code, notes = max(code, 1), [*notes, change.reason]
-    if rewiring is not None:
-        code, notes = max(code, 2), [*notes, f"{rewiring.reason}; the verdicts are those with the readings put back"]
+    if changed is not None and changed.reason:
+        code = max(code, 1 if changed.rewiring is None else 2)
+        notes = [*notes, f"{changed.reason}; the verdicts are those with the readings put back"]
     _write(args, diagnosis, code, notes)
     found = {
         **diagnosis.to_dict(),
-        "rewiring": [] if rewiring is None else list(rewiring.steps),
+        "rewiring": [] if changed is None else list(changed.told["rewiring"]),
+        "replaced_pads": [] if changed is None else list(changed.told["replaced_pads"]),
         "change": None if change is None else vars(change),
     }
     emit(args, found, "\n".join([text_of(diagnosis), *notes]))
@@ -114,13 +121,34 @@ def _write(args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: lis
         write_diagnosis(args.html, diagnosis, name=name, reference=reference, code=code, notes=notes)
 
 
-def _rewiring(log: Recordings | Stream, diagnoser: SelfDiagnosis | None, undo: Undo) -> Rewiring | None:
-    """Return the change of the wiring that no version undoes yet; None where there is none, or nothing to compare."""
-    from adaptfault.data.recordings import Recordings
+def _changed_readings(
+    log: Recordings | Stream,
+    diagnoser: SelfDiagnosis | None,
+    running: Undo,
+    reference: Bundle | list[NDArray[Any]] | None,
+) -> ChangedReadings | None:
+    """Return the exchanged wires and replaced pads that no version undoes yet, and the diagnosis without them.
 
-    if diagnoser is None or not isinstance(log, Recordings):  # too large to be searched
+    None where there is nothing to compare, or the log is too large to be searched.
+    """
+    import numpy as np
+
+    from adaptfault.data.recordings import Recordings
+    from adaptfault.robot.changed_readings import find_changed_readings
+
+    if diagnoser is None or reference is None or not isinstance(log, Recordings):
         return None
-    return diagnoser.rewiring([undo(frames) for frames in log.frames])
+    frames = [running(np.asarray(recording, dtype=np.float64)) for recording in log.frames]
+    return find_changed_readings(diagnoser, frames, lambda: _healthy(reference, diagnoser))
+
+
+def _healthy(reference: Bundle | list[NDArray[Any]], diagnoser: SelfDiagnosis) -> list[NDArray[Any]]:
+    """Return the healthy recordings of a reference."""
+    from adaptfault.data.windows import recordings_of
+
+    if isinstance(reference, list):
+        return reference
+    return list(recordings_of(reference.parts.adapter().train, diagnoser.layout))
 
 
 def _bundle(args: argparse.Namespace) -> Bundle | None:
@@ -155,13 +183,10 @@ def _change(
     reference: Bundle | list[NDArray[Any]],
 ) -> SensorChange | None:
     """Return how a pad, or all cells together, differ from the healthy recordings; None where they do not."""
-    from adaptfault.data.windows import recordings_of
     from diagnostics.evidence.sensor_change import find_change
 
-    if not isinstance(reference, list):
-        reference = recordings_of(reference.parts.adapter().train, diagnosis.layout)
-    load = diagnoser.load_
-    new, old = (frames, reference) if load is None else ([*map(load.loads, frames)], [*map(load.loads, reference)])
+    healthy, load = _healthy(reference, diagnoser), diagnoser.load_
+    new, old = (frames, healthy) if load is None else ([*map(load.loads, frames)], [*map(load.loads, healthy)])
     return find_change(new, old, diagnosis.layout, diagnosis.fault_set | diagnosis.disturbed)
 
 
@@ -175,13 +200,9 @@ def text_of(diagnosis: Diagnosis) -> str:
 
 
 def _diagnosed(
-    args: argparse.Namespace,
-    diagnoser: SelfDiagnosis | None,
-    log: Recordings | Stream,
-    undo: Undo,
-    reference: Bundle | list[NDArray[Any]] | None,
-) -> tuple[Diagnosis, SensorChange | None]:
-    """Diagnose the log recording by recording, or in blocks in constant memory, and compare it with the reference."""
+    args: argparse.Namespace, diagnoser: SelfDiagnosis | None, log: Recordings | Stream, undo: Undo
+) -> Diagnosis:
+    """Diagnose the log recording by recording, or in blocks in constant memory."""
     import numpy as np
     from tqdm import tqdm
 
@@ -198,7 +219,4 @@ def _diagnosed(
     if not isinstance(log, Recordings):
         for problem in log.problems:
             print(problem, file=sys.stderr)
-    diagnosis = fitted.evaluate(stream, n_recordings=len(log))
-    if diagnoser is None or reference is None or not isinstance(log, Recordings):
-        return diagnosis, None
-    return diagnosis, _change(diagnosis, diagnoser, [undo(frames) for frames in log.frames], reference)
+    return fitted.evaluate(stream, n_recordings=len(log))

@@ -191,8 +191,13 @@ def _drift(
 
 
 def _with_prior(surprisal: Floats, cells: CellState) -> Floats:
-    """Return the evidence ``[D]``: a load that no event tests tells nothing, while any healthy cell may be at rest."""
-    tells = cells.scored & (cells.values.rests | (surprisal > 0))
+    """Return the evidence ``[D]``.
+
+    A load that no event tests tells nothing, nor does a cell at rest that never moved. That one came to rest does: any
+    healthy cell may.
+    """
+    came_to_rest = cells.values.rests & cells.runs.moved
+    tells = cells.scored & (came_to_rest | (surprisal > 0))
     return np.where(tells, cells.values.prior + surprisal, 0.0)
 
 

@@ -32,7 +32,7 @@ RULES = {
     ),
     "prior of a rest": (
         "evidence/spatial.py",
-        "cells.scored & (cells.values.rests | (surprisal > 0))",
+        "cells.scored & (came_to_rest | (surprisal > 0))",
         "cells.scored & (surprisal > 0)",
     ),
     "pad level": ("evidence/stream_state.py", "if reference.beside is not None:", "if False:"),

@@ -14,7 +14,7 @@ ZERO = np.zeros(CELLS)
 HEALTHY = CellFindings(
     faulty=NONE, alive=~NONE, silent=NONE, rests=NONE, full=NONE, intermittent=NONE, noisy=NONE, drifting=NONE,
     gain=np.full(CELLS, np.nan), value=np.full(CELLS, np.nan), since=np.zeros(CELLS, np.intp), probability=ZERO,
-    weight=ZERO, events=np.zeros(CELLS, np.intp), known=NONE,
+    weight=ZERO, events=np.zeros(CELLS, np.intp), known=NONE, refuted=np.full(CELLS, -1), share=ZERO,
 )  # fmt: skip
 
 

@@ -174,8 +174,8 @@ def record(folder: Path) -> None:
             recorder.write(frame, i / LAYOUT.rate)
 
 
-def operations(home: Path) -> Iterator[Operation]:
-    """Make the states before each operation; call within :func:`small_versions`."""
+def operations(home: Path, bundle: Path | None) -> Iterator[Operation]:
+    """Make the states before each operation, of a copy of ``bundle`` if there is one; see :func:`small_versions`."""
     import adaptfault as af
 
     def state(name: str) -> Path:
@@ -183,7 +183,10 @@ def operations(home: Path) -> Iterator[Operation]:
         return home / name
 
     (home / "now").mkdir()
-    make(home / "now")
+    if bundle is None:
+        make(home / "now")
+    else:
+        shutil.copytree(bundle, home / "now" / NAME)
     (home / "empty").mkdir()
     shutil.copytree(home / "now" / NAME, home / "empty" / "source.bundle")
     yield Operation("save", home / "empty", save, (1,), False, after=("deployed",))
@@ -194,8 +197,7 @@ def operations(home: Path) -> Iterator[Operation]:
     yield Operation("start", deployed, start, (1, 2), True, ("deployed",))
     yield Operation("dry run", deployed, dry_run, (1, 2), True, ("deployed",))
     yield Operation("confirm", deployed, confirm, (1, 2), False, ("deployed",), ("confirmed",))
-    bundle = af.Bundle.open(home / "now" / NAME)
-    bundle.confirm()
+    af.Bundle.open(home / "now" / NAME).confirm()
     after = ("unchanged", "kept", "deployed")
     confirmed = state("confirmed")
     runs = ("deployed", "confirmed")
@@ -361,12 +363,15 @@ def same_every_time() -> Iterator[None]:
         yield
 
 
-def run(home: Path, *, sample: int | None, say: Callable[[str], None] = print) -> tuple[int, int, list[str]]:
+def run(
+    home: Path, *, sample: int | None, bundle: Path | None = None, say: Callable[[str], None] = print
+) -> tuple[int, int, list[str]]:
     """Try the failures, and return how many calls and failures there were, and what went wrong.
 
     Args:
         home: an empty folder.
         sample: number of failures of each operation that are tried; None: all.
+        bundle: folder of one that :func:`power_cut.make` made, which saves time; None: make it.
         say: receives one line for each operation.
     """
     import torch
@@ -379,11 +384,11 @@ def run(home: Path, *, sample: int | None, say: Callable[[str], None] = print) -
     with small_versions(), same_every_time():
         for seed in (9, 10):
             broken_log(seed)  # simulated once, before the process forks
-        every = list(operations(home))
-        bundle = af.Bundle.open(home / "now" / NAME)
-        x = bundle.parts.check_windows().x
+        every = list(operations(home, bundle))
+        last = af.Bundle.open(home / "now" / NAME)
+        x = last.parts.check_windows().x
         x[..., list(ROW.cells)] = 1  # where the two versions differ
-        expected = {n: af.Adaptation.load(bundle.versions.path(n)).predict(x) for n in (1, 2)}
+        expected = {n: af.Adaptation.load(last.versions.path(n)).predict(x) for n in (1, 2)}
         for operation in every:
             trial = Trial(operation, loaded, home / "case", expected, x)
             chosen = failures(trial.calls)
@@ -427,6 +432,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--all", action="store_true", help="every failure, not a sample")
     parser.add_argument("--sample", type=int, default=12, metavar="N", help="failures of each operation (default 12)")
+    parser.add_argument("--bundle", type=Path, metavar="FOLDER", help="that power_cut.make made (default: make one)")
     args = parser.parse_args()
     if LIBRARY not in os.environ:
         with tempfile.TemporaryDirectory() as folder:
@@ -434,7 +440,10 @@ def main() -> None:
     logging.disable()
     with tempfile.TemporaryDirectory() as home:
         calls, tried, wrong = run(
-            Path(home), sample=None if args.all else args.sample, say=lambda text: print(text, flush=True)
+            Path(home),
+            sample=None if args.all else args.sample,
+            bundle=args.bundle,
+            say=lambda text: print(text, flush=True),
         )
     print("\n".join(wrong[:40]))
     print(f"{calls} calls, {tried} failures, {len(wrong)} wrong")

@@ -162,7 +162,7 @@ def tried(diagnosis: Diagnosis, layout: SensorLayout) -> None:
     assert isinstance(diagnosis.frozen, tuple)
 
 
-@on_every_kind(5)
+@on_every_kind(2)
 def test_every_call_of_the_diagnosis_ends_well_with_a_reference_and_without(layout: SensorLayout):
     healthy, later = touched(layout, 1), touched(layout, 2)
     broken = [inject(frames, some_faults(layout, 3), layout, seed=4) for frames in later]

@@ -94,7 +94,7 @@ def test_a_reference_without_a_model_of_life_takes_a_cell_that_moves_for_alive(f
 
 def test_frame_by_frame_a_floating_cell_is_told_as_in_batch(fitted, log, used):
     cell = int(used[0])
-    frames = np.concatenate(broken(log, Fault(FaultKind.FLOATING, (cell,), value=1.0), fitted))
+    frames = np.concatenate(broken(log[:16], Fault(FaultKind.FLOATING, (cell,), value=1.0), fitted))
     monitor, told = Monitor(fitted), set[FaultKind]()
     for frame in frames:
         told |= {fault.kind for fault in monitor.update(frame) if fault.cells == (cell,) and fault.probability}

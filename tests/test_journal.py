@@ -196,13 +196,19 @@ def test_entries_wait_in_order_while_the_journal_is_held_and_this_is_told_once(j
     assert [run["what"] for run in journal.runs()] == ["unchanged", "deployed", "kept", "confirmed"]
 
 
-def test_waiting_entries_that_are_damaged_are_given_up(journal, tmp_path):
+def test_waiting_entries_that_cannot_be_read_stay_until_they_can_or_the_next_switch_replaces_them(journal, tmp_path):
     journal.prepare(THIRD, "another")
-    document = json.loads((tmp_path / PENDING).read_bytes())
-    for content in (b"", b"{}", json.dumps({**document, "entries": 3}).encode()):
+    whole = (tmp_path / PENDING).read_bytes()
+    for content in (b"", b"{}", json.dumps({**json.loads(whole), "entries": 3}).encode()):
         (tmp_path / PENDING).write_bytes(content)
-        assert journal.settle(THIRD.key)
-    assert len(journal.runs()) == 2
+        assert not journal.settle(THIRD.key)
+        assert (tmp_path / PENDING).read_bytes() == content
+    later = Entry("2026-01-04T00:00:00+00:00", "confirmed", {"version": 3})
+    journal.prepare(later, THIRD.key)
+    assert journal.settle(later.key)
+    (tmp_path / PENDING).write_bytes(whole)
+    assert journal.settle(THIRD.key)
+    assert [run["what"] for run in journal.runs()] == ["unchanged", "deployed", "confirmed", "kept"]
 
 
 def test_a_checksum_that_cannot_be_written_costs_no_entry(journal, monkeypatch, caplog):

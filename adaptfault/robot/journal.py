@@ -151,7 +151,11 @@ class Journal:
             entry: of the switch that follows.
             active: key that the pointer names now.
         """
-        waiting = self._waiting(active)
+        try:
+            waiting = self._waiting(active)
+        except Damaged as error:
+            _log.warning("entries that waited for the journal are lost: %s", error)
+            waiting = []
         document = {"schema": _PENDING_SCHEMA, "entries": [one.to_dict() for one in (*waiting, entry)]}
         write_checksummed(self._pending, document)
 
@@ -179,12 +183,16 @@ class Journal:
         return True
 
     def _waiting(self, active: str) -> list[Entry]:
-        """Return the entries that count and are not in the database; all but the last do, as they waited before."""
+        """Return the entries that count and are not in the database; all but the last do, as they waited before.
+
+        Raises:
+            Damaged: they cannot be read; by another attempt they may be.
+        """
         try:
             with decoding(self._pending):
                 document = read_checksummed(self._pending, _PENDING_SCHEMA)
                 entries = [Entry.from_dict(one) for one in document["entries"]]
-        except (FileNotFoundError, Damaged):
+        except FileNotFoundError:
             return []
         return entries if entries and entries[-1].key == active else entries[:-1]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,6 +38,7 @@ _DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as al
 
 _LONG_BEFORE = 8 * SEGMENT  # frames
 
+Result = TypeVar("Result", covariant=True)
 LogRatio = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -132,7 +133,7 @@ class SelfDiagnosis:
         """
         progress(0.0)
         present = self.layout.present.ravel()
-        healthy = _recordings(recordings, self.layout).valid(self.layout.full_scale, present).whole(present)
+        healthy = checked_recordings(recordings, self.layout).valid(self.layout.full_scale, present).whole(present)
         layout = self._planes
         if self.layout.axes > 1:
             healthy = RecordingBlocks([given[:, self._order] for given in healthy.given])
@@ -157,7 +158,7 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
-        return self._diagnosed(_recordings(recordings, self.layout))
+        return self._diagnosed(checked_recordings(recordings, self.layout))
 
     def rewiring(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Rewiring | None:
         """Return the rows, columns or pads that answer in each other's place, None where the data show none.
@@ -171,7 +172,7 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
-        log = _recordings(recordings, self.layout).valid(self.layout.full_scale, self.layout.present.ravel())
+        log = checked_recordings(recordings, self.layout).valid(self.layout.full_scale, self.layout.present.ravel())
         if self.reference_ is None or self.layout.axes > 1:
             return None
         if self.load_ is not None:
@@ -247,14 +248,12 @@ class SelfDiagnosis:
         log_ratio = self._log_ratio(stream, life)
         spatial, found = yield from self._tested(stream, explained, log_ratio, life)
         if stream.reference.life is not None:
-            suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
-            life = yield from self._proof_of_life(stream, copies, suspected)
+            life = yield from self._proof_of_life(stream, copies, spatial, found)
             log_ratio = self._log_ratio(stream, life)
             if self._misleading(stream, life).any():
                 # They misled the spatial test, and its suspects the proof of life: once more without them.
                 spatial, found = yield from self._tested(stream, explained, log_ratio, life)
-                suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
-                life = yield from self._proof_of_life(stream, copies, suspected)
+                life = yield from self._proof_of_life(stream, copies, spatial, found)
                 log_ratio = self._log_ratio(stream, life)
             found = self._found(stream, spatial, explained, log_ratio, life)
         for beside in (False, True):
@@ -326,16 +325,17 @@ class SelfDiagnosis:
         before = runs.moved & (runs.start - life.since > _LONG_BEFORE)
         return life.certain & ((runs.length < SHORTEST_RUN) | before)
 
+    @staticmethod
     def _proof_of_life(
-        self, stream: StreamState, explained: NDArray[np.bool_], suspected: NDArray[np.bool_]
+        stream: StreamState, explained: NDArray[np.bool_], spatial: Spatial, found: CellFindings
     ) -> Generator[None, None, Life]:
-        """Yield between steps of the proof of life, see ``StreamState.proof_of_life``; return its result."""
-        test = stream.proof_of_life(explained, suspected)
-        assert test is not None
-        yield
-        while not test.step():
-            yield
-        return test.finish()
+        """Yield between steps of the proof of life, see ``StreamState.proof_of_life``; return its result.
+
+        Cells that the spatial test suspects predict no others.
+        """
+        suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
+        result = yield from _stepped(stream.proof_of_life(explained, suspected))
+        return result
 
     def _tested(
         self, stream: StreamState, explained: NDArray[np.bool_], log_ratio: LogRatio, life: Life
@@ -344,11 +344,7 @@ class SelfDiagnosis:
 
         Moving cells that are refuted predict no others.
         """
-        test = stream.spatial(explained | self._misleading(stream, life))
-        yield
-        while not test.step():
-            yield
-        spatial = test.finish()
+        spatial = yield from _stepped(stream.spatial(explained | self._misleading(stream, life)))
         yield
         return spatial, self._found(stream, spatial, explained, log_ratio, life)
 
@@ -459,6 +455,21 @@ class SelfDiagnosis:
         return [place[group] for group in groups]
 
 
+class _Steps(Protocol[Result]):
+    """A test that takes a few milliseconds a step."""
+
+    def step(self) -> bool: ...
+    def finish(self) -> Result: ...
+
+
+def _stepped(test: _Steps[Result]) -> Generator[None, None, Result]:
+    """Yield between the steps of a test; return its result."""
+    yield
+    while not test.step():
+        yield
+    return test.finish()
+
+
 def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:
     """Return the array in which each axis of a pad is a pad of its own, and which cell each of its cells is.
 
@@ -474,7 +485,7 @@ def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:
     return replace(layout, pads=pads, axes=1, present=present, wiring="bus", groups=None, rest=rest), order
 
 
-def _recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> RecordingBlocks:
+def checked_recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> RecordingBlocks:
     """Return the recordings as blocks, each ``[T, D]`` with T >= 1."""
     checked = [_checked(r, f"recording {i}", layout) for i, r in enumerate(layout.recordings(recordings))]
     checked = [r for r in checked if len(r)]

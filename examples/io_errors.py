@@ -34,7 +34,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from power_cut import LAYOUT, NAME, ROW, make, small_versions
+from power_cut import LAYOUT, NAME, ROW, make, predictions, small_versions
 from power_cut import broken_log as simulated_log
 
 SOURCE = Path(__file__).parent / "disk" / "io_errors.c"
@@ -390,10 +390,7 @@ def run(
         for seed in (9, 10):
             broken_log(seed)  # simulated once, before the process forks
         every = list(operations(home, bundle))
-        last = af.Bundle.open(home / "now" / NAME)
-        x = last.parts.check_windows().x
-        x[..., list(ROW.cells)] = 1  # where the two versions differ
-        expected = {n: af.Adaptation.load(last.versions.path(n)).predict(x) for n in (1, 2)}
+        x, expected = predictions(af.Bundle.open(home / "now" / NAME))
         for operation in every:
             trial = Trial(operation, loaded, home / "case", expected, x)
             chosen = failures(trial.calls)

@@ -77,6 +77,17 @@ def broken_log(seed: int = 9) -> list[Any]:
     return [inject(frames, [ROW], LAYOUT) for frames in grasps.frames]
 
 
+def predictions(bundle: Any) -> tuple[Any, dict[int, Any]]:
+    """Return windows on which versions 1 and 2 differ, and the classes that each gives them."""
+    import adaptfault as af
+
+    x = bundle.parts.check_windows().x
+    x[..., list(ROW.cells)] = 1
+    expected = {number: af.Adaptation.load(bundle.versions.path(number)).predict(x) for number in (1, 2)}
+    assert (expected[1] != expected[2]).any()
+    return x, expected
+
+
 @dataclass(frozen=True)
 class Operation:
     """A traced operation and what holds after it.
@@ -244,11 +255,7 @@ def run(*, sample: int | None, home: Path, say: Callable[[str], None] = print) -
     with small_versions():
         (home / "robot").mkdir()
         traced = list(operations(home / "robot"))
-        bundle = af.Bundle.open(home / "robot" / NAME)
-        x = bundle.parts.check_windows().x
-        x[..., list(ROW.cells)] = 1  # where the two versions differ
-        expected = {n: af.Adaptation.load(bundle.versions.path(n)).predict(x) for n in (1, 2)}
-        assert (expected[1] != expected[2]).any()
+        x, expected = predictions(af.Bundle.open(home / "robot" / NAME))
         for one in traced:
             attempt(one.name, one.trace, lambda t, c, p, one=one: check(one, t, c, p, expected, x))
         (home / "log").mkdir()

@@ -194,8 +194,11 @@ def test_changes_of_the_sensor_are_looked_for_on_every_kind(layout: SensorLayout
         reference = SelfDiagnosis(layout).fit(healthy).reference_
     none = np.zeros(layout.n_cells, bool)
     for excluded in (none, ~none):
-        find_recalibration(later, healthy, reference, layout, excluded, none)
-        find_change(later, healthy, layout, FaultSet(np.flatnonzero(excluded), layout.n_cells))
+        replaced = find_recalibration(later, healthy, reference, layout, excluded, none)
+        change = find_change(later, healthy, layout, FaultSet(np.flatnonzero(excluded), layout.n_cells))
+        assert replaced is None or set(replaced.pads) <= set(range(layout.pads))
+        assert change is None or change.pad in (None, *range(layout.pads))
+    assert change is None  # of no cell
 
 
 @pytest.mark.parametrize("layout", KINDS, ids=str)

@@ -64,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
     """Diagnose; the exit code says who has to act, as that of maintain."""
     import numpy as np
 
+    from adaptfault.data.recordings import Recordings
     from adaptfault.data.recordings.blocks import is_large
 
     bundle = _bundle(args)
@@ -80,15 +81,12 @@ def run(args: argparse.Namespace) -> int:
     if healthy is not None:  # fitted once the log is known to be of the same array
         diagnoser = fit_diagnoser(args, healthy)
     running: Undo = np.asarray if bundle is None else bundle.active().undo
-    reference = bundle if healthy is None else list(healthy)
-    changed = _changed_readings(log, diagnoser, running, reference)
-    change = None
-    if changed is None:
+    changed = change = None
+    if diagnoser is None or not isinstance(log, Recordings):  # nothing to compare with, or too large to be searched
         diagnosis = _diagnosed(args, diagnoser, log, running)
     else:
+        changed, change = _compared(log, diagnoser, running, _healthy(bundle, healthy))
         diagnosis = changed.diagnosis
-        if diagnoser is not None and reference is not None:
-            change = _change(diagnosis, diagnoser, changed.frames, reference)
     code, notes = _severity(diagnosis, bundle, args.untested_code)
     if change is not None:
         code, notes = max(code, 1), [*notes, change.reason]
@@ -121,34 +119,27 @@ def _write(args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: lis
         write_diagnosis(args.html, diagnosis, name=name, reference=reference, code=code, notes=notes)
 
 
-def _changed_readings(
-    log: Recordings | Stream,
-    diagnoser: SelfDiagnosis | None,
-    running: Undo,
-    reference: Bundle | list[NDArray[Any]] | None,
-) -> ChangedReadings | None:
-    """Return the exchanged wires and replaced pads that no version undoes yet, and the diagnosis without them.
-
-    None where there is nothing to compare, or the log is too large to be searched.
-    """
+def _compared(
+    log: Recordings, diagnoser: SelfDiagnosis, running: Undo, healthy: list[NDArray[Any]]
+) -> tuple[ChangedReadings, SensorChange | None]:
+    """Return the exchanged wires and replaced pads that no version undoes yet, and how the sensor changed besides."""
     import numpy as np
 
-    from adaptfault.data.recordings import Recordings
-    from adaptfault.robot.changed_readings import find_changed_readings
+    from adaptfault.robot.changed_readings import find_changed_readings, find_sensor_change
 
-    if diagnoser is None or reference is None or not isinstance(log, Recordings):
-        return None
     frames = [running(np.asarray(recording, dtype=np.float64)) for recording in log.frames]
-    return find_changed_readings(diagnoser, frames, lambda: _healthy(reference, diagnoser))
+    changed = find_changed_readings(diagnoser, frames, lambda: healthy)
+    return changed, find_sensor_change(diagnoser, changed.diagnosis, changed.frames, healthy)
 
 
-def _healthy(reference: Bundle | list[NDArray[Any]], diagnoser: SelfDiagnosis) -> list[NDArray[Any]]:
-    """Return the healthy recordings of a reference."""
+def _healthy(bundle: Bundle | None, recordings: Recordings | None) -> list[NDArray[Any]]:
+    """Return the healthy recordings that were given, else those of the bundle, which then was."""
     from adaptfault.data.windows import recordings_of
 
-    if isinstance(reference, list):
-        return reference
-    return list(recordings_of(reference.parts.adapter().train, diagnoser.layout))
+    if recordings is not None:
+        return list(recordings)
+    assert bundle is not None
+    return list(recordings_of(bundle.parts.adapter().train, bundle.layout))
 
 
 def _bundle(args: argparse.Namespace) -> Bundle | None:
@@ -164,30 +155,17 @@ def _bundle(args: argparse.Namespace) -> Bundle | None:
 
 def _severity(diagnosis: Diagnosis, bundle: Bundle | None, untested_code: int) -> tuple[int, list[str]]:
     """Return the exit code, and a sentence where it is another one than that of the faults."""
-    from adaptfault.robot.sensor_state import UNTESTED, SensorState, unhandled_cells
+    from adaptfault.robot.sensor_state import SensorState, unhandled_cells, untested
 
-    code, share = diagnosis.exit_code, diagnosis.coverage.test_coverage
-    if code == 0 and share < UNTESTED:
-        return untested_code, [f"only {share:.0%} of the cells were tested, so faults may be hidden"]
+    code = diagnosis.exit_code
+    reason = untested(diagnosis)
+    if code == 0 and reason is not None:
+        return untested_code, [reason]
     if code == 2 and bundle is not None:
         version = bundle.active()
         if not unhandled_cells(bundle, diagnosis.fault_set, version) and SensorState.of(bundle).exit_code < 2:
             return 1, [f"handled: version {version.number} of {bundle.path} runs without these cells"]
     return code, []
-
-
-def _change(
-    diagnosis: Diagnosis,
-    diagnoser: SelfDiagnosis,
-    frames: list[NDArray[Any]],
-    reference: Bundle | list[NDArray[Any]],
-) -> SensorChange | None:
-    """Return how a pad, or all cells together, differ from the healthy recordings; None where they do not."""
-    from diagnostics.evidence.sensor_change import find_change
-
-    healthy, load = _healthy(reference, diagnoser), diagnoser.load_
-    new, old = (frames, healthy) if load is None else ([*map(load.loads, frames)], [*map(load.loads, healthy)])
-    return find_change(new, old, diagnosis.layout, diagnosis.fault_set | diagnosis.disturbed)
 
 
 def text_of(diagnosis: Diagnosis) -> str:

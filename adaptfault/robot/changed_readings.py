@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from diagnostics import Diagnosis, FaultKind, SelfDiagnosis
 from diagnostics.evidence.recalibration import Recalibration, find_recalibration, recalibrated
 from diagnostics.evidence.rewiring import Rewiring
+from diagnostics.evidence.sensor_change import SensorChange, find_change
 
 if TYPE_CHECKING:
     from adaptfault.robot.versions import Version
@@ -100,6 +101,23 @@ def find_changed_readings(
         return ChangedReadings(None, None, frames, diagnosis, diagnosis)
     undone = [recalibration.undo(recording, diagnoser.layout.full_scale) for recording in frames]
     return ChangedReadings(None, recalibration, undone, diagnoser.diagnose(undone), diagnosis)
+
+
+def find_sensor_change(
+    diagnoser: SelfDiagnosis, diagnosis: Diagnosis, frames: Frames, healthy: Sequence[NDArray[Any]]
+) -> SensorChange | None:
+    """Return how a pad, or all cells together, differ from the healthy recordings; None where they do not.
+
+    Faulty cells, and those that a static load may reach, do not count. Arguments as of :func:`find_changed_readings`.
+    """
+    excluded = diagnosis.fault_set | diagnosis.disturbed
+    return find_change(as_loads(diagnoser, frames), as_loads(diagnoser, healthy), diagnosis.layout, excluded)
+
+
+def as_loads(diagnoser: SelfDiagnosis, recordings: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
+    """Return recordings ``[T, D]`` as loads, where readings fall with the load or rest in the middle."""
+    load = diagnoser.load_
+    return list(recordings) if load is None else [load.loads(recording) for recording in recordings]
 
 
 def _recalibration(

@@ -9,13 +9,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.robot.changed_readings import ChangedReadings, find_changed_readings
+from adaptfault.robot.changed_readings import ChangedReadings, find_changed_readings, find_sensor_change
 from adaptfault.robot.converter_range import within_range
-from adaptfault.robot.sensor_state import UNTESTED
+from adaptfault.robot.sensor_state import untested
 from diagnostics import Diagnosis, SelfDiagnosis, SensorLayout
+from diagnostics.diagnosis import checked_recordings
 from diagnostics.evidence.recalibration import Recalibration
 from diagnostics.evidence.rewiring import Rewiring
-from diagnostics.evidence.sensor_change import find_change
 from diagnostics.sensor.disturbance import (
     CommonMode,
     Disturbance,
@@ -128,8 +128,8 @@ def inspect(
         ValueError: recordings that do not fit the layout, or hold no frame.
     """
     layout = diagnoser.layout
-    given = _checked(recordings, layout)
-    healthy = [] if reference is None else [within_range(r, layout)[0] for r in _checked(reference, layout)]
+    given = list(checked_recordings(recordings, layout))
+    healthy = [] if reference is None else [within_range(r, layout)[0] for r in checked_recordings(reference, layout)]
     sentinel = find_sentinel(given, layout)
     log = [within_range(frames, layout)[0] for frames in given]
     if not any(np.isfinite(frames[:, layout.present.ravel()]).any() for frames in log):
@@ -148,16 +148,6 @@ def inspect(
         *_of_diagnosis(changed.diagnosis),
     ]
     return Inspection(changed.diagnosis, tuple(findings), changed.rewiring, changed.recalibration, common)
-
-
-def _checked(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> list[NDArray[np.float64]]:
-    """Return recordings ``[T, D]`` with at least one frame each."""
-    given = layout.recordings(recordings)
-    checked = [layout.check_recording(one, f"recording {i}") for i, one in enumerate(given)]
-    checked = [np.asarray(frames, dtype=np.float64) for frames in checked if len(frames)]
-    if not checked:
-        raise ValueError("no frames: expected recordings [T, D] with T >= 1")
-    return checked
 
 
 def _judged(
@@ -201,11 +191,7 @@ def _of_change(
     """Return what changed of a pad or of the sensor, unless a disturbance explains it."""
     if not healthy or any(one.name in ("normalised", "ramp", "hum", "crosstalk") for one in disturbances):
         return []
-    diagnosis, load = changed.diagnosis, diagnoser.load_
-    new, old = changed.frames, healthy
-    if load is not None:
-        new, old = [load.loads(frames) for frames in new], [load.loads(frames) for frames in old]
-    change = find_change(new, old, diagnoser.layout, diagnosis.fault_set | diagnosis.disturbed)
+    change = find_sensor_change(diagnoser, changed.diagnosis, changed.frames, healthy)
     if change is None:
         return []
     return [Finding("gain" if change.gain != 1.0 else "offset", 1, change.reason)]
@@ -218,9 +204,8 @@ def _of_diagnosis(diagnosis: Diagnosis) -> list[Finding]:
     findings += [Finding("static_load", 1, load.reason) for load in diagnosis.static_loads]
     findings += [Finding("frozen", 1, frozen.reason) for frozen in diagnosis.frozen]
     findings += [Finding("lost_frames", 0, link.reason) for link in diagnosis.transport if link.kind == "lost"]
-    share = diagnosis.coverage.test_coverage
-    if share < UNTESTED:
-        reason = f"only {share:.0%} of the cells were tested, so faults may be hidden"
+    reason = untested(diagnosis)
+    if reason is not None:
         findings.append(Finding("untested", 1, reason))
     return findings
 

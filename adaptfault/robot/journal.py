@@ -103,7 +103,7 @@ class Journal:
             if self._checksum.is_file() and self._checksum.read_bytes().decode("latin-1") == hash_file(self.path):
                 return []
             try:
-                intact = self._intact(repair=repair)
+                intact = self._intact()
             except (Damaged, ValueError):
                 intact = False
             if intact and not self._checksum.exists():
@@ -117,7 +117,7 @@ class Journal:
                 self._checksum.unlink(missing_ok=True)
             return [f"{self.path} is damaged: it is renamed to {_ASIDE} and a new journal is started"]
 
-    def _intact(self, *, repair: bool) -> bool:
+    def _intact(self) -> bool:
         """Return whether every row can be read; raises Damaged or ValueError where one cannot."""
         with self._connect() as connection:
             if connection.execute("PRAGMA integrity_check").fetchone() != ("ok",):

@@ -18,7 +18,7 @@ from adaptfault.data.windows import recordings_of
 from adaptfault.evaluation.scores import chance
 from adaptfault.robot.ageing import encode
 from adaptfault.robot.bundle import Bundle, now
-from adaptfault.robot.changed_readings import ChangedReadings, find_changed_readings
+from adaptfault.robot.changed_readings import ChangedReadings, as_loads, find_changed_readings
 from adaptfault.robot.checksummed_json import Damaged
 from adaptfault.robot.converter_range import within_range
 from adaptfault.robot.deployment_test import Judgement, compare_candidate, with_faults
@@ -177,8 +177,7 @@ class _Maintenance:
 
     def _loads(self, frames: list[NDArray[np.float64]]) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
         """Return new recordings, and the healthy ones of the bundle, as loads, ``[T, D]`` each."""
-        load, healthy = self.diagnoser.load_, self.healthy
-        return (frames, healthy) if load is None else ([*map(load.loads, frames)], [*map(load.loads, healthy)])
+        return as_loads(self.diagnoser, frames), as_loads(self.diagnoser, self.healthy)
 
     def _decide_readings(
         self, changed: ChangedReadings, frames: list[NDArray[np.float64]], used: tuple[str, ...]

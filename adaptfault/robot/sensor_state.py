@@ -12,7 +12,7 @@ from typing import Any
 from adaptfault.robot.bundle import Bundle
 from adaptfault.robot.known_faults import KnownFaults
 from adaptfault.robot.versions import Version
-from diagnostics import Fault, FaultSet
+from diagnostics import Diagnosis, Fault, FaultSet
 
 TECHNICIAN_BELOW = 0.9
 """Share of the fault-free accuracy below which a person is needed."""
@@ -21,6 +21,12 @@ UNTESTED = 0.05
 """Test coverage below which recordings test nothing."""
 
 _WEAK = 0.02  # by so much more accuracy than the healthy model's, a repaired one shows that the healthy one is weak
+
+
+def untested(diagnosis: Diagnosis) -> str | None:
+    """Return that a log tests too few of the cells, in one sentence; None where it tests enough."""
+    share = diagnosis.coverage.test_coverage
+    return f"only {share:.0%} of the cells were tested, so faults may be hidden" if share < UNTESTED else None
 
 
 def judged_before(bundle: Bundle, faulty: FaultSet, version: int) -> dict[str, Any] | None:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.evidence.term import untouched_evidence
+from diagnostics.preprocessing.baseline import half_segment_peaks
 from diagnostics.preprocessing.levels import FEWEST, RARE
 from diagnostics.preprocessing.offset import least_loaded
 from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks, spread
@@ -66,7 +67,7 @@ class PadLimit:
             some = spread(cells)
             for i in readings.some:
                 above = readings.piece(i, slice(None), some) - rest.highest[some]
-                tops = _tops(above)
+                tops = half_segment_peaks(above)
                 level = np.array([_level(top) for top in tops])
                 lowest.append(np.fmin.reduce(tops - level[:, None]))
         if not lowest:
@@ -129,11 +130,3 @@ class PadLevel:
 def _level(top: Floats) -> float:
     """Return the level of a pad with these highest readings above the baseline, ``[n]``: at most 0."""
     return min(0.0, least_loaded(top))
-
-
-def _tops(above: Floats) -> Floats:
-    """Return the highest reading of each cell in each half segment, ``[n, cells]``."""
-    length = min(SEGMENT // 2, len(above))
-    whole = len(above) // length * length
-    tops: Floats = np.fmax.reduce(above[:whole].reshape(-1, length, above.shape[1]), axis=1)
-    return tops

@@ -224,10 +224,17 @@ class _Test:
         """
         features = self._features(source)
         counted = (self.used & ~faulty)[source]
-        likely = self.model.predict(features, counted & self.present).log_likelihood(features)
-        likely = np.where(self.present, likely, np.where(features[:, 2] > 0, np.log(MIN_P_FLOOR), 0.0))
+        expected = self.model.predict(features, counted & self.present)
+        likely = self._where_cells_are(expected.log_likelihood(features), features)
         by_event: Floats = self.weight * np.where(counted, likely, 0.0).sum(axis=1)
         return by_event
+
+    def _where_cells_are(self, likely: Floats, features: NDArray[np.float32]) -> Floats:
+        """Return log likelihoods ``[n, D]``; a load where no cell is, is as good as impossible.
+
+        So the same readings count for each permutation.
+        """
+        return np.where(self.present, likely, np.where(features[:, 2] > 0, np.log(MIN_P_FLOOR), 0.0))
 
     def score(self, source: Cells, faulty: Mask) -> _Score:
         """Return the score of one permutation; ``faulty`` channels (bool ``[D]``) are no predictors."""
@@ -237,9 +244,7 @@ class _Test:
         states = expected.states
         usual = (states * np.log(states)).sum(axis=0)
         surplus = np.where(used, self.weight @ (expected.log_likelihood(features) - usual), 0.0)
-        likely = _log_likelihood(features, expected)
-        # The same readings count for each permutation; a load where no cell is, is as good as impossible.
-        likely = np.where(self.present, likely, np.where(features[:, 2] > 0, np.log(MIN_P_FLOOR), 0.0))
+        likely = self._where_cells_are(_log_likelihood(features, expected), features)
         alone = self.alone[:, source]
         refuted = used & (self.weight @ (alone - likely) > _FAULTY)
         explained = np.where(used, np.where(refuted, alone, likely), 0.0)

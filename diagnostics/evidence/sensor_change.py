@@ -155,7 +155,12 @@ def _beside(given: NDArray[np.float64], pad: int, contact: float) -> tuple[NDArr
 def _change(new: NDArray[np.float64], old: NDArray[np.float64], least: float) -> float:
     """Return the difference of two medians, 0 where it is below ``least`` or may be chance."""
     change = _shift(new, old)
-    return change if abs(change) >= least and ks_2samp(new, old).pvalue < P_MIN else 0.0
+    return change if abs(change) >= least and differ(new, old) else 0.0
+
+
+def differ(new: NDArray[np.float64], old: NDArray[np.float64]) -> bool:
+    """Return whether two samples ``[n]``, of at least five recordings each, differ by more than chance."""
+    return min(len(new), len(old)) >= _LEAST and bool(ks_2samp(new, old).pvalue < P_MIN)
 
 
 def _statistics(recordings: Iterable[NDArray[Any]], healthy: NDArray[np.intp]) -> NDArray[np.float64]:

@@ -246,13 +246,12 @@ class StreamState:
             if suffixes:
                 yield np.stack(suffixes), tile.inputs, tile.place, self.model_of(i, events)
 
-    def proof_of_life(self, explained: Mask, suspected: Mask) -> LifeTest | None:
-        """Return the test whether cells depend on each other as healthy ones do; None: the reference tells nothing.
+    def proof_of_life(self, explained: Mask, suspected: Mask) -> LifeTest:
+        """Return the test whether cells depend on each other as healthy ones do; the reference must have a model of it.
 
         Cells that are ``explained`` (bool ``[D]``) are left out; those ``suspected`` to be constant predict no others.
         """
-        if self.reference.life is None:
-            return None
+        assert self.reference.life is not None
         eligible = self.received & ~self.silent & ~explained & (self.reference.dead == 0)
         return LifeTest(self.life, self.reference.life, self.layout, eligible, suspected)
 

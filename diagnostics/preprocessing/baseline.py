@@ -69,7 +69,7 @@ def baseline(recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance
     offset = np.concatenate(offsets)
     light = offset < LIGHT * full_scale
     drift = _highest(offset[light], np.concatenate(unloaded)[light])
-    noise = float(np.quantile(np.concatenate(curvatures), LEAST_LOADED)) / (0.6745 * np.sqrt(6))
+    noise = deviation(float(np.quantile(np.concatenate(curvatures), LEAST_LOADED)))
     highest = low + max(0.0, drift + _NOISE * noise - tolerance)
     return Baseline(low, highest, noise, last, peaks)
 
@@ -114,7 +114,18 @@ def _low(readings: RecordingBlocks) -> tuple[Floats, Floats, Floats]:
 
 def _lowest_peak(frames: Floats) -> Floats:
     """Return the minimum over half segments of the highest reading in each, ``[D]``: that of a constant run."""
+    lowest: Floats = np.fmin.reduce(half_segment_peaks(frames), axis=0)
+    return lowest
+
+
+def half_segment_peaks(frames: Floats) -> Floats:
+    """Return the highest reading of each cell in each half segment, ``[n, D]``; a shorter recording is one."""
     length = min(SEGMENT // 2, len(frames))
     whole = len(frames) // length * length
-    lowest: Floats = np.fmin.reduce(np.fmax.reduce(frames[:whole].reshape(-1, length, frames.shape[1]), axis=1), axis=0)
-    return lowest
+    peaks: Floats = np.fmax.reduce(frames[:whole].reshape(-1, length, frames.shape[1]), axis=1)
+    return peaks
+
+
+def deviation(curvature: float) -> float:
+    """Return the standard deviation of noise whose second differences have this median size."""
+    return float(curvature / (0.6745 * np.sqrt(6)))

@@ -29,11 +29,12 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
-from scipy.stats import ks_2samp
 
+from diagnostics.evidence.sensor_change import differ
 from diagnostics.layout import SensorLayout
+from diagnostics.preprocessing.baseline import deviation
 from diagnostics.preprocessing.levels import LEAST_LOADED, LOW, MAJORITY, MARGIN, P_MIN, RARE, SLIGHT
+from diagnostics.preprocessing.transport import invalid
 
 Name = Literal["hum", "ramp", "crosstalk", "noise", "quantised", "saturated", "normalised", "sentinel", "silent_array"]
 
@@ -127,7 +128,7 @@ def _is_unusual(common: list[Floats], usual: list[Floats], pad: int, layout: Sen
         old = np.array([extreme(one[:, pad]) for one in usual])
         new = new[np.isfinite(new)]
         old = old[np.isfinite(old)]
-        if min(len(new), len(old)) < _FEWEST or ks_2samp(new, old).pvalue >= P_MIN:
+        if not differ(new, old):
             continue
         if np.abs(np.quantile(new, _DECILES) - np.quantile(old, _DECILES)).max() > _LEAST * layout.full_scale:
             return True
@@ -153,10 +154,11 @@ def find_sentinel(recordings: Recordings, layout: SensorLayout) -> Disturbance |
     readings = 0
     for frames in recordings:
         given = np.asarray(frames, dtype=np.float64)[:, layout.present.ravel()]
-        outside = np.isfinite(given) & (np.abs(given - layout.full_scale / 2) > 1.5 * layout.full_scale)
-        values, how_often = np.unique(given[outside], return_counts=True)
-        counts.update(dict(zip(values.tolist(), how_often.tolist(), strict=True)))
         readings += given.size
+        outside = invalid(given, layout.full_scale)
+        if outside is not None:
+            values, how_often = np.unique(given[outside & np.isfinite(given)], return_counts=True)
+            counts.update(dict(zip(values.tolist(), how_often.tolist(), strict=True)))
     if not counts:
         return None
     value, times = counts.most_common(1)[0]
@@ -243,10 +245,9 @@ def _told(recordings: Recordings, excess: list[Floats], rest: Floats, of_pad: ND
 
 def _differs(new: Floats, old: Floats) -> bool:
     """Return whether the statistic of the recordings of a log is larger than that of the reference, not by chance."""
-    new, old = new[np.isfinite(new)], old[np.isfinite(old)]
-    if min(len(new), len(old)) < _FEWEST or np.median(new) <= np.median(old):
-        return False
-    return bool(ks_2samp(new, old).pvalue < P_MIN)
+    new = new[np.isfinite(new)]
+    old = old[np.isfinite(old)]
+    return differ(new, old) and bool(np.median(new) > np.median(old))
 
 
 def _noise(recordings: Recordings, reference: Recordings, layout: SensorLayout) -> Disturbance | None:
@@ -269,8 +270,7 @@ def _deviation(frames: Floats, layout: SensorLayout) -> float:
     received = ~np.isnan(curvature).all(axis=0)
     if not received.any():
         return np.nan
-    typical = float(np.median(np.nanmedian(curvature[:, received], axis=0)))
-    return typical / (float(ndtri(0.75)) * 6**0.5)
+    return deviation(float(np.median(np.nanmedian(curvature[:, received], axis=0))))
 
 
 def _step(recordings: Recordings, layout: SensorLayout) -> float:

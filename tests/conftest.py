@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -96,6 +97,32 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def once_bound(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[int], object]], threading.Thread]:
+    """Return what has ``send(port)`` called in a thread of its own as soon as a receiver has bound its port.
+
+    What is sent before is lost, and a command that counts frames would wait for them without end.
+    """
+    from adaptfault.acquisition.receiver import Receiver
+
+    begin = Receiver.__aenter__
+
+    def once_bound(send: Callable[[int], object]) -> threading.Thread:
+        ports: list[int] = []
+        sending = threading.Thread(target=lambda: send(ports[0]))
+
+        async def begin_and_send(receiver: Receiver) -> Receiver:
+            await begin(receiver)
+            ports.append(receiver.port)
+            sending.start()
+            return receiver
+
+        monkeypatch.setattr(Receiver, "__aenter__", begin_and_send)
+        return sending
+
+    return once_bound
 
 
 SMALL = SensorLayout(2, 3, 3, full_scale=4.0, present=np.arange(18) != 4)

@@ -123,10 +123,10 @@ def test_a_version_that_cannot_be_confirmed_is_reported_once_and_tried_again():
     assert not answers
 
 
-def test_readings_outside_the_range_are_missing_and_counted(capsys):
+def test_readings_outside_the_range_are_missing_and_counted(listened):
     values = np.zeros((12, 6))
     values[3, 2], values[5, 1] = 1e30, -700.0
-    lines = listened(capsys, packets(values), "--shape", "1x2x3", "--frames", "12", "--json")
+    lines = listened(packets(values), "--shape", "1x2x3", "--frames", "12", "--json")
     end = json.loads(lines[-1])
     assert end["counters"]["kept"] == 12
     assert end["readings_outside_range"] == 2
@@ -177,28 +177,23 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path, monkeypatch)
 # The command
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
-        line.bind(("127.0.0.1", 0))
-        return line.getsockname()[1]
-
-
-def listened(capsys, datagrams, *arguments, code=0):
+@pytest.fixture
+def listened(capsys, once_bound):
     """Run the command in this process while datagrams come; return stdout's lines."""
-    port = free_port()
-    sending = threading.Timer(0.5, send, (port, datagrams, 0.001))
-    sending.start()
-    assert main(["listen", *map(str, arguments), "--port", str(port), "--quiet"]) == code
-    sending.join()
-    return capsys.readouterr().out.splitlines()
+
+    def listened(datagrams, *arguments):
+        sending = once_bound(lambda port: send(port, datagrams, 0.001))
+        assert main(["listen", *map(str, arguments), "--port", "0", "--quiet"]) == 0
+        sending.join()
+        return capsys.readouterr().out.splitlines()
+
+    return listened
 
 
-def test_what_is_sent_is_recorded_and_the_counters_come_last(tmp_path, capsys):
+def test_what_is_sent_is_recorded_and_the_counters_come_last(tmp_path, listened):
     values = np.arange(60.0).reshape(10, 6) % 5
     datagrams = [b"garbage", *packets(values), b"a,1,2"]
-    lines = listened(
-        capsys, datagrams, "--shape", "1x2x3", "--record", tmp_path, "--when", "always", "--seconds", 2, "--json"
-    )
+    lines = listened(datagrams, "--shape", "1x2x3", "--record", tmp_path, "--when", "always", "--seconds", 2, "--json")
     first, *_, last = map(json.loads, lines)
     assert (first["schema"], first["kind"]) == ("adaptfault.event/1", "recording")
     assert last["schema"] == "adaptfault.listen/1"
@@ -206,7 +201,7 @@ def test_what_is_sent_is_recorded_and_the_counters_come_last(tmp_path, capsys):
     np.testing.assert_array_equal(load(tmp_path, layout=SMALL).recordings.frames[0], values)
 
 
-def test_with_a_bundle_classes_are_told(tmp_path, capsys, monkeypatch):
+def test_with_a_bundle_classes_are_told(tmp_path, listened, monkeypatch):
     loaded = []
 
     class Predictor(Scripted):
@@ -221,7 +216,7 @@ def test_with_a_bundle_classes_are_told(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "robot.bundle").mkdir()
     (tmp_path / "robot.bundle/bundle.json").touch()
-    lines = listened(capsys, packets(np.zeros((3, 6))), "robot.bundle", "--frames", 3, "--seconds", 20)
+    lines = listened(packets(np.zeros((3, 6))), "robot.bundle", "--frames", 3, "--seconds", 20)
     assert lines[0] == "0.1 a class: cup (90%)"
     assert lines[1] == "0.2 a class: ball (90%)"
     assert lines[-1].startswith("end: 3 received, 3 kept")
@@ -238,30 +233,24 @@ def test_without_what_a_bundle_needs_the_user_is_told_so(bundle, capsys, monkeyp
     assert "expected a bundle" in capsys.readouterr().err
 
 
-def test_counts_are_turned_into_newtons_by_a_calibration(tmp_path, capsys):
+def test_counts_are_turned_into_newtons_by_a_calibration(tmp_path, listened):
     table = tmp_path / "tables.csv"
     table.write_text("cell,raw,force\n" + "".join(f"{cell},0,0\n{cell},1000,4\n" for cell in range(6)))
     datagrams = packets(np.full((5, 6), 500.0))
     options = ("--shape", "1x2x3", "--calibration", table, "--record", tmp_path / "log", "--when", "always")
-    listened(capsys, datagrams, *options, "--frames", 5, "--seconds", 20)
+    listened(datagrams, *options, "--frames", 5, "--seconds", 20)
     loaded = load(tmp_path / "log", layout=tmp_path / "log" / "layout.json").recordings
     assert (loaded.layout.unit, loaded.layout.full_scale) == ("N", 4.0)
     np.testing.assert_array_equal(loaded.frames[0], 2.0)
 
 
-def test_a_row_that_breaks_is_told_without_any_bundle(grasps, capsys):
+def test_a_row_that_breaks_is_told_without_any_bundle(grasps, capsys, once_bound):
     values = np.concatenate(grasps.frames[::7]).copy()[:600]
     values.reshape(-1, 2, 11, 10)[:, 1, 5] = 5.0
-    port = free_port()
     events = []
-    station = Station(grasps.layout, port, frames=len(values), seconds=60, quiet=True, on_event=events.append)
-    sending = threading.Thread(target=send, args=(port, packets(values), 0.002))
-
-    async def run():
-        asyncio.get_running_loop().call_later(0.2, sending.start)
-        await station.listen()
-
-    asyncio.run(run())
+    station = Station(grasps.layout, frames=len(values), seconds=60, quiet=True, on_event=events.append)
+    sending = once_bound(lambda port: send(port, packets(values), 0.002))
+    asyncio.run(station.listen())
     sending.join()
     assert any(event.kind == "fault" and "pad 1, row 5 is short" in event.text for event in events)
     assert capsys.readouterr().out.startswith("end: 600 received")

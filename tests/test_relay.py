@@ -165,29 +165,22 @@ def test_an_address_of_another_form_is_refused(text, restorer):
         Relay(text, restorer, DEAD)
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
-        line.bind(("127.0.0.1", 0))
-        return line.getsockname()[1]
-
-
 def test_every_frame_is_relayed_once_and_in_order_and_a_cell_that_breaks_is_restored(
-    bundle, small_grasps, broken_row, consumer, capsys
+    bundle, small_grasps, broken_row, consumer, capsys, monkeypatch, once_bound
 ):
     layout = bundle.layout
     frames = np.concatenate(small_grasps.frames[60:70]).astype(float)
     broken = inject(frames, [Fault("short", broken_row.cells, onset=100)], layout)
     packets = [format_packet("a", i / layout.rate, frame) for i, frame in enumerate(broken)]
     packets[20:22] = [packets[21], packets[20], packets[20]]  # swapped, and one twice
-    port, told, relay_found = free_port(), threading.Event(), Relay.found
+    told, relay_found = threading.Event(), Relay.found
 
     def found(self, device, faulty) -> None:
         relay_found(self, device, faulty)
         if set(broken_row.cells) <= set(faulty):
             told.set()
 
-    def send() -> None:
-        time.sleep(0.5)  # until the socket is bound
+    def send(port: int) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             for i, data in enumerate(packets):
                 if i == len(packets) - 100:  # the monitor comes after the relay, and may be slow
@@ -195,18 +188,10 @@ def test_every_frame_is_relayed_once_and_in_order_and_a_cell_that_breaks_is_rest
                 line.sendto(data, ("127.0.0.1", port))
                 time.sleep(0.002)
 
-    sending = threading.Thread(target=send)
-    options = ["--port", str(port), "--relay", address(consumer), "--frames", str(len(frames)), "--seconds", "60"]
-    listen = Station.listen
-
-    async def listen_and_send(self):
-        sending.start()
-        await listen(self)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Station, "listen", listen_and_send)
-        patch.setattr(Relay, "found", found)
-        assert main(["listen", str(bundle.path), *options, "--json", "--quiet"]) == 0
+    sending = once_bound(send)
+    options = ["--port", "0", "--relay", address(consumer), "--frames", str(len(frames)), "--seconds", "60"]
+    monkeypatch.setattr(Relay, "found", found)
+    assert main(["listen", str(bundle.path), *options, "--json", "--quiet"]) == 0
     sending.join()
     end = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert end["relay"]["sent"] == end["counters"]["kept"] == len(frames)

@@ -55,12 +55,12 @@ _BESIDE = (0.01, 0.34, 0.67, 0.99)  # shares of the cells beside one that are lo
 _OWN_ERRS = 20.0  # pseudo-count of units, of the share e of each cell
 _LAGS = (1, 2, 3, 4)  # pieces
 _UNLOADED = 1e-3  # root load up to which a piece counts as unloaded
-_SHRINKAGES = (16.0, 64.0, 256.0, 1024.0)  # pseudo-counts of the table of all cells: a grid
+_SHRINKAGES = (4.0, 16.0, 64.0, 256.0, 1024.0)  # pseudo-counts of the table of all cells: a grid
 _CONTAMINATIONS = (0.01, 0.02, 0.04, 0.08)  # shares e: a grid
 _CORRELATED = 0.25  # correlation of successive units that is small
 _MOST_PIECES = 6000  # of the reference: a size
 _CERTAINLY_NOT = 1e3  # evidence against what is impossible
-_ROUNDS = 8  # at most: a size
+_ROUNDS = 12  # at most: a size
 _REFUTED = 4.0  # evidence from which on a cell is replaced
 _THRESHOLD = 9.0  # evidence of a certain fault: with its prior, P(faulty) = 0.994
 _FAILS, _RECOVERS = 0.1, 0.3  # probability per unit
@@ -160,7 +160,9 @@ class LifeModel:
         unit: segments of a unit.
         errs: float ``[D]``, share e of the units.
         tolerance: a cell whose readings lie within this of its highest one reads it, in the layout's unit.
-        factors: float ``[5, D]``, on the evidence of each of the ``FAULTS``.
+        reached: float ``[5, D]``, evidence that a healthy cell reaches in a log, for each of the ``FAULTS``.
+        units: number of units of these logs.
+        counts: factor on all evidence, 0 to 1: a reference of few units contains few unusual contacts.
     """
 
     means: tuple[ConditionalMean, ...]
@@ -171,7 +173,9 @@ class LifeModel:
     unit: int
     errs: Floats
     tolerance: float
-    factors: Floats
+    reached: Floats
+    units: int
+    counts: float
 
     @classmethod
     def fit(
@@ -196,8 +200,8 @@ class LifeModel:
         shape = ((len(self.predicted) + 1) * (len(_BESIDE) + 1), len(self.levels) + 1)
         if self.table.shape not in ((1, *shape), (layout.n_cells, *shape)):
             raise ValueError(f"expected a table [1 or {layout.n_cells}, {shape[0]}, {shape[1]}]")
-        if self.factors.shape != (len(FAULTS), layout.n_cells) or self.errs.shape != (layout.n_cells,):
-            raise ValueError(f"expected factors and errs of {layout}")
+        if self.reached.shape != (len(FAULTS), layout.n_cells) or self.errs.shape != (layout.n_cells,):
+            raise ValueError(f"expected reached and errs of {layout}")
         if not (self.unit > 0 and 0 < self.equal < 1 and ((self.errs > 0) & (self.errs < 1)).all()):
             raise ValueError("expected a positive unit, and probabilities between 0 and 1")
 
@@ -212,6 +216,15 @@ class LifeModel:
         """Return what the others say of each cell, as a number from 0 to M - 1, int ``[n, D]``."""
         level = np.searchsorted(self.predicted, self.expected(loads, known), side="right")
         return level * (len(_BESIDE) + 1) + _loaded_beside(loads, known, beside)
+
+    def factors(self, units: int) -> Floats:
+        """Return the factors ``[5, D]`` on the evidence in a log of so many units: healthy cells stay below the threshold.
+
+        The evidence against a healthy cell that the model predicts badly grows with the length of the log.
+        """
+        reached = np.maximum(self.reached, 0.0) * max(1.0, units / self.units)
+        factors: Floats = self.counts * _THRESHOLD / np.maximum(_THRESHOLD, MARGIN * reached)
+        return factors
 
     def of_cell(self, cells: Cells) -> Cells:
         """Return where the table of each cell is."""
@@ -294,6 +307,7 @@ class LifeTest:
             return
         self._record = record
         self._log = _Log.of(record.loads, record.segment, model)
+        self._factors = model.factors(self.units)
         self._work = self._steps()
 
     def step(self) -> bool:
@@ -308,16 +322,30 @@ class LifeTest:
             self.step()
         return self.result
 
+    def found(self) -> Floats:
+        """Do all work that is left, and return the evidence of each of the ``FAULTS`` before the factors, ``[5, D]``."""
+        self.finish()
+        return self.of_faults
+
+    def given(self, known: Mask) -> Floats:
+        """Return the same where only the ``known`` cells (bool ``[D]``) predict others."""
+        return _full_evidence(self._log, self._model, known, self._layout.beside, self._record.means)[0]
+
+    @property
+    def units(self) -> int:
+        """Number of units of the log."""
+        return len(self._log.begins)
+
     def _steps(self) -> Iterator[None]:
         log, model = self._log, self._model
         beside = self._layout.beside
         refuted = np.zeros(len(self._eligible), np.intp)  # how often each cell was
         for _ in range(_ROUNDS):
-            evidence = self._fast(self._known)
+            evidence, plain = self._fast(self._known)
             yield
             bad = self._eligible & (evidence > _REFUTED)
-            around = np.where((beside >= 0) & self._known[beside], evidence[beside], -np.inf)
-            gone = bad & self._known & (evidence > MAJORITY * around.max(axis=1, initial=-np.inf))
+            around = np.where((beside >= 0) & self._known[beside], plain[beside], -np.inf)
+            gone = bad & self._known & (plain >= around.max(axis=1, initial=-np.inf))
             refuted += gone
             # A cell that the others beside it had made look wrong comes back, but once only.
             allowed = self._eligible & ~self._constant
@@ -330,14 +358,14 @@ class LifeTest:
         self.of_faults = of_faults
         self.result = _concluded(of_faults, details, log, model, self._eligible, self._constant)
 
-    def _fast(self, known: Mask) -> Floats:
-        """Return the highest evidence of two faults, which all others are near, ``[D]``."""
+    def _fast(self, known: Mask) -> tuple[Floats, Floats]:
+        """Return the highest evidence of two faults, which all others are near, ``[D]``, and the same without factors."""
         log = self._log
         healthy, _ = log.healthy(self._model, known, self._layout.beside)
-        independent = _robust(log.by_unit(log.own - healthy), self._model.errs).sum(axis=0) * self._model.factors[0]
-        gone = _forward(_robust(log.by_unit(log.at_rest - healthy), self._model.errs))[0] * self._model.factors[1]
-        found: Floats = np.maximum(independent, gone)
-        return found
+        independent = _robust(log.by_unit(log.own - healthy), self._model.errs).sum(axis=0)
+        gone, _ = _forward(_robust(log.by_unit(log.at_rest - healthy), self._model.errs))
+        evidence = np.maximum(independent * self._factors[0], gone * self._factors[1])
+        return evidence, np.maximum(independent, gone)
 
 
 @dataclass(frozen=True)
@@ -504,7 +532,7 @@ def _concluded(
     of_faults: Floats, details: _Details, log: _Log, model: LifeModel, eligible: Mask, constant: Mask
 ) -> Life:
     """Return the result."""
-    scaled = of_faults * model.factors
+    scaled = of_faults * model.factors(len(log.begins))
     evidence = np.where(eligible, logsumexp(scaled + np.log(_SHARES)[:, None], axis=0), 0.0)
     shown = eligible & (of_faults[0] < -_SHOWN)
     refuted = eligible & (evidence > _REFUTED)
@@ -624,13 +652,13 @@ class _Fit:
         """Return the fitted model."""
         blank = LifeModel(
             self._full, self._levels, np.zeros(0), np.zeros((0, 0, 0), np.float32), self._equal(), 1,
-            np.full(len(self._present), 0.05), self._tolerance, np.ones((len(FAULTS), len(self._present))),
+            np.full(len(self._present), 0.05), self._tolerance, np.zeros((len(FAULTS), len(self._present))), 1, 1.0,
         )  # fmt: skip
         seen = [self._expected(replace(blank, means=means), fold) for means, fold in self._cross()]
         predicted = self._predicted_edges([expected for expected, _ in seen])
         counts = np.stack([self._counts(fold, *of, predicted) for fold, of in zip(self._folds, seen, strict=True)])
         total = counts.sum(axis=0)
-        shrinkage = max(_SHRINKAGES, key=lambda k: self._likelihood(counts, total, k))
+        shrinkage = self._shrinkage(counts, total)
         fitted = replace(blank, predicted=predicted, table=_table(total, shrinkage))
         held_out = [
             replace(fitted, means=means, table=_table(total - counts[k], shrinkage))
@@ -639,7 +667,14 @@ class _Fit:
         unit = self._unit(held_out)
         errs, of_others = self._errs([replace(of, unit=unit) for of in held_out])
         held_out = [replace(of, unit=unit, errs=own) for of, own in zip(held_out, of_others, strict=True)]
-        return replace(fitted, unit=unit, errs=errs, factors=self._factors(held_out))
+        # First with the dead cells known: else healthy cells would be taken for dead ones, and mislead the others.
+        reached, units = self._reached(held_out, informed=True)
+        held_out = [replace(of, reached=reached, units=units) for of in held_out]
+        reached = np.maximum(reached, self._reached(held_out, informed=False)[0])
+        of_all = sum(len(np.unique(fold.segment // unit)) for fold in self._folds)
+        # Few units contain few unusual contacts.
+        counted = 1 - _MOST_DISCOUNT / (1 + of_all / _HALF_DISCOUNT)
+        return replace(fitted, unit=unit, errs=errs, reached=reached, units=units, counts=counted)
 
     def _cross(self) -> list[tuple[tuple[ConditionalMean, ...], _Fold]]:
         return list(zip(self._held_out, self._folds, strict=True))
@@ -691,8 +726,14 @@ class _Fit:
         counted = np.bincount(index[:, self._present].ravel(), minlength=tables * m * k)
         return counted.astype(np.float64).reshape(tables, m, k)
 
-    def _likelihood(self, counts: Floats, total: Floats, shrinkage: float) -> float:
-        return float(sum((of * _table(total - of, shrinkage)).sum() for of in counts))
+    def _shrinkage(self, counts: Floats, total: Floats) -> Floats:
+        """Return the pseudo-count of each cell, ``[tables, 1, 1]``: the likeliest for the folds that it has not seen."""
+        likelihood = []
+        for shrinkage in _SHRINKAGES:
+            each = [(of * _table(total - of, shrinkage)).sum(axis=(1, 2)) for of in counts]
+            likelihood.append(np.sum(each, axis=0))
+        best = np.argmax(likelihood, axis=0)
+        return np.asarray(_SHRINKAGES)[best][:, None, None]
 
     def _unit(self, held_out: list[LifeModel]) -> int:
         """Return the segments of a unit: successive units of healthy cells are hardly correlated."""
@@ -736,15 +777,16 @@ class _Fit:
         without = [share(np.delete(erred, k, axis=0), np.delete(units, k, axis=0)) for k in range(len(ratios))]
         return share(erred, units), without
 
-    def _factors(self, held_out: list[LifeModel]) -> Floats:
-        """Return the factors ``[5, D]`` that keep healthy cells, with dead ones beside them, below the threshold.
+    def _reached(self, held_out: list[LifeModel], *, informed: bool) -> tuple[Floats, int]:
+        """Return the evidence ``[5, D]`` that healthy cells reach in logs with dead ones, and the units of these logs.
 
-        Cells where contacts end are predicted worse than others: the limit is the highest evidence of the cell itself,
+        ``informed``: the test is told which cells are dead. Cells where contacts end are predicted worse than others: the limit is the highest evidence of the cell itself,
         and at least what all but a few of the cells reach.
         """
         cells = np.flatnonzero(self._present)
         reached = np.full((len(FAULTS), len(self._present)), -np.inf)
         usual = []
+        units = []
         for model, fold in zip(held_out, self._folds, strict=True):
             for dead_share in (0.0, _DEAD):
                 loads = fold.loads.copy()
@@ -754,17 +796,13 @@ class _Fit:
                 healthy = np.setdiff1d(cells, dead)
                 for record in _logs(_Fold(loads, fold.readings, fold.segment)):
                     test = LifeTest(record, model, self._layout, self._present)
-                    test.finish()
-                    found = test.of_faults[:, healthy]
+                    of_faults = test.given(np.isin(np.arange(len(self._present)), healthy)) if informed else test.found()
+                    found = of_faults[:, healthy]
                     reached[:, healthy] = np.maximum(reached[:, healthy], found)
                     usual.append(found)
+                    units.append(test.units)
         most = np.quantile(np.concatenate(usual, axis=1), _HEALTHY, axis=1)
-        reached = np.maximum(reached, most[:, None])
-        # Few units contain few unusual contacts.
-        units = sum(len(np.unique(fold.segment // held_out[0].unit)) for fold in self._folds)
-        counts = 1 - _MOST_DISCOUNT / (1 + units / _HALF_DISCOUNT)
-        factors: Floats = counts * _THRESHOLD / np.maximum(_THRESHOLD, MARGIN * reached)
-        return factors
+        return np.maximum(reached, most[:, None]), int(np.median(units))
 
 
 def _logs(fold: _Fold) -> list[LifeRecord]:
@@ -788,7 +826,7 @@ def _edges(values: Array, n: int) -> Floats:
     return np.unique(np.append(_UNLOADED, np.quantile(loaded, np.linspace(0, 1, n)[1:-1]))).astype(np.float64)
 
 
-def _table(counts: Floats, shrinkage: float) -> Array:
+def _table(counts: Floats, shrinkage: Floats | float) -> Array:
     """Return log P(level | prediction) of each cell, ``[D, M, K]``, shrunk towards that of all cells."""
     pooled = counts.sum(axis=0)
     usual = pooled.sum(axis=0) / pooled.sum()

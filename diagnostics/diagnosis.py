@@ -245,16 +245,17 @@ class SelfDiagnosis:
         aliases, copies = find_aliasing(stream)
         yield
         explained, still, life = copies, list[StaticLoad](), Life.assumed(stream.layout.n_cells)
+        proves = stream.reference.life is not None
+        if proves:
+            # Cells that move by themselves mislead the spatial test.
+            life = yield from _stepped(stream.proof_of_life(copies, np.zeros_like(copies)))
         log_ratio = self._log_ratio(stream, life)
         spatial, found = yield from self._tested(stream, explained, log_ratio, life)
-        if stream.reference.life is not None:
-            life = yield from self._proof_of_life(stream, copies, spatial, found)
+        if proves:
+            # Cells that the spatial test suspects predict no others.
+            suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
+            life = yield from _stepped(stream.proof_of_life(copies, suspected))
             log_ratio = self._log_ratio(stream, life)
-            if self._misleading(stream, life).any():
-                # They misled the spatial test, and its suspects the proof of life: once more without them.
-                spatial, found = yield from self._tested(stream, explained, log_ratio, life)
-                life = yield from self._proof_of_life(stream, copies, spatial, found)
-                log_ratio = self._log_ratio(stream, life)
             found = self._found(stream, spatial, explained, log_ratio, life)
         for beside in (False, True):
             while True:
@@ -324,18 +325,6 @@ class SelfDiagnosis:
         runs = stream.runs
         before = runs.moved & (runs.start - life.since > _LONG_BEFORE)
         return life.certain & ((runs.length < SHORTEST_RUN) | before)
-
-    @staticmethod
-    def _proof_of_life(
-        stream: StreamState, explained: NDArray[np.bool_], spatial: Spatial, found: CellFindings
-    ) -> Generator[None, None, Life]:
-        """Yield between steps of the proof of life, see ``StreamState.proof_of_life``; return its result.
-
-        Cells that the spatial test suspects predict no others.
-        """
-        suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
-        result = yield from _stepped(stream.proof_of_life(explained, suspected))
-        return result
 
     def _tested(
         self, stream: StreamState, explained: NDArray[np.bool_], log_ratio: LogRatio, life: Life

@@ -60,7 +60,7 @@ _CONTAMINATIONS = (0.01, 0.02, 0.04, 0.08)  # shares e: a grid
 _CORRELATED = 0.25  # correlation of successive units that is small
 _MOST_PIECES = 6000  # of the reference: a size
 _CERTAINLY_NOT = 1e3  # evidence against what is impossible
-_ROUNDS = 12  # at most: a size
+_ROUNDS = 16  # at most: a size
 _REFUTED = 4.0  # evidence from which on a cell is replaced
 _THRESHOLD = 9.0  # evidence of a certain fault: with its prior, P(faulty) = 0.994
 _FAILS, _RECOVERS = 0.1, 0.3  # probability per unit
@@ -68,6 +68,8 @@ _AT_REST = 0.95  # of the pieces of a cell that is dead for a time are unloaded
 _GUESS = 0.005  # of a uniform distribution over the levels, in any table: models err
 _AGAINST = 1.0  # log ratio from which on a unit speaks against a cell
 _SHOWN = 2.0  # evidence against independence that proves life
+_TILTED = 8.0  # pseudo-count of pieces, of the frequency of a level
+_MOST_TILT = 16.0  # times as frequent as expected, or as rare, levels of healthy cells are in a log
 _MOST_DISCOUNT, _HALF_DISCOUNT = 0.5, 100.0  # of the factors; units of the reference that halve it
 _DEAD = 0.08  # share of the cells that are dead in half of the simulated logs
 _HEALTHY = 0.99  # of the healthy cells in simulated logs
@@ -345,7 +347,8 @@ class LifeTest:
             yield
             bad = self._eligible & (evidence > _REFUTED)
             around = np.where((beside >= 0) & self._known[beside], plain[beside], -np.inf)
-            gone = bad & self._known & (plain >= around.max(axis=1, initial=-np.inf))
+            worst = plain.max(initial=-np.inf, where=bad & self._known)
+            gone = bad & self._known & (plain >= around.max(axis=1, initial=-np.inf)) & (plain > MAJORITY * worst)
             refuted += gone
             # A cell that the others beside it had made look wrong comes back, but once only.
             allowed = self._eligible & ~self._constant
@@ -405,8 +408,27 @@ class _Log:
     def healthy(self, model: LifeModel, known: Mask, beside: Cells) -> tuple[Floats, NDArray[np.intp]]:
         """Return log P(level | healthy) and the context, ``[n, D]`` each."""
         context = model.contexts(self.loads, known, beside)
-        cells = model.of_cell(np.arange(self.level.shape[1]))
-        return model.table[cells, context, self.level].astype(np.float64), context
+        return self.given(model, context, self.level), context
+
+    def given(self, model: LifeModel, context: NDArray[np.intp], level: NDArray[np.intp]) -> Floats:
+        """Return log P(level | context) of a healthy cell whose levels are as frequent as they are in the log.
+
+        Where contacts hardly change, a level is likely because the cell had it before, whatever the others say. The
+        table of healthy cells is tilted, P(l | c) f(l) / sum over l' of P(l' | c) f(l'), with f the frequency in the log
+        over the expected one, within limits.
+        """
+        d = level.shape[1]
+        cells = model.of_cell(np.arange(d))
+        m, k = model.table.shape[1:]
+        contexts = np.bincount((context + m * np.arange(d)).ravel(), minlength=m * d).reshape(d, m)
+        levels = np.bincount((level + k * np.arange(d)).ravel(), minlength=k * d).reshape(d, k)
+        table = np.exp(model.table[cells].astype(np.float64))
+        expected = np.einsum("dm,dmk->dk", contexts, table)
+        tilt = np.clip((levels + _TILTED) / (expected + _TILTED), 1 / _MOST_TILT, _MOST_TILT)
+        total = np.log(np.einsum("dk,dmk->dm", tilt, table))
+        each = np.arange(d)
+        found: Floats = model.table[cells, context, level] + np.log(tilt)[each, level] - total[each, context]
+        return found
 
     def by_unit(self, ratio: Floats) -> Floats:
         """Return the sums over the pieces of each unit, ``[units, D]``."""
@@ -469,10 +491,12 @@ def _full_evidence(log: _Log, model: LifeModel, known: Mask, beside: Cells, read
     lagged = []
     for lag in _LAGS:
         late = healthy.copy()
-        late[lag:] = model.table[cells, predicted[:-lag], log.level[lag:]]
+        late[lag:] = log.given(model, predicted[:-lag], log.level[lag:])
         lagged.append(summed(late))
     found[2] = logsumexp(lagged, axis=0) - np.log(len(lagged))
-    found[4] = summed(_clamped(log, model, healthy, predicted, readings))
+    plain = model.table[cells, predicted, log.level].astype(np.float64)
+    clamped = _robust(log.by_unit(_clamped(log, model, plain, predicted, readings) - plain), model.errs)
+    found[4] = clamped.sum(axis=0)
     against |= dead > _AGAINST
     lag = np.array(_LAGS)[np.argmax(lagged, axis=0)]
     return found, _Details(lag, source, share, against, readings.max(axis=0).astype(np.float64))

@@ -27,7 +27,7 @@ from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED, RARE
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED, MAJORITY, RARE
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks
 
@@ -73,7 +73,7 @@ class SelfDiagnosis:
     calibrator_: Calibrator = Calibrator.cold()
 
     def __init__(
-        self, layout: SensorLayout, *, false_discovery_rate: float = 0.006, proof_of_life: bool = False
+        self, layout: SensorLayout, *, false_discovery_rate: float = 0.006, proof_of_life: bool = True
     ) -> None:
         self.layout = layout
         self.proof_of_life = proof_of_life
@@ -374,7 +374,7 @@ class SelfDiagnosis:
         judged = delivers & runs.moved & ~certain & (reference.life is not None)
         # The factors of the evidence hold for this prior: many doubtful cells do not make each other faulty.
         refuted = np.where(judged, expit(life.evidence + logit(EXPECTED)), 0.0)
-        by_life = judged & (refuted > stuck)
+        by_life = judged & (refuted > stuck) & (stuck < MAJORITY)  # a constant run tells more: its value, its onset
         probability = np.where(present, np.where(certain, _CERTAIN, np.maximum(stuck, refuted)), 0.0)
         faulty = faulty_at(np.where(certain, 0.0, probability), self.false_discovery_rate)
         faulty = (faulty | certain) & present & ~explained

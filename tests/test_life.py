@@ -9,7 +9,7 @@ import pytest
 
 from adaptfault.data.recordings import Recordings
 from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, Verdict, inject
-from diagnostics.evidence.life import LifeTest
+from diagnostics.evidence.life import LifeTest, _Log
 from diagnostics.evidence.life_record import KEPT, LifeRecord
 
 
@@ -120,10 +120,45 @@ def test_a_log_without_contact_proves_nothing(fitted):
     assert not life.evidence.any()
 
 
-def test_the_proof_of_life_is_off_unless_it_is_asked_for_and_is_stored_with_the_fit(fitted, log):
-    assert SelfDiagnosis(fitted.layout).proof_of_life is False
-    assert SelfDiagnosis(fitted.layout).get_params()["proof_of_life"] is False
+def test_the_proof_of_life_is_on_unless_it_is_declined_and_is_stored_with_the_fit(fitted, log):
+    assert SelfDiagnosis(fitted.layout).proof_of_life is True
+    assert SelfDiagnosis(fitted.layout, proof_of_life=False).get_params()["proof_of_life"] is False
     about, arrays = fitted.state()
     again = SelfDiagnosis.from_state(about, arrays)
     assert again.proof_of_life
     assert again.diagnose(log).to_dict() == fitted.diagnose(log).to_dict()
+
+
+def test_the_longer_the_log_the_more_evidence_is_needed_against_cells_that_the_model_predicts_badly(fitted):
+    model = fitted.reference_.life
+    short, usual, long = (model.factors(units) for units in (1, model.units, 4 * model.units))
+    np.testing.assert_array_equal(short, usual)
+    badly = usual < model.counts
+    np.testing.assert_allclose(long[badly], usual[badly] / 4)
+    assert badly.any()
+
+
+def test_a_level_that_a_cell_has_all_the_time_is_no_contradiction_whatever_was_expected(fitted, log):
+    stream = fitted.stream()
+    for frames in log:
+        stream.extend(frames)
+    record = stream.complete().life
+    model = fitted.reference_.life
+    pieces = _Log.of(record.loads, record.segment, model)
+    each = np.arange(pieces.level.shape[1])
+    likeliest = model.table[model.of_cell(each), :, 3].argmax(axis=1)
+    context = np.broadcast_to(likeliest, pieces.level.shape)
+    always = pieces.given(model, context, np.full(pieces.level.shape, 3))
+    assert (always > np.log(0.9)).all()
+    _, context = pieces.healthy(model, np.ones(len(each), bool), fitted.layout.beside)
+    plain = model.table[model.of_cell(each), context, pieces.level]
+    assert pieces.given(model, context, pieces.level).mean() > plain.mean()
+
+
+def test_two_cells_side_by_side_that_move_by_themselves_are_found_and_none_of_those_between(fitted, log, used):
+    first = int(used[0])
+    dead = (first, first + 1)
+    seen = broken(log, Fault(FaultKind.FLOATING, (first,), value=1.0), fitted)
+    seen = broken(seen, Fault(FaultKind.LATE, (first + 1,), value=10), fitted)
+    found = fitted.diagnose(seen)
+    assert tuple(sorted(found.fault_set)) == dead

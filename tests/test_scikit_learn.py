@@ -118,7 +118,7 @@ def presses(n: int, seed: int) -> np.ndarray:
 def test_the_diagnosis_clones_and_ends_a_pipeline():
     layout = SensorLayout(1, 4, 6, full_scale=1.0)
     diagnoser = SelfDiagnosis(layout, false_discovery_rate=0.01)
-    assert diagnoser.get_params() == {"layout": layout, "false_discovery_rate": 0.01, "proof_of_life": False}
+    assert diagnoser.get_params() == {"layout": layout, "false_discovery_rate": 0.01, "proof_of_life": True}
     pipeline = make_pipeline(FunctionTransformer(lambda counts: counts / 255), diagnoser)
     assert pipeline.fit(255 * presses(60, 0))[-1] is diagnoser
     check_is_fitted(pipeline)

@@ -69,9 +69,11 @@ _GUESS = 0.005  # of a uniform distribution over the levels, in any table: model
 _AGAINST = 1.0  # log ratio from which on a unit speaks against a cell
 _SHOWN = 2.0  # evidence against independence that proves life
 _TILTED = 8.0  # pseudo-count of pieces, of the frequency of a level
+_FITS = 3  # of the tilt, by iterative proportional fitting: a size
 _MOST_TILT = 16.0  # times as frequent as expected, or as rare, levels of healthy cells are in a log
 _MOST_DISCOUNT, _HALF_DISCOUNT = 0.5, 100.0  # of the factors; units of the reference that halve it
-_DEAD = 0.08  # share of the cells that are dead in half of the simulated logs
+_DEAD = 0.08  # share of the cells that are dead in simulated logs
+_DRAWS = 4  # of dead cells in each fold
 _HEALTHY = 0.99  # of the healthy cells in simulated logs
 _DISTURBED = 1 / 3  # share of the tested cells: if more are refuted, all are disturbed
 
@@ -423,8 +425,11 @@ class _Log:
         contexts = np.bincount((context + m * np.arange(d)).ravel(), minlength=m * d).reshape(d, m)
         levels = np.bincount((level + k * np.arange(d)).ravel(), minlength=k * d).reshape(d, k)
         table = np.exp(model.table[cells].astype(np.float64))
-        expected = np.einsum("dm,dmk->dk", contexts, table)
-        tilt = np.clip((levels + _TILTED) / (expected + _TILTED), 1 / _MOST_TILT, _MOST_TILT)
+        tilt = np.ones((d, k))
+        for _ in range(_FITS):
+            total = np.einsum("dk,dmk->dm", tilt, table)
+            expected = tilt * np.einsum("dm,dmk->dk", contexts / total, table)
+            tilt = np.clip(tilt * (levels + _TILTED) / (expected + _TILTED), 1 / _MOST_TILT, _MOST_TILT)
         total = np.log(np.einsum("dk,dmk->dm", tilt, table))
         each = np.arange(d)
         found: Floats = model.table[cells, context, level] + np.log(tilt)[each, level] - total[each, context]
@@ -812,7 +817,7 @@ class _Fit:
         usual = []
         units = []
         for model, fold in zip(held_out, self._folds, strict=True):
-            for dead_share in (0.0, _DEAD):
+            for dead_share in (0.0, *[_DEAD] * _DRAWS):
                 loads = fold.loads.copy()
                 dead = self._rng.choice(cells, round(dead_share * len(cells)), replace=False)
                 for cell in dead.tolist():

@@ -29,14 +29,12 @@ from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED, MAJORITY, RARE
 from diagnostics.preprocessing.load import LoadDirection
-from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks
+from diagnostics.preprocessing.readings import RecordingBlocks
 
 SCHEMA = "adaptfault.diagnoser/10"
 
 _CERTAIN = 1 - RARE  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
 _DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
-
-_LONG_BEFORE = 8 * SEGMENT  # frames
 
 Result = TypeVar("Result", covariant=True)
 LogRatio = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -321,9 +319,9 @@ class SelfDiagnosis:
 
     @staticmethod
     def _misleading(stream: StreamState, life: Life) -> NDArray[np.bool_]:
-        """Return the cells that are refuted and move, or did so long before they came to hold a value, bool ``[D]``."""
+        """Return the cells that are refuted and move, or were before they came to hold a value, bool ``[D]``."""
         runs = stream.runs
-        before = runs.moved & (runs.start - life.since > _LONG_BEFORE)
+        before = runs.moved & life.mostly_before(runs.start)
         return life.certain & ((runs.length < SHORTEST_RUN) | before)
 
     def _tested(
@@ -333,7 +331,7 @@ class SelfDiagnosis:
 
         Moving cells that are refuted predict no others.
         """
-        spatial = yield from _stepped(stream.spatial(explained | self._misleading(stream, life)))
+        spatial = yield from _stepped(stream.spatial(explained, self._misleading(stream, life)))
         yield
         return spatial, self._found(stream, spatial, explained, log_ratio, life)
 
@@ -369,7 +367,7 @@ class SelfDiagnosis:
         stuck[known] = reference.dead[known]
         delivers = present & ~explained & ~silent
         intermittent, noisy = intermittency.intermittent & delivers, intermittency.excess & delivers
-        drifting = delivers & ~intermittent & ~noisy & spatial.drifting
+        drifting = delivers & ~intermittent & ~noisy & spatial.drifting & ~(life.floats & np.isfinite(spatial.factor))
         certain = silent | intermittent | noisy | drifting
         judged = delivers & runs.moved & ~certain & (reference.life is not None)
         # The factors of the evidence hold for this prior: many doubtful cells do not make each other faulty.

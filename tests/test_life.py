@@ -144,7 +144,7 @@ def test_a_level_that_a_cell_has_all_the_time_is_no_contradiction_whatever_was_e
         stream.extend(frames)
     record = stream.complete().life
     model = fitted.reference_.life
-    pieces = _Log.of(record.loads, record.segment, model)
+    pieces = _Log.of(record.loads, record.means, record.segment, model)
     each = np.arange(pieces.level.shape[1])
     likeliest = model.table[model.of_cell(each), :, 3].argmax(axis=1)
     context = np.broadcast_to(likeliest, pieces.level.shape)

@@ -35,7 +35,7 @@ from diagnostics.healthy.cross_fitting import FOLDS
 from diagnostics.healthy.dual_ridge import covariance_and_precision
 from diagnostics.preprocessing.levels import FEWEST, MAJORITY, MARGIN, TESTED
 from diagnostics.preprocessing.offset import OffsetTracker
-from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks
+from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks, spread
 from diagnostics.preprocessing.scale import Array
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ _PREDICTED = 16  # levels of the prediction: a size
 _BESIDE = (0.01, 0.34, 0.67, 0.99)  # shares of the cells beside one that are loaded, between levels
 _OWN_ERRS = 20.0  # pseudo-count of units, of the share e of each cell
 _LAGS = (1, 2, 3, 4)  # pieces
+_GAINS = (0.1, 0.2, 0.35)  # of weak cells: a grid
 _UNLOADED = 1e-3  # root load up to which a piece counts as unloaded
 _SHRINKAGES = (4.0, 16.0, 64.0, 256.0, 1024.0)  # pseudo-counts of the table of all cells: a grid
 _CONTAMINATIONS = (0.01, 0.02, 0.04, 0.08)  # shares e: a grid
@@ -68,6 +69,7 @@ _AT_REST = 0.95  # of the pieces of a cell that is dead for a time are unloaded
 _GUESS = 0.005  # of a uniform distribution over the levels, in any table: models err
 _AGAINST = 1.0  # log ratio from which on a unit speaks against a cell
 _SHOWN = 2.0  # evidence against independence that proves life
+_THE_SAME = 0.1  # relative difference of loads that are the same
 _TILTED = 8.0  # pseudo-count of pieces, of the frequency of a level
 _FITS = 3  # of the tilt, by iterative proportional fitting: a size
 _MOST_TILT = 16.0  # times as frequent as expected, or as rare, levels of healthy cells are in a log
@@ -222,13 +224,26 @@ class LifeModel:
         return level * (len(_BESIDE) + 1) + _loaded_beside(loads, known, beside)
 
     def factors(self, units: int) -> Floats:
-        """Return the factors ``[5, D]`` on the evidence in a log of so many units: healthy cells stay below the threshold.
+        """Return the factors ``[5, D]`` on the evidence in a log of so many units: healthy cells stay below the limit.
 
         The evidence against a healthy cell that the model predicts badly grows with the length of the log.
         """
         reached = np.maximum(self.reached, 0.0) * max(1.0, units / self.units)
         factors: Floats = self.counts * _THRESHOLD / np.maximum(_THRESHOLD, MARGIN * reached)
         return factors
+
+    def probabilities(self, gain: float = 1.0) -> Floats:
+        """Return P(observed level | context) of cells with a lower ``gain``, shape of ``table``."""
+        table = np.exp(self.table.astype(np.float64))
+        if gain == 1:
+            return table
+        middle = (np.append(self.levels, 1.0) + np.append(0.0, self.levels)) / 2
+        becomes = np.searchsorted(self.levels, middle * np.sqrt(gain), side="right")
+        becomes[0] = 0  # what is unloaded stays so
+        lower = np.full(table.shape, _GUESS / len(middle))
+        for before, after in enumerate(becomes.tolist()):
+            lower[:, :, after] += (1 - _GUESS) * table[:, :, before]
+        return lower
 
     def of_cell(self, cells: Cells) -> Cells:
         """Return where the table of each cell is."""
@@ -249,8 +264,10 @@ class Life:
         source: int, the cell that it repeats, if it does.
         share: float, of the tested units in which a cell that comes and goes was dead.
         since: int, number of the first frame of the first unit against the cell.
-        units: int, number of units against the cell.
+        against: bool ``[units, D]``, units against the cell.
+        begins: int ``[units]``, number of the first frame of each.
         highest: float, highest reading of a piece, in the layout's unit.
+        floats: bool, certain cells that do not follow the others at all, not with a lower gain either.
         contradicting: share of the tested cells that are refuted, where it is so large that all are disturbed and none
             is faulty; else 0.
     """
@@ -264,8 +281,10 @@ class Life:
     source: NDArray[np.intp]
     share: Floats
     since: NDArray[np.intp]
-    units: NDArray[np.intp]
+    against: Mask
+    begins: NDArray[np.intp]
     highest: Floats
+    floats: Mask
     contradicting: float
 
     @classmethod
@@ -273,7 +292,17 @@ class Life:
         """Return the evidence of a log that tells nothing."""
         nothing, no = np.zeros(n_cells), np.zeros(n_cells, bool)
         zero = np.zeros(n_cells, np.intp)
-        return cls(nothing, zero, no, no, no, zero, zero, nothing, zero, zero, nothing, 0.0)
+        return cls(nothing, zero, no, no, no, zero, zero, nothing, zero, no[None], zero[:1], nothing, no, 0.0)
+
+    @property
+    def units(self) -> NDArray[np.intp]:
+        """Number of units against each cell, int ``[D]``."""
+        return self.against.sum(axis=0)
+
+    def mostly_before(self, frame: NDArray[np.intp]) -> Mask:
+        """Return the cells that most units against them contradict before a ``frame`` (int ``[D]``), bool ``[D]``."""
+        before = (self.against & (self.begins[:, None] < frame)).sum(axis=0)
+        return before > MAJORITY * self.units
 
     @classmethod
     def assumed(cls, n_cells: int) -> Life:
@@ -310,7 +339,7 @@ class LifeTest:
             self.result = Life.unknown(layout.n_cells)
             return
         self._record = record
-        self._log = _Log.of(record.loads, record.segment, model)
+        self._log = _Log.of(record.loads, record.means, record.segment, model)
         self._factors = model.factors(self.units)
         self._work = self._steps()
 
@@ -327,7 +356,7 @@ class LifeTest:
         return self.result
 
     def found(self) -> Floats:
-        """Do all work that is left, and return the evidence of each of the ``FAULTS`` before the factors, ``[5, D]``."""
+        """Do all work that is left, and return the evidence of each fault before the factors, ``[5, D]``."""
         self.finish()
         return self.of_faults
 
@@ -364,13 +393,13 @@ class LifeTest:
         self.result = _concluded(of_faults, details, log, model, self._eligible, self._constant)
 
     def _fast(self, known: Mask) -> tuple[Floats, Floats]:
-        """Return the highest evidence of two faults, which all others are near, ``[D]``, and the same without factors."""
+        """Return the highest evidence of two faults, which all others are near, and the same without factors."""
         log = self._log
         healthy, _ = log.healthy(self._model, known, self._layout.beside)
-        independent = _robust(log.by_unit(log.own - healthy), self._model.errs).sum(axis=0)
-        gone, _ = _forward(_robust(log.by_unit(log.at_rest - healthy), self._model.errs))
-        evidence = np.maximum(independent * self._factors[0], gone * self._factors[1])
-        return evidence, np.maximum(independent, gone)
+        independent = _from_some_unit(log.counted(log.own - healthy, self._model.errs))
+        intermittent, _ = _forward(log.counted(log.at_rest - healthy, self._model.errs))
+        evidence = np.maximum(independent * self._factors[0], intermittent * self._factors[1])
+        return evidence, np.maximum(independent, intermittent)
 
 
 @dataclass(frozen=True)
@@ -379,22 +408,26 @@ class _Log:
 
     Attributes:
         loads: mean root loads ``[n, D]``.
+        read: bool ``[n, D]``, where a cell delivered readings.
         level: int ``[n, D]``.
         unit: int ``[n]``, ascending from 0.
         begins: int ``[units]``, number of the first segment of each.
+        weight: float ``[units]``, 1 / (1 + k) of a unit with k others of the same loads: a contact that is held is one.
         own: float ``[n, D]``, log frequency of the level in the other pieces of the cell.
         at_rest: float ``[n, D]``, log probability of the level of a cell without load.
     """
 
     loads: Array
+    read: Mask
     level: NDArray[np.intp]
     unit: NDArray[np.intp]
     begins: NDArray[np.intp]
+    weight: Floats
     own: Floats
     at_rest: Floats
 
     @classmethod
-    def of(cls, loads: Array, segment: NDArray[np.intp], model: LifeModel) -> _Log:
+    def of(cls, loads: Array, readings: Array, segment: NDArray[np.intp], model: LifeModel) -> _Log:
         level = np.searchsorted(model.levels, loads, side="right")
         n_levels = len(model.levels) + 1
         n, d = level.shape
@@ -405,26 +438,27 @@ class _Log:
         numbers = segment // model.unit
         begins = np.flatnonzero(np.diff(numbers, prepend=-1))
         unit = np.cumsum(np.diff(numbers, prepend=-1) != 0) - 1
-        return cls(loads, level, unit, segment[begins], own, at_rest)
+        means = np.add.reduceat(loads, begins, axis=0) / np.diff(np.append(begins, n))[:, None]
+        return cls(loads, np.isfinite(readings), level, unit, segment[begins], _novelty(means), own, at_rest)
 
     def healthy(self, model: LifeModel, known: Mask, beside: Cells) -> tuple[Floats, NDArray[np.intp]]:
         """Return log P(level | healthy) and the context, ``[n, D]`` each."""
         context = model.contexts(self.loads, known, beside)
         return self.given(model, context, self.level), context
 
-    def given(self, model: LifeModel, context: NDArray[np.intp], level: NDArray[np.intp]) -> Floats:
-        """Return log P(level | context) of a healthy cell whose levels are as frequent as they are in the log.
+    def given(self, model: LifeModel, context: NDArray[np.intp], level: NDArray[np.intp], gain: float = 1.0) -> Floats:
+        """Return log P(level | context) of a cell with a ``gain`` whose levels are as frequent as they are in the log.
 
         Where contacts hardly change, a level is likely because the cell had it before, whatever the others say. The
-        table of healthy cells is tilted, P(l | c) f(l) / sum over l' of P(l' | c) f(l'), with f the frequency in the log
-        over the expected one, within limits.
+        table of healthy cells is tilted, P(l | c) f(l) / sum over l' of P(l' | c) f(l'), with f the frequency in the
+        log over the expected one, within limits.
         """
         d = level.shape[1]
         cells = model.of_cell(np.arange(d))
         m, k = model.table.shape[1:]
         contexts = np.bincount((context + m * np.arange(d)).ravel(), minlength=m * d).reshape(d, m)
         levels = np.bincount((level + k * np.arange(d)).ravel(), minlength=k * d).reshape(d, k)
-        table = np.exp(model.table[cells].astype(np.float64))
+        table = model.probabilities(gain)[cells]
         tilt = np.ones((d, k))
         for _ in range(_FITS):
             total = np.einsum("dk,dmk->dm", tilt, table)
@@ -432,14 +466,34 @@ class _Log:
             tilt = np.clip(tilt * (levels + _TILTED) / (expected + _TILTED), 1 / _MOST_TILT, _MOST_TILT)
         total = np.log(np.einsum("dk,dmk->dm", tilt, table))
         each = np.arange(d)
-        found: Floats = model.table[cells, context, level] + np.log(tilt)[each, level] - total[each, context]
+        found: Floats = np.log(table[each, context, level] * tilt[each, level]) - total[each, context]
+        return found
+
+    def counted(self, ratio: Floats, errs: Floats) -> Floats:
+        """Return the evidence of each unit, ``[units, D]``, of the log ratio of each piece, ``[n, D]``."""
+        found: Floats = _robust(self.by_unit(ratio), errs) * self.weight[:, None]
         return found
 
     def by_unit(self, ratio: Floats) -> Floats:
-        """Return the sums over the pieces of each unit, ``[units, D]``."""
+        """Return the sums over the pieces of each unit that were read, ``[units, D]``."""
         begins = np.flatnonzero(np.diff(self.unit, prepend=-1))
-        summed: Floats = np.add.reduceat(ratio, begins, axis=0)
+        summed: Floats = np.add.reduceat(np.where(self.read, ratio, 0.0), begins, axis=0)
         return summed
+
+
+def _novelty(means: NDArray[np.floating]) -> Floats:
+    """Return the weight of each unit, ``[units]``, of the mean root loads in it, ``[units, D]``.
+
+    Two units have the same loads if these differ by less than a tenth, over the cells whose loads change at all.
+    """
+    cells = spread(np.flatnonzero(np.ptp(means, axis=0) > _UNLOADED))
+    changing = means[:, cells]
+    size = changing.sum(axis=1)
+    repeats = np.zeros(len(means))
+    for u, one in enumerate(changing):
+        differ = np.abs(changing - one).sum(axis=1)
+        repeats[u] = (differ <= _THE_SAME * np.maximum(size, size[u])).sum() - 1
+    return 1 / (1 + repeats)
 
 
 def _robust(ratio: Floats, errs: Floats | float) -> Floats:
@@ -465,6 +519,28 @@ def _forward(dead: Floats) -> tuple[Floats, Floats]:
     return np.logaddexp(alive, gone), np.exp(filtered)
 
 
+def _from_some_unit(dead: Floats) -> Floats:
+    """Return the log evidence ``[D]`` of a cell that is dead from a unit on, half of them from the first."""
+    before = np.cumsum(dead, axis=0)
+    later = logsumexp(before[-1] - before, axis=0) - np.log(len(dead))
+    found: Floats = np.logaddexp(before[-1], later) - np.log(2)
+    return found
+
+
+def _up_to_some_unit(dead: Floats) -> Floats:
+    """Return the log evidence ``[D]`` of a cell that was dead up to a unit, and works again; see _forward."""
+    before = np.cumsum(dead, axis=0)
+    found: Floats = logsumexp(before, axis=0) - np.log(len(dead))
+    return found
+
+
+def _since_it_works(dead: Floats) -> Floats:
+    """Return the log ratio dead : healthy ``[D]`` after the unit up to which a cell was most likely dead, if any."""
+    before = np.cumsum(dead, axis=0)
+    found: Floats = before[-1] - np.maximum(before.max(axis=0), 0.0)
+    return found
+
+
 @dataclass(frozen=True)
 class _Details:
     """What is known of each fault, ``[D]`` each, see :class:`Life`."""
@@ -474,6 +550,8 @@ class _Details:
     share: Floats
     against: Mask  # [units, D], units against the cell
     highest: Floats
+    now: Floats  # log ratio of dead : healthy since the cell, if it ever was dead, works again
+    weak: Mask  # it follows the others with a lower gain rather than not at all
 
 
 def _full_evidence(log: _Log, model: LifeModel, known: Mask, beside: Cells, readings: Array) -> tuple[Floats, _Details]:
@@ -484,13 +562,18 @@ def _full_evidence(log: _Log, model: LifeModel, known: Mask, beside: Cells, read
     healthy, predicted = log.healthy(model, known & (found[3] <= _REFUTED), beside)
 
     def summed(fault: Floats) -> Floats:
-        evidence: Floats = _robust(log.by_unit(fault - healthy), model.errs).sum(axis=0)
+        evidence: Floats = log.counted(fault - healthy, model.errs).sum(axis=0)
         return evidence
 
-    found[0] = summed(log.own)
+    independent = log.counted(log.own - healthy, model.errs)
     against = log.by_unit(log.own - healthy) > _AGAINST
-    dead = _robust(log.by_unit(log.at_rest - healthy), model.errs)
+    dead = log.counted(log.at_rest - healthy, model.errs)
+    # What was dead once, and works again, is no fault any more.
+    now = _since_it_works(independent)
+    ever = _from_some_unit(independent)
+    found[0] = np.where(now < -_REFUTED, np.minimum(ever, now), ever)
     found[1], filtered = _forward(dead)
+    found[1] -= np.logaddexp(0.0, _up_to_some_unit(dead))
     tested = np.abs(dead) > TESTED
     share = ((filtered > MAJORITY) & tested).sum(axis=0) / np.maximum(tested.sum(axis=0), 1)
     lagged = []
@@ -500,11 +583,16 @@ def _full_evidence(log: _Log, model: LifeModel, known: Mask, beside: Cells, read
         lagged.append(summed(late))
     found[2] = logsumexp(lagged, axis=0) - np.log(len(lagged))
     plain = model.table[cells, predicted, log.level].astype(np.float64)
-    clamped = _robust(log.by_unit(_clamped(log, model, plain, predicted, readings) - plain), model.errs)
-    found[4] = clamped.sum(axis=0)
+    found[4] = log.counted(_clamped(log, model, plain, predicted, readings) - plain, model.errs).sum(axis=0)
     against |= dead > _AGAINST
     lag = np.array(_LAGS)[np.argmax(lagged, axis=0)]
-    return found, _Details(lag, source, share, against, readings.max(axis=0).astype(np.float64))
+    weak = []
+    for gain in _GAINS:
+        lower = log.given(model, predicted, log.level, gain)
+        weak.append(_from_some_unit(log.counted(lower - healthy, model.errs)))
+    return found, _Details(
+        lag, source, share, against, np.fmax.reduce(readings).astype(np.float64), now, np.max(weak, axis=0) > ever
+    )
 
 
 def _clamped(log: _Log, model: LifeModel, healthy: Floats, context: NDArray[np.intp], readings: Array) -> Floats:
@@ -545,7 +633,7 @@ def _copies(
         alone[pairs] = False
         alone[source[pairs]] = False
         healthy, _ = log.healthy(model, alone, beside)
-        fits = _robust(log.by_unit(healthy - log.own), model.errs).sum(axis=0)
+        fits = log.counted(healthy - log.own, model.errs).sum(axis=0)
         worse = fits[source[pairs]] - fits[pairs]
         copies, other = total[pairs] + _log_expit(worse), total[pairs] + _log_expit(-worse)
         total[pairs] = copies - np.logaddexp(0.0, other)
@@ -563,7 +651,7 @@ def _concluded(
     """Return the result."""
     scaled = of_faults * model.factors(len(log.begins))
     evidence = np.where(eligible, logsumexp(scaled + np.log(_SHARES)[:, None], axis=0), 0.0)
-    shown = eligible & (of_faults[0] < -_SHOWN)
+    shown = eligible & (details.now < -_SHOWN)
     refuted = eligible & (evidence > _REFUTED)
     tested = shown | refuted
     contradicting = float((refuted & ~constant).sum() / max(int((tested & ~constant).sum()), 1))
@@ -573,19 +661,22 @@ def _concluded(
         refuted = np.zeros_like(refuted)
     else:
         contradicting = 0.0
+    certain = refuted & (evidence > _THRESHOLD)
     begins = log.begins[details.against.argmax(axis=0)] * SEGMENT
     return Life(
         evidence=evidence,
         kind=of_faults.argmax(axis=0),
         shown=shown,
         refuted=refuted,
-        certain=refuted & (evidence > _THRESHOLD),
+        certain=certain,
         lag=details.lag,
         source=details.source,
         share=details.share,
         since=np.where(details.against[0], 0, begins),
-        units=details.against.sum(axis=0),
+        against=details.against,
+        begins=log.begins * SEGMENT,
         highest=details.highest,
+        floats=certain & (of_faults[0] >= of_faults.max(axis=0)) & ~details.weak,
         contradicting=contradicting,
     )
 
@@ -756,7 +847,7 @@ class _Fit:
         return counted.astype(np.float64).reshape(tables, m, k)
 
     def _shrinkage(self, counts: Floats, total: Floats) -> Floats:
-        """Return the pseudo-count of each cell, ``[tables, 1, 1]``: the likeliest for the folds that it has not seen."""
+        """Return the pseudo-count of each cell, ``[tables, 1, 1]``: the likeliest for folds that it has not seen."""
         likelihood = []
         for shrinkage in _SHRINKAGES:
             each = [(of * _table(total - of, shrinkage)).sum(axis=(1, 2)) for of in counts]
@@ -771,7 +862,7 @@ class _Fit:
             products = variance = 0.0
             fewest = np.inf
             for model, fold in zip(held_out, self._folds, strict=True):
-                log = _Log.of(fold.loads, fold.segment, replace(model, unit=unit))
+                log = _Log.of(fold.loads, fold.readings, fold.segment, replace(model, unit=unit))
                 healthy, _ = log.healthy(model, self._present, self._layout.beside)
                 ratio = _robust(log.by_unit(log.own - healthy), model.errs)
                 ratio = ratio - ratio.mean(axis=0)
@@ -789,7 +880,7 @@ class _Fit:
         """
         ratios = []
         for model, fold in zip(held_out, self._folds, strict=True):
-            log = _Log.of(fold.loads, fold.segment, model)
+            log = _Log.of(fold.loads, fold.readings, fold.segment, model)
             healthy, _ = log.healthy(model, self._present, self._layout.beside)
             ratios.append(log.by_unit(log.own - healthy))
         every = np.concatenate(ratios)[:, self._present].ravel()
@@ -809,8 +900,12 @@ class _Fit:
     def _reached(self, held_out: list[LifeModel], *, informed: bool) -> tuple[Floats, int]:
         """Return the evidence ``[5, D]`` that healthy cells reach in logs with dead ones, and the units of these logs.
 
-        ``informed``: the test is told which cells are dead. Cells where contacts end are predicted worse than others: the limit is the highest evidence of the cell itself,
+        Cells where contacts end are predicted worse than others: the limit is the highest evidence of the cell itself,
         and at least what all but a few of the cells reach.
+
+        Args:
+            held_out: a model for each fold, fitted to the others.
+            informed: whether the test is told which cells are dead.
         """
         cells = np.flatnonzero(self._present)
         reached = np.full((len(FAULTS), len(self._present)), -np.inf)
@@ -825,8 +920,8 @@ class _Fit:
                 healthy = np.setdiff1d(cells, dead)
                 for record in _logs(_Fold(loads, fold.readings, fold.segment)):
                     test = LifeTest(record, model, self._layout, self._present)
-                    of_faults = test.given(np.isin(np.arange(len(self._present)), healthy)) if informed else test.found()
-                    found = of_faults[:, healthy]
+                    known = np.isin(np.arange(len(self._present)), healthy)
+                    found = (test.given(known) if informed else test.found())[:, healthy]
                     reached[:, healthy] = np.maximum(reached[:, healthy], found)
                     usual.append(found)
                     units.append(test.units)

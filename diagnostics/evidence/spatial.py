@@ -102,17 +102,27 @@ class SpatialTest:
         cells: state of each cell.
         model: the healthy model.
         exclusion: when a cell is excluded from the predictors.
+        misleading: bool ``[D]``, cells that are tested and predict no others; None: none.
 
     Attributes:
         result: None before the last step.
     """
 
-    def __init__(self, events: Sequence[ContactEvent], cells: CellState, model: Model, exclusion: Exclusion) -> None:
+    def __init__(
+        self,
+        events: Sequence[ContactEvent],
+        cells: CellState,
+        model: Model,
+        exclusion: Exclusion,
+        misleading: Mask | None = None,
+    ) -> None:
         self.result = None if events else Spatial.before(cells)
         if not events:
             return
         self._events, self._cells, self._exclusion = events, cells, exclusion
         self._test = ConditionalTest.of(events, cells, model)
+        if misleading is not None:
+            self._test = replace(self._test, eligible=self._test.eligible & ~misleading)
         # First predictors: cells that moved, unless their load outlasts an event, or they jumped alone. Few of the
         # cells at rest are broken.
         fresh = cells.runs.start >= events[-1].since

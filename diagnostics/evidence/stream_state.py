@@ -255,10 +255,14 @@ class StreamState:
         eligible = self.received & ~self.silent & ~explained & (self.reference.dead == 0)
         return LifeTest(self.life, self.reference.life, self.layout, eligible, suspected)
 
-    def spatial(self, explained: Mask | None = None) -> Test:
-        """Return the spatial test of all constant cells; cells already ``explained`` (bool ``[D]``) are left out."""
+    def spatial(self, explained: Mask | None = None, misleading: Mask | None = None) -> Test:
+        """Return the spatial test of all constant cells.
+
+        Cells already ``explained`` (bool ``[D]``) are left out; those that are ``misleading`` predict no others.
+        """
         cells = self.cells(explained)
-        return self._test(self._with_held_loads(cells) if self.tiled else cells, self.local, passes=2)
+        cells = self._with_held_loads(cells) if self.tiled else cells
+        return self._test(cells, self.local, passes=2, misleading=misleading)
 
     def each_excluded(
         self, spatial: Spatial, explained: Mask, groups: Sequence[Cells]
@@ -353,11 +357,12 @@ class StreamState:
             runs = replace(runs, length=np.where(untestable, 0, runs.length))
         return CellState(runs, self.scale, self.reference.tolerance, self.accumulated, self.temporal(), eligible)
 
-    def _test(self, cells: CellState, events: TiledEvents, passes: int) -> Test:
+    def _test(self, cells: CellState, events: TiledEvents, passes: int, misleading: Mask | None = None) -> Test:
         if self.tiled:
-            return _TiledTest(self, cells, events, passes)
+            none = np.zeros(self.layout.n_cells, bool)
+            return _TiledTest(self, cells, events, passes, none if misleading is None else misleading)
         (only,) = events.of
-        return SpatialTest(only.kept, cells, self.model_of(0, only), self.exclusion)
+        return SpatialTest(only.kept, cells, self.model_of(0, only), self.exclusion, misleading)
 
     def _with_held_loads(self, cells: CellState) -> CellState:
         """Return the cells with the evidence of loads that are held where nothing has moved for some events."""
@@ -429,8 +434,11 @@ class StreamState:
 class _TiledTest:
     """The spatial test of several tiles, in one or two passes, see the module."""
 
-    def __init__(self, stream: StreamState, cells: CellState, events: TiledEvents, passes: int) -> None:
+    def __init__(
+        self, stream: StreamState, cells: CellState, events: TiledEvents, passes: int, misleading: Mask
+    ) -> None:
         self._stream, self._cells, self._events, self._passes = stream, cells, events, passes
+        self._misleading = misleading
         self._outside = stream.runs.moved  # predictors of each tile outside its outputs
         self._begin()
 
@@ -465,7 +473,8 @@ class _TiledTest:
         cells, allowed = self._cells.of(tile.inputs), self._outside[tile.inputs]
         allowed[tile.place] = True
         cells = replace(cells, eligible=cells.eligible & allowed)
-        test = SpatialTest(events.kept, cells, stream.model_of(i, events), stream.exclusion)
+        misleading = self._misleading[tile.inputs]
+        test = SpatialTest(events.kept, cells, stream.model_of(i, events), stream.exclusion, misleading)
         for name, values in vars(test.finish()).items():
             getattr(self._result, name)[tile.outputs] = values[tile.place]
 

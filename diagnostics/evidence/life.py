@@ -75,7 +75,7 @@ _FITS = 3  # of the tilt, by iterative proportional fitting: a size
 _MOST_TILT = 16.0  # times as frequent as expected, or as rare, levels of healthy cells are in a log
 _MOST_DISCOUNT, _HALF_DISCOUNT = 0.5, 100.0  # of the factors; units of the reference that halve it
 _DEAD = 0.08  # share of the cells that are dead in simulated logs
-_DRAWS = 4  # of dead cells in each fold
+_DRAWS = 2  # of dead cells in each fold
 _HEALTHY = 0.99  # of the healthy cells in simulated logs
 _DISTURBED = 1 / 3  # share of the tested cells: if more are refuted, all are disturbed
 
@@ -297,12 +297,14 @@ class Life:
     @property
     def units(self) -> NDArray[np.intp]:
         """Number of units against each cell, int ``[D]``."""
-        return self.against.sum(axis=0)
+        found: NDArray[np.intp] = self.against.sum(axis=0)
+        return found
 
     def mostly_before(self, frame: NDArray[np.intp]) -> Mask:
         """Return the cells that most units against them contradict before a ``frame`` (int ``[D]``), bool ``[D]``."""
         before = (self.against & (self.begins[:, None] < frame)).sum(axis=0)
-        return before > MAJORITY * self.units
+        found: Mask = before > MAJORITY * self.units
+        return found
 
     @classmethod
     def assumed(cls, n_cells: int) -> Life:
@@ -396,7 +398,7 @@ class LifeTest:
         """Return the highest evidence of two faults, which all others are near, and the same without factors."""
         log = self._log
         healthy, _ = log.healthy(self._model, known, self._layout.beside)
-        independent = _from_some_unit(log.counted(log.own - healthy, self._model.errs))
+        independent = log.counted(log.own - healthy, self._model.errs).sum(axis=0)
         intermittent, _ = _forward(log.counted(log.at_rest - healthy, self._model.errs))
         evidence = np.maximum(independent * self._factors[0], intermittent * self._factors[1])
         return evidence, np.maximum(independent, intermittent)
@@ -415,6 +417,7 @@ class _Log:
         weight: float ``[units]``, 1 / (1 + k) of a unit with k others of the same loads: a contact that is held is one.
         own: float ``[n, D]``, log frequency of the level in the other pieces of the cell.
         at_rest: float ``[n, D]``, log probability of the level of a cell without load.
+        cells: int ``[D]``, the cells.
     """
 
     loads: Array
@@ -425,6 +428,7 @@ class _Log:
     weight: Floats
     own: Floats
     at_rest: Floats
+    cells: Cells
 
     @classmethod
     def of(cls, loads: Array, readings: Array, segment: NDArray[np.intp], model: LifeModel) -> _Log:
@@ -439,7 +443,15 @@ class _Log:
         begins = np.flatnonzero(np.diff(numbers, prepend=-1))
         unit = np.cumsum(np.diff(numbers, prepend=-1) != 0) - 1
         means = np.add.reduceat(loads, begins, axis=0) / np.diff(np.append(begins, n))[:, None]
-        return cls(loads, np.isfinite(readings), level, unit, segment[begins], _novelty(means), own, at_rest)
+        return cls(
+            loads, np.isfinite(readings), level, unit, segment[begins], _novelty(means), own, at_rest, np.arange(d)
+        )
+
+    def on(self, cells: Cells) -> _Log:
+        """Return the log of some of the cells."""
+        of_cells = (self.loads, self.read, self.level, self.own, self.at_rest)
+        loads, read, level, own, at_rest = (values[:, cells] for values in of_cells)
+        return replace(self, loads=loads, read=read, level=level, own=own, at_rest=at_rest, cells=self.cells[cells])
 
     def healthy(self, model: LifeModel, known: Mask, beside: Cells) -> tuple[Floats, NDArray[np.intp]]:
         """Return log P(level | healthy) and the context, ``[n, D]`` each."""
@@ -454,19 +466,19 @@ class _Log:
         log over the expected one, within limits.
         """
         d = level.shape[1]
-        cells = model.of_cell(np.arange(d))
+        cells = model.of_cell(self.cells)
         m, k = model.table.shape[1:]
         contexts = np.bincount((context + m * np.arange(d)).ravel(), minlength=m * d).reshape(d, m)
         levels = np.bincount((level + k * np.arange(d)).ravel(), minlength=k * d).reshape(d, k)
         table = model.probabilities(gain)[cells]
         tilt = np.ones((d, k))
         for _ in range(_FITS):
-            total = np.einsum("dk,dmk->dm", tilt, table)
-            expected = tilt * np.einsum("dm,dmk->dk", contexts / total, table)
+            total = (table @ tilt[:, :, None])[:, :, 0]
+            expected = tilt * ((contexts / total)[:, None, :] @ table)[:, 0]
             tilt = np.clip(tilt * (levels + _TILTED) / (expected + _TILTED), 1 / _MOST_TILT, _MOST_TILT)
-        total = np.log(np.einsum("dk,dmk->dm", tilt, table))
-        each = np.arange(d)
-        found: Floats = np.log(table[each, context, level] * tilt[each, level]) - total[each, context]
+        total = table @ tilt[:, :, None]
+        given = np.log(table * tilt[:, None, :] / total)
+        found: Floats = given[np.arange(d), context, level]
         return found
 
     def counted(self, ratio: Floats, errs: Floats) -> Floats:
@@ -530,7 +542,7 @@ def _from_some_unit(dead: Floats) -> Floats:
 def _up_to_some_unit(dead: Floats) -> Floats:
     """Return the log evidence ``[D]`` of a cell that was dead up to a unit, and works again; see _forward."""
     before = np.cumsum(dead, axis=0)
-    found: Floats = logsumexp(before, axis=0) - np.log(len(dead))
+    found: Floats = logsumexp(before, axis=0) - np.log(len(dead)) + np.log(_FAILS * _RECOVERS)
     return found
 
 
@@ -551,7 +563,8 @@ class _Details:
     against: Mask  # [units, D], units against the cell
     highest: Floats
     now: Floats  # log ratio of dead : healthy since the cell, if it ever was dead, works again
-    weak: Mask  # it follows the others with a lower gain rather than not at all
+    predicted: NDArray[np.intp]  # [n, D], context of each piece
+    healthy: Floats  # [n, D], log P(level | healthy)
 
 
 def _full_evidence(log: _Log, model: LifeModel, known: Mask, beside: Cells, readings: Array) -> tuple[Floats, _Details]:
@@ -570,8 +583,8 @@ def _full_evidence(log: _Log, model: LifeModel, known: Mask, beside: Cells, read
     dead = log.counted(log.at_rest - healthy, model.errs)
     # What was dead once, and works again, is no fault any more.
     now = _since_it_works(independent)
-    ever = _from_some_unit(independent)
-    found[0] = np.where(now < -_REFUTED, np.minimum(ever, now), ever)
+    ever = independent.sum(axis=0)
+    found[0] = np.where(now < -_THRESHOLD, np.minimum(ever, now), ever)
     found[1], filtered = _forward(dead)
     found[1] -= np.logaddexp(0.0, _up_to_some_unit(dead))
     tested = np.abs(dead) > TESTED
@@ -586,13 +599,22 @@ def _full_evidence(log: _Log, model: LifeModel, known: Mask, beside: Cells, read
     found[4] = log.counted(_clamped(log, model, plain, predicted, readings) - plain, model.errs).sum(axis=0)
     against |= dead > _AGAINST
     lag = np.array(_LAGS)[np.argmax(lagged, axis=0)]
+    highest = np.fmax.reduce(readings).astype(np.float64)
+    return found, _Details(lag, source, share, against, highest, now, predicted, healthy)
+
+
+def _weak(log: _Log, model: LifeModel, details: _Details, cells: Cells) -> Mask:
+    """Return which of some cells follow the others with a lower gain rather than not at all, bool ``[cells]``."""
+    own = log.on(cells)
+    healthy = details.healthy[:, cells]
+    errs = model.errs[cells]
+    independent = _from_some_unit(own.counted(own.own - healthy, errs))
     weak = []
     for gain in _GAINS:
-        lower = log.given(model, predicted, log.level, gain)
-        weak.append(_from_some_unit(log.counted(lower - healthy, model.errs)))
-    return found, _Details(
-        lag, source, share, against, np.fmax.reduce(readings).astype(np.float64), now, np.max(weak, axis=0) > ever
-    )
+        lower = own.given(model, details.predicted[:, cells], own.level, gain)
+        weak.append(_from_some_unit(own.counted(lower - healthy, errs)))
+    follows: Mask = np.max(weak, axis=0) > independent
+    return follows
 
 
 def _clamped(log: _Log, model: LifeModel, healthy: Floats, context: NDArray[np.intp], readings: Array) -> Floats:
@@ -651,7 +673,7 @@ def _concluded(
     """Return the result."""
     scaled = of_faults * model.factors(len(log.begins))
     evidence = np.where(eligible, logsumexp(scaled + np.log(_SHARES)[:, None], axis=0), 0.0)
-    shown = eligible & (details.now < -_SHOWN)
+    shown = eligible & (details.now < -_SHOWN) & (of_faults[0] < 0)
     refuted = eligible & (evidence > _REFUTED)
     tested = shown | refuted
     contradicting = float((refuted & ~constant).sum() / max(int((tested & ~constant).sum()), 1))
@@ -662,6 +684,10 @@ def _concluded(
     else:
         contradicting = 0.0
     certain = refuted & (evidence > _THRESHOLD)
+    floats = certain & (of_faults[0] >= of_faults.max(axis=0))
+    cells = np.flatnonzero(floats)
+    if len(cells):
+        floats[cells] = ~_weak(log, model, details, cells)
     begins = log.begins[details.against.argmax(axis=0)] * SEGMENT
     return Life(
         evidence=evidence,
@@ -676,7 +702,7 @@ def _concluded(
         against=details.against,
         begins=log.begins * SEGMENT,
         highest=details.highest,
-        floats=certain & (of_faults[0] >= of_faults.max(axis=0)) & ~details.weak,
+        floats=floats,
         contradicting=contradicting,
     )
 
@@ -853,7 +879,8 @@ class _Fit:
             each = [(of * _table(total - of, shrinkage)).sum(axis=(1, 2)) for of in counts]
             likelihood.append(np.sum(each, axis=0))
         best = np.argmax(likelihood, axis=0)
-        return np.asarray(_SHRINKAGES)[best][:, None, None]
+        found: Floats = np.asarray(_SHRINKAGES)[best][:, None, None]
+        return found
 
     def _unit(self, held_out: list[LifeModel]) -> int:
         """Return the segments of a unit: successive units of healthy cells are hardly correlated."""

@@ -22,7 +22,7 @@ from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.baseline import baseline
 from diagnostics.preprocessing.levels import MARGIN
 from diagnostics.preprocessing.noise import UsualNoise
-from diagnostics.preprocessing.offset import ReferenceOffset
+from diagnostics.preprocessing.offset import ReferenceOffset, levelled, levels
 from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks, spread
 from diagnostics.preprocessing.scale import Scale
 from diagnostics.preprocessing.transport import Patience
@@ -103,6 +103,9 @@ class Reference:
         dead = np.zeros(layout.n_cells) if dead is None else dead
         layout = living(layout, dead)
         present = layout.present.ravel()
+        level = levels(recordings, present, layout.full_scale)
+        as_read = recordings
+        recordings = levelled(recordings, level)
         readings = baseline(recordings, present, tolerance, layout.full_scale)
         least = LowerLimit.fit(readings, present, tolerance, layout.full_scale)
         # The baseline of a dead cell is unknown.
@@ -117,20 +120,22 @@ class Reference:
             jumps_seen,
             least,
             NoiseLoss.fit(recordings, present),
-            ReferenceOffset.fit(recordings, scale, present),
+            ReferenceOffset.fit(recordings, scale, present, float(np.ptp(level))),
             patience.idle,
             HealthyRates.fit(recordings, scale, layout),
             _usual_duplicates(recordings, layout, scale),
             model,
             dead,
-            patience.loaded,
-            PadLimit.fit(recordings, readings, layout, tolerance),
+            # At another level every cell seems loaded.
+            patience.idle if level.any() else patience.loaded,
+            PadLimit.fit(as_read, readings, layout, tolerance, float(np.ptp(level))),
             noise=UsualNoise.fit(recordings, present, converter_step(recordings, layout)),
         )
 
     def with_life(self, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> Reference:
         """Return the reference with the model of the proof of life, fitted to the same recordings."""
         layout = living(layout, self.dead)
+        recordings = levelled(recordings, levels(recordings, layout.present.ravel(), layout.full_scale))
         return replace(self, life=LifeModel.fit(recordings, layout, self.scale, self.offset, self.tolerance))
 
     @classmethod

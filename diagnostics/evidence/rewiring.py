@@ -38,6 +38,7 @@ from diagnostics.events.contact_events import THE_SAME, Summary, count_repeats
 from diagnostics.healthy.model import contact_events
 from diagnostics.healthy.prediction import MIN_P_FLOOR, OUTLIERS, log_student_t
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
+from diagnostics.preprocessing.offset import levelled, levels_above
 from diagnostics.preprocessing.readings import held
 
 if TYPE_CHECKING:
@@ -110,6 +111,8 @@ def find_rewiring(
     """
     if reference.model is None:
         return None
+    present = layout.present.ravel()
+    recordings = levelled(recordings, levels_above(recordings, reference.scale, present, reference.offset))
     events, weight = _events(recordings, reference.scale)
     if len(events) < _FEWEST:
         return None
@@ -117,7 +120,7 @@ def find_rewiring(
     moved = np.ptp(np.concatenate(events), axis=0) > reference.scale.near
     rested = np.any([((reference.scale.root_load(r) == 0) & ~np.isnan(r)).any(axis=0) for r in recordings], axis=0)
     used = moved & rested
-    test = _Test(events, weight, reference.model, reference.scale, layout.present.ravel(), used)
+    test = _Test(events, weight, reference.model, reference.scale, present, used)
     source = np.arange(layout.n_cells)
     total = 0.0
     steps: list[str] = []

@@ -399,7 +399,8 @@ class StreamState:
         self.accumulated = np.where(runs.start == start, self.accumulated, 0.0)
         if self.reference.beside is not None:
             baseline = self.reference.scale.baseline
-            self._of_pad = self._of_pad.extend(frames, runs, int(numbers[0]), baseline, self.layout)
+            most = self.reference.beside.most
+            self._of_pad = self._of_pad.extend(frames, runs, int(numbers[0]), baseline, self.layout, most)
         steady = self._offsets.off(known)
         root = scale.root_load(steady)
         still = runs.start <= numbers[0]

@@ -2,11 +2,13 @@
 
 Estimates the standard deviation of white noise in each segment from the second differences of each cell,
 
-    sigma = q25 over cells of mean(middle half over t of |x_{t+1} - 2 x_t + x_{t-1}|) / (0.693 sqrt 6)
+    d_it  = x_{t+1} - 2 x_t + x_{t-1}
+    sigma = q25 over cells of mean(middle half over t of |d_it - median over cells of d_it|) / (0.693 sqrt 6)
 
-and takes its median over the last 5 segments. A load changes slowly, so that its second difference is small, and most
-loads leave a quarter of the cells alone. The mean of the middle half (an L-estimator with a breakdown point of 25 %)
-has no steps where noise is as small as a converter step, as a median has; 0.693 is its value for |N(0, 1)|.
+and takes its median over the last 5 segments. What all cells share, as hum, is in the median over cells: it is no
+noise. A load changes slowly, so that its second difference is small, and most loads leave a quarter of the cells alone.
+The mean of the middle half (an L-estimator with a breakdown point of 25 %) has no steps where noise is as small as a
+converter step, as a median has; 0.693 is its value for |N(0, 1)|.
 
 Noise exceeds that of the reference where sigma is 1.5 times the largest of the reference, and half a converter step
 larger. The excess then raises the reading from which on a cell counts as loaded by six standard deviations.
@@ -106,7 +108,9 @@ def _deviation(frames: Floats, present: NDArray[np.bool_]) -> float | None:
     given = given[:, ~np.isnan(given).any(axis=0)]
     if len(given) < _FEWEST or not given.shape[1]:
         return None
-    curvature = np.sort(np.abs(np.diff(given, 2, axis=0)), axis=0)
-    outer = len(curvature) // 4
-    middle = curvature[outer : len(curvature) - outer].mean(axis=0)
+    curvature = np.diff(given, 2, axis=0)
+    own = np.abs(curvature - np.median(curvature, axis=1, keepdims=True))
+    own.sort(axis=0)
+    outer = len(own) // 4
+    middle = own[outer : len(own) - outer].mean(axis=0)
     return float(np.quantile(middle, LEAST_LOADED) / (_MIDDLE_HALF * np.sqrt(6)))

@@ -141,7 +141,8 @@ def levels(recordings: Sequence[Floats], present: NDArray[np.bool_], full_scale:
     low = _lows(readings, readings.some, cells)
     rest = np.nan_to_num(_quantile(low, LOW, axis=0))
     lifted = _quantile(low - rest, LOW, axis=1)
-    if not np.nanquantile(lifted, MAJORITY) > LIGHT * full_scale:
+    lifted = lifted[~np.isnan(lifted)]
+    if not len(lifted) or np.quantile(lifted, MAJORITY) <= LIGHT * full_scale:
         return np.zeros(len(readings))
     above = _lows(readings, range(len(readings)), cells) - rest
     return np.array([least_loaded(of_recording) for of_recording in above])
@@ -184,10 +185,9 @@ def _lows(readings: RecordingBlocks, which: range, cells: NDArray[np.intp]) -> F
 
 def _quantile(values: Floats, share: float, axis: int) -> Floats:
     """Return a quantile of what is known; NaN where nothing is."""
-    known = ~np.isnan(values)
-    filled = np.where(known.any(axis=axis, keepdims=True), values, np.inf)
-    found = np.nanquantile(filled, share, axis=axis)
-    return np.where(np.isfinite(found), found, np.nan)
+    known = (~np.isnan(values)).any(axis=axis)
+    filled = np.where(np.expand_dims(known, axis), values, 0.0)
+    return np.where(known, np.nanquantile(filled, share, axis=axis), np.nan)
 
 
 def _own_offsets(lowest: Floats, scale: Scale, present: NDArray[np.bool_], usual: ReferenceOffset) -> Floats:

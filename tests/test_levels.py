@@ -12,6 +12,7 @@ from diagnostics.preprocessing.offset import levelled, levels
 
 LAYOUT = SensorLayout(1, 8, 8, full_scale=4095, unit="count", rate=20.0)
 PRESENT = np.ones(64, bool)
+GAIN = np.random.default_rng(7).uniform(0.4, 1.0, 64)  # of each cell
 
 
 def presses(seed: int, count: int = 48) -> list[np.ndarray]:
@@ -93,6 +94,37 @@ def test_exchanged_rows_are_found_at_other_levels(fitted: SelfDiagnosis):
     found = fitted.rewiring([f[:, grid.ravel()] for f in lifted(presses(30, 24), 31)])
     assert found is not None
     assert (found.source == grid.ravel()).all()
+
+
+@pytest.fixture(scope="module")
+def uneven() -> SelfDiagnosis:
+    with without_calibration():
+        return SelfDiagnosis(LAYOUT).fit([f * GAIN for f in presses(0)])
+
+
+def turned(quarters: int, transposed: bool) -> np.ndarray:
+    grid = np.rot90(np.arange(64).reshape(8, 8), quarters)
+    return (grid.T if transposed else grid).ravel()
+
+
+@pytest.mark.parametrize("transposed", [True, False])
+@pytest.mark.parametrize("quarters", range(4))
+def test_a_pad_that_is_turned_or_transposed_is_put_in_order(uneven: SelfDiagnosis, quarters: int, transposed: bool):
+    order = turned(quarters, transposed)
+    found = uneven.rewiring([(f * GAIN)[:, order] for f in presses(34, 40)])
+    if not transposed and quarters == 0:
+        assert found is None
+    else:
+        assert found is not None
+        assert (order[found.source] == np.arange(64)).all()
+
+
+@pytest.mark.parametrize("transposed", [True, False])
+@pytest.mark.parametrize("seed", [34, 61, 62])
+def test_where_cells_and_loads_are_symmetric_a_turned_pad_is_not_named(
+    fitted: SelfDiagnosis, seed: int, transposed: bool
+):
+    assert fitted.rewiring([f[:, turned(0, transposed)] for f in lifted(presses(seed, 40), 35)]) is None
 
 
 def test_healthy_wiring_at_other_levels_is_not_called_exchanged(fitted: SelfDiagnosis):

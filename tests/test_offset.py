@@ -67,7 +67,7 @@ def test_offsets_that_most_cells_have_are_no_loads():
 def test_an_offset_as_in_the_reference_is_usual():
     assert ReferenceOffset.fit(events(0), SCALE, PRESENT) == USUAL
     shifted = ReferenceOffset.fit([r + 0.02 for r in events(0)], SCALE, PRESENT)
-    assert astuple(shifted) == pytest.approx((0, 0.02))
+    assert astuple(shifted) == pytest.approx((0, 0.02, 0))
 
 
 def test_where_rests_wander_an_offset_counts_from_where_cells_mostly_rest():

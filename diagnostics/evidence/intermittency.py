@@ -143,6 +143,10 @@ class HealthyRates:
         of_cells = np.maximum(0.1 * _RARE, (blinks + _PRIOR_BLINKS) / (loaded + _PRIOR_BLINKS / mean))
         return cls(mean, limit, alone=alone, lowest=lowest, of_cells=of_cells)
 
+    def with_noise(self, shared: float) -> HealthyRates:
+        """Return the rates where noise that all cells share raises the limits by ``shared`` of full scale."""
+        return replace(self, noise=self.noise + shared) if shared else self
+
     @classmethod
     def unknown(cls) -> HealthyRates:
         """Return the rates of a cold start, at which only gross faults count."""
@@ -270,7 +274,7 @@ def _measure(
     if np.isnan(x).any():
         x = np.nan_to_num(x)
     near, top = scale.near, scale.full_scale - scale.near
-    loaded = x > max(LIGHT * scale.full_scale, MARGIN * lowest)
+    loaded = x > max(LIGHT * scale.full_scale, MARGIN * lowest, MARGIN * near)
     rests, full = x <= near, frames >= top
     moderate = loaded & ~full
 

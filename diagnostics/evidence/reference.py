@@ -21,7 +21,8 @@ from diagnostics.healthy.model import HealthyModel
 from diagnostics.healthy.tiled_model import fit_healthy_model
 from diagnostics.preprocessing.baseline import baseline
 from diagnostics.preprocessing.levels import MARGIN
-from diagnostics.preprocessing.offset import ReferenceOffset
+from diagnostics.preprocessing.noise import UsualNoise
+from diagnostics.preprocessing.offset import ReferenceOffset, levelled, levels
 from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks, spread
 from diagnostics.preprocessing.scale import Scale
 from diagnostics.preprocessing.transport import Patience
@@ -53,6 +54,7 @@ class Reference:
         loaded_patience: the same of a frame with load; 0: as ``patience``.
         beside: lower limit of the readings of healthy cells, relative to their pad; None: unknown.
         life: how cells depend on each other; None: unknown.
+        noise: what all cells have; None: unknown.
     """
 
     tolerance: float
@@ -69,6 +71,7 @@ class Reference:
     loaded_patience: int = field(default=0, metadata={"newer": True})
     beside: PadLimit | None = field(default=None, metadata={"newer": True})
     life: LifeModel | None = field(default=None, metadata={"newer": True})
+    noise: UsualNoise | None = field(default=None, metadata={"newer": True})
 
     def repeats(self, layout: SensorLayout) -> Patience:
         """Return how often healthy frames repeat."""
@@ -100,6 +103,9 @@ class Reference:
         dead = np.zeros(layout.n_cells) if dead is None else dead
         layout = living(layout, dead)
         present = layout.present.ravel()
+        level = levels(recordings, present, layout.full_scale)
+        as_read = recordings
+        recordings = levelled(recordings, level)
         readings = baseline(recordings, present, tolerance, layout.full_scale)
         least = LowerLimit.fit(readings, present, tolerance, layout.full_scale)
         # The baseline of a dead cell is unknown.
@@ -114,19 +120,22 @@ class Reference:
             jumps_seen,
             least,
             NoiseLoss.fit(recordings, present),
-            ReferenceOffset.fit(recordings, scale, present),
+            ReferenceOffset.fit(recordings, scale, present, float(np.ptp(level))),
             patience.idle,
             HealthyRates.fit(recordings, scale, layout),
             _usual_duplicates(recordings, layout, scale),
             model,
             dead,
-            patience.loaded,
-            PadLimit.fit(recordings, readings, layout, tolerance),
+            # At another level every cell seems loaded.
+            patience.idle if level.any() else patience.loaded,
+            PadLimit.fit(as_read, readings, layout, tolerance, float(np.ptp(level))),
+            noise=UsualNoise.fit(recordings, present, converter_step(recordings, layout)),
         )
 
     def with_life(self, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> Reference:
         """Return the reference with the model of the proof of life, fitted to the same recordings."""
         layout = living(layout, self.dead)
+        recordings = levelled(recordings, levels(recordings, layout.present.ravel(), layout.full_scale))
         return replace(self, life=LifeModel.fit(recordings, layout, self.scale, self.offset, self.tolerance))
 
     @classmethod
@@ -164,12 +173,17 @@ def highest_reading(recordings: Sequence[NDArray[np.float64]], layout: SensorLay
 
 def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
     """Return the half range of a constant reading: 1.5 converter steps, within 0.5 to 1 % of full scale."""
+    step = converter_step(recordings, layout)
+    return max(_TOLERANCE * layout.full_scale, min(MARGIN * step, 2 * _TOLERANCE * layout.full_scale))
+
+
+def converter_step(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
+    """Return the smallest difference of two readings, 0 without any."""
     readings = RecordingBlocks.of(recordings)
     sample = readings.thinned(spread(np.flatnonzero(layout.present)))
     steps = np.diff(np.unique(sample[np.isfinite(sample)]))
     steps = steps[steps > 1e-6 * layout.full_scale]  # smaller differences are rounding
-    step = float(steps.min()) if len(steps) else 0.0
-    return max(_TOLERANCE * layout.full_scale, min(MARGIN * step, 2 * _TOLERANCE * layout.full_scale))
+    return float(steps.min()) if len(steps) else 0.0
 
 
 def _usual_duplicates(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale) -> int:

@@ -13,11 +13,13 @@ exchanged lines contradict their neighbours until they are put back. It is found
 scored again with those of its best rival.
 
 Candidates are exchanges of two rows or two columns of a pad, a pad mirrored along either axis, its rows or columns
-shifted by one, and exchanged pads. The best is taken, and the search goes on from there, so that combinations are
-found. A permutation is reported if the gain l(P) - l(identity) exceeds 24, is positive without the two events that
-favour it most, exceeds by 12 that of any other candidate that moves some of the same cells, is as large for the working
-channels alone, and explains half of what a random order leaves unexplained; w_e = 1 / (1 + k) discounts an event that
-repeats k earlier ones of the 32 strongest.
+shifted by one, a pad turned by half a turn, one read column by column in place of row by row, mirrored or not (a square
+one is transposed then, or turned by a quarter), and exchanged pads. The best is taken, and the search goes on from
+there, so that combinations are found. A permutation is reported if the gain l(P) - l(identity) exceeds 24, is positive
+without the two events that favour it most, exceeds by 12 that of any other candidate that moves some of the same cells,
+is as large for the working channels alone, and explains half of what a random order leaves unexplained; w_e = 1 / (1 +
+k) discounts an event that repeats k earlier ones of the 32 strongest.
+A whole pad that is mirrored or turned must also gain a tenth of what a random order of it loses.
 Where the array is loaded symmetrically two wirings read alike, and nothing is reported. Lines that no event loads
 differently are not distinguished. Where loads are spread widely, as by thick gloves, exchanged lines may be named by
 mistake: the whole sensor has then changed as well.
@@ -38,6 +40,7 @@ from diagnostics.events.contact_events import THE_SAME, Summary, count_repeats
 from diagnostics.healthy.model import contact_events
 from diagnostics.healthy.prediction import MIN_P_FLOOR, OUTLIERS, log_student_t
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
+from diagnostics.preprocessing.offset import levelled, levels_above
 from diagnostics.preprocessing.readings import held
 
 if TYPE_CHECKING:
@@ -54,6 +57,7 @@ _LINES, _FEW_LINES = 16, 4  # of one kind on a pad, the least expected, whose ex
 _WORK = 6400  # lines times cells, about: a size
 _LIMIT = 2 * CERTAIN_RATIO  # log likelihood gained, all events together
 _WITHOUT = 2  # events without which there must be a gain too: one odd contact proves nothing
+_TURNED = 0.1  # of what a random order of a pad loses: gained where a whole pad is turned; by chance 0.03
 _MOST_STEPS = 6  # in which permutations are combined, or the faulty channels found anew: a size
 _FAULTY = CERTAIN_RATIO  # log ratio from which on a channel is faulty: of what only a fault explains
 _T4_AT_0 = 0.375  # density of Student's t with 4 degrees of freedom at 0
@@ -92,8 +96,11 @@ class Rewiring:
 
 
 class _Candidate(NamedTuple):
+    """A permutation that is tried; ``turned``: of a whole pad, so that symmetric loads hardly tell it."""
+
     source: Cells
     text: str
+    turned: bool = False
 
 
 def find_rewiring(
@@ -110,6 +117,8 @@ def find_rewiring(
     """
     if reference.model is None:
         return None
+    present = layout.present.ravel()
+    recordings = levelled(recordings, levels_above(recordings, reference.scale, present, reference.offset))
     events, weight = _events(recordings, reference.scale)
     if len(events) < _FEWEST:
         return None
@@ -117,8 +126,13 @@ def find_rewiring(
     moved = np.ptp(np.concatenate(events), axis=0) > reference.scale.near
     rested = np.any([((reference.scale.root_load(r) == 0) & ~np.isnan(r)).any(axis=0) for r in recordings], axis=0)
     used = moved & rested
-    test = _Test(events, weight, reference.model, reference.scale, layout.present.ravel(), used)
+    test = _Test(events, weight, reference.model, reference.scale, present, used)
     source = np.arange(layout.n_cells)
+    anywhere = np.random.default_rng(0).permutation(layout.n_cells)
+
+    def at_random(faulty: Mask) -> float:
+        return float(test.score(anywhere, faulty).by_event.sum())
+
     total = 0.0
     steps: list[str] = []
     now = test.settled(source, test.score(source, ~used))
@@ -141,6 +155,8 @@ def find_rewiring(
         rivals = [sums[i] for i, of in enumerate(candidates) if i != best and (moves & (of.source != source)).any()]
         if not _certain(gain) or sums[best] - max(rivals, default=-np.inf) < _LIMIT / 2:
             break
+        if candidates[best].turned and gain.sum() < _TURNED * (sums[best] - at_random(found.faulty)) / layout.pads:
+            break
         # The channels that work say so by themselves: no permutation is due to the faulty ones.
         working = test.of_working(candidates[best].source, found.faulty) - test.of_working(source, found.faulty)
         if not _certain(working):
@@ -151,10 +167,9 @@ def find_rewiring(
         now = found
     if not steps:
         return None
-    anywhere = np.random.default_rng(0).permutation(layout.n_cells)
-    at_random = test.score(anywhere, now.faulty)
+    random = test.score(anywhere, now.faulty)
     left = now.surplus[~now.faulty[source]].sum()
-    if left < MAJORITY * at_random.surplus[~now.faulty[anywhere]].sum():
+    if left < MAJORITY * random.surplus[~now.faulty[anywhere]].sum():
         return None  # another sensor
     return Rewiring(source, tuple(steps), total, len(events))
 
@@ -331,9 +346,25 @@ def _candidates(layout: SensorLayout, surplus: Floats, source: Cells) -> Iterato
             for order, text in orders:
                 changed = grid.copy()
                 changed[pad] = np.take(grid[pad], order, axis=axis)
-                yield _Candidate(source[changed.ravel()], text)
+                yield _Candidate(source[changed.ravel()], text, turned="reverse" in text)
+        for order, text in _orientations(*grid[pad].shape):
+            changed = grid.copy()
+            changed[pad] = grid[pad].ravel()[order]
+            yield _Candidate(source[changed.ravel()], f"pad {pad} is {text}", turned=True)
     for a, b in combinations(range(layout.pads), 2):
         yield _Candidate(source[grid[_exchanged(layout.pads, a, b)].ravel()], f"pads {a} and {b} are exchanged")
+
+
+def _orientations(rows: int, columns: int) -> Iterator[tuple[NDArray[np.intp], str]]:
+    """Yield the orders of a pad that is turned or read in the other order, ``[rows, columns]``, and their names."""
+    if min(rows, columns) < 2:
+        return
+    by_column = np.arange(rows * columns).reshape(columns, rows).T
+    yield by_column, "transposed: read column by column"
+    yield by_column[::-1], "transposed: read column by column, the rows in reverse order"
+    yield by_column[:, ::-1], "transposed: read column by column, the columns in reverse order"
+    yield by_column[::-1, ::-1], "transposed: read column by column, both in reverse order"
+    yield np.arange(rows * columns)[::-1].reshape(rows, columns), "turned by half a turn"
 
 
 def _exchanged(size: int, a: int, b: int) -> NDArray[np.intp]:

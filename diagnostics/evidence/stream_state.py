@@ -37,7 +37,8 @@ from diagnostics.evidence.term import ConstantCells, Term
 from diagnostics.evidence.weak_response import WeakResponse
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
 from diagnostics.healthy.prediction import OUTLIERS
-from diagnostics.preprocessing.levels import SUSPICIOUS
+from diagnostics.preprocessing.levels import LIGHT, SUSPICIOUS
+from diagnostics.preprocessing.noise import NoiseNow
 from diagnostics.preprocessing.offset import OffsetTracker
 from diagnostics.preprocessing.readings import SEGMENT, held
 from diagnostics.preprocessing.rest_of_log import RestOfLog
@@ -110,6 +111,7 @@ class StreamState:
         self.scale: Scale = reference.scale
         self._skin, self._begun = EventLog(), list[int]()  # of the whole skin, if there are several tiles
         self._offsets = OffsetTracker.begin(layout.n_cells)
+        self._noise = NoiseNow()
         self._rest, self._response = RestOfLog(), WeakResponse.begin(layout.n_cells)
         self._level = RestLevel.begin(layout.n_cells)
         self.life = LifeRecord()
@@ -385,10 +387,15 @@ class StreamState:
         frames, numbers = self._buffer[: self._filled], self._numbers[: self._filled]
         self._filled = 0
         self._offsets = self._offsets.extend(frames, self.reference.scale, self.present, self.reference.offset)
-        self.scale = scale = plain = self._offsets.on(self.reference.scale)
+        self._noise = self._noise.extend(frames, self.present)
+        plain = self._offsets.on(self.reference.scale)
+        noise = 0.0 if self.reference.noise is None else self.reference.noise.raises(self._noise)
+        noisy = plain.above(noise)
+        self.scale = scale = noisy
         if self.reference.model is None:
             moved = self.runs.moved & self.received
-            self._rest = self._rest.extend(frames[:, moved], self.lowest[moved], plain.full_scale)
+            light = max(LIGHT * plain.full_scale, self._noise.range)
+            self._rest = self._rest.extend(frames[:, moved], self.lowest[moved], light)
             self.scale = scale = self._rest.scale(plain, self.lowest, moved)
         start, known = self.runs.start, _known(frames, self.runs.last)
         before, self.runs = self.runs, self.runs.extend(frames, numbers, self.reference.tolerance, scale.baseline)
@@ -397,15 +404,22 @@ class StreamState:
         self.accumulated = np.where(runs.start == start, self.accumulated, 0.0)
         if self.reference.beside is not None:
             baseline = self.reference.scale.baseline
-            self._of_pad = self._of_pad.extend(frames, runs, int(numbers[0]), baseline, self.layout)
+            most = self.reference.beside.most
+            self._of_pad = self._of_pad.extend(frames, runs, int(numbers[0]), baseline, self.layout, most)
         steady = self._offsets.off(known)
-        root, still, clear = scale.root_load(steady), runs.start <= numbers[0], plain
+        root = scale.root_load(steady)
+        still = runs.start <= numbers[0]
+        clear = noisy
+        touched = root.any(axis=0)
         if self.reference.model is None:
             self._level = self._level.extend(before, runs.start != start)
             self._response = self._response.extend(steady, scale.full_scale * root.astype(np.float64) ** 2, self.layout)
             # How often healthy lines with light loads agree is unknown.
             clear = replace(plain, near=max(scale.near, _CLEAR * plain.near))
-        self.touched = self.touched | root.any(axis=0)
+            # Where a cell rests that never moved is unknown: at its lowest reading at most.
+            rise = np.fmax.reduce(steady) - self.lowest
+            touched &= moved | (rise > max(scale.near, self._noise.range))
+        self.touched = self.touched | touched
         if self.reference.life is not None:
             self.life = self.life.extend(root, known, int(numbers[0]) // SEGMENT)
         jump = self.reference.jumps_seen.size(runs, self.reference.scale.full_scale)
@@ -417,8 +431,11 @@ class StreamState:
             _, self._skin = skin.split(1)
             # On long lines some cell is always dead: cells that never moved are no difference between two lines.
             frames = np.where(runs.moved, frames, np.nan)
-        self.intermittency = self.intermittency.extend(known, root, numbers, plain, self.reference.usual, still)
-        self.duplicates = self.duplicates.extend(frames, numbers, informative(frames, still, clear), plain.near)
+        usual = self.reference.usual.with_noise(noise / plain.full_scale)
+        self.intermittency = self.intermittency.extend(known, root, numbers, noisy, usual, still)
+        # Lines that only have noise where they rest agree by chance.
+        telling = informative(frames, still, clear) & self.touched
+        self.duplicates = self.duplicates.extend(frames, numbers, telling, plain.near)
 
     @property
     def _crowded(self) -> bool:

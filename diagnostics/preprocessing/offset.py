@@ -9,18 +9,26 @@ A quantile filter over cells and a running minimum over time, as in baseline cor
 2001). Common offsets up to 5 % of full scale are removed, and own offsets up to 2 %, or up to what is usual in the log:
 three robust standard deviations above the median of all cells, at most 5 %. Larger ones are not
 tracked: such a cell is loaded or faulty.
+
+Where the recordings of the reference rest at levels of their own, further apart than 5 % of full scale, common offsets
+up to the range of these levels and 5 % more are removed. The level of recording r is
+
+    level_r = q25 over cells of (q05 over t of x_i(t) - b_i),    b_i = q05 over r of q05 over t of x_i(t)
+
+and counts if the q05 over cells, in place of q25, exceeds 5 % in half of the recordings: no contact loads nearly all
+cells throughout most recordings. Levels within a recording of the reference are not recognised.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, SLIGHT
+from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, MAJORITY, SLIGHT
 from diagnostics.preprocessing.readings import RecordingBlocks, spread
 from diagnostics.preprocessing.scale import usual_limit
 
@@ -37,24 +45,32 @@ class ReferenceOffset:
     Attributes:
         mostly: median of the common offset, at most 0.
         most: largest common offset that counts as usual.
+        levels: range of the levels at which recordings of the reference rest; 0: all rest at one.
     """
 
     mostly: float
     most: float
+    levels: float = field(default=0.0, metadata={"newer": True})
 
     @classmethod
-    def fit(cls, recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_]) -> ReferenceOffset:
-        """Fit to fault-free recordings, ``[T, D]`` each."""
+    def fit(
+        cls, recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_], levels: float = 0.0
+    ) -> ReferenceOffset:
+        """Fit to fault-free recordings, ``[T, D]`` each, less their levels, which have the range ``levels``."""
         cells = spread(np.flatnonzero(present))
         above = RecordingBlocks.of(recordings).thinned(cells) - scale.baseline[cells]
         common = [least_loaded(frame) for frame in above]
         mostly = min(0.0, float(np.median(common)))
-        return cls(mostly, max(mostly + scale.near / 2, float(np.quantile(common, 1 - LOW))))
+        return cls(mostly, max(mostly + scale.near / 2, float(np.quantile(common, 1 - LOW))), levels)
 
     def excess(self, offset: ArrayLike) -> Floats:
         """Return offsets ``[...]`` relative to the median of the reference; 0 for usual ones."""
         offset = np.asarray(offset, dtype=np.float64)
         return np.where(offset > self.most, offset - self.mostly, 0.0)
+
+    def limit(self, full_scale: float) -> float:
+        """Return the common offset from which on nearly all cells are loaded."""
+        return LIGHT * full_scale + self.levels
 
 
 @dataclass(frozen=True)
@@ -93,7 +109,9 @@ class OffsetTracker:
             return OffsetTracker(lowest, own, np.zeros(len(frames)))
         common = usual.excess([least_loaded(frame) for frame in (frames - scale.baseline - own)[:, present]])
         last = self.common[-1]
-        for t in np.flatnonzero(common >= LIGHT * scale.full_scale):  # nearly all cells are loaded: keep the last one
+        for t in np.flatnonzero(
+            common >= usual.limit(scale.full_scale)
+        ):  # nearly all cells are loaded: keep the last one
             common[t] = common[t - 1] if t else last
         return OffsetTracker(lowest, own, common)
 
@@ -108,12 +126,76 @@ class OffsetTracker:
         return frames - drift[:, None] if drift.any() else frames
 
 
+def levels(recordings: Sequence[Floats], present: NDArray[np.bool_], full_scale: float) -> Floats:
+    """Return the level at which each recording rests, ``[recordings]``; 0 where all rest at one, see the module.
+
+    Args:
+        recordings: ``[T, D]`` each.
+        present: bool ``[D]``.
+        full_scale: of the layout.
+    """
+    readings = RecordingBlocks.of(recordings)
+    cells = spread(np.flatnonzero(present))
+    if not len(cells):
+        return np.zeros(len(readings))
+    low = _lows(readings, readings.some, cells)
+    rest = np.nan_to_num(_quantile(low, LOW, axis=0))
+    lifted = _quantile(low - rest, LOW, axis=1)
+    lifted = lifted[~np.isnan(lifted)]
+    if not len(lifted) or np.quantile(lifted, MAJORITY) <= LIGHT * full_scale:
+        return np.zeros(len(readings))
+    above = _lows(readings, range(len(readings)), cells) - rest
+    return np.array([least_loaded(of_recording) for of_recording in above])
+
+
+def levelled(recordings: Sequence[Floats], level: Floats) -> RecordingBlocks:
+    """Return recordings less their levels (``[recordings]``); the same ones without any."""
+    readings = RecordingBlocks.of(recordings)
+    if not level.any():
+        return readings
+    return RecordingBlocks([given - of_it for given, of_it in zip(readings.given, level, strict=True)])
+
+
+def levels_above(
+    recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_], usual: ReferenceOffset
+) -> Floats:
+    """Return the level of each recording of a log above the baseline of the reference, ``[recordings]``.
+
+    0 where the reference rests at one level, and where nearly all cells are loaded.
+
+    Args:
+        recordings: ``[T, D]`` each.
+        scale: of the reference.
+        present: bool ``[D]``.
+        usual: common offsets of the reference.
+    """
+    readings = RecordingBlocks.of(recordings)
+    if usual.levels == 0:
+        return np.zeros(len(readings))
+    cells = spread(np.flatnonzero(present))
+    above = _lows(readings, range(len(readings)), cells) - scale.baseline[cells]
+    level = usual.excess([least_loaded(of_recording) for of_recording in above])
+    return np.where(level < usual.limit(scale.full_scale), level, 0.0)
+
+
+def _lows(readings: RecordingBlocks, which: range, cells: NDArray[np.intp]) -> Floats:
+    """Return the low quantile of the readings of each of the ``cells``, ``[which, cells]``; NaN where one misses."""
+    return np.stack([np.quantile(readings.piece(i, slice(None), cells), LOW, axis=0) for i in which])
+
+
+def _quantile(values: Floats, share: float, axis: int) -> Floats:
+    """Return a quantile of what is known; NaN where nothing is."""
+    known = (~np.isnan(values)).any(axis=axis)
+    filled = np.where(np.expand_dims(known, axis), values, 0.0)
+    return np.where(known, np.nanquantile(filled, share, axis=axis), np.nan)
+
+
 def _own_offsets(lowest: Floats, scale: Scale, present: NDArray[np.bool_], usual: ReferenceOffset) -> Floats:
     """Return the offset of each cell in addition to the common one, ``[D]``, of its ``lowest`` reading."""
     if not (lowest > scale.near / 2).any():
         return np.zeros(len(lowest))
     shared = usual.excess(least_loaded(lowest[present]))
-    beyond = lowest - np.where(shared < LIGHT * scale.full_scale, shared, 0.0)
+    beyond = lowest - np.where(shared < usual.limit(scale.full_scale), shared, 0.0)
     usual_own = usual_limit(beyond[present & np.isfinite(beyond)]) / scale.full_scale
     limit = min(max(usual_own, SLIGHT), LIGHT) * scale.full_scale
     return np.where((beyond > scale.near / 2) & (beyond < limit), beyond, 0.0)

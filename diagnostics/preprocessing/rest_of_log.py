@@ -38,18 +38,18 @@ class RestOfLog:
     varies: float = 0.0
     segments: int = 0
 
-    def extend(self, frames: Floats, lowest: Floats, full_scale: float) -> RestOfLog:
+    def extend(self, frames: Floats, lowest: Floats, light: float) -> RestOfLog:
         """Return the state after one more segment; one in which nearly all cells are loaded does not count.
 
         Args:
             frames: ``[t, n]``, NaN = missing, of the n cells that moved.
             lowest: ``[n]``, lowest reading of each of them so far.
-            full_scale: of the layout.
+            light: readings so far above the lowest one may be noise or a rest that wanders.
         """
         above = np.fmax.reduce(frames) - lowest
         above = above[np.isfinite(above)]
         typical = float(np.quantile(above, LEAST_LOADED)) if len(above) else np.inf
-        if typical > LIGHT * full_scale:
+        if typical > light:
             return self
         return RestOfLog(self.varies + typical, self.segments + 1)
 

@@ -41,6 +41,10 @@ class Scale:
         """Return the scale of some cells."""
         return replace(self, baseline=self.baseline[cells])
 
+    def above(self, noise: float) -> Scale:
+        """Return the scale where readings up to so much further above the baseline count as unloaded."""
+        return replace(self, near=self.near + noise) if noise else self
+
     @property
     def root_near(self) -> float:
         """The root load above which a cell counts as loaded."""

@@ -58,8 +58,8 @@ class SelfDiagnosis:
         layout: the array.
         false_discovery_rate: expected share of healthy cells in F.
         proof_of_life: with a reference, a cell that moves is ALIVE only where it depends on the others as a healthy
-            cell does (:mod:`diagnostics.evidence.life`), so that dead cells that move are found. Off by default: it
-            blames a healthy cell now and then (benchmark, rows ``moving`` and ``proven``).
+            cell does (:mod:`diagnostics.evidence.life`), so that dead cells that move are found. Without it, what moves
+            counts as alive.
 
     Attributes:
         reference_: the healthy reference, after :meth:`fit`; None: cold start.

@@ -8,14 +8,20 @@ Ledoit-Wolf covariance) and compares, over a table P(observed level | predicted 
 with four faults: the level is independent of the others (its own frequencies in the log, leaving the piece out); it is
 that of the prediction some pieces ago (late); it is the healthy one up to its highest reading (clamped); it repeats
 the reading of a cell beside it (copy). A fault that comes and goes reads as at rest in the units of a two-state Markov
-chain (forward algorithm). Units are so long that those of the reference are hardly correlated. Either side errs in a
-share e of the units (contamination, Huber 1964):
+chain (forward algorithm); one that was there once and has gone is none. Units are so long that those of the reference
+are hardly correlated. Either side errs in a share e of the units (contamination, Huber 1964), and k units of the same
+loads count as one:
 
-    evidence = sum over u of log ((1 - e) exp(r_u) + e) / ((1 - e) + e exp(r_u))
+    evidence = sum over u of  w_u log ((1 - e) exp(r_u) + e) / ((1 - e) + e exp(r_u)),   w_u = 1 / k_u
 
-so that no unit counts for more than log(1/e). The factor on the evidence of each fault keeps healthy cells of held-out
-reference recordings, with dead ones beside them, below the threshold. Cells that are refuted are replaced by what the
-others say, the worst of a neighbourhood first, until nothing changes.
+so that no unit counts for more than log(1/e). The table is tilted to the frequencies of the levels in the log
+(iterative proportional fitting, Deming and Stephan 1940): a contact that hardly changes contradicts nobody. The factor
+on the evidence of each fault keeps healthy cells of held-out reference recordings, with dead ones beside them, below
+the threshold, for a log of any length. Cells that are refuted are replaced by what the others say, the worst of all
+first, until nothing changes.
+
+Not detected: faults that leave loads nearly as predicted (the mean of the neighbours, a peak that is kept), rare ones,
+and what moves where the reference or the log has no contact.
 """
 
 from __future__ import annotations
@@ -449,9 +455,15 @@ class _Log:
 
     def on(self, cells: Cells) -> _Log:
         """Return the log of some of the cells."""
-        of_cells = (self.loads, self.read, self.level, self.own, self.at_rest)
-        loads, read, level, own, at_rest = (values[:, cells] for values in of_cells)
-        return replace(self, loads=loads, read=read, level=level, own=own, at_rest=at_rest, cells=self.cells[cells])
+        return replace(
+            self,
+            loads=self.loads[:, cells],
+            read=self.read[:, cells],
+            level=self.level[:, cells],
+            own=self.own[:, cells],
+            at_rest=self.at_rest[:, cells],
+            cells=self.cells[cells],
+        )
 
     def healthy(self, model: LifeModel, known: Mask, beside: Cells) -> tuple[Floats, NDArray[np.intp]]:
         """Return log P(level | healthy) and the context, ``[n, D]`` each."""

@@ -370,8 +370,8 @@ class SelfDiagnosis:
         drifting = delivers & ~intermittent & ~noisy & spatial.drifting & ~(life.floats & np.isfinite(spatial.factor))
         certain = silent | intermittent | noisy | drifting
         judged = delivers & runs.moved & ~certain & (reference.life is not None)
-        # The factors of the evidence hold for this prior: many doubtful cells do not make each other faulty.
-        refuted = np.where(judged, expit(life.evidence + logit(EXPECTED)), 0.0)
+        # The model of life errs where its reference has no like: only what is far beyond its limits is faulty.
+        refuted = np.where(judged, expit(life.evidence + logit(EXPECTED) - CERTAIN_RATIO / 2), 0.0)
         by_life = judged & (refuted > stuck) & (stuck < MAJORITY)  # a constant run tells more: its value, its onset
         probability = np.where(present, np.where(certain, _CERTAIN, np.maximum(stuck, refuted)), 0.0)
         faulty = faulty_at(np.where(certain, 0.0, probability), self.false_discovery_rate)

@@ -148,11 +148,11 @@ def test_a_level_that_a_cell_has_all_the_time_is_no_contradiction_whatever_was_e
     each = np.arange(pieces.level.shape[1])
     likeliest = model.table[model.of_cell(each), :, 3].argmax(axis=1)
     context = np.broadcast_to(likeliest, pieces.level.shape)
-    always = pieces.given(model, context, np.full(pieces.level.shape, 3))
+    always = pieces.given(model.probabilities[model.of_cell(each)], context, np.full(pieces.level.shape, 3))
     assert (always > np.log(0.9)).all()
     _, context = pieces.healthy(model, np.ones(len(each), bool), fitted.layout.beside)
     plain = model.table[model.of_cell(each), context, pieces.level]
-    assert pieces.given(model, context, pieces.level).mean() > plain.mean()
+    assert pieces.given(model.probabilities[model.of_cell(each)], context, pieces.level).mean() > plain.mean()
 
 
 def test_two_cells_side_by_side_that_move_by_themselves_are_found_and_none_of_those_between(fitted, log, used):

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,7 +61,11 @@ _PREDICTED = 16  # levels of the prediction: a size
 _BESIDE = (0.01, 0.34, 0.67, 0.99)  # shares of the cells beside one that are loaded, between levels
 _OWN_ERRS = 20.0  # pseudo-count of units, of the share e of each cell
 _LAGS = (1, 2, 3, 4)  # pieces
-_GAINS = (0.1, 0.2, 0.35)  # of weak cells: a grid
+# Gain and offset, as a share of full scale, of a cell that reads otherwise than it did, but follows the others: a grid.
+_OTHERWISE = (
+    *((gain, 0.0) for gain in (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0)),
+    *((1.0, offset) for offset in (0.02, 0.05, 0.1, 0.2, 0.4)),
+)
 _UNLOADED = 1e-3  # root load up to which a piece counts as unloaded
 _SHRINKAGES = (4.0, 16.0, 64.0, 256.0, 1024.0)  # pseudo-counts of the table of all cells: a grid
 _CONTAMINATIONS = (0.01, 0.02, 0.04, 0.08)  # shares e: a grid
@@ -80,8 +85,7 @@ _TILTED = 8.0  # pseudo-count of pieces, of the frequency of a level
 _FITS = 3  # of the tilt, by iterative proportional fitting: a size
 _MOST_TILT = 16.0  # times as frequent as expected, or as rare, levels of healthy cells are in a log
 _MOST_DISCOUNT, _HALF_DISCOUNT = 0.5, 100.0  # of the factors; units of the reference that halve it
-_DEAD = 0.08  # share of the cells that are dead in simulated logs
-_DRAWS = 2  # of dead cells in each fold
+_DEAD = 0.08  # share of the cells that are dead in some simulated logs
 _HEALTHY = 0.99  # of the healthy cells in simulated logs
 _DISTURBED = 1 / 3  # share of the tested cells: if more are refuted, all are disturbed
 
@@ -238,18 +242,22 @@ class LifeModel:
         factors: Floats = self.counts * _THRESHOLD / np.maximum(_THRESHOLD, MARGIN * reached)
         return factors
 
-    def probabilities(self, gain: float = 1.0) -> Floats:
-        """Return P(observed level | context) of cells with a lower ``gain``, shape of ``table``."""
-        table = np.exp(self.table.astype(np.float64))
-        if gain == 1:
-            return table
+    @cached_property
+    def probabilities(self) -> Floats:
+        """P(observed level | context) of each healthy cell, shape of ``table``."""
+        return np.exp(self.table.astype(np.float64))
+
+    def otherwise(self, gain: float, offset: float, cells: Cells) -> Floats:
+        """Return P(observed level | context) of cells with a gain and an offset (of full scale), ``[cells, M, K]``."""
         middle = (np.append(self.levels, 1.0) + np.append(0.0, self.levels)) / 2
-        becomes = np.searchsorted(self.levels, middle * np.sqrt(gain), side="right")
-        becomes[0] = 0  # what is unloaded stays so
-        lower = np.full(table.shape, _GUESS / len(middle))
+        middle[0] = 0.0
+        load = np.clip(gain * middle**2 + offset, 0.0, 1.0)
+        becomes = np.searchsorted(self.levels, np.sqrt(load), side="right")
+        table = self.probabilities[self.of_cell(cells)]
+        found = np.full(table.shape, _GUESS / len(middle))
         for before, after in enumerate(becomes.tolist()):
-            lower[:, :, after] += (1 - _GUESS) * table[:, :, before]
-        return lower
+            found[:, :, after] += (1 - _GUESS) * table[:, :, before]
+        return found
 
     def of_cell(self, cells: Cells) -> Cells:
         """Return where the table of each cell is."""
@@ -468,21 +476,23 @@ class _Log:
     def healthy(self, model: LifeModel, known: Mask, beside: Cells) -> tuple[Floats, NDArray[np.intp]]:
         """Return log P(level | healthy) and the context, ``[n, D]`` each."""
         context = model.contexts(self.loads, known, beside)
-        return self.given(model, context, self.level), context
+        return self.given(model.probabilities[model.of_cell(self.cells)], context, self.level), context
 
-    def given(self, model: LifeModel, context: NDArray[np.intp], level: NDArray[np.intp], gain: float = 1.0) -> Floats:
-        """Return log P(level | context) of a cell with a ``gain`` whose levels are as frequent as they are in the log.
+    def given(self, table: Floats, context: NDArray[np.intp], level: NDArray[np.intp]) -> Floats:
+        """Return log P(level | context) of cells whose levels are as frequent as they are in the log.
 
         Where contacts hardly change, a level is likely because the cell had it before, whatever the others say. The
         table of healthy cells is tilted, P(l | c) f(l) / sum over l' of P(l' | c) f(l'), with f the frequency in the
         log over the expected one, within limits.
+
+        Args:
+            table: P(level | context) of each cell, ``[D, M, K]``.
+            context, level: int ``[n, D]``.
         """
         d = level.shape[1]
-        cells = model.of_cell(self.cells)
-        m, k = model.table.shape[1:]
+        m, k = table.shape[1:]
         contexts = np.bincount((context + m * np.arange(d)).ravel(), minlength=m * d).reshape(d, m)
         levels = np.bincount((level + k * np.arange(d)).ravel(), minlength=k * d).reshape(d, k)
-        table = model.probabilities(gain)[cells]
         tilt = np.ones((d, k))
         for _ in range(_FITS):
             total = (table @ tilt[:, :, None])[:, :, 0]
@@ -601,10 +611,11 @@ def _full_evidence(log: _Log, model: LifeModel, known: Mask, beside: Cells, read
     found[1] -= np.logaddexp(0.0, _up_to_some_unit(dead))
     tested = np.abs(dead) > TESTED
     share = ((filtered > MAJORITY) & tested).sum(axis=0) / np.maximum(tested.sum(axis=0), 1)
+    table = model.probabilities[cells]
     lagged = []
     for lag in _LAGS:
         late = healthy.copy()
-        late[lag:] = log.given(model, predicted[:-lag], log.level[lag:])
+        late[lag:] = log.given(table, predicted[:-lag], log.level[lag:])
         lagged.append(summed(late))
     found[2] = logsumexp(lagged, axis=0) - np.log(len(lagged))
     plain = model.table[cells, predicted, log.level].astype(np.float64)
@@ -615,17 +626,17 @@ def _full_evidence(log: _Log, model: LifeModel, known: Mask, beside: Cells, read
     return found, _Details(lag, source, share, against, highest, now, predicted, healthy)
 
 
-def _weak(log: _Log, model: LifeModel, details: _Details, cells: Cells) -> Mask:
-    """Return which of some cells follow the others with a lower gain rather than not at all, bool ``[cells]``."""
+def _follows(log: _Log, model: LifeModel, details: _Details, cells: Cells) -> Mask:
+    """Return which of some cells follow the others with another gain or offset, bool ``[cells]``."""
     own = log.on(cells)
     healthy = details.healthy[:, cells]
     errs = model.errs[cells]
     independent = _from_some_unit(own.counted(own.own - healthy, errs))
-    weak = []
-    for gain in _GAINS:
-        lower = own.given(model, details.predicted[:, cells], own.level, gain)
-        weak.append(_from_some_unit(own.counted(lower - healthy, errs)))
-    follows: Mask = np.max(weak, axis=0) > independent
+    evidence = []
+    for gain, offset in _OTHERWISE:
+        changed = own.given(model.otherwise(gain, offset, cells), details.predicted[:, cells], own.level)
+        evidence.append(_from_some_unit(own.counted(changed - healthy, errs)))
+    follows: Mask = np.max(evidence, axis=0) > independent + _REFUTED
     return follows
 
 
@@ -687,6 +698,15 @@ def _concluded(
     evidence = np.where(eligible, logsumexp(scaled + np.log(_SHARES)[:, None], axis=0), 0.0)
     shown = eligible & (details.now < -_SHOWN) & (of_faults[0] < 0)
     refuted = eligible & (evidence > _REFUTED)
+    shown &= ~refuted
+    certain = refuted & (evidence > _THRESHOLD)
+    # A load that lies still, another specimen, a weak cell: it reads otherwise, but it follows the others.
+    independent = refuted & (of_faults[0] >= of_faults.max(axis=0))
+    cells = np.flatnonzero(independent)
+    if len(cells):
+        follows = _follows(log, model, details, cells)
+        evidence[cells[follows]] = np.minimum(evidence[cells[follows]], 0.0)
+        independent[cells[follows]] = False
     tested = shown | refuted
     contradicting = float((refuted & ~constant).sum() / max(int((tested & ~constant).sum()), 1))
     if contradicting > _DISTURBED and (refuted & ~constant).sum() >= FEWEST:
@@ -695,11 +715,7 @@ def _concluded(
         refuted = np.zeros_like(refuted)
     else:
         contradicting = 0.0
-    certain = refuted & (evidence > _THRESHOLD)
-    floats = certain & (of_faults[0] >= of_faults.max(axis=0))
-    cells = np.flatnonzero(floats)
-    if len(cells):
-        floats[cells] = ~_weak(log, model, details, cells)
+    floats = certain & independent
     begins = log.begins[details.against.argmax(axis=0)] * SEGMENT
     return Life(
         evidence=evidence,
@@ -951,7 +967,7 @@ class _Fit:
         usual = []
         units = []
         for model, fold in zip(held_out, self._folds, strict=True):
-            for dead_share in (0.0, *[_DEAD] * _DRAWS):
+            for dead_share in (0.0, _DEAD, _DEAD):
                 loads = fold.loads.copy()
                 dead = self._rng.choice(cells, round(dead_share * len(cells)), replace=False)
                 for cell in dead.tolist():

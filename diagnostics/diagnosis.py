@@ -245,8 +245,8 @@ class SelfDiagnosis:
         explained, still, life = copies, list[StaticLoad](), Life.assumed(stream.layout.n_cells)
         proves = stream.reference.life is not None
         if proves:
-            # Cells that move by themselves mislead the spatial test.
-            life = yield from _stepped(stream.proof_of_life(copies, np.zeros_like(copies)))
+            # Cells that move by themselves mislead the spatial test; those that never moved say nothing yet.
+            life = yield from _stepped(stream.proof_of_life(copies, ~stream.runs.moved))
         log_ratio = self._log_ratio(stream, life)
         spatial, found = yield from self._tested(stream, explained, log_ratio, life)
         if proves:
@@ -369,7 +369,11 @@ class SelfDiagnosis:
         intermittent, noisy = intermittency.intermittent & delivers, intermittency.excess & delivers
         drifting = delivers & ~intermittent & ~noisy & spatial.drifting & ~(life.floats & np.isfinite(spatial.factor))
         certain = silent | intermittent | noisy | drifting
-        judged = delivers & runs.moved & ~certain & (reference.life is not None)
+        # Side by side, cells that never return to their baseline carry something that lies still.
+        held = stream.lowest > stream.scale.baseline + stream.scale.near
+        beside = stream.layout.beside
+        carries = held & ((beside >= 0) & held[beside]).any(axis=1)
+        judged = delivers & runs.moved & ~certain & ~carries & (reference.life is not None)
         # The model of life errs where its reference has no like: only what is far beyond its limits is faulty.
         refuted = np.where(judged, expit(life.evidence + logit(EXPECTED) - CERTAIN_RATIO / 2), 0.0)
         by_life = judged & (refuted > stuck) & (stuck < MAJORITY)  # a constant run tells more: its value, its onset

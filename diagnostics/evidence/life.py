@@ -626,8 +626,8 @@ def _full_evidence(log: _Log, model: LifeModel, known: Mask, beside: Cells, read
     return found, _Details(lag, source, share, against, highest, now, predicted, healthy)
 
 
-def _follows(log: _Log, model: LifeModel, details: _Details, cells: Cells) -> Mask:
-    """Return which of some cells follow the others with another gain or offset, bool ``[cells]``."""
+def _following(log: _Log, model: LifeModel, details: _Details, cells: Cells) -> Floats:
+    """Return the log ratio follows the others with another gain or offset : not at all, of some cells, ``[cells]``."""
     own = log.on(cells)
     healthy = details.healthy[:, cells]
     errs = model.errs[cells]
@@ -636,8 +636,8 @@ def _follows(log: _Log, model: LifeModel, details: _Details, cells: Cells) -> Ma
     for gain, offset in _OTHERWISE:
         changed = own.given(model.otherwise(gain, offset, cells), details.predicted[:, cells], own.level)
         evidence.append(_from_some_unit(own.counted(changed - healthy, errs)))
-    follows: Mask = np.max(evidence, axis=0) > independent + _REFUTED
-    return follows
+    found: Floats = np.max(evidence, axis=0) - independent
+    return found
 
 
 def _clamped(log: _Log, model: LifeModel, healthy: Floats, context: NDArray[np.intp], readings: Array) -> Floats:
@@ -704,9 +704,10 @@ def _concluded(
     independent = refuted & (of_faults[0] >= of_faults.max(axis=0))
     cells = np.flatnonzero(independent)
     if len(cells):
-        follows = _follows(log, model, details, cells)
+        better = _following(log, model, details, cells)
+        follows = better > _REFUTED
         evidence[cells[follows]] = np.minimum(evidence[cells[follows]], 0.0)
-        independent[cells[follows]] = False
+        independent[cells[better > 0]] = False
     tested = shown | refuted
     contradicting = float((refuted & ~constant).sum() / max(int((tested & ~constant).sum()), 1))
     if contradicting > _DISTURBED and (refuted & ~constant).sum() >= FEWEST:

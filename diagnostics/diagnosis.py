@@ -243,7 +243,7 @@ class SelfDiagnosis:
         aliases, copies = find_aliasing(stream)
         yield
         explained, still, life = copies, list[StaticLoad](), Life.assumed(stream.layout.n_cells)
-        proves = stream.reference.life is not None
+        proves = stream.reference.life is not None and not stream.noisier
         if proves:
             # Cells that move by themselves mislead the spatial test; those that never moved say nothing yet.
             life = yield from _stepped(stream.proof_of_life(copies, ~stream.runs.moved))
@@ -291,6 +291,8 @@ class SelfDiagnosis:
             cells = list(fault.cells)
             probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
             inferred[cells] = True
+        # Noise alone is no test; nor is movement, where the reference tells how cells depend on each other.
+        shown = life.shown | (stream.reference.dead > 0)
         scale, intermittency = stream.scale, stream.intermittency
         working = np.empty_like(inferred)
         moved = bool((stream.runs.moved & stream.present).any())
@@ -307,7 +309,8 @@ class SelfDiagnosis:
             faults=causes,
             probability=probability,
             # Noise alone is no test; nor is movement, where the reference tells how cells depend on each other.
-            tested=(found.alive & (stream.touched & life.shown)[self._place]) | inferred,
+            tested=(found.alive & (stream.touched & (life.shown | (stream.reference.dead > 0)))[self._place])
+            | inferred,
             transport=stream.transport.faults(rest + scale.near, working, self.layout.rate, moved),
             evidence={name: values[self._place] for name, values in evidence.items()},
             n_frames=stream.transport.seen,

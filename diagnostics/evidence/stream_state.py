@@ -194,6 +194,12 @@ class StreamState:
         """Cells that deliver no reading, or no longer do, bool ``[D]``."""
         return self.present & (self.runs.missed >= np.where(self.received, _SILENT, _NEVER_RECEIVED))
 
+    @property
+    def noisier(self) -> bool:
+        """Whether all cells have more noise than in the reference: how they depend on each other is unknown then."""
+        usual = self.reference.noise
+        return usual is not None and usual.raises(self._noise) > 0
+
     def rests(self) -> Mask:
         """Cells whose constant run lies at their baseline, bool ``[D]``."""
         return np.isfinite(self.runs.value) & (self.scale.root_load(self.runs.value) <= self.scale.root_near)

@@ -19,7 +19,7 @@ there, so that combinations are found. A permutation is reported if the gain l(P
 without the two events that favour it most, exceeds by 12 that of any other candidate that moves some of the same cells,
 is as large for the working channels alone, and explains half of what a random order leaves unexplained; w_e = 1 / (1 +
 k) discounts an event that repeats k earlier ones of the 32 strongest.
-A whole pad that is mirrored or turned must also gain a tenth of what a random order of it loses.
+A whole pad that is mirrored or turned must also gain 5 % of what a random order of it loses.
 Where the array is loaded symmetrically two wirings read alike, and nothing is reported. Lines that no event loads
 differently are not distinguished. Where loads are spread widely, as by thick gloves, exchanged lines may be named by
 mistake: the whole sensor has then changed as well.
@@ -57,7 +57,7 @@ _LINES, _FEW_LINES = 16, 4  # of one kind on a pad, the least expected, whose ex
 _WORK = 6400  # lines times cells, about: a size
 _LIMIT = 2 * CERTAIN_RATIO  # log likelihood gained, all events together
 _WITHOUT = 2  # events without which there must be a gain too: one odd contact proves nothing
-_TURNED = 0.1  # of what a random order of a pad loses: gained where a whole pad is turned; by chance 0.03
+_TURNED = 0.05  # of what a random order of a pad loses: gained where a whole pad is turned; by chance up to 0.03
 _MOST_STEPS = 6  # in which permutations are combined, or the faulty channels found anew: a size
 _FAULTY = CERTAIN_RATIO  # log ratio from which on a channel is faulty: of what only a fault explains
 _T4_AT_0 = 0.375  # density of Student's t with 4 degrees of freedom at 0

@@ -308,9 +308,7 @@ class SelfDiagnosis:
             layout=self.layout,
             faults=causes,
             probability=probability,
-            # Noise alone is no test; nor is movement, where the reference tells how cells depend on each other.
-            tested=(found.alive & (stream.touched & (life.shown | (stream.reference.dead > 0)))[self._place])
-            | inferred,
+            tested=(found.alive & (stream.touched & shown)[self._place]) | inferred,
             transport=stream.transport.faults(rest + scale.near, working, self.layout.rate, moved),
             evidence={name: values[self._place] for name, values in evidence.items()},
             n_frames=stream.transport.seen,
@@ -373,9 +371,9 @@ class SelfDiagnosis:
         drifting = delivers & ~intermittent & ~noisy & spatial.drifting & ~(life.floats & np.isfinite(spatial.factor))
         certain = silent | intermittent | noisy | drifting
         # Side by side, cells that never return to their baseline carry something that lies still.
-        held = stream.lowest > stream.scale.baseline + stream.scale.near
+        never_unloaded = stream.lowest > stream.scale.baseline + stream.scale.near
         beside = stream.layout.beside
-        carries = held & ((beside >= 0) & held[beside]).any(axis=1)
+        carries = never_unloaded & ((beside >= 0) & never_unloaded[beside]).any(axis=1)
         judged = delivers & runs.moved & ~certain & ~carries & (reference.life is not None)
         # The model of life errs where its reference has no like: only what is far beyond its limits is faulty.
         refuted = np.where(judged, expit(life.evidence + logit(EXPECTED) - CERTAIN_RATIO / 2), 0.0)

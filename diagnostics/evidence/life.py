@@ -218,7 +218,7 @@ class LifeModel:
             raise ValueError(f"expected a table [1 or {layout.n_cells}, {shape[0]}, {shape[1]}]")
         if self.reached.shape != (len(FAULTS), layout.n_cells) or self.errs.shape != (layout.n_cells,):
             raise ValueError(f"expected reached and errs of {layout}")
-        if not (self.unit > 0 and 0 < self.equal < 1 and ((self.errs > 0) & (self.errs < 1)).all()):
+        if not (self.unit > 0 and 0 < self.equal <= 1 and ((self.errs > 0) & (self.errs < 1)).all()):
             raise ValueError("expected a positive unit, and probabilities between 0 and 1")
 
     def expected(self, loads: Array, known: Mask) -> Floats:

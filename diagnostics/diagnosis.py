@@ -19,11 +19,11 @@ from diagnostics.decision.root_causes import CellFindings, root_causes
 from diagnostics.decision.serialization import Arrays, from_state, to_state
 from diagnostics.decision.static_loads import StaticLoad, find_static_loads
 from diagnostics.events.constant_runs import SHORTEST_RUN
-from diagnostics.evidence.life import Life
-from diagnostics.evidence.life_record import PIECE
+from diagnostics.evidence.life import PIECE, Life
 from diagnostics.evidence.reference import Reference, highest_reading, living, tolerance_of
 from diagnostics.evidence.rewiring import Rewiring, find_rewiring
 from diagnostics.evidence.spatial import Exclusion, Spatial
+from diagnostics.evidence.stepping import finished
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
@@ -227,34 +227,29 @@ class SelfDiagnosis:
         Raises:
             ValueError: no frame with a reading was received yet.
         """
-        steps = self.steps(stream, n_recordings=n_recordings)
-        while True:
-            try:
-                next(steps)
-            except StopIteration as end:
-                diagnosis: Diagnosis = end.value
-                return diagnosis
+        return finished(self.steps(stream, n_recordings=n_recordings))
 
-    def steps(self, stream: StreamState, *, n_recordings: int = 1) -> Generator[None, None, Diagnosis]:
-        """Yield between steps of a few milliseconds of :meth:`evaluate`, for a control loop; return the diagnosis."""
+    def steps(
+        self, stream: StreamState, *, n_recordings: int = 1, life: Life | None = None
+    ) -> Generator[None, None, Diagnosis]:
+        """Yield between steps of a few milliseconds of :meth:`evaluate`, for a control loop; return the diagnosis.
+
+        Args:
+            stream: the state of the log.
+            n_recordings: of which it consists.
+            life: the last result of :meth:`proof`, which is then not repeated; None: it is.
+        """
         stream = stream.complete()
         if not stream.received.any():
             raise ValueError("the recordings hold no frame with a reading: nothing to diagnose")
         aliases, copies = find_aliasing(stream)
         yield
-        explained, still, life = copies, list[StaticLoad](), Life.assumed(stream.layout.n_cells)
-        proves = stream.reference.life is not None and not stream.noisier
-        if proves:
-            # Cells that move by themselves mislead the spatial test; those that never moved say nothing yet.
-            life = yield from _stepped(stream.proof_of_life(copies, ~stream.runs.moved))
+        explained = copies
+        still = list[StaticLoad]()
+        if life is None:
+            life = yield from self._proof(stream, copies)
         log_ratio = self._log_ratio(stream, life)
         spatial, found = yield from self._tested(stream, explained, log_ratio, life)
-        if proves:
-            # Cells that the spatial test suspects predict no others.
-            suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
-            life = yield from _stepped(stream.proof_of_life(copies, suspected))
-            log_ratio = self._log_ratio(stream, life)
-            found = self._found(stream, spatial, explained, log_ratio, life)
         for beside in (False, True):
             while True:
                 yield
@@ -317,6 +312,30 @@ class SelfDiagnosis:
             static_loads=tuple(still),
             contradicting=life.contradicting,
         )
+
+    def proof(self, stream: StreamState) -> Generator[None, None, Life]:
+        """Yield between steps of a few milliseconds; return whether cells depend on each other as healthy ones do."""
+        stream = stream.complete()
+        _, copies = find_aliasing(stream)
+        yield
+        life = yield from self._proof(stream, copies)
+        return life
+
+    def _proof(self, stream: StreamState, explained: NDArray[np.bool_]) -> Generator[None, None, Life]:
+        """Yield between steps; return whether cells depend on each other; ``explained`` ones (bool ``[D]``) are out."""
+        if stream.reference.life is None or stream.noisier:
+            return Life.assumed(stream.layout.n_cells)
+        evidence = stream.evidence_of_life()
+        yield
+        # Cells that move by themselves mislead the spatial test; those that never moved say nothing yet.
+        first = stream.proof_of_life(evidence, explained, ~stream.runs.moved)
+        life = yield from _stepped(first)
+        log_ratio = self._log_ratio(stream, life)
+        spatial, found = yield from self._tested(stream, explained, log_ratio, life)
+        # Cells that the spatial test suspects predict no others.
+        suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
+        life = yield from _stepped(stream.proof_of_life(evidence, explained, suspected, first))
+        return life
 
     @staticmethod
     def _misleading(stream: StreamState, life: Life) -> NDArray[np.bool_]:

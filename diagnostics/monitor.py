@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from diagnostics.evidence.life import Life
 from diagnostics.layout import Line
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 Key = tuple[Line | None, int]
 
+_PROVEN_EVERY = 4  # segments, life is proven: a size
 _LONGEST_GAP = 86400.0  # seconds; after a longer one the clock was set
 
 
@@ -27,7 +29,9 @@ class Monitor:
     """Monitors a running sensor and reports faults that are new, have changed, or are gone.
 
     After each segment of 32 frames the diagnosis is updated, in small steps over the frames that follow: a fault is
-    reported at most about 50 frames after it becomes detectable. :meth:`diagnosis` evaluates at once.
+    reported at most about 50 frames after it becomes detectable. The proof of life of all cells takes the frames in
+    between, so that a dead cell that moves is reported up to some 200 frames later. :meth:`diagnosis` evaluates at
+    once.
 
     Args:
         fitted: a fitted :class:`SelfDiagnosis`; an unfitted one is a cold start.
@@ -43,12 +47,15 @@ class Monitor:
         self._diagnoser = fitted
         self._stream = fitted.stream()
         self._work: Generator[None, None, Diagnosis] | None = None
+        self._proof: Generator[None, None, Life] | None = None
+        self._life = Life.unknown(fitted.layout.n_cells)
+        self._segments = 0  # since the last proof of life began
         self._known: dict[Key, Fault] = {}
         self._time: float | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy or a pickle holds; an evaluation under way begins anew after the copy's next segment."""
-        state = {**vars(self), "_work": None}
+        state = {**vars(self), "_work": None, "_proof": None}
         del state["_threads"]
         return state
 
@@ -85,15 +92,40 @@ class Monitor:
         due = self._stream.due
         with self._threads.limit(limits=1) if due else nullcontext():
             completed = self._stream.extend(reading[None])
-        if self._work is None and completed:
-            self._work = self._diagnoser.steps(copy(self._stream))
-        elif self._work is not None and not due:
+        if completed:
+            self._begin()
+        elif not due:
+            with self._threads.limit(limits=1) if self._busy else nullcontext():
+                return self._step()
+        return ()
+
+    @property
+    def _busy(self) -> bool:
+        return self._work is not None or self._proof is not None
+
+    def _begin(self) -> None:
+        """Begin to evaluate the frames so far, unless an evaluation is under way."""
+        if self._work is None:
+            self._work = self._diagnoser.steps(copy(self._stream), life=self._life)
+        self._segments += 1
+        if self._proof is None and self._segments >= _PROVEN_EVERY:
+            self._proof = self._diagnoser.proof(copy(self._stream))
+            self._segments = 0
+
+    def _step(self) -> tuple[Fault, ...]:
+        """Do a step of the evaluation, or else of the proof of life; return the changes when it is complete."""
+        if self._work is not None:
             try:
-                with self._threads.limit(limits=1):
-                    next(self._work)
+                next(self._work)
             except StopIteration as end:
                 self._work = None
                 return self._changes(end.value)
+        elif self._proof is not None:
+            try:
+                next(self._proof)
+            except StopIteration as end:
+                self._proof = None
+                self._life = end.value
         return ()
 
     def diagnosis(self) -> Diagnosis:

@@ -9,8 +9,9 @@ import pytest
 
 from adaptfault.data.recordings import Recordings
 from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, Verdict, inject
-from diagnostics.evidence.life import LifeTest, _Log
-from diagnostics.evidence.life_record import KEPT, LifeRecord
+from diagnostics.evidence.life import EvidenceOfLog, LifeRecord, LifeTest
+from diagnostics.evidence.life.record import KEPT
+from diagnostics.evidence.stepping import finished
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +84,8 @@ def test_where_many_cells_contradict_at_once_the_sensor_is_disturbed_and_no_cell
     for frames in seen:
         stream.extend(frames)
     none = np.zeros(fitted.layout.n_cells, bool)
-    life = stream.complete().proof_of_life(none, none).finish()
+    whole = stream.complete()
+    life = whole.proof_of_life(whole.evidence_of_life(), none, none).finish()
     assert life.contradicting > 1 / 3
     assert not life.refuted.any()
     told = replace(found, contradicting=life.contradicting)
@@ -123,7 +125,8 @@ def test_a_log_without_contact_proves_nothing(fitted):
     idle = [np.zeros((50, fitted.layout.n_cells))]
     stream = fitted.stream()
     stream.extend(idle[0])
-    life = LifeTest(stream.life, fitted.reference_.life, fitted.layout, np.ones(220, bool)).finish()
+    evidence = EvidenceOfLog.of(stream.life, fitted.reference_.life, fitted.layout.beside)
+    life = LifeTest(evidence, np.ones(220, bool)).finish()
     assert not life.shown.any()
     assert not life.evidence.any()
 
@@ -150,17 +153,16 @@ def test_a_level_that_a_cell_has_all_the_time_is_no_contradiction_whatever_was_e
     stream = fitted.stream()
     for frames in log:
         stream.extend(frames)
-    record = stream.complete().life
+    pieces = stream.complete().evidence_of_life().log
     model = fitted.reference_.life
-    pieces = _Log.of(record.loads, record.means, record.segment, model)
     each = np.arange(pieces.level.shape[1])
     likeliest = model.table[model.of_cell(each), :, 3].argmax(axis=1)
     context = np.broadcast_to(likeliest, pieces.level.shape)
-    always = pieces.given(model.probabilities[model.of_cell(each)], context, np.full(pieces.level.shape, 3))
+    always = pieces.tilted(model.probabilities, context, np.full(pieces.level.shape, 3))
     assert (always > np.log(0.9)).all()
-    _, context = pieces.healthy(model, np.ones(len(each), bool), fitted.layout.beside)
+    healthy, context = finished(pieces.healthy(np.ones(len(each), bool)))
     plain = model.table[model.of_cell(each), context, pieces.level]
-    assert pieces.given(model.probabilities[model.of_cell(each)], context, pieces.level).mean() > plain.mean()
+    assert healthy.mean() > plain.mean()
 
 
 def test_two_cells_side_by_side_that_move_by_themselves_are_found_and_none_of_those_between(fitted, log, used):
@@ -170,3 +172,16 @@ def test_two_cells_side_by_side_that_move_by_themselves_are_found_and_none_of_th
     seen = broken(seen, Fault(FaultKind.LATE, (first + 1,), value=10), fitted)
     found = fitted.diagnose(seen)
     assert tuple(sorted(found.fault_set)) == dead
+
+
+def test_a_second_test_of_the_same_log_finds_what_the_first_did_and_asks_the_model_nothing(fitted, log):
+    stream = fitted.stream()
+    for frames in log:
+        stream.extend(frames)
+    evidence = stream.complete().evidence_of_life()
+    every = np.ones(fitted.layout.n_cells, bool)
+    first = LifeTest(evidence, every)
+    life = first.finish()
+    evidence.log.healthy = None
+    again = LifeTest(evidence, every, known=first.known).finish()
+    np.testing.assert_array_equal(again.evidence, life.evidence)

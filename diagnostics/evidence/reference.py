@@ -13,7 +13,7 @@ from diagnostics.events.constant_runs import segments
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import HealthyRates
 from diagnostics.evidence.jumps import JumpHistogram
-from diagnostics.evidence.life import LifeModel
+from diagnostics.evidence.life import LifeModel, fit_life
 from diagnostics.evidence.lower_limit import LowerLimit
 from diagnostics.evidence.noise_loss import NoiseLoss
 from diagnostics.evidence.pad_level import PadLimit
@@ -136,7 +136,7 @@ class Reference:
         """Return the reference with the model of the proof of life, fitted to the same recordings."""
         layout = living(layout, self.dead)
         recordings = levelled(recordings, levels(recordings, layout.present.ravel(), layout.full_scale))
-        return replace(self, life=LifeModel.fit(recordings, layout, self.scale, self.offset, self.tolerance))
+        return replace(self, life=fit_life(recordings, layout, self.scale, self.offset, self.tolerance))
 
     @classmethod
     def unknown(cls, layout: SensorLayout, rest: NDArray[np.float64] | None = None) -> Reference:

@@ -28,8 +28,7 @@ from diagnostics.evidence.drift import offset_evidence
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
 from diagnostics.evidence.jumps import SUDDEN_JUMP
-from diagnostics.evidence.life import LifeTest
-from diagnostics.evidence.life_record import LifeRecord
+from diagnostics.evidence.life import EvidenceOfLog, LifeRecord, LifeTest
 from diagnostics.evidence.pad_level import PadLevel
 from diagnostics.evidence.rest_level import RestLevel
 from diagnostics.evidence.spatial import Exclusion, Spatial, SpatialTest, held_load_evidence
@@ -254,14 +253,29 @@ class StreamState:
             if suffixes:
                 yield np.stack(suffixes), tile.inputs, tile.place, self.model_of(i, events)
 
-    def proof_of_life(self, explained: Mask, suspected: Mask) -> LifeTest:
-        """Return the test whether cells depend on each other as healthy ones do; the reference must have a model of it.
-
-        Cells that are ``explained`` (bool ``[D]``) are left out; those ``suspected`` to be constant predict no others.
-        """
+    def evidence_of_life(self) -> EvidenceOfLog | None:
+        """Return what the log says of how cells depend on each other; the reference must have a model of it."""
         assert self.reference.life is not None
+        return EvidenceOfLog.of(self.life, self.reference.life, self.layout.beside)
+
+    def proof_of_life(
+        self,
+        evidence: EvidenceOfLog | None,
+        explained: Mask,
+        constant: Mask,
+        first: LifeTest | None = None,
+    ) -> LifeTest:
+        """Return the test whether cells depend on each other as healthy ones do.
+
+        Args:
+            evidence: what the log says.
+            explained: bool ``[D]``, cells that are left out.
+            constant: bool ``[D]``, cells that predict no others.
+            first: an earlier test, whose result this one begins with.
+        """
         eligible = self.received & ~self.silent & ~explained & (self.reference.dead == 0)
-        return LifeTest(self.life, self.reference.life, self.layout, eligible, suspected)
+        known = None if first is None else first.known
+        return LifeTest(evidence, eligible, constant, known)
 
     def spatial(self, explained: Mask | None = None, misleading: Mask | None = None) -> Test:
         """Return the spatial test of all constant cells.

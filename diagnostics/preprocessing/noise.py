@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +63,7 @@ class NoiseNow:
     @property
     def deviation(self) -> float:
         """The standard deviation, median over the last segments; 0 before any."""
-        return float(np.median(self.of_segments)) if self.of_segments else 0.0
+        return median(self.of_segments) if self.of_segments else 0.0
 
     @property
     def range(self) -> float:
@@ -109,8 +110,12 @@ def _deviation(frames: Floats, present: NDArray[np.bool_]) -> float | None:
     if len(given) < _FEWEST or not given.shape[1]:
         return None
     curvature = np.diff(given, 2, axis=0)
-    own = np.abs(curvature - np.median(curvature, axis=1, keepdims=True))
+    half = curvature.shape[1] // 2
+    shared = np.partition(curvature, half, axis=1)[:, half]
+    own = np.abs(curvature - shared[:, None])
     own.sort(axis=0)
     outer = len(own) // 4
     middle = own[outer : len(own) - outer].mean(axis=0)
-    return float(np.quantile(middle, LEAST_LOADED) / (_MIDDLE_HALF * np.sqrt(6)))
+    middle.sort()
+    quarter = middle[int(LEAST_LOADED * len(middle))]
+    return float(quarter / (_MIDDLE_HALF * np.sqrt(6)))

@@ -1,0 +1,226 @@
+"""What healthy cells do, given the others: a linear prediction, and a table P(observed level | predicted level)."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from diagnostics.healthy.dual_ridge import covariance_and_precision
+from diagnostics.preprocessing.levels import MARGIN
+from diagnostics.preprocessing.scale import Array
+
+if TYPE_CHECKING:
+    from diagnostics.layout import SensorLayout
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Cells = NDArray[np.intp]
+Levels = NDArray[np.uint8]
+
+FAULTS = ("independent", "intermittent", "late", "copy", "clamped")
+UNLOADED = 1e-3  # root load up to which a piece counts as unloaded
+THRESHOLD = 9.0  # evidence of a certain fault: with its prior, P(faulty) = 0.994
+GUESS = 0.005  # of a uniform distribution over the levels, in any table: models err
+_STEPS = 4  # of a prediction: a size
+BESIDE = (0.01, 0.34, 0.67, 0.99)  # shares of the cells beside one that are loaded, between levels
+
+
+@dataclass(frozen=True)
+class ConditionalMean:
+    """Linear prediction of some cells from others.
+
+    Attributes:
+        inputs: int ``[k]``, the cells.
+        place: int ``[outputs]``, which of them are predicted.
+        mean, scale: float ``[k]``; a scale of 0: constant in the reference.
+        covariance, precision: float ``[k, k]``, of the standardised loads.
+    """
+
+    inputs: Cells
+    place: Cells
+    mean: Floats
+    scale: Floats
+    covariance: Floats
+    precision: Floats
+
+    @classmethod
+    def fit(cls, loads: Array, inputs: Cells, place: Cells) -> ConditionalMean:
+        """Fit to mean root loads ``[n, D]``."""
+        own = loads[:, inputs].astype(np.float64)
+        mean = own.mean(axis=0)
+        spread = own.std(axis=0)
+        scale = np.where(spread < UNLOADED, 0.0, spread)
+        covariance, precision = covariance_and_precision(_standardised(own, mean, scale), 1.0)
+        return cls(inputs, place, mean, scale, covariance, precision)
+
+    @property
+    def outputs(self) -> Cells:
+        """The predicted cells."""
+        return self.inputs[self.place]
+
+    def predict(self, loads: Array, known: Mask) -> Floats:
+        """Return the expected loads ``[n, outputs]``, given those of the ``known`` cells (bool ``[D]``) alone."""
+        z = _standardised(loads[:, self.inputs], self.mean, self.scale)
+        known = known[self.inputs]
+        unknown = ~known
+        if not known.any():
+            z[:] = 0.0
+        elif unknown.any():
+            z[:, unknown] = z[:, known] @ self._regression(known, unknown).T
+        of_others = self.precision[:, self.place] / np.diag(self.precision)[self.place]
+        expected_z = z[:, self.place] - z @ of_others
+        expected: Floats = expected_z * self.scale[self.place] + self.mean[self.place]
+        return expected
+
+    def _regression(self, known: Mask, unknown: Mask) -> Floats:
+        if unknown.sum() <= known.sum():
+            within = self.precision[np.ix_(unknown, unknown)]
+            across = self.precision[np.ix_(unknown, known)]
+            found: Floats = -linalg.solve(within, across, assume_a="pos")
+            return found
+        within = self.covariance[np.ix_(known, known)]
+        across = self.covariance[np.ix_(known, unknown)]
+        turned: Floats = linalg.solve(within, across, assume_a="pos").T
+        return turned
+
+
+def _standardised(loads: NDArray[np.floating], mean: Floats, scale: Floats) -> Floats:
+    inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
+    return (loads - mean) * inverse
+
+
+def levels_of(values: NDArray[np.floating], edges: Floats) -> Levels:
+    """Return the number of the ``edges`` (ascending) that each value reaches: ``np.searchsorted(side="right")``."""
+    level = np.zeros(values.shape, np.uint8)
+    for edge in edges:
+        level += values >= edge
+    return level
+
+
+def loaded_beside(loads: Array, known: Mask, beside: Cells) -> Levels:
+    """Return the level of the share of the known cells beside each cell that are loaded, ``[n, D]``.
+
+    Args:
+        loads: root loads ``[n, D]``.
+        known: bool ``[D]``.
+        beside: int ``[D, 8]``, the cells beside each; -1: none.
+    """
+    of_cell = np.ascontiguousarray((loads > UNLOADED).T)
+    loaded = np.zeros(of_cell.shape, np.uint8)
+    count = np.zeros(len(of_cell), np.intp)
+    for other in beside.T:
+        counts = (other >= 0) & known[other]
+        loaded += of_cell[other] & counts[:, None]
+        count += counts
+    shares = np.arange(beside.shape[1] + 1) / np.maximum(count, 1)[:, None]
+    level = levels_of(shares, np.asarray(BESIDE))
+    found: Levels = np.take_along_axis(level, loaded.astype(np.intp), axis=1).T
+    return found
+
+
+@dataclass(frozen=True)
+class LifeModel:
+    """What healthy cells do, given the others.
+
+    Attributes:
+        means: predictions, for each tile; each cell is an output of one.
+        levels: float ``[K - 1]``, root loads between the levels that are observed.
+        predicted: float ``[M - 1]``, the same of those that are predicted.
+        table: float ``[D, M, K]``, log P(observed level | context) of each healthy cell; ``[1, M, K]``: of all.
+        equal: probability that a healthy cell reads the same as one beside it in a loaded unit.
+        unit: segments of a unit.
+        errs: float ``[D]``, share e of the units.
+        tolerance: a cell whose readings lie within this of its highest one reads it, in the layout's unit.
+        reached: float ``[5, D]``, evidence that a healthy cell reaches in a log, for each of the ``FAULTS``.
+        units: number of units of these logs.
+        counts: factor on all evidence, 0 to 1: a reference of few units contains few unusual contacts.
+    """
+
+    means: tuple[ConditionalMean, ...]
+    levels: Floats
+    predicted: Floats
+    table: Array
+    equal: float
+    unit: int
+    errs: Floats
+    tolerance: float
+    reached: Floats
+    units: int
+    counts: float
+
+    def check(self, layout: SensorLayout) -> None:
+        """Raise ValueError unless this is a model of ``layout``."""
+        outputs = np.concatenate([mean.outputs for mean in self.means])
+        if not np.array_equal(np.sort(outputs), np.flatnonzero(layout.present)):
+            raise ValueError(f"the proof of life does not cover each cell of {layout} exactly once")
+        shape = (self.n_contexts, len(self.levels) + 1)
+        if self.table.shape not in ((1, *shape), (layout.n_cells, *shape)):
+            raise ValueError(f"expected a table [1 or {layout.n_cells}, {shape[0]}, {shape[1]}]")
+        if self.reached.shape != (len(FAULTS), layout.n_cells):
+            raise ValueError(f"expected reached [{len(FAULTS)}, {layout.n_cells}]")
+        if self.errs.shape != (layout.n_cells,):
+            raise ValueError(f"expected errs [{layout.n_cells}]")
+        probable = ((self.errs > 0) & (self.errs < 1)).all()
+        if not (self.unit > 0 and 0 < self.equal <= 1 and probable):
+            raise ValueError("expected a positive unit, and probabilities between 0 and 1")
+
+    @property
+    def n_contexts(self) -> int:
+        """Number M of contexts."""
+        return (len(self.predicted) + 1) * (len(BESIDE) + 1)
+
+    def expected(self, loads: Array, known: Mask) -> Floats:
+        """Return the expected root loads ``[n, D]``, given those of the ``known`` cells (bool ``[D]``)."""
+        found = np.zeros(loads.shape)
+        for mean in self.means:
+            found[:, mean.outputs] = mean.predict(loads, known)
+        return found
+
+    def contexts(self, loads: Array, known: Mask, beside: Cells) -> Generator[None, None, NDArray[np.intp]]:
+        """Yield between steps; return what the others say of each cell, 0 to M - 1, int ``[n, D]``."""
+        level = np.zeros(loads.shape, np.uint8)
+        each = -(-len(self.means) // _STEPS)
+        for k, mean in enumerate(self.means):
+            level[:, mean.outputs] = levels_of(mean.predict(loads, known), self.predicted)
+            if k % each == 0:
+                yield
+        around = loaded_beside(loads, known, beside)
+        return level.astype(np.intp) * (len(BESIDE) + 1) + around
+
+    def factors(self, units: int) -> Floats:
+        """Return the factors ``[5, D]`` on the evidence in a log of so many units: healthy cells stay below the limit.
+
+        The evidence against a healthy cell that the model predicts badly grows with the length of the log.
+        """
+        reached = np.maximum(self.reached, 0.0) * max(1.0, units / self.units)
+        factors: Floats = self.counts * THRESHOLD / np.maximum(THRESHOLD, MARGIN * reached)
+        return factors
+
+    @cached_property
+    def probabilities(self) -> Floats:
+        """P(observed level | context) of each healthy cell, shape of ``table``."""
+        return np.exp(self.table.astype(np.float64))
+
+    def otherwise(self, gain: float, offset: float, cells: Cells) -> Floats:
+        """Return P(observed level | context) of cells with a gain and an offset (of full scale), ``[cells, M, K]``."""
+        above = np.append(self.levels, 1.0)
+        below = np.append(0.0, self.levels)
+        middle = (above + below) / 2
+        middle[0] = 0.0
+        load = np.clip(gain * middle**2 + offset, 0.0, 1.0)
+        becomes = levels_of(np.sqrt(load), self.levels)
+        table = self.probabilities[self.of_cell(cells)]
+        found = np.full(table.shape, GUESS / len(middle))
+        for before, after in enumerate(becomes.tolist()):
+            found[:, :, after] += (1 - GUESS) * table[:, :, before]
+        return found
+
+    def of_cell(self, cells: Cells) -> Cells:
+        """Return where the table of each cell is."""
+        return cells % len(self.table)

@@ -1,0 +1,244 @@
+"""The iterated test whether each cell depends on the others, and its result."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from diagnostics.evidence.life.healthy_table import THRESHOLD, Floats, Mask
+from diagnostics.evidence.life.levels_in_log import LifeLog
+from diagnostics.evidence.life.ways_to_fail import (
+    REFUTED,
+    EvidenceOfLog,
+    Suspicion,
+    WaysToFail,
+    follows_otherwise,
+)
+from diagnostics.preprocessing.levels import FEWEST, MAJORITY
+
+_SHARES = (0.4, 0.3, 0.1, 0.1, 0.1)  # of the FAULTS among faults
+_ROUNDS = 16  # at most: a size
+_OFTEN = 2  # times that a cell was refuted: it does not come back
+_SHOWN = 2.0  # evidence against independence that proves life
+_DISTURBED = 1 / 3  # share of the tested cells: if more are refuted, all are disturbed
+
+
+@dataclass(frozen=True)
+class Life:
+    """Evidence of each cell, ``[D]``.
+
+    Attributes:
+        evidence: float, log likelihood ratio of any of the faults : healthy.
+        kind: int, number of the likeliest of the ``FAULTS``.
+        shown: bool, the cell depends on the others as a healthy cell does.
+        refuted: bool, cells that must not predict others.
+        certain: bool, those of them that are faulty.
+        lag: int, pieces by which the cell is late, if it is.
+        source: int, the cell that it repeats, if it does.
+        share: float, of the tested units in which a cell that comes and goes was dead.
+        since: int, number of the first frame of the first unit against the cell.
+        against: bool ``[units, D]``, units against the cell.
+        begins: int ``[units]``, number of the first frame of each.
+        highest: float, highest reading of a piece, in the layout's unit.
+        floats: bool, certain cells that do not follow the others at all, not with a lower gain either.
+        contradicting: share of the tested cells that are refuted, where it is so large that all are disturbed and none
+            is faulty; else 0.
+    """
+
+    evidence: Floats
+    kind: NDArray[np.intp]
+    shown: Mask
+    refuted: Mask
+    certain: Mask
+    lag: NDArray[np.intp]
+    source: NDArray[np.intp]
+    share: Floats
+    since: NDArray[np.intp]
+    against: Mask
+    begins: NDArray[np.intp]
+    highest: Floats
+    floats: Mask
+    contradicting: float
+
+    @classmethod
+    def unknown(cls, n_cells: int) -> Life:
+        """Return the evidence of a log that tells nothing."""
+        nothing = np.zeros(n_cells)
+        zero = np.zeros(n_cells, np.intp)
+        no = np.zeros(n_cells, bool)
+        return cls(
+            evidence=nothing,
+            kind=zero,
+            shown=no,
+            refuted=no,
+            certain=no,
+            lag=zero,
+            source=zero,
+            share=nothing,
+            since=zero,
+            against=no[None],
+            begins=zero[:1],
+            highest=nothing,
+            floats=no,
+            contradicting=0.0,
+        )
+
+    @classmethod
+    def assumed(cls, n_cells: int) -> Life:
+        """Return the evidence where the reference tells nothing: a cell that moves counts as alive."""
+        return replace(cls.unknown(n_cells), shown=np.ones(n_cells, bool))
+
+    @property
+    def units(self) -> NDArray[np.intp]:
+        """Number of units against each cell, int ``[D]``."""
+        found: NDArray[np.intp] = self.against.sum(axis=0)
+        return found
+
+    def mostly_before(self, frame: NDArray[np.intp]) -> Mask:
+        """Return the cells that most units against them contradict before a ``frame`` (int ``[D]``), bool ``[D]``."""
+        before = (self.against & (self.begins[:, None] < frame)).sum(axis=0)
+        found: Mask = before > MAJORITY * self.units
+        return found
+
+
+class LifeTest:
+    """The iterated test; each :meth:`step` takes a few milliseconds.
+
+    What it finds of the log, given the cells that predict others, is kept with the log: a second test of it is short.
+
+    Args:
+        evidence: what the log says; None: it holds too little, and tells nothing.
+        eligible: bool ``[D]``, cells that are present and not explained otherwise.
+        constant: bool ``[D]``, cells that look stuck now, and predict no others; None: none.
+        known: bool ``[D]``, cells that may predict others at first, of an earlier test; None: all.
+
+    Attributes:
+        result: None before the last step.
+        known: bool ``[D]``, the cells that predict others.
+    """
+
+    def __init__(
+        self,
+        evidence: EvidenceOfLog | None,
+        eligible: Mask,
+        constant: Mask | None = None,
+        known: Mask | None = None,
+    ) -> None:
+        self.result: Life | None = None
+        self._eligible = eligible
+        self._constant = np.zeros_like(eligible) if constant is None else constant
+        self.known = eligible & ~self._constant
+        if known is not None:
+            self.known &= known
+        if evidence is None:
+            self.result = Life.unknown(len(eligible))
+            return
+        self._evidence = evidence
+        self._work = self._steps()
+
+    def step(self) -> bool:
+        """Do some work; return whether there is a result."""
+        if self.result is None:
+            next(self._work, None)
+        return self.result is not None
+
+    def finish(self) -> Life:
+        """Do all work that is left, and return the result."""
+        while self.result is None:
+            self.step()
+        return self.result
+
+    def _steps(self) -> Iterator[None]:
+        log = self._evidence.log
+        yield from log.prepared()
+        refuted = np.zeros(len(self._eligible), np.intp)  # how often each cell was
+        factors = log.model.factors(log.units)
+        seen = yield from self._evidence.suspicion(self.known)
+        for _ in range(_ROUNDS):
+            bad, gone = self._worst(seen, factors)
+            refuted += gone
+            # A cell that the others beside it had made look wrong comes back, but once only.
+            returns = self._eligible & ~self._constant & ~bad & (refuted < _OFTEN)
+            known = self.known & ~gone | returns
+            if (known == self.known).all():
+                break
+            self.known = known
+            yield
+            seen = yield from self._evidence.suspicion(known)
+        ways = yield from self._evidence.ways(self.known)
+        yield
+        life = _concluded(log, ways, self._eligible, self._constant)
+        self.result = yield from _without_followers(log, ways, life)
+
+    def _worst(self, seen: Suspicion, factors: Floats) -> tuple[Mask, Mask]:
+        """Return the cells that are refuted, and the worst of those that predict others, bool ``[D]`` each.
+
+        The worst: worse than any cell beside them, and half as bad as the worst of all.
+        """
+        scaled = np.maximum(seen.independent * factors[0], seen.intermittent * factors[1])
+        plain = np.maximum(seen.independent, seen.intermittent)
+        bad = self._eligible & (scaled > REFUTED)
+        predicts = bad & self.known
+        beside = self._evidence.log.beside
+        of_beside = np.where((beside >= 0) & self.known[beside], plain[beside], -np.inf)
+        of_all = plain.max(initial=-np.inf, where=predicts)
+        local = plain >= of_beside.max(axis=1, initial=-np.inf)
+        return bad, predicts & local & (plain > MAJORITY * of_all)
+
+
+def _without_followers(log: LifeLog, ways: WaysToFail, life: Life) -> Generator[None, None, Life]:
+    """Yield between steps; return the result where cells that follow the others otherwise are not floating.
+
+    A load that lies still, another specimen, a weak cell: it reads otherwise, but it follows the others.
+    """
+    cells = np.flatnonzero((life.refuted | life.certain) & (life.kind == 0))
+    if not len(cells):
+        return life
+    better = yield from follows_otherwise(log, ways, cells)
+    evidence = life.evidence.copy()
+    follows = cells[better > REFUTED]
+    evidence[follows] = np.minimum(evidence[follows], 0.0)
+    floats = life.floats.copy()
+    floats[cells[better > 0]] = False
+    return replace(life, evidence=evidence, floats=floats)
+
+
+def _concluded(log: LifeLog, ways: WaysToFail, eligible: Mask, constant: Mask) -> Life:
+    """Return the result."""
+    scaled = ways.evidence * log.model.factors(log.units)
+    any_fault = logsumexp(scaled + np.log(_SHARES)[:, None], axis=0)
+    evidence = np.where(eligible, any_fault, 0.0)
+    kind = ways.evidence.argmax(axis=0)
+    refuted = eligible & (evidence > REFUTED)
+    certain = refuted & (evidence > THRESHOLD)
+    shown = eligible & (ways.now < -_SHOWN) & (ways.evidence[0] < 0) & ~refuted
+    moving = ~constant
+    against = int((refuted & moving).sum())
+    tested = int(((shown | refuted) & moving).sum())
+    contradicting = against / max(tested, 1)
+    if contradicting > _DISTURBED and against >= FEWEST:
+        evidence = np.minimum(evidence, 0.0)
+        refuted = np.zeros_like(refuted)
+    else:
+        contradicting = 0.0
+    first = log.begins[ways.against.argmax(axis=0)]
+    return Life(
+        evidence=evidence,
+        kind=kind,
+        shown=shown,
+        refuted=refuted,
+        certain=certain,
+        lag=ways.lag,
+        source=ways.source,
+        share=ways.share,
+        since=np.where(ways.against[0], 0, first),
+        against=ways.against,
+        begins=log.begins,
+        highest=ways.highest,
+        floats=certain & (kind == 0),
+        contradicting=contradicting,
+    )

@@ -1,0 +1,312 @@
+"""The evidence of each way in which a cell that moves can be dead, see :data:`healthy_table.FAULTS`.
+
+Each is a log likelihood ratio fault : healthy, summed over the units of the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_expit, logsumexp
+
+from diagnostics.evidence.life.healthy_table import THRESHOLD, Cells, Floats, LifeModel, Mask
+from diagnostics.evidence.life.levels_in_log import LifeLog, bounded
+from diagnostics.evidence.life.record import LifeRecord
+from diagnostics.preprocessing.levels import MAJORITY, TESTED
+
+REFUTED = 4.0  # evidence from which on a cell is replaced
+
+_LAGS = (1, 2, 3, 4)  # pieces
+# Gain and offset, as a share of full scale, of a cell that reads otherwise than it did, but follows the others: a grid.
+_OTHERWISE = (
+    *((gain, 0.0) for gain in (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0)),
+    *((1.0, offset) for offset in (0.02, 0.05, 0.1, 0.2, 0.4)),
+)
+_FEWEST_SEGMENTS = 2  # with load
+_PASSED = 300_000  # readings: a size
+_MOST_PASSES = 4  # a size
+_KEPT = 3  # answers: a size
+_CERTAINLY_NOT = 1e3  # evidence against what is impossible
+_FAILS = 0.1  # probability per unit
+_RECOVERS = 0.3  # probability per unit
+_AGAINST = 1.0  # log ratio from which on a unit speaks against a cell
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """The two faults that all others are near, before the factors.
+
+    Attributes:
+        healthy: float ``[n, D]``, log P(level | healthy).
+        context: int ``[n, D]``, what the others say.
+        independent, intermittent: float ``[D]``, evidence.
+        by_unit: float ``[units, D]``, evidence of each unit for an independent cell.
+        dead: float ``[units, D]``, evidence of each unit for a cell that is dead for a time.
+        dying: float ``[units, D]``, P(dead) in each unit, given the units up to it.
+    """
+
+    healthy: Floats
+    context: NDArray[np.intp]
+    independent: Floats
+    intermittent: Floats
+    by_unit: Floats
+    dead: Floats
+    dying: Floats
+
+
+@dataclass(frozen=True)
+class WaysToFail:
+    """The evidence of all faults, before the factors, and what is known of them.
+
+    Attributes:
+        evidence: float ``[5, D]``.
+        lag: int ``[D]``, pieces by which the cell is late, if it is.
+        source: int ``[D]``, the cell that it repeats, if it does.
+        share: float ``[D]``, of the tested units in which a cell that comes and goes was dead.
+        against: bool ``[units, D]``, units against the cell.
+        highest: float ``[D]``, highest reading of a piece, in the layout's unit.
+        now: float ``[D]``, log ratio independent : healthy since the cell, if it ever was dead, works again.
+        healthy: float ``[n, D]``, log P(level | healthy).
+        context: int ``[n, D]``, what the others say.
+    """
+
+    evidence: Floats
+    lag: NDArray[np.intp]
+    source: NDArray[np.intp]
+    share: Floats
+    against: Mask
+    highest: Floats
+    now: Floats
+    healthy: Floats
+    context: NDArray[np.intp]
+
+
+class EvidenceOfLog:
+    """What a log says of each way to fail, given the cells that predict others; the last answers are kept.
+
+    Args:
+        log: the levels of the log.
+    """
+
+    def __init__(self, log: LifeLog) -> None:
+        self.log = log
+        self._seen: dict[bytes, Suspicion] = {}
+        self._ways: dict[bytes, WaysToFail] = {}
+
+    @classmethod
+    def of(cls, record: LifeRecord, model: LifeModel, beside: Cells) -> EvidenceOfLog | None:
+        """Return the evidence of a log; None: it holds too little, and tells nothing."""
+        if len(record.number) < _FEWEST_SEGMENTS:
+            return None
+        return cls(LifeLog(record.loads, record.means, record.segment, model, beside))
+
+    def suspicion(self, known: Mask) -> Generator[None, None, Suspicion]:
+        """Yield between steps; return the evidence of the two faults that all others are near."""
+        key = known.tobytes()
+        if key not in self._seen:
+            _forget(self._seen)
+            self._seen[key] = yield from suspicion(self.log, known)
+        return self._seen[key]
+
+    def ways(self, known: Mask) -> Generator[None, None, WaysToFail]:
+        """Yield between steps; return the evidence of each fault."""
+        key = known.tobytes()
+        if key not in self._ways:
+            _forget(self._ways)
+            seen = yield from self.suspicion(known)
+            self._ways[key] = yield from ways_to_fail(self.log, known, seen)
+        return self._ways[key]
+
+
+def _forget(answers: dict[bytes, Any]) -> None:
+    """Drop the oldest answer, where many are kept."""
+    if len(answers) >= _KEPT:
+        del answers[next(iter(answers))]
+
+
+def _at_once(readings: int) -> int:
+    """Return how many passes over so many readings take about a millisecond."""
+    return int(np.clip(_PASSED // readings, 1, _MOST_PASSES))
+
+
+def suspicion(log: LifeLog, known: Mask) -> Generator[None, None, Suspicion]:
+    """Yield between steps; return the evidence of the two faults, where only the ``known`` cells predict others."""
+    healthy, context = yield from log.healthy(known)
+    yield
+    by_unit = log.counted(log.own - healthy)
+    dead = log.counted(log.at_rest - healthy)
+    intermittent, dying = _dies_and_recovers(dead)
+    return Suspicion(healthy, context, by_unit.sum(axis=0), intermittent, by_unit, dead, dying)
+
+
+def ways_to_fail(log: LifeLog, known: Mask, seen: Suspicion) -> Generator[None, None, WaysToFail]:
+    """Yield between steps; return the evidence of each fault.
+
+    Args:
+        log: the levels of the log.
+        known: bool ``[D]``, cells that predict others.
+        seen: the evidence of the first two faults, given these.
+    """
+    copy, source = yield from _copies(log, known)
+    if (known & (copy > REFUTED)).any():
+        seen = yield from suspicion(log, known & (copy <= REFUTED))
+        yield
+    lagged = []
+    for lag in _LAGS:
+        lagged.append(_late(log, seen, lag))
+        yield
+    late = logsumexp(lagged, axis=0) - np.log(len(lagged))
+    clamped = _clamped(log, seen.context)
+    # What was dead once, and works again, is no fault any more.
+    now = _since_it_works(seen.by_unit)
+    works = now < -THRESHOLD
+    independent = np.where(works, np.minimum(seen.independent, now), seen.independent)
+    intermittent = seen.intermittent - np.logaddexp(0.0, _up_to_some_unit(seen.dead))
+    tested = np.abs(seen.dead) > TESTED
+    gone = (seen.dying > MAJORITY) & tested
+    share = gone.sum(axis=0) / np.maximum(tested.sum(axis=0), 1)
+    moves = log.by_unit(log.own - seen.healthy) > _AGAINST
+    rests = seen.dead > _AGAINST
+    return WaysToFail(
+        evidence=np.stack([independent, intermittent, late, copy, clamped]),
+        lag=np.array(_LAGS)[np.argmax(lagged, axis=0)],
+        source=source,
+        share=share,
+        against=moves | rests,
+        highest=np.fmax.reduce(log.readings).astype(np.float64),
+        now=now,
+        healthy=seen.healthy,
+        context=seen.context,
+    )
+
+
+def follows_otherwise(log: LifeLog, ways: WaysToFail, cells: Cells) -> Generator[None, None, Floats]:
+    """Yield between steps; return the log ratio follows with another gain or offset : not at all, ``[cells]``."""
+    healthy = ways.healthy[:, cells]
+    context = ways.context[:, cells]
+    level = log.level[:, cells]
+    own = log.own[:, cells]
+    independent = _from_some_unit(log.counted(own - healthy, cells))
+    best = np.full(len(cells), -np.inf)
+    each = _at_once(level.size)
+    for k, (gain, offset) in enumerate(_OTHERWISE):
+        if k % each == 0:
+            yield
+        changed = log.tilted(log.model.otherwise(gain, offset, cells), context, level)
+        evidence = _from_some_unit(log.counted(changed - healthy, cells))
+        best = np.maximum(best, evidence)
+    return best - independent
+
+
+def _dies_and_recovers(dead: Floats) -> tuple[Floats, Floats]:
+    """Return the log evidence ``[D]`` of a cell that dies and recovers, and P(dead) in each unit ``[units, D]``.
+
+    Args:
+        dead: float ``[units, D]``, log ratio dead : healthy, bounded.
+    """
+    likelihood = np.exp(dead)
+    gone = np.full(dead.shape[1], _FAILS)
+    dying = np.empty(dead.shape)
+    total = np.empty(dead.shape)
+    total_before = 1 + _FAILS
+    # The forward algorithm; the probabilities are scaled to a sum of 1 after each unit.
+    gone /= total_before
+    for u, ratio in enumerate(likelihood):
+        stays = (1 - _FAILS) - (1 - _FAILS - _RECOVERS) * gone
+        gone = (1 - stays) * ratio
+        total[u] = stays + gone
+        gone /= total[u]
+        dying[u] = gone
+    return np.log(total).sum(axis=0) + np.log(total_before), dying
+
+
+def _from_some_unit(dead: Floats) -> Floats:
+    """Return the log evidence ``[D]`` of a cell that is dead from a unit on, half of them from the first."""
+    before = np.cumsum(dead, axis=0)
+    later = logsumexp(before[-1] - before, axis=0) - np.log(len(dead))
+    found: Floats = np.logaddexp(before[-1], later) - np.log(2)
+    return found
+
+
+def _up_to_some_unit(dead: Floats) -> Floats:
+    """Return the log evidence ``[D]`` of a cell that was dead up to a unit, and works again."""
+    before = np.cumsum(dead, axis=0)
+    prior = np.log(_FAILS * _RECOVERS) - np.log(len(dead))
+    found: Floats = logsumexp(before, axis=0) + prior
+    return found
+
+
+def _since_it_works(dead: Floats) -> Floats:
+    """Return the log ratio dead : healthy ``[D]`` after the unit up to which a cell was most likely dead, if any."""
+    before = np.cumsum(dead, axis=0)
+    found: Floats = before[-1] - np.maximum(before.max(axis=0), 0.0)
+    return found
+
+
+def _late(log: LifeLog, seen: Suspicion, lag: int) -> Floats:
+    """Return the evidence ``[D]`` that a cell shows what the others said some pieces ago."""
+    cells = np.arange(log.level.shape[1])
+    table = log.model.probabilities[log.model.of_cell(cells)]
+    ratio = np.zeros(seen.healthy.shape)
+    late = log.tilted(table, seen.context[:-lag], log.level[lag:])
+    ratio[lag:] = late - seen.healthy[lag:]
+    evidence: Floats = log.counted(ratio).sum(axis=0)
+    return evidence
+
+
+def _clamped(log: LifeLog, context: NDArray[np.intp]) -> Floats:
+    """Return the evidence ``[D]`` that a cell is clamped: any higher load explains its highest reading."""
+    model = log.model
+    limit = log.readings.max(axis=0)
+    piece, cell = np.nonzero((log.readings >= limit - model.tolerance) & (log.level > 0))
+    level = log.level[piece, cell]
+    of_level = model.table[model.of_cell(cell), context[piece, cell]].astype(np.float64)
+    at_least = np.arange(of_level.shape[1]) >= level[:, None]
+    clamped = logsumexp(np.where(at_least, of_level, -np.inf), axis=1)
+    ratio = np.zeros(log.level.shape)
+    ratio[piece, cell] = clamped - of_level[np.arange(len(cell)), level]
+    evidence: Floats = log.counted(ratio).sum(axis=0)
+    return evidence
+
+
+def _copies(log: LifeLog, known: Mask) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
+    """Yield between steps; return the evidence ``[D]`` that a cell repeats one beside it, and which, int ``[D]``.
+
+    Either cell of two that read the same may be the copy: the one that fits worse to the others, without both.
+    """
+    errs = log.model.errs
+    of_same = bounded(np.log(1 / log.model.equal) * np.ones_like(errs), errs)
+    of_different = bounded(np.log(errs), errs)
+    loaded = log.level > 0
+    evidence = []
+    each = _at_once(log.level.size)
+    for k, other in enumerate(log.beside.T):
+        either = loaded & loaded[:, other] & (other >= 0)
+        differs = either & (log.readings != log.readings[:, other])
+        different = log.any_by_unit(differs).sum(axis=0)
+        same = log.any_by_unit(either).sum(axis=0) - different
+        found = same * of_same + different * of_different
+        evidence.append(np.where(other >= 0, found, -np.inf))
+        if k % each == 0:
+            yield
+    cell = np.arange(len(errs))
+    best = np.argmax(evidence, axis=0)
+    source = log.beside[cell, best]
+    likeliest = np.max(evidence, axis=0) - np.log(len(evidence))
+    total = np.maximum(likeliest, -_CERTAINLY_NOT)
+    pairs = np.flatnonzero(total > REFUTED)
+    if len(pairs):
+        without = known.copy()
+        without[pairs] = False
+        without[source[pairs]] = False
+        healthy, _ = yield from log.healthy(without)
+        fits = log.counted(healthy - log.own).sum(axis=0)
+        worse = fits[source[pairs]] - fits[pairs]
+        copies = total[pairs] + log_expit(worse)
+        copied = total[pairs] + log_expit(-worse)
+        total[pairs] = copies - np.logaddexp(0.0, copied)
+    return total, source

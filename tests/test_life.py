@@ -10,6 +10,7 @@ import pytest
 from adaptfault.data.recordings import Recordings
 from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, Verdict, inject
 from diagnostics.evidence.life import EvidenceOfLog, LifeRecord, LifeTest
+from diagnostics.evidence.life.healthy_table import ConditionalMean
 from diagnostics.evidence.life.record import KEPT
 from diagnostics.evidence.stepping import finished
 
@@ -185,3 +186,17 @@ def test_a_second_test_of_the_same_log_finds_what_the_first_did_and_asks_the_mod
     evidence.log.healthy = None
     again = LifeTest(evidence, every, known=first.known).finish()
     np.testing.assert_array_equal(again.evidence, life.evidence)
+
+
+def test_what_the_others_say_of_a_cell_is_the_regression_on_the_known_ones_without_itself():
+    rng = np.random.default_rng(0)
+    loads = rng.normal(size=(300, 6)) @ rng.normal(size=(6, 6)) + 3
+    cells = np.arange(6)
+    mean = ConditionalMean.fit(loads, cells, cells)
+    known = np.array([True, True, False, True, False, True])
+    expected = mean.predict(loads, known)
+    z = (loads - mean.mean) / mean.scale
+    for cell in cells:
+        others = np.flatnonzero(known & (cells != cell))
+        weights = np.linalg.solve(mean.covariance[np.ix_(others, others)], mean.covariance[others, cell])
+        np.testing.assert_allclose(expected[:, cell], z[:, others] @ weights * mean.scale[cell] + mean.mean[cell])

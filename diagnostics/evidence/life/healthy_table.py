@@ -65,16 +65,24 @@ class ConditionalMean:
         return self.inputs[self.place]
 
     def predict(self, loads: Array, known: Mask) -> Floats:
-        """Return the expected loads ``[n, outputs]``, given those of the ``known`` cells (bool ``[D]``) alone."""
+        """Return the expected loads ``[n, outputs]``, given those of the ``known`` cells (bool ``[D]``) but the cell.
+
+        With K the known cells, Q the inverse of their covariance, and unknown cells as the known ones predict them,
+        E[z_i | K without i] = z_i - (P z)_i / Q_ii.
+        """
         z = _standardised(loads[:, self.inputs], self.mean, self.scale)
         known = known[self.inputs]
         unknown = ~known
+        own_precision = np.diag(self.precision).copy()
         if not known.any():
             z[:] = 0.0
         elif unknown.any():
-            z[:, unknown] = z[:, known] @ self._regression(known, unknown).T
-        of_others = self.precision[:, self.place] / np.diag(self.precision)[self.place]
-        expected_z = z[:, self.place] - z @ of_others
+            regression = self._regression(known, unknown)
+            z[:, unknown] = z[:, known] @ regression.T
+            across = self.precision[np.ix_(unknown, known)]
+            own_precision[known] += (across * regression).sum(axis=0)
+        of_all = self.precision[:, self.place] / own_precision[self.place]
+        expected_z = z[:, self.place] - z @ of_all
         expected: Floats = expected_z * self.scale[self.place] + self.mean[self.place]
         return expected
 

@@ -404,9 +404,8 @@ class SelfDiagnosis:
         blinks_to = np.where(2 * intermittency.high > intermittency.blinks, self.layout.full_scale, 0.0)
         held, beyond = stream.reading(value), spatial.scored & ~rests
         kind = np.where(by_life & faulty, life.kind, -1)
-        of_life = np.stack(
-            [held, stream.reading(stream.scale.baseline), life.lag * PIECE, self._order[life.source], life.highest]
-        )
+        source = np.where(life.source < 0, np.nan, self._order[life.source])
+        of_life = np.stack([held, stream.reading(stream.scale.baseline), life.lag * PIECE, source, life.highest])
         weight = log_ratio(spatial.surprisal, spatial.surprisal)
         return CellFindings(
             faulty=faulty,

@@ -168,7 +168,9 @@ def _fault(kind: FaultKind, value: float | None, cause: Cause, found: CellFindin
     own = (FaultKind.STUCK, FaultKind.OPEN, FaultKind.INTERMITTENT, FaultKind.LATE, FaultKind.COPY, FaultKind.CLAMPED)
     if kind in own and not found.silent[seen[0]]:
         value = float(np.median(found.value[seen]))
-        if found.zero is not None and kind is FaultKind.OPEN:  # at rest, which is not the lower end
+        if np.isnan(value):  # a copy of no single cell
+            value = None
+        elif found.zero is not None and kind is FaultKind.OPEN:  # at rest, which is not the lower end
             low, high = SLIGHT * layout.full_scale, (1 - SLIGHT) * layout.full_scale
             kind = FaultKind.SHORT if value >= high else FaultKind.OPEN if value <= low else FaultKind.STUCK
     start = int(np.median(found.since[seen]))
@@ -214,7 +216,8 @@ def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
     if fault.kind is FaultKind.DRIFT and np.isfinite(gain).any():
         return f"is loaded when the others are, but reads about {np.nanmedian(gain):.2g} times what it should"
     if fault.kind is FaultKind.COPY:
-        return f"repeats {layout.place(int(fault.value or 0))}"
+        source = "the mean of the cells beside it" if fault.value is None else layout.place(int(fault.value))
+        return f"repeats {source}"
     if fault.kind is FaultKind.INTERMITTENT and found.refuted[fault.cells[0]] >= 0:
         share = float(np.median(found.share[list(fault.cells)]))
         return f"reads nothing in {share:.0%} of the contacts that load the cells around it, and its load in the others"

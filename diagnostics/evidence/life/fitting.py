@@ -12,6 +12,7 @@ from scipy.special import expit
 
 from diagnostics.events.tiles import MOST_CELLS, tiles
 from diagnostics.evidence.life.healthy_table import (
+    AMID,
     BESIDE,
     FAULTS,
     GUESS,
@@ -25,7 +26,7 @@ from diagnostics.evidence.life.healthy_table import (
 )
 from diagnostics.evidence.life.levels_in_log import LifeLog, bounded
 from diagnostics.evidence.life.proof import LifeTest
-from diagnostics.evidence.life.record import KEPT, LifeRecord
+from diagnostics.evidence.life.record import KEPT, PIECE, LifeRecord
 from diagnostics.evidence.life.ways_to_fail import EvidenceOfLog
 from diagnostics.evidence.stepping import finished
 from diagnostics.healthy.cross_fitting import FOLDS
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 
 _LEVELS = 12  # of the root load: a size
 _PREDICTED = 16  # levels of the prediction: a size
-_OWN_ERRS = 20.0  # pseudo-count of units, of the share e of each cell
+_OWN_ERRS = 20.0  # pseudo-count of units of all cells, in the frequencies of each cell
 _SHRINKAGES = (4.0, 16.0, 64.0, 256.0, 1024.0)  # pseudo-counts of the table of all cells: a grid
 _CONTAMINATIONS = (0.01, 0.02, 0.04, 0.08)  # shares e: a grid
 _ERRS = 0.05  # share e of the units, before it is known
@@ -69,11 +70,25 @@ def fit_life(
 
 @dataclass(frozen=True)
 class _Fold:
-    """Pieces of some reference recordings: loads and readings ``[n, D]``, segment numbers int ``[n]``."""
+    """Pieces of some reference recordings: loads and readings ``[n, D]``, piece numbers int ``[n]``."""
 
     loads: Array
     readings: Array
-    segment: NDArray[np.intp]
+    piece: NDArray[np.intp]
+
+    def copy(self) -> _Fold:
+        """Return a copy whose loads and readings can be changed."""
+        return _Fold(self.loads.copy(), self.readings.copy(), self.piece)
+
+    def kill(self, cell: int, source: int, rng: np.random.Generator) -> None:
+        """Let a cell read, equally often, what another one (``source``) read at other times, or nothing."""
+        if rng.random() < MAJORITY:
+            self.loads[:, cell] = 0.0
+            self.readings[:, cell] = np.nanmin(self.readings[:, cell])
+            return
+        order = rng.permutation(len(self.loads))
+        self.loads[:, cell] = self.loads[order, source]
+        self.readings[:, cell] = self.readings[order, source]
 
 
 def _folds(
@@ -96,7 +111,7 @@ def _folds(
             log = np.concatenate([blocks[i] for i in some])
             record, begin = _recorded(log, begin, present, scale, offset)
             if record.number:
-                parts.append(_Fold(record.loads, record.means, record.segment))
+                parts.append(_Fold(record.loads, record.means, record.piece))
         if not parts:
             return None
         folds.append(_joined(parts))
@@ -107,7 +122,7 @@ def _joined(parts: Sequence[_Fold]) -> _Fold:
     return _Fold(
         np.concatenate([part.loads for part in parts]),
         np.concatenate([part.readings for part in parts]),
-        np.concatenate([part.segment for part in parts]),
+        np.concatenate([part.piece for part in parts]),
     )
 
 
@@ -156,10 +171,21 @@ class _Fit:
 
     def model(self) -> LifeModel:
         """Return the fitted model."""
+        n_cells = len(self._present)
         blank = LifeModel(
-            self._full, self._levels, np.zeros(0), np.zeros((0, 0, 0), np.float32), self._equal(), 1,
-            np.full(len(self._present), _ERRS), self._tolerance, np.zeros((len(FAULTS), len(self._present))), 1, 1.0,
-        )  # fmt: skip
+            means=self._full,
+            levels=self._levels,
+            predicted=np.zeros(0),
+            table=np.zeros((0, 0, 0), np.float32),
+            equal=np.ones(self._layout.beside.shape),
+            amid=np.ones((n_cells, len(AMID) + 1)),
+            unit=1,
+            errs=np.full(n_cells, _ERRS),
+            tolerance=self._tolerance,
+            reached=np.zeros((len(FAULTS), n_cells)),
+            units=1,
+            counts=1.0,
+        )
         seen = [self._expected(replace(blank, means=means), fold) for means, fold in self._cross()]
         predicted = self._predicted_edges([expected for expected, _ in seen])
         counts = np.stack([self._counts(fold, *of, predicted) for fold, of in zip(self._folds, seen, strict=True)])
@@ -172,31 +198,45 @@ class _Fit:
         ]
         ratios = [self._independent(model, fold) for model, fold in zip(held_out, self._folds, strict=True)]
         unit = self._unit(ratios)
-        errs, of_others = self._errs(
-            [_by_unit(ratio, fold, unit) for ratio, fold in zip(ratios, self._folds, strict=True)]
-        )
-        held_out = [replace(of, unit=unit, errs=own) for of, own in zip(held_out, of_others, strict=True)]
+        by_unit = [_by_unit(ratio, fold, unit) for ratio, fold in zip(ratios, self._folds, strict=True)]
+        errs, of_others = self._errs(by_unit)
+        fitted = self._beside(replace(fitted, unit=unit, errs=errs))
+        held_out = [
+            replace(of, unit=unit, errs=own, equal=fitted.equal, amid=fitted.amid)
+            for of, own in zip(held_out, of_others, strict=True)
+        ]
         # First with the dead cells known: else healthy cells would be taken for dead ones, and mislead the others.
         reached, units = self._reached(held_out, informed=True)
         held_out = [replace(of, reached=reached, units=units) for of in held_out]
         reached = np.maximum(reached, self._reached(held_out, informed=False)[0])
-        of_all = sum(len(np.unique(fold.segment // unit)) for fold in self._folds)
+        of_all = sum(len(np.unique(fold.piece // unit)) for fold in self._folds)
         # Few units contain few unusual contacts.
         counted = 1 - _MOST_DISCOUNT / (1 + of_all / _HALF_DISCOUNT)
-        return replace(fitted, unit=unit, errs=errs, reached=reached, units=units, counts=counted)
+        return replace(fitted, reached=reached, units=units, counts=counted)
 
     def _cross(self) -> list[tuple[tuple[ConditionalMean, ...], _Fold]]:
         return list(zip(self._held_out, self._folds, strict=True))
 
-    def _equal(self) -> float:
-        """Return how often a healthy cell reads the same as one beside it where both are loaded."""
-        equal = both = 1
-        other = self._layout.beside[:, 4]
+    def _beside(self, model: LifeModel) -> LifeModel:
+        """Return the model with how often healthy cells read as one beside them, or as the mean of these."""
+        d = len(self._present)
+        same = np.zeros(model.equal.shape)
+        loaded = np.zeros(model.equal.shape)
+        amid = np.zeros((d, len(AMID) + 1))
         for fold in self._folds:
-            loaded = (fold.loads > UNLOADED) & (fold.loads[:, other] > UNLOADED) & (other >= 0)
-            both += int(loaded.sum())
-            equal += int((loaded & (fold.readings == fold.readings[:, other])).sum())
-        return equal / both
+            log = LifeLog(fold.loads, fold.readings, fold.piece, model, self._layout.beside)
+            for k in range(self._layout.beside.shape[1]):
+                some, equal = log.same(k)
+                loaded[:, k] += some.sum(axis=0)
+                same[:, k] += equal.sum(axis=0)
+            some, level = log.amid()
+            for n in range(len(AMID) + 1):
+                amid[:, n] += (some & (level == n)).sum(axis=0)
+        usual = (same.sum() + 1) / (loaded.sum() + 1)
+        equal = (same + usual * _OWN_ERRS) / (loaded + _OWN_ERRS)
+        shared = (amid.sum(axis=0) + 1) / (amid.sum() + len(AMID) + 1)
+        amid = (amid + shared * _OWN_ERRS) / (amid.sum(axis=1, keepdims=True) + _OWN_ERRS)
+        return replace(model, equal=equal, amid=amid)
 
     def _expected(self, model: LifeModel, fold: _Fold) -> tuple[Floats, NDArray[np.intp]]:
         """Return predictions in which some cells are unknown, as in a log with dead ones, and levels of loads beside.
@@ -247,12 +287,12 @@ class _Fit:
 
     def _independent(self, model: LifeModel, fold: _Fold) -> Floats:
         """Return the log ratio independent of the others : healthy of each piece of a fold, ``[n, D]``."""
-        log = LifeLog(fold.loads, fold.readings, fold.segment, model, self._layout.beside)
+        log = LifeLog(fold.loads, fold.readings, fold.piece, model, self._layout.beside)
         healthy, _ = finished(log.healthy(self._present))
         return np.where(np.isfinite(fold.readings), log.own - healthy, 0.0)
 
     def _unit(self, ratios: list[Floats]) -> int:
-        """Return the segments of a unit: successive units of healthy cells are hardly correlated."""
+        """Return the pieces of a unit: successive units of healthy cells are hardly correlated."""
         unit = 1
         while True:
             products = 0.0
@@ -306,13 +346,13 @@ class _Fit:
         units = []
         for model, fold in zip(held_out, self._folds, strict=True):
             for dead_share in (0.0, _DEAD, _DEAD):
-                loads = fold.loads.copy()
+                broken = fold.copy()
                 dead = self._rng.choice(cells, round(dead_share * len(cells)), replace=False)
                 for cell in dead.tolist():
-                    loads[:, cell] = self._rng.permutation(loads[:, self._rng.choice(cells)])
+                    broken.kill(cell, int(self._rng.choice(cells)), self._rng)
                 healthy = np.setdiff1d(cells, dead)
                 known = np.isin(np.arange(len(self._present)), healthy)
-                for record in _logs(_Fold(loads, fold.readings, fold.segment)):
+                for record in _logs(broken):
                     evidence = EvidenceOfLog.of(record, model, self._layout.beside)
                     if evidence is None:
                         continue
@@ -330,14 +370,14 @@ class _Fit:
 
 def _by_unit(ratio: Floats, fold: _Fold, unit: int) -> Floats:
     """Return the sums over the pieces of each unit, ``[units, D]``, of those of each piece ``[n, D]``."""
-    begins = np.flatnonzero(np.diff(fold.segment // unit, prepend=-1))
+    begins = np.flatnonzero(np.diff(fold.piece // unit, prepend=-1))
     found: Floats = np.add.reduceat(ratio, begins, axis=0)
     return found
 
 
 def _logs(fold: _Fold) -> list[LifeRecord]:
     """Return the pieces as records of logs, each of as many segments as are kept of a log."""
-    numbers, begins = np.unique(fold.segment, return_index=True)
+    numbers, begins = np.unique(fold.piece // (SEGMENT // PIECE), return_index=True)
     loads, readings = np.split(fold.loads, begins[1:]), np.split(fold.readings, begins[1:])
     return [
         LifeRecord(

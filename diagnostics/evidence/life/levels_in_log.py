@@ -9,14 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.evidence.life.healthy_table import (
+    AMID,
     UNLOADED,
     Cells,
     Floats,
+    Levels,
     LifeModel,
     Mask,
     levels_of,
 )
-from diagnostics.preprocessing.readings import SEGMENT, spread
+from diagnostics.evidence.life.record import PIECE
+from diagnostics.preprocessing.readings import spread
 from diagnostics.preprocessing.scale import Array
 
 _AT_REST = 0.95  # of the pieces of a cell that is dead for a time are unloaded
@@ -33,7 +36,7 @@ class LifeLog:
     Args:
         loads: mean root loads of the pieces, ``[n, D]``.
         readings: their mean readings ``[n, D]``, in the layout's unit.
-        segment: number of the segment of each, int ``[n]``, ascending.
+        piece: number of each, int ``[n]``, ascending.
         model: of healthy cells.
         beside: int ``[D, 8]``, the cells beside each; -1: none.
 
@@ -46,7 +49,7 @@ class LifeLog:
         self,
         loads: Array,
         readings: Array,
-        segment: NDArray[np.intp],
+        piece: NDArray[np.intp],
         model: LifeModel,
         beside: Cells,
     ) -> None:
@@ -55,10 +58,10 @@ class LifeLog:
         self.loads = loads
         self.readings = readings
         self.level = levels_of(loads, model.levels)
-        self._segment = segment
+        self._piece = piece
         self._read = np.isfinite(self.readings)
         self._all_read = bool(self._read.all())
-        self.unit_begins = np.flatnonzero(np.diff(self._segment // model.unit, prepend=-1))
+        self.unit_begins = np.flatnonzero(np.diff(piece // model.unit, prepend=-1))
         self._cell = np.arange(self.level.shape[1])
 
     def prepared(self) -> Iterator[None]:
@@ -75,7 +78,7 @@ class LifeLog:
     @property
     def begins(self) -> NDArray[np.intp]:
         """Number of the first frame of each unit, int ``[units]``."""
-        found: NDArray[np.intp] = self._segment[self.unit_begins] * SEGMENT
+        found: NDArray[np.intp] = self._piece[self.unit_begins] * PIECE
         return found
 
     @cached_property
@@ -154,6 +157,45 @@ class LifeLog:
             ratio = np.where(read, ratio, 0.0)
         summed: Floats = np.add.reduceat(ratio, self.unit_begins, axis=0)
         return summed
+
+    def same(self, k: int) -> tuple[Mask, Mask]:
+        """Return in which units a cell and its neighbour k are both loaded, and read the same, ``[units, D]`` each."""
+        other = self.beside[:, k]
+        loaded = self.level > 0
+        either = loaded & loaded[:, other] & (other >= 0)
+        differs = either & (self.readings != self.readings[:, other])
+        some = self.any_by_unit(either)
+        return some, some & ~self.any_by_unit(differs)
+
+    def amid(self) -> tuple[Mask, Levels]:
+        """Return in which units a cell and some beside it are loaded, and how far it is from the mean beside it.
+
+        The distance is relative to the mean distance of the cells beside it from their mean, without the farthest one:
+        it may be dead.
+
+        Returns:
+            bool ``[units, D]``; levels ``[units, D]``.
+        """
+        has = self.beside >= 0
+        count = np.maximum(has.sum(axis=1), 2)
+        mean = np.zeros(self.readings.shape)
+        some = np.zeros(self.readings.shape, bool)
+        for k, other in enumerate(self.beside.T):
+            mean += np.where(has[:, k], self.readings[:, other], 0.0)
+            some |= (self.level[:, other] > 0) & has[:, k]
+        mean /= count
+        total_beside = np.zeros(self.readings.shape)
+        farthest = np.zeros(self.readings.shape)
+        for k, other in enumerate(self.beside.T):
+            away = np.where(has[:, k], np.abs(self.readings[:, other] - mean), 0.0)
+            total_beside += away
+            np.maximum(farthest, away, out=farthest)
+        usual_beside = (total_beside - farthest) / (count - 1)
+        distance = np.abs(self.readings - mean) / (usual_beside + self.model.tolerance)
+        some &= (self.level > 0) & self._read & (has.sum(axis=1) > 1) & np.isfinite(distance)
+        total = np.add.reduceat(np.where(some, distance, 0.0), self.unit_begins, axis=0)
+        pieces = np.add.reduceat(some.astype(np.intp), self.unit_begins, axis=0)
+        return pieces > 0, levels_of(total / np.maximum(pieces, 1), np.asarray(AMID))
 
     def any_by_unit(self, holds: Mask) -> Mask:
         """Return whether something holds in a piece of each unit, bool ``[units, D]``, of each piece ``[n, D]``."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from diagnostics.evidence.life.healthy_table import THRESHOLD, Floats, Mask
+from diagnostics.evidence.life.healthy_table import COPY, THRESHOLD, Floats, Mask
 from diagnostics.evidence.life.levels_in_log import LifeLog
 from diagnostics.evidence.life.ways_to_fail import (
     REFUTED,
@@ -24,6 +24,7 @@ _SHARES = (0.4, 0.3, 0.1, 0.1, 0.1)  # of the FAULTS among faults
 _ROUNDS = 16  # at most: a size
 _OFTEN = 2  # times that a cell was refuted: it does not come back
 _SHOWN = 2.0  # evidence against independence that proves life
+_DOUBT = 1.0  # evidence of a fault that leaves a cell in doubt
 _DISTURBED = 1 / 3  # share of the tested cells: if more are refuted, all are disturbed
 
 
@@ -38,7 +39,7 @@ class Life:
         refuted: bool, cells that must not predict others.
         certain: bool, those of them that are faulty.
         lag: int, pieces by which the cell is late, if it is.
-        source: int, the cell that it repeats, if it does.
+        source: int, the cell that it repeats, if it does; -1: the mean of those beside it.
         share: float, of the tested units in which a cell that comes and goes was dead.
         since: int, number of the first frame of the first unit against the cell.
         against: bool ``[units, D]``, units against the cell.
@@ -156,10 +157,10 @@ class LifeTest:
         log = self._evidence.log
         yield from log.prepared()
         refuted = np.zeros(len(self._eligible), np.intp)  # how often each cell was
-        factors = log.model.factors(log.units)
         seen = yield from self._evidence.suspicion(self.known)
         for _ in range(_ROUNDS):
-            bad, gone = self._worst(seen, factors)
+            bad = self._eligible & seen.refuted(log)
+            gone = self._worst(seen, bad)
             refuted += gone
             # A cell that the others beside it had made look wrong comes back, but once only.
             returns = self._eligible & ~self._constant & ~bad & (refuted < _OFTEN)
@@ -174,20 +175,19 @@ class LifeTest:
         life = _concluded(log, ways, self._eligible, self._constant)
         self.result = yield from _without_followers(log, ways, life)
 
-    def _worst(self, seen: Suspicion, factors: Floats) -> tuple[Mask, Mask]:
-        """Return the cells that are refuted, and the worst of those that predict others, bool ``[D]`` each.
+    def _worst(self, seen: Suspicion, bad: Mask) -> Mask:
+        """Return the worst of the ``bad`` cells that predict others, bool ``[D]``.
 
-        The worst: worse than any cell beside them, and half as bad as the worst of all.
+        They are worse than any cell beside them, and half as bad as the worst of all.
         """
-        scaled = np.maximum(seen.independent * factors[0], seen.intermittent * factors[1])
         plain = np.maximum(seen.independent, seen.intermittent)
-        bad = self._eligible & (scaled > REFUTED)
         predicts = bad & self.known
         beside = self._evidence.log.beside
         of_beside = np.where((beside >= 0) & self.known[beside], plain[beside], -np.inf)
         of_all = plain.max(initial=-np.inf, where=predicts)
         local = plain >= of_beside.max(axis=1, initial=-np.inf)
-        return bad, predicts & local & (plain > MAJORITY * of_all)
+        found: Mask = predicts & local & (plain > MAJORITY * of_all)
+        return found
 
 
 def _without_followers(log: LifeLog, ways: WaysToFail, life: Life) -> Generator[None, None, Life]:
@@ -215,7 +215,10 @@ def _concluded(log: LifeLog, ways: WaysToFail, eligible: Mask, constant: Mask) -
     kind = ways.evidence.argmax(axis=0)
     refuted = eligible & (evidence > REFUTED)
     certain = refuted & (evidence > THRESHOLD)
-    shown = eligible & (ways.now < -_SHOWN) & (ways.evidence[0] < 0) & ~refuted
+    depends = (ways.now < -_SHOWN) & (ways.evidence[0] < 0)
+    # Of two cells that read the same, either may be the copy.
+    in_doubt = (evidence > _DOUBT) | (scaled[COPY] > -_DOUBT)
+    shown = eligible & depends & ~in_doubt & ~refuted
     moving = ~constant
     against = int((refuted & moving).sum())
     tested = int(((shown | refuted) & moving).sum())

@@ -57,6 +57,7 @@ class LifeRecord:
         return np.concatenate(self.readings)
 
     @property
-    def segment(self) -> NDArray[np.intp]:
-        """Number of the segment of each piece, int ``[n]``."""
-        return np.repeat(self.number, [len(root) for root in self.root]).astype(np.intp)
+    def piece(self) -> NDArray[np.intp]:
+        """Number of each piece, counted from the begin of the log, int ``[n]``."""
+        first = np.array(self.number, np.intp) * (SEGMENT // PIECE)
+        return np.concatenate([begin + np.arange(len(root)) for begin, root in zip(first, self.root, strict=True)])

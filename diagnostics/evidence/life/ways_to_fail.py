@@ -30,6 +30,8 @@ _FEWEST_SEGMENTS = 2  # with load
 _PASSED = 300_000  # readings: a size
 _MOST_PASSES = 4  # a size
 _KEPT = 3  # answers: a size
+# P(distance from the mean beside it) of a cell that reads it; dead cells beside it read otherwise.
+_AMID = (0.7, 0.15, 0.07, 0.04, 0.04)
 _CERTAINLY_NOT = 1e3  # evidence against what is impossible
 _FAILS = 0.1  # probability per unit
 _RECOVERS = 0.3  # probability per unit
@@ -57,6 +59,13 @@ class Suspicion:
     dead: Floats
     dying: Floats
 
+    def refuted(self, log: LifeLog) -> Mask:
+        """Return the cells that either fault explains better, bool ``[D]``."""
+        factors = log.model.factors(log.units)
+        evidence = np.maximum(self.independent * factors[0], self.intermittent * factors[1])
+        found: Mask = evidence > REFUTED
+        return found
+
 
 @dataclass(frozen=True)
 class WaysToFail:
@@ -65,7 +74,7 @@ class WaysToFail:
     Attributes:
         evidence: float ``[5, D]``.
         lag: int ``[D]``, pieces by which the cell is late, if it is.
-        source: int ``[D]``, the cell that it repeats, if it does.
+        source: int ``[D]``, the cell that it repeats, if it does; -1: the mean of those beside it.
         share: float ``[D]``, of the tested units in which a cell that comes and goes was dead.
         against: bool ``[units, D]``, units against the cell.
         highest: float ``[D]``, highest reading of a piece, in the layout's unit.
@@ -102,7 +111,7 @@ class EvidenceOfLog:
         """Return the evidence of a log; None: it holds too little, and tells nothing."""
         if len(record.number) < _FEWEST_SEGMENTS:
             return None
-        return cls(LifeLog(record.loads, record.means, record.segment, model, beside))
+        return cls(LifeLog(record.loads, record.means, record.piece, model, beside))
 
     def suspicion(self, known: Mask) -> Generator[None, None, Suspicion]:
         """Yield between steps; return the evidence of the two faults that all others are near."""
@@ -276,29 +285,29 @@ def _clamped(log: LifeLog, context: NDArray[np.intp]) -> Floats:
 def _copies(log: LifeLog, known: Mask) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
     """Yield between steps; return the evidence ``[D]`` that a cell repeats one beside it, and which, int ``[D]``.
 
-    Either cell of two that read the same may be the copy: the one that fits worse to the others, without both.
+    Or the mean of those beside it: -1. Either cell of two that read the same may be the copy: the one that fits worse
+    to the others, without both.
     """
     errs = log.model.errs
-    of_same = bounded(np.log(1 / log.model.equal) * np.ones_like(errs), errs)
     of_different = bounded(np.log(errs), errs)
-    loaded = log.level > 0
     evidence = []
     each = _at_once(log.level.size)
     for k, other in enumerate(log.beside.T):
-        either = loaded & loaded[:, other] & (other >= 0)
-        differs = either & (log.readings != log.readings[:, other])
-        different = log.any_by_unit(differs).sum(axis=0)
-        same = log.any_by_unit(either).sum(axis=0) - different
-        found = same * of_same + different * of_different
+        of_same = bounded(-np.log(log.model.equal[:, k]), errs)
+        either, same = log.same(k)
+        n_same = same.sum(axis=0)
+        found = n_same * of_same + (either.sum(axis=0) - n_same) * of_different
         evidence.append(np.where(other >= 0, found, -np.inf))
         if k % each == 0:
             yield
+    evidence.append(_mean_of_others(log))
+    yield
     cell = np.arange(len(errs))
     best = np.argmax(evidence, axis=0)
-    source = log.beside[cell, best]
+    source = np.column_stack([log.beside, np.full(len(errs), -1)])[cell, best]
     likeliest = np.max(evidence, axis=0) - np.log(len(evidence))
     total = np.maximum(likeliest, -_CERTAINLY_NOT)
-    pairs = np.flatnonzero(total > REFUTED)
+    pairs = np.flatnonzero((total > REFUTED) & (source >= 0))
     if len(pairs):
         without = known.copy()
         without[pairs] = False
@@ -310,3 +319,12 @@ def _copies(log: LifeLog, known: Mask) -> Generator[None, None, tuple[Floats, ND
         copied = total[pairs] + log_expit(-worse)
         total[pairs] = copies - np.logaddexp(0.0, copied)
     return total, source
+
+
+def _mean_of_others(log: LifeLog) -> Floats:
+    """Return the evidence ``[D]`` that a cell reads the mean of those beside it."""
+    some, level = log.amid()
+    healthy = log.model.amid[np.arange(level.shape[1]), level]
+    ratio = np.where(some, np.log(np.asarray(_AMID)[level] / healthy), 0.0)
+    evidence: Floats = (bounded(ratio, log.model.errs) * log.weight[:, None]).sum(axis=0)
+    return evidence

@@ -16,6 +16,7 @@ from diagnostics.evidence.life.healthy_table import (
     BESIDE,
     FAULTS,
     GUESS,
+    UNIT,
     UNLOADED,
     ConditionalMean,
     Floats,
@@ -24,7 +25,7 @@ from diagnostics.evidence.life.healthy_table import (
     levels_of,
     loaded_beside,
 )
-from diagnostics.evidence.life.levels_in_log import LifeLog, bounded
+from diagnostics.evidence.life.levels_in_log import LifeLog
 from diagnostics.evidence.life.proof import LifeTest
 from diagnostics.evidence.life.record import KEPT, PIECE, LifeRecord
 from diagnostics.evidence.life.ways_to_fail import EvidenceOfLog
@@ -42,10 +43,11 @@ if TYPE_CHECKING:
 
 _LEVELS = 12  # of the root load: a size
 _PREDICTED = 16  # levels of the prediction: a size
-_OWN_ERRS = 20.0  # pseudo-count of units of all cells, in the frequencies of each cell
+_OWN_ERRS = 20.0  # pseudo-count of independent units of all cells, in the frequencies of each cell
 _SHRINKAGES = (4.0, 16.0, 64.0, 256.0, 1024.0)  # pseudo-counts of the table of all cells: a grid
 _CONTAMINATIONS = (0.01, 0.02, 0.04, 0.08)  # shares e: a grid
 _ERRS = 0.05  # share e of the units, before it is known
+_LONGEST = 16  # units in a sum: a size
 _CORRELATED = 0.25  # correlation of successive units that is small
 _MOST_PIECES = 6000  # of the reference: a size
 _MOST_DISCOUNT = 0.5  # of the factors
@@ -179,7 +181,7 @@ class _Fit:
             table=np.zeros((0, 0, 0), np.float32),
             equal=np.ones(self._layout.beside.shape),
             amid=np.ones((n_cells, len(AMID) + 1)),
-            unit=1,
+            independent=1.0,
             errs=np.full(n_cells, _ERRS),
             tolerance=self._tolerance,
             reached=np.zeros((len(FAULTS), n_cells)),
@@ -197,19 +199,19 @@ class _Fit:
             for k, (means, _) in enumerate(self._cross())
         ]
         ratios = [self._independent(model, fold) for model, fold in zip(held_out, self._folds, strict=True)]
-        unit = self._unit(ratios)
-        by_unit = [_by_unit(ratio, fold, unit) for ratio, fold in zip(ratios, self._folds, strict=True)]
-        errs, of_others = self._errs(by_unit)
-        fitted = self._beside(replace(fitted, unit=unit, errs=errs))
+        by_unit = [_by_unit(ratio, fold) for ratio, fold in zip(ratios, self._folds, strict=True)]
+        independent = self._independent_share(held_out)
+        errs, of_others = self._errs(by_unit, independent)
+        fitted = self._beside(replace(fitted, independent=independent, errs=errs))
         held_out = [
-            replace(of, unit=unit, errs=own, equal=fitted.equal, amid=fitted.amid)
+            replace(of, independent=independent, errs=own, equal=fitted.equal, amid=fitted.amid)
             for of, own in zip(held_out, of_others, strict=True)
         ]
         # First with the dead cells known: else healthy cells would be taken for dead ones, and mislead the others.
         reached, units = self._reached(held_out, informed=True)
         held_out = [replace(of, reached=reached, units=units) for of in held_out]
         reached = np.maximum(reached, self._reached(held_out, informed=False)[0])
-        of_all = sum(len(np.unique(fold.piece // unit)) for fold in self._folds)
+        of_all = independent * sum(map(len, by_unit))
         # Few units contain few unusual contacts.
         counted = 1 - _MOST_DISCOUNT / (1 + of_all / _HALF_DISCOUNT)
         return replace(fitted, reached=reached, units=units, counts=counted)
@@ -232,6 +234,9 @@ class _Fit:
             some, level = log.amid()
             for n in range(len(AMID) + 1):
                 amid[:, n] += (some & (level == n)).sum(axis=0)
+        same *= model.independent
+        loaded *= model.independent
+        amid *= model.independent
         usual = (same.sum() + 1) / (loaded.sum() + 1)
         equal = (same + usual * _OWN_ERRS) / (loaded + _OWN_ERRS)
         shared = (amid.sum(axis=0) + 1) / (amid.sum() + len(AMID) + 1)
@@ -291,35 +296,45 @@ class _Fit:
         healthy, _ = finished(log.healthy(self._present))
         return np.where(np.isfinite(fold.readings), log.own - healthy, 0.0)
 
-    def _unit(self, ratios: list[Floats]) -> int:
-        """Return the pieces of a unit: successive units of healthy cells are hardly correlated."""
-        unit = 1
-        while True:
-            products = 0.0
-            variance = 0.0
-            fewest = np.inf
-            for ratio, fold in zip(ratios, self._folds, strict=True):
-                of_unit = bounded(_by_unit(ratio, fold, unit), _ERRS)
-                deviation = of_unit - of_unit.mean(axis=0)
-                products += float((deviation[1:] * deviation[:-1]).sum())
-                variance += float((deviation**2).sum())
-                fewest = min(fewest, len(deviation))
-            if products <= _CORRELATED * variance or fewest < 4 * FEWEST:
-                return unit
-            unit *= 2
+    def _independent_share(self, held_out: list[LifeModel]) -> float:
+        """Return the share of the units that count as independent of each other: those of one contact are alike.
 
-    def _errs(self, ratios: list[Floats]) -> tuple[Floats, list[Floats]]:
+        It is the variance of m independent units over that of the sum of m successive ones, with m so large that
+        successive sums are hardly correlated.
+
+        Args:
+            held_out: a model for each fold, fitted to the others.
+        """
+        each = []
+        for model, fold in zip(held_out, self._folds, strict=True):
+            for record in _logs(fold):
+                log = LifeLog(record.loads, record.means, record.piece, model, self._layout.beside)
+                healthy, _ = finished(log.healthy(self._present))
+                counted = log.counted(log.own - healthy)
+                each.append(counted - counted.mean(axis=0))
+        alone = sum(float((of**2).sum()) for of in each)
+        m = 1
+        while True:
+            sums = [np.add.reduceat(of, np.arange(0, len(of), m), axis=0) for of in each]
+            products = sum(float((of[1:] * of[:-1]).sum()) for of in sums)
+            together = sum(float((of**2).sum()) for of in sums)
+            if products <= _CORRELATED * together or m >= _LONGEST:
+                return min(1.0, alone / together)
+            m *= 2
+
+    def _errs(self, ratios: list[Floats], independent: float) -> tuple[Floats, list[Floats]]:
         """Return the share of units in which each healthy cell contradicts, ``[D]``, and the same without each fold.
 
         The share of all cells is the likeliest of a grid; that of a cell has it as prior.
 
         Args:
             ratios: log ratio independent : healthy of each unit, ``[units, D]``, for each fold.
+            independent: share of the units that count as independent of each other.
         """
         every = np.concatenate(ratios)[:, self._present].ravel()
         usual = max(_CONTAMINATIONS, key=lambda e: float(np.logaddexp(np.log1p(-e), np.log(e) + every).sum()))
-        erred = np.stack([expit(ratio + np.log(usual / (1 - usual))).sum(axis=0) for ratio in ratios])
-        units = np.array([len(ratio) for ratio in ratios])[:, None]
+        erred = independent * np.stack([expit(ratio + np.log(usual / (1 - usual))).sum(axis=0) for ratio in ratios])
+        units = independent * np.array([len(ratio) for ratio in ratios])[:, None]
 
         def share(erred: Floats, units: Floats) -> Floats:
             found: Floats = (erred.sum(axis=0) + usual * _OWN_ERRS) / (units.sum() + _OWN_ERRS)
@@ -368,9 +383,9 @@ class _Fit:
         return np.maximum(reached, most[:, None]), int(np.median(units))
 
 
-def _by_unit(ratio: Floats, fold: _Fold, unit: int) -> Floats:
+def _by_unit(ratio: Floats, fold: _Fold) -> Floats:
     """Return the sums over the pieces of each unit, ``[units, D]``, of those of each piece ``[n, D]``."""
-    begins = np.flatnonzero(np.diff(fold.piece // unit, prepend=-1))
+    begins = np.flatnonzero(np.diff(fold.piece // UNIT, prepend=-1))
     found: Floats = np.add.reduceat(ratio, begins, axis=0)
     return found
 

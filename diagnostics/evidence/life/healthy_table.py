@@ -28,6 +28,7 @@ COPY = FAULTS.index("copy")
 UNLOADED = 1e-3  # root load up to which a piece counts as unloaded
 THRESHOLD = 9.0  # evidence of a certain fault: with its prior, P(faulty) = 0.994
 GUESS = 0.005  # of a uniform distribution over the levels, in any table: models err
+UNIT = 2  # pieces: a size
 AMID = (0.02, 0.08, 0.25, 0.6)  # distances from the mean of the cells beside one, over their spread, between levels
 _STEPS = 4  # of a prediction: a size
 BESIDE = (0.01, 0.34, 0.67, 0.99)  # shares of the cells beside one that are loaded, between levels
@@ -145,7 +146,7 @@ class LifeModel:
         table: float ``[D, M, K]``, log P(observed level | context) of each healthy cell; ``[1, M, K]``: of all.
         equal: float ``[D, 8]``, probability that a healthy cell reads the same as one beside it throughout a unit.
         amid: float ``[D, 5]``, probability of each level of how far a healthy cell reads from the mean beside it.
-        unit: pieces of a unit.
+        independent: share of the units that count as independent of each other: those of one contact are alike.
         errs: float ``[D]``, share e of the units.
         tolerance: a cell whose readings lie within this of its highest one reads it, in the layout's unit.
         reached: float ``[5, D]``, evidence that a healthy cell reaches in a log, for each of the ``FAULTS``.
@@ -159,7 +160,7 @@ class LifeModel:
     table: Array
     equal: Floats
     amid: Floats
-    unit: int
+    independent: float
     errs: Floats
     tolerance: float
     reached: Floats
@@ -180,9 +181,9 @@ class LifeModel:
             raise ValueError(f"expected errs [{layout.n_cells}]")
         if self.equal.shape != layout.beside.shape or self.amid.shape != (layout.n_cells, len(AMID) + 1):
             raise ValueError(f"expected equal and amid of {layout}")
-        probabilities = np.concatenate([self.errs, self.equal.ravel(), self.amid.ravel()])
-        if self.unit < 1 or not ((probabilities > 0) & (probabilities <= 1)).all():
-            raise ValueError("expected a positive unit, and probabilities between 0 and 1")
+        probabilities = np.concatenate([[self.independent], self.errs, self.equal.ravel(), self.amid.ravel()])
+        if not ((probabilities > 0) & (probabilities <= 1)).all():
+            raise ValueError("expected probabilities between 0 and 1")
 
     @property
     def n_contexts(self) -> int:

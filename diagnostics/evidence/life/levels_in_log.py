@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from diagnostics.evidence.life.healthy_table import (
     AMID,
+    UNIT,
     UNLOADED,
     Cells,
     Floats,
@@ -61,7 +62,7 @@ class LifeLog:
         self._piece = piece
         self._read = np.isfinite(self.readings)
         self._all_read = bool(self._read.all())
-        self.unit_begins = np.flatnonzero(np.diff(piece // model.unit, prepend=-1))
+        self.unit_begins = np.flatnonzero(np.diff(piece // UNIT, prepend=-1))
         self._cell = np.arange(self.level.shape[1])
 
     def prepared(self) -> Iterator[None]:
@@ -101,9 +102,10 @@ class LifeLog:
 
     @cached_property
     def weight(self) -> Floats:
-        """Weight ``[units]``: 1 / (1 + k) of a unit with k others of the same loads: a contact that is held is one."""
+        """Weight of each unit ``[units]``: share of independent ones, over 1 + k with k others of the same loads."""
         length = np.diff(np.append(self.unit_begins, len(self.loads)))[:, None]
-        return _novelty(np.add.reduceat(self.loads, self.unit_begins, axis=0) / length)
+        novelty = _novelty(np.add.reduceat(self.loads, self.unit_begins, axis=0) / length)
+        return self.model.independent * novelty
 
     def healthy(self, known: Mask) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
         """Yield between steps; return log P(level | healthy) and the context, ``[n, D]`` each.

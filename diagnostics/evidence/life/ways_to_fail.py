@@ -160,7 +160,7 @@ def ways_to_fail(log: LifeLog, known: Mask, seen: Suspicion) -> Generator[None, 
         known: bool ``[D]``, cells that predict others.
         seen: the evidence of the first two faults, given these.
     """
-    copy, source = yield from _copies(log, known)
+    copy, source = yield from _copies(log, known, seen)
     if (known & (copy > REFUTED)).any():
         seen = yield from suspicion(log, known & (copy <= REFUTED))
         yield
@@ -282,7 +282,7 @@ def _clamped(log: LifeLog, context: NDArray[np.intp]) -> Floats:
     return evidence
 
 
-def _copies(log: LifeLog, known: Mask) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
+def _copies(log: LifeLog, known: Mask, seen: Suspicion) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
     """Yield between steps; return the evidence ``[D]`` that a cell repeats one beside it, and which, int ``[D]``.
 
     Or the mean of those beside it: -1. Either cell of two that read the same may be the copy: the one that fits worse
@@ -296,11 +296,11 @@ def _copies(log: LifeLog, known: Mask) -> Generator[None, None, tuple[Floats, ND
         of_same = bounded(-np.log(log.model.equal[:, k]), errs)
         either, same = log.same(k)
         n_same = same.sum(axis=0)
-        found = n_same * of_same + (either.sum(axis=0) - n_same) * of_different
+        found = log.model.independent * (n_same * of_same + (either.sum(axis=0) - n_same) * of_different)
         evidence.append(np.where(other >= 0, found, -np.inf))
         if k % each == 0:
             yield
-    evidence.append(_mean_of_others(log))
+    evidence.append(_mean_of_others(log, seen))
     yield
     cell = np.arange(len(errs))
     best = np.argmax(evidence, axis=0)
@@ -321,10 +321,17 @@ def _copies(log: LifeLog, known: Mask) -> Generator[None, None, tuple[Floats, ND
     return total, source
 
 
-def _mean_of_others(log: LifeLog) -> Floats:
-    """Return the evidence ``[D]`` that a cell reads the mean of those beside it."""
+def _mean_of_others(log: LifeLog, seen: Suspicion) -> Floats:
+    """Return the evidence ``[D]`` that a cell reads the mean of those beside it.
+
+    Where one of these is refuted their mean is unknown.
+    """
     some, level = log.amid()
     healthy = log.model.amid[np.arange(level.shape[1]), level]
     ratio = np.where(some, np.log(np.asarray(_AMID)[level] / healthy), 0.0)
-    evidence: Floats = (bounded(ratio, log.model.errs) * log.weight[:, None]).sum(axis=0)
-    return evidence
+    evidence = (bounded(ratio, log.model.errs) * log.weight[:, None]).sum(axis=0)
+    plain = np.maximum(seen.independent, seen.intermittent)
+    worse = seen.refuted(log)[log.beside] & (plain[log.beside] > plain[:, None])
+    misled = ((log.beside >= 0) & worse).any(axis=1)
+    found: Floats = np.where(misled, np.minimum(evidence, 0.0), evidence)
+    return found

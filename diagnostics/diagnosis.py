@@ -27,7 +27,7 @@ from diagnostics.evidence.stepping import finished
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED, MAJORITY, RARE, SUSPICIOUS
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED, MAJORITY, RARE
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
 
@@ -395,7 +395,7 @@ class SelfDiagnosis:
         carries = never_unloaded & ((beside >= 0) & never_unloaded[beside]).any(axis=1)
         judged = delivers & runs.moved & ~certain & ~carries & (reference.life is not None)
         # The model of life errs where its reference has no like: only what is far beyond its limits is faulty.
-        refuted = np.where(judged, expit(life.evidence + logit(EXPECTED) - SUSPICIOUS), 0.0)
+        refuted = np.where(judged, expit(life.evidence + logit(EXPECTED) - CERTAIN_RATIO / 2), 0.0)
         by_life = judged & (refuted > stuck) & (stuck < MAJORITY)  # a constant run tells more: its value, its onset
         probability = np.where(present, np.where(certain, _CERTAIN, np.maximum(stuck, refuted)), 0.0)
         faulty = faulty_at(np.where(certain, 0.0, probability), self.false_discovery_rate)

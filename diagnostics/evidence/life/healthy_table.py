@@ -28,6 +28,7 @@ COPY = FAULTS.index("copy")
 UNLOADED = 1e-3  # root load up to which a piece counts as unloaded
 THRESHOLD = 9.0  # evidence of a certain fault: with its prior, P(faulty) = 0.994
 GUESS = 0.005  # of a uniform distribution over the levels, in any table: models err
+_UNSEEN = 3.0  # evidence that a healthy cell may reach in a log as long as those of the reference, though none did
 UNIT = 2  # pieces: a size
 AMID = (0.02, 0.08, 0.25, 0.6)  # distances from the mean of the cells beside one, over their spread, between levels
 _STEPS = 4  # of a prediction: a size
@@ -211,9 +212,11 @@ class LifeModel:
     def factors(self, units: int) -> Floats:
         """Return the factors ``[5, D]`` on the evidence in a log of so many units: healthy cells stay below the limit.
 
-        The evidence against a healthy cell that the model predicts badly grows with the length of the log.
+        The evidence against a healthy cell that the model predicts badly grows with the length of the log; a log that
+        is longer than those of the reference may hold contacts that are like none of these.
         """
-        reached = np.maximum(self.reached, 0.0) * max(1.0, units / self.units)
+        unseen = np.array([_UNSEEN, 0.0, 0.0, 0.0, 0.0])[:, None]
+        reached = np.maximum(self.reached, unseen) * max(1.0, units / self.units)
         factors: Floats = self.counts * THRESHOLD / np.maximum(THRESHOLD, MARGIN * reached)
         return factors
 

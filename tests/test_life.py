@@ -61,6 +61,13 @@ def test_of_two_cells_that_read_the_same_the_one_that_contradicts_the_others_is_
     assert fitted.layout.place(cell + 1) in fault.reason
 
 
+def test_a_cell_that_reads_the_mean_of_those_beside_it_is_told_as_such(fitted, log, used):
+    cell = int(used[0])
+    (fault,) = fitted.diagnose(broken(log, Fault(FaultKind.COPY, (cell,)), fitted)).faults
+    assert (fault.kind, fault.cells, fault.value) == (FaultKind.COPY, (cell,), None)
+    assert "the mean of the cells beside it" in fault.reason
+
+
 def test_a_cell_that_is_dead_in_every_second_recording_is_not_called_alive(fitted, log, used):
     cell = int(used[0])
     dead = Fault(FaultKind.OPEN, (cell,))

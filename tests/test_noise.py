@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from adaptfault import inspect
 from adaptfault.data.simulated_grasps import simulate
-from diagnostics import SelfDiagnosis, SensorLayout
+from diagnostics import FaultKind, SelfDiagnosis, SensorLayout
 from diagnostics.preprocessing.noise import NoiseNow, UsualNoise
 
 LAYOUT = SensorLayout(1, 8, 8, full_scale=4095, unit="count", rate=20.0)
@@ -61,7 +61,36 @@ def test_noise_as_in_the_reference_raises_nothing():
 
 def test_noise_within_half_a_converter_step_raises_nothing():
     assert UsualNoise(0.1, 1.0).raises(NoiseNow((0.55,))) == 0
-    assert UsualNoise(0.1, 1.0).raises(NoiseNow((0.65,))) == pytest.approx(6 * 0.55)
+    assert UsualNoise(0.1, 1.0).raises(NoiseNow((0.65,))) == pytest.approx(8 * 0.55)
+
+
+def test_the_step_between_readings_counts_where_it_is_twice_that_of_the_reference():
+    usual = UsualNoise(most=0.1, step=4.0)
+    assert usual.raises(NoiseNow((0.1,), (8.0, 16.0, 8.0, 12.0, 9.0))) == 0
+    assert usual.raises(NoiseNow((0.1,), (9.0, 16.0, 12.0, 12.0, 10.0))) == 9
+    assert usual.raises(NoiseNow((0.1,), (9.0, 16.0, 12.0, 12.0))) == 0  # too few segments
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**20), st.integers(1, 200))
+def test_the_step_is_that_of_the_converter(seed: int, step: int):
+    rng = np.random.default_rng(seed)
+    now = NoiseNow()
+    for _ in range(5):
+        now = now.extend(step * rng.integers(0, 4, (32, 64)).astype(float), PRESENT)
+        now = now.extend(np.zeros((32, 64)), PRESENT)  # where nothing changes, it is unknown
+    assert now.step == step
+
+
+def test_coarser_readings_than_in_the_reference_are_no_blinks(fitted: SelfDiagnosis):
+    coarse = [128 * np.rint(frames / 128) for frames in touched(5, 0.0005)]
+    kinds = {fault.kind for fault in fitted.diagnose(coarse).faults}
+    assert FaultKind.INTERMITTENT not in kinds
+
+
+def test_noise_that_is_cut_off_at_the_lower_end_is_no_contact(fitted: SelfDiagnosis):
+    diagnosis = fitted.diagnose(untouched(4, 0.01, rest=0.0))
+    assert diagnosis.coverage.test_coverage <= 0.05
 
 
 @pytest.mark.parametrize("times", [2.5, 5, 15, 25])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
+from scipy.special import logit, logsumexp
 
 from diagnostics.evidence.life.healthy_table import COPY, THRESHOLD, Floats, Mask
 from diagnostics.evidence.life.levels_in_log import LifeLog
@@ -18,13 +18,14 @@ from diagnostics.evidence.life.ways_to_fail import (
     WaysToFail,
     follows_otherwise,
 )
-from diagnostics.preprocessing.levels import FEWEST, MAJORITY
+from diagnostics.preprocessing.levels import EXPECTED, FEWEST, MAJORITY
 
 _SHARES = (0.4, 0.3, 0.1, 0.1, 0.1)  # of the FAULTS among faults
 _ROUNDS = 16  # at most: a size
 _OFTEN = 2  # times that a cell was refuted: it does not come back
 _SHOWN = 2.0  # evidence against independence that proves life
-_DOUBT = 1.0  # evidence of a fault that leaves a cell in doubt
+_DOUBT = logit(0.1) - logit(EXPECTED)  # evidence of a fault with which P(faulty) is 0.1: the cell is in doubt
+_EITHER = 1.0  # evidence against a copy, without which either of two cells may be it
 _DISTURBED = 1 / 3  # share of the tested cells: if more are refuted, all are disturbed
 
 
@@ -217,7 +218,7 @@ def _concluded(log: LifeLog, ways: WaysToFail, eligible: Mask, constant: Mask) -
     certain = refuted & (evidence > THRESHOLD)
     depends = (ways.now < -_SHOWN) & (ways.evidence[0] < 0)
     # Of two cells that read the same, either may be the copy.
-    in_doubt = (evidence > _DOUBT) | (scaled[COPY] > -_DOUBT)
+    in_doubt = (evidence > _DOUBT) | (scaled[COPY] > -_EITHER)
     shown = eligible & depends & ~in_doubt & ~refuted
     moving = ~constant
     against = int((refuted & moving).sum())
@@ -226,6 +227,7 @@ def _concluded(log: LifeLog, ways: WaysToFail, eligible: Mask, constant: Mask) -
     if contradicting > _DISTURBED and against >= FEWEST:
         evidence = np.minimum(evidence, 0.0)
         refuted = np.zeros_like(refuted)
+        certain = np.zeros_like(certain)
     else:
         contradicting = 0.0
     first = log.begins[ways.against.argmax(axis=0)]

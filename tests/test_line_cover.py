@@ -52,6 +52,22 @@ def test_an_untested_cell_on_a_broken_wire_is_inferred():
     assert cause.cells == tuple(column)
 
 
+def test_two_witnesses_are_too_few_for_a_wire_of_ten_cells():
+    column = LAYOUT.cells_on(Line(0, "column", 2))
+    causes = explained(mask(column[[1, 8]]), ~mask(column))
+    assert [cause.line for cause in causes] == [None, None]
+    (cause,) = explained(mask(column[[1, 4, 8]]), ~mask(column))
+    assert cause.line == Line(0, "column", 2)
+
+
+def test_two_witnesses_are_enough_for_a_wire_of_three_cells():
+    layout = SensorLayout(1, 3, 3)
+    row = np.isin(np.arange(9), [0, 1, 2])
+    faulty = np.isin(np.arange(9), [0, 2])
+    (cause,) = solve(faulty, row, ~row, np.where(faulty, SURE, NOTHING), layout)
+    assert cause.line == Line(0, "row", 0)
+
+
 @pytest.mark.parametrize("alive", [0, 5, 10])
 def test_a_working_cell_on_a_broken_wire_is_never_inferred_to_be_faulty(alive: int):
     column = LAYOUT.cells_on(Line(0, "column", 2))

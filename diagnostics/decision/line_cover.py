@@ -8,8 +8,9 @@ for each working cell on a broken wire. A cell that is not certainly faulty supp
 the log ratio of "broken wire" against "single fault or none", where w is its log likelihood ratio and c discounts the
 correlation rho of the n uncertain cells on the wire (design effect, Kish 1965): neighbours at the edge of a contact err
 together. Minimum weight set cover, solved by enumeration or by ``scipy.optimize.milp``; q is re-estimated from the
-solution until it no longer changes, between 1 in 200 and one half. Wires with fewer than two tested cells are not
-found. Wires that are more likely broken than not, at odds below 9, are returned as possible: one more contact tells.
+solution until it no longer changes, between 1 in 200 and one half. Wires with fewer than three tested cells, or two
+thirds of those behind the break, are not found. Wires that are more likely broken than not, at odds below 9, are
+returned as possible: one more contact tells.
 
 With declared wiring the wires are buses and nested groups (``SensorLayout.groups``), which are
 broken as a whole. Of those that explain the same cells the innermost is named.
@@ -29,7 +30,8 @@ from diagnostics.preprocessing.levels import EXPECTED_LATE, MAJORITY, RARE, SUSP
 
 _LINE_COST = -np.log(EXPECTED_LATE)  # of a broken wire, and of the rarest single fault: few cells cannot estimate it
 _MOST_CONTRADICTIONS = 1  # working cells on a wire that can still be broken
-_MIN_SUPPORT = 2  # supporting cells of a broken wire
+_MIN_OF_GROUP = 2  # supporting cells of a group that is tested again as a whole
+_MIN_SUPPORT = 3  # supporting cells of a broken wire, or two thirds of those behind the break
 _CORRELATION, _MAX_CORRELATION = 0.0125, 0.3  # rho per cell on the line (long lines run along edges), and at most
 PROVEN = np.log(9.0)  # log odds from which on a wire is reported, without a certain cell twice that: edges err together
 _ROUNDS = 5  # of re-estimating q, at most: a size
@@ -115,10 +117,15 @@ def candidate_groups(
     return [
         cells[consistent[cells]]
         for line in layout.lines
-        if line.kind in _WIRES and supporting[layout.cells_on(line)].sum() >= _MIN_SUPPORT
+        if line.kind in _WIRES and supporting[layout.cells_on(line)].sum() >= _MIN_OF_GROUP
         for cells in _silenced(line, contradicting, layout)
-        if supporting[cells].sum() >= _MIN_SUPPORT
+        if supporting[cells].sum() >= _MIN_OF_GROUP
     ]
+
+
+def _least_support(behind: int) -> int:
+    """Return how many cells must support a break with so many cells behind it."""
+    return max(_MIN_OF_GROUP, min(_MIN_SUPPORT, -(-2 * behind // 3)))
 
 
 def _silenced(line: Line, contradicting: Mask, layout: SensorLayout) -> Sequence[NDArray[np.intp]]:
@@ -152,7 +159,7 @@ def _explain(
     supporting = consistent & (faulty | (weight >= SUSPICIOUS))
     tested_cells = consistent & (faulty | (weight > TESTED))
     candidates = []
-    for line in lines if supporting.sum() >= _MIN_SUPPORT else ():
+    for line in lines if supporting.any() else ():
         if line.kind in _WIRES:
             candidates += _candidates(line, layout.cells_on(line), contradicting, supporting, faulty)
     if not layout.is_matrix:  # of groups that explain the same cells, the innermost: it comes first
@@ -201,7 +208,7 @@ def _candidates(
     """Return the wire broken as a whole, and in its middle with either end working, where enough cells support it."""
 
     def proven(behind: NDArray[np.intp]) -> bool:
-        return bool(supporting[behind].sum() >= _MIN_SUPPORT)
+        return bool(supporting[behind].sum() >= _least_support(len(behind)))
 
     def cost(behind: NDArray[np.intp]) -> float:
         return float(_LINE_COST + (0.0 if faulty[behind].any() else PROVEN))

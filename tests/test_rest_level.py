@@ -1,12 +1,18 @@
 """Rest level: where living cells rest above 0, a cell that reads a constant 0 is open, whatever touches it."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import betabinom
 from test_baseline import CELLS, LAYOUT, events
 
 from diagnostics import Fault, FaultKind, SelfDiagnosis, inject
 from diagnostics.events.constant_runs import ConstantRuns
-from diagnostics.evidence.rest_level import RestLevel
+from diagnostics.evidence.rest_level import RestLevel, beta_binomial
 from diagnostics.evidence.term import ConstantCells
 
 TOLERANCE, STEP, LENGTH = 0.005, 1 / 1023, 100
@@ -86,3 +92,15 @@ def test_in_a_cold_start_an_open_cell_in_a_corner_is_found_and_healthy_corners_a
     cold = SelfDiagnosis(LAYOUT)
     assert cold.diagnose(seen).probability[CORNERS[1]] > 0.5
     assert cold.diagnose(log).probability[CORNERS].max() < 0.02
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 2000), st.floats(0.01, 50), st.floats(0.01, 50))
+def test_the_beta_binomial_distribution_is_scipys(n: int, a: float, b: float):
+    k = np.arange(0, n + 1, max(1, n // 20))
+    np.testing.assert_allclose(beta_binomial(k, n, a, b), betabinom.pmf(k, n, a, b), rtol=1e-6)
+
+
+def test_importing_the_diagnosis_does_not_import_the_statistics_of_scipy():
+    code = "import sys, diagnostics; print('scipy.stats' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import betabinom, median_abs_deviation, t
+from scipy.special import betaln, ndtri, stdtr
 
 from diagnostics.events.constant_runs import SHORTEST_RUN
 from diagnostics.preprocessing.levels import ANYWHERE, CERTAIN_RATIO, EXPECTED, EXPECTED_CELLS, FEWEST, MAJORITY
@@ -78,14 +78,17 @@ class RestLevel:
         others, still, margin = self.level[known], self.still[known], 2 * tolerance
         level, exact = runs.high[tested], runs.low[tested] == runs.high[tested]
         with_noise = still & ~self.exact[known]
-        scale = max(float(median_abs_deviation(others, scale="normal")), tolerance)
-        far = -np.abs(level - np.median(others))
-        p_level = t.cdf((far + margin) / scale, 4) - t.cdf((far - margin) / scale, 4)
+        middle = np.median(others)
+        deviation = np.median(np.abs(others - middle)) / ndtri(0.75)
+        scale = max(float(deviation), tolerance)
+        far = -np.abs(level - middle)
+        p_level = stdtr(4, (far + margin) / scale) - stdtr(4, (far - margin) / scale)
         p_exact = (np.count_nonzero(still & ~with_noise) + 0.5) / (np.count_nonzero(still) + 1)
         k = _near(others, level, margin) - np.where(exact, _near(others[with_noise], level, margin), 0)
         like_others = (k + p_level * np.where(exact, p_exact, 1.0)) / (len(known) + 1)
-        m, n = _near(level, level, margin), np.count_nonzero(present)
-        faults = betabinom.pmf(m, n, EXPECTED * EXPECTED_CELLS, (1 - EXPECTED) * EXPECTED_CELLS)
+        m = _near(level, level, margin)
+        n = int(np.count_nonzero(present))
+        faults = beta_binomial(m, n, EXPECTED * EXPECTED_CELLS, (1 - EXPECTED) * EXPECTED_CELLS)
         unlike = 1 / (1 + (1 / EXPECTED - 1) * (n + 1) * faults)
         healthy = (1 - unlike) * like_others + unlike * np.maximum(like_others, m / n)
         rail = level <= margin
@@ -96,6 +99,13 @@ class RestLevel:
         pad = layout.pad_of
         unusual = np.bincount(pad, ratio > 0) > MAJORITY * np.bincount(pad, present)
         return np.where(unusual[pad], np.minimum(ratio, 0.0), ratio)
+
+
+def beta_binomial(k: NDArray[np.intp], n: int, a: float, b: float) -> Floats:
+    """Return the probability of each ``k`` of n, as ``scipy.stats.betabinom(n, a, b).pmf``, which is slow to import."""
+    log_choices = -np.log1p(n) - betaln(n - k + 1, k + 1)
+    probability: Floats = np.exp(log_choices + betaln(k + a, n - k + b) - betaln(a, b))
+    return probability
 
 
 def _near(others: Floats, level: Floats, margin: float) -> NDArray[np.intp]:

@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import ks_2samp
 
 from diagnostics.evidence.drift import GAIN
 from diagnostics.faults import FaultSet
@@ -160,6 +159,8 @@ def _change(new: NDArray[np.float64], old: NDArray[np.float64], least: float) ->
 
 def differ(new: NDArray[np.float64], old: NDArray[np.float64]) -> bool:
     """Return whether two samples ``[n]``, of at least five recordings each, differ by more than chance."""
+    from scipy.stats import ks_2samp  # slow to import, and rarely needed
+
     return min(len(new), len(old)) >= _LEAST and bool(ks_2samp(new, old).pvalue < P_MIN)
 
 

@@ -19,14 +19,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from diagnostics.preprocessing.levels import CERTAIN_RATIO
 
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
-_CERTAIN = float(norm.isf(np.exp(-CERTAIN_RATIO)))  # z from which on a cell follows its neighbours
+_CERTAIN = float(-ndtri(np.exp(-CERTAIN_RATIO)))  # z from which on a cell follows its neighbours
 
 Floats = NDArray[np.float64]
 

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import iqr
 
 from diagnostics.preprocessing.levels import MAJORITY, SLIGHT
 from diagnostics.preprocessing.readings import CELLS, RecordingBlocks, spread
@@ -100,6 +99,12 @@ def _learned(readings: RecordingBlocks, layout: SensorLayout) -> Rest:
     up = float(np.median((high - rest) / (high - low)))
     quiet = float(np.median((np.abs(sample - rest) <= SLIGHT * layout.full_scale).mean(axis=0)))
     # Where a load is held most of the time, it differs between cells more than the readings without it do.
-    if up >= 1 - _ASIDE or quiet < MAJORITY or iqr(rest) > iqr(low):
+    if up >= 1 - _ASIDE or quiet < MAJORITY or _quartile_range(rest) > _quartile_range(low):
         return "low"
     return "high" if up <= _ASIDE else "middle" if abs(up - 0.5) <= _ASIDE else "low"
+
+
+def _quartile_range(values: NDArray[np.float64]) -> float:
+    """Return ``scipy.stats.iqr(values)``, which is slow to import."""
+    lower, upper = np.percentile(values, [25, 75])
+    return float(upper - lower)

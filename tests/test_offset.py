@@ -139,3 +139,20 @@ def test_while_nearly_all_cells_are_loaded_the_offset_stays():
     assert tracker.common.min() > 0.025
     held = OffsetTracker.begin(CELLS).extend(np.full((40, CELLS), 0.5), SCALE, PRESENT, USUAL)
     assert not held.common.any()
+
+
+def test_offsets_that_creep_by_up_to_5_percent_of_the_range_are_no_faults(fitted):
+    log = events(1) + events(2)
+    rate = np.random.default_rng(0).uniform(0, 0.028, CELLS) / sum(map(len, log))
+    crept = np.split(np.arange(sum(map(len, log))), np.cumsum([len(frames) for frames in log])[:-1])
+    seen = [frames + at[:, None] * rate for frames, at in zip(log, crept, strict=True)]
+    assert not fitted.diagnose(seen).fault_set
+
+
+def test_the_offset_of_a_cell_is_that_of_the_last_frames():
+    tracker = OffsetTracker.begin(CELLS)
+    for frames in [*events(1), *(frames + 0.01 * (np.arange(CELLS) == 3) for frames in events(2) * 9)]:
+        for first in range(0, len(frames), 32):
+            tracker = tracker.extend(frames[first : first + 32], SCALE, PRESENT, USUAL)
+    assert tracker.on(SCALE).baseline[3] == pytest.approx(0.01, abs=1e-3)
+    assert tracker.lowest[3] == pytest.approx(0.0, abs=1e-3)

@@ -3,9 +3,9 @@
 Estimates two offsets above the reference baseline b:
 
     common(t) = q25 over cells of (x_i(t) - b_i - own_i)        where it exceeds the usual one of the reference
-    own_i     = min over t of (x_i(t) - b_i) - common           where it exceeds the noise
+    own_i     = min over the last 512 frames of (x_i(t) - b_i) - common           where it exceeds the noise
 
-A quantile filter over cells and a running minimum over time, as in baseline correction by minimum statistics (Martin
+A quantile filter over cells and a windowed minimum over time, as in baseline correction by minimum statistics (Martin
 2001). Common offsets up to 5 % of full scale are removed, and own offsets up to 2 %, or up to what is usual in the log:
 three robust standard deviations above the median of all cells, at most 5 %. Larger ones are not
 tracked: such a cell is loaded or faulty.
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Scale
 
 Floats = NDArray[np.float64]
+
+_RECENT = 16  # segments in which a cell rests at least once: offsets of cells creep
 
 
 @dataclass(frozen=True)
@@ -81,11 +83,13 @@ class OffsetTracker:
         lowest: float ``[D]``, lowest reading of each cell in the log above its baseline; inf: no reading.
         own: float ``[D]``, offset of each cell in addition to the common one.
         common: float ``[t]``, common offset in each of the last frames.
+        recent: lowest reading of each cell above its baseline, ``[D]``, in each of the last calls.
     """
 
     lowest: Floats
     own: Floats
     common: Floats
+    recent: tuple[Floats, ...] = ()
 
     @classmethod
     def begin(cls, n_cells: int) -> OffsetTracker:
@@ -101,19 +105,21 @@ class OffsetTracker:
             present: bool ``[D]``.
             usual: common offsets of the reference.
         """
-        lowest = np.fmin(self.lowest, np.fmin.reduce(frames) - scale.baseline)
-        own = self.own if np.array_equal(lowest, self.lowest) else _own_offsets(lowest, scale, present, usual)
+        now = np.fmin.reduce(frames) - scale.baseline
+        lowest = np.fmin(self.lowest, now)
+        recent = (*self.recent, now)[-_RECENT:]
+        own = _own_offsets(np.fmin.reduce(recent), scale, present, usual)
         # Usually there is no common offset: enough cells stay at their baseline throughout.
         calm = present & (np.fmax.reduce(frames) - scale.baseline - own <= usual.most)
         if np.count_nonzero(calm) > LEAST_LOADED * np.count_nonzero(present):
-            return OffsetTracker(lowest, own, np.zeros(len(frames)))
+            return OffsetTracker(lowest, own, np.zeros(len(frames)), recent)
         common = usual.excess([least_loaded(frame) for frame in (frames - scale.baseline - own)[:, present]])
         last = self.common[-1]
         for t in np.flatnonzero(
             common >= usual.limit(scale.full_scale)
         ):  # nearly all cells are loaded: keep the last one
             common[t] = common[t - 1] if t else last
-        return OffsetTracker(lowest, own, common)
+        return OffsetTracker(lowest, own, common, recent)
 
     def on(self, scale: Scale) -> Scale:
         """Return ``scale`` with the baseline of the last frame."""

@@ -3,12 +3,13 @@
 Estimates two offsets above the reference baseline b:
 
     common(t) = q25 over cells of (x_i(t) - b_i - own_i)        where it exceeds the usual one of the reference
-    own_i     = min over the last 512 frames of (x_i(t) - b_i) - common           where it exceeds the noise
+    own_i     = min over t of (x_i(t) - b_i) - common           where it exceeds the noise
 
-A quantile filter over cells and a windowed minimum over time, as in baseline correction by minimum statistics (Martin
-2001). Common offsets up to 5 % of full scale are removed, and own offsets up to 2 %, or up to what is usual in the log:
-three robust standard deviations above the median of all cells, at most 5 %. Larger ones are not
-tracked: such a cell is loaded or faulty.
+A quantile filter over cells and a running minimum over time, as in baseline correction by minimum statistics (Martin
+2001): of the last 512 frames, where most cells no longer come down to their baseline, else of the whole log. Common
+offsets up to 5 % of full scale are removed, and own offsets up to 2 %, or up to what is usual in the log: three robust
+standard deviations above the median of all cells, at most 5 %. Larger ones are not tracked: such a cell is loaded or
+faulty.
 
 Where the recordings of the reference rest at levels of their own, further apart than 5 % of full scale, common offsets
 up to the range of these levels and 5 % more are removed. The level of recording r is
@@ -108,7 +109,7 @@ class OffsetTracker:
         now = np.fmin.reduce(frames) - scale.baseline
         lowest = np.fmin(self.lowest, now)
         recent = (*self.recent, now)[-_RECENT:]
-        own = _own_offsets(np.fmin.reduce(recent), scale, present, usual)
+        own = _own_offsets(_rests(lowest, np.fmin.reduce(recent), present, scale), scale, present, usual)
         # Usually there is no common offset: enough cells stay at their baseline throughout.
         calm = present & (np.fmax.reduce(frames) - scale.baseline - own <= usual.most)
         if np.count_nonzero(calm) > LEAST_LOADED * np.count_nonzero(present):
@@ -194,6 +195,16 @@ def _quantile(values: Floats, share: float, axis: int) -> Floats:
     known = (~np.isnan(values)).any(axis=axis)
     filled = np.where(np.expand_dims(known, axis), values, 0.0)
     return np.where(known, np.nanquantile(filled, share, axis=axis), np.nan)
+
+
+def _rests(lowest: Floats, recent: Floats, present: NDArray[np.bool_], scale: Scale) -> Floats:
+    """Return where each cell rests above its baseline, ``[D]``: the lowest reading ever, or the recent one.
+
+    Where most cells no longer come down to their baseline, offsets creep; else a cell that does not is loaded.
+    """
+    known = present & np.isfinite(recent)
+    creeping = known.any() and np.median(recent[known]) > scale.near / 2
+    return recent if creeping else lowest
 
 
 def _own_offsets(lowest: Floats, scale: Scale, present: NDArray[np.bool_], usual: ReferenceOffset) -> Floats:

@@ -231,7 +231,7 @@ class _Fit:
                 some, equal = log.same(k)
                 loaded[:, k] += some.sum(axis=0)
                 same[:, k] += equal.sum(axis=0)
-            some, level = log.amid()
+            some, level = finished(log.amid())
             for n in range(len(AMID) + 1):
                 amid[:, n] += (some & (level == n)).sum(axis=0)
         same *= model.independent

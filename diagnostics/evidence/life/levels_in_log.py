@@ -20,6 +20,7 @@ from diagnostics.evidence.life.healthy_table import (
     levels_of,
 )
 from diagnostics.evidence.life.record import PIECE
+from diagnostics.evidence.stepping import finished
 from diagnostics.preprocessing.readings import spread
 from diagnostics.preprocessing.scale import Array
 
@@ -28,6 +29,7 @@ _THE_SAME = 0.1  # relative difference of loads that are the same
 _TILTED = 8.0  # pseudo-count of pieces, of the frequency of a level
 _FITS = 3  # of the tilt, by iterative proportional fitting: a size
 _MOST_TILT = 16.0  # times as frequent as expected, or as rare, levels of healthy cells are in a log
+_TOGETHER = 48  # units that are compared in one step: a size
 _SATURATED = 50.0  # log ratio of a unit beyond which nothing changes
 
 
@@ -67,9 +69,13 @@ class LifeLog:
 
     def prepared(self) -> Iterator[None]:
         """Yield after the work that every test needs, unless it is done."""
-        if "weight" not in vars(self):
-            _ = self.own, self.at_rest, self.weight
-            yield
+        if "weight" in vars(self):
+            return
+        _ = self.own, self.at_rest
+        yield
+        novelty = yield from _novelty(self._means())
+        self.weight = self.model.independent * novelty
+        yield
 
     @property
     def units(self) -> int:
@@ -103,9 +109,13 @@ class LifeLog:
     @cached_property
     def weight(self) -> Floats:
         """Weight of each unit ``[units]``: share of independent ones, over 1 + k with k others of the same loads."""
+        return self.model.independent * finished(_novelty(self._means()))
+
+    def _means(self) -> Floats:
+        """Return the mean root loads in each unit, ``[units, D]``."""
         length = np.diff(np.append(self.unit_begins, len(self.loads)))[:, None]
-        novelty = _novelty(np.add.reduceat(self.loads, self.unit_begins, axis=0) / length)
-        return self.model.independent * novelty
+        found: Floats = np.add.reduceat(self.loads, self.unit_begins, axis=0) / length
+        return found
 
     def healthy(self, known: Mask) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
         """Yield between steps; return log P(level | healthy) and the context, ``[n, D]`` each.
@@ -169,14 +179,14 @@ class LifeLog:
         some = self.any_by_unit(either)
         return some, some & ~self.any_by_unit(differs)
 
-    def amid(self) -> tuple[Mask, Levels]:
-        """Return in which units a cell and some beside it are loaded, and how far it is from the mean beside it.
+    def amid(self) -> Generator[None, None, tuple[Mask, Levels]]:
+        """Yield between steps; return how far a cell is from the mean of those beside it.
 
         The distance is relative to the mean distance of the cells beside it from their mean, without the farthest one:
         it may be dead.
 
         Returns:
-            bool ``[units, D]``; levels ``[units, D]``.
+            The units in which it and some beside it are loaded, bool ``[units, D]``; levels ``[units, D]``.
         """
         has = self.beside >= 0
         count = np.maximum(has.sum(axis=1), 2)
@@ -186,12 +196,14 @@ class LifeLog:
             mean += np.where(has[:, k], self.readings[:, other], 0.0)
             some |= (self.level[:, other] > 0) & has[:, k]
         mean /= count
+        yield
         total_beside = np.zeros(self.readings.shape)
         farthest = np.zeros(self.readings.shape)
         for k, other in enumerate(self.beside.T):
             away = np.where(has[:, k], np.abs(self.readings[:, other] - mean), 0.0)
             total_beside += away
             np.maximum(farthest, away, out=farthest)
+        yield
         usual_beside = (total_beside - farthest) / (count - 1)
         distance = np.abs(self.readings - mean) / (usual_beside + self.model.tolerance)
         some &= (self.level > 0) & self._read & (has.sum(axis=1) > 1) & np.isfinite(distance)
@@ -212,8 +224,8 @@ def _counted(numbers: NDArray[np.integer], n: int) -> NDArray[np.intp]:
     return np.bincount(index.ravel(), minlength=n * d).reshape(d, n)
 
 
-def _novelty(means: NDArray[np.floating]) -> Floats:
-    """Return the weight of each unit, ``[units]``, of the mean root loads in it, ``[units, D]``.
+def _novelty(means: Floats) -> Generator[None, None, Floats]:
+    """Yield between steps; return the weight of each unit, ``[units]``, of the mean root loads in it, ``[units, D]``.
 
     Two units have the same loads if these differ by less than a tenth, over the cells whose loads change at all.
     """
@@ -222,6 +234,8 @@ def _novelty(means: NDArray[np.floating]) -> Floats:
     size = changing.sum(axis=1)
     repeats = np.zeros(len(means))
     for u, one in enumerate(changing):
+        if u % _TOGETHER == _TOGETHER - 1:
+            yield
         differ = np.abs(changing - one).sum(axis=1)
         repeats[u] = (differ <= _THE_SAME * np.maximum(size, size[u])).sum() - 1
     return 1 / (1 + repeats)

@@ -5,7 +5,7 @@ Each is a log likelihood ratio fault : healthy, summed over the units of the log
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -105,6 +105,7 @@ class EvidenceOfLog:
         self.log = log
         self._seen: dict[bytes, Suspicion] = {}
         self._ways: dict[bytes, WaysToFail] = {}
+        self._alike: tuple[Floats, ...] = ()
 
     @classmethod
     def of(cls, record: LifeRecord, model: LifeModel, beside: Cells) -> EvidenceOfLog | None:
@@ -127,7 +128,9 @@ class EvidenceOfLog:
         if key not in self._ways:
             _forget(self._ways)
             seen = yield from self.suspicion(known)
-            self._ways[key] = yield from ways_to_fail(self.log, known, seen)
+            if not self._alike:
+                self._alike = yield from _alike(self.log)
+            self._ways[key] = yield from ways_to_fail(self.log, known, seen, self._alike)
         return self._ways[key]
 
 
@@ -152,15 +155,19 @@ def suspicion(log: LifeLog, known: Mask) -> Generator[None, None, Suspicion]:
     return Suspicion(healthy, context, by_unit.sum(axis=0), intermittent, by_unit, dead, dying)
 
 
-def ways_to_fail(log: LifeLog, known: Mask, seen: Suspicion) -> Generator[None, None, WaysToFail]:
+def ways_to_fail(
+    log: LifeLog, known: Mask, seen: Suspicion, alike: Sequence[Floats]
+) -> Generator[None, None, WaysToFail]:
     """Yield between steps; return the evidence of each fault.
 
     Args:
         log: the levels of the log.
         known: bool ``[D]``, cells that predict others.
         seen: the evidence of the first two faults, given these.
+        alike: evidence ``[D]`` that a cell repeats each of those beside it, or their mean.
     """
-    copy, source = yield from _copies(log, known, seen)
+    copy, source = yield from _copies(log, known, seen, alike)
+    yield
     if (known & (copy > REFUTED)).any():
         seen = yield from suspicion(log, known & (copy <= REFUTED))
         yield
@@ -282,12 +289,8 @@ def _clamped(log: LifeLog, context: NDArray[np.intp]) -> Floats:
     return evidence
 
 
-def _copies(log: LifeLog, known: Mask, seen: Suspicion) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
-    """Yield between steps; return the evidence ``[D]`` that a cell repeats one beside it, and which, int ``[D]``.
-
-    Or the mean of those beside it: -1. Either cell of two that read the same may be the copy: the one that fits worse
-    to the others, without both.
-    """
+def _alike(log: LifeLog) -> Generator[None, None, tuple[Floats, ...]]:
+    """Yield between steps; return the evidence ``[D]`` that a cell repeats each of those beside it, and their mean."""
     errs = log.model.errs
     of_different = bounded(np.log(errs), errs)
     evidence = []
@@ -300,11 +303,22 @@ def _copies(log: LifeLog, known: Mask, seen: Suspicion) -> Generator[None, None,
         evidence.append(np.where(other >= 0, found, -np.inf))
         if k % each == 0:
             yield
-    evidence.append(_mean_of_others(log, seen))
-    yield
-    cell = np.arange(len(errs))
+    evidence.append((yield from _mean_of_others(log)))
+    return tuple(evidence)
+
+
+def _copies(
+    log: LifeLog, known: Mask, seen: Suspicion, alike: Sequence[Floats]
+) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
+    """Yield between steps; return the evidence ``[D]`` that a cell repeats one beside it, and which, int ``[D]``.
+
+    Or the mean of those beside it: -1. Either cell of two that read the same may be the copy: the one that fits worse
+    to the others, without both.
+    """
+    evidence = [*alike[:-1], _unless_misled(alike[-1], log, seen)]
+    cell = np.arange(len(known))
     best = np.argmax(evidence, axis=0)
-    source = np.column_stack([log.beside, np.full(len(errs), -1)])[cell, best]
+    source = np.column_stack([log.beside, np.full(len(known), -1)])[cell, best]
     likeliest = np.max(evidence, axis=0) - np.log(len(evidence))
     total = np.maximum(likeliest, -_CERTAINLY_NOT)
     pairs = np.flatnonzero((total > REFUTED) & (source >= 0))
@@ -321,15 +335,17 @@ def _copies(log: LifeLog, known: Mask, seen: Suspicion) -> Generator[None, None,
     return total, source
 
 
-def _mean_of_others(log: LifeLog, seen: Suspicion) -> Floats:
-    """Return the evidence ``[D]`` that a cell reads the mean of those beside it.
-
-    Where one of these is refuted their mean is unknown.
-    """
-    some, level = log.amid()
+def _mean_of_others(log: LifeLog) -> Generator[None, None, Floats]:
+    """Yield between steps; return the evidence ``[D]`` that a cell reads the mean of those beside it."""
+    some, level = yield from log.amid()
     healthy = log.model.amid[np.arange(level.shape[1]), level]
     ratio = np.where(some, np.log(np.asarray(_AMID)[level] / healthy), 0.0)
-    evidence = (bounded(ratio, log.model.errs) * log.weight[:, None]).sum(axis=0)
+    evidence: Floats = (bounded(ratio, log.model.errs) * log.weight[:, None]).sum(axis=0)
+    return evidence
+
+
+def _unless_misled(evidence: Floats, log: LifeLog, seen: Suspicion) -> Floats:
+    """Return the evidence of a mean, where none of the cells beside one is refuted: else their mean is unknown."""
     plain = np.maximum(seen.independent, seen.intermittent)
     worse = seen.refuted(log)[log.beside] & (plain[log.beside] > plain[:, None])
     misled = ((log.beside >= 0) & worse).any(axis=1)

@@ -27,14 +27,13 @@ from diagnostics.evidence.stepping import finished
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference_faults import find_reference_faults
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED, MAJORITY, RARE
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, EXPECTED, MAJORITY, RARE
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
 
 SCHEMA = "adaptfault.diagnoser/10"
 
 _CERTAIN = 1 - RARE  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
-_DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
 
 Result = TypeVar("Result", covariant=True)
 LogRatio = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -253,7 +252,7 @@ class SelfDiagnosis:
         for beside in (False, True):
             while True:
                 yield
-                faulty = found.probability >= _DOUBTED if beside else found.faulty
+                faulty = found.probability >= DOUBTED if beside else found.faulty
                 loads = find_static_loads(stream, spatial, faulty, copies, still, beside=beside)
                 others = copies.copy()
                 others[[cell for load in loads for cell in load.cells]] = True
@@ -329,12 +328,12 @@ class SelfDiagnosis:
         yield
         # Cells that move by themselves mislead the spatial test; those that never moved say nothing yet.
         first = stream.proof_of_life(evidence, explained, ~stream.runs.moved)
-        life = yield from _stepped(first)
+        life = yield from first.steps()
         log_ratio = self._log_ratio(stream, life)
         spatial, found = yield from self._tested(stream, explained, log_ratio, life)
         # Cells that the spatial test suspects predict no others.
         suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
-        life = yield from _stepped(stream.proof_of_life(evidence, explained, suspected, first))
+        life = yield from stream.proof_of_life(evidence, explained, suspected, first).steps()
         return life
 
     @staticmethod
@@ -410,7 +409,7 @@ class SelfDiagnosis:
         return CellFindings(
             faulty=faulty,
             # A cell that moved is alive, unless it is suspected since.
-            alive=present & ~explained & ~faulty & runs.moved & (probability < _DOUBTED),
+            alive=present & ~explained & ~faulty & runs.moved & (probability < DOUBTED),
             silent=silent,
             rests=rests,
             full=beyond & (held >= self.layout.full_scale - 2 * reference.tolerance),

@@ -48,7 +48,8 @@ class Monitor:
         self._stream = fitted.stream()
         self._work: Generator[None, None, Diagnosis] | None = None
         self._proof: Generator[None, None, Life] | None = None
-        self._life = Life.unknown(fitted.layout.n_cells)
+        proves = self._stream.reference.life is not None
+        self._life = Life.unknown(fitted.layout.n_cells) if proves else None
         self._segments = 0  # since the last proof of life began
         self._known: dict[Key, Fault] = {}
         self._time: float | None = None
@@ -108,7 +109,7 @@ class Monitor:
         if self._work is None:
             self._work = self._diagnoser.steps(copy(self._stream), life=self._life)
         self._segments += 1
-        if self._proof is None and self._segments >= _PROVEN_EVERY:
+        if self._proof is None and self._life is not None and self._segments >= _PROVEN_EVERY:
             self._proof = self._diagnoser.proof(copy(self._stream))
             self._segments = 0
 

@@ -27,11 +27,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaln, ndtri, stdtr
+from scipy.special import betaln, stdtr
 
 from diagnostics.events.constant_runs import SHORTEST_RUN
 from diagnostics.preprocessing.levels import ANYWHERE, CERTAIN_RATIO, EXPECTED, EXPECTED_CELLS, FEWEST, MAJORITY
 from diagnostics.preprocessing.readings import SEGMENT
+from diagnostics.preprocessing.scale import robust_moments
 
 if TYPE_CHECKING:
     from diagnostics.events.constant_runs import ConstantRuns
@@ -78,9 +79,8 @@ class RestLevel:
         others, still, margin = self.level[known], self.still[known], 2 * tolerance
         level, exact = runs.high[tested], runs.low[tested] == runs.high[tested]
         with_noise = still & ~self.exact[known]
-        middle = np.median(others)
-        deviation = np.median(np.abs(others - middle)) / ndtri(0.75)
-        scale = max(float(deviation), tolerance)
+        middle, deviation = robust_moments(others)
+        scale = max(deviation, tolerance)
         far = -np.abs(level - middle)
         p_level = stdtr(4, (far + margin) / scale) - stdtr(4, (far - margin) / scale)
         p_exact = (np.count_nonzero(still & ~with_noise) + 0.5) / (np.count_nonzero(still) + 1)

@@ -65,3 +65,24 @@ def covariance_and_precision(
         return covariance, linalg.cho_solve(linalg.cho_factor(covariance), np.eye(len(covariance)))
     except linalg.LinAlgError:
         return covariance, linalg.pinvh(covariance)
+
+
+def regression_on_known(
+    covariance: NDArray[np.float64], precision: NDArray[np.float64], known: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return the weights ``[unknown, known]`` of the conditional mean of the unknown inputs, given the known ones.
+
+    Args:
+        covariance, precision: ``[inputs, inputs]``, each the inverse of the other.
+        known: bool ``[inputs]``; some are known, and some are not.
+    """
+    unknown = ~known
+    if unknown.sum() <= known.sum():
+        within = precision[np.ix_(unknown, unknown)]
+        across = precision[np.ix_(unknown, known)]
+        of_few: NDArray[np.float64] = -linalg.solve(within, across, assume_a="pos")
+        return of_few
+    within = covariance[np.ix_(known, known)]
+    across = covariance[np.ix_(known, unknown)]
+    of_many: NDArray[np.float64] = linalg.solve(within, across, assume_a="pos").T
+    return of_many

@@ -15,10 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 from scipy.special import expit, logit
 
-from diagnostics.healthy.dual_ridge import STEPS, covariance_and_precision
+from diagnostics.healthy.dual_ridge import STEPS, covariance_and_precision, regression_on_known
 from diagnostics.healthy.dual_ridge import logistic as dual_logistic
 from diagnostics.preprocessing.levels import FEWEST
 from diagnostics.preprocessing.scale import Array
@@ -160,12 +159,7 @@ class LocalRegression:
         if not known.any():
             z[:] = 0
             return
-        if unknown.sum() <= known.sum():
-            within, across = self.precision[np.ix_(unknown, unknown)], self.precision[np.ix_(unknown, known)]
-            regression = -linalg.solve(within, across, assume_a="pos")
-        else:
-            within, across = self.covariance[np.ix_(known, known)], self.covariance[np.ix_(known, unknown)]
-            regression = linalg.solve(within, across, assume_a="pos").T
+        regression = regression_on_known(self.covariance, self.precision, known)
         z[:, :, unknown] = z[:, :, known] @ regression.T.astype(np.float32)
 
 

@@ -23,5 +23,6 @@ CERTAIN_RATIO = 12.0  # of what only a fault explains
 EXPECTED = 0.02  # share of cells that are faulty from the start
 EXPECTED_LATE = 0.005  # share of cells that fail in the log, and of broken wires
 EXPECTED_CELLS = 35.0  # pseudo-count of either share of cells
+DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
 P_MIN = 1e-4  # lower limit of what chance explains, in one event or one test: models err
 ANYWHERE = 0.2  # share of broken cells that stick at any value; the others stick to either rail equally often

@@ -54,10 +54,18 @@ class Scale:
 def usual_limit(values: NDArray[np.float64]) -> float:
     """Return the median of ``values`` ``[n]`` plus three robust standard deviations: higher ones are outliers.
 
-    The filter of Hampel (1974); -inf without values. The deviation equals
-    ``scipy.stats.median_abs_deviation(scale="normal")``, which is fifteen times as slow.
+    The filter of Hampel (1974); -inf without values.
     """
     if not len(values):
         return -np.inf
+    middle, deviation = robust_moments(values)
+    return middle + _OUTLYING * deviation
+
+
+def robust_moments(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the median of ``values`` ``[n]`` and their robust standard deviation.
+
+    The latter equals ``scipy.stats.median_abs_deviation(scale="normal")``, which is fifteen times as slow.
+    """
     middle = np.median(values)
-    return float(middle + _OUTLYING * (np.median(np.abs(values - middle)) / ndtri(0.75)))
+    return float(middle), float(np.median(np.abs(values - middle)) / ndtri(0.75))

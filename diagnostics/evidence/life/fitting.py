@@ -16,7 +16,6 @@ from diagnostics.evidence.life.healthy_table import (
     BESIDE,
     FAULTS,
     GUESS,
-    UNIT,
     UNLOADED,
     ConditionalMean,
     Floats,
@@ -198,8 +197,7 @@ class _Fit:
             replace(fitted, means=means, table=_table(total - counts[k], shrinkage))
             for k, (means, _) in enumerate(self._cross())
         ]
-        ratios = [self._independent(model, fold) for model, fold in zip(held_out, self._folds, strict=True)]
-        by_unit = [_by_unit(ratio, fold) for ratio, fold in zip(ratios, self._folds, strict=True)]
+        by_unit = [self._independent(model, fold) for model, fold in zip(held_out, self._folds, strict=True)]
         independent = self._independent_share(held_out)
         errs, of_others = self._errs(by_unit, independent)
         fitted = self._beside(replace(fitted, independent=independent, errs=errs))
@@ -291,10 +289,10 @@ class _Fit:
         return found
 
     def _independent(self, model: LifeModel, fold: _Fold) -> Floats:
-        """Return the log ratio independent of the others : healthy of each piece of a fold, ``[n, D]``."""
+        """Return the log ratio independent of the others : healthy of each unit of a fold, ``[units, D]``."""
         log = LifeLog(fold.loads, fold.readings, fold.piece, model, self._layout.beside)
         healthy, _ = finished(log.healthy(self._present))
-        return np.where(np.isfinite(fold.readings), log.own - healthy, 0.0)
+        return log.by_unit(log.own - healthy)
 
     def _independent_share(self, held_out: list[LifeModel]) -> float:
         """Return the share of the units that count as independent of each other: those of one contact are alike.
@@ -381,13 +379,6 @@ class _Fit:
                     units.append(evidence.log.units)
         most = np.quantile(np.concatenate(usual, axis=1), _HEALTHY, axis=1)
         return np.maximum(reached, most[:, None]), int(np.median(units))
-
-
-def _by_unit(ratio: Floats, fold: _Fold) -> Floats:
-    """Return the sums over the pieces of each unit, ``[units, D]``, of those of each piece ``[n, D]``."""
-    begins = np.flatnonzero(np.diff(fold.piece // UNIT, prepend=-1))
-    found: Floats = np.add.reduceat(ratio, begins, axis=0)
-    return found
 
 
 def _logs(fold: _Fold) -> list[LifeRecord]:

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
-from diagnostics.healthy.dual_ridge import covariance_and_precision
+from diagnostics.healthy.dual_ridge import covariance_and_precision, regression_on_known
 from diagnostics.preprocessing.levels import MARGIN
 from diagnostics.preprocessing.scale import Array
 
@@ -81,7 +80,7 @@ class ConditionalMean:
         if not known.any():
             z[:] = 0.0
         elif unknown.any():
-            regression = self._regression(known, unknown)
+            regression = regression_on_known(self.covariance, self.precision, known)
             z[:, unknown] = z[:, known] @ regression.T
             across = self.precision[np.ix_(unknown, known)]
             own_precision[known] += (across * regression).sum(axis=0)
@@ -89,17 +88,6 @@ class ConditionalMean:
         expected_z = z[:, self.place] - z @ of_all
         expected: Floats = expected_z * self.scale[self.place] + self.mean[self.place]
         return expected
-
-    def _regression(self, known: Mask, unknown: Mask) -> Floats:
-        if unknown.sum() <= known.sum():
-            within = self.precision[np.ix_(unknown, unknown)]
-            across = self.precision[np.ix_(unknown, known)]
-            found: Floats = -linalg.solve(within, across, assume_a="pos")
-            return found
-        within = self.covariance[np.ix_(known, known)]
-        across = self.covariance[np.ix_(known, unknown)]
-        turned: Floats = linalg.solve(within, across, assume_a="pos").T
-        return turned
 
 
 def _standardised(loads: NDArray[np.floating], mean: Floats, scale: Floats) -> Floats:

@@ -73,8 +73,7 @@ class LifeLog:
             return
         _ = self.own, self.at_rest
         yield
-        novelty = yield from _novelty(self._means())
-        self.weight = self.model.independent * novelty
+        self.weight = yield from self._weighed()
         yield
 
     @property
@@ -109,13 +108,13 @@ class LifeLog:
     @cached_property
     def weight(self) -> Floats:
         """Weight of each unit ``[units]``: share of independent ones, over 1 + k with k others of the same loads."""
-        return self.model.independent * finished(_novelty(self._means()))
+        return finished(self._weighed())
 
-    def _means(self) -> Floats:
-        """Return the mean root loads in each unit, ``[units, D]``."""
+    def _weighed(self) -> Generator[None, None, Floats]:
+        """Yield between steps; return the weight of each unit."""
         length = np.diff(np.append(self.unit_begins, len(self.loads)))[:, None]
-        found: Floats = np.add.reduceat(self.loads, self.unit_begins, axis=0) / length
-        return found
+        novelty = yield from _novelty(np.add.reduceat(self.loads, self.unit_begins, axis=0) / length)
+        return self.model.independent * novelty
 
     def healthy(self, known: Mask) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
         """Yield between steps; return log P(level | healthy) and the context, ``[n, D]`` each.

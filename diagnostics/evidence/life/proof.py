@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logit, logsumexp
 
-from diagnostics.evidence.life.healthy_table import COPY, THRESHOLD, Floats, Mask
+from diagnostics.evidence.life.healthy_table import COPY, THRESHOLD, Cells, Floats, Mask
 from diagnostics.evidence.life.levels_in_log import LifeLog
 from diagnostics.evidence.life.ways_to_fail import (
     REFUTED,
@@ -18,13 +18,14 @@ from diagnostics.evidence.life.ways_to_fail import (
     WaysToFail,
     follows_otherwise,
 )
-from diagnostics.preprocessing.levels import EXPECTED, FEWEST, MAJORITY
+from diagnostics.evidence.stepping import finished
+from diagnostics.preprocessing.levels import DOUBTED, EXPECTED, FEWEST, MAJORITY
 
 _SHARES = (0.4, 0.3, 0.1, 0.1, 0.1)  # of the FAULTS among faults
 _ROUNDS = 16  # at most: a size
 _OFTEN = 2  # times that a cell was refuted: it does not come back
 _SHOWN = 2.0  # evidence against independence that proves life
-_DOUBT = logit(0.1) - logit(EXPECTED)  # evidence of a fault with which P(faulty) is 0.1: the cell is in doubt
+_DOUBT = logit(DOUBTED) - logit(EXPECTED)  # evidence of a fault from which on a cell is in doubt
 _EITHER = 1.0  # evidence against a copy, without which either of two cells may be it
 _DISTURBED = 1 / 3  # share of the tested cells: if more are refuted, all are disturbed
 
@@ -108,7 +109,7 @@ class Life:
 
 
 class LifeTest:
-    """The iterated test; each :meth:`step` takes a few milliseconds.
+    """The iterated test.
 
     What it finds of the log, given the cells that predict others, is kept with the log: a second test of it is short.
 
@@ -119,7 +120,6 @@ class LifeTest:
         known: bool ``[D]``, cells that may predict others at first, of an earlier test; None: all.
 
     Attributes:
-        result: None before the last step.
         known: bool ``[D]``, the cells that predict others.
     """
 
@@ -130,38 +130,29 @@ class LifeTest:
         constant: Mask | None = None,
         known: Mask | None = None,
     ) -> None:
-        self.result: Life | None = None
+        self._evidence = evidence
         self._eligible = eligible
         self._constant = np.zeros_like(eligible) if constant is None else constant
         self.known = eligible & ~self._constant
         if known is not None:
             self.known &= known
-        if evidence is None:
-            self.result = Life.unknown(len(eligible))
-            return
-        self._evidence = evidence
-        self._work = self._steps()
-
-    def step(self) -> bool:
-        """Do some work; return whether there is a result."""
-        if self.result is None:
-            next(self._work, None)
-        return self.result is not None
 
     def finish(self) -> Life:
-        """Do all work that is left, and return the result."""
-        while self.result is None:
-            self.step()
-        return self.result
+        """Return the result."""
+        return finished(self.steps())
 
-    def _steps(self) -> Iterator[None]:
-        log = self._evidence.log
+    def steps(self) -> Generator[None, None, Life]:
+        """Yield between steps of a few milliseconds; return the result."""
+        evidence = self._evidence
+        if evidence is None:
+            return Life.unknown(len(self._eligible))
+        log = evidence.log
         yield from log.prepared()
         refuted = np.zeros(len(self._eligible), np.intp)  # how often each cell was
-        seen = yield from self._evidence.suspicion(self.known)
+        seen = yield from evidence.suspicion(self.known)
         for _ in range(_ROUNDS):
             bad = self._eligible & seen.refuted(log)
-            gone = self._worst(seen, bad)
+            gone = self._worst(seen, bad, log.beside)
             refuted += gone
             # A cell that the others beside it had made look wrong comes back, but once only.
             returns = self._eligible & ~self._constant & ~bad & (refuted < _OFTEN)
@@ -170,20 +161,20 @@ class LifeTest:
                 break
             self.known = known
             yield
-            seen = yield from self._evidence.suspicion(known)
-        ways = yield from self._evidence.ways(self.known)
+            seen = yield from evidence.suspicion(known)
+        ways = yield from evidence.ways(self.known)
         yield
         life = _concluded(log, ways, self._eligible, self._constant)
-        self.result = yield from _without_followers(log, ways, life)
+        life = yield from _without_followers(log, ways, life)
+        return life
 
-    def _worst(self, seen: Suspicion, bad: Mask) -> Mask:
+    def _worst(self, seen: Suspicion, bad: Mask, beside: Cells) -> Mask:
         """Return the worst of the ``bad`` cells that predict others, bool ``[D]``.
 
         They are worse than any cell beside them, and half as bad as the worst of all.
         """
         plain = np.maximum(seen.independent, seen.intermittent)
         predicts = bad & self.known
-        beside = self._evidence.log.beside
         of_beside = np.where((beside >= 0) & self.known[beside], plain[beside], -np.inf)
         of_all = plain.max(initial=-np.inf, where=predicts)
         local = plain >= of_beside.max(axis=1, initial=-np.inf)

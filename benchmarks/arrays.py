@@ -21,7 +21,7 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 HAND, FINGERTIPS, SOLES = "sdh2x13x6_grasps36.npz", "icub5x1x12_grasps11.npz", "insole2x33x15.npz"
 FABRIC = "fabric4x4_slides7.npz"
 MAIN = ("cells", "onset", "healthy")
-LIFE = ("moving", "proven")
+LIFE = ("moving", "proven", "own_reference")
 SKIN = (*MAIN, "lines", "cold", "static")
 EVERY = (
     "cells", "onset", "dither", "missing", "many", "cold", "reference_faults", "lines", "cut", "address", "healthy",
@@ -157,6 +157,10 @@ ARRAYS = [
         for name, skin in static_holds.SKINS.items()
     ),
     Array("grasps, 2 x 11 x 10", SKIN, simulated(grasps(SensorLayout.paper())), 30),
+    Array(
+        "grasps, 1 x 10 x 10, long logs", ("own_reference",), simulated(grasps(SensorLayout(1, 10, 10))), 10, 1, 4,
+        ("own_reference",),
+    ),
     Array(
         "grasps, 1 x 12 x 12", (*MAIN, "lines", "address", "rewired"), simulated(grasps(SensorLayout(1, 12, 12))), 30
     ),

@@ -153,9 +153,10 @@ class Bench:
         dither: float = 0.0,
         missing: float = 0.0,
         cold: bool = False,
+        length: int = 6,
     ) -> Tally:
         tally, diagnoser = Tally(), SelfDiagnosis(self.layout) if cold else self.fitted
-        for seed, log, rng in self.logs():
+        for seed, log, rng in self.logs(length):
             faults = draw_faults(self.layout, share, kinds, rng)
             seen = list(broken(log, faults, self.layout, onset, dither, seed))
             if missing:
@@ -227,6 +228,16 @@ def cold(bench: Bench) -> Iterator[Count]:
     for _, log, _ in bench.logs():
         false, windows = false + len(diagnoser.diagnose(log).fault_set), windows + windows_of(log, bench.layout)
     yield Count("no reference, healthy: false alarms", 1e6 * false, windows, "in 1e6 windows", higher=False)
+
+
+def own_reference(bench: Bench) -> Iterator[Count]:
+    """Long logs without a reference: dead from the start, from some frame on, and healthy."""
+    for onset, since in ((0.0, ""), (0.3, " from 30 % of the log on"), (0.6, " from 60 % of the log on")):
+        tally = bench.case(MOVING_SHARE, onset, cold=True, length=IN_USE)
+        yield from tally.counts(f"no reference, 40 recordings, 8 % dead{since}")
+    diagnoser = SelfDiagnosis(bench.layout)
+    blamed = sum(len(diagnoser.diagnose(log).fault_set) for _, log, _ in bench.logs(IN_USE))
+    yield Count("no reference, 40 recordings, healthy: cells blamed in a log", blamed, bench.count, higher=False)
 
 
 def reference_faults(bench: Bench) -> Iterator[Count]:
@@ -843,8 +854,8 @@ def speed(bench: Bench) -> Iterator[Count]:
 ROWS: dict[str, Callable[[Bench], Iterator[Count]]] = {
     row.__name__: row
     for row in (
-        cells, onset, dither, missing, many, cold, reference_faults, lines, cut, address, healthy, holds, untouched,
-        kind, calibration, changing, gain, moving, proven, rewired, groups, replaced, specimen, static, transport,
-        speed,
+        cells, onset, dither, missing, many, cold, own_reference, reference_faults, lines, cut, address, healthy, holds,
+        untouched, kind, calibration, changing, gain, moving, proven, rewired, groups, replaced, specimen, static,
+        transport, speed,
     )
 }  # fmt: skip

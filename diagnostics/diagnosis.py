@@ -25,15 +25,18 @@ from diagnostics.evidence.rewiring import Rewiring, find_rewiring
 from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stepping import finished
 from diagnostics.evidence.stream_state import StreamState
-from diagnostics.healthy.reference_faults import find_reference_faults
+from diagnostics.healthy.reference_faults import find_reference_faults, never_moved
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, EXPECTED, MAJORITY, RARE
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, EXPECTED, LEAST_LOADED, MAJORITY, RARE, SLIGHT
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.threads import one_thread
 
 SCHEMA = "adaptfault.diagnoser/10"
 
 _CERTAIN = 1 - RARE  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
+
+OWN_REFERENCE = 32  # recordings from which on a log is its own reference: with a model of ten, healthy cells are blamed
 
 Result = TypeVar("Result", covariant=True)
 LogRatio = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -128,9 +131,19 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame with a reading.
         """
+        with one_thread():
+            return self._fit(checked_recordings(recordings, self.layout), progress)
+
+    def _fit(
+        self,
+        recordings: RecordingBlocks,
+        progress: Callable[[float], None],
+        suspected: NDArray[np.float64] | None = None,
+    ) -> SelfDiagnosis:
+        """Fit; ``suspected``: P(dead) ``[D]`` of cells that are dead if they never move; None: found here."""
         progress(0.0)
         present = self.layout.present.ravel()
-        healthy = checked_recordings(recordings, self.layout).valid(self.layout.full_scale, present).whole(present)
+        healthy = recordings.valid(self.layout.full_scale, present).whole(present)
         layout = self._planes
         if self.layout.axes > 1:
             healthy = RecordingBlocks([given[:, self._order] for given in healthy.given])
@@ -139,7 +152,11 @@ class SelfDiagnosis:
             healthy, layout = RecordingBlocks([self.load_.loads(r) for r in healthy]), replace(layout, rest="low")
         # Fractions of full scale refer to the range that was seen: a stated one may be too high.
         layout = replace(layout, full_scale=min(layout.full_scale, highest_reading(healthy, layout)))
-        dead = find_reference_faults(healthy, layout, tolerance_of(healthy, layout), self._diagnosed_cold)
+        tolerance = tolerance_of(healthy, layout)
+        if suspected is None:
+            dead = find_reference_faults(healthy, layout, tolerance, self._diagnosed_cold)
+        else:
+            dead = np.where(never_moved(healthy, tolerance), suspected[self._order], 0.0)
         self.reference_ = Reference.fit(healthy, layout, dead)
         if self.proof_of_life:
             self.reference_ = self.reference_.with_life(healthy, layout)
@@ -150,12 +167,48 @@ class SelfDiagnosis:
     def diagnose(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Diagnosis:
         """Diagnose a log: recordings ``[T, D]`` or a list of them, in time order.
 
-        Without :meth:`fit` (cold start), cells are compared with cells that have similar surroundings in the same log.
+        Without :meth:`fit` (cold start), a log of 32 recordings or more is its own reference (:meth:`for_log`), which
+        takes the time of a fit. In a shorter one, cells are compared with cells that have similar surroundings.
 
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
-        return self._diagnosed(checked_recordings(recordings, self.layout))
+        log = checked_recordings(recordings, self.layout)
+        with one_thread():
+            return self.for_log(log.given)._diagnosed(log)
+
+    def for_log(
+        self,
+        recordings: ArrayLike | Sequence[ArrayLike],
+        *,
+        progress: Callable[[float], None] = lambda share: None,
+    ) -> SelfDiagnosis:
+        """Return what :meth:`diagnose` judges a log with: this diagnosis, or in a cold start one fitted to the log.
+
+        That one is fitted to the first half of the log, so that a cell that fails in it is compared with how it worked
+        before. Cells that never move in this half, and are faulty by the cold start on the whole log, are excluded and
+        reported. A cell that fails early in this half may be learned as it is, and not be found.
+
+        A log of fewer than 32 recordings, or in which most cells never move, is no reference: it is judged by this
+        diagnosis.
+
+        Args:
+            recordings: a log, as for :meth:`diagnose`.
+            progress: as for :meth:`fit`.
+
+        Raises:
+            ValueError: recordings that do not fit the layout, or hold no frame.
+        """
+        log = checked_recordings(recordings, self.layout)
+        if self.reference_ is not None or len(log) < OWN_REFERENCE:
+            return self
+        first = log[: len(log) // 2]
+        if not _shows_contacts(first, log, self.layout):
+            return self
+        own = SelfDiagnosis(**self.get_params())
+        with one_thread():
+            cold = self._diagnosed(log)
+            return own._fit(first, progress, np.where(cold.fault_set.mask, cold.probability, 0.0))
 
     def rewiring(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Rewiring | None:
         """Return the rows, columns or pads that answer in each other's place, None where the data show none.
@@ -176,7 +229,8 @@ class SelfDiagnosis:
             if self.load_.direction == "middle":
                 return None
             log = RecordingBlocks([self.load_.loads(recording) for recording in log])
-        return find_rewiring(log, self.reference_, self.layout)
+        with one_thread():
+            return find_rewiring(log, self.reference_, self.layout)
 
     def state(self) -> tuple[dict[str, Any], Arrays]:
         """Return the fitted state: a JSON-safe dict and arrays by name, as :meth:`from_state` reads them."""
@@ -226,7 +280,8 @@ class SelfDiagnosis:
         Raises:
             ValueError: no frame with a reading was received yet.
         """
-        return finished(self.steps(stream, n_recordings=n_recordings))
+        with one_thread():
+            return finished(self.steps(stream, n_recordings=n_recordings))
 
     def steps(
         self, stream: StreamState, *, n_recordings: int = 1, life: Life | None = None
@@ -492,6 +547,22 @@ def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:
     present = layout.present.ravel()[order]
     pads = layout.pads * layout.axes
     return replace(layout, pads=pads, axes=1, present=present, wiring="bus", groups=None, rest=rest), order
+
+
+def _shows_contacts(first: RecordingBlocks, log: RecordingBlocks, layout: SensorLayout) -> bool:
+    """Return whether most cells are loaded in the ``first`` recordings of a log, by what loads there are in it."""
+    present = layout.present.ravel()
+    before = _typical_range(first.valid(layout.full_scale, present), present)
+    typical = _typical_range(log.valid(layout.full_scale, present), present)
+    return before > SLIGHT * layout.full_scale and before >= LEAST_LOADED * typical
+
+
+def _typical_range(recordings: RecordingBlocks, present: NDArray[np.bool_]) -> float:
+    """Return the median over cells of the range of readings; 0 without any."""
+    low, high = recordings.extremes()
+    ranges = (high - low)[present]
+    received = ranges[np.isfinite(ranges)]
+    return float(np.median(received)) if len(received) else 0.0
 
 
 def checked_recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> RecordingBlocks:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from contextlib import nullcontext
 from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from diagnostics.evidence.life import Life
 from diagnostics.layout import Line
+from diagnostics.threads import one_thread
 
 if TYPE_CHECKING:
     from diagnostics.decision.result import Diagnosis
@@ -40,10 +40,9 @@ class Monitor:
     def __init__(self, fitted: SelfDiagnosis) -> None:
         import scipy.ndimage  # imported here, not in the control loop
         import scipy.optimize  # noqa: F401
-        from threadpoolctl import ThreadpoolController
 
-        # On small matrices the synchronisation of threads costs more than it saves.
-        self._threads = ThreadpoolController()
+        with one_thread():  # looks for the libraries once
+            pass
         self._diagnoser = fitted
         self._stream = fitted.stream()
         self._work: Generator[None, None, Diagnosis] | None = None
@@ -56,15 +55,7 @@ class Monitor:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy or a pickle holds; an evaluation under way begins anew after the copy's next segment."""
-        state = {**vars(self), "_work": None, "_proof": None}
-        del state["_threads"]
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        from threadpoolctl import ThreadpoolController
-
-        vars(self).update(state)
-        self._threads = ThreadpoolController()
+        return {**vars(self), "_work": None, "_proof": None}
 
     def update(self, frame: ArrayLike, time: float | None = None) -> tuple[Fault, ...]:
         """Process one frame; return the faults that are new, changed, or gone.
@@ -91,18 +82,12 @@ class Monitor:
                 self._stream.miss(round((time - self._time) * layout.rate) - 1)
             self._time = time
         due = self._stream.due
-        with self._threads.limit(limits=1) if due else nullcontext():
-            completed = self._stream.extend(reading[None])
-        if completed:
-            self._begin()
-        elif not due:
-            with self._threads.limit(limits=1) if self._busy else nullcontext():
+        with one_thread():
+            if self._stream.extend(reading[None]):
+                self._begin()
+            elif not due:
                 return self._step()
         return ()
-
-    @property
-    def _busy(self) -> bool:
-        return self._work is not None or self._proof is not None
 
     def _begin(self) -> None:
         """Begin to evaluate the frames so far, unless an evaluation is under way."""

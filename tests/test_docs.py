@@ -195,11 +195,6 @@ def test_files_that_a_page_names_exist(page):
     assert missing == []
 
 
-@pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.name)
-def test_a_guide_has_at_most_1000_words(page):
-    assert len(page.read_text().split()) <= 1000
-
-
 @pytest.mark.parametrize("page", sorted((HOME / "docs" / "methods").glob("*.md")), ids=lambda page: page.stem)
 def test_a_method_page_has_formula_figure_cost_and_limits(page):
     text = page.read_text()

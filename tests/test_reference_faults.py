@@ -23,9 +23,7 @@ DEAD = {OPEN, SHORT, STUCK}
 
 def reference_faults(recordings: list[np.ndarray], layout: SensorLayout = LAYOUT) -> np.ndarray:
     readings = RecordingBlocks(recordings)
-    return find_reference_faults(
-        readings, layout, tolerance_of(readings, layout), lambda log, *_: SelfDiagnosis(layout).diagnose(list(log))
-    )
+    return find_reference_faults(readings, layout, tolerance_of(readings, layout), SelfDiagnosis._diagnosed_cold)
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from adaptfault.cli.options import (
     command,
     emit,
     fit_diagnoser,
+    fitting_bar,
     load_recordings,
     progress,
     report_inferred,
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
     from diagnostics.evidence.sensor_change import SensorChange
 
 _EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.json --html diagnosis.html
-      without --reference each cell is compared with the cells around it
+      without --reference the first half of 32 or more recordings is the reference; with fewer, each cell is compared
+      with the cells around it
   adaptfault diagnose today/ --reference robot.bundle
       the healthy model of the bundle
       exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version excludes, nothing tested, an
@@ -177,6 +179,21 @@ def text_of(diagnosis: Diagnosis) -> str:
     return "\n".join(lines)
 
 
+def _cold(args: argparse.Namespace, log: Recordings | Stream, undo: Undo) -> SelfDiagnosis:
+    """Return a diagnosis without reference; a log of enough recordings that is in memory is its own."""
+    import numpy as np
+
+    from adaptfault.data.recordings import Recordings
+    from diagnostics import SelfDiagnosis
+
+    cold = SelfDiagnosis(log.layout)
+    if not isinstance(log, Recordings):
+        return cold
+    frames = [undo(np.asarray(recording, dtype=np.float64)) for recording in log.frames]
+    with fitting_bar(args) as advance:
+        return cold.for_log(frames, progress=advance)
+
+
 def _diagnosed(
     args: argparse.Namespace, diagnoser: SelfDiagnosis | None, log: Recordings | Stream, undo: Undo
 ) -> Diagnosis:
@@ -185,15 +202,16 @@ def _diagnosed(
     from tqdm import tqdm
 
     from adaptfault.data.recordings import Recordings
-    from diagnostics import SelfDiagnosis
+    from diagnostics.threads import one_thread
 
-    fitted = diagnoser or SelfDiagnosis(log.layout)
+    fitted = diagnoser or _cold(args, log, undo)
     stream = fitted.stream()
     hide = None if (shown := progress(args)) is None else not shown
     total = len(log) if isinstance(log, Recordings) else None
     unit = "recording" if isinstance(log, Recordings) else "block"
     for frames in tqdm(log, total=total, unit=unit, desc="diagnosing", disable=hide, leave=False):
-        stream.extend(undo(np.asarray(frames, dtype=np.float64)))
+        with one_thread():
+            stream.extend(undo(np.asarray(frames, dtype=np.float64)))
     if not isinstance(log, Recordings):
         for problem in log.problems:
             print(problem, file=sys.stderr)

@@ -7,7 +7,8 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -354,19 +355,26 @@ def progress(args: argparse.Namespace) -> bool | None:
 
 def fit_diagnoser(args: argparse.Namespace, recordings: Recordings) -> SelfDiagnosis:
     """Return the healthy model of recordings, with a bar while it is fitted."""
-    from tqdm import tqdm
-
     from diagnostics import SelfDiagnosis
 
-    form = "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]"
     say(args, f"fitting the healthy model of the diagnosis on {len(recordings)} recordings")
+    with fitting_bar(args) as advance:
+        return SelfDiagnosis(recordings.layout).fit(recordings.frames, progress=advance)
+
+
+@contextmanager
+def fitting_bar(args: argparse.Namespace) -> Iterator[Callable[[float], None]]:
+    """Show a bar while something is fitted; it is called with the share of the work that is done."""
+    from tqdm import tqdm
+
+    form = "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]"
     hide = None if (shown := progress(args)) is None else not shown
     with tqdm(total=1.0, desc="fitting", bar_format=form, disable=hide, leave=False) as bar:
 
         def advance(share: float) -> None:
             bar.update(share - bar.n)
 
-        return SelfDiagnosis(recordings.layout).fit(recordings.frames, progress=advance)
+        yield advance
 
 
 def say(args: argparse.Namespace, text: str) -> None:

@@ -41,25 +41,31 @@ def find_reference_faults(
         diagnose: a cold-start diagnosis of the candidate cells (bool ``[D]``) with known baselines (float ``[D]``).
     """
     present = layout.present.ravel()
-    low, high = recordings.extremes()
-    never_moved = present & (high - low <= 2 * tolerance)  # False without any reading
-    candidates = _enclosed_groups(never_moved, layout)
-    if not candidates.any() or never_moved[present].mean() > MAJORITY:
+    still = present & never_moved(recordings, tolerance)
+    candidates = _enclosed_groups(still, layout)
+    if not candidates.any() or still[present].mean() > MAJORITY:
         return np.zeros(layout.n_cells)
-    rest = baseline(recordings, present & ~never_moved, tolerance, layout.full_scale).highest
-    typical = rest[present & ~never_moved]
+    rest = baseline(recordings, present & ~still, tolerance, layout.full_scale).highest
+    typical = rest[present & ~still]
     # A cell that holds more than any baseline is loaded, or dead.
     rest = np.where(rest > typical.max(), np.median(typical), rest)
     found = diagnose(_sample(recordings), candidates, rest, layout)
-    dead = never_moved & found.fault_set.mask & (found.probability >= 1 - RARE)
+    dead = still & found.fault_set.mask & (found.probability >= 1 - RARE)
     return np.where(dead, found.probability, 0.0)
 
 
-def _enclosed_groups(never_moved: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.bool_]:
-    """Return the groups of ``never_moved`` cells in which one is enclosed by cells that moved, bool ``[D]``."""
-    moved = layout.grid(~never_moved & layout.present.ravel())
-    groups = layout.connected(never_moved)
-    candidates: NDArray[np.bool_] = np.isin(groups, groups[enclosed(moved[..., None]).ravel() & never_moved])
+def never_moved(recordings: RecordingBlocks, tolerance: float) -> NDArray[np.bool_]:
+    """Return the cells whose readings stay within +- ``tolerance`` of a value, bool ``[D]``; False without any."""
+    low, high = recordings.extremes()
+    still: NDArray[np.bool_] = high - low <= 2 * tolerance
+    return still
+
+
+def _enclosed_groups(still: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.bool_]:
+    """Return the groups of cells that are ``still`` in which one is enclosed by cells that moved, bool ``[D]``."""
+    moved = layout.grid(~still & layout.present.ravel())
+    groups = layout.connected(still)
+    candidates: NDArray[np.bool_] = np.isin(groups, groups[enclosed(moved[..., None]).ravel() & still])
     return candidates
 
 

@@ -85,7 +85,7 @@ class _Fold:
         """Let a cell read, equally often, what another one (``source``) read at other times, or nothing."""
         if rng.random() < MAJORITY:
             self.loads[:, cell] = 0.0
-            self.readings[:, cell] = np.nanmin(self.readings[:, cell])
+            self.readings[:, cell] = np.fmin.reduce(self.readings[:, cell])  # NaN without any reading
             return
         order = rng.permutation(len(self.loads))
         self.loads[:, cell] = self.loads[order, source]

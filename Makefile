@@ -46,7 +46,7 @@ test-cpus: .venv/installed-dev
 		OMP_NUM_THREADS=$$4 $(PYTEST) -m 'not slow' || exit 1; done
 
 examples: .venv/installed-dev
-	OMP_NUM_THREADS=1 $(PYTEST) -vv -rs tests/test_examples.py tests/test_docs.py
+	OMP_NUM_THREADS=1 $(PYTEST) -vv -rs tests/project/test_examples.py tests/project/test_docs.py
 
 # Real arrays are read from ../shared/data where it exists.
 benchmark: .venv/installed-dev

@@ -1,6 +1,7 @@
 """Keeps a tactile classifier working when cells of the skin die.
 
-Names are loaded when first used, so that ``import adaptfault`` is quick and torch comes only with a model.
+Names are loaded when first used, so that ``import adaptfault`` is quick and torch comes only with a
+model.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from adaptfault.adaptation.reduced_model import ReducedModel
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.adaptation.worst import WorstFaults, worst_faults
+    from adaptfault.bundle.bundle import Bundle
+    from adaptfault.bundle.signing import sign_bundle
+    from adaptfault.bundle.versions import Untrusted
     from adaptfault.data.calibration import Calibration
     from adaptfault.data.recordings import Recordings, load, save, save_npz
     from adaptfault.data.simulated_grasps import simulate
@@ -30,21 +34,22 @@ if TYPE_CHECKING:
     from adaptfault.fleet.run import maintain_fleet
     from adaptfault.fleet.summary import FleetReport
     from adaptfault.imputation.restorer import Restorer
-    from adaptfault.imputation.scikit_learn import CellImputer, FaultTolerantClassifier, FaultTolerantRegressor
+    from adaptfault.imputation.scikit_learn import (
+        CellImputer,
+        FaultTolerantClassifier,
+        FaultTolerantRegressor,
+    )
+    from adaptfault.inspection.inspection import Finding, Inspection, inspect
     from adaptfault.models.builders import allow_model, build_model
-    from adaptfault.models.export import add_onnx
     from adaptfault.models.history import History
-    from adaptfault.models.inference import Inference
     from adaptfault.models.network import TactileTransformer
-    from adaptfault.models.store import load_healthy, load_model, save_model
+    from adaptfault.models.store import load_model, save_model
     from adaptfault.models.training import train
-    from adaptfault.robot.bundle import Bundle
-    from adaptfault.robot.inspection import Finding, Inspection, inspect
+    from adaptfault.prediction.export import add_onnx
+    from adaptfault.prediction.inference import Inference
+    from adaptfault.prediction.predictor import Predictor, Reading
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.maintenance_report import MaintenanceReport
-    from adaptfault.robot.predictor import Predictor, Reading
-    from adaptfault.robot.signature import sign_bundle
-    from adaptfault.robot.versions import Untrusted
 
 __version__ = "0.1.0"
 
@@ -116,23 +121,23 @@ __all__ = [
 _HOMES = {
     "Adaptation": "adaptation.result",
     "Adapter": "adaptation.adapter",
-    "Bundle": "robot.bundle",
+    "Bundle": "bundle.bundle",
     "Calibration": "data.calibration",
     "CausalCorrection": "adaptation.baselines.correction",
     "CellImputer": "imputation.scikit_learn",
     "FaultTolerantClassifier": "imputation.scikit_learn",
     "FaultTolerantRegressor": "imputation.scikit_learn",
-    "Finding": "robot.inspection",
+    "Finding": "inspection.inspection",
     "Fleet": "fleet.listing",
     "FleetReport": "fleet.summary",
     "Forecast": "adaptation.forecast",
     "History": "models.history",
-    "Inference": "models.inference",
-    "Inspection": "robot.inspection",
+    "Inference": "prediction.inference",
+    "Inspection": "inspection.inspection",
     "MaintenanceReport": "robot.maintenance_report",
     "NotAuthentic": "acquisition",
-    "Predictor": "robot.predictor",
-    "Reading": "robot.predictor",
+    "Predictor": "prediction.predictor",
+    "Reading": "prediction.predictor",
     "Receiver": "acquisition",
     "Recorder": "acquisition",
     "Recordings": "data.recordings",
@@ -143,21 +148,21 @@ _HOMES = {
     "Summary": "data.summary",
     "Sensitivity": "evaluation.sensitivity",
     "TactileTransformer": "models.network",
-    "Untrusted": "robot.versions",
+    "Untrusted": "bundle.versions",
     "ValueScores": "evaluation.scores",
     "Windows": "data.windows",
     "WorstFaults": "adaptation.worst",
-    "add_onnx": "models.export",
+    "add_onnx": "prediction.export",
     "allow_model": "models.builders",
     "analyse": "evaluation.sensitivity",
     "build_model": "models.builders",
     "correct": "adaptation.baselines.correction",
     "diagnostic_array": "acquisition.ros",
     "evaluate": "evaluation.scores",
-    "inspect": "robot.inspection",
+    "inspect": "inspection.inspection",
     "load": "data.recordings",
     "load_adapter": "adaptation.adapter_files",
-    "load_healthy": "models.store",
+    "load_healthy": "adaptation.result",
     "load_model": "models.store",
     "maintain": "robot.maintenance",
     "maintain_fleet": "fleet.run",
@@ -168,7 +173,7 @@ _HOMES = {
     "save_model": "models.store",
     "save_npz": "data.recordings",
     "sensitivity": "evaluation.sensitivity",
-    "sign_bundle": "robot.signature",
+    "sign_bundle": "bundle.signing",
     "simulate": "data.simulated_grasps",
     "split": "data.windows",
     "summarise": "data.summary",

@@ -1,9 +1,12 @@
-"""What does each rule of the diagnosis carry? python benchmarks/ablations.py [RULE ...] [-- options of diagnosis.py]
+"""What does each rule of the diagnosis carry? python benchmarks/ablations.py [RULE ...] [-- options
+of diagnosis.py]
 
-Removes one rule at a time from a copy of ``diagnostics``, measures the benchmark with it, and names the rows that are
-worse than with the rule, beyond their noise. Without RULE: all. The options choose arrays, rows and splits:
+Removes one rule at a time from a copy of ``diagnostics``, measures the benchmark with it, and names
+the rows that are worse than with the rule, beyond their noise. Without RULE: all. The options
+choose arrays, rows and splits:
 
-    python benchmarks/ablations.py jumps tempering -- --arrays hand fingertips --rows cells onset --splits 0
+    python benchmarks/ablations.py jumps tempering -- --arrays hand fingertips --rows cells onset
+    --splits 0
 """
 
 from __future__ import annotations
@@ -61,33 +64,53 @@ RULES = {
         "if same or (follows and kept[-1].persists(part, root_near, start, jumped)):",
         "if same:",
     ),
-    "location of the load": ("events/contact_events.py", "return size <= _MIN_AMPLITUDE**2 or", "return True or"),
+    "location of the load": (
+        "events/contact_events.py",
+        "return size <= _MIN_AMPLITUDE**2 or",
+        "return True or",
+    ),
     "release of held loads": (
         "events/contact_events.py",
-        "max(_WEAKEST * largest, _MIN_AMPLITUDE, _LEAST_OF_HELD * float(ahead[0] @ held))",
-        "max(_WEAKEST * largest, _MIN_AMPLITUDE)",
+        "_WEAKEST * largest, _MIN_AMPLITUDE, _LEAST_OF_HELD * float(ahead[0] @ held)",
+        "_WEAKEST * largest, _MIN_AMPLITUDE",
     ),
-    "frames of a release": ("events/contact_events.py", "begin += _releasing_frames(root[begin:], last)", "pass"),
+    "frames of a release": (
+        "events/contact_events.py",
+        "begin += _releasing_frames(root[begin:], last)",
+        "pass",
+    ),
     "late prevalence": (
         "decision/calibration.py",
-        "late, early = scored & began, scored & ~began",
-        "late, early = scored & False, scored",
+        "late = scored & began",
+        "began &= False; late = scored & began",
     ),
-    "discount of few recordings": ("decision/calibration.py", "_HALF_DISCOUNT = 0.5,", "_HALF_DISCOUNT = 0.0,"),
+    "discount of few recordings": (
+        "decision/calibration.py",
+        "_MAX_DISCOUNT = 0.5",
+        "_MAX_DISCOUNT = 0.0",
+    ),
     "nearest false discovery rate": (
         "decision/calibration.py",
         "excess <= np.maximum(shortfall, 0.0)",
         "excess <= 0.0",
     ),
-    "first, rough calibration": ("decision/calibration.py", "for n in stages:", "for n in stages[1:]:"),
+    "first, rough calibration": (
+        "decision/calibration.py",
+        "for n in stages:",
+        "for n in stages[1:]:",
+    ),
     "second line cover": (
         "decision/root_causes.py",
         "if 0 < singles < sum(cause.proven for _, _, cause in causes):",
         "if False:",
     ),
-    "objects beside faults": ("diagnosis.py", "for beside in (False, True):", "for beside in (False,):"),
+    "objects beside faults": (
+        "diagnosis.py",
+        "for beside in (False, True):",
+        "for beside in (False,):",
+    ),
     "half of the samples": ("healthy/cross_fitting.py", "_SAMPLES = 100_000", "_SAMPLES = 50_000"),
-}  # fmt: skip
+}
 
 
 def without(rule: str, folder: Path) -> Path:
@@ -106,7 +129,12 @@ def without(rule: str, folder: Path) -> Path:
 def main() -> int:
     parser = argparse.ArgumentParser(description="What does each rule of the diagnosis carry?")
     parser.add_argument("rules", nargs="*", metavar="RULE", help=f"of: {', '.join(RULES)}")
-    parser.add_argument("--out", type=Path, default=Path("ablations"), help="folder of the counts (default ablations)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("ablations"),
+        help="folder of the counts (default ablations)",
+    )
     given = sys.argv[1:]
     end = given.index("--") if "--" in given else len(given)
     options = parser.parse_args(given[:end])
@@ -117,11 +145,20 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         for rule in dict.fromkeys(["whole", *rules]):
             print(f"== {rule}", flush=True)
-            counts = {name: str(options.out / f"{name.replace(' ', '_')}.jsonl") for name in (rule, "whole")}
+            counts = {
+                name: str(options.out / f"{name.replace(' ', '_')}.jsonl")
+                for name in (rule, "whole")
+            }
             against = [] if rule == "whole" else ["--against", counts["whole"]]
-            command = [sys.executable, str(Path(__file__).with_name("diagnosis.py")), *given[end + 1 :]]
+            command = [
+                sys.executable,
+                str(Path(__file__).with_name("diagnosis.py")),
+                *given[end + 1 :],
+            ]
             environment = {**os.environ, "PYTHONPATH": str(without(rule, Path(folder)))}
-            subprocess.run([*command, "--out", counts[rule], *against], env=environment, check=False)
+            subprocess.run(
+                [*command, "--out", counts[rule], *against], env=environment, check=False
+            )
     return 0
 
 

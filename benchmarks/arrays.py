@@ -1,4 +1,5 @@
-"""The arrays that the benchmark measures: real ones where their recordings are at hand, remade ones, simulated ones."""
+"""The arrays that the benchmark measures: real ones where their recordings are at hand, remade
+ones, simulated ones."""
 
 from __future__ import annotations
 
@@ -18,16 +19,37 @@ from adaptfault.data.simulated_grasps import simulate
 from diagnostics import SensorLayout
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-HAND, FINGERTIPS, SOLES = "sdh2x13x6_grasps36.npz", "icub5x1x12_grasps11.npz", "insole2x33x15.npz"
+HAND = "sdh2x13x6_grasps36.npz"
+FINGERTIPS = "icub5x1x12_grasps11.npz"
+SOLES = "insole2x33x15.npz"
 FABRIC = "fabric4x4_slides7.npz"
 MAIN = ("cells", "onset", "healthy")
 LIFE = ("moving", "proven", "own_reference")
 SKIN = (*MAIN, "lines", "cold", "static")
 EVERY = (
-    "cells", "onset", "dither", "missing", "many", "cold", "reference_faults", "lines", "cut", "address", "healthy",
-    "holds", "untouched", "kind", "calibration", "changing", "gain", "rewired", "replaced", "specimen", "static",
+    "cells",
+    "onset",
+    "dither",
+    "missing",
+    "many",
+    "cold",
+    "reference_faults",
+    "lines",
+    "cut",
+    "address",
+    "healthy",
+    "holds",
+    "untouched",
+    "kind",
+    "calibration",
+    "changing",
+    "gain",
+    "rewired",
+    "replaced",
+    "specimen",
+    "static",
     "transport",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -36,7 +58,8 @@ class Array:
 
     Attributes:
         name: as the table prints it; rows: of it, by name.
-        bench: builds it from split, repeat and number of logs; None where its recordings are absent.
+        bench: builds it from split, repeat and number of logs; None where its recordings are
+            absent.
         logs, repeats: of a full run; quick: logs of a quick one, 0: left out.
         quick_rows: of a quick run.
     """
@@ -78,9 +101,13 @@ def sensor(name: str) -> Callable[[int, int, int], Bench]:
     return bench
 
 
-def simulated(record: Callable[[int, int], Recordings], count: int = 120) -> Callable[[int, int, int], Bench]:
+def simulated(
+    record: Callable[[int, int], Recordings], count: int = 120
+) -> Callable[[int, int, int], Bench]:
     """Return a builder of benches, with recordings of their own for each split and repeat."""
-    return lambda split, repeat, logs: Bench(record(count, 1000 * split + repeat), split, logs, repeat)
+    return lambda split, repeat, logs: Bench(
+        record(count, 1000 * split + repeat), split, logs, repeat
+    )
 
 
 def grasps(layout: SensorLayout) -> Callable[[int, int], Recordings]:
@@ -88,8 +115,10 @@ def grasps(layout: SensorLayout) -> Callable[[int, int], Recordings]:
 
 
 def triangles(rows: int, cols: int) -> SensorLayout:
-    """Return a skin of triangles of 10 cells, 4 of them behind a connector, as of ``rows`` x ``cols`` blocks."""
-    wide, groups = 5 * cols, {}
+    """Return a skin of triangles of 10 cells, 4 of them behind a connector, as of ``rows`` x
+    ``cols`` blocks."""
+    wide = 5 * cols
+    groups = {}
     for r in range(rows):
         for c in range(cols):
             cells = [(2 * r + i) * wide + 5 * c + j for i in range(2) for j in range(5)]
@@ -102,7 +131,9 @@ def triangles(rows: int, cols: int) -> SensorLayout:
 def on_buses(split: int, repeat: int, logs: int) -> Bench:
     """Return the fingertips with their true wiring."""
     recordings = load(DATA / FINGERTIPS).recordings
-    return Bench(replace(recordings, layout=replace(recordings.layout, wiring="bus")), split, logs, repeat)
+    return Bench(
+        replace(recordings, layout=replace(recordings.layout, wiring="bus")), split, logs, repeat
+    )
 
 
 def random_sensor(split: int, repeat: int, logs: int) -> Bench:
@@ -122,10 +153,25 @@ ARRAYS = [
     Array(
         "fingertips",
         (
-            *MAIN, "many", "cold", "reference_faults", "holds", "untouched", "calibration", "rewired", "replaced",
-            "specimen", "static", "transport",
+            *MAIN,
+            "many",
+            "cold",
+            "reference_faults",
+            "holds",
+            "untouched",
+            "calibration",
+            "rewired",
+            "replaced",
+            "specimen",
+            "static",
+            "transport",
         ),
-        real(FINGERTIPS), 60, 2, 40, (*MAIN, "cold"), FINGERTIPS,
+        real(FINGERTIPS),
+        60,
+        2,
+        40,
+        (*MAIN, "cold"),
+        FINGERTIPS,
     ),
     Array("sliding finger", MAIN, slides, 30, 1, 12, MAIN, FABRIC),
     *(
@@ -137,17 +183,37 @@ ARRAYS = [
             ("sliding finger", slides, 30, 9, FABRIC),  # one dead cell a log
         )
     ),
-    Array("fingertips, buses", (*MAIN, "groups"), on_buses, 60, 1, 40, (*MAIN, "groups"), FINGERTIPS),
+    Array(
+        "fingertips, buses", (*MAIN, "groups"), on_buses, 60, 1, 40, (*MAIN, "groups"), FINGERTIPS
+    ),
     Array(
         "soles",
         (
-            *MAIN, "many", "cold", "reference_faults", "lines", "cut", "holds", "untouched", "calibration", "changing",
+            *MAIN,
+            "many",
+            "cold",
+            "reference_faults",
+            "lines",
+            "cut",
+            "holds",
+            "untouched",
+            "calibration",
+            "changing",
             "rewired",
         ),
-        real(SOLES), 30, 2, 12, (*MAIN, "cold"), SOLES,
+        real(SOLES),
+        30,
+        2,
+        12,
+        (*MAIN, "cold"),
+        SOLES,
     ),
     Array("random sensors", MAIN, random_sensor, 10, 20, file=HAND),
-    *(Array(f"hand, {name}", MAIN, sensor(name), 30, file=HAND) for name in (*SENSORS, *DRIFTS) if name != "as it is"),
+    *(
+        Array(f"hand, {name}", MAIN, sensor(name), 30, file=HAND)
+        for name in (*SENSORS, *DRIFTS)
+        if name != "as it is"
+    ),
     *(
         Array(f"fabric, {name}", SKIN, simulated(skin.recordings), 30, 1, 12 * (name == "10 x 10"))
         for name, skin in gestures.SKINS.items()
@@ -158,15 +224,31 @@ ARRAYS = [
     ),
     Array("grasps, 2 x 11 x 10", SKIN, simulated(grasps(SensorLayout.paper())), 30),
     Array(
-        "grasps, 1 x 10 x 10, long logs", ("own_reference",), simulated(grasps(SensorLayout(1, 10, 10))), 10, 1, 4,
+        "grasps, 1 x 10 x 10, long logs",
+        ("own_reference",),
+        simulated(grasps(SensorLayout(1, 10, 10))),
+        10,
+        1,
+        4,
         ("own_reference",),
     ),
     Array(
-        "grasps, 1 x 12 x 12", (*MAIN, "lines", "address", "rewired"), simulated(grasps(SensorLayout(1, 12, 12))), 30
+        "grasps, 1 x 12 x 12",
+        (*MAIN, "lines", "address", "rewired"),
+        simulated(grasps(SensorLayout(1, 12, 12))),
+        30,
     ),
-]  # fmt: skip
+]
 SPEED = [
     Array("hand", ("speed",), real(HAND), 1, 3, 1, ("speed",), HAND),
-    Array("grasps, 2 x 11 x 10", ("speed",), simulated(grasps(SensorLayout.paper()), 42), 1, 3, 1, ("speed",)),
+    Array(
+        "grasps, 2 x 11 x 10",
+        ("speed",),
+        simulated(grasps(SensorLayout.paper()), 42),
+        1,
+        3,
+        1,
+        ("speed",),
+    ),
     Array("grasps, 1 x 64 x 32", ("speed",), simulated(grasps(SensorLayout(1, 64, 32)), 21), 1, 3),
 ]

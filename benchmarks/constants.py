@@ -1,9 +1,10 @@
 """Does the diagnosis depend on its constants? python benchmarks/constants.py [RECORDINGS [LOGS]]
 
-Halves and doubles every number in a module of ``diagnostics``, one at a time, and measures precision and recall with
-16 % of the cells dead. The diagnosis is fitted anew where fitting uses the number; which functions run is recorded to
-tell that. ``--out`` keeps what is measured: a second run continues from there. ``--only conditional_test.P_MIN`` picks
-constants. Without RECORDINGS: the real hand in ``../shared/data``.
+Halves and doubles every number in a module of ``diagnostics``, one at a time, and measures
+precision and recall with 16 % of the cells dead. The diagnosis is fitted anew where fitting uses
+the number; which functions run is recorded to tell that. ``--out`` keeps what is measured: a second
+run continues from there. ``--only conditional_test.P_MIN`` picks constants. Without RECORDINGS: the
+real hand in ``../shared/data``.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ from adaptfault.data.recordings import Recordings, load
 from diagnostics import SelfDiagnosis
 
 Result = TypeVar("Result")
-PRECISION, RECALL, SLACK = 0.995, 0.98, 0.01
+PRECISION = 0.995
+RECALL = 0.98
+SLACK = 0.01
 SHARE = 0.16
-NOT_DIAGNOSING = ("circuit", "injection", "plot", "earlier_versions")  # public tools and the injector
+NOT_DIAGNOSING = ("circuit", "injection", "plot")  # public tools and the injector
 COUNTS = ("FEATURES", "N_FEATURES", "_KINDS")  # of what there is: nobody chose them
 
 
@@ -82,13 +85,25 @@ class Measured:
             return "FAILS"
         if self.precision >= PRECISION and self.recall >= RECALL:
             return "holds"
-        return "near" if self.precision >= PRECISION - SLACK and self.recall >= RECALL - SLACK else "BREAKS"
+        return (
+            "near"
+            if self.precision >= PRECISION - SLACK and self.recall >= RECALL - SLACK
+            else "BREAKS"
+        )
 
 
 def modules() -> list[ModuleType]:
     """Return those of `diagnostics` that find faults."""
-    names = [info.name for info in pkgutil.walk_packages(diagnostics.__path__, "diagnostics.") if not info.ispkg]
-    return [importlib.import_module(name) for name in names if name.rpartition(".")[2] not in NOT_DIAGNOSING]
+    names = [
+        info.name
+        for info in pkgutil.walk_packages(diagnostics.__path__, "diagnostics.")
+        if not info.ispkg
+    ]
+    return [
+        importlib.import_module(name)
+        for name in names
+        if name.rpartition(".")[2] not in NOT_DIAGNOSING
+    ]
 
 
 def constants() -> Iterator[Constant]:
@@ -105,7 +120,8 @@ def constants() -> Iterator[Constant]:
 
 
 def mentioned(work: Callable[[], Result]) -> tuple[Result, set[tuple[str, str]]]:
-    """Do work; return its result, and module and name of what the functions of `diagnostics` that ran mention."""
+    """Do work; return its result, and module and name of what the functions of `diagnostics` that
+    ran mention."""
     found: set[tuple[str, str]] = set()
     codes = set()
 
@@ -153,10 +169,18 @@ def show(row: Measured) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Does the diagnosis hang on its constants?")
-    parser.add_argument("recordings", nargs="?", help="fault-free recordings; without: simulated grasps")
-    parser.add_argument("logs", nargs="?", type=int, default=20, help="logs for each constant (default 20)")
+    parser.add_argument(
+        "recordings", nargs="?", help="fault-free recordings; without: simulated grasps"
+    )
+    parser.add_argument(
+        "logs", nargs="?", type=int, default=20, help="logs for each constant (default 20)"
+    )
     parser.add_argument("--split", type=int, default=0, help="seed of the halves (default 0)")
-    parser.add_argument("--out", type=Path, help="JSON lines of what is measured; what it holds is not measured again")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="JSON lines of what is measured; what it holds is not measured again",
+    )
     parser.add_argument("--jobs", type=int, default=-1, help="processes (default: one a core)")
     parser.add_argument("--only", nargs="+", metavar="MODULE.NAME", help="constants")
     options = parser.parse_args()
@@ -178,7 +202,8 @@ def main() -> None:
     left = [c for c in used if str(c) not in done]
     with parallel_config(backend="loky", inner_max_num_threads=1):
         for row in Parallel(n_jobs=options.jobs, return_as="generator_unordered")(
-            delayed(changed_row)(c, *job, fitted if met_fitting.isdisjoint(c.places) else None) for c in left
+            delayed(changed_row)(c, *job, fitted if met_fitting.isdisjoint(c.places) else None)
+            for c in left
         ):
             show(row)
             if kept:

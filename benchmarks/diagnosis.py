@@ -1,10 +1,12 @@
-"""Measures the diagnosis on all arrays and prints one table: python benchmarks/diagnosis.py [--quick] [--against FILE]
+"""Measures the diagnosis on all arrays and prints one table: python benchmarks/diagnosis.py
+[--quick] [--against FILE]
 
-Every row is measured several times, with another half of the recordings as reference, other random draws in the fit,
-and other logs and faults. ``+-`` is the standard error of the mean over these repeats, and no less than that of the
-cases counted. ``--against FILE`` compares with an earlier table, repeat by repeat, and names the rows that got worse by
-more than twice the noise; the exit code is then 1. ``--out FILE`` keeps the counts (JSON lines); a run that was cut off
-goes on where it stopped. Real arrays are read from ``../shared/data`` and left out where that is absent.
+Every row is measured several times, with another half of the recordings as reference, other random
+draws in the fit, and other logs and faults. ``+-`` is the standard error of the mean over these
+repeats, and no less than that of the cases counted. ``--against FILE`` compares with an earlier
+table, repeat by repeat, and names the rows that got worse by more than twice the noise; the exit
+code is then 1. ``--out FILE`` keeps the counts (JSON lines); a run that was cut off goes on where
+it stopped. Real arrays are read from ``../shared/data`` and left out where that is absent.
 
 The method is chosen on splits 0 and 1. Splits 2 and 3 are for the end: ``--splits 2 3``.
 """
@@ -31,7 +33,8 @@ Samples = dict[tuple[int, int], dict]  # by split and repeat
 def measured(array: Array, split: int, repeat: int, logs: int, rows: tuple[str, ...]) -> list[dict]:
     """Return the counts of one array, one half of its recordings and one draw of faults."""
     bench = array.bench(split, repeat, logs)
-    found, about = [], {"array": array.name, "split": split, "repeat": repeat, "logs": logs}
+    found = []
+    about = {"array": array.name, "split": split, "repeat": repeat, "logs": logs}
     for name in rows:
         began = time.perf_counter()
         counts = list(ROWS[name](bench))
@@ -56,10 +59,13 @@ def by_row(counts: list[dict]) -> dict[Key, Samples]:
 
 def value_and_noise(samples: Samples) -> tuple[float, float]:
     """Return the pooled ratio and its standard error."""
-    part, of = (np.array([s[name] for s in samples.values()], dtype=float) for name in ("part", "of"))
+    part, of = (
+        np.array([s[name] for s in samples.values()], dtype=float) for name in ("part", "of")
+    )
     if not of.sum():
         return float("nan"), float("nan")
-    value, some = part.sum() / of.sum(), of > 0
+    value = part.sum() / of.sum()
+    some = of > 0
     each = part[some] / of[some]
     between = float(each.std(ddof=1) / np.sqrt(len(each))) if len(each) > 1 else 0.0
     unit = next(iter(samples.values()))["unit"]
@@ -81,18 +87,31 @@ def shown(value: float, unit: str) -> str:
 
 def table(counts: list[dict], against: list[dict] | None) -> list[str]:
     """Print the table; return the rows that got worse beyond their noise."""
-    before, worse = by_row(against or []), []
-    print(f"{'':24}{'':55}{'value':>22}{'+-':>9}" + (f"{'before':>22}{'change':>10}" if against else ""))
+    before = by_row(against or [])
+    worse = []
+    print(
+        f"{'':24}{'':55}{'value':>22}{'+-':>9}"
+        + (f"{'before':>22}{'change':>10}" if against else "")
+    )
     for key, samples in by_row(counts).items():
         (value, noise), first = value_and_noise(samples), next(iter(samples.values()))
         line = f"{key[0]:24}{key[1]:55}{shown(value, first['unit']):>22}{noise:9.4f}"
-        both = {k: s for k, s in before.get(key, {}).items() if k in samples and samples[k]["logs"] == s["logs"]}
+        both = {
+            k: s
+            for k, s in before.get(key, {}).items()
+            if k in samples and samples[k]["logs"] == s["logs"]
+        }
         if both:
-            (now, _), (then, spread) = value_and_noise({k: samples[k] for k in both}), value_and_noise(both)
+            (now, _), (then, spread) = (
+                value_and_noise({k: samples[k] for k in both}),
+                value_and_noise(both),
+            )
             change = (now - then) * (1 if first["higher"] else -1)
             line += f"{shown(then, first['unit']):>22}{now - then:+10.4f}"
             if change < -2 * max(spread, noise):
-                worse.append(f"{key[0]}, {key[1]}: {then:.4f} -> {now:.4f} (noise {max(spread, noise):.4f})")
+                worse.append(
+                    f"{key[0]}, {key[1]}: {then:.4f} -> {now:.4f} (noise {max(spread, noise):.4f})"
+                )
                 line += "  WORSE"
         print(line)
     return worse
@@ -100,21 +119,33 @@ def table(counts: list[dict], against: list[dict] | None) -> list[str]:
 
 def chosen(name: str, wanted: list[str]) -> bool:
     """Return whether an array is named, or is one of a kind: ``fabric`` for ``fabric, 16 x 16``."""
-    return name in wanted or (name.split(",")[0] in wanted and name.split(",")[0] not in {a.name for a in ARRAYS})
+    return name in wanted or (
+        name.split(",")[0] in wanted and name.split(",")[0] not in {a.name for a in ARRAYS}
+    )
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(
         description="Measures the diagnosis on all arrays", epilog=f"rows: {', '.join(ROWS)}"
     )
-    parser.add_argument("--quick", action="store_true", help="the main rows of a few arrays: minutes")
-    parser.add_argument("--splits", type=int, nargs="+", default=[0, 1], help="halves of the recordings (default 0 1)")
+    parser.add_argument(
+        "--quick", action="store_true", help="the main rows of a few arrays: minutes"
+    )
+    parser.add_argument(
+        "--splits",
+        type=int,
+        nargs="+",
+        default=[0, 1],
+        help="halves of the recordings (default 0 1)",
+    )
     arrays_help = "only these arrays, or these kinds: fabric, posture"
     parser.add_argument("--arrays", nargs="+", metavar="TEXT", help=arrays_help)
     parser.add_argument("--rows", nargs="+", choices=ROWS, metavar="ROW", help="only these rows")
     parser.add_argument("--speed", action="store_true", help="only speed, in one process")
     parser.add_argument("--jobs", type=int, default=-1, help="processes (default: one a core)")
-    parser.add_argument("--out", type=Path, help="JSON lines of the counts; a run that was cut off goes on there")
+    parser.add_argument(
+        "--out", type=Path, help="JSON lines of the counts; a run that was cut off goes on there"
+    )
     parser.add_argument("--against", type=Path, help="counts of an earlier version")
     options = parser.parse_args()
     kept = (
@@ -122,8 +153,11 @@ def main() -> int:
         if options.out and options.out.exists()
         else []
     )
-    done = {(c["array"], c["split"], c["repeat"], c["logs"], c["row"].startswith("fit")) for c in kept}
-    jobs, absent = [], []
+    done = {
+        (c["array"], c["split"], c["repeat"], c["logs"], c["row"].startswith("fit")) for c in kept
+    }
+    jobs = []
+    absent = []
     for array in SPEED if options.speed else ARRAYS:
         logs, rows = (array.quick, array.quick_rows) if options.quick else (array.logs, array.rows)
         rows = tuple(row for row in rows if not options.rows or row in options.rows)
@@ -138,12 +172,21 @@ def main() -> int:
                     jobs.append((array, split, repeat, logs, rows))
     with parallel_config(backend="loky", inner_max_num_threads=1):
         work = Parallel(n_jobs=1 if options.speed else options.jobs, return_as="generator")
-        for counts in tqdm(work(delayed(measured)(*job) for job in jobs), total=len(jobs), disable=None, unit="array"):
+        for counts in tqdm(
+            work(delayed(measured)(*job) for job in jobs),
+            total=len(jobs),
+            disable=None,
+            unit="array",
+        ):
             kept += counts
             if options.out:
                 with options.out.open("a") as file:
                     file.writelines(json.dumps(count) + "\n" for count in counts)
-    against = [json.loads(line) for line in options.against.read_text().splitlines()] if options.against else None
+    against = (
+        [json.loads(line) for line in options.against.read_text().splitlines()]
+        if options.against
+        else None
+    )
     worse = table(kept, against)
     for text in absent:
         print(f"left out, no recordings at hand: {text}")

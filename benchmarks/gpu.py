@@ -1,4 +1,5 @@
-"""Training steps and predictions of the paper's network on a GPU and on the CPU, and how far the outputs differ.
+"""Training steps and predictions of the paper's network on a GPU and on the CPU, and how far the
+outputs differ.
 
 Run: python benchmarks/gpu.py
 """
@@ -16,7 +17,8 @@ from adaptfault.models.network import TactileTransformer, logits_of
 from adaptfault.models.training import Optimisation
 from diagnostics import SensorLayout
 
-CLASSES, WARM_UP = 7, 3
+CLASSES = 7
+WARM_UP = 3
 
 
 def network(device: str) -> TactileTransformer:
@@ -26,8 +28,10 @@ def network(device: str) -> TactileTransformer:
 
 def step_ms(device: str, x: np.ndarray, y: np.ndarray, steps: int) -> float:
     """Return the median time of a training step, that of the first ones left out."""
-    model, taken = network(device).train(), []
-    windows, labels = torch.from_numpy(x).to(device), torch.from_numpy(y).to(device)
+    model = network(device).train()
+    taken = []
+    windows = torch.from_numpy(x).to(device)
+    labels = torch.from_numpy(y).to(device)
     run = Optimisation(model, 1e-4, 0.995)
     for _ in range(WARM_UP + steps):
         began = time.perf_counter()
@@ -44,13 +48,18 @@ def main() -> None:
     y = rng.integers(0, CLASSES, len(x))
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     print(
-        f"torch {torch.__version__}, {torch.get_num_threads()} threads", *map(torch.cuda.get_device_name, devices[1:])
+        f"torch {torch.__version__}, {torch.get_num_threads()} threads",
+        *map(torch.cuda.get_device_name, devices[1:]),
     )
     logits = []
     for device in devices:
         for size in (32, 256):
-            print(f"{device}: a step of {size} windows {step_ms(device, x[:size], y[:size], 20):.2f} ms")
-        model, taken = network(device).eval(), []
+            print(
+                f"{device}: a step of {size} windows"
+                f" {step_ms(device, x[:size], y[:size], 20):.2f} ms"
+            )
+        model = network(device).eval()
+        taken = []
         windows = x if device == "cpu" else np.concatenate([x] * 8)
         for _ in range(WARM_UP):
             began = time.perf_counter()
@@ -58,7 +67,8 @@ def main() -> None:
             taken.append(1000 * (time.perf_counter() - began))
         print(f"{device}: prediction of {len(windows)} windows {min(taken):.1f} ms")
     print(
-        f"logits differ by at most {np.abs(logits[-1] - logits[0]).max():.1e}; their deviation is {logits[0].std():.2f}"
+        f"logits differ by at most {np.abs(logits[-1] - logits[0]).max():.1e}; their deviation is"
+        f" {logits[0].std():.2f}"
     )
 
 

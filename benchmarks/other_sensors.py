@@ -1,7 +1,7 @@
 """The recordings of one array, remade as another sensor would have read them.
 
-A *sensor* differs both when the reference is recorded and when the log is; a *drift* came in between: the reference is
-the plain one.
+A *sensor* differs both when the reference is recorded and when the log is; a *drift* came in
+between: the reference is the plain one.
 """
 
 from __future__ import annotations
@@ -14,14 +14,17 @@ import numpy as np
 from adaptfault.data.recordings import Recordings
 
 Frames = np.ndarray
-Change = Callable[[Frames, np.random.Generator], Frames]  # of readings as a share of full scale, 0..1
+# of readings as a share of full scale, 0..1
+Change = Callable[[Frames, np.random.Generator], Frames]
 
 
 def read_with(noise: float = 0.0, rest: float = 0.0, steps: int = 4095) -> Change:
-    """Read with noise, cells resting at 0.5 to 1.5 times ``rest``, and a converter of so many steps."""
+    """Read with noise, cells resting at 0.5 to 1.5 times ``rest``, and a converter of so many
+    steps."""
 
     def change(frames: Frames, rng: np.random.Generator) -> Frames:
-        offset = rest * np.random.default_rng(0).uniform(0.5, 1.5, frames.shape[1])  # the same in all recordings
+        # the same in all recordings
+        offset = rest * np.random.default_rng(0).uniform(0.5, 1.5, frames.shape[1])
         read = frames * (1 - 1.5 * rest) + offset + noise * rng.standard_normal(frames.shape)
         return np.clip(np.round(read * steps) / steps, 0, 1)
 
@@ -29,14 +32,16 @@ def read_with(noise: float = 0.0, rest: float = 0.0, steps: int = 4095) -> Chang
 
 
 def of_each(spread: float, frames: Frames) -> Frames:
-    return np.random.default_rng(1).uniform(0, spread, frames.shape[1])  # the same in all recordings
+    # the same in all recordings
+    return np.random.default_rng(1).uniform(0, spread, frames.shape[1])
 
 
 def one_supply(moves: float = 0.0) -> Change:
-    """Read two pads on one supply, which rest at 26 % and 5 %, with noise of 0.2 % and a converter of 10 bits.
+    """Read two pads on one supply, which rest at 26 % and 5 %, with noise of 0.2 % and a converter
+    of 10 bits.
 
-    The rest of a pad falls by up to 0.6 % while the other one is loaded, and lies elsewhere in each recording, with a
-    standard deviation of ``moves``.
+    The rest of a pad falls by up to 0.6 % while the other one is loaded, and lies elsewhere in each
+    recording, with a standard deviation of ``moves``.
     """
 
     def change(frames: Frames, rng: np.random.Generator) -> Frames:
@@ -44,7 +49,9 @@ def one_supply(moves: float = 0.0) -> Change:
         drawn = load.sum(axis=2)
         share = np.minimum(drawn / (np.quantile(drawn, 0.95) + 1e-3), 1)
         rest = np.array([0.26, 0.05]) + moves * rng.standard_normal(2) - 0.006 * share[:, ::-1]
-        read = (load + rest[:, :, None]).reshape(frames.shape) + 0.002 * rng.standard_normal(frames.shape)
+        read = (load + rest[:, :, None]).reshape(frames.shape) + 0.002 * rng.standard_normal(
+            frames.shape
+        )
         return np.clip(np.round(read * 1023) / 1023, 0, 1)
 
     return change
@@ -77,6 +84,9 @@ DRIFTS: dict[str, Change] = {
 
 def remade(recordings: Recordings, change: Change) -> Recordings:
     """Return what another sensor, of full scale 1, would have recorded."""
-    rng, full_scale = np.random.default_rng(0), recordings.layout.full_scale
-    frames = tuple(change(np.asarray(f, dtype=np.float64) / full_scale, rng) for f in recordings.frames)
+    rng = np.random.default_rng(0)
+    full_scale = recordings.layout.full_scale
+    frames = tuple(
+        change(np.asarray(f, dtype=np.float64) / full_scale, rng) for f in recordings.frames
+    )
     return replace(recordings, frames=frames, layout=replace(recordings.layout, full_scale=1.0))

@@ -1,8 +1,9 @@
 """Sensors drawn at random: what the diagnosis does on arrays for which no rule was chosen.
 
-A number determines the sensor: real recordings remade (other noise, baselines, gains, converter steps, power law, lag,
-frame rate, crosstalk), simulated grasps on pads of any size, and fabric skins, seats and mats of any size and noise.
-The number of recordings is drawn too, from few to many.
+A number determines the sensor: real recordings remade (other noise, baselines, gains, converter
+steps, power law, lag, frame rate, crosstalk), simulated grasps on pads of any size, and fabric
+skins, seats and mats of any size and noise. The number of recordings is drawn too, from few to
+many.
 """
 
 from __future__ import annotations
@@ -25,7 +26,12 @@ FEWEST_FRAMES = 20  # of a recording at a lower frame rate
 def draw(seed: int, real: list[Callable[[], Recordings]]) -> Recordings:
     """Return the recordings of sensor ``seed``; ``real`` recordings are remade."""
     rng = np.random.default_rng(seed)
-    kinds = fabric, posture, grasps, *(lambda rng, seed, load=load: some(load(), rng) for load in real)
+    kinds = (
+        fabric,
+        posture,
+        grasps,
+        *(lambda rng, seed, load=load: some(load(), rng) for load in real),
+    )
     kind = int(rng.integers(len(kinds)))
     recordings = kinds[kind](rng, seed)
     # Fabric skins and seats have a noise and a baseline of their own.
@@ -63,9 +69,12 @@ def posture(rng: np.random.Generator, seed: int) -> Recordings:
 
 def grasps(rng: np.random.Generator, seed: int) -> Recordings:
     pads, rows, cols = rng.integers((1, 3, 3), (4, 14, 14)).tolist()
-    count, frames = int(rng.integers(24, 160)), int(rng.choice([40, 60, 100]))
+    count = int(rng.integers(24, 160))
+    frames = int(rng.choice([40, 60, 100]))
     layout = SensorLayout(pads, rows, cols)
-    return simulate(-(-count // len(CLASS_NAMES)), layout, n_frames=frames, seed=seed, sensor_seed=seed)
+    return simulate(
+        -(-count // len(CLASS_NAMES)), layout, n_frames=frames, seed=seed, sensor_seed=seed
+    )
 
 
 def some(recordings: Recordings, rng: np.random.Generator) -> Recordings:
@@ -76,11 +85,14 @@ def some(recordings: Recordings, rng: np.random.Generator) -> Recordings:
 
 def reading(rng: np.random.Generator, n_cells: int) -> Change:
     """Return how a sensor drawn at random reads, of which ``rng`` draws the noise too."""
-    noise, steps = rng.choice([0.0, 0.001, 0.004, 0.01]), rng.choice([100, 255, 1023, 4095])
+    noise = rng.choice([0.0, 0.001, 0.004, 0.01])
+    steps = rng.choice([100, 255, 1023, 4095])
     rest = rng.choice([0.0, 0.0, 0.03, 0.1]) * rng.uniform(0.5, 1.5, n_cells)
     gain = 1 + rng.choice([0.0, 0.3, 0.6]) * rng.uniform(-1, 1, n_cells)
-    power, lag = rng.choice([0.5, 1.0, 1.0, 1.5]), rng.choice([0.0, 0.0, 0.5])
-    wander, crosstalk = rng.choice([0.0, 0.0, 0.01]), rng.choice([0.0, 0.0, 0.05])
+    power = rng.choice([0.5, 1.0, 1.0, 1.5])
+    lag = rng.choice([0.0, 0.0, 0.5])
+    wander = rng.choice([0.0, 0.0, 0.01])
+    crosstalk = rng.choice([0.0, 0.0, 0.05])
     every = int(rng.choice([1, 1, 2, 3]))
 
     def read(frames: Frames, _: np.random.Generator) -> Frames:
@@ -89,7 +101,12 @@ def reading(rng: np.random.Generator, n_cells: int) -> Change:
             load = load[::every]
         load = np.maximum(lfilter([1 - lag], [1, -lag], load, axis=0), 0) ** power * gain
         load += crosstalk * load.mean(axis=1, keepdims=True)
-        value = load * (1 - 1.5 * rest.max()) + rest + rng.uniform(0, wander) + noise * rng.standard_normal(load.shape)
+        value = (
+            load * (1 - 1.5 * rest.max())
+            + rest
+            + rng.uniform(0, wander)
+            + noise * rng.standard_normal(load.shape)
+        )
         return np.clip(np.round(value * steps) / steps, 0, 1)
 
     return read

@@ -1,8 +1,10 @@
-"""The rows of the benchmark: each injects known faults into healthy logs and counts what the diagnosis says of them.
+"""The rows of the benchmark: each injects known faults into healthy logs and counts what the
+diagnosis says of them.
 
-Half of an array's recordings are the reference, from which :class:`SelfDiagnosis` learns what healthy looks like. A log
-is six recordings of the other half. A faulty cell is *testable* if its true reading differs from what it reads by more
-than 5 % of full scale in at least 10 frames of the log.
+Half of an array's recordings are the reference, from which :class:`SelfDiagnosis` learns what
+healthy looks like. A log is six recordings of the other half. A faulty cell is *testable* if its
+true reading differs from what it reads by more than 5 % of full scale in at least 10 frames of the
+log.
 """
 
 from __future__ import annotations
@@ -31,20 +33,28 @@ from diagnostics import (
     line_fault,
     lose_frames,
 )
-from diagnostics.evidence.recalibration import find_recalibration
-from diagnostics.evidence.sensor_change import pad_change
+from diagnostics.sensor.recalibration import find_recalibration
+from diagnostics.sensor.sensor_change import pad_change
 
 Log = list[np.ndarray]
 STUCK_KINDS = ("open", "short", "stuck")
-VISIBLE, TESTABLE = 0.05, 10  # of full scale; frames
-HELD, WINDOW = 300, 50  # frames of a static hold; of a window in which a cell can raise a false alarm
+# of full scale; frames
+VISIBLE = 0.05
+TESTABLE = 10
+# frames of a static hold; of a window in which a cell can raise a false alarm
+HELD = 300
+WINDOW = 50
 REPEATED = 100  # frames of a frozen stream, beyond the longest repetition that still counts as idle
 CHANGING = (FaultKind.INTERMITTENT, FaultKind.NOISY, FaultKind.DRIFT)
-GAINS, FADED = (0.2, 0.35, 0.5), 0.1  # times the load; what is left at the end
+# times the load; what is left at the end
+GAINS = (0.2, 0.35, 0.5)
+FADED = 0.1
 UNDER = 20  # recordings of a log in which an object lies still
 SPECIMEN = 48  # recordings from which a new specimen is learned
 REPLACED = 12  # recordings with a new specimen of a pad
-LONG, LOADED = 30, 8  # recordings of a log that shows a gain; in so many of them the cell is loaded
+# recordings of a log that shows a gain; in so many of them the cell is loaded
+LONG = 30
+LOADED = 8
 IN_USE = 40  # recordings of a log in which dead cells move
 MOVING_SHARE = 0.08  # share of its cells that are dead
 USED = 3  # recordings that load a cell: then the log tests it
@@ -54,7 +64,8 @@ DEAD_BEFORE = 0.04  # share of the cells that were dead when the reference was r
 
 @dataclass(frozen=True)
 class Count:
-    """One figure: ``of`` cases, ``part`` of them; ``unit``: how the ratio reads; ``higher``: whether more is better."""
+    """One figure: ``of`` cases, ``part`` of them; ``unit``: how the ratio reads; ``higher``:
+    whether more is better."""
 
     row: str
     part: float
@@ -73,18 +84,27 @@ class Tally:
     hit: int = 0
     right_kind: int = 0
     objects: int = 0  # static loads in logs without one
-    late: list[int] = field(default_factory=list)  # observable frames between the true and the reported onset
+    # observable frames between the true and the reported onset
+    late: list[int] = field(default_factory=list)
     probability: list[np.ndarray] = field(default_factory=list)
     dead: list[np.ndarray] = field(default_factory=list)
 
-    def add(self, log: Log, seen: Log, faults: Sequence[Fault], diagnosis: Diagnosis, start: int) -> None:
-        """Count one log: true readings, readings with the faults, and the diagnosis; ``start``: the onset."""
-        layout, found = diagnosis.layout, diagnosis.fault_set
-        before, after = np.concatenate(log), np.concatenate(seen)
+    def add(
+        self, log: Log, seen: Log, faults: Sequence[Fault], diagnosis: Diagnosis, start: int
+    ) -> None:
+        """Count one log: true readings, readings with the faults, and the diagnosis; ``start``: the
+        onset."""
+        layout = diagnosis.layout
+        found = diagnosis.fault_set
+        before = np.concatenate(log)
+        after = np.concatenate(seen)
         can = set(np.flatnonzero(differs(before, after, layout).sum(axis=0) >= TESTABLE).tolist())
         kinds = kind_of_cells(faults)
         told = {cell: fault for fault in diagnosis.faults for cell in fault.cells}
-        self.true, self.false = self.true + len(found & kinds.keys()), self.false + len(found - kinds.keys())
+        self.true, self.false = (
+            self.true + len(found & kinds.keys()),
+            self.false + len(found - kinds.keys()),
+        )
         self.testable, self.hit = self.testable + len(can), self.hit + len(found & can)
         self.objects += len(diagnosis.static_loads)
         self.right_kind += sum(kinds.get(cell) == fault.kind for cell, fault in told.items())
@@ -106,9 +126,11 @@ class Bench:
     """The recordings of one array, dealt into reference and rest.
 
     Attributes:
-        split: which half is the reference; repeat: shuffles the reference and draws other logs and faults.
+        split: which half is the reference; repeat: shuffles the reference and draws other logs and
+            faults.
         count: logs of a row.
-        trained: recordings that the diagnosis learns from in place of ``recordings``: before a drift.
+        trained: recordings that the diagnosis learns from in place of ``recordings``: before a
+            drift.
     """
 
     recordings: Recordings
@@ -121,7 +143,8 @@ class Bench:
         self.layout = self.recordings.layout
         order = np.random.default_rng(self.split).permutation(len(self.recordings))
         half = len(order) // 2
-        self.reference, self.rest = order[:half], order[half:]
+        self.reference = order[:half]
+        self.rest = order[half:]
         if self.repeat:
             np.random.default_rng(self.repeat).shuffle(self.reference)
         self.case = cache(self._case)
@@ -143,7 +166,11 @@ class Bench:
         for seed in range(10_000 * self.repeat, 10_000 * self.repeat + self.count):
             rng = np.random.default_rng(seed)
             drawn = rng.choice(self.rest, min(length, len(self.rest)), replace=False)
-            yield seed, [np.asarray(self.recordings.frames[i], dtype=np.float64) for i in drawn], rng
+            yield (
+                seed,
+                [np.asarray(self.recordings.frames[i], dtype=np.float64) for i in drawn],
+                rng,
+            )
 
     def _case(
         self,
@@ -155,30 +182,47 @@ class Bench:
         cold: bool = False,
         length: int = 6,
     ) -> Tally:
-        tally, diagnoser = Tally(), SelfDiagnosis(self.layout) if cold else self.fitted
+        tally = Tally()
+        diagnoser = SelfDiagnosis(self.layout) if cold else self.fitted
         for seed, log, rng in self.logs(length):
             faults = draw_faults(self.layout, share, kinds, rng)
             seen = list(broken(log, faults, self.layout, onset, dither, seed))
             if missing:
-                seen = [np.where(rng.random(frames.shape) < missing, np.nan, frames) for frames in seen]
-            tally.add(log, seen, faults, diagnoser.diagnose(seen), round(onset * sum(map(len, log))))
+                seen = [
+                    np.where(rng.random(frames.shape) < missing, np.nan, frames) for frames in seen
+                ]
+            tally.add(
+                log, seen, faults, diagnoser.diagnose(seen), round(onset * sum(map(len, log)))
+            )
         return tally
 
 
-def draw_faults(layout: SensorLayout, share: float, kinds: tuple[str, ...], rng: np.random.Generator) -> list[Fault]:
+def draw_faults(
+    layout: SensorLayout, share: float, kinds: tuple[str, ...], rng: np.random.Generator
+) -> list[Fault]:
     present = np.flatnonzero(layout.present)
     cells = rng.choice(present, round(share * len(present)), replace=False)
     return [
-        Fault(kind, (int(cell),), value=rng.uniform(0.1, 0.9) * layout.full_scale if kind == "stuck" else None)
-        for cell, kind in zip(cells, rng.choice([FaultKind(k) for k in kinds], len(cells)), strict=True)
+        Fault(
+            kind,
+            (int(cell),),
+            value=rng.uniform(0.1, 0.9) * layout.full_scale if kind == "stuck" else None,
+        )
+        for cell, kind in zip(
+            cells, rng.choice([FaultKind(k) for k in kinds], len(cells)), strict=True
+        )
     ]
 
 
-def broken(log: Log, faults: list[Fault], layout: SensorLayout, onset: float, dither: float, seed: int):
+def broken(
+    log: Log, faults: list[Fault], layout: SensorLayout, onset: float, dither: float, seed: int
+):
     """Yield the recordings of a log that breaks after a share ``onset`` of its frames."""
     start = round(onset * sum(map(len, log)))
     for i, frames in enumerate(log):
-        here = [Fault(f.kind, f.cells, line=f.line, value=f.value, onset=max(0, start)) for f in faults]
+        here = [
+            Fault(f.kind, f.cells, line=f.line, value=f.value, onset=max(0, start)) for f in faults
+        ]
         yield inject(frames, here, layout, seed=1000 * seed + i, dither=dither)
         start -= len(frames)
 
@@ -224,49 +268,85 @@ def many(bench: Bench) -> Iterator[Count]:
 def cold(bench: Bench) -> Iterator[Count]:
     """Without a reference."""
     yield from bench.case(0.16, cold=True).counts("no reference, 16 % dead")
-    diagnoser, false, windows = SelfDiagnosis(bench.layout), 0, 0
+    diagnoser = SelfDiagnosis(bench.layout)
+    false = 0
+    windows = 0
     for _, log, _ in bench.logs():
-        false, windows = false + len(diagnoser.diagnose(log).fault_set), windows + windows_of(log, bench.layout)
-    yield Count("no reference, healthy: false alarms", 1e6 * false, windows, "in 1e6 windows", higher=False)
+        false = false + len(diagnoser.diagnose(log).fault_set)
+        windows = windows + windows_of(log, bench.layout)
+    yield Count(
+        "no reference, healthy: false alarms", 1e6 * false, windows, "in 1e6 windows", higher=False
+    )
 
 
 def own_reference(bench: Bench) -> Iterator[Count]:
     """Long logs without a reference: dead from the start, from some frame on, and healthy."""
-    for onset, since in ((0.0, ""), (0.3, " from 30 % of the log on"), (0.6, " from 60 % of the log on")):
+    for onset, since in (
+        (0.0, ""),
+        (0.3, " from 30 % of the log on"),
+        (0.6, " from 60 % of the log on"),
+    ):
         tally = bench.case(MOVING_SHARE, onset, cold=True, length=IN_USE)
         yield from tally.counts(f"no reference, 40 recordings, 8 % dead{since}")
     diagnoser = SelfDiagnosis(bench.layout)
     blamed = sum(len(diagnoser.diagnose(log).fault_set) for _, log, _ in bench.logs(IN_USE))
-    yield Count("no reference, 40 recordings, healthy: cells blamed in a log", blamed, bench.count, higher=False)
+    yield Count(
+        "no reference, 40 recordings, healthy: cells blamed in a log",
+        blamed,
+        bench.count,
+        higher=False,
+    )
 
 
 def reference_faults(bench: Bench) -> Iterator[Count]:
     """Cells that were dead already when the reference was recorded."""
-    layout, rng = bench.layout, np.random.default_rng(1000 + bench.repeat)
+    layout = bench.layout
+    rng = np.random.default_rng(1000 + bench.repeat)
     faults = draw_faults(layout, DEAD_BEFORE, STUCK_KINDS, rng)
     cells = [cell for fault in faults for cell in fault.cells]
     frames = [np.asarray(bench.recordings.frames[i], dtype=np.float64) for i in bench.reference]
-    fitted = SelfDiagnosis(layout).fit([inject(f, faults, layout, seed=i) for i, f in enumerate(frames)])
-    hidden = differs(np.concatenate(frames), inject(np.concatenate(frames), faults, layout), layout).sum(axis=0)
+    fitted = SelfDiagnosis(layout).fit(
+        [inject(f, faults, layout, seed=i) for i, f in enumerate(frames)]
+    )
+    hidden = differs(
+        np.concatenate(frames), inject(np.concatenate(frames), faults, layout), layout
+    ).sum(axis=0)
     testable = [cell for cell in cells if hidden[cell] >= TESTABLE]
     assert fitted.reference_ is not None
     known = np.flatnonzero(fitted.reference_.dead > 0)
-    yield Count("4 % dead in the reference: found", len(np.intersect1d(known, testable)), len(testable))
+    yield Count(
+        "4 % dead in the reference: found", len(np.intersect1d(known, testable)), len(testable)
+    )
     false = true = windows = 0
     for seed, log, _ in bench.logs():
         seen = list(broken(log, faults, layout, 0.0, 0.0, seed))
         found = fitted.diagnose(seen).fault_set
-        false, true = false + len(found - set(cells)), true + len(found & set(cells))
+        false = false + len(found - set(cells))
+        true = true + len(found & set(cells))
         windows += windows_of(log, layout)
-    yield Count("4 % dead in the reference: false alarms", 1e6 * false, windows, "in 1e6 windows", higher=False)
+    yield Count(
+        "4 % dead in the reference: false alarms",
+        1e6 * false,
+        windows,
+        "in 1e6 windows",
+        higher=False,
+    )
 
 
 def wires(layout: SensorLayout) -> list[Line]:
-    return [line for line in layout.lines if line.kind in ("row", "column") and len(layout.cells_on(line)) > 2]
+    return [
+        line
+        for line in layout.lines
+        if line.kind in ("row", "column") and len(layout.cells_on(line)) > 2
+    ]
 
 
 def lines(bench: Bench) -> Iterator[Count]:
-    layout, exact, held, invented, doubtful = bench.layout, [], [], 0, 0
+    layout = bench.layout
+    exact = []
+    held = []
+    invented = 0
+    doubtful = 0
     for seed, log, rng in bench.logs():
         choice = wires(layout)
         while True:
@@ -274,27 +354,45 @@ def lines(bench: Bench) -> Iterator[Count]:
             if a.pad != b.pad or a.kind == b.kind:  # they do not cross
                 break
         kinds = rng.choice([FaultKind.OPEN, FaultKind.SHORT], 2)
-        on_lines = [line_fault(layout, line, FaultKind(kind)) for line, kind in zip((a, b), kinds, strict=True)]
+        on_lines = [
+            line_fault(layout, line, FaultKind(kind))
+            for line, kind in zip((a, b), kinds, strict=True)
+        ]
         behind = {cell for fault in on_lines for cell in fault.cells}
-        single = [fault for fault in draw_faults(layout, 0.04, STUCK_KINDS, rng) if behind.isdisjoint(fault.cells)]
+        single = [
+            fault
+            for fault in draw_faults(layout, 0.04, STUCK_KINDS, rng)
+            if behind.isdisjoint(fault.cells)
+        ]
         seen = list(broken(log, on_lines + single, layout, 0.0, 0.0, seed))
-        testable = differs(np.concatenate(log), np.concatenate(seen), layout).sum(axis=0) >= TESTABLE
-        diagnosis, true = bench.fitted.diagnose(seen), {(fault.line, fault.kind) for fault in on_lines}
+        testable = (
+            differs(np.concatenate(log), np.concatenate(seen), layout).sum(axis=0) >= TESTABLE
+        )
+        diagnosis = bench.fitted.diagnose(seen)
+        true = {(fault.line, fault.kind) for fault in on_lines}
         found = {(f.line, f.kind) for f in diagnosis.faults if f.line is not None}
         possible = {(f.line, f.kind) for f in diagnosis.possible}
-        invented, doubtful = invented + len(found - true), doubtful + len(possible - true)
+        invented = invented + len(found - true)
+        doubtful = doubtful + len(possible - true)
         if all(testable[list(f.cells)].sum() >= 3 for f in on_lines if f.kind is FaultKind.OPEN):
             exact.append(found == true)
             held.append(found <= true <= found | possible)
     yield Count("2 broken lines + 4 % of the cells: exact lines", sum(exact), len(exact))
     yield Count("  exact, or what is missing is possible", sum(held), len(held))
     yield Count("  lines invented in a log", invented, bench.count, higher=False)
-    yield Count("  possible lines in a log that are not broken", doubtful, bench.count, higher=False)
+    yield Count(
+        "  possible lines in a log that are not broken", doubtful, bench.count, higher=False
+    )
 
 
 def groups(bench: Bench) -> Iterator[Count]:
-    """Two dead buses or groups, inner or outer ones, and single cells: are they named, and nothing else?"""
-    layout, named, asked, invented, healthy = bench.layout, 0, 0, 0, 0
+    """Two dead buses or groups, inner or outer ones, and single cells: are they named, and nothing
+    else?"""
+    layout = bench.layout
+    named = 0
+    asked = 0
+    invented = 0
+    healthy = 0
     sets = {line: set(layout.cells_on(line).tolist()) for line in layout.lines}
     for seed, log, rng in bench.logs():
         healthy += sum(fault.line is not None for fault in bench.fitted.diagnose(log).faults)
@@ -303,7 +401,11 @@ def groups(bench: Bench) -> Iterator[Count]:
         dead = [first, choice[rng.integers(len(choice))]]
         behind = sets[dead[0]] | sets[dead[1]]
         whole = {line for line in layout.lines if sets[line] <= behind}
-        faults = [fault for fault in draw_faults(layout, 0.04, STUCK_KINDS, rng) if behind.isdisjoint(fault.cells)]
+        faults = [
+            fault
+            for fault in draw_faults(layout, 0.04, STUCK_KINDS, rng)
+            if behind.isdisjoint(fault.cells)
+        ]
         seen = list(broken(log, faults, layout, 0.0, 0.0, seed))
         for line in dead:
             silent = rng.random() < 0.5
@@ -311,11 +413,14 @@ def groups(bench: Bench) -> Iterator[Count]:
             for frames in seen:
                 frames[:, layout.cells_on(line)] = value
         touched = differs(np.concatenate(log), np.concatenate(seen), layout).sum(axis=0) >= TESTABLE
-        found = {fault.line for fault in bench.fitted.diagnose(seen).faults if fault.line is not None}
+        found = {
+            fault.line for fault in bench.fitted.diagnose(seen).faults if fault.line is not None
+        }
         for line in dead:
             unread = np.isnan(seen[0][:, layout.cells_on(line)]).all()
             if unread or touched[layout.cells_on(line)].sum() >= 3:
-                asked, named = asked + 1, named + (line in found)
+                asked = asked + 1
+                named = named + (line in found)
         invented += len(found - whole)
     yield Count("2 dead groups + 4 % of the cells: named", named, asked)
     yield Count("  other groups named in a log", invented, bench.count, higher=False)
@@ -323,9 +428,13 @@ def groups(bench: Bench) -> Iterator[Count]:
 
 
 def cut(bench: Bench) -> Iterator[Count]:
-    layout, exact, asked = bench.layout, 0, 0
+    layout = bench.layout
+    exact = 0
+    asked = 0
     for seed, log, rng in bench.logs():
-        touched = differs(np.concatenate(log), np.zeros(layout.n_cells), layout).sum(axis=0) >= TESTABLE
+        touched = (
+            differs(np.concatenate(log), np.zeros(layout.n_cells), layout).sum(axis=0) >= TESTABLE
+        )
         choice = []
         for line in wires(layout):
             across = 2 if line.kind == "row" else 1
@@ -342,30 +451,40 @@ def cut(bench: Bench) -> Iterator[Count]:
             line, at, end = choice[rng.integers(len(choice))]
             fault = line_fault(layout, line, FaultKind.OPEN, break_at=at, driven_from=end)
             found = bench.fitted.diagnose(list(broken(log, [fault], layout, 0.0, 0.0, seed))).faults
-            asked, exact = asked + 1, exact + any(f.line == line and f.cells == fault.cells for f in found)
+            asked = asked + 1
+            exact = exact + any(f.line == line and f.cells == fault.cells for f in found)
     yield Count("a break inside a line: exact position", exact, asked)
 
 
 def address(bench: Bench) -> Iterator[Count]:
-    layout, asked, right, blamed = bench.layout, 0, 0, 0
+    layout = bench.layout
+    asked = 0
+    right = 0
+    blamed = 0
     choice = [line for line in layout.lines if line.kind in ("row_address", "column_address")]
     for seed, log, rng in bench.logs():
-        line, level = choice[rng.integers(len(choice))], int(rng.integers(2))
+        line = choice[rng.integers(len(choice))]
+        level = int(rng.integers(2))
         fault = line_fault(layout, line, FaultKind.ALIAS, value=level)
         seen = list(broken(log, [fault], layout, 0.0, 0.0, seed))
         if differs(np.concatenate(log), np.concatenate(seen), layout).any(axis=1).sum() < TESTABLE:
             continue
         diagnosis = bench.fitted.diagnose(seen)
         asked += 1
-        right += any(f.kind is FaultKind.ALIAS and f.line == line and f.value == level for f in diagnosis.faults)
+        right += any(
+            f.kind is FaultKind.ALIAS and f.line == line and f.value == level
+            for f in diagnosis.faults
+        )
         blamed += len(diagnosis.fault_set - set(fault.cells))
     yield Count("stuck address bit: bit and level named", right, asked)
     yield Count("  other cells blamed in a log", blamed, asked, higher=False)
 
 
 def held(log: Log, layout: SensorLayout, rng: np.random.Generator) -> Log:
-    """Return a log in which the last frame of each recording is held, the loaded cells within +-1 converter count."""
-    count, seen = layout.full_scale / 4095, []
+    """Return a log in which the last frame of each recording is held, the loaded cells within +-1
+    converter count."""
+    count = layout.full_scale / 4095
+    seen = []
     for frames in log:
         jitter = count * rng.integers(-1, 2, (HELD, layout.n_cells)) * (frames[-1] > count)
         seen.append(np.concatenate([frames, np.clip(frames[-1] + jitter, 0.0, layout.full_scale)]))
@@ -381,7 +500,8 @@ def healthy(bench: Bench) -> Iterator[Count]:
     false = windows = possible = 0
     for _, log, _ in bench.logs():
         diagnosis = bench.fitted.diagnose(log)
-        false, windows = false + len(diagnosis.fault_set), windows + windows_of(log, bench.layout)
+        false = false + len(diagnosis.fault_set)
+        windows = windows + windows_of(log, bench.layout)
         possible += len(diagnosis.possible)
     yield Count("healthy: false alarms", 1e6 * false, windows, "in 1e6 windows", higher=False)
     yield Count("  possible lines in a log", possible, bench.count, higher=False)
@@ -391,7 +511,8 @@ def holds(bench: Bench) -> Iterator[Count]:
     false = windows = 0
     for _, log, rng in bench.logs():
         seen = held(log, bench.layout, rng)
-        false, windows = false + len(bench.fitted.diagnose(seen).fault_set), windows + windows_of(seen, bench.layout)
+        false = false + len(bench.fitted.diagnose(seen).fault_set)
+        windows = windows + windows_of(seen, bench.layout)
     yield Count("healthy, held: false alarms", 1e6 * false, windows, "in 1e6 windows", higher=False)
 
 
@@ -406,19 +527,27 @@ def untouched(bench: Bench) -> Iterator[Count]:
 
 def kind(bench: Bench) -> Iterator[Count]:
     tallies = [bench.case(0.16), bench.case(0.16, onset=0.6)]
-    yield Count("kind of fault right", sum(t.right_kind for t in tallies), sum(t.true for t in tallies))
+    yield Count(
+        "kind of fault right", sum(t.right_kind for t in tallies), sum(t.true for t in tallies)
+    )
 
 
 def calibration(bench: Bench) -> Iterator[Count]:
     tallies = [bench.case(0.16), bench.case(0.16, onset=0.6)]
-    p, y = (np.concatenate([x for t in tallies for x in getattr(t, name)]) for name in ("probability", "dead"))
+    p, y = (
+        np.concatenate([x for t in tallies for x in getattr(t, name)])
+        for name in ("probability", "dead")
+    )
     where = np.minimum((10 * p).astype(int), 9)
     error = sum(abs(p[where == b].sum() - y[where == b].sum()) for b in range(10))
     yield Count("P(faulty): calibration error", error, len(p), higher=False)
 
 
 def changing(bench: Bench) -> Iterator[Count]:
-    layout, drawn, right, false = bench.layout, Counter(), Counter(), 0
+    layout = bench.layout
+    drawn = Counter()
+    right = Counter()
+    false = 0
     for seed, log, rng in bench.logs():
         whole = np.concatenate(log)
         loaded = np.flatnonzero((whole > VISIBLE * layout.full_scale).sum(axis=0) > 40)
@@ -438,15 +567,22 @@ def changing(bench: Bench) -> Iterator[Count]:
 
 def gain(bench: Bench) -> Iterator[Count]:
     """One contact says little of a gain: these logs are longer."""
-    layout, drawn, named, false = bench.layout, Counter(), Counter(), 0
+    layout = bench.layout
+    drawn = Counter()
+    named = Counter()
+    false = 0
     for _, log, rng in bench.logs(LONG):
         whole = np.concatenate(log)
-        loaded = sum((frames > VISIBLE * layout.full_scale).any(axis=0).astype(int) for frames in log)
+        loaded = sum(
+            (frames > VISIBLE * layout.full_scale).any(axis=0).astype(int) for frames in log
+        )
         chosen = rng.permutation(np.flatnonzero(loaded >= LOADED)).tolist()
         lasts = len(whole) / layout.rate  # seconds
         fading = [Fault(FaultKind.DRIFT, (cell,), value=0.0) for cell in chosen[:1]]
         seen = inject(whole, fading, layout, gain=(FADED - 1) / lasts)
-        cases = dict(zip(chosen, (f"gain fades to {FADED}", *(f"gain {g}" for g in GAINS)), strict=False))
+        cases = dict(
+            zip(chosen, (f"gain fades to {FADED}", *(f"gain {g}" for g in GAINS)), strict=False)
+        )
         for cell, times in zip(chosen[1:], GAINS, strict=False):
             seen[:, cell] *= times
         diagnosis = bench.fitted.diagnose(parted(seen, log))
@@ -488,16 +624,21 @@ def wirings(layout: SensorLayout) -> dict[str, list[np.ndarray]]:
 
 
 def highest(bench: Bench) -> float:
-    """Return the highest reading of the reference: the range of sensors that never come near full scale."""
+    """Return the highest reading of the reference: the range of sensors that never come near full
+    scale."""
     return max(float(np.nanmax(bench.recordings.frames[i])) for i in bench.reference)
 
 
 def rest_levels(bench: Bench) -> np.ndarray:
     """Return the low quantile of the readings of each cell in the reference, ``[D]``."""
-    return np.quantile(np.concatenate([bench.recordings.frames[i] for i in bench.reference]), 0.05, axis=0)
+    return np.quantile(
+        np.concatenate([bench.recordings.frames[i] for i in bench.reference]), 0.05, axis=0
+    )
 
 
-def per_recording(log: Log, fault: Callable[[int], Fault | None], layout: SensorLayout, seed: int) -> Log:
+def per_recording(
+    log: Log, fault: Callable[[int], Fault | None], layout: SensorLayout, seed: int
+) -> Log:
     """Return the log with another fault, or none, in each recording."""
     seen = []
     for i, frames in enumerate(log):
@@ -506,28 +647,37 @@ def per_recording(log: Log, fault: Callable[[int], Fault | None], layout: Sensor
     return seen
 
 
-def in_one_piece(log: Log, fault: Fault, layout: SensorLayout, seed: int, dither: float = 0.0) -> Log:
+def in_one_piece(
+    log: Log, fault: Fault, layout: SensorLayout, seed: int, dither: float = 0.0
+) -> Log:
     """Return the log with a fault that goes on from recording to recording."""
     return parted(inject(np.concatenate(log), [fault], layout, seed=seed, dither=dither), log)
 
 
 def moving_cases(bench: Bench) -> dict[str, Callable[[Log, Log, int, np.random.Generator], Log]]:
-    """Return by name what a dead cell that moves reads: from log, another log, cell and generator to the log seen."""
-    layout, span, rest = bench.layout, highest(bench), rest_levels(bench)
+    """Return by name what a dead cell that moves reads: from log, another log, cell and generator
+    to the log seen."""
+    layout = bench.layout
+    span = highest(bench)
+    rest = rest_levels(bench)
 
     def seed_of(rng: np.random.Generator) -> int:
         return int(rng.integers(1 << 30))
 
     def swings(share: float):
         def case(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
-            return in_one_piece(log, Fault(FaultKind.FLOATING, (cell,), value=share * span), layout, seed_of(rng))
+            return in_one_piece(
+                log, Fault(FaultKind.FLOATING, (cell,), value=share * span), layout, seed_of(rng)
+            )
 
         return case
 
     def noise(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
         at_rest = in_one_piece(log, Fault(FaultKind.OPEN, (cell,), value=rest[cell]), layout, 0)
         sigma = rng.uniform(0.004, 0.008) * span
-        return in_one_piece(at_rest, Fault(FaultKind.NOISY, (cell,), value=sigma), layout, seed_of(rng))
+        return in_one_piece(
+            at_rest, Fault(FaultKind.NOISY, (cell,), value=sigma), layout, seed_of(rng)
+        )
 
     def dead_every(k: int):
         def case(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
@@ -553,7 +703,9 @@ def moving_cases(bench: Bench) -> dict[str, Callable[[Log, Log, int, np.random.G
 
     def latched(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
         levels = rng.uniform(0.0, 0.9, len(log)) * span
-        return per_recording(log, lambda i: Fault(FaultKind.STUCK, (cell,), value=float(levels[i])), layout, 0)
+        return per_recording(
+            log, lambda i: Fault(FaultKind.STUCK, (cell,), value=float(levels[i])), layout, 0
+        )
 
     def clamped(log: Log, other: Log, cell: int, rng: np.random.Generator) -> Log:
         fault = Fault(FaultKind.CLAMPED, (cell,), value=rest[cell] + 0.1 * span)
@@ -590,12 +742,17 @@ def moving_cases(bench: Bench) -> dict[str, Callable[[Log, Log, int, np.random.G
 
 
 def moving(bench: Bench) -> Iterator[Count]:
-    """Dead cells that move; testable is what reads otherwise by more than 5 % of the range in use in 10 frames."""
-    layout, span = bench.layout, highest(bench)
+    """Dead cells that move; testable is what reads otherwise by more than 5 % of the range in use
+    in 10 frames."""
+    layout = bench.layout
+    span = highest(bench)
     for case, seen_by in moving_cases(bench).items():
         hit = true = false = testable = alive = 0
         for _, log, rng in bench.logs(IN_USE):
-            other = [np.asarray(bench.recordings.frames[i], dtype=np.float64) for i in rng.permutation(bench.rest)]
+            other = [
+                np.asarray(bench.recordings.frames[i], dtype=np.float64)
+                for i in rng.permutation(bench.rest)
+            ]
             present = np.flatnonzero(layout.present)
             dead = rng.choice(present, max(1, round(MOVING_SHARE * len(present))), replace=False)
             seen = [frames.copy() for frames in log]
@@ -618,8 +775,10 @@ def moving(bench: Bench) -> Iterator[Count]:
 
 
 def proven(bench: Bench) -> Iterator[Count]:
-    """Long healthy logs: who is blamed, and who is shown to be alive of those that are loaded in 3 recordings."""
-    span, rest = highest(bench), rest_levels(bench)
+    """Long healthy logs: who is blamed, and who is shown to be alive of those that are loaded in 3
+    recordings."""
+    span = highest(bench)
+    rest = rest_levels(bench)
     blamed = alive = used = 0
     for _, log, _ in bench.logs(IN_USE):
         loaded = [(frames - rest > VISIBLE * span).any(axis=0) for frames in log]
@@ -635,7 +794,10 @@ def proven(bench: Bench) -> Iterator[Count]:
 def rewired(bench: Bench) -> Iterator[Count]:
     """Wirings that change a visible number of readings; told right: put back as they were."""
     layout, choice = bench.layout, wirings(bench.layout)
-    right, told, asked, false = Counter(), Counter(), Counter(), 0
+    right = Counter()
+    told = Counter()
+    asked = Counter()
+    false = 0
     for _, log, rng in bench.logs():
         whole = np.concatenate(log)
         false += bench.fitted.rewiring(log) is not None
@@ -647,25 +809,38 @@ def rewired(bench: Bench) -> Iterator[Count]:
             found = bench.fitted.rewiring([frames[:, wiring] for frames in log])
             if found is not None:
                 told[case] += 1
-                right[case] += not differs(found.undo(whole[:, wiring]), whole, layout)[:, layout.present.ravel()].any()
+                right[case] += not differs(found.undo(whole[:, wiring]), whole, layout)[
+                    :, layout.present.ravel()
+                ].any()
     for case in choice:
         yield Count(f"{case}: undone", right[case], asked[case])
     yield Count(
-        "changed wiring: undone wrongly", sum(told.values()) - sum(right.values()), sum(asked.values()), "", False
+        "changed wiring: undone wrongly",
+        sum(told.values()) - sum(right.values()),
+        sum(asked.values()),
+        "",
+        False,
     )
     yield Count("healthy: a changed wiring named in a log", false, bench.count, higher=False)
 
 
 def replaced(bench: Bench) -> Iterator[Count]:
     """One pad is a new specimen that reads half, or twice, as much; so many recordings show it."""
-    layout, told, wrong, healthy, blamed = bench.layout, 0, 0, 0, 0
+    layout = bench.layout
+    told = 0
+    wrong = 0
+    healthy = 0
+    blamed = 0
     cells = np.flatnonzero(layout.present)
     reference = [np.asarray(bench.recordings.frames[i], dtype=np.float64) for i in bench.reference]
     for _, log, rng in bench.logs(REPLACED):
         healthy += pad_change(log, reference, layout, cells) is not None
-        pad, times = int(rng.integers(layout.pads)), rng.choice([0.5, 2.0])
+        pad = int(rng.integers(layout.pads))
+        times = rng.choice([0.5, 2.0])
         on_it = layout.pad_of == pad
-        seen = [np.where(on_it, np.minimum(times * frames, layout.full_scale), frames) for frames in log]
+        seen = [
+            np.where(on_it, np.minimum(times * frames, layout.full_scale), frames) for frames in log
+        ]
         change = pad_change(seen, reference, layout, cells)
         told += change is not None and change.pad == pad
         wrong += change is not None and change.pad != pad
@@ -678,17 +853,29 @@ def replaced(bench: Bench) -> Iterator[Count]:
 
 def summaries(recordings: Sequence[np.ndarray]) -> np.ndarray:
     """Return mean and maximum of each cell in each recording, ``[n, 2 D]``."""
-    return np.array([np.concatenate([frames.mean(axis=0), frames.max(axis=0)]) for frames in recordings])
+    return np.array(
+        [np.concatenate([frames.mean(axis=0), frames.max(axis=0)]) for frames in recordings]
+    )
 
 
 def specimen(bench: Bench) -> Iterator[Count]:
-    """A pad, or in every other draw all pads, have other gains, offsets and noise for each cell: recalibrated."""
-    layout, fitted, draws = bench.layout, bench.fitted, max(2, bench.count // 15)
-    frames, labels = [np.asarray(f, dtype=np.float64) for f in bench.recordings.frames], bench.recordings.labels
-    reference, full = [frames[i] for i in bench.reference], layout.full_scale
+    """A pad, or in every other draw all pads, have other gains, offsets and noise for each cell:
+    recalibrated."""
+    layout = bench.layout
+    fitted = bench.fitted
+    draws = max(2, bench.count // 15)
+    frames = [np.asarray(f, dtype=np.float64) for f in bench.recordings.frames]
+    labels = bench.recordings.labels
+    reference = [frames[i] for i in bench.reference]
+    full = layout.full_scale
     pad_of = layout.pad_of
-    trees = ExtraTreesClassifier(300, random_state=0).fit(summaries(reference), labels[bench.reference])
-    told, blamed, right, of = 0, Counter(), Counter(), 0
+    trees = ExtraTreesClassifier(300, random_state=0).fit(
+        summaries(reference), labels[bench.reference]
+    )
+    told = 0
+    blamed = Counter()
+    right = Counter()
+    of = 0
     for draw in range(draws):
         rng = np.random.default_rng(1000 * bench.repeat + draw)
         on = pad_of == rng.integers(layout.pads) if draw % 2 == 0 else np.full(layout.n_cells, True)
@@ -697,11 +884,14 @@ def specimen(bench: Bench) -> Iterator[Count]:
         noise = [0.002 * full * on * rng.standard_normal(f.shape) for f in frames]
         seen = [np.clip(gain * f + offset + n, 0, full) for f, n in zip(frames, noise, strict=True)]
         order = rng.permutation(bench.rest)
-        new, test = order[:SPECIMEN], order[SPECIMEN:]
+        new = order[:SPECIMEN]
+        test = order[SPECIMEN:]
         faulty = np.zeros(layout.n_cells, bool)
         under = fitted.diagnose([seen[i] for i in new]).statically_loaded.mask
         assert fitted.reference_ is not None
-        found = find_recalibration([seen[i] for i in new], reference, fitted.reference_, layout, faulty, under)
+        found = find_recalibration(
+            [seen[i] for i in new], reference, fitted.reference_, layout, faulty, under
+        )
         told += found is not None and set(found.pads) == set(pad_of[on].tolist())
         given = {"earlier": frames, "new": seen, "recalibrated": seen}
         if found is not None:
@@ -723,14 +913,17 @@ def neighbours(layout: SensorLayout, cell: int) -> list[int]:
     near = layout.present[pad, max(0, row - 1) : row + 2, max(0, col - 1) : col + 2]
     rows, cols = np.nonzero(near)
     around = [
-        layout.cell(pad, max(0, row - 1) + int(r), max(0, col - 1) + int(c)) for r, c in zip(rows, cols, strict=True)
+        layout.cell(pad, max(0, row - 1) + int(r), max(0, col - 1) + int(c))
+        for r, c in zip(rows, cols, strict=True)
     ]
     return [other for other in around if other != cell]
 
 
 def object_of(bench: Bench, log_seed: int, rng: np.random.Generator) -> np.ndarray:
-    """Return the loads ``[D]`` of an object that lies still: cut out of a recording, a bump, or a strap, in turn."""
-    layout, least = bench.layout, VISIBLE * bench.layout.full_scale
+    """Return the loads ``[D]`` of an object that lies still: cut out of a recording, a bump, or a
+    strap, in turn."""
+    least = VISIBLE * bench.layout.full_scale
+    layout = bench.layout
     top = max(float(np.max(bench.recordings.frames[i])) for i in bench.rest)
     while True:
         load = np.zeros(layout.n_cells)
@@ -743,15 +936,23 @@ def object_of(bench: Bench, log_seed: int, rng: np.random.Generator) -> np.ndarr
             patch = [int(rng.choice(loaded))]
             size = int(rng.integers(3, 13))
             for cell in patch:  # grows while it is walked through
-                more = [c for c in rng.permutation(neighbours(layout, cell)).tolist() if c in loaded and c not in patch]
+                more = [
+                    c
+                    for c in rng.permutation(neighbours(layout, cell)).tolist()
+                    if c in loaded and c not in patch
+                ]
                 patch += more[: size - len(patch)]
             load[patch] = contact[patch]
         else:
             pad, row, col = layout.position(int(rng.choice(np.flatnonzero(layout.present))))
             r, c = np.mgrid[: layout.rows, : layout.cols]
             if log_seed % 3 == 1:
-                distance = np.hypot(r - row - rng.uniform(-0.5, 0.5), c - col - rng.uniform(-0.5, 0.5))
-                shape = rng.uniform(0.2, 0.8) * np.exp(-0.5 * (distance / rng.uniform(0.7, 1.5)) ** 2)
+                distance = np.hypot(
+                    r - row - rng.uniform(-0.5, 0.5), c - col - rng.uniform(-0.5, 0.5)
+                )
+                shape = rng.uniform(0.2, 0.8) * np.exp(
+                    -0.5 * (distance / rng.uniform(0.7, 1.5)) ** 2
+                )
             else:
                 angle = rng.uniform(0, np.pi)
                 across = (r - row) * np.sin(angle) + (c - col) * np.cos(angle)
@@ -766,23 +967,38 @@ def object_of(bench: Bench, log_seed: int, rng: np.random.Generator) -> np.ndarr
 
 
 def static(bench: Bench) -> Iterator[Count]:
-    """An object lies still while the contacts of a log go on: constant, within a converter count, or with noise."""
-    layout, blamed, told, asked, invented = bench.layout, 0, 0, 0, 0
+    """An object lies still while the contacts of a log go on: constant, within a converter count,
+    or with noise."""
+    layout = bench.layout
+    blamed = 0
+    told = 0
+    asked = 0
+    invented = 0
     tally = Tally()
     for seed, log, rng in bench.logs(UNDER):
-        load, length = object_of(bench, seed, rng), sum(map(len, log))
+        load = object_of(bench, seed, rng)
+        length = sum(map(len, log))
         onset = int(length * rng.choice([0.0, rng.uniform(0.2, 0.6)]))
         noise = layout.full_scale * rng.choice([0.0, 1 / 4095, 0.003])
         whole = np.concatenate(log)
         held = load + noise * rng.standard_normal(whole.shape).round(1) * (load > 0)
-        laid = np.where((np.arange(length) >= onset)[:, None], np.clip(whole + held, 0, layout.full_scale), whole)
+        laid = np.where(
+            (np.arange(length) >= onset)[:, None],
+            np.clip(whole + held, 0, layout.full_scale),
+            whole,
+        )
         diagnosis = bench.fitted.diagnose(parted(laid, log))
         blamed += len(diagnosis.fault_set)
         lie = {cell for still in diagnosis.static_loads for cell in still.cells}
         under = set(np.flatnonzero(load).tolist())
-        asked, told = asked + 1, told + bool(lie & under)
+        asked = asked + 1
+        told = told + bool(lie & under)
         invented += sum(not under & set(still.cells) for still in diagnosis.static_loads)
-        faults = [fault for fault in draw_faults(layout, 0.08, STUCK_KINDS, rng) if under.isdisjoint(fault.cells)]
+        faults = [
+            fault
+            for fault in draw_faults(layout, 0.08, STUCK_KINDS, rng)
+            if under.isdisjoint(fault.cells)
+        ]
         seen = list(broken(parted(laid, log), faults, layout, 0.0, 0.0, seed))
         tally.add(parted(laid, log), seen, faults, bench.fitted.diagnose(seen), 0)
     yield Count("an object lies still: healthy cells blamed in a log", blamed, asked, higher=False)
@@ -792,28 +1008,38 @@ def static(bench: Bench) -> Iterator[Count]:
 
 
 def transport(bench: Bench) -> Iterator[Count]:
-    layout, told, blamed = bench.layout, 0, 0
+    layout = bench.layout
+    told = 0
+    blamed = 0
     for seed, log, rng in bench.logs():
-        seen = {"lost": [lose_frames(frames, 0.2, seed=1000 * seed + i) for i, frames in enumerate(log)]}
+        seen = {
+            "lost": [lose_frames(frames, 0.2, seed=1000 * seed + i) for i, frames in enumerate(log)]
+        }
         lost = sum(int(np.isnan(frames).all(axis=1).sum()) for frames in seen["lost"])
         whole = np.concatenate(log)
         loaded = (whole > VISIBLE * layout.full_scale).sum(axis=1)
         at = int(rng.choice(np.flatnonzero(loaded >= np.quantile(loaded, 0.75))))
         assert bench.fitted.reference_ is not None
         again = bench.fitted.reference_.patience + REPEATED
-        seen["frozen"] = [np.insert(whole, at, np.repeat(whole[at : at + 1], again, axis=0), axis=0)]
+        seen["frozen"] = [
+            np.insert(whole, at, np.repeat(whole[at : at + 1], again, axis=0), axis=0)
+        ]
         for name, frames in seen.items():
             diagnosis = bench.fitted.diagnose(frames)
             of_it = [fault for fault in diagnosis.transport if fault.kind == name]
-            told += len(of_it) == len(diagnosis.transport) == 1 and (name == "frozen" or of_it[0].frames == lost)
+            told += len(of_it) == len(diagnosis.transport) == 1 and (
+                name == "frozen" or of_it[0].frames == lost
+            )
             blamed += len(diagnosis.fault_set)
     yield Count("lost frames, frozen stream: reported", told, 2 * bench.count)
     yield Count("  cells blamed in a log", blamed, 2 * bench.count, higher=False)
 
 
 def matrix_product() -> float:
-    """Return how many ms this machine needs for the product of two 500 x 500 matrices of float32: its speed today."""
-    a, seconds = np.random.default_rng(0).random((500, 500), dtype=np.float32), []
+    """Return how many ms this machine needs for the product of two 500 x 500 matrices of float32:
+    its speed today."""
+    a = np.random.default_rng(0).random((500, 500), dtype=np.float32)
+    seconds = []
     for _ in range(30):
         began = time.perf_counter()
         a @ a
@@ -827,18 +1053,26 @@ def long_log(frames: Sequence[np.ndarray], length: int) -> np.ndarray:
 
 
 def speed(bench: Bench) -> Iterator[Count]:
-    """Times are given in matrix products (see :func:`matrix_product`), measured in turn with the work."""
+    """Times are given in matrix products (see :func:`matrix_product`), measured in turn with the
+    work."""
     began = time.perf_counter()
     fitted = SelfDiagnosis(bench.layout).fit([bench.recordings.frames[i] for i in bench.reference])
-    yield Count("fit", 1000 * (time.perf_counter() - began), matrix_product(), "products", higher=False)
-    log = long_log([bench.recordings.frames[i] for i in bench.rest], 20_000 if bench.layout.n_cells < 500 else 4_000)
+    yield Count(
+        "fit", 1000 * (time.perf_counter() - began), matrix_product(), "products", higher=False
+    )
+    log = long_log(
+        [bench.recordings.frames[i] for i in bench.rest],
+        20_000 if bench.layout.n_cells < 500 else 4_000,
+    )
     ratios = []
     for _ in range(5):
         began = time.perf_counter()
         fitted.diagnose(log)
         ratios.append(1000 * (time.perf_counter() - began) / matrix_product())
     size = log.size / bench.layout.n_cells * bench.layout.present.sum() / 1e6
-    yield Count("batch, a million cell-frames", float(np.median(ratios)), size, "products", higher=False)
+    yield Count(
+        "batch, a million cell-frames", float(np.median(ratios)), size, "products", higher=False
+    )
     runs = np.empty((3, min(len(log), 3000)))
     for run in runs:  # what a frame takes each time is the code, what it takes once is the machine
         monitor = Monitor(fitted)
@@ -846,16 +1080,45 @@ def speed(bench: Bench) -> Iterator[Count]:
             began = time.perf_counter()
             monitor.update(frame)
             run[i] = 1000 * (time.perf_counter() - began)
-    ms, product = runs[:, 200:].min(axis=0), matrix_product()
-    for name, value in (("mean", ms.mean()), ("slowest in 100", np.quantile(ms, 0.99)), ("slowest", ms.max())):
+    ms = runs[:, 200:].min(axis=0)
+    product = matrix_product()
+    for name, value in (
+        ("mean", ms.mean()),
+        ("slowest in 100", np.quantile(ms, 0.99)),
+        ("slowest", ms.max()),
+    ):
         yield Count(f"Monitor.update, {name}", float(value), product, "products", higher=False)
 
 
 ROWS: dict[str, Callable[[Bench], Iterator[Count]]] = {
     row.__name__: row
     for row in (
-        cells, onset, dither, missing, many, cold, own_reference, reference_faults, lines, cut, address, healthy, holds,
-        untouched, kind, calibration, changing, gain, moving, proven, rewired, groups, replaced, specimen, static,
-        transport, speed,
+        cells,
+        onset,
+        dither,
+        missing,
+        many,
+        cold,
+        own_reference,
+        reference_faults,
+        lines,
+        cut,
+        address,
+        healthy,
+        holds,
+        untouched,
+        kind,
+        calibration,
+        changing,
+        gain,
+        moving,
+        proven,
+        rewired,
+        groups,
+        replaced,
+        specimen,
+        static,
+        transport,
+        speed,
     )
-}  # fmt: skip
+}

@@ -1,7 +1,7 @@
 """Simulated people who sit on a seat or lie on a mat, so that loads stay for a whole recording.
 
-A healthy cell holds its load for as long as the posture lasts, as a broken cell does, and the next recording begins
-with another posture. Some people breathe visibly, some shift their weight.
+A healthy cell holds its load for as long as the posture lasts, as a broken cell does, and the next
+recording begins with another posture. Some people breathe visibly, some shift their weight.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from diagnostics import SensorLayout
 SITTING = ("upright", "back", "left", "right", "front", "edge", "back left", "back right")
 LYING = ("on the back", "on the left", "on the right")
 Array = np.ndarray
-Ellipse = tuple[float, float, float, float, float, float]  # centre, half axes, as shares of the skin; force; angle
+# centre, half axes, as shares of the skin; force; angle
+Ellipse = tuple[float, float, float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -42,13 +43,15 @@ class Skin:
 
     def recordings(self, count: int, seed: int) -> Recordings:
         """Simulate so many people; one in ten recordings is of the empty skin."""
-        rng, shape = np.random.default_rng(seed), (self.rows, self.cols)
+        rng = np.random.default_rng(seed)
+        shape = (self.rows, self.cols)
         rest = self.rest * np.random.default_rng(99).uniform(0.3, 1.7, shape)
         postures = LYING if self.lying else SITTING
         labels = rng.integers(len(postures), size=count)
         read = []
         for label in labels.tolist():
-            size, weight = rng.uniform(0.75, 1.25), rng.uniform(0.5, 1.2)
+            size = rng.uniform(0.75, 1.25)
+            weight = rng.uniform(0.5, 1.2)
             body = lying(label, size, rng) if self.lying else sitting(label, size, rng)
             load = weight * self.held(body, rng) * (rng.random() >= 0.1)
             load = np.minimum(np.where(load > 0.03, load, 0), 1)  # foam takes the rest
@@ -58,25 +61,42 @@ class Skin:
         return Recordings(tuple(read), layout, labels, postures)
 
     def held(self, body: list[Ellipse], rng: np.random.Generator) -> Array:
-        """Return the load ``[frames, rows, cols]`` of a body that breathes, and shifts its weight now and then."""
+        """Return the load ``[frames, rows, cols]`` of a body that breathes, and shifts its weight
+        now and then."""
         t = np.arange(int(self.rate * self.seconds)) / self.rate
         shift = np.searchsorted(np.sort(rng.uniform(0, t[-1], rng.poisson(self.shifts))), t)
         load = np.zeros((len(t), self.rows, self.cols))
         for since in np.unique(shift):
-            now, moved = shift == since, since > 0
+            now = shift == since
+            moved = since > 0
             away = moved * rng.normal(0, 0.03, (len(body), 2))
             force = np.exp(moved * rng.normal(0, 0.15, len(body)))
-            phase, pace = rng.uniform(0, 6, len(body)), rng.uniform(0.15, 0.4)
+            phase = rng.uniform(0, 6, len(body))
+            pace = rng.uniform(0.15, 0.4)
             breath = 1 + self.breath * np.sin(2 * np.pi * pace * t[now, None] + phase)
-            pressed = np.stack([self.pressed(*part, *by) for part, by in zip(body, away, strict=True)])
+            pressed = np.stack(
+                [self.pressed(*part, *by) for part, by in zip(body, away, strict=True)]
+            )
             load[now] = np.tensordot(breath * force, pressed, (1, 0))
         return load
 
-    def pressed(self, y: float, x: float, length: float, width: float, force: float, angle: float, *by: float) -> Array:
+    def pressed(
+        self,
+        y: float,
+        x: float,
+        length: float,
+        width: float,
+        force: float,
+        angle: float,
+        *by: float,
+    ) -> Array:
         """Return the load ``[rows, cols]`` of an ellipse that has moved ``by`` so much."""
         rows, cols = (np.arange(n) + 0.5 for n in (self.rows, self.cols))
-        down, right = np.meshgrid(rows / self.rows - y - by[0], cols / self.cols - x - by[1], indexing="ij")
-        along, across = down * np.cos(angle) + right * np.sin(angle), right * np.cos(angle) - down * np.sin(angle)
+        down, right = np.meshgrid(
+            rows / self.rows - y - by[0], cols / self.cols - x - by[1], indexing="ij"
+        )
+        along = down * np.cos(angle) + right * np.sin(angle)
+        across = right * np.cos(angle) - down * np.sin(angle)
         return force * np.maximum(0, 1 - (along / length) ** 2 - (across / width) ** 2)
 
 
@@ -91,14 +111,21 @@ SKINS = {
 
 def sitting(label: int, size: float, rng: np.random.Generator) -> list[Ellipse]:
     """Return two sit bones and, but on the edge of the seat, two thighs."""
-    lean = (0, 0.12, 0, 0, -0.12, 0.05, 0.1, 0.1)[label], (0, 0, 0.12, -0.12, 0, 0, 0.1, -0.1)[label]
+    lean = (
+        (0, 0.12, 0, 0, -0.12, 0.05, 0.1, 0.1)[label],
+        (0, 0, 0.12, -0.12, 0, 0, 0.1, -0.1)[label],
+    )
     y, x = 0.5 + np.array(lean) + rng.normal(0, 0.03, 2)
-    turn, parts = rng.normal(0, 0.15), []
+    turn = rng.normal(0, 0.15)
+    parts = []
     for side in (-1, 1):
-        force, at = float(np.clip(0.7 + side * 1.5 * (x - 0.5), 0.2, 1)), size * side
+        force = float(np.clip(0.7 + side * 1.5 * (x - 0.5), 0.2, 1))
+        at = size * side
         parts.append((y + 0.12, x + 0.17 * at, 0.16 * size, 0.16 * size, force, turn))
         if SITTING[label] != "edge":
-            parts.append((y - 0.2, x + 0.2 * at, 0.35 * size, 0.11 * size, 0.5 * force, turn - 0.15 * side))
+            parts.append(
+                (y - 0.2, x + 0.2 * at, 0.35 * size, 0.11 * size, 0.5 * force, turn - 0.15 * side)
+            )
     return parts
 
 

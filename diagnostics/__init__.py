@@ -1,6 +1,7 @@
 """Self-diagnosis of tactile arrays: which cells are faulty, why, and which could not be tested.
 
-Needs numpy, scipy, statsmodels and scikit-learn; never torch, so that a robot can run the monitor without it.
+Needs numpy, scipy, statsmodels and scikit-learn; never torch, so that a robot can run the monitor
+without it.
 """
 
 from diagnostics.decision.coverage import Coverage
@@ -8,10 +9,11 @@ from diagnostics.decision.result import Diagnosis, Verdict
 from diagnostics.decision.static_loads import StaticLoad
 from diagnostics.diagnosis import SelfDiagnosis
 from diagnostics.faults import Fault, FaultKind, FaultSet
-from diagnostics.layout import Line, SensorLayout
+from diagnostics.layout import SensorLayout
 from diagnostics.monitor import Monitor
 from diagnostics.preprocessing.transport import TransportFault
 from diagnostics.simulation.injection import bridge, freeze_stream, inject, line_fault, lose_frames
+from diagnostics.wiring import Line
 
 __all__ = [
     "Coverage",

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit, logit
 
-from diagnostics.decision import earlier_versions
 from diagnostics.decision.address_aliasing import find_aliasing
 from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
 from diagnostics.decision.line_cover import candidate_groups
@@ -21,22 +20,32 @@ from diagnostics.decision.static_loads import StaticLoad, find_static_loads
 from diagnostics.events.constant_runs import SHORTEST_RUN
 from diagnostics.evidence.life import PIECE, Life
 from diagnostics.evidence.reference import Reference, highest_reading, living, tolerance_of
-from diagnostics.evidence.rewiring import Rewiring, find_rewiring
 from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stepping import finished
 from diagnostics.evidence.stream_state import StreamState
 from diagnostics.healthy.reference_faults import find_reference_faults, never_moved
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.levels import CERTAIN_RATIO, DOUBTED, EXPECTED, LEAST_LOADED, MAJORITY, RARE, SLIGHT
+from diagnostics.preprocessing.levels import (
+    CERTAIN_RATIO,
+    DOUBTED,
+    EXPECTED,
+    LEAST_LOADED,
+    MAJORITY,
+    RARE,
+    SLIGHT,
+)
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
+from diagnostics.sensor.rewiring import Rewiring, find_rewiring
 from diagnostics.threads import one_thread
 
-SCHEMA = "adaptfault.diagnoser/10"
+SCHEMA = "adaptfault.diagnoser/1"
 
-_CERTAIN = 1 - RARE  # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
+# P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
+_CERTAIN = 1 - RARE
 
-OWN_REFERENCE = 32  # recordings from which on a log is its own reference: with a model of ten, healthy cells are blamed
+# recordings from which on a log is its own reference: with a model of ten, healthy cells are blamed
+OWN_REFERENCE = 32
 
 Result = TypeVar("Result", covariant=True)
 LogRatio = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -50,7 +59,7 @@ class Fitted:
     false_discovery_rate: float
     calibrator: Calibrator
     reference: Reference | None
-    load: LoadDirection | None = field(default=None, metadata={"newer": True})
+    load: LoadDirection | None = None
 
 
 class SelfDiagnosis:
@@ -59,9 +68,9 @@ class SelfDiagnosis:
     Args:
         layout: the array.
         false_discovery_rate: expected share of healthy cells in F.
-        proof_of_life: with a reference, a cell that moves is ALIVE only where it depends on the others as a healthy
-            cell does (:mod:`diagnostics.evidence.life`), so that dead cells that move are found. Without it, what moves
-            counts as alive.
+        proof_of_life: with a reference, a cell that moves is ALIVE only where it depends on the
+            others as a healthy cell does (:mod:`diagnostics.evidence.life`), so that dead cells
+            that move are found. Without it, what moves counts as alive.
 
     Attributes:
         reference_: the healthy reference, after :meth:`fit`; None: cold start.
@@ -73,7 +82,11 @@ class SelfDiagnosis:
     calibrator_: Calibrator = Calibrator.cold()
 
     def __init__(
-        self, layout: SensorLayout, *, false_discovery_rate: float = 0.006, proof_of_life: bool = True
+        self,
+        layout: SensorLayout,
+        *,
+        false_discovery_rate: float = 0.006,
+        proof_of_life: bool = True,
     ) -> None:
         self.layout = layout
         self.proof_of_life = proof_of_life
@@ -98,9 +111,12 @@ class SelfDiagnosis:
         """
         known = self.get_params()
         if unknown := sorted(set(params) - set(known)):
-            raise ValueError(f"SelfDiagnosis has no parameter {unknown[0]!r}: use {' or '.join(known)}")
+            raise ValueError(
+                f"SelfDiagnosis has no parameter {unknown[0]!r}: use {' or '.join(known)}"
+            )
         SelfDiagnosis.__init__(self, **(known | params))
-        self.reference_, self.calibrator_ = None, Calibrator.cold()
+        self.reference_ = None
+        self.calibrator_ = Calibrator.cold()
         return self
 
     def __sklearn_is_fitted__(self) -> bool:
@@ -120,8 +136,8 @@ class SelfDiagnosis:
     ) -> SelfDiagnosis:
         """Fit to fault-free recordings, ``[T, D]`` or a list of them.
 
-        Cells that are dead in them are found first and excluded; they are reported in every log in which they do not
-        move.
+        Cells that are dead in them are found first and excluded; they are reported in every log in
+        which they do not move.
 
         Args:
             recordings: as :meth:`SensorLayout.recordings` takes them.
@@ -140,7 +156,8 @@ class SelfDiagnosis:
         progress: Callable[[float], None],
         suspected: NDArray[np.float64] | None = None,
     ) -> SelfDiagnosis:
-        """Fit; ``suspected``: P(dead) ``[D]`` of cells that are dead if they never move; None: found here."""
+        """Fit; ``suspected``: P(dead) ``[D]`` of cells that are dead if they never move; None:
+        found here."""
         progress(0.0)
         present = self.layout.present.ravel()
         healthy = recordings.valid(self.layout.full_scale, present).whole(present)
@@ -149,9 +166,12 @@ class SelfDiagnosis:
             healthy = RecordingBlocks([given[:, self._order] for given in healthy.given])
         self.load_ = LoadDirection.fit(healthy, layout)
         if self.load_ is not None:
-            healthy, layout = RecordingBlocks([self.load_.loads(r) for r in healthy]), replace(layout, rest="low")
+            healthy = RecordingBlocks([self.load_.loads(r) for r in healthy])
+            layout = replace(layout, rest="low")
         # Fractions of full scale refer to the range that was seen: a stated one may be too high.
-        layout = replace(layout, full_scale=min(layout.full_scale, highest_reading(healthy, layout)))
+        layout = replace(
+            layout, full_scale=min(layout.full_scale, highest_reading(healthy, layout))
+        )
         tolerance = tolerance_of(healthy, layout)
         if suspected is None:
             dead = find_reference_faults(healthy, layout, tolerance, self._diagnosed_cold)
@@ -167,8 +187,9 @@ class SelfDiagnosis:
     def diagnose(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Diagnosis:
         """Diagnose a log: recordings ``[T, D]`` or a list of them, in time order.
 
-        Without :meth:`fit` (cold start), a log of 32 recordings or more is its own reference (:meth:`for_log`), which
-        takes the time of a fit. In a shorter one, cells are compared with cells that have similar surroundings.
+        Without :meth:`fit` (cold start), a log of 32 recordings or more is its own reference
+        (:meth:`for_log`), which takes the time of a fit. In a shorter one, cells are compared with
+        cells that have similar surroundings.
 
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame.
@@ -183,14 +204,16 @@ class SelfDiagnosis:
         *,
         progress: Callable[[float], None] = lambda share: None,
     ) -> SelfDiagnosis:
-        """Return what :meth:`diagnose` judges a log with: this diagnosis, or in a cold start one fitted to the log.
+        """Return what :meth:`diagnose` judges a log with: this diagnosis, or in a cold start one
+        fitted to the log.
 
-        That one is fitted to the first half of the log, so that a cell that fails in it is compared with how it worked
-        before. Cells that never move in this half, and are faulty by the cold start on the whole log, are excluded and
-        reported. A cell that fails early in this half may be learned as it is, and not be found.
+        That one is fitted to the first half of the log, so that a cell that fails in it is compared
+        with how it worked before. Cells that never move in this half, and are faulty by the cold
+        start on the whole log, are excluded and reported. A cell that fails early in this half may
+        be learned as it is, and not be found.
 
-        A log of fewer than 32 recordings, or in which most cells never move, is no reference: it is judged by this
-        diagnosis.
+        A log of fewer than 32 recordings, or in which most cells never move, is no reference: it is
+        judged by this diagnosis.
 
         Args:
             recordings: a log, as for :meth:`diagnose`.
@@ -211,10 +234,11 @@ class SelfDiagnosis:
             return own._fit(first, progress, np.where(cold.fault_set.mask, cold.probability, 0.0))
 
     def rewiring(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Rewiring | None:
-        """Return the rows, columns or pads that answer in each other's place, None where the data show none.
+        """Return the rows, columns or pads that answer in each other's place, None where the data
+        show none.
 
-        ``Rewiring.undo`` puts the readings back; diagnose and predict with those. Without :meth:`fit`, with
-        several axes and where cells rest in the middle always None.
+        ``Rewiring.undo`` puts the readings back; diagnose and predict with those. Without
+        :meth:`fit`, with several axes and where cells rest in the middle always None.
 
         Args:
             recordings: a log, as for :meth:`diagnose`.
@@ -222,7 +246,9 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
-        log = checked_recordings(recordings, self.layout).valid(self.layout.full_scale, self.layout.present.ravel())
+        log = checked_recordings(recordings, self.layout).valid(
+            self.layout.full_scale, self.layout.present.ravel()
+        )
         if self.reference_ is None or self.layout.axes > 1:
             return None
         if self.load_ is not None:
@@ -233,9 +259,16 @@ class SelfDiagnosis:
             return find_rewiring(log, self.reference_, self.layout)
 
     def state(self) -> tuple[dict[str, Any], Arrays]:
-        """Return the fitted state: a JSON-safe dict and arrays by name, as :meth:`from_state` reads them."""
+        """Return the fitted state: a JSON-safe dict and arrays by name, as :meth:`from_state` reads
+        them."""
         fitted, arrays = to_state(
-            Fitted(self.layout, self.false_discovery_rate, self.calibrator_, self.reference_, self.load_)
+            Fitted(
+                self.layout,
+                self.false_discovery_rate,
+                self.calibrator_,
+                self.reference_,
+                self.load_,
+            )
         )
         return {"schema": SCHEMA, **fitted}, arrays
 
@@ -247,14 +280,13 @@ class SelfDiagnosis:
             ValueError: another schema; a field or an array is missing, or of a wrong kind or shape.
         """
         schema = about.get("schema")
-        if schema not in (SCHEMA, *earlier_versions.SCHEMAS):
+        if schema != SCHEMA:
             raise ValueError(f"expected schema {SCHEMA!r}, got {schema!r}")
         try:
-            if schema != SCHEMA:
-                about, arrays = earlier_versions.converted(about, arrays)
             fitted = from_state(Fitted, about, arrays)
             diagnoser = cls(fitted.layout, false_discovery_rate=fitted.false_discovery_rate)
-            diagnoser.calibrator_, diagnoser.reference_ = fitted.calibrator, fitted.reference
+            diagnoser.calibrator_ = fitted.calibrator
+            diagnoser.reference_ = fitted.reference
             diagnoser.load_ = fitted.load
             if fitted.load is not None:
                 fitted.load.check(fitted.layout)
@@ -268,7 +300,8 @@ class SelfDiagnosis:
         return diagnoser
 
     def stream(self, needed: NDArray[np.bool_] | None = None) -> StreamState:
-        """Return the state before any frame. Only tiles with a ``needed`` cell (bool ``[D]``; None: all) are scored."""
+        """Return the state before any frame. Only tiles with a ``needed`` cell (bool ``[D]``; None:
+        all) are scored."""
         reference = self.reference_ or Reference.unknown(self._planes)
         exclusion = self.calibrator_.exclusion if reference.model else Exclusion()
         order = self._order if self.layout.axes > 1 else None
@@ -286,7 +319,8 @@ class SelfDiagnosis:
     def steps(
         self, stream: StreamState, *, n_recordings: int = 1, life: Life | None = None
     ) -> Generator[None, None, Diagnosis]:
-        """Yield between steps of a few milliseconds of :meth:`evaluate`, for a control loop; return the diagnosis.
+        """Yield between steps of a few milliseconds of :meth:`evaluate`, for a control loop; return
+        the diagnosis.
 
         Args:
             stream: the state of the log.
@@ -318,21 +352,25 @@ class SelfDiagnosis:
                 if tested[1].probability.sum() >= found.probability.sum():  # it explains nothing
                     break
                 still, explained, (spatial, found) = loads, others, tested
-        alone, weight = found.weight, found.weight.copy()
+        alone = found.weight
+        weight = found.weight.copy()
 
         def together(surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
-            # By the chain rule of probability each cell of a group is conditioned on those before it: on half of them,
-            # about the mean of conditioning on all and on none.
+            # By the chain rule of probability each cell of a group is conditioned on those before
+            # it: on half of them, about the mean of conditioning on all and on none.
             return alone + np.maximum(log_ratio(surprisal, surprisal) - alone, 0.0) / 2
 
         groups = self._groups(found, stream, together(spatial.initial), explained)
         yield
-        for group, surprisal in zip(groups, stream.each_excluded(spatial, explained, groups), strict=True):
+        for group, surprisal in zip(
+            groups, stream.each_excluded(spatial, explained, groups), strict=True
+        ):
             weight[group] = np.maximum(weight[group], together(surprisal)[group])
             yield
         found = replace(found, weight=weight).of(self._place)
         causes, possible = root_causes(found, aliases, self.layout)
-        probability, inferred = found.probability.copy(), np.zeros(self.layout.n_cells, bool)
+        probability = found.probability.copy()
+        inferred = np.zeros(self.layout.n_cells, bool)
         still = [load.of(self._order, self.layout) for load in still]
         for load in still:
             probability[list(load.cells)] = 1 - load.probability
@@ -340,9 +378,11 @@ class SelfDiagnosis:
             cells = list(fault.cells)
             probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
             inferred[cells] = True
-        # Noise alone is no test; nor is movement, where the reference tells how cells depend on each other.
+        # Noise alone is no test; nor is movement, where the reference tells how cells depend on
+        # each other.
         shown = life.shown | (stream.reference.dead > 0)
-        scale, intermittency = stream.scale, stream.intermittency
+        scale = stream.scale
+        intermittency = stream.intermittency
         working = np.empty_like(inferred)
         moved = bool((stream.runs.moved & stream.present).any())
         working[self._place] = ~inferred & (found.alive if moved else self.layout.present.ravel())
@@ -350,7 +390,9 @@ class SelfDiagnosis:
         rest = np.maximum(scale.baseline, stream.lowest) if moved else scale.baseline
         evidence = {
             "spatial": spatial.evidence + spatial.offset + spatial.gain,
-            "temporal": np.where(spatial.scored, stream.temporal(), intermittency.blinking + intermittency.noisy),
+            "temporal": np.where(
+                spatial.scored, stream.temporal(), intermittency.blinking + intermittency.noisy
+            ),
             "events": spatial.events.astype(np.float64),
         }
         return Diagnosis(
@@ -368,20 +410,25 @@ class SelfDiagnosis:
         )
 
     def proof(self, stream: StreamState) -> Generator[None, None, Life]:
-        """Yield between steps of a few milliseconds; return whether cells depend on each other as healthy ones do."""
+        """Yield between steps of a few milliseconds; return whether cells depend on each other as
+        healthy ones do."""
         stream = stream.complete()
         _, copies = find_aliasing(stream)
         yield
         life = yield from self._proof(stream, copies)
         return life
 
-    def _proof(self, stream: StreamState, explained: NDArray[np.bool_]) -> Generator[None, None, Life]:
-        """Yield between steps; return whether cells depend on each other; ``explained`` ones (bool ``[D]``) are out."""
+    def _proof(
+        self, stream: StreamState, explained: NDArray[np.bool_]
+    ) -> Generator[None, None, Life]:
+        """Yield between steps; return whether cells depend on each other; ``explained`` ones (bool
+        ``[D]``) are out."""
         if stream.reference.life is None or stream.noisier:
             return Life.assumed(stream.layout.n_cells)
         evidence = stream.evidence_of_life()
         yield
-        # Cells that move by themselves mislead the spatial test; those that never moved say nothing yet.
+        # Cells that move by themselves mislead the spatial test; those that never moved say nothing
+        # yet.
         first = stream.proof_of_life(evidence, explained, ~stream.runs.moved)
         life = yield from first.steps()
         log_ratio = self._log_ratio(stream, life)
@@ -393,7 +440,8 @@ class SelfDiagnosis:
 
     @staticmethod
     def _misleading(stream: StreamState, life: Life) -> NDArray[np.bool_]:
-        """Return the cells that are refuted and move, or were before they came to hold a value, bool ``[D]``."""
+        """Return the cells that are refuted and move, or were before they came to hold a value,
+        bool ``[D]``."""
         runs = stream.runs
         before = runs.moved & life.mostly_before(runs.start)
         return life.certain & ((runs.length < SHORTEST_RUN) | before)
@@ -401,7 +449,8 @@ class SelfDiagnosis:
     def _tested(
         self, stream: StreamState, explained: NDArray[np.bool_], log_ratio: LogRatio, life: Life
     ) -> Generator[None, None, tuple[Spatial, CellFindings]]:
-        """Yield between steps of the spatial test without ``explained`` cells (bool ``[D]``); return its findings.
+        """Yield between steps of the spatial test without ``explained`` cells (bool ``[D]``);
+        return its findings.
 
         Moving cells that are refuted predict no others.
         """
@@ -409,7 +458,9 @@ class SelfDiagnosis:
         yield
         return spatial, self._found(stream, spatial, explained, log_ratio, life)
 
-    def _diagnosed(self, log: RecordingBlocks, needed: NDArray[np.bool_] | None = None) -> Diagnosis:
+    def _diagnosed(
+        self, log: RecordingBlocks, needed: NDArray[np.bool_] | None = None
+    ) -> Diagnosis:
         stream = self.stream(needed)
         for frames in log.blocks():
             stream.extend(frames)
@@ -417,7 +468,10 @@ class SelfDiagnosis:
 
     @staticmethod
     def _diagnosed_cold(
-        log: RecordingBlocks, needed: NDArray[np.bool_], rest: NDArray[np.float64], layout: SensorLayout
+        log: RecordingBlocks,
+        needed: NDArray[np.bool_],
+        rest: NDArray[np.float64],
+        layout: SensorLayout,
     ) -> Diagnosis:
         """Diagnose the ``needed`` cells without a reference, but with known baselines ``rest``."""
         cold = SelfDiagnosis(layout)
@@ -433,33 +487,53 @@ class SelfDiagnosis:
         life: Life,
     ) -> CellFindings:
         """Return the findings about each cell; ``explained`` cells (bool ``[D]``) are left out."""
-        reference, runs, intermittency = stream.reference, stream.runs, stream.intermittency
-        present, silent = stream.present, stream.silent & ~explained
+        reference = stream.reference
+        runs = stream.runs
+        intermittency = stream.intermittency
+        present = stream.present
+        silent = stream.silent & ~explained
         known = spatial.scored & ~runs.moved & (reference.dead > 0)
         odds = log_ratio(spatial.evidence, spatial.surprisal)
         stuck = self.calibrator_.probability(odds, kinds(stream), spatial.scored & ~known)
         stuck[known] = reference.dead[known]
         delivers = present & ~explained & ~silent
-        intermittent, noisy = intermittency.intermittent & delivers, intermittency.excess & delivers
-        drifting = delivers & ~intermittent & ~noisy & spatial.drifting & ~(life.floats & np.isfinite(spatial.factor))
+        intermittent = intermittency.intermittent & delivers
+        noisy = intermittency.excess & delivers
+        drifting = (
+            delivers
+            & ~intermittent
+            & ~noisy
+            & spatial.drifting
+            & ~(life.floats & np.isfinite(spatial.factor))
+        )
         certain = silent | intermittent | noisy | drifting
         # Side by side, cells that never return to their baseline carry something that lies still.
         never_unloaded = stream.lowest > stream.scale.baseline + stream.scale.near
         beside = stream.layout.beside
         carries = never_unloaded & ((beside >= 0) & never_unloaded[beside]).any(axis=1)
         judged = delivers & runs.moved & ~certain & ~carries & (reference.life is not None)
-        # The model of life errs where its reference has no like: only what is far beyond its limits is faulty.
+        # The model of life errs where its reference has no like: only what is far beyond its limits
+        # is faulty.
         refuted = np.where(judged, expit(life.evidence + logit(EXPECTED) - CERTAIN_RATIO / 2), 0.0)
-        by_life = judged & (refuted > stuck) & (stuck < MAJORITY)  # a constant run tells more: its value, its onset
-        probability = np.where(present, np.where(certain, _CERTAIN, np.maximum(stuck, refuted)), 0.0)
+        # a constant run tells more: its value, its onset
+        by_life = judged & (refuted > stuck) & (stuck < MAJORITY)
+        probability = np.where(
+            present, np.where(certain, _CERTAIN, np.maximum(stuck, refuted)), 0.0
+        )
         faulty = faulty_at(np.where(certain, 0.0, probability), self.false_discovery_rate)
         faulty = (faulty | certain) & present & ~explained
-        value, rests = runs.value, spatial.scored & stream.rests()
-        blinks_to = np.where(2 * intermittency.high > intermittency.blinks, self.layout.full_scale, 0.0)
-        held, beyond = stream.reading(value), spatial.scored & ~rests
+        value = runs.value
+        rests = spatial.scored & stream.rests()
+        blinks_to = np.where(
+            2 * intermittency.high > intermittency.blinks, self.layout.full_scale, 0.0
+        )
+        held = stream.reading(value)
+        beyond = spatial.scored & ~rests
         kind = np.where(by_life & faulty, life.kind, -1)
         source = np.where(life.source < 0, np.nan, self._order[life.source])
-        of_life = np.stack([held, stream.reading(stream.scale.baseline), life.lag * PIECE, source, life.highest])
+        of_life = np.stack(
+            [held, stream.reading(stream.scale.baseline), life.lag * PIECE, source, life.highest]
+        )
         weight = log_ratio(spatial.surprisal, spatial.surprisal)
         return CellFindings(
             faulty=faulty,
@@ -474,40 +548,61 @@ class SelfDiagnosis:
             drifting=drifting,
             gain=np.where(drifting, spatial.factor, np.nan),
             value=np.where(
-                kind >= 0, of_life[kind, np.arange(len(kind))], np.where(intermittent, stream.reading(blinks_to), held)
+                kind >= 0,
+                of_life[kind, np.arange(len(kind))],
+                np.where(intermittent, stream.reading(blinks_to), held),
             ),
             since=np.select(
                 [silent, intermittent, noisy, drifting, kind >= 0],
-                [runs.missed_since, intermittency.blinks_since, intermittency.noisy_since, spatial.since, life.since],
+                [
+                    runs.missed_since,
+                    intermittency.blinks_since,
+                    intermittency.noisy_since,
+                    spatial.since,
+                    life.since,
+                ],
                 runs.start,
             ),
             probability=probability,
-            # A cell at rest supports a broken line by the events alone, without the prior of its value.
+            # A cell at rest supports a broken line by the events alone, without the prior of its
+            # value.
             weight=np.where(known, CERTAIN_RATIO, np.where(kind >= 0, life.evidence, weight)),
-            events=np.where(intermittent, intermittency.blinks, np.where(kind >= 0, life.units, spatial.events)),
+            events=np.where(
+                intermittent, intermittency.blinks, np.where(kind >= 0, life.units, spatial.events)
+            ),
             known=known,
             refuted=kind,
             share=life.share,
         )
 
     def _log_ratio(self, stream: StreamState, life: Life) -> LogRatio:
-        """Return the function from evidence and summed surprisal to the calibrated log likelihood ratio, ``[D]`` each.
+        """Return the function from evidence and summed surprisal to the calibrated log likelihood
+        ratio, ``[D]`` each.
 
-        The events tell something of cells with a surprisal, and with a reference of all. Faulty cells that move mislead
-        the search for events: then these say no more of cells at rest than the proof of life does.
+        The events tell something of cells with a surprisal, and with a reference of all. Faulty
+        cells that move mislead the search for events: then these say no more of cells at rest than
+        the proof of life does.
         """
-        temporal, kind, known = stream.temporal(), kinds(stream), stream.reference.model is not None
+        temporal = stream.temporal()
+        kind = kinds(stream)
+        known = stream.reference.model is not None
         misled = bool(self._misleading(stream, life).any()) & stream.rests()
         most = np.where(misled, np.maximum(life.evidence, 0.0), np.inf)
 
-        def log_ratio(evidence: NDArray[np.float64], surprisal: NDArray[np.float64]) -> NDArray[np.float64]:
+        def log_ratio(
+            evidence: NDArray[np.float64], surprisal: NDArray[np.float64]
+        ) -> NDArray[np.float64]:
             tested = (surprisal > 0) | known
             return np.minimum(self.calibrator_.calibrate(evidence, temporal, kind, tested), most)
 
         return log_ratio
 
     def _groups(
-        self, found: CellFindings, stream: StreamState, weight: NDArray[np.float64], explained: NDArray[np.bool_]
+        self,
+        found: CellFindings,
+        stream: StreamState,
+        weight: NDArray[np.float64],
+        explained: NDArray[np.bool_],
     ) -> list[NDArray[np.intp]]:
         """Return the groups of cells at rest that one broken line would explain."""
         if stream.reference.model is None:
@@ -515,7 +610,9 @@ class SelfDiagnosis:
         consistent = found.rests & ~found.known & ~explained
         contradicting = found.alive | ~(found.rests | found.silent) & stream.present
         place = self._place
-        groups = candidate_groups(consistent[place], contradicting[place], weight[place], self.layout)
+        groups = candidate_groups(
+            consistent[place], contradicting[place], weight[place], self.layout
+        )
         return [place[group] for group in groups]
 
 
@@ -535,7 +632,8 @@ def _stepped(test: _Steps[Result]) -> Generator[None, None, Result]:
 
 
 def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:
-    """Return the array in which each axis of a pad is a pad of its own, and which cell each of its cells is.
+    """Return the array in which each axis of a pad is a pad of its own, and which cell each of its
+    cells is.
 
     The neighbours of a cell are then cells of the same axis. With one axis: the layout itself.
     """
@@ -546,11 +644,14 @@ def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:
     rest = "middle" if layout.rest == "learn" else layout.rest
     present = layout.present.ravel()[order]
     pads = layout.pads * layout.axes
-    return replace(layout, pads=pads, axes=1, present=present, wiring="bus", groups=None, rest=rest), order
+    return replace(
+        layout, pads=pads, axes=1, present=present, wiring="bus", groups=None, rest=rest
+    ), order
 
 
 def _shows_contacts(first: RecordingBlocks, log: RecordingBlocks, layout: SensorLayout) -> bool:
-    """Return whether most cells are loaded in the ``first`` recordings of a log, by what loads there are in it."""
+    """Return whether most cells are loaded in the ``first`` recordings of a log, by what loads
+    there are in it."""
     present = layout.present.ravel()
     before = _typical_range(first.valid(layout.full_scale, present), present)
     typical = _typical_range(log.valid(layout.full_scale, present), present)
@@ -565,9 +666,13 @@ def _typical_range(recordings: RecordingBlocks, present: NDArray[np.bool_]) -> f
     return float(np.median(received)) if len(received) else 0.0
 
 
-def checked_recordings(recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout) -> RecordingBlocks:
+def checked_recordings(
+    recordings: ArrayLike | Sequence[ArrayLike], layout: SensorLayout
+) -> RecordingBlocks:
     """Return the recordings as blocks, each ``[T, D]`` with T >= 1."""
-    checked = [_checked(r, f"recording {i}", layout) for i, r in enumerate(layout.recordings(recordings))]
+    checked = [
+        _checked(r, f"recording {i}", layout) for i, r in enumerate(layout.recordings(recordings))
+    ]
     checked = [r for r in checked if len(r)]
     if not checked:
         raise ValueError("no frames: expected recordings [T, D] with T >= 1")

@@ -1,4 +1,5 @@
-"""Faults of a tactile array: fault kinds, one root cause (Fault), and the fault set F of the paper (FaultSet)."""
+"""Faults of a tactile array: fault kinds, one root cause (Fault), and the fault set F of the paper
+(FaultSet)."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.layout import Line, SensorLayout
+from diagnostics.layout import SensorLayout
+from diagnostics.wiring import Line
 
 
 class FaultKind(str, Enum):
@@ -53,19 +55,21 @@ class Fault:
         kind: kind of the fault.
         cells: indices of the faulty cells, ascending and unique.
         line: the wire at fault; None for single cells.
-        value: in the layout's unit. OPEN, SHORT, STUCK: what the cells read (None: 0 for OPEN, full scale for SHORT).
-            INTERMITTENT: the value they blink to (None: 0). NOISY: standard deviation of the added noise. DRIFT: how
-            much the offset moves in one second (a drift of the gain is given to ``inject``, as a share per second).
-            ALIAS: the level (0 or 1) of the stuck address bit in ``line``; with a row or column line, the index of the
-            row or column read instead, or, where ``cells`` holds the cells of both lines, of the one that ``line``
-            touches (a bridge: both read the sum); without a line, the cell read instead. FLOATING: the range of its
-            own movement. LATE: the delay in frames. COPY: the cell that it repeats (None: the mean of the cells beside
-            it). CLAMPED: the highest reading. WEAK: the share of the load that it reads.
+        value: in the layout's unit. OPEN, SHORT, STUCK: what the cells read (None: 0 for OPEN, full
+            scale for SHORT). INTERMITTENT: the value they blink to (None: 0). NOISY: standard
+            deviation of the added noise. DRIFT: how much the offset moves in one second (a drift of
+            the gain is given to ``inject``, as a share per second). ALIAS: the level (0 or 1) of
+            the stuck address bit in ``line``; with a row or column line, the index of the row or
+            column read instead, or, where ``cells`` holds the cells of both lines, of the one that
+            ``line`` touches (a bridge: both read the sum); without a line, the cell read instead.
+            FLOATING: the range of its own movement. LATE: the delay in frames. COPY: the cell that
+            it repeats (None: the mean of the cells beside it). CLAMPED: the highest reading. WEAK:
+            the share of the load that it reads.
         onset: first faulty frame; None: from the first frame on.
         probability: P(the fault exists), 0..1; None: known, not inferred.
         reason: one sentence: what was observed, and what to check.
-        evidence: number of independent observations of it (events that tested its cells, blinks, coincidences of two
-            lines); None: known, not inferred.
+        evidence: number of independent observations of it (events that tested its cells, blinks,
+            coincidences of two lines); None: known, not inferred.
         alternatives: other causes that the data permit, one sentence each.
     """
 
@@ -83,14 +87,24 @@ class Fault:
         object.__setattr__(self, "kind", FaultKind(self.kind))
         cells = np.unique(np.atleast_1d(np.asarray(self.cells)))
         if cells.size == 0 or not np.issubdtype(cells.dtype, np.integer) or cells[0] < 0:
-            raise ValueError(f"a fault needs at least one cell index, whole and >= 0; got {self.cells!r}")
+            raise ValueError(
+                f"a fault needs at least one cell index, whole and >= 0; got {self.cells!r}"
+            )
         object.__setattr__(self, "cells", tuple(cells.tolist()))
 
     def describe(self, layout: SensorLayout) -> str:
         """Return place and kind in a few words: "pad 0, row 4, column 5: stuck at 2.5 N"."""
-        where = str(self.line) if self.line is not None else "; ".join(layout.place(cell) for cell in self.cells)
+        where = (
+            str(self.line)
+            if self.line is not None
+            else "; ".join(layout.place(cell) for cell in self.cells)
+        )
         no_reading = (FaultKind.ALIAS, FaultKind.LATE, FaultKind.COPY, FaultKind.WEAK)
-        at = "" if self.value is None or self.kind in no_reading else f" at {self.value:.4g} {layout.unit}"
+        at = (
+            ""
+            if self.value is None or self.kind in no_reading
+            else f" at {self.value:.4g} {layout.unit}"
+        )
         return f"{where}: {self.kind}{at}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -122,7 +136,9 @@ class Fault:
             lists = {"cells": tuple(d["cells"]), "alternatives": alternatives}
             return cls(**{**d, "line": line, "reason": d.get("reason") or "", **lists})
         except (TypeError, KeyError, AttributeError, OverflowError) as error:
-            raise ValueError(f"expected a fault with kind and cells, got {str(d)[:60]} ({error})") from None
+            raise ValueError(
+                f"expected a fault with kind and cells, got {str(d)[:60]} ({error})"
+            ) from None
 
 
 _NONE = type(None)
@@ -146,22 +162,30 @@ class FaultSet(Set[int]):
     Behaves as a set (``in``, ``len``, iteration in ascending order, ``| & - ==``).
 
     Raises:
-        ValueError: a cell that is not a whole number from 0 to ``n_cells - 1``; sets over different arrays combined.
+        ValueError: a cell that is not a whole number from 0 to ``n_cells - 1``; sets over different
+            arrays combined.
     """
 
     cells: tuple[int, ...]
     n_cells: int
 
     def __post_init__(self) -> None:
-        if isinstance(self.n_cells, bool) or not isinstance(self.n_cells, int | np.integer) or self.n_cells < 0:
-            raise ValueError(f"F needs the number of cells, a whole number >= 0; got {self.n_cells!r}")
+        if (
+            isinstance(self.n_cells, bool)
+            or not isinstance(self.n_cells, int | np.integer)
+            or self.n_cells < 0
+        ):
+            raise ValueError(
+                f"F needs the number of cells, a whole number >= 0; got {self.n_cells!r}"
+            )
         cells = np.unique(np.asarray(list(self.cells)))
         if cells.size and not np.issubdtype(cells.dtype, np.integer):
             raise ValueError(f"F holds cell indices, whole numbers; got {self.cells!r}")
         if cells.size and (cells[0] < 0 or cells[-1] >= self.n_cells):
             stray = cells[0] if cells[0] < 0 else cells[-1]
             raise ValueError(
-                f"F names cell {stray}, but there are {self.n_cells} cells, numbered 0 to {self.n_cells - 1}"
+                f"F names cell {stray}, but there are {self.n_cells} cells, numbered 0 to"
+                f" {self.n_cells - 1}"
             )
         object.__setattr__(self, "cells", tuple(cells.tolist()))
         object.__setattr__(self, "n_cells", int(self.n_cells))
@@ -176,11 +200,16 @@ class FaultSet(Set[int]):
 
     @cached_property
     def healthy(self) -> NDArray[np.intp]:
-        """The other cells, int ``[D - k]``, ascending: what the selector phi of Section IV keeps."""
+        """The other cells, int ``[D - k]``, ascending: what the selector phi of Section IV
+        keeps."""
         return np.flatnonzero(~self.mask)
 
     def __contains__(self, cell: object) -> bool:
-        return isinstance(cell, int | np.integer) and 0 <= int(cell) < self.n_cells and bool(self.mask[int(cell)])
+        return (
+            isinstance(cell, int | np.integer)
+            and 0 <= int(cell) < self.n_cells
+            and bool(self.mask[int(cell)])
+        )
 
     def __iter__(self) -> Iterator[int]:
         return iter(self.cells)
@@ -210,5 +239,8 @@ class FaultSet(Set[int]):
 
     def _same_array(self, other: Iterable[Any]) -> Iterable[Any]:
         if isinstance(other, FaultSet) and other.n_cells != self.n_cells:
-            raise ValueError(f"fault sets of arrays with {self.n_cells} and {other.n_cells} cells cannot be combined")
+            raise ValueError(
+                f"fault sets of arrays with {self.n_cells} and {other.n_cells} cells cannot be"
+                " combined"
+            )
         return other

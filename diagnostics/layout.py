@@ -10,9 +10,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.wiring import members, nested
+from diagnostics.wiring import Line, LineKind, members, nested
 
-LineKind = Literal["row", "column", "row_address", "column_address", "converter", "position", "bus", "group"]
 Wiring = Literal["matrix", "bus"]
 Rest = Literal["low", "high", "middle", "learn"]
 
@@ -21,75 +20,41 @@ SCHEMA = "adaptfault.layout/1"
 _MOST_CELLS = 10_000_000  # larger sizes are errors of a file
 
 
-@dataclass(frozen=True, order=True)
-class Line:
-    """One wire of a pad, or a group of cells that share a fate.
-
-    ``kind`` is ``"row"`` or ``"column"`` (``index`` counts the wires), ``"row_address"`` or ``"column_address"``
-    (``index`` is the bit, 0 the least significant), ``"converter"`` (``index`` 0: each pad has one channel),
-    ``"position"`` (all axes of one position, counted row by row), ``"bus"`` (``index`` 0: the pad is one bus)
-    or ``"group"`` (``index`` counts the groups of the layout, ``name`` is that of the group, and ``pad`` the pad of its
-    first cell).
-    """
-
-    pad: int
-    kind: LineKind
-    index: int
-    name: str = ""
-
-    def __post_init__(self) -> None:
-        if self.kind not in get_args(LineKind):
-            raise ValueError(f"unknown kind of line {self.kind!r}: use one of {', '.join(get_args(LineKind))}")
-        if not all(isinstance(n, int | np.integer) and n >= 0 for n in (self.pad, self.index)):
-            raise ValueError(f"a line needs a pad and an index, whole and >= 0; got {self.pad!r} and {self.index!r}")
-
-    def __str__(self) -> str:
-        match self.kind:
-            case "row_address":
-                return f"pad {self.pad}, row address bit {self.index}"
-            case "column_address":
-                return f"pad {self.pad}, column address bit {self.index}"
-            case "converter":
-                return f"pad {self.pad}, converter channel"
-            case "position":
-                return f"pad {self.pad}, position {self.index}"
-            case "bus":
-                return f"pad {self.pad}, bus"
-            case "group":
-                return self.name or f"group {self.index}"
-            case kind:
-                return f"pad {self.pad}, {kind} {self.index}"
-
-
 @dataclass(frozen=True, eq=False)
 class SensorLayout:
-    """A tactile array: ``pads`` arrays of ``rows`` x ``cols`` cells, by default behind row and column multiplexers.
+    """A tactile array: ``pads`` arrays of ``rows`` x ``cols`` cells, by default behind row and
+    column multiplexers.
 
-    A cell's index runs pad, then row, then column (C order of ``[pads, rows, cols]``). Positions where ``present``
-    is False hold no sensing element (a masked corner); they keep their index, so that D is always
-    ``pads * rows * cols``, and take no part in fitting or diagnosis.
+    A cell's index runs pad, then row, then column (C order of ``[pads, rows, cols]``). Positions
+    where ``present`` is False hold no sensing element (a masked corner); they keep their index, so
+    that D is always ``pads * rows * cols``, and take no part in fitting or diagnosis.
 
     Args:
-        pads, rows, cols: size, each at least 1. The paper's 11 x 10 pad has 11 rows here (Section III-A, H = 11).
+        pads, rows, cols: size, each at least 1. The paper's 11 x 10 pad has 11 rows here (Section
+        III-A, H = 11).
         full_scale: the largest value a cell can report, in ``unit``; the smallest is 0.
         unit: name of the unit of recordings.
         rate: frames per second.
         present: bool ``[pads, rows, cols]`` (or flat ``[D]``); None means every position is a cell.
-        wiring: ``"matrix"``: each pad has row and column wires; ``"bus"``: each pad is one bus, without rows and
-            columns.
-        groups: cells that share a fate, as a chip, triangle, patch, board or connector: lists of cells or of the names
-            of other groups, by name. Two groups are disjoint, or one contains the other. With groups, causes are
-            groups and cells, and no rows or columns, whatever ``wiring`` says.
-        axes: readings of one position, as 3 of a magnetic taxel. Each axis is a cell of its own; D is ``pads * rows *
-            cols * axes``, and the axis runs last. A dead axis is a faulty cell, a dead position is one cause with all
-            its axes. There are no rows and columns of wires then, and ``rest="learn"`` means ``"middle"``.
-        rest: what a cell reads without load: ``"low"``: its lower end, and load raises it; ``"high"``: its upper end,
-            and load lowers it; ``"middle"``: in between, and load moves it either way; ``"learn"``: whichever the
-            healthy recordings show, ``"low"`` without any.
+        wiring: ``"matrix"``: each pad has row and column wires; ``"bus"``: each pad is one bus,
+            without rows and columns.
+        groups: cells that share a fate, as a chip, triangle, patch, board or connector: lists of
+            cells or of the names of other groups, by name. Two groups are disjoint, or one contains
+            the other. With groups, causes are groups and cells, and no rows or columns, whatever
+            ``wiring`` says.
+        axes: readings of one position, as 3 of a magnetic taxel. Each axis is a cell of its own; D
+            is ``pads * rows * cols * axes``, and the axis runs last. A dead axis is a faulty cell,
+            a dead position is one cause with all its axes. There are no rows and columns of wires
+            then, and ``rest="learn"`` means ``"middle"``.
+        rest: what a cell reads without load: ``"low"``: its lower end, and load raises it;
+            ``"high"``: its upper end, and load lowers it; ``"middle"``: in between, and load moves
+            it either way; ``"learn"``: whichever the healthy recordings show, ``"low"`` without
+            any.
 
     Raises:
-        ValueError: a size below 1, a full scale or rate that is not positive, ``present`` of another shape, an unknown
-            ``wiring`` or ``rest``, groups that overlap without nesting or name what is not there.
+        ValueError: a size below 1, a full scale or rate that is not positive, ``present`` of
+            another shape, an unknown ``wiring`` or ``rest``, groups that overlap without nesting or
+            name what is not there.
     """
 
     pads: int
@@ -119,12 +84,15 @@ class SensorLayout:
             raise ValueError(f"a layout has at most {_MOST_CELLS:,} cells; got {self.n_cells:,}")
         if not isinstance(self.unit, str) or not self.unit.isprintable():
             raise ValueError(f"a layout needs the name of a unit; got {self.unit!r}")
-        present = np.ones(self.shape, bool) if self.present is None else np.array(self.present, bool)
+        present = (
+            np.ones(self.shape, bool) if self.present is None else np.array(self.present, bool)
+        )
         if self.axes > 1 and present.size * self.axes == self.n_cells:
             present = np.repeat(present.ravel(), self.axes)
         if present.size != self.n_cells:
             raise ValueError(
-                f"present has shape {present.shape}, the layout {self.shape}: give one bool for each position"
+                f"present has shape {present.shape}, the layout {self.shape}: give one bool for"
+                " each position"
             )
         present = present.reshape(self.shape)
         if not present.any():
@@ -133,14 +101,23 @@ class SensorLayout:
         object.__setattr__(self, "present", present)
         for name, choices in (("wiring", get_args(Wiring)), ("rest", get_args(Rest))):
             if getattr(self, name) not in choices:
-                also = "; groups of cells are given as groups={name: cells}" if name == "wiring" else ""
-                raise ValueError(f"{name} is one of {', '.join(choices)}; got {getattr(self, name)!r}{also}")
+                also = (
+                    "; groups of cells are given as groups={name: cells}"
+                    if name == "wiring"
+                    else ""
+                )
+                raise ValueError(
+                    f"{name} is one of {', '.join(choices)}; got {getattr(self, name)!r}{also}"
+                )
         if self.groups is not None:
             members_of = members(self.groups, self.n_cells)
             object.__setattr__(
                 self,
                 "groups",
-                {name: tuple(x if isinstance(x, str) else int(x) for x in self.groups[name]) for name in members_of},
+                {
+                    name: tuple(x if isinstance(x, str) else int(x) for x in self.groups[name])
+                    for name in members_of
+                },
             )
         _ = self._wires  # raises ValueError for groups that overlap
 
@@ -162,7 +139,9 @@ class SensorLayout:
     def cell(self, pad: int, row: int, col: int, axis: int = 0) -> int:
         """Return the index of the cell at a position; IndexError names what is out of range."""
         sizes = self.pads, self.rows, self.cols, self.axes
-        for name, value, size in zip(("pad", "row", "col", "axis"), (pad, row, col, axis), sizes, strict=True):
+        for name, value, size in zip(
+            ("pad", "row", "col", "axis"), (pad, row, col, axis), sizes, strict=True
+        ):
             if not 0 <= value < size:
                 raise IndexError(f"{name} {value} is outside this layout: use 0 to {size - 1}")
         return int(((pad * self.rows + row) * self.cols + col) * self.axes + axis)
@@ -170,13 +149,16 @@ class SensorLayout:
     def position(self, cell: int) -> tuple[int, int, int]:
         """Return ``(pad, row, col)`` of a cell; IndexError if the layout has no such cell."""
         if not 0 <= cell < self.n_cells:
-            raise IndexError(f"cell {cell} is outside this layout: it has {self.n_cells} cells, numbered from 0")
+            raise IndexError(
+                f"cell {cell} is outside this layout: it has {self.n_cells} cells, numbered from 0"
+            )
         pad, rest = divmod(int(cell) // self.axes, self.rows * self.cols)
         return (pad, *divmod(rest, self.cols))
 
     @cached_property
     def lines(self) -> tuple[Line, ...]:
-        """Every wire a fault can sit on: rows, columns, address bits of both, one converter channel a pad.
+        """Every wire a fault can sit on: rows, columns, address bits of both, one converter channel
+        a pad.
 
         With declared wiring: the buses and groups, an inner group before those that contain it.
         """
@@ -189,7 +171,12 @@ class SensorLayout:
             "column_address": address_bits(self.cols),
             "converter": 1,
         }
-        return tuple(Line(pad, kind, i) for pad in range(self.pads) for kind, n in counts.items() for i in range(n))
+        return tuple(
+            Line(pad, kind, i)
+            for pad in range(self.pads)
+            for kind, n in counts.items()
+            for i in range(n)
+        )
 
     @property
     def is_matrix(self) -> bool:
@@ -206,7 +193,10 @@ class SensorLayout:
                 line = Line(cell // size, "position", cell % size // self.axes)
                 served[line] = np.arange(cell, cell + self.axes)
         if self.wiring == "bus":
-            served = {Line(pad, "bus", 0): np.arange(pad * size, (pad + 1) * size) for pad in range(self.pads)}
+            served = {
+                Line(pad, "bus", 0): np.arange(pad * size, (pad + 1) * size)
+                for pad in range(self.pads)
+            }
         if self.groups is not None:
             for i, (name, cells) in enumerate(members(self.groups, self.n_cells).items()):
                 served[Line(int(cells[0]) // size, "group", i, name)] = cells
@@ -217,7 +207,8 @@ class SensorLayout:
         return {cell: line for line in reversed(self._wires) for cell in self._wires[line].tolist()}
 
     def place(self, cell: int) -> str:
-        """Return where a cell is, in words: "pad 0, row 4, column 5", or "triangle 7, cell 72" with declared wiring.
+        """Return where a cell is, in words: "pad 0, row 4, column 5", or "triangle 7, cell 72" with
+        declared wiring.
 
         With several axes: "pad 0, position 24, axis 2 (cell 74)".
         """
@@ -225,17 +216,25 @@ class SensorLayout:
         if self.is_matrix:
             return f"pad {pad}, row {row}, column {col}"
         if self.axes > 1:
-            return f"pad {pad}, position {row * self.cols + col}, axis {cell % self.axes} (cell {cell})"
+            return (
+                f"pad {pad}, position {row * self.cols + col}, axis {cell % self.axes} (cell"
+                f" {cell})"
+            )
         line = self._innermost.get(cell)
         return f"{line if line and line.kind == 'group' else f'pad {pad}'}, cell {cell}"
 
     def parts(self, line: Line) -> tuple[Line, ...]:
-        """Return the groups directly within a bus or group that together hold all its cells; none if there are none."""
+        """Return the groups directly within a bus or group that together hold all its cells; none
+        if there are none."""
         own = set(self.cells_on(line).tolist())
         within: list[Line] = []
         for other in self.lines[: self.lines.index(line)][::-1]:
             cells = set(self.cells_on(other).tolist())
-            if cells and cells < own and not any(cells <= set(self.cells_on(w).tolist()) for w in within):
+            if (
+                cells
+                and cells < own
+                and not any(cells <= set(self.cells_on(w).tolist()) for w in within)
+            ):
                 within.append(other)
         whole = sum(len(self.cells_on(w)) for w in within) == len(own)
         return tuple(sorted(within)) if whole else ()
@@ -247,8 +246,8 @@ class SensorLayout:
     def cells_on(self, line: Line) -> NDArray[np.intp]:
         """Return the present cells that ``line`` serves, ascending.
 
-        An address bit and a converter channel serve their whole pad: every cell is selected and read through them.
-        The cells that a *stuck* bit misreads are those of :meth:`misaddressed`.
+        An address bit and a converter channel serve their whole pad: every cell is selected and
+        read through them. The cells that a *stuck* bit misreads are those of :meth:`misaddressed`.
 
         Raises:
             IndexError: the layout has no such line.
@@ -265,23 +264,33 @@ class SensorLayout:
 
     @cached_property
     def beside(self) -> NDArray[np.intp]:
-        """The eight neighbours of each cell, of its axis and on its pad, row by row, int ``[D, 8]``; -1: none."""
+        """The eight neighbours of each cell, of its axis and on its pad, row by row, int
+        ``[D, 8]``; -1: none."""
         index = np.full((self.pads, self.rows + 2, self.cols + 2, self.axes), -1, dtype=np.intp)
-        index[:, 1:-1, 1:-1] = np.where(self.present, self._grid, -1).reshape(self.pads, self.rows, self.cols, -1)
-        steps = [(down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1)]
-        around = [index[:, down : down + self.rows, across : across + self.cols] for down, across in steps]
+        index[:, 1:-1, 1:-1] = np.where(self.present, self._grid, -1).reshape(
+            self.pads, self.rows, self.cols, -1
+        )
+        steps = [
+            (down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1)
+        ]
+        around = [
+            index[:, down : down + self.rows, across : across + self.cols] for down, across in steps
+        ]
         return np.stack(around, axis=-1).reshape(self.n_cells, len(steps))
 
     def connected(self, cells: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """Return the number of the group of neighbouring ``cells`` (bool ``[D]``) of each, int ``[D]``; 0: none."""
+        """Return the number of the group of neighbouring ``cells`` (bool ``[D]``) of each, int
+        ``[D]``; 0: none."""
         from scipy.ndimage import label
 
-        of_pad = np.pad(np.ones((1, 3, 3)), ((1, 1), (0, 0), (0, 0)))  # diagonal neighbours included
+        # diagonal neighbours included
+        of_pad = np.pad(np.ones((1, 3, 3)), ((1, 1), (0, 0), (0, 0)))
         return np.asarray(label(self.grid(cells), of_pad)[0].ravel(), dtype=np.intp)
 
     def with_neighbours(self, cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return ``cells`` (bool ``[D]``) and their neighbours on the same pad, bool ``[D]``."""
-        every, near = cells.copy(), self.beside[cells]
+        every = cells.copy()
+        near = self.beside[cells]
         every[near[near >= 0]] = True
         return every
 
@@ -291,7 +300,13 @@ class SensorLayout:
         served = {}
         for line in self.lines:
             pad = self._grid[line.pad]
-            cells = pad[line.index] if line.kind == "row" else pad[:, line.index] if line.kind == "column" else pad
+            cells = (
+                pad[line.index]
+                if line.kind == "row"
+                else pad[:, line.index]
+                if line.kind == "column"
+                else pad
+            )
             cells = self._wires.get(line, cells)
             served[line] = cells.ravel()[present[cells.ravel()]]
             served[line].setflags(write=False)
@@ -300,19 +315,23 @@ class SensorLayout:
     def misaddressed(self, line: Line, level: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return which cells an address bit stuck at ``level`` misreads, and what is read instead.
 
-        Returns ``(cells, sources)``, int arrays of the same length. A source of -1 is an address with nothing
-        connected to it.
+        Returns ``(cells, sources)``, int arrays of the same length. A source of -1 is an address
+        with nothing connected to it.
         """
         if line not in self._served or line.kind not in ("row_address", "column_address"):
             raise IndexError(f"{line} is not an address bit of {self}")
-        bit, by_row = 1 << line.index, line.kind == "row_address"
+        bit = 1 << line.index
+        by_row = line.kind == "row_address"
         wires = np.arange(self.rows if by_row else self.cols)
         selected = (wires | bit) if level else (wires & ~bit)
         pad = self._grid[line.pad] if by_row else self._grid[line.pad].T  # [wire, across]
         moved = wires != selected
-        sources = np.where((selected < len(wires))[:, None], pad[np.minimum(selected, len(wires) - 1)], -1)
+        sources = np.where(
+            (selected < len(wires))[:, None], pad[np.minimum(selected, len(wires) - 1)], -1
+        )
         present = self.present.ravel()
-        cells, sources = pad[moved].ravel(), sources[moved].ravel()
+        cells = pad[moved].ravel()
+        sources = sources[moved].ravel()
         sources = np.where((sources >= 0) & present[np.maximum(sources, 0)], sources, -1)
         return cells[present[cells]], sources[present[cells]]
 
@@ -324,22 +343,27 @@ class SensorLayout:
     @property
     def _grids(self) -> tuple[tuple[int, ...], ...]:
         """The shapes of a frame that is not flat."""
-        every = [self.shape] if self.axes == 1 else [self.shape, (self.pads, self.rows, self.cols, self.axes)]
+        every = (
+            [self.shape]
+            if self.axes == 1
+            else [self.shape, (self.pads, self.rows, self.cols, self.axes)]
+        )
         return (*every, *(grid[1:] for grid in every)) if self.pads == 1 else tuple(every)
 
     def recordings(self, given: Any) -> list[Any]:
         """Return one or several recordings as a list; nothing is checked or converted.
 
         Args:
-            given: one array ``[T, D]``, ``[T, pads, rows, cols]`` or, of a layout with one pad, ``[T, rows, cols]``; or
-                a sequence of such arrays; or recordings of one length in an array with one axis more,
-                ``[n, T, ...]``.
+            given: one array ``[T, D]``, ``[T, pads, rows, cols]`` or, of a layout with one pad,
+                ``[T, rows, cols]``; or a sequence of such arrays; or recordings of one length in an
+                array with one axis more, ``[n, T, ...]``.
         """
         one = isinstance(given, np.ndarray) and (given.ndim <= 2 or given.shape[1:] in self._grids)
         return [given] if one else list(given)
 
     def check_frame(self, frame: ArrayLike) -> NDArray[np.float64]:
-        """Return one frame as float64 ``[D]``; ``[pads, rows, cols]`` and, of one pad, ``[rows, cols]`` are flattened.
+        """Return one frame as float64 ``[D]``; ``[pads, rows, cols]`` and, of one pad,
+        ``[rows, cols]`` are flattened.
 
         Raises:
             ValueError: another shape.
@@ -347,7 +371,9 @@ class SensorLayout:
         values = np.asarray(frame, dtype=np.float64)
         if values.shape not in ((self.n_cells,), *self._grids):
             grid = list(self._grids[-1])
-            raise ValueError(f"expected a frame [{self.n_cells}] or {grid}, got {list(values.shape)}")
+            raise ValueError(
+                f"expected a frame [{self.n_cells}] or {grid}, got {list(values.shape)}"
+            )
         return values.reshape(-1)
 
     def check_recording(self, recording: ArrayLike, name: str = "recording") -> NDArray[np.float64]:
@@ -374,29 +400,53 @@ class SensorLayout:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe description that :meth:`from_dict` reads."""
-        d: dict[str, Any] = {"schema": SCHEMA, "pads": self.pads, "rows": self.rows, "cols": self.cols}
+        d: dict[str, Any] = {
+            "schema": SCHEMA,
+            "pads": self.pads,
+            "rows": self.rows,
+            "cols": self.cols,
+        }
         d |= {"full_scale": self.full_scale, "unit": self.unit, "rate": self.rate}
         if not self.present.all():
             d["present"] = self.present.tolist()
         if self.groups is not None:
             d["groups"] = {name: list(of) for name, of in self.groups.items()}
-        # Only what differs from the default, so that earlier versions read the layouts that they know.
-        return d | {name: getattr(self, name) for name, usual in _DEFAULTS.items() if getattr(self, name) != usual}
+        # What differs from the default.
+        return d | {
+            name: getattr(self, name)
+            for name, usual in _DEFAULTS.items()
+            if getattr(self, name) != usual
+        }
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> SensorLayout:
-        """Build a layout from a dict with ``pads``, ``rows``, ``cols`` and the optional other fields.
+        """Build a layout from a dict with ``pads``, ``rows``, ``cols`` and the optional other
+        fields.
 
         Raises:
             ValueError: a field is missing, unknown, or of a wrong kind; another schema.
         """
         if not isinstance(d, Mapping):
-            raise ValueError(f"expected a layout, a dict with pads, rows and cols; got {str(d)[:60]}")
+            raise ValueError(
+                f"expected a layout, a dict with pads, rows and cols; got {str(d)[:60]}"
+            )
         if d.get("schema", SCHEMA) != SCHEMA:
             raise ValueError(f"expected schema {SCHEMA!r}, got {d['schema']!r}")
-        known = ("pads", "rows", "cols", "full_scale", "unit", "rate", "present", "groups", *_DEFAULTS)
+        known = (
+            "pads",
+            "rows",
+            "cols",
+            "full_scale",
+            "unit",
+            "rate",
+            "present",
+            "groups",
+            *_DEFAULTS,
+        )
         if unknown := set(d) - set(known) - {"schema"}:
-            raise ValueError(f"a layout has no field {sorted(unknown, key=str)[0]!r}: use {', '.join(known)}")
+            raise ValueError(
+                f"a layout has no field {sorted(unknown, key=str)[0]!r}: use {', '.join(known)}"
+            )
         if missing := [name for name in known[:3] if name not in d]:
             raise ValueError(f"a layout needs the field {missing[0]!r}")
         try:
@@ -416,19 +466,29 @@ class SensorLayout:
         masked = self.n_cells - int(self.present.sum())
         axes = f" x {self.axes} axes" if self.axes > 1 else ""
         text = (
-            f"{self.pads} x {self.rows} x {self.cols} cells{axes}, 0..{self.full_scale:g} {self.unit}, {self.rate:g} Hz"
+            f"{self.pads} x {self.rows} x {self.cols} cells{axes}, 0..{self.full_scale:g}"
+            f" {self.unit}, {self.rate:g} Hz"
         )
         return f"{text}, {masked} position{'s' if masked > 1 else ''} masked" if masked else text
 
     def _key(self) -> tuple[Any, ...]:
         groups = tuple((self.groups or {}).items())
         declared = tuple(getattr(self, name) for name in _DEFAULTS)
-        return (*self.shape, self.full_scale, self.unit, self.rate, self.present.tobytes(), groups, *declared)
+        return (
+            *self.shape,
+            self.full_scale,
+            self.unit,
+            self.rate,
+            self.present.tobytes(),
+            groups,
+            *declared,
+        )
 
 
 _DEFAULTS = {"wiring": "matrix", "axes": 1, "rest": "learn"}
 
 
 def address_bits(wires: int) -> int:
-    """Return the number of address bits for ``wires`` lines: 4 for the paper's 11 rows and 10 columns (Section II)."""
+    """Return the number of address bits for ``wires`` lines: 4 for the paper's 11 rows and 10
+    columns (Section II)."""
     return (wires - 1).bit_length()

@@ -1,4 +1,5 @@
-"""Monitor: diagnosis frame by frame in a control loop, with constant memory and the results of the batch diagnosis."""
+"""Monitor: diagnosis frame by frame in a control loop, with constant memory and the results of the
+batch diagnosis."""
 
 from __future__ import annotations
 
@@ -11,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diagnostics.evidence.life import Life
-from diagnostics.layout import Line
 from diagnostics.threads import one_thread
+from diagnostics.wiring import Line
 
 if TYPE_CHECKING:
     from diagnostics.decision.result import Diagnosis
@@ -28,10 +29,10 @@ _LONGEST_GAP = 86400.0  # seconds; after a longer one the clock was set
 class Monitor:
     """Monitors a running sensor and reports faults that are new, have changed, or are gone.
 
-    After each segment of 32 frames the diagnosis is updated, in small steps over the frames that follow: a fault is
-    reported at most about 50 frames after it becomes detectable. The proof of life of all cells takes the frames in
-    between, so that a dead cell that moves is reported up to some 200 frames later. :meth:`diagnosis` evaluates at
-    once.
+    After each segment of 32 frames the diagnosis is updated, in small steps over the frames that
+    follow: a fault is reported at most about 50 frames after it becomes detectable. The proof of
+    life of all cells takes the frames in between, so that a dead cell that moves is reported up to
+    some 200 frames later. :meth:`diagnosis` evaluates at once.
 
     Args:
         fitted: a fitted :class:`SelfDiagnosis`; an unfitted one is a cold start.
@@ -54,7 +55,8 @@ class Monitor:
         self._time: float | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy or a pickle holds; an evaluation under way begins anew after the copy's next segment."""
+        """Return what a copy or a pickle holds; an evaluation under way begins anew after the
+        copy's next segment."""
         return {**vars(self), "_work": None, "_proof": None}
 
     def update(self, frame: ArrayLike, time: float | None = None) -> tuple[Fault, ...]:
@@ -62,19 +64,23 @@ class Monitor:
 
         Args:
             frame: ``[D]`` or ``[pads, rows, cols]``, in the layout's unit; NaN = missing.
-            time: time of the frame in seconds; frames missing from the sequence of times are counted as lost. A step
-                back, or forward by more than a day, is a clock that was set: no frame counts as lost.
+            time: time of the frame in seconds; frames missing from the sequence of times are
+                counted as lost. A step back, or forward by more than a day, is a clock that was
+                set: no frame counts as lost.
 
         Returns:
             The faults; one that is gone has probability 0.
 
         Raises:
-            ValueError: a frame of another shape, or a time that is not finite; the frame is not processed.
+            ValueError: a frame of another shape, or a time that is not finite; the frame is not
+                processed.
         """
         layout = self._diagnoser.layout
         reading = np.asarray(frame, dtype=np.float64).reshape(-1)
         if reading.size != layout.n_cells:
-            raise ValueError(f"expected a frame of {layout.n_cells} readings ({layout}), got {reading.size}")
+            raise ValueError(
+                f"expected a frame of {layout.n_cells} readings ({layout}), got {reading.size}"
+            )
         if time is not None:
             if not np.isfinite(time):
                 raise ValueError(f"time {time}: expected seconds, or None where it is unknown")
@@ -99,7 +105,8 @@ class Monitor:
             self._segments = 0
 
     def _step(self) -> tuple[Fault, ...]:
-        """Do a step of the evaluation, or else of the proof of life; return the changes when it is complete."""
+        """Do a step of the evaluation, or else of the proof of life; return the changes when it is
+        complete."""
         if self._work is not None:
             try:
                 next(self._work)
@@ -123,7 +130,10 @@ class Monitor:
         return self._diagnoser.evaluate(self._stream)
 
     def _changes(self, diagnosis: Diagnosis) -> tuple[Fault, ...]:
-        now = {(fault.line, fault.cells[0] if fault.line is None else -1): fault for fault in diagnosis.faults}
+        now = {
+            (fault.line, fault.cells[0] if fault.line is None else -1): fault
+            for fault in diagnosis.faults
+        }
         changes = []
         for key, fault in now.items():
             before = self._known.get(key)

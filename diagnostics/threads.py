@@ -1,4 +1,5 @@
-"""One thread for linear algebra: on the small matrices of a diagnosis, more threads take four times as long."""
+"""One thread for linear algebra: on the small matrices of a diagnosis, more threads take four times
+as long."""
 
 from __future__ import annotations
 

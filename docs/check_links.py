@@ -1,4 +1,5 @@
-"""Checks the links between the pages of a built site, anchors included: python docs/check_links.py build/site
+"""Checks the links between the pages of a built site, anchors included: python docs/check_links.py
+build/site
 
 Sphinx checks only the links that it makes itself. Links to other sites are not followed.
 """
@@ -35,7 +36,11 @@ def broken(site: Path) -> list[str]:
         for link in page.links:
             parts = urlsplit(link)
             target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
-            missing = parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].anchors
+            missing = (
+                parts.fragment
+                and target in pages
+                and unquote(parts.fragment) not in pages[target].anchors
+            )
             if not parts.scheme and (missing or not target.exists()):
                 found.append(f"{path.relative_to(site.resolve())}: broken link {link}")
     return sorted(found)

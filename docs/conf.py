@@ -1,4 +1,5 @@
-"""Sphinx: the pages of this folder, and the reference made from the docstrings. ``make docs`` builds the site."""
+"""Sphinx: the pages of this folder, and the reference made from the docstrings. ``make docs``
+builds the site."""
 
 from __future__ import annotations
 
@@ -40,7 +41,11 @@ myst_heading_anchors = 3
 
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 # Show the names of these aliases, not the types behind them, which fill half a page.
-autodoc_type_aliases = {"NDArray": "NDArray", "ArrayLike": "ArrayLike", "StateArrays": "StateArrays"}
+autodoc_type_aliases = {
+    "NDArray": "NDArray",
+    "ArrayLike": "ArrayLike",
+    "StateArrays": "StateArrays",
+}
 autodoc_preserve_defaults = True
 python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 100
@@ -49,7 +54,8 @@ napoleon_use_rtype = False
 napoleon_use_ivar = True
 napoleon_attr_annotations = False  # the signature above has the types
 
-# An unknown name of these packages is an error; other projects' pages are not available when the site is built.
+# An unknown name of these packages is an error; other projects' pages are not available when the
+# site is built.
 nitpicky = True
 nitpick_ignore_regex = [
     (r"py:.*", r"(?!adaptfault\.|diagnostics\.).*"),
@@ -60,7 +66,9 @@ suppress_warnings = ["ref.python"]  # two modules may have a class of one name
 
 
 # Pages whose source lies elsewhere, so that links work in the repository as well as on the site.
-ELSEWHERE = {f"../examples/paper/{name}/README.md": f"paper/{name}.md" for name in ("simulated", "real")}
+ELSEWHERE = {
+    f"../examples/paper/{name}/README.md": f"paper/{name}.md" for name in ("simulated", "real")
+}
 
 
 def follow_elsewhere(app: Sphinx, page: str, source: list[str]) -> None:
@@ -70,26 +78,38 @@ def follow_elsewhere(app: Sphinx, page: str, source: list[str]) -> None:
 
 
 def missing_names(app: Sphinx, env: BuildEnvironment) -> None:
-    """Warn of each public name that the reference lacks; ``make docs`` takes warnings for errors."""
+    """Warn of each public name that the reference lacks; ``make docs`` takes warnings for
+    errors."""
     documented = env.get_domain("py").objects
     for package in PUBLIC:
         for name in importlib.import_module(package).__all__:
             if f"{package}.{name}" not in documented:
-                logging.getLogger(__name__).warning("%s.%s is public, but on no page of docs/api", package, name)
+                logging.getLogger(__name__).warning(
+                    "%s.%s is public, but on no page of docs/api", package, name
+                )
 
 
-def public_name(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: TextElement) -> Element | None:
-    """Resolve a name of a module, ``FaultSet`` or ``adaptfault.models.store.save_model``, to the public one."""
-    domain, parts = env.get_domain("py"), node.get("reftarget", "").split(".")
+def public_name(
+    app: Sphinx, env: BuildEnvironment, node: pending_xref, content: TextElement
+) -> Element | None:
+    """Resolve a name of a module, ``FaultSet`` or ``adaptfault.models.store.save_model``, to the
+    public one."""
+    domain = env.get_domain("py")
+    parts = node.get("reftarget", "").split(".")
     for package in PUBLIC if node.get("refdomain") == "py" else ():
         for full in (f"{package}.{parts[-1]}", ".".join([package, *parts[-2:]])):
             if full in domain.objects:
-                return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", full, node, content)
+                return domain.resolve_xref(
+                    env, node["refdoc"], app.builder, "obj", full, node, content
+                )
     return None
 
 
-def described_elsewhere(app: Sphinx, what: str, name: str, thing: Any, skip: bool, options: Any) -> bool | None:
-    """Skip public names on the pages of modules, which have pages of their own, and what other packages describe."""
+def described_elsewhere(
+    app: Sphinx, what: str, name: str, thing: Any, skip: bool, options: Any
+) -> bool | None:
+    """Skip public names on the pages of modules, which have pages of their own, and what other
+    packages describe."""
     module = getattr(thing, "__module__", None)
     if callable(thing) and module and not module.startswith(PUBLIC):
         return True
@@ -105,17 +125,26 @@ def public_things() -> tuple[Any, ...]:
     return tuple(getattr(package, name) for package in packages for name in package.__all__)
 
 
-def public_names(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+def public_names(
+    app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]
+) -> None:
     """Link a module's page to its public names, which are described elsewhere."""
     for package in PUBLIC if what == "module" and name not in PUBLIC else ():
         there = importlib.import_module(package)
         names = [n for n in there.__all__ if getattr(getattr(there, n), "__module__", None) == name]
         if names:
-            lines += ["", f"Public, see :doc:`/api/{package}`: " + ", ".join(f":py:obj:`{package}.{n}`" for n in names)]
+            lines += [
+                "",
+                f"Public, see :doc:`/api/{package}`: "
+                + ", ".join(f":py:obj:`{package}.{n}`" for n in names),
+            ]
 
 
-def plain_words(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Escape text that reStructuredText would read as markup: bars, and text before a colon in a property."""
+def plain_words(
+    app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]
+) -> None:
+    """Escape text that reStructuredText would read as markup: bars, and text before a colon in a
+    property."""
     for i, line in enumerate(lines):
         parts = re.split(r"(``.*?``)", line)  # every other one is a literal
         parts[::2] = [part.replace("|", "\\|") for part in parts[::2]]
@@ -124,8 +153,11 @@ def plain_words(app: Sphinx, what: str, name: str, thing: Any, options: Any, lin
         lines.insert(0, "")
 
 
-def several_names(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Join attributes that are described together, "low, high", which are else read as a type and a name."""
+def several_names(
+    app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]
+) -> None:
+    """Join attributes that are described together, "low, high", which are else read as a type and a
+    name."""
     for i, line in enumerate(lines):
         if names := re.match(r":ivar (\w+(?:, \w+)+):", line):
             lines[i] = f":ivar {names[1].replace(', ', ',')}:{line[names.end() :]}"

@@ -1,6 +1,8 @@
-"""Draws the figures of the method pages from simulated grasps: python docs/figures.py [--out FOLDER] [--only NAME ...]
+"""Draws the figures of the method pages from simulated grasps: python docs/figures.py [--out
+FOLDER] [--only NAME ...]
 
-All seeds are fixed. The whole takes about a minute and a half of one core; each figure can be drawn alone.
+All seeds are fixed. The whole takes about a minute and a half of one core; each figure can be drawn
+alone.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 
 import adaptfault as af
 from adaptfault.adaptation.reduced_model import phi
-from adaptfault.robot.trend import trends
+from adaptfault.prognosis.trend import trends
 from diagnostics import (
     Diagnosis,
     Fault,
@@ -40,11 +42,15 @@ from diagnostics.healthy.model import contact_events
 Floats = NDArray[np.float64]
 
 LAYOUT = SensorLayout(1, 10, 8)
-OPEN, STUCK = LAYOUT.cell(0, 4, 3), LAYOUT.cell(0, 6, 5)
+OPEN = LAYOUT.cell(0, 4, 3)
+STUCK = LAYOUT.cell(0, 6, 5)
 CUT = line_fault(LAYOUT, Line(0, "row", 4), "open", break_at=3)
 ONSET = 130
 FAULTS = (CUT, Fault(FaultKind.STUCK, (STUCK,), value=2.0, onset=ONSET))
-RED, BLUE, GREEN, GREY = "#c0392b", "#2c6fa6", "#3f8f4f", "#8a9199"
+RED = "#c0392b"
+BLUE = "#2c6fa6"
+GREEN = "#3f8f4f"
+GREY = "#8a9199"
 SETTINGS = {
     "font.size": 8.5,
     "axes.titlesize": 9,
@@ -71,7 +77,8 @@ def healthy(seed: int, n_per_class: int = 1) -> list[Floats]:
 
 @cache
 def log() -> tuple[Floats, Floats, Diagnosis]:
-    """Return one log as it would be without faults and as it reads, ``[T, D]`` each, and its diagnosis."""
+    """Return one log as it would be without faults and as it reads, ``[T, D]`` each, and its
+    diagnosis."""
     true = np.concatenate(healthy(seed=2))
     seen = inject(true, FAULTS, LAYOUT, seed=0)
     return true, seen, reference().diagnose(seen)
@@ -105,20 +112,29 @@ def draw_map(axes: Axes, values: Floats, title: str, label: str, **style: object
 def outline(axes: Axes, cell: int, colour: str) -> None:
     """Mark one cell of a map."""
     _, row, column = LAYOUT.position(cell)
-    axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, edgecolor=colour, linewidth=1.8))
+    axes.add_patch(
+        Rectangle((column - 0.5, row - 0.5), 1, 1, fill=False, edgecolor=colour, linewidth=1.8)
+    )
 
 
 def draw_verdicts(axes: Axes, diagnosis: Diagnosis) -> None:
     """Draw the verdict of each cell and the letter of its fault."""
     codes = [list(Verdict).index(verdict) for verdict in diagnosis.verdicts]
     colours = {Verdict.ALIVE: "#a9d3a5", Verdict.FAULTY: RED, Verdict.UNTESTED: "#d5d8dc"}
-    axes.imshow(LAYOUT.grid(np.array(codes))[0], cmap=ListedColormap([colours[v] for v in Verdict]), vmin=0, vmax=2)
+    axes.imshow(
+        LAYOUT.grid(np.array(codes))[0],
+        cmap=ListedColormap([colours[v] for v in Verdict]),
+        vmin=0,
+        vmax=2,
+    )
     for fault in diagnosis.faults:
         for cell in fault.cells:
             _, row, column = LAYOUT.position(cell)
             letter = "K" if fault.kind == FaultKind.STUCK else fault.kind.value[0].upper()
             axes.text(column, row, letter, color="white", ha="center", va="center", weight="bold")
-    for row, column in zip(*np.nonzero(LAYOUT.grid(diagnosis.verdicts == Verdict.UNTESTED)[0]), strict=True):
+    for row, column in zip(
+        *np.nonzero(LAYOUT.grid(diagnosis.verdicts == Verdict.UNTESTED)[0]), strict=True
+    ):
         axes.text(column, row, "?", color=GREY, ha="center", va="center")
     axes.set(title="verdicts and root causes", xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
@@ -134,7 +150,9 @@ def diagnosis() -> Figure:
     axes[0].set(title="frames: root load of each cell", xlabel="frame", ylabel="cell")
     axes[0].spines[:].set_visible(False)
     figure.colorbar(image, ax=axes[0], shrink=0.85)
-    draw_map(axes[1], found.evidence["spatial"], "evidence", "log likelihood ratio", cmap="Reds", vmin=0)
+    draw_map(
+        axes[1], found.evidence["spatial"], "evidence", "log likelihood ratio", cmap="Reds", vmin=0
+    )
     draw_verdicts(axes[2], found)
     return figure
 
@@ -150,7 +168,9 @@ def events() -> Figure:
     axes[0].plot(total, color="black", linewidth=0.9)
     for k, event in enumerate(found):
         axes[0].axvspan(event.first, event.end, color=(BLUE, GREEN)[k % 2], alpha=0.22, linewidth=0)
-        axes[0].text((event.first + event.end) / 2, total.max() * 1.05, str(k + 1), ha="center", va="center")
+        axes[0].text(
+            (event.first + event.end) / 2, total.max() * 1.05, str(k + 1), ha="center", va="center"
+        )
     axes[0].set(
         title=f"{len(found)} contact events",
         xlabel="frame",
@@ -187,23 +207,45 @@ def evidence() -> Figure:
     ends = list(range(25, len(seen) + 1, 25))
     grown = [reference().diagnose(seen[:end]).evidence["spatial"] for end in ends]
     idle = int(true.max(axis=0).argmin())
-    cells = {OPEN: ("open cell", RED), STUCK: (f"stuck from frame {ONSET}", "#e67e22"), idle: ("idle cell", GREY)}
+    cells = {
+        OPEN: ("open cell", RED),
+        STUCK: (f"stuck from frame {ONSET}", "#e67e22"),
+        idle: ("idle cell", GREY),
+    }
     figure, axes = panels(1, 1)
     for cell, (name, colour) in cells.items():
         axes[0].plot(root_load(seen[:, cell]), color=colour, label=name)
-        axes[1].plot(ends, [ratios[cell] for ratios in grown], marker="o", markersize=3, color=colour, label=name)
-    axes[0].plot(root_load(true[:, OPEN]), color=RED, linewidth=0.8, linestyle=":", label="the open cell, if healthy")
+        axes[1].plot(
+            ends,
+            [ratios[cell] for ratios in grown],
+            marker="o",
+            markersize=3,
+            color=colour,
+            label=name,
+        )
+    axes[0].plot(
+        root_load(true[:, OPEN]),
+        color=RED,
+        linewidth=0.8,
+        linestyle=":",
+        label="the open cell, if healthy",
+    )
     axes[0].set(title="reading", xlabel="frame", ylabel="root load", ylim=(-0.02, 1))
     axes[0].legend(ncols=2, fontsize=7)
     axes[1].axhline(0, color="black", linewidth=0.6)
-    axes[1].set(title="evidence of a constant reading", xlabel="frames seen", ylabel="log likelihood ratio")
+    axes[1].set(
+        title="evidence of a constant reading", xlabel="frames seen", ylabel="log likelihood ratio"
+    )
     axes[1].legend()
     return figure
 
 
 def calibration() -> Figure:
-    """Draw log ratios of healthy and dead cells, the fitted curve, and how often cells of a given P are dead."""
-    ratios, probabilities, dead = [], [], []
+    """Draw log ratios of healthy and dead cells, the fitted curve, and how often cells of a given P
+    are dead."""
+    ratios = []
+    probabilities = []
+    dead = []
     for seed in range(10, 50):
         rng = np.random.default_rng(seed)
         cells = rng.choice(LAYOUT.n_cells, 13, replace=False)
@@ -220,7 +262,9 @@ def calibration() -> Figure:
     bins = np.linspace(-4, 20, 25)
     axes[0].hist(np.clip(ratio[~is_dead], -4, 20), bins, color=BLUE, alpha=0.7, label="healthy")
     axes[0].hist(np.clip(ratio[is_dead], -4, 20), bins, color=RED, alpha=0.7, label="dead")
-    axes[0].set(title="constant cells of 40 logs", xlabel="raw log ratio", ylabel="cells", yscale="log")
+    axes[0].set(
+        title="constant cells of 40 logs", xlabel="raw log ratio", ylabel="cells", yscale="log"
+    )
     axes[0].legend()
     order = np.argsort(ratio)
     axes[1].plot(ratio[order], probability[order], ".", color=GREY, markersize=2)
@@ -230,7 +274,8 @@ def calibration() -> Figure:
     for k in range(len(edges) - 1):
         of_bin = which == k
         if of_bin.sum() >= 5:
-            mean, n = is_dead[of_bin].mean(), of_bin.sum()
+            mean = is_dead[of_bin].mean()
+            n = of_bin.sum()
             error = np.sqrt(max(mean * (1 - mean), 1 / n) / n)
             axes[2].errorbar(probability[of_bin].mean(), mean, error, fmt="o", color=BLUE)
     axes[2].plot([0, 1], [0, 1], color="black", linewidth=0.6)
@@ -242,13 +287,21 @@ def root_causes() -> Figure:
     """Draw the evidence of single cells and the wire that explains them."""
     _, _, found = log()
     figure, axes = panels(1, 0.85, 1.1)
-    draw_map(axes[0], found.evidence["spatial"], "evidence of single cells", "log ratio", cmap="Reds", vmin=0)
+    draw_map(
+        axes[0],
+        found.evidence["spatial"],
+        "evidence of single cells",
+        "log ratio",
+        cmap="Reds",
+        vmin=0,
+    )
     draw_verdicts(axes[1], found)
     for fault in found.faults:
         if fault.line is not None:
             positions = np.array([LAYOUT.position(cell)[1:] for cell in fault.cells])
             (top, left), (bottom, right) = positions.min(axis=0), positions.max(axis=0)
-            corner, size = (left - 0.5, top - 0.5), (right - left + 1, bottom - top + 1)
+            corner = (left - 0.5, top - 0.5)
+            size = (right - left + 1, bottom - top + 1)
             axes[1].add_patch(Rectangle(corner, *size, fill=False, edgecolor="black", linewidth=2))
     text = "\n\n".join(fault.reason for fault in found.faults)
     axes[2].text(0, 0.95, text, va="top", wrap=True, transform=axes[2].transAxes, fontsize=8)
@@ -271,7 +324,9 @@ def repair() -> Figure:
     """Draw a frame with dead cells, and what the fill makes of it."""
     network, test = adapter()
     scattered = np.random.default_rng(0).choice(LAYOUT.n_cells, 16, replace=False)
-    fault_set = FaultSet(tuple(np.union1d(scattered, LAYOUT.cells_on(CUT.line)).tolist()), LAYOUT.n_cells)
+    fault_set = FaultSet(
+        tuple(np.union1d(scattered, LAYOUT.cells_on(CUT.line)).tolist()), LAYOUT.n_cells
+    )
     window = test.x[test.x.sum(axis=(1, 2)).argmax()][None]
     adapted = network.adapt(fault_set, method="fill", progress=False)
     with torch.no_grad():
@@ -289,41 +344,66 @@ def repair() -> Figure:
 
 
 def forecast() -> Figure:
-    """Draw the forecast accuracy of some fault sets beside the accuracy that the adapted model reaches."""
+    """Draw the forecast accuracy of some fault sets beside the accuracy that the adapted model
+    reaches."""
     network, test = adapter()
     rng = np.random.default_rng(1)
     sets = {f"{n} cells": rng.choice(LAYOUT.n_cells, n, replace=False) for n in (8, 40, 68)}
-    sets["rows 3 to 6"] = np.concatenate([LAYOUT.cells_on(Line(0, "row", row)) for row in (3, 4, 5, 6)])
+    sets["rows 3 to 6"] = np.concatenate(
+        [LAYOUT.cells_on(Line(0, "row", row)) for row in (3, 4, 5, 6)]
+    )
     figure, axes = panels(1)
     for k, cells in enumerate(sets.values()):
         fault_set = FaultSet(tuple(cells.tolist()), LAYOUT.n_cells)
         expected = network.forecast(fault_set).stages
         for method, colour, side in (("fill", BLUE, -0.15), ("head", GREEN, 0.15)):
-            of, label = expected[method], method if k == 0 else None
+            of = expected[method]
+            label = method if k == 0 else None
             error = [[of.accuracy - of.low], [of.high - of.accuracy]]
-            axes[0].errorbar(k + side, of.accuracy, error, fmt="_", capsize=3, color=colour, label=label)
-            reached = af.evaluate(network.adapt(fault_set, method=method, progress=False), test).accuracy
+            axes[0].errorbar(
+                k + side, of.accuracy, error, fmt="_", capsize=3, color=colour, label=label
+            )
+            reached = af.evaluate(
+                network.adapt(fault_set, method=method, progress=False), test
+            ).accuracy
             axes[0].plot(
-                k + side, reached, "x", color="black", label="reached on test" if k == 0 and side > 0 else None
+                k + side,
+                reached,
+                "x",
+                color="black",
+                label="reached on test" if k == 0 and side > 0 else None,
             )
     axes[0].set_xticks(range(len(sets)), sets)
-    axes[0].set(ylabel="accuracy", title="forecast with its 95 % interval, and the accuracy reached on test recordings")
+    axes[0].set(
+        ylabel="accuracy",
+        title="forecast with its 95 % interval, and the accuracy reached on test recordings",
+    )
     axes[0].legend(loc="lower left")
     return figure
 
 
 def ageing() -> Figure:
-    """Draw the gains of a weakening and of a stable cell over weekly runs, with what is reported of them."""
+    """Draw the gains of a weakening and of a stable cell over weekly runs, with what is reported of
+    them."""
     rng = np.random.default_rng(0)
     when = 7.0 * np.arange(14)
     gains = rng.normal(0, 0.05, (14, 40))
     gains[:, 0] += np.log(0.97) * when / 7
-    found = {t.series: t for t in trends(when, gains, np.full(40, np.log(0.5)), np.full(40, np.log(2))).found}
+    found = {
+        t.series: t
+        for t in trends(when, gains, np.full(40, np.log(0.5)), np.full(40, np.log(2))).found
+    }
     figure, axes = panels(1, 1)
     for cell, place in enumerate(axes):
         place.plot(when, np.exp(gains[:, cell]), ".", color=BLUE)
         place.axhline(0.5, color=GREY, linestyle=":")
-        place.set(xlabel="days", ylabel="gain", ylim=(0.3, 1.3), xlim=(-3, 200), title="no drift beyond chance")
+        place.set(
+            xlabel="days",
+            ylabel="gain",
+            ylim=(0.3, 1.3),
+            xlim=(-3, 200),
+            title="no drift beyond chance",
+        )
         if (trend := found.get(cell)) is not None and trend.crossing is not None:
             days = np.linspace(when[0], when[-1] + trend.crossing)
             place.plot(days, np.exp(trend.now + trend.rate * (days - when[-1])), color=RED)
@@ -347,8 +427,15 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 def main() -> None:
     """Draw them."""
     parser = argparse.ArgumentParser(description="Draws the figures of the method pages")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "figures", help="folder of the PNG files")
-    parser.add_argument("--only", nargs="+", choices=FIGURES, metavar="NAME", help=f"some of {', '.join(FIGURES)}")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path(__file__).parent / "figures",
+        help="folder of the PNG files",
+    )
+    parser.add_argument(
+        "--only", nargs="+", choices=FIGURES, metavar="NAME", help=f"some of {', '.join(FIGURES)}"
+    )
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     matplotlib.rcParams.update(SETTINGS)

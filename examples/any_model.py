@@ -1,15 +1,18 @@
-"""Repair of any consumer of tactile data: python examples/any_model.py [RECORDINGS ...] [--small] [--out any_model]
+"""Repair of any consumer of tactile data: python examples/any_model.py [RECORDINGS ...] [--small]
+[--out any_model]
 
-A 1-D CNN over time, an LSTM, a small 3-D CNN, an MLP on statistics and the paper's network; ExtraTrees, SVC and
-histogram boosting from scikit-learn; a regression of total force and its centre. For each kind of fault (10 % and 50 %
-of the cells at random, five rows, one pad, two lines) the table has the test score with the faults ignored, with zeros,
-restored, restored + head, fine-tuned for ``--finetune`` seconds and trained anew, and CPU seconds. Faulty cells read 0
-or full scale. The score is the accuracy, or R2; a regression also has the mean absolute
-error of restored and of restored + head, divided by that of training anew. Without RECORDINGS, grasps are simulated.
+A 1-D CNN over time, an LSTM, a small 3-D CNN, an MLP on statistics and the paper's network;
+ExtraTrees, SVC and histogram boosting from scikit-learn; a regression of total force and its
+centre. For each kind of fault (10 % and 50 % of the cells at random, five rows, one pad, two lines)
+the table has the test score with the faults ignored, with zeros, restored, restored + head,
+fine-tuned for ``--finetune`` seconds and trained anew, and CPU seconds. Faulty cells read 0 or full
+scale. The score is the accuracy, or R2; a regression also has the mean absolute error of restored
+and of restored + head, divided by that of training anew. Without RECORDINGS, grasps are simulated.
 
-Networks are trained until validation does not improve for 10 epochs; the paper's network 20 epochs, as in
-``adaptation_figures.py``, whose networks ``--bases`` takes instead. Each result is a line of OUT.jsonl; started again,
-the script goes on where it was. At the end it writes OUT.csv and OUT.png. ``--small`` takes seconds.
+Networks are trained until validation does not improve for 10 epochs; the paper's network 20 epochs,
+as in ``adaptation_figures.py``, whose networks ``--bases`` takes instead. Each result is a line of
+OUT.jsonl; started again, the script goes on where it was. At the end it writes OUT.csv and OUT.png.
+``--small`` takes seconds.
 """
 
 from __future__ import annotations
@@ -79,7 +82,9 @@ class OverTime(nn.Module):
     def __init__(self, layout: SensorLayout, length: int, n: int) -> None:
         super().__init__()
         d = layout.n_cells
-        self.net = nn.Sequential(nn.Conv1d(d, 64, 3, padding=1), nn.ReLU(), nn.Conv1d(64, 64, 3, padding=1), nn.ReLU())
+        self.net = nn.Sequential(
+            nn.Conv1d(d, 64, 3, padding=1), nn.ReLU(), nn.Conv1d(64, 64, 3, padding=1), nn.ReLU()
+        )
         self.last = nn.Linear(64, n)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -91,7 +96,8 @@ class Lstm(nn.Module):
 
     def __init__(self, layout: SensorLayout, length: int, n: int) -> None:
         super().__init__()
-        self.lstm, self.last = nn.LSTM(layout.n_cells, 64, batch_first=True), nn.Linear(64, n)
+        self.lstm = nn.LSTM(layout.n_cells, 64, batch_first=True)
+        self.last = nn.Linear(64, n)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return self.last(self.lstm(x)[0].mean(1))
@@ -104,7 +110,9 @@ class Volume(nn.Module):
         super().__init__()
         self.shape = layout.shape
         self.net = nn.Sequential(
-            nn.Conv3d(layout.pads, 8, 3, padding=1), nn.ReLU(), nn.AdaptiveAvgPool3d((1, layout.rows, layout.cols))
+            nn.Conv3d(layout.pads, 8, 3, padding=1),
+            nn.ReLU(),
+            nn.AdaptiveAvgPool3d((1, layout.rows, layout.cols)),
         )
         self.last = nn.Linear(8 * layout.rows * layout.cols, n)
 
@@ -118,7 +126,8 @@ class Statistics(nn.Module):
 
     def __init__(self, layout: SensorLayout, length: int, n: int) -> None:
         super().__init__()
-        self.hidden, self.last = nn.Linear(2 * layout.n_cells, 128), nn.Linear(128, n)
+        self.hidden = nn.Linear(2 * layout.n_cells, 128)
+        self.last = nn.Linear(128, n)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return self.last(torch.relu(self.hidden(torch.cat([x.mean(1), x.amax(1)], 1))))
@@ -144,21 +153,30 @@ CLASSIFIERS = {
 
 def fault_sets(layout: SensorLayout, rng: np.random.Generator) -> dict[str, FaultSet]:
     """Return the kinds of fault; one pad only where there are several."""
-    d, present = layout.n_cells, np.flatnonzero(layout.present)
+    d = layout.n_cells
+    present = np.flatnonzero(layout.present)
     rows = [line for line in layout.lines if line.kind == "row" and len(layout.cells_on(line))]
-    wires = [line for line in layout.lines if line.kind in ("row", "column") and len(layout.cells_on(line))]
+    wires = [
+        line
+        for line in layout.lines
+        if line.kind in ("row", "column") and len(layout.cells_on(line))
+    ]
 
     def lines(of: list, n: int) -> FaultSet:
         chosen = rng.choice(len(of), min(n, len(of) // 2), replace=False)
         return FaultSet(tuple(int(c) for i in chosen for c in layout.cells_on(of[i])), d)
 
     kinds = {
-        f"{share:.0%} random": FaultSet(tuple(rng.permutation(present)[: round(share * len(present))].tolist()), d)
+        f"{share:.0%} random": FaultSet(
+            tuple(rng.permutation(present)[: round(share * len(present))].tolist()), d
+        )
         for share in (0.1, 0.5)
     }
     kinds |= {"five rows": lines(rows, 5), "two lines": lines(wires, 2)}
     if layout.pads > 1:
-        kinds["one pad"] = FaultSet(tuple(c for c in present.tolist() if c < layout.rows * layout.cols), d)
+        kinds["one pad"] = FaultSet(
+            tuple(c for c in present.tolist() if c < layout.rows * layout.cols), d
+        )
     return kinds
 
 
@@ -181,13 +199,21 @@ def error(model: object, windows: Windows) -> float:
 
 
 def options(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Return how a network is trained: the paper's as in ``adaptation_figures.py``, others until validation stops."""
+    """Return how a network is trained: the paper's as in ``adaptation_figures.py``, others until
+    validation stops."""
     if name == "TactileTransformer":
-        return {"epochs": min(20, args.epochs), "patience": None, "learning_rate": 1e-4, "progress": False}
+        return {
+            "epochs": min(20, args.epochs),
+            "patience": None,
+            "learning_rate": 1e-4,
+            "progress": False,
+        }
     return {"epochs": args.epochs, "learning_rate": 1e-3, "progress": False}
 
 
-def trained(name: str, layout: SensorLayout, parts, args: argparse.Namespace, seed: int) -> nn.Module:
+def trained(
+    name: str, layout: SensorLayout, parts, args: argparse.Namespace, seed: int
+) -> nn.Module:
     """Return the fault-free network."""
     if name == "TactileTransformer" and args.bases is not None:
         return load_model(args.bases / f"base{seed}")
@@ -216,29 +242,46 @@ def of_network(
     for kind, fault_set in kinds.items():
         broken = spoilt(test, fault_set, rng)
         zeros = Windows(np.where(fault_set.mask, 0, broken.x), test.y, test.recording)
-        row = {"fault-free": score(model, test), "nothing": score(model, broken), "zeros": score(model, zeros)}
+        row = {
+            "fault-free": score(model, test),
+            "nothing": score(model, broken),
+            "zeros": score(model, zeros),
+        }
         began = time.process_time()
         restored = adapter.adapt(fault_set, method="fill")
-        row["restored s"], row["restored"] = time.process_time() - began, score(restored, broken)
+        row["restored s"] = time.process_time() - began
+        row["restored"] = score(restored, broken)
         began = time.process_time()
         head = adapter.adapt(fault_set, method="head")
-        row["head s"], row["head"] = time.process_time() - began, score(head, broken)
+        row["head s"] = time.process_time() - began
+        row["head"] = score(head, broken)
         if args.finetune:
-            tuned = adapter.adapt(fault_set, method="finetune", budget=args.finetune, progress=False)
+            tuned = adapter.adapt(
+                fault_set, method="finetune", budget=args.finetune, progress=False
+            )
             row["finetuned"] = score(tuned, broken)
         if not args.no_anew:
-            began, anew = time.process_time(), fresh(name, layout, parts)
-            without = [Windows(np.where(fault_set.mask, 0, w.x), w.y, w.recording) for w in (training, validation)]
+            began = time.process_time()
+            anew = fresh(name, layout, parts)
+            without = [
+                Windows(np.where(fault_set.mask, 0, w.x), w.y, w.recording)
+                for w in (training, validation)
+            ]
             row["anew epochs"] = train(anew, *without, **options(name, args)).epochs
-            row["anew s"], row["anew"] = time.process_time() - began, score(anew, zeros)
+            row["anew s"] = time.process_time() - began
+            row["anew"] = score(anew, zeros)
             if test.y.ndim == 2:
                 least = error(anew, zeros)
-                row |= {"restored/anew": error(restored, broken) / least, "head/anew": error(head, broken) / least}
+                row |= {
+                    "restored/anew": error(restored, broken) / least,
+                    "head/anew": error(head, broken) / least,
+                }
         yield kind, row
 
 
 def of_classifier(estimator, parts, kinds, seed: int) -> Iterator[tuple[str, dict[str, float]]]:
-    """Measure one scikit-learn classifier; "head" is what FaultTolerantClassifier chose, "anew" the refit."""
+    """Measure one scikit-learn classifier; "head" is what FaultTolerantClassifier chose, "anew" the
+    refit."""
     from sklearn.base import clone
 
     def table(windows: Windows) -> np.ndarray:
@@ -251,44 +294,63 @@ def of_classifier(estimator, parts, kinds, seed: int) -> Iterator[tuple[str, dic
         broken = table(spoilt(test, fault_set, rng))
         columns = np.tile(fault_set.mask, 2)
         whole = tolerant.set_faults(None).estimator_
-        row = {"fault-free": whole.score(table(test), test.y), "nothing": whole.score(broken, test.y)}
+        row = {
+            "fault-free": whole.score(table(test), test.y),
+            "nothing": whole.score(broken, test.y),
+        }
         row["zeros"] = whole.score(np.where(columns, 0, broken), test.y)
         row["restored"] = whole.score(CellImputer(fault_set).fit(x).transform(broken), test.y)
         began = time.process_time()
         tolerant.set_faults(fault_set)
-        row["head s"], row["head"] = time.process_time() - began, tolerant.score(broken, test.y)
+        row["head s"] = time.process_time() - began
+        row["head"] = tolerant.score(broken, test.y)
         began = time.process_time()
         refit = clone(estimator).fit(x[:, ~columns], training.y)
-        row["anew s"], row["anew"] = time.process_time() - began, refit.score(broken[:, ~columns], test.y)
+        row["anew s"] = time.process_time() - began
+        row["anew"] = refit.score(broken[:, ~columns], test.y)
         yield kind, row
 
 
 def forces(windows: Windows, layout: SensorLayout) -> Windows:
-    """Return the windows with contact; their values are total force and its centre, scaled to about -1 to 1."""
+    """Return the windows with contact; their values are total force and its centre, scaled to about
+    -1 to 1."""
     mean = windows.x.mean(1)
     total = np.maximum(mean.sum(1), 1e-6)
-    row, col = np.arange(layout.n_cells) // layout.cols % layout.rows, np.arange(layout.n_cells) % layout.cols
-    centre = (mean @ row / total / max(1, layout.rows - 1), mean @ col / total / max(1, layout.cols - 1))
+    row = np.arange(layout.n_cells) // layout.cols % layout.rows
+    col = np.arange(layout.n_cells) % layout.cols
+    centre = (
+        mean @ row / total / max(1, layout.rows - 1),
+        mean @ col / total / max(1, layout.cols - 1),
+    )
     touched = total > np.percentile(total, 20)
     y = np.stack([np.log(total / np.median(total)), 2 * centre[0] - 1, 2 * centre[1] - 1], axis=1)
     return Windows(windows.x[touched], y[touched], windows.recording[touched])
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("recordings", nargs="*", help="labelled recordings; none: simulated grasps")
-    parser.add_argument("--small", action="store_true", help="one seed, little training, two models")
+    parser.add_argument(
+        "--small", action="store_true", help="one seed, little training, two models"
+    )
     parser.add_argument("--only", nargs="+", help="names of consumers")
     parser.add_argument("--kinds", nargs="+", help="kinds of fault, as the table names them")
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
     parser.add_argument("--epochs", type=int, default=200, help="at most")
-    parser.add_argument("--bases", type=Path, help="folder with trained networks base20, base21, ...")
+    parser.add_argument(
+        "--bases", type=Path, help="folder with trained networks base20, base21, ..."
+    )
     parser.add_argument("--no-anew", action="store_true", help="leave out training anew")
     parser.add_argument("--finetune", type=float, default=60.0, help="seconds; 0 leaves it out")
-    parser.add_argument("--out", default="any_model", help="name of the results, the table and the picture")
+    parser.add_argument(
+        "--out", default="any_model", help="name of the results, the table and the picture"
+    )
     args = parser.parse_args()
     if args.small:
-        args.epochs, args.finetune = 2, 0.0
+        args.epochs = 2
+        args.finetune = 0.0
         args.only = args.only or ["MLP", "ExtraTrees", "forces"]
     if args.recordings:
         recordings = load(args.recordings).recordings
@@ -307,7 +369,8 @@ def main() -> None:
 
 def measure(recordings: Recordings, args: argparse.Namespace) -> None:
     """Append a line for each seed, consumer and kind of fault that OUT.jsonl lacks."""
-    layout, path = recordings.layout, Path(f"{args.out}.jsonl")
+    layout = recordings.layout
+    path = Path(f"{args.out}.jsonl")
     windows = make_windows(recordings.frames, recordings.labels, layout)
     results = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     done = {(result["seed"], result["consumer"], result["faults"]) for result in results}
@@ -316,16 +379,25 @@ def measure(recordings: Recordings, args: argparse.Namespace) -> None:
         of_forces = tuple(forces(w, layout) for w in parts)
         every = fault_sets(layout, np.random.default_rng(seed))
         for name in args.only or [*NETWORKS, *CLASSIFIERS, "forces"]:
-            kinds = {k: f for k, f in every.items() if k in (args.kinds or every) and (seed, name, k) not in done}
+            kinds = {
+                k: f
+                for k, f in every.items()
+                if k in (args.kinds or every) and (seed, name, k) not in done
+            }
             if not kinds:
                 continue
             if name in CLASSIFIERS:
                 rows = of_classifier(CLASSIFIERS[name], parts, kinds, seed)
             else:
-                rows = of_network(name, layout, of_forces if name == "forces" else parts, kinds, args, seed)
+                rows = of_network(
+                    name, layout, of_forces if name == "forces" else parts, kinds, args, seed
+                )
             for kind, row in rows:
                 with path.open("a") as file:
-                    file.write(json.dumps({"seed": seed, "consumer": name, "faults": kind, "row": row}) + "\n")
+                    file.write(
+                        json.dumps({"seed": seed, "consumer": name, "faults": kind, "row": row})
+                        + "\n"
+                    )
             print(f"seed {seed}: {name} done", file=sys.stderr, flush=True)
 
 
@@ -338,7 +410,10 @@ def report(found: dict[tuple[str, str], list[dict[str, float]]], out: str) -> No
     columns = [c for c in COLUMNS + ERRORS if any(c in row for row in table.values())]
     print(f"{'consumer':20s}{'faults':12s}" + "".join(f"{c:>14s}" for c in columns))
     for (name, kind), row in table.items():
-        print(f"{name:20s}{kind:12s}" + "".join(f"{row[c]:14.3f}" if c in row else f"{'-':>14s}" for c in columns))
+        print(
+            f"{name:20s}{kind:12s}"
+            + "".join(f"{row[c]:14.3f}" if c in row else f"{'-':>14s}" for c in columns)
+        )
     with open(f"{out}.csv", "w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["consumer", "faults", *columns])
@@ -362,9 +437,16 @@ def draw(table: dict[tuple[str, str], dict[str, float]], path: str) -> None:
             at = np.arange(len(kinds)) + 0.8 * ((i + 0.5) / len(shown) - 0.5)
             heights = [table[name, kind].get(column, np.nan) for kind in kinds]
             ax.bar(at, heights, 0.8 / len(shown), color=COLOURS[column], label=column)
-        ax.axhline(table[name, kinds[0]]["fault-free"], color="0.3", linestyle="--", linewidth=1, label="fault-free")
+        ax.axhline(
+            table[name, kinds[0]]["fault-free"],
+            color="0.3",
+            linestyle="--",
+            linewidth=1,
+            label="fault-free",
+        )
         regression = "head/anew" in table[name, kinds[0]]
-        ax.set(title=name, ylabel="R2" if regression else "accuracy", ylim=(0, 1))  # an R2 below 0 shows no bar
+        # an R2 below 0 shows no bar
+        ax.set(title=name, ylabel="R2" if regression else "accuracy", ylim=(0, 1))
         ax.set_xticks(range(len(kinds)), kinds)
         ax.spines[["top", "right"]].set_visible(False)
     for ax in axes[len(names) :]:

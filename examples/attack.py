@@ -1,7 +1,9 @@
-"""Attacks a bundle, the readers of recordings and the receiver, and prints what held: attack.py [--small]
+"""Attacks a bundle, the readers of recordings and the receiver, and prints what held: attack.py
+[--small]
 
-One table: the attack, how often it was tried, how often it held. A damaged bundle holds when it predicts as before or
-is refused with one line; a malformed recording when it is read or refused; packets when every valid one arrives.
+One table: the attack, how often it was tried, how often it held. A damaged bundle holds when it
+predicts as before or is refused with one line; a malformed recording when it is read or refused;
+packets when every valid one arrives.
 """
 
 from __future__ import annotations
@@ -34,13 +36,17 @@ Outcome = Iterator[bool]  # whether it held, for each attempt
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """Return the content with a flipped bit, cut off, with zeros at its end, or with bytes inserted."""
+    """Return the content with a flipped bit, cut off, with zeros at its end, or with bytes
+    inserted."""
     at = int(rng.integers(len(data)))
     flipped = bytearray(data)
     flipped[at] ^= 1 << int(rng.integers(8))
-    return (bytes(flipped), data[:at], data[:at] + bytes(len(data) - at), data[:at] + rng.bytes(9) + data[at:])[
-        rng.integers(4)
-    ]
+    return (
+        bytes(flipped),
+        data[:at],
+        data[:at] + bytes(len(data) - at),
+        data[:at] + rng.bytes(9) + data[at:],
+    )[rng.integers(4)]
 
 
 def bundles(count: int, home: Path, rng: np.random.Generator) -> Outcome:
@@ -49,7 +55,9 @@ def bundles(count: int, home: Path, rng: np.random.Generator) -> Outcome:
         whole = power_cut.make(home)
         x = whole.parts.check_windows().x
         expected = af.Predictor.load(whole.path).predict(x)
-        files = [path for path in sorted(whole.path.rglob("*")) if path.is_file() and path.stat().st_size]
+        files = [
+            path for path in sorted(whole.path.rglob("*")) if path.is_file() and path.stat().st_size
+        ]
         for _ in range(count):
             path = files[rng.integers(len(files))]
             with tempfile.TemporaryDirectory(dir=home) as place:
@@ -69,7 +77,9 @@ def recordings(count: int, home: Path, rng: np.random.Generator) -> Outcome:
         name = ("a.npz", "a.csv")[i % 2]
         (home / "bad").mkdir(exist_ok=True)
         (home / "bad" / name).write_bytes(damaged((home / name).read_bytes(), rng))
-        yield held(lambda name=name: len(af.load(home / "bad" / name, layout=layout).recordings.frames) > 0)
+        yield held(
+            lambda name=name: len(af.load(home / "bad" / name, layout=layout).recordings.frames) > 0
+        )
 
 
 def packets(count: int, home: Path, rng: np.random.Generator) -> Outcome:
@@ -94,7 +104,8 @@ def names(count: int, home: Path, rng: np.random.Generator) -> Outcome:
 
 
 def replays(count: int, home: Path, rng: np.random.Generator) -> Outcome:
-    """Replay old packets from the device's own address while it sends; none is taken for a restart."""
+    """Replay old packets from the device's own address while it sends; none is taken for a
+    restart."""
     receiver = Receiver(SensorLayout(1, 2, 3))
     for i in range(count + 100):
         now = i / 10
@@ -120,7 +131,9 @@ def storms(count: int, home: Path, rng: np.random.Generator) -> Outcome:
                     line.sendto(format_packet("robot", i / 10, np.ones(6)), ("127.0.0.1", port))
                     i += 1
 
-        station = af.Station(SensorLayout(1, 2, 3), on_event=lambda event: None, quiet=True, seconds=0.3)
+        station = af.Station(
+            SensorLayout(1, 2, 3), on_event=lambda event: None, quiet=True, seconds=0.3
+        )
         listening = asyncio.create_task(station.listen())
         while not station.receiver.port:
             await asyncio.sleep(0.01)
@@ -144,7 +157,9 @@ def storms(count: int, home: Path, rng: np.random.Generator) -> Outcome:
 def kills(count: int, home: Path, rng: np.random.Generator) -> Outcome:
     """Kill maintenance with kill -9, see kill_maintenance.py."""
     script = Path(__file__).with_name("kill_maintenance.py")
-    done = subprocess.run([sys.executable, script, "--kills", str(count)], capture_output=True, check=False)
+    done = subprocess.run(
+        [sys.executable, script, "--kills", str(count)], capture_output=True, check=False
+    )
     yield from [done.returncode == 0] * count
 
 
@@ -188,7 +203,9 @@ def main() -> None:
         if args.small and not few:
             continue
         with tempfile.TemporaryDirectory() as home:
-            outcomes = list(attack(few if args.small else many, Path(home), np.random.default_rng(0)))
+            outcomes = list(
+                attack(few if args.small else many, Path(home), np.random.default_rng(0))
+            )
         failed += outcomes.count(False)
         print(f"{name:28} {len(outcomes):7} {outcomes.count(True):7}", flush=True)
     raise SystemExit(failed > 0)

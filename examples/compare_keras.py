@@ -1,13 +1,16 @@
-"""The paper's network here and in Keras: python examples/compare_keras.py [GRASPS.npz] [--epochs 10] [--seeds 0]
+"""The paper's network here and in Keras: python examples/compare_keras.py [GRASPS.npz] [--epochs
+10] [--seeds 0]
 
-The same layers in Keras 3, on TensorFlow (the paper's stack) and on torch, with the same initial weights; that both are
-one network is checked: as many parameters, the same logits. Then all train for as many epochs on the same windows:
-Adam at 1e-4, batches of 32, the best of the epochs by validation accuracy, no averaging of weights. Each stack has a
-process and one thread of its own. They take turns, an epoch each, and later a few predictions each, so that whatever
-else the machine does falls on all. "CPU" is what a process really used; on a busy machine only that compares.
+The same layers in Keras 3, on TensorFlow (the paper's stack) and on torch, with the same initial
+weights; that both are one network is checked: as many parameters, the same logits. Then all train
+for as many epochs on the same windows: Adam at 1e-4, batches of 32, the best of the epochs by
+validation accuracy, no averaging of weights. Each stack has a process and one thread of its own.
+They take turns, an epoch each, and later a few predictions each, so that whatever else the machine
+does falls on all. "CPU" is what a process really used; on a busy machine only that compares.
 
-An epoch is with its validation; the first (graphs are built) is apart. A prediction goes from windows in numpy to
-classes in numpy, in each way that the stack offers. Without recordings: a few simulated grasps and one epoch.
+An epoch is with its validation; the first (graphs are built) is apart. A prediction goes from
+windows in numpy to classes in numpy, in each way that the stack offers. Without recordings: a few
+simulated grasps and one epoch.
 
     pip install 'adaptfault[compare-keras]'    # Keras and TensorFlow; what is missing is skipped
 """
@@ -43,9 +46,12 @@ class Result:
     parameters: int = 0
     difference: float = 0.0  # of the untrained logits from ours, the largest
     accuracy: list[float] = field(default_factory=list)  # a seed each
-    first: list[tuple[float, float]] = field(default_factory=list)  # wall and CPU seconds of the first epoch
+    # wall and CPU seconds of the first epoch
+    first: list[tuple[float, float]] = field(default_factory=list)
     epochs: list[tuple[float, float]] = field(default_factory=list)  # of the later ones
-    milliseconds: dict[tuple[str, int], list[tuple[float, float]]] = field(default_factory=lambda: defaultdict(list))
+    milliseconds: dict[tuple[str, int], list[tuple[float, float]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
     megabytes: float = 0.0
 
     def epoch(self) -> tuple[float, float]:
@@ -55,7 +61,11 @@ class Result:
 
     def latency(self, batch: int) -> dict[str, tuple[float, float]]:
         """Median wall and CPU milliseconds of each way to predict so many windows."""
-        return {way: tuple(np.median(ms, axis=0)) for (way, n), ms in self.milliseconds.items() if n == batch}
+        return {
+            way: tuple(np.median(ms, axis=0))
+            for (way, n), ms in self.milliseconds.items()
+            if n == batch
+        }
 
 
 @dataclass(frozen=True)
@@ -106,8 +116,11 @@ class Worker:
 class Race:
     """All stacks on one setup, in turns; one that fails is out, the others go on."""
 
-    def __init__(self, names: list[str], setup: Setup, results: dict[str, Result], limit: float) -> None:
-        self.setup, self.results = setup, results
+    def __init__(
+        self, names: list[str], setup: Setup, results: dict[str, Result], limit: float
+    ) -> None:
+        self.setup = setup
+        self.results = results
         self.workers = {name: Worker.start(name, setup, limit) for name in names}
 
     def each(self, question: object, keep: Callable[[Result, object], None]) -> None:
@@ -130,7 +143,10 @@ class Race:
 
         self.each("", about)
         for epoch in range(self.setup.epochs):
-            self.each("on", lambda r, took, first=epoch == 0: (r.first if first else r.epochs).append(took))
+            self.each(
+                "on",
+                lambda r, took, first=epoch == 0: (r.first if first else r.epochs).append(took),
+            )
         self.each("on", lambda result, accuracy: result.accuracy.append(accuracy))
         for _ in range(rounds):
             for batch in BATCHES:
@@ -140,12 +156,24 @@ class Race:
                         result.milliseconds[way, batch].append(took)
 
                 self.each((batch, max(2, runs // batch)), keep)
-        self.each(None, lambda result, megabytes: setattr(result, "megabytes", max(result.megabytes, megabytes)))
+        self.each(
+            None,
+            lambda result, megabytes: setattr(
+                result, "megabytes", max(result.megabytes, megabytes)
+            ),
+        )
         for worker in self.workers.values():
             worker.end()
 
 
-def race(parts: tuple, layout: SensorLayout, names: list[str], options: argparse.Namespace, seed: int, results) -> None:
+def race(
+    parts: tuple,
+    layout: SensorLayout,
+    names: list[str],
+    options: argparse.Namespace,
+    seed: int,
+    results,
+) -> None:
     """One seed: the same weights and windows to all."""
     setup = Setup(layout, *parts, seed, options.epochs, options.small)
     model = af.TactileTransformer(layout, setup.n_classes, length=parts[0].x.shape[1], seed=seed)
@@ -154,11 +182,16 @@ def race(parts: tuple, layout: SensorLayout, names: list[str], options: argparse
 
 
 def show(results: dict[str, Result]) -> None:
-    print(f"\n{'':20s}{'parameters':>12s}{'logits differ':>15s}{'accuracy':>22s}{'first epoch s (CPU)':>23s}", end="")
+    print(
+        f"\n{'':20s}{'parameters':>12s}{'logits differ':>15s}{'accuracy':>22s}"
+        f"{'first epoch s (CPU)':>23s}",
+        end="",
+    )
     print(f"{'epoch s (CPU)':>18s}{'memory MB':>11s}")
     for name, r in results.items():
         accuracy = f"{np.mean(r.accuracy):.3f} ± {np.std(r.accuracy):.3f} ({len(r.accuracy)})"
-        first, later = np.median(r.first, axis=0), r.epoch()
+        first = np.median(r.first, axis=0)
+        later = r.epoch()
         print(f"{name:20s}{r.parameters:12,d}{r.difference:15.1e}{accuracy:>22s}", end="")
         print(f"{first[0]:14.2f} ({first[1]:.2f})".rjust(23), end="")
         print(f"{later[0]:.2f} ({later[1]:.2f})".rjust(18) + f"{r.megabytes:11.0f}")
@@ -166,12 +199,17 @@ def show(results: dict[str, Result]) -> None:
     for name, r in results.items():
         for way in r.latency(1):
             cells = (r.latency(n)[way] for n in BATCHES)
-            print(f"{name + ', ' + way:40s}" + "".join(f"{wall:.2f} ({cpu:.2f})".rjust(22) for wall, cpu in cells))
+            print(
+                f"{name + ', ' + way:40s}"
+                + "".join(f"{wall:.2f} ({cpu:.2f})".rjust(22) for wall, cpu in cells)
+            )
 
 
 def verdict(results: dict[str, Result]) -> list[str]:
-    """Say where each is better than ours, from the numbers; times are CPU, each stack's fastest way to predict."""
-    ours, lines = results[OURS], []
+    """Say where each is better than ours, from the numbers; times are CPU, each stack's fastest way
+    to predict."""
+    ours = results[OURS]
+    lines = []
     for name, r in results.items():
         if name == OURS:
             continue
@@ -180,17 +218,28 @@ def verdict(results: dict[str, Result]) -> list[str]:
         if np.mean(r.accuracy) > np.mean(ours.accuracy):
             better = sum(theirs > mine for theirs, mine in pairs)
             won.append(
-                f"accuracy: +{np.mean(r.accuracy) - np.mean(ours.accuracy):.3f} (in {better} of {len(pairs)} seeds)"
+                f"accuracy: +{np.mean(r.accuracy) - np.mean(ours.accuracy):.3f} (in {better} of"
+                f" {len(pairs)} seeds)"
             )
         if r.epoch()[1] < ours.epoch()[1]:
             won.append(f"an epoch: {r.epoch()[1]:.2f} s against {ours.epoch()[1]:.2f}")
         for batch in BATCHES:
             (way, theirs), (mine, least) = (
-                min(((w, cpu) for w, (_, cpu) in x.latency(batch).items()), key=lambda pair: pair[1]) for x in (r, ours)
+                min(
+                    ((w, cpu) for w, (_, cpu) in x.latency(batch).items()), key=lambda pair: pair[1]
+                )
+                for x in (r, ours)
             )
             if theirs < least:
-                won.append(f"{batch} window{'s' * (batch > 1)}: {theirs:.2f} ms ({way}) against {least:.2f} ({mine})")
-        won += [f"memory: {r.megabytes:.0f} MB against {ours.megabytes:.0f}"] if r.megabytes < ours.megabytes else []
+                won.append(
+                    f"{batch} window{'s' * (batch > 1)}: {theirs:.2f} ms ({way}) against"
+                    f" {least:.2f} ({mine})"
+                )
+        won += (
+            [f"memory: {r.megabytes:.0f} MB against {ours.megabytes:.0f}"]
+            if r.megabytes < ours.megabytes
+            else []
+        )
         lines.append(f"  {name}: {'; '.join(won) or 'in nothing'}")
     return lines
 
@@ -209,9 +258,15 @@ def plot(results: dict[str, Result], path: Path) -> None:
     epoch.barh(names, [results[n].epoch()[1] for n in names], color=bars)
     epoch.set(title="an epoch, s of CPU", yticks=[])
     for axis, batch in zip(latencies, BATCHES, strict=True):
-        ways = [(name, way, cpu) for name in names for way, (_, cpu) in results[name].latency(batch).items()]
+        ways = [
+            (name, way, cpu)
+            for name in names
+            for way, (_, cpu) in results[name].latency(batch).items()
+        ]
         axis.barh(
-            [f"{name}\n{way}" for name, way, _ in ways], [cpu for *_, cpu in ways], color=[colors[n] for n, *_ in ways]
+            [f"{name}\n{way}" for name, way, _ in ways],
+            [cpu for *_, cpu in ways],
+            color=[colors[n] for n, *_ in ways],
         )
         axis.set(title=f"{batch} window{'s' * (batch > 1)}, ms of CPU")
         axis.tick_params(axis="y", labelsize=7)
@@ -226,13 +281,35 @@ def write(results: dict[str, Result], path: Path) -> None:
         out = csv.writer(file)
         times = [f"ms_{kind}_{n}" for n in BATCHES for kind in ("wall", "cpu")]
         out.writerow(
-            ["stack", "parameters", "logits_differ", "accuracy", "seeds", "epoch_wall", "epoch_cpu", "way", *times]
+            [
+                "stack",
+                "parameters",
+                "logits_differ",
+                "accuracy",
+                "seeds",
+                "epoch_wall",
+                "epoch_cpu",
+                "way",
+                *times,
+            ]
         )
         for name, r in results.items():
             for way in r.latency(1):
                 ms = [round(t, 3) for n in BATCHES for t in r.latency(n)[way]]
-                accuracy, epoch = round(float(np.mean(r.accuracy)), 4), [round(t, 3) for t in r.epoch()]
-                out.writerow([name, r.parameters, f"{r.difference:.1e}", accuracy, len(r.accuracy), *epoch, way, *ms])
+                accuracy = round(float(np.mean(r.accuracy)), 4)
+                epoch = [round(t, 3) for t in r.epoch()]
+                out.writerow(
+                    [
+                        name,
+                        r.parameters,
+                        f"{r.difference:.1e}",
+                        accuracy,
+                        len(r.accuracy),
+                        *epoch,
+                        way,
+                        *ms,
+                    ]
+                )
 
 
 def installed() -> list[str]:
@@ -242,30 +319,52 @@ def installed() -> list[str]:
     for name, package in list(STACKS.items())[1:]:
         missing = [p for p in ("keras", package) if find_spec(p) is None]
         if missing:
-            print(f"{name}: skipped, {' and '.join(missing)} missing: pip install 'adaptfault[compare-keras]'")
+            print(
+                f"{name}: skipped, {' and '.join(missing)} missing: pip install"
+                " 'adaptfault[compare-keras]'"
+            )
             continue
-        distribution = "tensorflow_cpu" if package == "tensorflow" and find_spec("tensorflow") else package
+        distribution = (
+            "tensorflow_cpu" if package == "tensorflow" and find_spec("tensorflow") else package
+        )
         print(f"{name}: keras {version('keras')}, {package} {version(distribution)}")
         names.append(name)
     return names
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("recordings", nargs="?", help="labelled recordings of a healthy array")
     parser.add_argument("--epochs", type=int, default=10, help="default 10")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of split and weights (default 0)")
-    parser.add_argument("--windows", type=int, default=10**9, help="train on at most so many (default: all)")
-    parser.add_argument("--limit", type=float, default=1800, help="seconds a stack may take for a step (default 1800)")
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[0], help="of split and weights (default 0)"
+    )
+    parser.add_argument(
+        "--windows", type=int, default=10**9, help="train on at most so many (default: all)"
+    )
+    parser.add_argument(
+        "--limit",
+        type=float,
+        default=1800,
+        help="seconds a stack may take for a step (default 1800)",
+    )
     parser.add_argument("--small", action="store_true", help="a few simulated grasps, one epoch")
-    parser.add_argument("--out", type=Path, default=Path("comparison"), help="folder for keras.csv and keras.png")
+    parser.add_argument(
+        "--out", type=Path, default=Path("comparison"), help="folder for keras.csv and keras.png"
+    )
     options = parser.parse_args()
     options.small = options.small or options.recordings is None
     if options.small:
         options.epochs = 1
-    recordings = af.simulate(4, seed=3) if options.small else af.load([options.recordings]).recordings
+    recordings = (
+        af.simulate(4, seed=3) if options.small else af.load([options.recordings]).recordings
+    )
     windows = af.make_windows(recordings.frames, recordings.labels, recordings.layout)
-    windows = af.Windows(windows.x * recordings.layout.present.ravel(), windows.y, windows.recording)
+    windows = af.Windows(
+        windows.x * recordings.layout.present.ravel(), windows.y, windows.recording
+    )
     names = installed()
     few = f"at most {options.windows} to train on; " if options.windows < len(windows) else ""
     print(f"{windows}; {few}epochs {options.epochs}, seeds {options.seeds}, one thread a stack")
@@ -273,7 +372,12 @@ def main() -> None:
     for seed in options.seeds:
         train, *rest = af.split(windows, seed=seed)
         race(
-            (train.select(evenly(len(train), options.windows)), *rest), recordings.layout, names, options, seed, results
+            (train.select(evenly(len(train), options.windows)), *rest),
+            recordings.layout,
+            names,
+            options,
+            seed,
+            results,
         )
     results = {name: result for name, result in results.items() if result.megabytes}
     if OURS not in results:

@@ -1,7 +1,8 @@
-"""What a model costs on a robot: latency of one window, share of a core in a 10 Hz loop with the monitor, resident
-memory, on ONNX Runtime and on torch; and what it costs to read the adapter and to export a repair. The paper's
-network, one thread; bare, and with fill and head for 20 dead cells.
-Needs Linux and pip install 'adaptfault[deploy]'. Run: python examples/deploy_speed.py [--seconds 20]
+"""What a model costs on a robot: latency of one window, share of a core in a 10 Hz loop with the
+monitor, resident memory, on ONNX Runtime and on torch; and what it costs to read the adapter and to
+export a repair. The paper's network, one thread; bare, and with fill and head for 20 dead cells.
+Needs Linux and pip install 'adaptfault[deploy]'. Run: python examples/deploy_speed.py [--seconds
+20]
 """
 
 import argparse
@@ -27,7 +28,7 @@ def prepare(folder: Path) -> None:
     import torch
 
     import adaptfault as af
-    from adaptfault.models.export import to_onnx
+    from adaptfault.prediction.export import to_onnx
 
     torch.set_num_threads(1)
     grasps = af.simulate(n_per_class=10, seed=0)
@@ -35,7 +36,9 @@ def prepare(folder: Path) -> None:
     training, validation, test = af.split(windows)
     model = af.TactileTransformer(grasps.layout, 7).eval()
     adapter = af.Adapter(model, training, validation)
-    af.Bundle.create(folder / "bare", model, adapter, SelfDiagnosis(grasps.layout).fit(grasps.frames), check=test)
+    af.Bundle.create(
+        folder / "bare", model, adapter, SelfDiagnosis(grasps.layout).fit(grasps.frames), check=test
+    )
     shutil.copytree(folder / "bare", folder / "adapted")
     adapted = af.Bundle.open(folder / "adapted")
     dead = FaultSet(tuple(range(0, 220, 11)), 220)
@@ -43,7 +46,9 @@ def prepare(folder: Path) -> None:
     seconds = {
         "adapter read": cpu_seconds(adapted.parts.adapter),
         "head exported": cpu_seconds(lambda: to_onnx(repair.model)),
-        "with the graph of the bundle": cpu_seconds(lambda: to_onnx(repair.model, adapted.parts.graph)),
+        "with the graph of the bundle": cpu_seconds(
+            lambda: to_onnx(repair.model, adapted.parts.graph)
+        ),
     }
     print("; ".join(f"{what} in {took:.1f} s CPU" for what, took in seconds.items()))
     version = adapted.write_version(repair, {"reason": "measured"})
@@ -74,7 +79,8 @@ def latency(folder: Path) -> None:
             seconds[runtime].append(time.perf_counter() - began)
     onnx, eager = (1000 * float(np.median(seconds[runtime][10:])) for runtime in ("onnx", "torch"))
     print(
-        f"{folder.name:8} one window: {onnx:.2f} ms on ONNX Runtime, {eager:.2f} ms on torch: {onnx / eager:.2f} of it"
+        f"{folder.name:8} one window: {onnx:.2f} ms on ONNX Runtime, {eager:.2f} ms on torch:"
+        f" {onnx / eager:.2f} of it"
     )
 
 
@@ -87,8 +93,10 @@ def loop(folder: Path, runtime: str, seconds: float) -> None:
         sys.modules["torch"].set_num_threads(1)
     assert predictor.runtime == runtime
     frames = np.load(folder.parent / "frames.npy")
-    longest, n = 0.0, round(10 * seconds)
-    used, began = time.process_time(), time.perf_counter()
+    longest = 0.0
+    n = round(10 * seconds)
+    used = time.process_time()
+    began = time.perf_counter()
     for i in range(n):
         tick = time.perf_counter()
         predictor.stream(frames[i % len(frames)], time=i / 10)
@@ -97,18 +105,21 @@ def loop(folder: Path, runtime: str, seconds: float) -> None:
     share = (time.process_time() - used) / (time.perf_counter() - began)
     resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     print(
-        f"{folder.name:8} 10 Hz on {runtime:5} for {seconds:g} s: {100 * share:.1f} % of a core, longest frame"
-        f" {1000 * longest:.0f} ms, {resident / 1e6:.0f} MB resident"
+        f"{folder.name:8} 10 Hz on {runtime:5} for {seconds:g} s: {100 * share:.1f} % of a core,"
+        f" longest frame {1000 * longest:.0f} ms, {resident / 1e6:.0f} MB resident"
     )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=2, help="length of each 10 Hz loop")
-    parser.add_argument("--measure", nargs=2, metavar=("FOLDER", "WHAT"), help="in a process of its own")
+    parser.add_argument(
+        "--measure", nargs=2, metavar=("FOLDER", "WHAT"), help="in a process of its own"
+    )
     arguments = parser.parse_args()
     if arguments.measure:
-        folder, what = Path(arguments.measure[0]), arguments.measure[1]
+        folder = Path(arguments.measure[0])
+        what = arguments.measure[1]
         return latency(folder) if what == "latency" else loop(folder, what, arguments.seconds)
     with tempfile.TemporaryDirectory() as temporary:
         prepare(Path(temporary))
@@ -116,7 +127,11 @@ def main() -> None:
             for what in ("latency", "onnx", "torch"):
                 command = [sys.executable, __file__, "--seconds", str(arguments.seconds)]
                 environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-                subprocess.run([*command, "--measure", f"{temporary}/{name}", what], check=True, env=environment)
+                subprocess.run(
+                    [*command, "--measure", f"{temporary}/{name}", what],
+                    check=True,
+                    env=environment,
+                )
 
 
 if __name__ == "__main__":

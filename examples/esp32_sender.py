@@ -1,8 +1,10 @@
-"""Plays a recording over UDP as the paper's ESP32 does (Section II), and as badly as Wi-Fi and strangers can.
+"""Plays a recording over UDP as the paper's ESP32 does (Section II), and as badly as Wi-Fi and
+strangers can.
 
     python examples/esp32_sender.py [RECORDING] [--port 5005] [--loss 0.01] [--garbage 0.1] ...
 
-Without a recording it plays a simulated grasp: `adaptfault listen --port 5005` in another terminal shows it arrive.
+Without a recording it plays a simulated grasp: `adaptfault listen --port 5005` in another terminal
+shows it arrive.
 """
 
 import argparse
@@ -40,11 +42,12 @@ def stream(
     start: float = 0.0,
     key: bytes | None = None,
 ) -> Iterator[tuple[str, bytes]]:
-    """Yield ("good" | "garbage" | "duplicates" | "lost", datagram) for each frame of ``[T, D]``, with mischief between.
+    """Yield ("good" | "garbage" | "duplicates" | "lost", datagram) for each frame of ``[T, D]``,
+    with mischief between.
 
     Args:
-        frames, rate, device: what is played; time stamps are milliseconds from ``start`` (seconds) on.
-        loss, duplicates, garbage: shares; ``reorder``: share of neighbours that change places.
+        frames, rate, device: what is played; time stamps are milliseconds from ``start`` (seconds)
+        on. loss, duplicates, garbage: shares; ``reorder``: share of neighbours that change places.
         seed: of the mischief.
         start: see above.
         key: authenticates the packets.
@@ -133,18 +136,30 @@ def main() -> None:
     parser.add_argument("--port", type=int, default=5005)
     parser.add_argument("--device", default="esp32-1")
     parser.add_argument("--frames", type=int, default=100, help="how many (default 100)")
-    parser.add_argument("--rate", type=float, default=100.0, help="packets per second (default 100; the ESP32: 10)")
+    parser.add_argument(
+        "--rate", type=float, default=100.0, help="packets per second (default 100; the ESP32: 10)"
+    )
     for name in ("loss", "reorder", "duplicates", "garbage"):
         parser.add_argument(f"--{name}", type=float, default=0.0, help="share of the packets")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--key", help="file with the key that authenticates the packets")
     args = parser.parse_args()
     frames, rate = recording(args.recording, args.frames)
-    mischief = {name: getattr(args, name) for name in ("loss", "reorder", "duplicates", "garbage", "seed")}
+    mischief = {
+        name: getattr(args, name) for name in ("loss", "reorder", "duplicates", "garbage", "seed")
+    }
     key = None if args.key is None else read_key(args.key)
     start = 0.0 if key is None else time.time()  # never goes back, so that replays are refused
-    sent = send(stream(frames, rate, args.device, start=start, key=key, **mischief), args.host, args.port, args.rate)
-    print(f"{args.host}:{args.port}:", ", ".join(f"{count} {name}" for name, count in asdict(sent).items()))
+    sent = send(
+        stream(frames, rate, args.device, start=start, key=key, **mischief),
+        args.host,
+        args.port,
+        args.rate,
+    )
+    print(
+        f"{args.host}:{args.port}:",
+        ", ".join(f"{count} {name}" for name, count in asdict(sent).items()),
+    )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""What two workers gain on a fleet, and what a night of 100,000 robots costs: fleet_scaling.py [--robots N]
+"""What two workers gain on a fleet, and what a night of 100,000 robots costs: fleet_scaling.py
+[--robots N]
 
-Copies one small trained bundle for N simulated robots, which have recorded twelve grasps each, and maintains them with
-one worker and with two: on loky, and on Dask clusters on loopback. One and two take turns, batch by batch on fresh
-copies, so that a machine that is busy with something else slows both alike; "on cores of their own" is the same less
-the time that workers stood in line for a core (/proc/self/schedstat). A few robots have a new short row and are
-adapted. From what one robot took (CPU, memory, bytes) follows, on paper, what 100,000 a night need. Linux only.
+Copies one small trained bundle for N simulated robots, which have recorded twelve grasps each, and
+maintains them with one worker and with two: on loky, and on Dask clusters on loopback. One and two
+take turns, batch by batch on fresh copies, so that a machine that is busy with something else slows
+both alike; "on cores of their own" is the same less the time that workers stood in line for a core
+(/proc/self/schedstat). A few robots have a new short row and are adapted. From what one robot took
+(CPU, memory, bytes) follows, on paper, what 100,000 a night need. Linux only.
 """
 
 from __future__ import annotations
@@ -29,15 +31,17 @@ from diagnostics import Line, SelfDiagnosis, SensorLayout, inject, line_fault
 
 LAYOUT = SensorLayout(2, 6, 5)
 CLASSES = ("nothing", "softer", "harder")
-ROBOTS, NIGHT = 100_000, 8  # robots, and hours to do them in
+# robots, and hours to do them in
+ROBOTS = 100_000
+NIGHT = 8
 
 
 @dataclass
 class Costs:
     """Of robots, in lists of equal length.
 
-    CPU seconds, seconds in line for a core, peak MB of the process, bytes of its files, read (most files are read three
-    times, for their checksums), written and sent back.
+    CPU seconds, seconds in line for a core, peak MB of the process, bytes of its files, read (most
+    files are read three times, for their checksums), written and sent back.
     """
 
     cpu: list[float] = field(default_factory=list)
@@ -60,12 +64,19 @@ def measured(robot: Robot) -> tuple[str, dict[str, float]]:
     def so_far() -> dict[str, int]:
         with open("/proc/self/io") as io, open("/proc/self/schedstat") as stat:
             lines = (line.split(": ") for line in io)
-            return {"waited": int(stat.read().split()[1]), **{key: int(value) for key, value in lines}}
+            return {
+                "waited": int(stat.read().split()[1]),
+                **{key: int(value) for key, value in lines},
+            }
 
-    files = sum(path.stat().st_size for path in Path(robot.bundle).parent.rglob("*") if path.is_file())
-    before, began = so_far(), time.process_time()
+    files = sum(
+        path.stat().st_size for path in Path(robot.bundle).parent.rglob("*") if path.is_file()
+    )
+    before = so_far()
+    began = time.process_time()
     outcome = maintain_robot(robot)
-    cpu, after = time.process_time() - began, so_far()
+    cpu = time.process_time() - began
+    after = so_far()
     with open("/proc/self/status") as file:
         peak = next(int(line.split()[1]) for line in file if line.startswith("VmHWM"))  # kB
     return outcome.decision, {
@@ -80,7 +91,8 @@ def measured(robot: Robot) -> tuple[str, dict[str, float]]:
 
 
 def prepare() -> None:
-    """Load what maintenance needs, in a session of its own: some kernels share cores among sessions, not processes."""
+    """Load what maintenance needs, in a session of its own: some kernels share cores among
+    sessions, not processes."""
     import os
 
     from adaptfault.fleet.work import ready
@@ -97,12 +109,15 @@ def make_bundle(folder: Path) -> Path:
     af.train(model, training, validation, epochs=4, progress=False)
     diagnoser = SelfDiagnosis(LAYOUT).fit(grasps.frames)
     adapter = af.Adapter(model, training, validation)
-    return af.Bundle.create(folder / "robot.bundle", model, adapter, diagnoser, check=test, class_names=CLASSES).path
+    return af.Bundle.create(
+        folder / "robot.bundle", model, adapter, diagnoser, check=test, class_names=CLASSES
+    ).path
 
 
 @dataclass(frozen=True)
 class Farm:
-    """Gives robots: copies of a bundle that have recorded grasps, healthy ones or with a short row."""
+    """Gives robots: copies of a bundle that have recorded grasps, healthy ones or with a short
+    row."""
 
     folder: Path
     bundle: Path
@@ -119,7 +134,10 @@ class Farm:
             for home in homes:
                 shutil.copytree(self.bundle, home / "robot.bundle")
                 af.save_npz(home / "log.npz", af.Recordings(tuple(frames), LAYOUT))
-            yield [Robot(home.name, str(home / "robot.bundle"), (str(home / "log.npz"),)) for home in homes]
+            yield [
+                Robot(home.name, str(home / "robot.bundle"), (str(home / "log.npz"),))
+                for home in homes
+            ]
 
 
 def timed(workers: Engine, farm: Farm, number: int, costs: Costs, *, broken: bool = False) -> float:
@@ -151,8 +169,11 @@ class Turns:
         self.alone.append(self.seconds[-1] - sum(self.costs.waited[known:]) / number)
 
 
-def alternating(name: str, one: Engine, two: Engine, farm: Farm, batches: Sequence[int], all_costs: Costs) -> float:
-    """Let one worker and two take turns, every other time two first; prints, and returns the speed-up."""
+def alternating(
+    name: str, one: Engine, two: Engine, farm: Farm, batches: Sequence[int], all_costs: Costs
+) -> float:
+    """Let one worker and two take turns, every other time two first; prints, and returns the
+    speed-up."""
     turns = {number: Turns(workers, [], [], Costs()) for number, workers in ((1, one), (2, two))}
     for i, batch in enumerate(batches):
         for number in (1, 2) if i % 2 else (2, 1):
@@ -165,8 +186,9 @@ def alternating(name: str, one: Engine, two: Engine, farm: Farm, batches: Sequen
         gains = [1.0] * 2 if number == 1 else [statistics.median(seen), statistics.median(alone)]
         rates = [sum(batches) / sum(turn.seconds), sum(batches) / sum(turn.alone)]
         print(
-            f"{name:8}{number:7}{sum(batches):8}   {rates[0]:7.2f} {gains[0]:6.2f} {gains[0] / number:5.0%}"
-            f"   {rates[1]:7.2f} {gains[1]:6.2f} {gains[1] / number:5.0%}{statistics.mean(turn.costs.cpu):13.3f}",
+            f"{name:8}{number:7}{sum(batches):8}   {rates[0]:7.2f} {gains[0]:6.2f}"
+            f" {gains[0] / number:5.0%}   {rates[1]:7.2f} {gains[1]:6.2f}"
+            f" {gains[1] / number:5.0%}{statistics.mean(turn.costs.cpu):13.3f}",
             flush=True,
         )
         for key, values in vars(turn.costs).items():
@@ -202,12 +224,15 @@ def dask() -> Iterator[tuple[Engine, Engine]]:
         yield one, two
 
 
-def on_paper(idle: Costs, adapting: Costs, efficiency: float, share: float, price: float) -> list[tuple[str, str]]:
+def on_paper(
+    idle: Costs, adapting: Costs, efficiency: float, share: float, price: float
+) -> list[tuple[str, str]]:
     """Return the rows of a night: what is needed, and from what."""
 
     def each(name: str) -> float:
         """The mean of a robot, as they come."""
-        a, b = statistics.mean(getattr(idle, name)), statistics.mean(getattr(adapting, name))
+        a = statistics.mean(getattr(idle, name))
+        b = statistics.mean(getattr(adapting, name))
         return (1 - share) * a + share * b
 
     memory = max(*idle.memory, *adapting.memory)
@@ -218,29 +243,62 @@ def on_paper(idle: Costs, adapting: Costs, efficiency: float, share: float, pric
         return 8 * ROBOTS * each(name) / (3600 * NIGHT) / 1e6
 
     return [
-        ("core hours", f"{hours:.1f}   {each('cpu'):.3f} CPU s a robot, at an efficiency of {efficiency:.2f}"),
+        (
+            "core hours",
+            f"{hours:.1f}   {each('cpu'):.3f} CPU s a robot, at an efficiency of {efficiency:.2f}",
+        ),
         ("cores", f"{cores}   for {NIGHT} hours"),
         ("memory", f"{cores * memory / 1024:.1f} GB   {memory:.0f} MB a worker at its peak"),
-        ("network in", f"{mbit('files'):.0f} Mbit/s where workers cache files, {mbit('read'):.0f} where they do not"),
-        ("network out", f"{mbit('written'):.1f} Mbit/s written, {mbit('sent'):.3f} sent back as reports"),
+        (
+            "network in",
+            (
+                f"{mbit('files'):.0f} Mbit/s where workers cache files, {mbit('read'):.0f} where"
+                " they do not"
+            ),
+        ),
+        (
+            "network out",
+            f"{mbit('written'):.1f} Mbit/s written, {mbit('sent'):.3f} sent back as reports",
+        ),
         ("money", f"{price * hours:.2f}   at {price:g} a core hour"),
     ]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--robots", type=int, default=200, help="for each engine and number of workers (default 200)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--robots",
+        type=int,
+        default=200,
+        help="for each engine and number of workers (default 200)",
+    )
     parser.add_argument("--engines", nargs="+", choices=["loky", "dask"], default=["loky", "dask"])
     parser.add_argument("--batch", type=int, default=20, help="robots of a turn (default 20)")
-    parser.add_argument("--adapted", type=int, default=2, help="robots with a new fault (default 2)")
-    parser.add_argument("--share", type=float, default=0.01, help="of robots with a new fault a night (default 0.01)")
-    parser.add_argument("--price", type=float, default=0.04, help="of a core hour, an assumption (default 0.04)")
+    parser.add_argument(
+        "--adapted", type=int, default=2, help="robots with a new fault (default 2)"
+    )
+    parser.add_argument(
+        "--share",
+        type=float,
+        default=0.01,
+        help="of robots with a new fault a night (default 0.01)",
+    )
+    parser.add_argument(
+        "--price", type=float, default=0.04, help="of a core hour, an assumption (default 0.04)"
+    )
     args = parser.parse_args()
     batch = max(1, min(args.batch, args.robots))
     batches = [batch] * (args.robots // batch)
-    idle, adapting, warm = Costs(), Costs(), Costs()
+    idle = Costs()
+    adapting = Costs()
+    warm = Costs()
     print("                            as it was: speed-up,    on cores of their own:")
-    print("engine  workers  robots  robots/s, efficiency        the same                CPU s/robot", flush=True)
+    print(
+        "engine  workers  robots  robots/s, efficiency        the same                CPU s/robot",
+        flush=True,
+    )
     with tempfile.TemporaryDirectory() as home:
         farm = Farm(Path(home), make_bundle(Path(home)))
         speedups = []

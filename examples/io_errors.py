@@ -1,11 +1,13 @@
 """Lets every call on the files of a bundle fail: io_errors.py [--all]
 
-A library that is loaded before the C library (examples/disk/io_errors.c, LD_PRELOAD; Linux, needs cc) counts the calls
-of a save, a maintenance run, a confirmation, a rollback, a start and a recording, SQLite's own calls among them. Then
-each call fails in turn, once and from then on, with each of EIO, ENOSPC, EROFS, EMFILE and EACCES that such a call may
-give. The operation must succeed or end with an error that the command line reports in one line. Afterwards the bundle
-must open and predict as one of its two versions, what was acknowledged must be there, no run may be lost from the
-journal, and the next maintenance run must end right. Without ``--all`` a fixed-seed sample is tried.
+A library that is loaded before the C library (examples/disk/io_errors.c, LD_PRELOAD; Linux, needs
+cc) counts the calls of a save, a maintenance run, a confirmation, a rollback, a start and a
+recording, SQLite's own calls among them. Then each call fails in turn, once and from then on, with
+each of EIO, ENOSPC, EROFS, EMFILE and EACCES that such a call may give. The operation must succeed
+or end with an error that the command line reports in one line. Afterwards the bundle must open and
+predict as one of its two versions, what was acknowledged must be there, no run may be lost from the
+journal, and the next maintenance run must end right. Without ``--all`` a fixed-seed sample is
+tried.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ from power_cut import LAYOUT, NAME, ROW, make, predictions, small_versions
 from power_cut import broken_log as simulated_log
 
 SOURCE = Path(__file__).parent / "disk" / "io_errors.c"
-LIBRARY = "IO_ERRORS_LIBRARY"  # environment variable: the compiled library, in the process that tries the calls
+# environment variable: the compiled library, in the process that tries the calls
+LIBRARY = "IO_ERRORS_LIBRARY"
 _LONGEST = 60  # seconds; a case that takes longer hangs
 
 _READING = {errno.EIO, errno.EACCES, errno.EMFILE}
@@ -115,8 +118,14 @@ def arm(loaded: Any, folder: Path, failure: Failure | None) -> None:
     if failure is None:
         loaded.io_errors_arm(os.fsencode(folder), -1, 0, 0, 0)
         return
-    kinds = sum(1 << (ord(letter) - ord("a")) for letter, (_, errors) in KINDS.items() if failure.error in errors)
-    loaded.io_errors_arm(os.fsencode(folder), failure.at, failure.error, int(failure.from_then_on), kinds)
+    kinds = sum(
+        1 << (ord(letter) - ord("a"))
+        for letter, (_, errors) in KINDS.items()
+        if failure.error in errors
+    )
+    loaded.io_errors_arm(
+        os.fsencode(folder), failure.at, failure.error, int(failure.from_then_on), kinds
+    )
 
 
 def save(folder: Path) -> None:
@@ -124,9 +133,12 @@ def save(folder: Path) -> None:
     import adaptfault as af
 
     source = af.Bundle.open(folder / "source.bundle")
-    adapter, check = source.parts.adapter(), source.parts.check_windows()
+    adapter = source.parts.adapter()
+    check = source.parts.check_windows()
     classes = source.class_names
-    af.Bundle.create(folder / NAME, adapter.model, adapter, source.diagnoser(), check=check, class_names=classes)
+    af.Bundle.create(
+        folder / NAME, adapter.model, adapter, source.diagnoser(), check=check, class_names=classes
+    )
 
 
 def maintain(folder: Path) -> None:
@@ -172,12 +184,15 @@ def record(folder: Path) -> None:
     from adaptfault.acquisition import Recorder
 
     with Recorder(folder / "today", LAYOUT, "hand", interval=0.0) as recorder:
-        for i, frame in enumerate(np.round(np.random.default_rng(0).uniform(0, 5, (60, LAYOUT.n_cells)), 3)):
+        for i, frame in enumerate(
+            np.round(np.random.default_rng(0).uniform(0, 5, (60, LAYOUT.n_cells)), 3)
+        ):
             recorder.write(frame, i / LAYOUT.rate)
 
 
 def operations(home: Path, bundle: Path | None) -> Iterator[Operation]:
-    """Make the states before each operation, of a copy of ``bundle`` if there is one; see :func:`small_versions`."""
+    """Make the states before each operation, of a copy of ``bundle`` if there is one; see
+    :func:`small_versions`."""
     import adaptfault as af
 
     def state(name: str) -> Path:
@@ -209,8 +224,11 @@ def operations(home: Path, bundle: Path | None) -> Iterator[Operation]:
     yield Operation("record", confirmed, record, (2,), False, runs, (), after)
 
 
-def attempt(loaded: Any, operation: Operation, failure: Failure | None, place: Path) -> tuple[bool, str]:
-    """Do an operation in ``place`` while calls fail; return whether it succeeded, and the kinds of its calls.
+def attempt(
+    loaded: Any, operation: Operation, failure: Failure | None, place: Path
+) -> tuple[bool, str]:
+    """Do an operation in ``place`` while calls fail; return whether it succeeded, and the kinds of
+    its calls.
 
     Raises:
         AssertionError: it ended with an error that no caller expects.
@@ -233,7 +251,7 @@ def attempt(loaded: Any, operation: Operation, failure: Failure | None, place: P
 def check(operation: Operation, done: bool, place: Path, expected: dict[int, Any], x: Any) -> None:
     """Raise AssertionError where a robot does not go on from this state."""
     import adaptfault as af
-    from adaptfault.robot.pointer import Pointer
+    from adaptfault.bundle.pointer import Pointer
 
     path = place / NAME
     if operation.name == "save" and not path.exists():
@@ -244,8 +262,12 @@ def check(operation: Operation, done: bool, place: Path, expected: dict[int, Any
     pointer = Pointer.read(path)
     assert pointer.active in operation.versions, f"version {pointer.active} is active"
     if done:
-        assert pointer.active == operation.versions[-1], f"version {pointer.active} is active, it was done"
-        assert pointer.probation == operation.probation, f"probation is {pointer.probation}, it was done"
+        assert pointer.active == operation.versions[-1], (
+            f"version {pointer.active} is active, it was done"
+        )
+        assert pointer.probation == operation.probation, (
+            f"probation is {pointer.probation}, it was done"
+        )
     predictor = af.Predictor.load(path)
     assert (predictor.predict(x) == expected[predictor.version]).all(), "it predicts otherwise"
     assert predictor.version == Pointer.read(path).active, f"version {predictor.version} runs"
@@ -260,7 +282,9 @@ def check(operation: Operation, done: bool, place: Path, expected: dict[int, Any
     assert report.decision in operation.after, f"the next maintenance run: {report}"
     assert report.fault_set == set(ROW.cells), f"the next maintenance run: {report}"
     assert not bundle.problems(), f"damage after it: {bundle.problems()}"
-    left = [path.name for path in (place / NAME / "versions").iterdir() if not path.name.isdecimal()]
+    left = [
+        path.name for path in (place / NAME / "versions").iterdir() if not path.name.isdecimal()
+    ]
     assert not left, f"left behind: {left}"
 
 
@@ -273,12 +297,15 @@ def check_recording(done: bool, place: Path) -> None:
     if done:
         assert lines == 60, f"{lines} of 60 frames are there"
     if lines:
-        read = sum(len(frames) for frames in af.load(place / "today", layout=LAYOUT).recordings.frames)
+        read = sum(
+            len(frames) for frames in af.load(place / "today", layout=LAYOUT).recordings.frames
+        )
         assert lines <= read <= lines + len(files), f"{read} of {lines} frames are read"
 
 
 def in_child(call: Callable[[], Any]) -> Any:
-    """Return what a call returns in a forked process; raises AssertionError where it fails or hangs."""
+    """Return what a call returns in a forked process; raises AssertionError where it fails or
+    hangs."""
     reading, writing = os.pipe()
     child = os.fork()
     if not child:
@@ -295,7 +322,9 @@ def in_child(call: Callable[[], Any]) -> Any:
     with open(reading, "rb") as file:
         data = file.read()
     _, status = os.waitpid(child, 0)
-    assert data, f"the process ended with status {status}" + (" (it hangs)" if status == signal.SIGALRM else "")
+    assert data, f"the process ended with status {status}" + (
+        " (it hangs)" if status == signal.SIGALRM else ""
+    )
     right, value = pickle.loads(data)
     assert right, value
     return value
@@ -312,7 +341,8 @@ def failures(calls: str) -> list[Failure]:
 
 
 class Trial:
-    """Tries failures of one operation; a state of the disk that was right once is not checked again.
+    """Tries failures of one operation; a state of the disk that was right once is not checked
+    again.
 
     Args:
         operation: that is tried.
@@ -322,9 +352,14 @@ class Trial:
         x: windows that it gives them to.
     """
 
-    def __init__(self, operation: Operation, loaded: Any, place: Path, expected: dict[int, Any], x: Any) -> None:
-        self.operation, self.loaded, self.place = operation, loaded, place
-        self.expected, self.x = expected, x
+    def __init__(
+        self, operation: Operation, loaded: Any, place: Path, expected: dict[int, Any], x: Any
+    ) -> None:
+        self.operation = operation
+        self.loaded = loaded
+        self.place = place
+        self.expected = expected
+        self.x = x
         self._right: set[tuple[bool, bytes]] = set()
         self.calls = self._case(None)[1]
 
@@ -334,7 +369,9 @@ class Trial:
 
     def _case(self, failure: Failure | None) -> tuple[bool, str]:
         try:
-            done, calls = in_child(lambda: attempt(self.loaded, self.operation, failure, self.place))
+            done, calls = in_child(
+                lambda: attempt(self.loaded, self.operation, failure, self.place)
+            )
             assert done or failure is not None, "it failed without a failure"
             state = (done, digest(self.place))
             if state not in self._right:
@@ -350,7 +387,9 @@ def digest(folder: Path) -> bytes:
     found = hashlib.sha256()
     for path in sorted(folder.rglob("*")):
         content = path.read_bytes() if path.is_file() else b"folder"
-        found.update(path.relative_to(folder).as_posix().encode() + b"\0" + hashlib.sha256(content).digest())
+        found.update(
+            path.relative_to(folder).as_posix().encode() + b"\0" + hashlib.sha256(content).digest()
+        )
     return found.digest()
 
 
@@ -361,15 +400,21 @@ def same_every_time() -> Iterator[None]:
     stopped = mock.Mock(perf_counter=lambda: 0.0, monotonic=lambda: 0.0)
     key = mock.Mock(side_effect=lambda: mock.Mock(hex=f"{next(numbers):032x}"))
     with ExitStack() as stack:
-        for module in ("bundle", "maintenance"):
-            stack.enter_context(mock.patch(f"adaptfault.robot.{module}.now", return_value="2026-01-01T00:00:00+00:00"))
-        stack.enter_context(mock.patch("adaptfault.robot.journal.uuid4", key))
+        for module in ("bundle.bundle", "robot.maintenance"):
+            stack.enter_context(
+                mock.patch(f"adaptfault.{module}.now", return_value="2026-01-01T00:00:00+00:00")
+            )
+        stack.enter_context(mock.patch("adaptfault.bundle.journal.uuid4", key))
         stack.enter_context(mock.patch("adaptfault.adaptation.stages.time", stopped))
         yield
 
 
 def run(
-    home: Path, *, sample: int | None, bundle: Path | None = None, say: Callable[[str], None] = print
+    home: Path,
+    *,
+    sample: int | None,
+    bundle: Path | None = None,
+    say: Callable[[str], None] = print,
 ) -> tuple[int, int, list[str]]:
     """Try the failures, and return how many calls and failures there were, and what went wrong.
 
@@ -385,7 +430,9 @@ def run(
 
     torch.set_num_threads(1)  # a forked process has no other threads
     loaded = library()
-    all_calls, tried, wrong = 0, 0, []
+    all_calls = 0
+    tried = 0
+    wrong = []
     with small_versions(), same_every_time():
         for seed in (9, 10):
             broken_log(seed)  # simulated once, before the process forks
@@ -402,13 +449,20 @@ def run(
                     trial(failure)
                 except AssertionError as error:
                     failed += 1
-                    what = f"{errno.errorcode[failure.error]}{' from then on' if failure.from_then_on else ''}"
+                    what = errno.errorcode[failure.error]
+                    if failure.from_then_on:
+                        what += " from then on"
                     kind = KINDS[trial.calls[failure.at]][0]
                     wrong.append(f"{operation.name}, call {failure.at} ({kind}), {what}: {error}")
             all_calls += len(trial.calls)
             tried += len(chosen)
-            kinds = ", ".join(f"{n} {KINDS[letter][0]}" for letter, n in sorted(Counter(trial.calls).items()))
-            say(f"{operation.name}: {len(trial.calls)} calls ({kinds}), {len(chosen)} failures, {failed} wrong")
+            kinds = ", ".join(
+                f"{n} {KINDS[letter][0]}" for letter, n in sorted(Counter(trial.calls).items())
+            )
+            say(
+                f"{operation.name}: {len(trial.calls)} calls ({kinds}), {len(chosen)} failures,"
+                f" {failed} wrong"
+            )
     return all_calls, tried, wrong
 
 
@@ -417,12 +471,24 @@ def build(folder: Path) -> Path:
     if not sys.platform.startswith("linux"):
         raise OSError("the library is for Linux")
     path = folder / "io_errors.so"
-    command = [os.environ.get("CC", "cc"), "-shared", "-fPIC", "-O1", "-o", str(path), str(SOURCE), "-ldl", "-lpthread"]
+    command = [
+        os.environ.get("CC", "cc"),
+        "-shared",
+        "-fPIC",
+        "-O1",
+        "-o",
+        str(path),
+        str(SOURCE),
+        "-ldl",
+        "-lpthread",
+    ]
     subprocess.run(command, check=True)
     return path
 
 
-def start_with_library(arguments: list[str], folder: Path, **options: Any) -> subprocess.CompletedProcess[str]:
+def start_with_library(
+    arguments: list[str], folder: Path, **options: Any
+) -> subprocess.CompletedProcess[str]:
     """Run this script in a process with the library loaded."""
     path = str(build(folder))
     environment = {**os.environ, "LD_PRELOAD": path, LIBRARY: path, "OMP_NUM_THREADS": "1"}
@@ -433,8 +499,16 @@ def start_with_library(arguments: list[str], folder: Path, **options: Any) -> su
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--all", action="store_true", help="every failure, not a sample")
-    parser.add_argument("--sample", type=int, default=12, metavar="N", help="failures of each operation (default 12)")
-    parser.add_argument("--bundle", type=Path, metavar="FOLDER", help="that power_cut.make made (default: make one)")
+    parser.add_argument(
+        "--sample",
+        type=int,
+        default=12,
+        metavar="N",
+        help="failures of each operation (default 12)",
+    )
+    parser.add_argument(
+        "--bundle", type=Path, metavar="FOLDER", help="that power_cut.make made (default: make one)"
+    )
     args = parser.parse_args()
     if LIBRARY not in os.environ:
         with tempfile.TemporaryDirectory() as folder:

@@ -1,9 +1,11 @@
-"""Kills maintenance with kill -9 at random moments, again and again: kill_maintenance.py [--kills N]
+"""Kills maintenance with kill -9 at random moments, again and again: kill_maintenance.py [--kills
+N]
 
-A bundle is made, a row breaks, and `adaptfault maintain` is killed N times, each time on a copy of the bundle as the
-last kill left it, while new recordings come in. After each kill the bundle has to open, its version has to predict,
-whatever was confirmed has to be there, and nothing may be damaged but the seal of the journal. At the end maintenance
-runs to its end. Prints how far the kills let it come.
+A bundle is made, a row breaks, and `adaptfault maintain` is killed N times, each time on a copy of
+the bundle as the last kill left it, while new recordings come in. After each kill the bundle has to
+open, its version has to predict, whatever was confirmed has to be there, and nothing may be damaged
+but the seal of the journal. At the end maintenance runs to its end. Prints how far the kills let it
+come.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ def make(folder: Path) -> af.Bundle:
     af.train(model, training, validation, epochs=6, progress=False)
     diagnoser = SelfDiagnosis(LAYOUT).fit(grasps.frames)
     adapter = af.Adapter(model, training, validation)
-    return af.Bundle.create(folder / "robot.bundle", model, adapter, diagnoser, check=test, class_names=CLASSES)
+    return af.Bundle.create(
+        folder / "robot.bundle", model, adapter, diagnoser, check=test, class_names=CLASSES
+    )
 
 
 def log(folder: Path, number: int, kind: FaultKind) -> Path:
@@ -43,12 +47,22 @@ def log(folder: Path, number: int, kind: FaultKind) -> Path:
     grasps = af.simulate(6, LAYOUT, n_frames=60, seed=100 + number, classes=CLASSES[1:])
     fault = line_fault(LAYOUT, Line(number % 2, "row", number % 6), kind)
     path = folder / f"log{number}.npz"
-    af.save_npz(path, af.Recordings(tuple(inject(r, [fault], LAYOUT) for r in grasps.frames), LAYOUT))
+    af.save_npz(
+        path, af.Recordings(tuple(inject(r, [fault], LAYOUT) for r in grasps.frames), LAYOUT)
+    )
     return path
 
 
 def maintain(bundle: af.Bundle, recordings: Path) -> subprocess.Popen:
-    command = [sys.executable, "-m", "adaptfault", "maintain", str(bundle.path), str(recordings), "--quiet"]
+    command = [
+        sys.executable,
+        "-m",
+        "adaptfault",
+        "maintain",
+        str(bundle.path),
+        str(recordings),
+        "--quiet",
+    ]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 
 
@@ -66,10 +80,13 @@ def check(bundle: af.Bundle, confirmed: int) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kills", type=int, default=4)
     args = parser.parse_args()
-    rng, states = np.random.default_rng(0), Counter()
+    rng = np.random.default_rng(0)
+    states = Counter()
     with tempfile.TemporaryDirectory() as home:
         folder = Path(home)
         bundle = make(folder)
@@ -96,7 +113,8 @@ def main() -> None:
         assert told.startswith("ADAPTFAULT"), told
         check(bundle, confirmed)
     print(
-        f"{args.kills} kills within the {whole:.1f} s of a run: every time the bundle opened, predicted, and kept what"
+        f"{args.kills} kills within the {whole:.1f} s of a run: every time the bundle opened,"
+        " predicted, and kept what"
     )
     print(f"was confirmed. States after a kill: {dict(states)}")
 

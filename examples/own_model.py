@@ -10,7 +10,8 @@ from diagnostics import FaultSet, SensorLayout
 class Lstm(nn.Module):
     def __init__(self, n_cells: int, n_classes: int) -> None:
         super().__init__()
-        self.lstm, self.last = nn.LSTM(n_cells, 64, batch_first=True), nn.Linear(64, n_classes)
+        self.lstm = nn.LSTM(n_cells, 64, batch_first=True)
+        self.last = nn.Linear(64, n_classes)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:  # [N, T, D] -> [N, n_classes]
         return self.last(self.lstm(x)[0][:, -1])

@@ -1,10 +1,11 @@
 """Replays every power cut of a bundle's writes: power_cut.py [--all]
 
-Every write, rename, removal, fsync and directory sync of a save, a maintenance run, a confirmation, a rollback and a
-recording is noted. For every prefix of these steps, every state of the disk is built that POSIX allows after a power
-cut: what was not synced may be there, be lost, or be there in part, in any order. After each state the bundle must
-open, predict as one of the two versions, and take the next confirmation; what was acknowledged must be there.
-Without ``--all`` a fixed-seed sample of the states is checked.
+Every write, rename, removal, fsync and directory sync of a save, a maintenance run, a confirmation,
+a rollback and a recording is noted. For every prefix of these steps, every state of the disk is
+built that POSIX allows after a power cut: what was not synced may be there, be lost, or be there in
+part, in any order. After each state the bundle must open, predict as one of the two versions, and
+take the next confirmation; what was acknowledged must be there. Without ``--all`` a fixed-seed
+sample of the states is checked.
 """
 
 from __future__ import annotations
@@ -41,13 +42,16 @@ def linear(layout: SensorLayout, n_classes: int, length: int) -> Any:
 
 @contextmanager
 def small_versions() -> Iterator[None]:
-    """Leave out the export, which takes seconds and runs on synced copies, and allow the model above."""
+    """Leave out the export, which takes seconds and runs on synced copies, and allow the model
+    above."""
     import adaptfault as af
 
     af.allow_model("power_cut:linear")
     absent = ImportError("left out here")
     with mock.patch.multiple(
-        "adaptfault.models.export", add_onnx=mock.Mock(side_effect=absent), graph_of=mock.Mock(side_effect=absent)
+        "adaptfault.prediction.export",
+        add_onnx=mock.Mock(side_effect=absent),
+        graph_of=mock.Mock(side_effect=absent),
     ):
         yield
 
@@ -66,7 +70,9 @@ def make(folder: Path) -> Any:
     af.train(model, training, validation, epochs=40, learning_rate=0.01, progress=False)
     adapter = af.Adapter(model, training, validation, layout=LAYOUT)
     diagnoser = SelfDiagnosis(LAYOUT).fit(grasps.frames)
-    return af.Bundle.create(folder / NAME, adapter.model, adapter, diagnoser, check=test, class_names=CLASSES)
+    return af.Bundle.create(
+        folder / NAME, adapter.model, adapter, diagnoser, check=test, class_names=CLASSES
+    )
 
 
 def broken_log(seed: int = 9) -> list[Any]:
@@ -83,7 +89,9 @@ def predictions(bundle: Any) -> tuple[Any, dict[int, Any]]:
 
     x = bundle.parts.check_windows().x
     x[..., list(ROW.cells)] = 1
-    expected = {number: af.Adaptation.load(bundle.versions.path(number)).predict(x) for number in (1, 2)}
+    expected = {
+        number: af.Adaptation.load(bundle.versions.path(number)).predict(x) for number in (1, 2)
+    }
     assert (expected[1] != expected[2]).any()
     return x, expected
 
@@ -95,7 +103,8 @@ class Operation:
     Attributes:
         name: for the table.
         trace: its steps.
-        versions: numbers of the versions that may run after a power cut, the one after the operation last.
+        versions: numbers of the versions that may run after a power cut, the one after the
+            operation last.
         probation: whether the version is on probation after it.
         runs: what the journal holds after it.
         next: decisions that the next maintenance run with the broken row may make.
@@ -112,7 +121,7 @@ class Operation:
 def operations(home: Path) -> Iterator[Operation]:
     """Make a bundle and trace each operation on it; call within :func:`small_versions`."""
     import adaptfault as af
-    from adaptfault.robot.versions import Versions
+    from adaptfault.bundle.versions import Versions
 
     trace = Trace(home)
     with trace.recording():
@@ -140,14 +149,21 @@ def operations(home: Path) -> Iterator[Operation]:
     with trace.recording():
         bundle.rollback()
     yield Operation(
-        "rollback", trace, (2, 1), False, ("deployed", "confirmed", "rollback"), ("unchanged", "kept", "deployed")
+        "rollback",
+        trace,
+        (2, 1),
+        False,
+        ("deployed", "confirmed", "rollback"),
+        ("unchanged", "kept", "deployed"),
     )
 
 
-def check(operation: Operation, tree: Tree, complete: bool, home: Path, expected: dict[int, Any], x: Any) -> None:
+def check(
+    operation: Operation, tree: Tree, complete: bool, home: Path, expected: dict[int, Any], x: Any
+) -> None:
     """Raise AssertionError where a robot that starts from this state is not right."""
     import adaptfault as af
-    from adaptfault.robot.pointer import Pointer
+    from adaptfault.bundle.pointer import Pointer
 
     build(tree, home)
     path = home / NAME
@@ -157,13 +173,19 @@ def check(operation: Operation, tree: Tree, complete: bool, home: Path, expected
         return
     before = Pointer.read(path)
     if complete:
-        assert before.active == operation.versions[-1], f"version {before.active} runs, the operation was done"
-        assert before.probation == operation.probation, f"probation is {before.probation}, the operation was done"
+        assert before.active == operation.versions[-1], (
+            f"version {before.active} runs, the operation was done"
+        )
+        assert before.probation == operation.probation, (
+            f"probation is {before.probation}, the operation was done"
+        )
         runs = tuple(run["what"] for run in af.Bundle.open(path).journal.runs())
         assert runs == operation.runs, f"the journal holds {runs}, expected {operation.runs}"
     predictor = af.Predictor.load(path)
     assert predictor.version in operation.versions, f"version {predictor.version} runs"
-    assert predictor.version == before.active, f"version {before.active} was active, {predictor.version} runs"
+    assert predictor.version == before.active, (
+        f"version {before.active} was active, {predictor.version} runs"
+    )
     assert (predictor.predict(x) == expected[predictor.version]).all(), "it predicts otherwise"
     assert predictor.confirm(), "the version cannot be confirmed"
     bundle = af.Bundle.open(path)
@@ -177,7 +199,8 @@ def check(operation: Operation, tree: Tree, complete: bool, home: Path, expected
 
 
 class _AtOnce:
-    """Runs what a recorder gives to its thread at once, so that the order of steps is always the same."""
+    """Runs what a recorder gives to its thread at once, so that the order of steps is always the
+    same."""
 
     def submit(self, call: Callable[..., Any], *args: Any) -> Future[Any]:
         done: Future[Any] = Future()
@@ -194,7 +217,10 @@ def traced_recording(home: Path) -> tuple[Trace, np.ndarray]:
 
     frames = np.round(np.random.default_rng(0).uniform(0, 5, (400, LAYOUT.n_cells)), 3)
     trace = Trace(home)
-    with trace.recording(), Recorder(home / "robot" / "today", LAYOUT, "hand", interval=0.0) as recorder:
+    with (
+        trace.recording(),
+        Recorder(home / "robot" / "today", LAYOUT, "hand", interval=0.0) as recorder,
+    ):
         recorder._disk.shutdown()
         recorder._disk = _AtOnce()
         for i, frame in enumerate(frames):
@@ -207,7 +233,8 @@ def traced_recording(home: Path) -> tuple[Trace, np.ndarray]:
 
 
 def check_recording(tree: Tree, complete: bool, home: Path, frames: np.ndarray) -> None:
-    """Raise AssertionError where a line that is on the disk is lost, or one that never was is read."""
+    """Raise AssertionError where a line that is on the disk is lost, or one that never was is
+    read."""
     import adaptfault as af
 
     build(tree, home)
@@ -215,9 +242,12 @@ def check_recording(tree: Tree, complete: bool, home: Path, frames: np.ndarray) 
     for path, data in sorted(tree.items()):
         if path.endswith(".csv") and data is not None:
             whole += data.partition(b"\0")[0].count(b"\n")
-            cut += not data.endswith(b"\n") and b"\0" not in data  # perhaps within the last number of a line
+            # perhaps within the last number of a line
+            cut += not data.endswith(b"\n") and b"\0" not in data
     if complete:
-        assert whole == len(frames), f"{whole} of {len(frames)} frames are there after the end of the recording"
+        assert whole == len(frames), (
+            f"{whole} of {len(frames)} frames are there after the end of the recording"
+        )
     if not whole:
         return
     read = np.concatenate(af.load(home / "robot" / "today", layout=LAYOUT).recordings.frames)
@@ -226,7 +256,9 @@ def check_recording(tree: Tree, complete: bool, home: Path, frames: np.ndarray) 
     assert (read == right).all(axis=1).sum() >= whole, "a frame is read that never was"
 
 
-def run(*, sample: int | None, home: Path, say: Callable[[str], None] = print) -> tuple[int, list[str]]:
+def run(
+    *, sample: int | None, home: Path, say: Callable[[str], None] = print
+) -> tuple[int, list[str]]:
     """Trace all operations, check their states, and return how many there were and what went wrong.
 
     Args:
@@ -236,14 +268,18 @@ def run(*, sample: int | None, home: Path, say: Callable[[str], None] = print) -
     """
     import adaptfault as af
 
-    tried, wrong = 0, []
+    tried = 0
+    wrong = []
 
     def attempt(name: str, trace: Trace, call: Callable[[Tree, bool, Path], None]) -> None:
         nonlocal tried
         states = failed = 0
         for tree, complete in trace.states(sample=sample):
             states += 1
-            with tempfile.TemporaryDirectory(dir=home) as place, mock.patch.object(os, "fsync", return_value=None):
+            with (
+                tempfile.TemporaryDirectory(dir=home) as place,
+                mock.patch.object(os, "fsync", return_value=None),
+            ):
                 try:
                     call(tree, complete, Path(place))
                 except Exception as error:

@@ -1,4 +1,5 @@
-"""Ten lines: recordings in, a broken row found, the classifier repaired. Run: python examples/repair.py"""
+"""Ten lines: recordings in, a broken row found, the classifier repaired. Run: python
+examples/repair.py"""
 
 import adaptfault as af
 from diagnostics import Line, SelfDiagnosis, inject, line_fault
@@ -8,7 +9,8 @@ def main() -> None:
     grasps = af.simulate(n_per_class=30)  # or: af.load("grasps/").recordings
     windows = af.make_windows(grasps.frames, grasps.labels, grasps.layout)
     training, validation, test = af.split(windows)
-    model = af.TactileTransformer(grasps.layout, n_classes=7, padding="valid", init="glorot")  # quick to learn
+    # quick to learn
+    model = af.TactileTransformer(grasps.layout, n_classes=7, padding="valid", init="glorot")
     af.train(model, training, validation, epochs=5)  # a real one takes 20 to 50
 
     row = line_fault(grasps.layout, Line(pad=0, kind="row", index=5), "short")

@@ -2,9 +2,10 @@
 
     python examples/ros_latency.py [robot.bundle] [--seconds 20] [--rates 100 500]
 
-Without a bundle, one is made from simulated grasps (a minute). A driver in this process publishes frames with a broken
-row, and subscribes to the restored ones with the same QoS: the latency is that of both ways and of the node between.
-It ends with exit code 1 where a frame comes twice or out of order.
+Without a bundle, one is made from simulated grasps (a minute). A driver in this process publishes
+frames with a broken row, and subscribes to the restored ones with the same QoS: the latency is that
+of both ways and of the node between. It ends with exit code 1 where a frame comes twice or out of
+order.
 """
 
 import argparse
@@ -28,7 +29,8 @@ DOMAIN = 87
 
 
 def measure(bundle: af.Bundle, frames: np.ndarray, rate: float, reliable: bool) -> bool:
-    """Send all frames to a node of its own at a rate, print what came back; return whether it came in order."""
+    """Send all frames to a node of its own at a rate, print what came back; return whether it came
+    in order."""
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -59,8 +61,17 @@ def measure(bundle: af.Bundle, frames: np.ndarray, rate: float, reliable: bool) 
     messages = []
     for number, frame in enumerate(frames.astype(np.float32)):
         messages.append(Float32MultiArray(layout=MultiArrayLayout(data_offset=number), data=frame))
-    command = [sys.executable, "-m", "adaptfault.ros2", "--ros-args", "-p", f"bundle:={bundle.path}"]
-    node = subprocess.Popen(command, env={**os.environ, "ROS_DOMAIN_ID": str(DOMAIN)}, stderr=subprocess.DEVNULL)
+    command = [
+        sys.executable,
+        "-m",
+        "adaptfault.ros2",
+        "--ros-args",
+        "-p",
+        f"bundle:={bundle.path}",
+    ]
+    node = subprocess.Popen(
+        command, env={**os.environ, "ROS_DOMAIN_ID": str(DOMAIN)}, stderr=subprocess.DEVNULL
+    )
     sent = np.zeros(len(messages))
     try:
         while not came and node.poll() is None:  # until the node is there
@@ -86,8 +97,9 @@ def measure(bundle: af.Bundle, frames: np.ndarray, rate: float, reliable: bool) 
     latency = 1e3 * (np.array([at for _, at in came]) - sent[numbers])
     name = "reliable" if reliable else "best effort"
     print(
-        f"| {name} | {rate:g} | {len(sent)} | {len(came)} | {len(sent) - len(set(numbers.tolist()))} "
-        f"| {np.median(latency):.1f} | {np.quantile(latency, 0.99):.1f} | {100 * share:.0f} % |",
+        f"| {name} | {rate:g} | {len(sent)} | {len(came)} |"
+        f" {len(sent) - len(set(numbers.tolist()))} | {np.median(latency):.1f} |"
+        f" {np.quantile(latency, 0.99):.1f} | {100 * share:.0f} % |",
         flush=True,
     )
     return bool((np.diff(numbers) > 0).all())
@@ -97,7 +109,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("bundle", nargs="?")
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--rates", type=float, nargs="+", default=[100.0, 500.0], help="frames per second")
+    parser.add_argument(
+        "--rates", type=float, nargs="+", default=[100.0, 500.0], help="frames per second"
+    )
     args = parser.parse_args()
     try:
         import rclpy  # noqa: F401
@@ -107,16 +121,28 @@ def main() -> int:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     in_order = []
     with tempfile.TemporaryDirectory() as folder:
-        bundle = af.Bundle.open(args.bundle) if args.bundle else make_bundle(Path(folder) / "robot.bundle")
+        bundle = (
+            af.Bundle.open(args.bundle)
+            if args.bundle
+            else make_bundle(Path(folder) / "robot.bundle")
+        )
         layout = bundle.layout
         frames = bundle.parts.check_windows().x.reshape(-1, layout.n_cells) * layout.full_scale
-        broken = inject(frames.astype(float), [line_fault(layout, Line(0, "row", layout.rows // 2), "short")], layout)
-        print("| QoS | frames a second | sent | received | lost | median ms | 99 % ms | of a core |")
+        broken = inject(
+            frames.astype(float),
+            [line_fault(layout, Line(0, "row", layout.rows // 2), "short")],
+            layout,
+        )
+        print(
+            "| QoS | frames a second | sent | received | lost | median ms | 99 % ms | of a core |"
+        )
         print("|---|---|---|---|---|---|---|---|")
         for reliable in (False, True):
             for rate in args.rates:
                 count = round(args.seconds * rate)
-                in_order.append(measure(bundle, np.resize(broken, (count, layout.n_cells)), rate, reliable))
+                in_order.append(
+                    measure(bundle, np.resize(broken, (count, layout.n_cells)), rate, reliable)
+                )
     return 0 if all(in_order) else 1
 
 

@@ -2,9 +2,9 @@
 
     python examples/udp_soak.py [--packets 100000] [--rate 1000] [--garbage 0.1]
 
-The sender (esp32_sender.py) is a process of its own. Without arguments it runs for two seconds. On a machine so busy
-that this process gets no turn, the system's buffer fills, then the queue: such packets are counted and named, and only
-one that went without a word is a failure.
+The sender (esp32_sender.py) is a process of its own. Without arguments it runs for two seconds. On
+a machine so busy that this process gets no turn, the system's buffer fills, then the queue: such
+packets are counted and named, and only one that went without a word is a failure.
 """
 
 import argparse
@@ -29,7 +29,8 @@ def resident() -> float:
 
 async def soak(args: argparse.Namespace) -> int:
     good = round(args.packets * (1 - args.garbage))
-    memory, taken = [], 0
+    memory = []
+    taken = 0
     async with Receiver(SensorLayout.paper()) as receiver:
         options = {
             "port": receiver.port,
@@ -44,7 +45,8 @@ async def soak(args: argparse.Namespace) -> int:
             stdout=subprocess.PIPE,
             text=True,
         )
-        began, spent = time.perf_counter(), time.process_time()
+        began = time.perf_counter()
+        spent = time.process_time()
 
         async def end() -> None:
             await asyncio.to_thread(sender.wait)
@@ -57,7 +59,8 @@ async def soak(args: argparse.Namespace) -> int:
             if taken % max(1, good // 20) == 0:
                 memory.append(resident())
         await ending
-        seconds, busy = time.perf_counter() - began, time.process_time() - spent
+        seconds = time.perf_counter() - began
+        busy = time.process_time() - spent
     sent = sender.stdout.read().strip()
     sender.stdout.close()
     counters = receiver.counters

@@ -1,6 +1,8 @@
-"""Installs the wheel where there is nothing else, and uses it from another folder: python tests/check_wheel.py dist
+"""Installs the wheel where there is nothing else, and uses it from another folder: python
+tests/check_wheel.py dist
 
-Not a test of pytest's: it takes minutes, and pip has to fetch what the package needs. ``make wheel-check`` runs it.
+Not a test of pytest's: it takes minutes, and pip has to fetch what the package needs.
+``make wheel-check`` runs it.
 """
 
 from __future__ import annotations
@@ -28,9 +30,12 @@ ROUNDS = 5  # of each start that is timed; the best counts
 
 
 def left_out(wheel: Path) -> set[str]:
-    """Return the files of the packages that the wheel lacks: templates and py.typed go missing easily."""
+    """Return the files of the packages that the wheel lacks: templates and py.typed go missing
+    easily."""
     files = (path for package in PACKAGES for path in (HOME / package).rglob("*"))
-    wanted = {str(p.relative_to(HOME)) for p in files if p.is_file() and "__pycache__" not in p.parts}
+    wanted = {
+        str(p.relative_to(HOME)) for p in files if p.is_file() and "__pycache__" not in p.parts
+    }
     return wanted - set(zipfile.ZipFile(wheel).namelist())
 
 
@@ -38,8 +43,15 @@ def main(dist: Path) -> None:
     (wheel,) = dist.resolve().glob("adaptfault-*.whl")
     if missing := left_out(wheel):
         sys.exit(f"{wheel.name} lacks {', '.join(sorted(missing))}")
-    print(f"{wheel.name}: {wheel.stat().st_size / 1e3:.0f} kB, every file of {' and '.join(PACKAGES)} is in it")
-    environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
+    print(
+        f"{wheel.name}: {wheel.stat().st_size / 1e3:.0f} kB, every file of {' and '.join(PACKAGES)}"
+        " is in it"
+    )
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("PYTHON", "VIRTUAL_ENV"))
+    }
     with tempfile.TemporaryDirectory() as folder:
         elsewhere = Path(folder, "elsewhere")
         elsewhere.mkdir()
@@ -66,9 +78,14 @@ def main(dist: Path) -> None:
             [python, "-c", "import diagnostics"],
         ):
             best = min(run(*start, quiet=True) for _ in range(ROUNDS))
-            print(f"{best:.2f} s, the best of {ROUNDS}: {start[0].name} {' '.join(start[1:])}", flush=True)
+            print(
+                f"{best:.2f} s, the best of {ROUNDS}: {start[0].name} {' '.join(start[1:])}",
+                flush=True,
+            )
         run(adaptfault, "demo")
-        assert "data:image/png;base64," in (elsewhere / "adaptfault-demo" / "report.html").read_text()
+        assert (
+            "data:image/png;base64," in (elsewhere / "adaptfault-demo" / "report.html").read_text()
+        )
 
 
 if __name__ == "__main__":

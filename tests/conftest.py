@@ -14,10 +14,10 @@ import hypothesis
 import numpy as np
 import pytest
 
+from adaptfault.bundle.bundle import Bundle
 from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.data.simulated_grasps import simulate
-from adaptfault.robot.bundle import Bundle
 from diagnostics import Fault, FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault
 from diagnostics.decision.calibration import Calibrator
 
@@ -30,9 +30,11 @@ hypothesis.settings.load_profile("few")
 
 @pytest.hookimpl(trylast=True)  # after the choice of tests
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put what needs a costly fixture together, so that the processes of ``pytest -n 2`` do not wait for each other.
+    """Put what needs a costly fixture together, so that the processes of ``pytest -n 2`` do not
+    wait for each other.
 
-    Each process gets one half: the first begins with the fitted diagnosis, the second with the bundle.
+    Each process gets one half: the first begins with the fitted diagnosis, the second with the
+    bundle.
     """
     parts: dict[str, list[pytest.Item]] = {"fitted": [], "made_bundle": [], "versions": [], "": []}
     for item in items:
@@ -50,7 +52,9 @@ def grasps() -> Recordings:
 
 
 @pytest.fixture(scope="session")
-def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+def made_once(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Callable[[str, Callable[[Path], object]], Path]:
     """Return a folder that ``make`` fills, once for all processes of ``pytest -n``."""
     home = tmp_path_factory.getbasetemp()
 
@@ -62,7 +66,8 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
             return home / name
         from filelock import FileLock
 
-        place, made = home.parent / name, home.parent / f"{name}.made"
+        place = home.parent / name
+        made = home.parent / f"{name}.made"
         with FileLock(f"{place}.lock"):
             if not made.exists():
                 shutil.rmtree(place, ignore_errors=True)
@@ -76,7 +81,8 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
 
 @pytest.fixture(scope="session")
 def fitted(grasps: Recordings, made_once) -> SelfDiagnosis:
-    """Fitted on every other of the simulated grasps; test_serialization.py proves that files lose nothing of it."""
+    """Fitted on every other of the simulated grasps; test_serialization.py proves that files lose
+    nothing of it."""
 
     def make(folder: Path) -> None:
         about, arrays = SelfDiagnosis(grasps.layout).fit(grasps.frames[::2]).state()
@@ -85,7 +91,9 @@ def fitted(grasps: Recordings, made_once) -> SelfDiagnosis:
 
     folder = made_once("fitted", make)
     with np.load(folder / "arrays.npz") as arrays:
-        return SelfDiagnosis.from_state(json.loads((folder / "about.json").read_text()), dict(arrays))
+        return SelfDiagnosis.from_state(
+            json.loads((folder / "about.json").read_text()), dict(arrays)
+        )
 
 
 @pytest.fixture
@@ -100,8 +108,11 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture
-def once_bound(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[int], object]], threading.Thread]:
-    """Return what has ``send(port)`` called in a thread of its own as soon as a receiver has bound its port.
+def once_bound(
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[[Callable[[int], object]], threading.Thread]:
+    """Return what has ``send(port)`` called in a thread of its own as soon as a receiver has bound
+    its port.
 
     What is sent before is lost, and a command that counts frames would wait for them without end.
     """
@@ -130,7 +141,8 @@ DROPPED = {"whole": (), "head": (1, 9, 17)}
 
 
 def small_windows(n: int, seed: int = 0) -> np.ndarray:
-    """Windows of 5 frames of the small array, half of the cells untouched; nothing where there is no cell."""
+    """Windows of 5 frames of the small array, half of the cells untouched; nothing where there is
+    no cell."""
     rng = np.random.default_rng(seed)
     touched = (rng.random((n, 1, 18)) < 0.5) & SMALL.present.ravel()
     return np.where(touched, rng.random((n, 5, 18)), 0).astype(np.float32)
@@ -138,7 +150,8 @@ def small_windows(n: int, seed: int = 0) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def versions(made_once) -> dict[str, Path]:
-    """Folders of two adaptations of one small network, with ONNX files: F empty, and one with all parts."""
+    """Folders of two adaptations of one small network, with ONNX files: F empty, and one with all
+    parts."""
     home = made_once("versions", export_versions)
     return {name: home / name for name in DROPPED}
 
@@ -146,36 +159,63 @@ def versions(made_once) -> dict[str, Path]:
 def export_versions(home: Path) -> None:
     import torch
 
-    from adaptfault.adaptation.heads import Head
     from adaptfault.adaptation.reduced_model import ReducedModel, phi
     from adaptfault.adaptation.result import Adaptation, Stage
     from adaptfault.data.windows import Windows
     from adaptfault.imputation.statistics import CellStatistics
-    from adaptfault.models.export import add_onnx
+    from adaptfault.models.heads import Head
     from adaptfault.models.network import TactileTransformer
+    from adaptfault.prediction.export import add_onnx
 
     network = TactileTransformer(SMALL, 3, length=5).eval()
     windows = Windows(small_windows(60), np.arange(60) % 3, np.arange(60))
     for name, cells in DROPPED.items():
-        fault_set, front, head = FaultSet(cells, 18), None, None
+        fault_set = FaultSet(cells, 18)
+        front = None
+        head = None
         if name == "head":
             front = CellStatistics.fit(windows).nearest(fault_set)
             with torch.no_grad():
-                views = ReducedModel(network, fault_set, front).views(torch.from_numpy(phi(windows.x, fault_set)))
-            weights = torch.from_numpy(np.random.default_rng(1).normal(0, 3, (4, 60, 3)).astype("f4"))
+                views = ReducedModel(network, fault_set, front).views(
+                    torch.from_numpy(phi(windows.x, fault_set))
+                )
+            weights = torch.from_numpy(
+                np.random.default_rng(1).normal(0, 3, (4, 60, 3)).astype("f4")
+            )
             weights -= weights.mean(1, keepdim=True)  # no class is preferred everywhere
-            widths = [torch.cdist(view, view).square().median() for view in views]
-            amounts = [torch.cdist(view, view, p=1).median() for view in (*views[:2], views[3])]
-            widths = torch.stack([*widths[:3], *amounts[:2], widths[3], amounts[2]])
-            shares = torch.tensor([0.1, 0.4, 0.2, 0.3])
-            head = Head(views, ((2,), (0, 1, 2, 5), (5,), (6,)), widths, weights, torch.zeros(3), shares)
+            known = [*views, views[-1]]
+            apart = [torch.cdist(view, view) for view in known]
+            amounts = [torch.cdist(view, view, p=1) for view in known]
+            widths = [
+                apart[0],
+                apart[1],
+                apart[2],
+                amounts[0],
+                amounts[1],
+                apart[3],
+                amounts[3],
+                apart[4],
+                amounts[4],
+            ]
+            for i in (0, 1, 2, 5, 7):
+                widths[i] = widths[i].square()
+            head = Head(
+                known,
+                widths=torch.stack([width.median() for width in widths]),
+                weights=weights,
+                bias=torch.zeros(3),
+                shares=torch.tensor([0.1, 0.4, 0.2, 0.3]),
+                units=torch.ones(known[-1].shape[1]),
+                restoring=torch.zeros_like(known[-1]),
+            )
         model = ReducedModel(network, fault_set, front, head).eval()
         Adaptation(model, fault_set, (Stage("fill", 0.1),), _validation=windows).save(home / name)
         add_onnx(home / name)
 
 
 class Clock:
-    """Stands in for the time module: its seconds pass only where a test lets them, however fast the machine is."""
+    """Stands in for the time module: its seconds pass only where a test lets them, however fast the
+    machine is."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -214,9 +254,14 @@ def write_keys(folder: Path, name: str) -> tuple[Path, Path]:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
     key = Ed25519PrivateKey.generate()
-    private, public = folder / f"{name}.pem", folder / f"{name}.public.pem"
-    private.write_bytes(key.private_bytes(to.Encoding.PEM, to.PrivateFormat.PKCS8, to.NoEncryption()))
-    public.write_bytes(key.public_key().public_bytes(to.Encoding.PEM, to.PublicFormat.SubjectPublicKeyInfo))
+    private = folder / f"{name}.pem"
+    public = folder / f"{name}.public.pem"
+    private.write_bytes(
+        key.private_bytes(to.Encoding.PEM, to.PrivateFormat.PKCS8, to.NoEncryption())
+    )
+    public.write_bytes(
+        key.public_key().public_bytes(to.Encoding.PEM, to.PublicFormat.SubjectPublicKeyInfo)
+    )
     return private, public
 
 
@@ -229,14 +274,15 @@ def without_export() -> Iterator[None]:
         raise ImportError("left out in this test")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("adaptfault.models.export.add_onnx", missing)
-        patch.setattr("adaptfault.models.export.graph_of", missing)
+        patch.setattr("adaptfault.prediction.export.add_onnx", missing)
+        patch.setattr("adaptfault.prediction.export.graph_of", missing)
         yield
 
 
 @contextmanager
 def without_calibration() -> Iterator[None]:
-    """Let a fit keep the calibration of a cold start: its simulated logs take most of the time and have tests."""
+    """Let a fit keep the calibration of a cold start: its simulated logs take most of the time and
+    have tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Calibrator, "fit", lambda recordings, layout, *, progress: Calibrator())
         yield
@@ -254,7 +300,15 @@ def made_bundle(small_grasps: Recordings, made_once) -> Path:
 
     def make(home: Path) -> None:
         save_npz(home / "grasps.npz", small_grasps)
-        command = ["train", str(home / "grasps.npz"), "--out", str(home / "robot.bundle"), "--epochs", "5", "--quiet"]
+        command = [
+            "train",
+            str(home / "grasps.npz"),
+            "--out",
+            str(home / "robot.bundle"),
+            "--epochs",
+            "5",
+            "--quiet",
+        ]
         with without_export():
             assert main(command) == 0
 
@@ -273,7 +327,8 @@ def bundle(made_bundle: Path, tmp_path: Path) -> Iterator[Bundle]:
 def repaired(
     made_bundle: Path, later_grasps: list[np.ndarray], broken_row: Fault, made_once, tmp_path: Path
 ) -> Iterator[Bundle]:
-    """A copy of it after maintenance with the broken row in 12 of the later grasps: version 2 is on probation."""
+    """A copy of it after maintenance with the broken row in 12 of the later grasps: version 2 is on
+    probation."""
 
     def make(home: Path) -> None:
         from adaptfault.robot.maintenance import maintain
@@ -289,7 +344,8 @@ def repaired(
 
 @pytest.fixture
 def linear_bundle(made_once) -> Iterator[Path]:
-    """The folder of a bundle of one linear layer, of which every step is cheap; not to be changed."""
+    """The folder of a bundle of one linear layer, of which every step is cheap; not to be
+    changed."""
     import power_cut
 
     with power_cut.small_versions():
@@ -303,8 +359,11 @@ def later_grasps() -> list[np.ndarray]:
     return [frames for frames, label in zip(grasps.frames, grasps.labels, strict=True) if label > 0]
 
 
-def worn(recordings: Sequence[np.ndarray], layout: SensorLayout, what: str, force: float = 2.0) -> list[np.ndarray]:
-    """Return recordings with a "strap" over pad 0, or with "gloves": loads are weaker and spread to neighbours."""
+def worn(
+    recordings: Sequence[np.ndarray], layout: SensorLayout, what: str, force: float = 2.0
+) -> list[np.ndarray]:
+    """Return recordings with a "strap" over pad 0, or with "gloves": loads are weaker and spread to
+    neighbours."""
     if what == "strap":
         y, x = np.indices(layout.shape[1:]) - (np.array(layout.shape[1:]) // 2)[:, None, None]
         strap = np.zeros(layout.shape)

@@ -1,7 +1,14 @@
 """Acquisition: receives frames from sensors, orders and records them."""
 
 from adaptfault.acquisition.ordering import Arrivals, Frame, Ordering
-from adaptfault.acquisition.packet import NotAuthentic, Packet, PacketError, format_packet, parse_packet, read_key
+from adaptfault.acquisition.packet import (
+    NotAuthentic,
+    Packet,
+    PacketError,
+    format_packet,
+    parse_packet,
+    read_key,
+)
 from adaptfault.acquisition.receiver import Counters, Receiver
 from adaptfault.acquisition.recorder import Recorded, Recorder
 from adaptfault.acquisition.relay import FrameRepair, Relay, Relayed

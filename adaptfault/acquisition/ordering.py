@@ -1,4 +1,5 @@
-"""Ordering of one device's packets: late, duplicate, lost and stray packets, and restarts of the device."""
+"""Ordering of one device's packets: late, duplicate, lost and stray packets, and restarts of the
+device."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from adaptfault.acquisition.packet import Packet
 WINDOW = 3
 """Most packets that are held back while an earlier one is missing."""
 
-_LATE = 1.0  # seconds by which a packet may be older than the last frame; an older time stamp is a restart
+# seconds by which a packet may be older than the last frame; an older time stamp is a restart
+_LATE = 1.0
 _FAR = 10.0  # seconds; a larger jump of the time stamp needs a second packet that agrees
 _PATIENCE = 0.25  # seconds for which a packet is held at least, because networks delay packets
 _QUIET = 0.5  # seconds; a device that sent within that has not restarted: no boot is so short
@@ -77,10 +79,11 @@ class _Waiting:
 class Ordering:
     """Orders the packets of one device by time stamp, in constant memory.
 
-    A packet that follows the last frame is passed on at once. A packet after a gap is held back until the gap is
-    filled, ``window`` packets are held, or the time of so many packets has passed. A jump of the time stamp needs a
-    second packet that agrees: backwards the device restarted, forwards it was silent. A device whose packets still
-    arrive has not restarted, so older time stamps are then replays, which are dropped as strays.
+    A packet that follows the last frame is passed on at once. A packet after a gap is held back
+    until the gap is filled, ``window`` packets are held, or the time of so many packets has passed.
+    A jump of the time stamp needs a second packet that agrees: backwards the device restarted,
+    forwards it was silent. A device whose packets still arrive has not restarted, so older time
+    stamps are then replays, which are dropped as strays.
 
     Args:
         device: name of the device.
@@ -89,22 +92,36 @@ class Ordering:
         restarts: the device's clock may restart; False: older time stamps are always dropped.
     """
 
-    def __init__(self, device: str, rate: float, *, window: int = WINDOW, restarts: bool = True) -> None:
-        self.device, self.rate, self.window, self.restarts = device, rate, window, restarts
+    def __init__(
+        self, device: str, rate: float, *, window: int = WINDOW, restarts: bool = True
+    ) -> None:
+        self.device = device
+        self.rate = rate
+        self.window = window
+        self.restarts = restarts
         self._last: float | None = None  # time stamp of the last frame passed on
         self._arrived = 0.0  # its arrival by the receiver's clock
         self._offset = 0.0  # from the device's clock to a clock that never goes back
         self._held: list[_Waiting] = []
         self._stray: _Waiting | None = None
         self._seen: deque[float] = deque(maxlen=_REMEMBERED)
-        self._received = self._kept = self._duplicates = self._late = self._strays = self._lost = self._restarts = 0
+        self._received = self._kept = self._duplicates = self._late = self._strays = self._lost = (
+            self._restarts
+        ) = 0
 
     @property
     def arrivals(self) -> Arrivals:
         """Counts so far."""
         held = len(self._held) + (self._stray is not None)
         return Arrivals(
-            self._received, self._kept, self._duplicates, self._late, self._strays, held, self._lost, self._restarts
+            self._received,
+            self._kept,
+            self._duplicates,
+            self._late,
+            self._strays,
+            held,
+            self._lost,
+            self._restarts,
         )
 
     def push(self, packet: Packet, now: float) -> list[Frame]:
@@ -113,8 +130,11 @@ class Ordering:
         return self._place(_Waiting(packet.time, packet, now))
 
     def overdue(self, now: float) -> list[Frame]:
-        """Return the frames whose waiting time is over at ``now``, seconds of the receiver's clock."""
-        if self._held and now - min(one.arrived for one in self._held) > max(_PATIENCE, (self.window + 1) / self.rate):
+        """Return the frames whose waiting time is over at ``now``, seconds of the receiver's
+        clock."""
+        if self._held and now - min(one.arrived for one in self._held) > max(
+            _PATIENCE, (self.window + 1) / self.rate
+        ):
             return self._release_held()
         return []
 
@@ -148,10 +168,13 @@ class Ordering:
     def _handle_jump(self, one: _Waiting) -> list[Frame]:
         """Handle a time stamp far from the last: wait for a second packet that agrees."""
         quiet = max(_QUIET, 3 / self.rate)
-        if one.time < (self._last or 0.0) and (not self.restarts or one.arrived - self._arrived < quiet):
+        if one.time < (self._last or 0.0) and (
+            not self.restarts or one.arrived - self._arrived < quiet
+        ):
             self._strays += 1
             return []
-        other, self._stray = self._stray, one
+        other = self._stray
+        self._stray = one
         if other is None:
             return []
         if abs(one.time - other.time) > _FAR:
@@ -170,7 +193,8 @@ class Ordering:
         return frames
 
     def _release_held(self) -> list[Frame]:
-        held, self._held = self._held, []
+        held = self._held
+        self._held = []
         return [self._release(one) for one in held]
 
     def _missing(self, time: float) -> int:
@@ -187,7 +211,8 @@ class Ordering:
             self._offset += self._last + away - one.time
         else:
             lost = self._missing(one.time)
-        self._last, self._arrived = one.time, one.arrived
+        self._last = one.time
+        self._arrived = one.arrived
         self._seen.append(one.time)
         self._lost += lost
         self._kept += 1

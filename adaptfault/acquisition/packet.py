@@ -1,4 +1,5 @@
-"""The paper's UDP packets, ``device_id,timestamp,220 values`` as CSV text (Section II): parsing and formatting."""
+"""The paper's UDP packets, ``device_id,timestamp,220 values`` as CSV text (Section II): parsing and
+formatting."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.data.recordings.sizes import check_file
+from adaptfault.data.recordings.facts.sizes import check_file
 
 TICKS = 1000.0
 """Time stamps count milliseconds, as the ESP32's ``millis()`` does."""
@@ -46,7 +47,8 @@ class Packet:
         device: name of the sender.
         time: seconds of the sender's clock.
         values: float64 ``[D]`` in the sender's unit; NaN = missing reading.
-        restored: cells whose value was written with a plus sign: ``adaptfault listen --relay`` restored them.
+        restored: cells whose value was written with a plus sign: ``adaptfault listen --relay``
+            restored them.
     """
 
     device: str
@@ -64,36 +66,47 @@ def read_key(path: str | os.PathLike[str]) -> bytes:
     """Return the key in a file, without white space at its ends.
 
     Raises:
-        ValueError: it is shorter than 16 bytes, or no regular file (a pipe or a device may have no end).
+        ValueError: it is shorter than 16 bytes, or no regular file (a pipe or a device may have no
+            end).
         OSError: the file cannot be read.
     """
     check_file(Path(path))
     key = Path(path).read_bytes().strip()
     if len(key) < _SHORTEST_KEY:
-        raise ValueError(f"{path}: a key of {len(key)} bytes, expected {_SHORTEST_KEY} or more; openssl rand -hex 32")
+        raise ValueError(
+            f"{path}: a key of {len(key)} bytes, expected {_SHORTEST_KEY} or more; openssl rand"
+            " -hex 32"
+        )
     return key
 
 
-def parse_packet(data: bytes, n_cells: int, *, ticks: float = TICKS, key: bytes | None = None) -> Packet:
-    """Parse a packet. An empty value and ``nan`` are missing readings; a line end or a trailing comma is ignored.
+def parse_packet(
+    data: bytes, n_cells: int, *, ticks: float = TICKS, key: bytes | None = None
+) -> Packet:
+    """Parse a packet. An empty value and ``nan`` are missing readings; a line end or a trailing
+    comma is ignored.
 
     Args:
         data: the datagram.
         n_cells: D, number of values.
         ticks: ticks of the time stamp in a second.
-        key: the packet must end with ``*`` and the HMAC-SHA256 of all before, its first 16 bytes as 32 hexadecimal
-            digits. None: packets have no such code.
+        key: the packet must end with ``*`` and the HMAC-SHA256 of all before, its first 16 bytes as
+            32 hexadecimal digits. None: packets have no such code.
 
     Raises:
         PacketError: the datagram is not such a packet.
         NotAuthentic: the code is missing or wrong.
     """
     if len(data) > longest_packet(n_cells):
-        raise PacketError(f"{len(data)} bytes; {n_cells} values take {longest_packet(n_cells)} at most")
+        raise PacketError(
+            f"{len(data)} bytes; {n_cells} values take {longest_packet(n_cells)} at most"
+        )
     if key is not None:
         data, _, code = data.rstrip(b"\r\n\0 ").rpartition(b"*")
         if not hmac.compare_digest(code.lower(), _code(data, key)):
-            raise NotAuthentic("no authentication code, or a wrong one; the sender needs the same key")
+            raise NotAuthentic(
+                "no authentication code, or a wrong one; the sender needs the same key"
+            )
     try:
         text = data.decode("ascii").rstrip("\r\n\0 ")
     except UnicodeDecodeError:
@@ -104,14 +117,18 @@ def parse_packet(data: bytes, n_cells: int, *, ticks: float = TICKS, key: bytes 
     if len(values) != n_cells:
         raise PacketError(f"{len(values)} values after device and time stamp, expected {n_cells}")
     if DEVICE.fullmatch(device) is None:
-        raise PacketError(f"device {device[:20]!r}; expected letters, digits and . _ : - (64 at most)")
+        raise PacketError(
+            f"device {device[:20]!r}; expected letters, digits and . _ : - (64 at most)"
+        )
     time = _number(stamp)
     if not 0 <= time < _LATEST:
         raise PacketError(f"time stamp {stamp[:20]!r}; expected a number of ticks, 0 or more")
     frame = np.array([_number(value) if value else math.nan for value in values])
     if (np.abs(frame) > _LARGEST).any():
         raise PacketError("a value is infinite or too large")
-    restored = tuple(i for i, value in enumerate(values) if value.startswith("+")) if "+" in text else ()
+    restored = (
+        tuple(i for i, value in enumerate(values) if value.startswith("+")) if "+" in text else ()
+    )
     return Packet(device, time / ticks, frame, restored)
 
 
@@ -132,7 +149,8 @@ def format_packet(
         time: seconds.
         values: ``[D]``; NaN = missing reading.
         ticks: ticks of the time stamp in a second.
-        restored: bool ``[D]``, values that are written with a plus sign, which readers of numbers ignore.
+        restored: bool ``[D]``, values that are written with a plus sign, which readers of numbers
+            ignore.
         digits: significant digits of a value that is not restored; restored ones have 6.
         key: of the authentication code that the packet ends with; None: no code.
 
@@ -154,7 +172,8 @@ def _code(data: bytes, key: bytes) -> bytes:
 
 
 def _number(text: str) -> float:
-    """Return the number; raise PacketError also for forms that only Python's float accepts ("1_000")."""
+    """Return the number; raise PacketError also for forms that only Python's float accepts
+    ("1_000")."""
     try:
         number = float(text)
     except ValueError:

@@ -13,12 +13,19 @@ from ipaddress import ip_address
 from types import TracebackType
 
 from adaptfault.acquisition.ordering import WINDOW, Arrivals, Frame, Ordering
-from adaptfault.acquisition.packet import TICKS, NotAuthentic, PacketError, longest_packet, parse_packet
+from adaptfault.acquisition.packet import (
+    TICKS,
+    NotAuthentic,
+    PacketError,
+    longest_packet,
+    parse_packet,
+)
 from diagnostics import SensorLayout
 
 MOST_DEVICES = 16
 QUEUE = 1024
-_KERNEL_BUFFER = 4 << 20  # bytes requested, for datagrams that arrive while this process does not run
+# bytes requested, for datagrams that arrive while this process does not run
+_KERNEL_BUFFER = 4 << 20
 _TURNS = 8  # of the event loop for each frame fetched; each turn reads one datagram
 _BOUND = 10.0  # seconds of silence after which a device may send from another address
 _IDLE = 2.0  # seconds of silence after which a device may give its place to another one
@@ -29,8 +36,8 @@ _TICK = 0.05  # seconds between checks for held packets
 class Counters:
     """Counts of all datagrams.
 
-    ``received`` is the sum of ``kept``, ``malformed``, ``oversized``, ``forged``, ``refused``, ``duplicates``,
-    ``late``, ``strays`` and ``held``.
+    ``received`` is the sum of ``kept``, ``malformed``, ``oversized``, ``forged``, ``refused``,
+    ``duplicates``, ``late``, ``strays`` and ``held``.
 
     Attributes:
         received: datagrams.
@@ -38,9 +45,11 @@ class Counters:
         dropped: kept frames that were not fetched in time.
         malformed, oversized: not packets of this array.
         forged: without the right authentication code, where a key is given.
-        refused: from devices that are not listed, beyond the limit of devices, or from another address.
+        refused: from devices that are not listed, beyond the limit of devices, or from another
+            address.
         devices: number of devices.
-        duplicates, late, strays, held, lost, restarts: as in :class:`Arrivals`, all devices together.
+        duplicates, late, strays, held, lost, restarts: as in :class:`Arrivals`, all devices
+        together.
     """
 
     received: int = 0
@@ -62,7 +71,9 @@ class Counters:
         named = {f.name: getattr(self, f.name) for f in fields(self)}
         head = f"{named.pop('received')} received, {named.pop('kept')} kept"
         counted = (
-            f"{count} {name.removesuffix('s') if count == 1 else name}" for name, count in named.items() if count
+            f"{count} {name.removesuffix('s') if count == 1 else name}"
+            for name, count in named.items()
+            if count
         )
         return ", ".join([head, *counted])
 
@@ -72,25 +83,30 @@ class Counters:
 
 
 class Receiver(asyncio.DatagramProtocol):
-    """Frames of one kind of array from the network: ``async with Receiver(layout, port) as r: async for frame in r:``.
+    """Frames of one kind of array from the network:
+    ``async with Receiver(layout, port) as r: async for frame in r:``.
 
-    No content of a datagram stops the receiver or grows its memory: invalid datagrams are counted and discarded; the
-    numbers of devices and of waiting frames are limited. A full queue discards its oldest frame. At the limit of
-    devices a new one takes the place of the one that has been silent longest, 2 s at least.
+    No content of a datagram stops the receiver or grows its memory: invalid datagrams are counted
+    and discarded; the numbers of devices and of waiting frames are limited. A full queue discards
+    its oldest frame. At the limit of devices a new one takes the place of the one that has been
+    silent longest, 2 s at least.
 
     Args:
         layout: the array; its rate determines which packets are missing.
         port: to listen on; 0 chooses a free one.
-        host: address to listen on; the default receives from this machine only, "0.0.0.0" from the whole network.
+        host: address to listen on; the default receives from this machine only, "0.0.0.0" from the
+            whole network.
         ticks: ticks of the time stamps in a second.
-        devices: names of the accepted devices, each with its address where it has a fixed one, as "hand@10.0.0.7";
-            None: any.
+        devices: names of the accepted devices, each with its address where it has a fixed one, as
+            "hand@10.0.0.7"; None: any.
         most_devices: limit of devices; packets of further ones are refused.
         queue: frames that may wait to be fetched.
         window: packets of a device held back for a late one.
-        key: packets without the right authentication code are refused (see :func:`parse_packet`). Time stamps must then
-            never go back, not even when the device restarts: that excludes replays.
-        on_frame: called with each frame before it waits to be fetched, also where the queue discards it.
+        key: packets without the right authentication code are refused (see :func:`parse_packet`).
+            Time stamps must then never go back, not even when the device restarts: that excludes
+            replays.
+        on_frame: called with each frame before it waits to be fetched, also where the queue
+            discards it.
 
     Raises:
         ValueError: an address in ``devices`` is none.
@@ -110,15 +126,26 @@ class Receiver(asyncio.DatagramProtocol):
         key: bytes | None = None,
         on_frame: Callable[[Frame], None] | None = None,
     ) -> None:
-        self.layout, self.port, self.host, self.ticks, self.on_frame = layout, port, host, ticks, on_frame
+        self.layout = layout
+        self.port = port
+        self.host = host
+        self.ticks = ticks
+        self.on_frame = on_frame
         self.devices = None if devices is None else dict(map(_device, devices))
-        self.most_devices, self.window, self.key = most_devices, window, key
+        self.most_devices = most_devices
+        self.window = window
+        self.key = key
         self._queue: deque[Frame] = deque(maxlen=queue)
         self._longest = longest_packet(layout.n_cells)
         self._streams: dict[str, Ordering] = {}
-        self._senders: dict[str, tuple[str, float]] = {}  # address of each device, and when it sent last
-        self._evicted = dict.fromkeys((f.name for f in fields(Arrivals)), 0)  # counts of devices that are forgotten
-        self._received = self._dropped = self._malformed = self._oversized = self._forged = self._refused = 0
+        self._senders: dict[
+            str, tuple[str, float]
+        ] = {}  # address of each device, and when it sent last
+        # counts of devices that are forgotten
+        self._evicted = dict.fromkeys((f.name for f in fields(Arrivals)), 0)
+        self._received = self._dropped = self._malformed = self._oversized = self._forged = (
+            self._refused
+        ) = 0
         self._transport: asyncio.BaseTransport | None = None
         self._news = asyncio.Event()
         self._closed = False
@@ -150,10 +177,11 @@ class Receiver(asyncio.DatagramProtocol):
         return {name: stream.arrivals for name, stream in self._streams.items()}
 
     def take(self, data: bytes, now: float, sender: str = "") -> None:
-        """Process one datagram that arrived at ``now``, seconds of a monotonic clock, from the address ``sender``.
+        """Process one datagram that arrived at ``now``, seconds of a monotonic clock, from the
+        address ``sender``.
 
-        A device is bound to the address that it sends from first: packets with its name from other addresses are
-        refused until it has been silent for 10 s.
+        A device is bound to the address that it sends from first: packets with its name from other
+        addresses are refused until it has been silent for 10 s.
         """
         self._received += 1
         if len(data) > self._longest:
@@ -167,7 +195,10 @@ class Receiver(asyncio.DatagramProtocol):
         except PacketError:
             self._malformed += 1
             return
-        if self.devices is not None and self.devices.get(packet.device, "none") not in (None, sender):
+        if self.devices is not None and self.devices.get(packet.device, "none") not in (
+            None,
+            sender,
+        ):
             self._refused += 1
             return
         stream = self._streams.get(packet.device)
@@ -227,7 +258,9 @@ class Receiver(asyncio.DatagramProtocol):
 
     async def __aenter__(self) -> Receiver:
         loop = asyncio.get_running_loop()
-        family, kind, protocol, _, address = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_DGRAM)[0]
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            self.host, self.port, type=socket.SOCK_DGRAM
+        )[0]
         listening = socket.socket(family, kind, protocol)
         try:
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KERNEL_BUFFER)
@@ -242,7 +275,10 @@ class Receiver(asyncio.DatagramProtocol):
         return self
 
     async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
         await asyncio.sleep(0)  # the transport closes its socket in the next turn
@@ -288,4 +324,6 @@ def _device(text: str) -> tuple[str, str | None]:
         return name, None
     with suppress(ValueError):
         return name, str(ip_address(address))
-    raise ValueError(f"device {text!r}: {address!r} is no IP address; expected NAME or NAME@ADDRESS")
+    raise ValueError(
+        f"device {text!r}: {address!r} is no IP address; expected NAME or NAME@ADDRESS"
+    )

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adaptfault.data.atomic import atomic_write, make_folder, sync_folder
-from adaptfault.data.recordings.layout_file import read_layout
+from adaptfault.data.recordings.facts.layout_file import read_layout
 from diagnostics import SensorLayout
 
 INTERVAL = 1.0
@@ -27,7 +27,9 @@ INTERVAL = 1.0
 LONGEST = 3600.0
 """Seconds after which a recording continues in a new file."""
 
-_GAP = 1.0  # seconds; lost frames up to that are written as missing readings, a longer pause begins a new recording
+# seconds; lost frames up to that are written as missing readings, a longer pause begins a new
+# recording
+_GAP = 1.0
 
 
 @dataclass(frozen=True)
@@ -43,11 +45,14 @@ class Recorded:
 
 
 class Recorder:
-    """Writes the frames of one device as CSV recordings into a folder, which :func:`adaptfault.load` reads.
+    """Writes the frames of one device as CSV recordings into a folder, which
+    :func:`adaptfault.load` reads.
 
-    One frame per line, one cell per column, no header; lost frames become lines of missing readings. Each line is
-    written at once and synced every ``interval`` seconds by a thread, so the caller does not wait for the disk.
-    :func:`adaptfault.load` reads a truncated file up to its last complete line. ``layout.json`` holds the layout.
+    One frame per line, one cell per column, no header; lost frames become lines of missing
+    readings. Each line is written at once and synced every ``interval`` seconds by a thread, so the
+    caller does not wait for the disk.
+    :func:`adaptfault.load` reads a truncated file up to its last complete line. ``layout.json``
+    holds the layout.
 
     Args:
         folder: created where missing.
@@ -70,13 +75,17 @@ class Recorder:
         longest: float = LONGEST,
         interval: float = INTERVAL,
     ) -> None:
-        self.folder, self.layout, self.device = Path(folder), layout, device
-        self.longest, self.interval = longest, interval
+        self.folder = Path(folder)
+        self.layout = layout
+        self.device = device
+        self.longest = longest
+        self.interval = interval
         make_folder(self.folder)
         try:
             _write_layout(self.folder / "layout.json", layout)
         except OSError as error:
-            if error.errno != errno.ENOSPC:  # a full disk may have room when the first recording begins
+            # a full disk may have room when the first recording begins
+            if error.errno != errno.ENOSPC:
                 raise
         self._file: TextIO | None = None
         self._path = self.folder
@@ -92,10 +101,12 @@ class Recorder:
         return None if self._file is None else self._path
 
     def write(self, values: ArrayLike, at: float) -> Recorded | None:
-        """Append a frame ``[D]`` taken at ``at`` (seconds, increasing); open a file where none is open.
+        """Append a frame ``[D]`` taken at ``at`` (seconds, increasing); open a file where none is
+        open.
 
         Returns:
-            The recording that ended before this frame, because of a pause or its length; None otherwise.
+            The recording that ended before this frame, because of a pause or its length; None
+            otherwise.
 
         Raises:
             ValueError: the frame has another size.
@@ -103,7 +114,10 @@ class Recorder:
         """
         frame = np.asarray(values, dtype=np.float64).ravel()
         if frame.size != self.layout.n_cells:
-            raise ValueError(f"expected a frame of {self.layout.n_cells} readings ({self.layout}), got {frame.size}")
+            raise ValueError(
+                f"expected a frame of {self.layout.n_cells} readings ({self.layout}), got"
+                f" {frame.size}"
+            )
         ended = None
         if self._file is not None and (
             at - self._last > _GAP + 1 / self.layout.rate or at - self._first > self.longest
@@ -124,7 +138,8 @@ class Recorder:
 
     def close(self) -> Recorded | None:
         """End the recording and sync it to the disk. None where nothing is being recorded."""
-        file, self._file = self._file, None
+        file = self._file
+        self._file = None
         if file is None:
             return None
         with file:
@@ -136,7 +151,10 @@ class Recorder:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         try:
             self.close()
@@ -156,7 +174,9 @@ class Recorder:
             except FileExistsError:
                 continue
         self._path = self.folder / name
-        self._first, self._last, self._frames = at, at, 0
+        self._first = at
+        self._last = at
+        self._frames = 0
         self._synced = time.monotonic()
         self._syncing = self._disk.submit(sync_folder, self.folder)
         return self._file
@@ -170,12 +190,14 @@ class Recorder:
 
     def _settle(self) -> None:
         """Wait for the running sync and raise its error."""
-        waiting, self._syncing = self._syncing, None
+        waiting = self._syncing
+        self._syncing = None
         if waiting is not None:
             waiting.result()
 
     def _abandon(self) -> None:
-        file, self._file = self._file, None
+        file = self._file
+        self._file = None
         if file is not None:
             with contextlib.suppress(OSError):  # close repeats the failed write
                 file.close()
@@ -188,6 +210,9 @@ def _line(frame: NDArray[np.float64]) -> str:
 def _write_layout(path: Path, layout: SensorLayout) -> None:
     if path.exists():
         if (there := read_layout(path)) != layout:
-            raise ValueError(f"{path.parent} holds recordings of {there}, not of {layout}; record into another folder")
+            raise ValueError(
+                f"{path.parent} holds recordings of {there}, not of {layout}; record into another"
+                " folder"
+            )
         return
     atomic_write(path, json.dumps(layout.to_dict(), allow_nan=False).encode())

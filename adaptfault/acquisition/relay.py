@@ -1,4 +1,5 @@
-"""Sends whole frames on: faulty cells are restored, so that software that only reads packets needs no change."""
+"""Sends whole frames on: faulty cells are restored, so that software that only reads packets needs
+no change."""
 
 from __future__ import annotations
 
@@ -13,9 +14,9 @@ from adaptfault.acquisition.packet import TICKS, format_packet
 from diagnostics import FaultSet
 
 if TYPE_CHECKING:
+    from adaptfault.bundle.versions import Version
     from adaptfault.data.calibration import Calibration
     from adaptfault.imputation.restorer import Restorer
-    from adaptfault.robot.versions import Version
 
 _DIGITS = 15  # every decimal number of so many digits is sent on as it came
 
@@ -40,7 +41,8 @@ class Relayed:
 
 
 class FrameRepair:
-    """Restores frames of one device in constant time: cells in F from the healthy ones, other gaps by the last reading.
+    """Restores frames of one device in constant time: cells in F from the healthy ones, other gaps
+    by the last reading.
 
     Args:
         restorer: fitted on healthy recordings.
@@ -51,14 +53,17 @@ class FrameRepair:
     """
 
     def __init__(self, restorer: Restorer, known: FaultSet) -> None:
-        self.restorer, self.known, self.fault_set = restorer, known, known
+        self.restorer = restorer
+        self.known = known
+        self.fault_set = known
         self._last = restorer.mean_.copy()  # of a cell that has not sent yet
 
     def found(self, faulty: FaultSet) -> None:
         """Restore these cells too, besides the known ones, from the next frame on."""
         fault_set = self.known | faulty
         if fault_set != self.fault_set:
-            self.restorer.deviation(fault_set)  # solves the linear system now, after the frame was sent
+            # solves the linear system now, after the frame was sent
+            self.restorer.deviation(fault_set)
             self.fault_set = fault_set
 
     def __call__(self, values: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -71,7 +76,11 @@ class FrameRepair:
         restored = np.isnan(frame) | self.fault_set.mask
         frame = np.where(np.isnan(frame), self._last, frame)
         self._last = np.where(restored, self._last, frame)
-        return self.restorer.update(frame, self.fault_set) + 0.0, restored  # + 0.0: no minus sign before a zero
+        # + 0.0: no minus sign before a zero
+        return (
+            self.restorer.update(frame, self.fault_set) + 0.0,
+            restored,
+        )
 
     def in_place(
         self,
@@ -85,12 +94,14 @@ class FrameRepair:
         Args:
             received: ``[D]`` as they came.
             values: ``[D]`` in the layout's unit; NaN = missing.
-            version: undoes exchanged wires and replaced pads; None: readings stay where they came from.
+            version: undoes exchanged wires and replaced pads; None: readings stay where they came
+                from.
             calibration: from received values to the layout's unit; None: they are in that unit.
 
         Returns:
-            The frame ``[D]`` in the unit in which it came, which cells are restored, and which values are others than
-            those received: restored ones and those of a replaced pad, both bool ``[D]``.
+            The frame ``[D]`` in the unit in which it came, which cells are restored, and which
+            values are others than those received: restored ones and those of a replaced pad, both
+            bool ``[D]``.
         """
         source = np.arange(len(values)) if version is None else version.source
         given = values[source]
@@ -107,9 +118,9 @@ class FrameRepair:
 class Relay:
     """Sends repaired packets to one address over UDP, in the format in which they came.
 
-    A restored value is written with a plus sign, ``+1.25``, which readers of numbers ignore. All other values are those
-    that came. Where a device sends whole numbers only, restored ones are rounded. Sending never waits: a consumer that
-    is not there, or does not read, has no effect.
+    A restored value is written with a plus sign, ``+1.25``, which readers of numbers ignore. All
+    other values are those that came. Where a device sends whole numbers only, restored ones are
+    rounded. Sending never waits: a consumer that is not there, or does not read, has no effect.
 
     Args:
         address: of the consumer, as ``HOST:PORT``.
@@ -132,12 +143,19 @@ class Relay:
         ticks: float = TICKS,
     ) -> None:
         self.host, self.port = parse_address(address)
-        self.restorer, self.known, self.calibration, self.ticks = restorer, known, calibration, ticks
+        self.restorer = restorer
+        self.known = known
+        self.calibration = calibration
+        self.ticks = ticks
         self._to: Any  # host and port, of IPv6 with two numbers more
         try:
-            family, kind, protocol, _, self._to = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_DGRAM)[0]
+            family, kind, protocol, _, self._to = socket.getaddrinfo(
+                self.host, self.port, type=socket.SOCK_DGRAM
+            )[0]
         except OSError as error:
-            raise ValueError(f"{address}: {error.strerror or error}; give a host that this machine knows") from None
+            raise ValueError(
+                f"{address}: {error.strerror or error}; give a host that this machine knows"
+            ) from None
         # Not connected: a connected socket reports that nobody listens, at the next packet.
         self._socket = socket.socket(family, kind, protocol)
         self._socket.setblocking(False)
@@ -154,7 +172,8 @@ class Relay:
         values: NDArray[np.float64],
         version: Version | None = None,
     ) -> None:
-        """Send one frame on, as the model of ``version`` reads it: wires put back, replaced pads recalibrated.
+        """Send one frame on, as the model of ``version`` reads it: wires put back, replaced pads
+        recalibrated.
 
         Args:
             device: name of the sender.
@@ -170,7 +189,9 @@ class Relay:
         self.relayed.restored += bool(restored.any())
         if whole:
             frame = np.where(other, np.rint(frame), frame)
-        data = format_packet(device, time, frame, ticks=self.ticks, restored=restored, digits=_DIGITS)
+        data = format_packet(
+            device, time, frame, ticks=self.ticks, restored=restored, digits=_DIGITS
+        )
         try:
             self._socket.sendto(data, self._to)
             self.relayed.sent += 1
@@ -188,7 +209,10 @@ class Relay:
     def __str__(self) -> str:
         counts = self.relayed
         failed = f", {counts.failed} failed" if counts.failed else ""
-        return f"{counts.sent} relayed to {self.host}:{self.port} ({counts.restored} with restored cells{failed})"
+        return (
+            f"{counts.sent} relayed to {self.host}:{self.port} ({counts.restored} with restored"
+            f" cells{failed})"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return address and counts as a JSON-safe dict."""

@@ -1,7 +1,8 @@
-"""Converts a diagnosis into ``diagnostic_msgs/DiagnosticArray``, as plain dicts, and writes it into a bag.
+"""Converts a diagnosis into ``diagnostic_msgs/DiagnosticArray``, as plain dicts, and writes it into
+a bag.
 
-No ROS is needed. Publish the dicts with rclpy (:mod:`adaptfault.ros2` does) once a second; ROS marks a status as stale
-when it is not repeated for some seconds.
+No ROS is needed. Publish the dicts with rclpy (:mod:`adaptfault.ros2` does) once a second; ROS
+marks a status as stale when it is not repeated for some seconds.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from diagnostics.decision.coverage import percent
 
 TOPIC = "/diagnostics"
 
-_SHARE = 0.1  # share of faulty cells of a pad that is an ERROR even without a faulty wire, as for exit codes
-_SLOW = 0.9  # of the declared rate; below it the stream is a WARN, the tolerance of diagnostic_updater
+# share of faulty cells of a pad that is an ERROR even without a faulty wire, as for exit codes
+_SHARE = 0.1
+# of the declared rate; below it the stream is a WARN, the tolerance of diagnostic_updater
+_SLOW = 0.9
 _LISTED = 20  # most cells named in one value
 _GROUPS = {
     "rows": ("row",),
@@ -48,13 +51,14 @@ def diagnostic_array(
     hardware_id: str = "tactile",
     rate: float | None = None,
 ) -> dict[str, Any]:
-    """Return a DiagnosticArray: one status for each pad, each group of its wires, and the stream of frames.
+    """Return a DiagnosticArray: one status for each pad, each group of its wires, and the stream of
+    frames.
 
-    The names depend on the layout only: "tactile: pad 0", "tactile: pad 0 rows" (``columns``, ``addresses``,
-    ``converter``; with declared wiring ``groups``), ..., "tactile: stream". Single faulty cells of
-    a pad are a WARN; a tenth of its cells, or a wire, is an ERROR, also of the wire's group. Lost or frozen frames are
-    a WARN of the stream, and so is a rate below 90 % of the layout's. Untested cells are counted in the values and do
-    not change the level.
+    The names depend on the layout only: "tactile: pad 0", "tactile: pad 0 rows" (``columns``,
+    ``addresses``, ``converter``; with declared wiring ``groups``), ..., "tactile: stream". Single
+    faulty cells of a pad are a WARN; a tenth of its cells, or a wire, is an ERROR, also of the
+    wire's group. Lost or frozen frames are a WARN of the stream, and so is a rate below 90 % of the
+    layout's. Untested cells are counted in the values and do not change the level.
 
     Args:
         diagnosis: to convert.
@@ -84,7 +88,8 @@ def stale_array(
     hardware_id: str = "tactile",
     level: Level = Level.STALE,
 ) -> dict[str, Any]:
-    """Return the same statuses, all STALE (or of another level) with this message, for a sensor without frames."""
+    """Return the same statuses, all STALE (or of another level) with this message, for a sensor
+    without frames."""
     names = [
         one
         for pad in range(layout.pads)
@@ -94,8 +99,11 @@ def stale_array(
     return _array(statuses, stamp, name, hardware_id)
 
 
-def write_diagnostics(path: str | os.PathLike[str], arrays: Iterable[Mapping[str, Any]], *, topic: str = TOPIC) -> None:
-    """Write DiagnosticArrays into a new bag (MCAP, metadata version 8, which ROS 2 Humble reads), at their stamps.
+def write_diagnostics(
+    path: str | os.PathLike[str], arrays: Iterable[Mapping[str, Any]], *, topic: str = TOPIC
+) -> None:
+    """Write DiagnosticArrays into a new bag (MCAP, metadata version 8, which ROS 2 Humble reads),
+    at their stamps.
 
     Raises:
         ValueError: rosbags is not installed, or the path exists.
@@ -105,7 +113,9 @@ def write_diagnostics(path: str | os.PathLike[str], arrays: Iterable[Mapping[str
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise ValueError(f"{path}: bags are written with rosbags; install it: pip install 'adaptfault[ros]'") from None
+        raise ValueError(
+            f"{path}: bags are written with rosbags; install it: pip install 'adaptfault[ros]'"
+        ) from None
     if Path(path).exists():
         raise ValueError(f"{path} exists already; give the bag another name")
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -125,36 +135,52 @@ def _groups(layout: SensorLayout) -> dict[str, tuple[str, ...]]:
 def _pad(diagnosis: Diagnosis, pad: int, faults: list[Fault]) -> dict[str, Any]:
     layout = diagnosis.layout
     cells = np.flatnonzero(
-        layout.present.ravel() & (np.arange(layout.n_cells) // (layout.rows * layout.shape[2]) == pad)
+        layout.present.ravel()
+        & (np.arange(layout.n_cells) // (layout.rows * layout.shape[2]) == pad)
     )
     faulty = [cell for cell in diagnosis.fault_set if cell in set(cells.tolist())]
     untested = np.intersect1d(diagnosis.coverage.untested, cells).size
     tested = 1 - untested / max(1, cells.size)
     if faulty:
         grave = any(f.line is not None for f in faults) or len(faulty) >= _SHARE * cells.size
-        level, message = (Level.ERROR if grave else Level.WARN), f"{len(faulty)} of {cells.size} cells faulty"
+        level = Level.ERROR if grave else Level.WARN
+        message = f"{len(faulty)} of {cells.size} cells faulty"
     else:
-        level, message = Level.OK, f"no fault found, {percent(tested)}% of the cells tested"
+        level = Level.OK
+        message = f"no fault found, {percent(tested)}% of the cells tested"
     values: dict[str, Any] = {"cells": cells.size, "faulty": len(faulty), "untested": untested}
     values |= {"test coverage": f"{tested:.3f}", "faulty cells": _places(layout, faulty)}
     values |= {f"cause {i}": fault.reason for i, fault in enumerate(faults, 1)}
     advice = next((touch for touch in diagnosis.coverage.advice if f"pad {pad}," in touch), None)
-    return _status(f"pad {pad}", level, message, values if advice is None else values | {"advice": advice})
+    return _status(
+        f"pad {pad}", level, message, values if advice is None else values | {"advice": advice}
+    )
 
 
-def _wires(layout: SensorLayout, pad: int, group: str, kinds: tuple[str, ...], faults: list[Fault]) -> dict[str, Any]:
+def _wires(
+    layout: SensorLayout, pad: int, group: str, kinds: tuple[str, ...], faults: list[Fault]
+) -> dict[str, Any]:
     wires = sum(line.pad == pad and line.kind in kinds for line in layout.lines)
     values: dict[str, Any] = {"wires": wires, "faulty": len(faults)}
     for fault in faults:
         values[_short(fault.line)] = fault.reason
     if faults:
-        return _status(f"pad {pad} {group}", Level.ERROR, "; ".join(_short(f.line) for f in faults), values)
+        return _status(
+            f"pad {pad} {group}", Level.ERROR, "; ".join(_short(f.line) for f in faults), values
+        )
     return _status(f"pad {pad} {group}", Level.OK, "no fault found", values)
 
 
 def _stream(diagnosis: Diagnosis, rate: float | None) -> dict[str, Any]:
-    counts = {kind: sum(t.frames for t in diagnosis.transport if t.kind == kind) for kind in ("lost", "frozen")}
-    values: dict[str, Any] = {"frames": diagnosis.n_frames, "recordings": diagnosis.n_recordings, **counts}
+    counts = {
+        kind: sum(t.frames for t in diagnosis.transport if t.kind == kind)
+        for kind in ("lost", "frozen")
+    }
+    values: dict[str, Any] = {
+        "frames": diagnosis.n_frames,
+        "recordings": diagnosis.n_recordings,
+        **counts,
+    }
     messages = [f"{count} frames {kind}" for kind, count in counts.items() if count]
     declared = diagnosis.layout.rate
     if rate is not None:
@@ -162,11 +188,17 @@ def _stream(diagnosis: Diagnosis, rate: float | None) -> dict[str, Any]:
         if rate < _SLOW * declared:
             messages.append(f"{rate:.3g} frames a second, {declared:g} are declared")
     message = "; ".join(messages)
-    return _status("stream", Level.WARN if message else Level.OK, message or "frames come as they should", values)
+    return _status(
+        "stream",
+        Level.WARN if message else Level.OK,
+        message or "frames come as they should",
+        values,
+    )
 
 
 def _places(layout: SensorLayout, cells: list[int]) -> str:
-    """Return at most 20 cells as "row.column", or by index with declared wiring, and the number of the others."""
+    """Return at most 20 cells as "row.column", or by index with declared wiring, and the number of
+    the others."""
     pattern = "{1}.{2}" if layout.is_matrix else "{3}"
     places = [pattern.format(*layout.position(cell), cell) for cell in cells[:_LISTED]]
     more = [f"and {len(cells) - _LISTED} more"] if len(cells) > _LISTED else []
@@ -182,16 +214,23 @@ def _status(name: str, level: Level, message: str, values: Mapping[str, Any]) ->
     return {"level": int(level), "name": name, "message": message, "values": pairs}
 
 
-def _array(statuses: list[dict[str, Any]], stamp: float, name: str, hardware_id: str) -> dict[str, Any]:
-    whole = [{**one, "name": f"{name}: {one['name']}", "hardware_id": hardware_id} for one in statuses]
+def _array(
+    statuses: list[dict[str, Any]], stamp: float, name: str, hardware_id: str
+) -> dict[str, Any]:
+    whole = [
+        {**one, "name": f"{name}: {one['name']}", "hardware_id": hardware_id} for one in statuses
+    ]
     seconds, rest = divmod(round(stamp * 1e9), 10**9)
     return {"header": {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": ""}, "status": whole}
 
 
 def _message(types: Mapping[str, Any], array: Mapping[str, Any]) -> Any:
     """Return a DiagnosticArray of rosbags' types."""
-    status, pair = types["diagnostic_msgs/msg/DiagnosticStatus"], types["diagnostic_msgs/msg/KeyValue"]
+    status = types["diagnostic_msgs/msg/DiagnosticStatus"]
+    pair = types["diagnostic_msgs/msg/KeyValue"]
     stamp = types["builtin_interfaces/msg/Time"](**array["header"]["stamp"])
     header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=array["header"]["frame_id"])
-    statuses = [status(**{**one, "values": [pair(**p) for p in one["values"]]}) for one in array["status"]]
+    statuses = [
+        status(**{**one, "values": [pair(**p) for p in one["values"]]}) for one in array["status"]
+    ]
     return types["diagnostic_msgs/msg/DiagnosticArray"](header=header, status=statuses)

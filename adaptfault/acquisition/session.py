@@ -26,7 +26,8 @@ _BEFORE = 0.5  # seconds recorded before a contact
 
 
 class StreamResult(Protocol):
-    """Result of one frame, as :class:`adaptfault.Reading`; ``label`` is None until a window is full."""
+    """Result of one frame, as :class:`adaptfault.Reading`; ``label`` is None until a window is
+    full."""
 
     @property
     def label(self) -> Any: ...  # noqa: D102
@@ -52,8 +53,8 @@ class Event:
     """An event of one device.
 
     Attributes:
-        kind: "fault" (new or changed), "gone", "class", "recording", "recorded", "restart", "silent", "confirmed" or
-            "trouble".
+        kind: "fault" (new or changed), "gone", "class", "recording", "recorded", "restart",
+            "silent", "confirmed" or "trouble".
         device: name of the device.
         time: seconds, as in :class:`Frame`.
         text: one sentence.
@@ -71,7 +72,12 @@ class Event:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
-        head = {"schema": "adaptfault.event/1", "kind": self.kind, "device": self.device, "time": self.time}
+        head = {
+            "schema": "adaptfault.event/1",
+            "kind": self.kind,
+            "device": self.device,
+            "time": self.time,
+        }
         return {**head, "text": self.text, **self.data}
 
 
@@ -95,7 +101,10 @@ class Session:
         rule: Rule | None = None,
         clock: Callable[[], datetime] = datetime.now,
     ) -> None:
-        self.device, self.watcher, self.recorder, self.clock = device, watcher, recorder, clock
+        self.device = device
+        self.watcher = watcher
+        self.recorder = recorder
+        self.clock = clock
         self.switch = None if rule is None else Switch(rule)
         self.label: Any = None
         self._classified = 0
@@ -103,7 +112,9 @@ class Session:
         self._faulty: NDArray[np.bool_] | None = None
         self._time = 0.0
         self._arrived: float | None = None
-        before = round(_BEFORE * recorder.layout.rate) if recorder and isinstance(rule, Contact) else 0
+        before = (
+            round(_BEFORE * recorder.layout.rate) if recorder and isinstance(rule, Contact) else 0
+        )
         self._before: deque[Frame] = deque(maxlen=before)
 
     @property
@@ -113,8 +124,10 @@ class Session:
         return FaultSet(tuple(np.flatnonzero(self._faulty).tolist()), self._faulty.size)
 
     def take(self, frame: Frame, now: float) -> list[Event]:
-        """Process a frame that arrived at ``now`` (seconds of the receiver's clock); return its events."""
-        self._time, self._arrived = frame.time, now
+        """Process a frame that arrived at ``now`` (seconds of the receiver's clock); return its
+        events."""
+        self._time = frame.time
+        self._arrived = now
         events = [self._event("restart", "the device restarted")] if frame.restarted else []
         if isinstance(self.watcher, Monitor):
             news = self.watcher.update(frame.values, frame.time)
@@ -166,10 +179,16 @@ class Session:
         label = self.label.item() if isinstance(self.label, np.generic) else self.label
         names = getattr(self.watcher, "class_names", ())
         text = f"{names[label] if names else label} ({share:.0%})"
-        return [*events, self._event("class", text, label=label, probability=share, dropped=len(reading.fault_set))]
+        return [
+            *events,
+            self._event(
+                "class", text, label=label, probability=share, dropped=len(reading.fault_set)
+            ),
+        ]
 
     def _confirm(self) -> list[Event]:
-        """Confirm the running version; a failure is reported once and repeated after as many windows."""
+        """Confirm the running version; a failure is reported once and repeated after as many
+        windows."""
         assert not isinstance(self.watcher, Monitor)
         try:
             self._confirmed = self.watcher.confirm() is not False
@@ -178,7 +197,8 @@ class Session:
             problem = str(error)
         if self._confirmed:
             return [self._event("confirmed", f"{self._classified} windows classified")]
-        first, self._confirm_failed = not self._confirm_failed, True
+        first = not self._confirm_failed
+        self._confirm_failed = True
         return [self._event("trouble", f"the version is not confirmed: {problem}")] if first else []
 
     def _record(self, frame: Frame) -> list[Event]:
@@ -194,7 +214,8 @@ class Session:
             try:
                 ended = recorder.write(one.values, one.time)
             except OSError as error:
-                self.switch.command = False  # until the next command: retrying on a full disk is pointless
+                # until the next command: retrying on a full disk is pointless
+                self.switch.command = False
                 return [*events, self._trouble(error)]
             events += [] if ended is None else [self._recorded(ended)]
             if recorder.path != before:
@@ -203,7 +224,9 @@ class Session:
         return events
 
     def _fault_event(self, fault: Fault) -> Event:
-        return self._event("gone" if fault.probability == 0 else "fault", fault.reason, fault=fault.to_dict())
+        return self._event(
+            "gone" if fault.probability == 0 else "fault", fault.reason, fault=fault.to_dict()
+        )
 
     def _recorded(self, recorded: Recorded) -> Event:
         data = {"path": str(recorded.path), "frames": recorded.frames, "seconds": recorded.seconds}

@@ -22,7 +22,7 @@ from adaptfault.acquisition.relay import Relay, parse_address
 from adaptfault.acquisition.session import Event, Session, StreamingPredictor
 from adaptfault.acquisition.switch import Rule, parse_when
 from adaptfault.data.printable import printable
-from adaptfault.robot.converter_range import within_range
+from adaptfault.inspection.converter_range import within_range
 from diagnostics import Monitor, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
@@ -31,7 +31,11 @@ if TYPE_CHECKING:
 SCHEMA = "adaptfault.listen/1"
 
 _COMMANDS = {"record": True, "stop": False, "auto": None}
-_ANSWERS = {True: "recording from now on", False: "not recording", None: "recording as the rule says"}
+_ANSWERS = {
+    True: "recording from now on",
+    False: "not recording",
+    None: "recording as the rule says",
+}
 _DRAIN = 0.5  # seconds for the frames that still wait at the end
 _CHECK = 0.5  # seconds between checks for silent devices
 _WAITING = 16_000_000  # bytes of frames that may wait, for bursts
@@ -41,9 +45,9 @@ _LINE = 1000  # bytes; longest command
 class Station:
     """Monitors, classifies (with a bundle) and records every device that sends.
 
-    Events go to stdout, one line each; the counters of all datagrams are the last line. It ends after ``seconds`` or
-    ``frames``, on SIGINT, SIGTERM or SIGHUP, and on "quit" from stdin ("record", "stop" and "auto" switch the
-    recording).
+    Events go to stdout, one line each; the counters of all datagrams are the last line. It ends
+    after ``seconds`` or ``frames``, on SIGINT, SIGTERM or SIGHUP, and on "quit" from stdin
+    ("record", "stop" and "auto" switch the recording).
 
     Args:
         layout: the array; None: the bundle's.
@@ -60,8 +64,8 @@ class Station:
         quiet: no output on stderr.
 
     Raises:
-        ValueError: neither layout nor bundle, an unknown rule, a calibration of another layout, or a relay that has no
-            bundle or sends to the port it listens on.
+        ValueError: neither layout nor bundle, an unknown rule, a calibration of another layout, or
+            a relay that has no bundle or sends to the port it listens on.
     """
 
     def __init__(
@@ -86,9 +90,15 @@ class Station:
         as_json: bool = False,
         quiet: bool = False,
     ) -> None:
-        self.bundle, self.record, self.calibration = bundle, record, calibration
-        self._keys, self._least_serial = keys, least_serial
-        self.seconds, self.frames, self.as_json, self.quiet = seconds, frames, as_json, quiet
+        self.bundle = bundle
+        self.record = record
+        self.calibration = calibration
+        self._keys = keys
+        self._least_serial = least_serial
+        self.seconds = seconds
+        self.frames = frames
+        self.as_json = as_json
+        self.quiet = quiet
         self.on_event = self._print if on_event is None else on_event
         self._ready: list[StreamingPredictor | Monitor] = []
         if bundle is not None:
@@ -111,7 +121,14 @@ class Station:
         queue = max(64, _WAITING // (8 * layout.n_cells))
         send = None if self._relay is None else self._send
         self.receiver = Receiver(
-            layout, port, host=host, devices=devices, ticks=ticks, queue=queue, key=key, on_frame=send
+            layout,
+            port,
+            host=host,
+            devices=devices,
+            ticks=ticks,
+            queue=queue,
+            key=key,
+            on_frame=send,
         )
         self._sessions: dict[str, Session] = {}
         self._outside = 0  # readings outside the layout's range
@@ -127,9 +144,15 @@ class Station:
         try:
             async with self.receiver as receiver:
                 self._say(f"listening on {receiver.host}, port {receiver.port}, for {self.layout}")
-                ends = (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM))  # Windows has none
+                # Windows has none
+                ends = (
+                    signal.SIGINT,
+                    signal.SIGTERM,
+                    getattr(signal, "SIGHUP", signal.SIGTERM),
+                )
                 for number in ends:
-                    with suppress(NotImplementedError, RuntimeError, ValueError):  # not in the main thread; Windows
+                    # not in the main thread; Windows
+                    with suppress(NotImplementedError, RuntimeError, ValueError):
                         loop.add_signal_handler(number, receiver.close)
                 if self.seconds is not None:
                     loop.call_later(self.seconds, receiver.close)
@@ -169,7 +192,8 @@ class Station:
     def _take(self, frame: Frame) -> None:
         session = self._sessions.get(frame.device)
         if session is None:
-            for gone in self._sessions.keys() - self.receiver.arrivals.keys():  # the receiver has forgotten them
+            # the receiver has forgotten them
+            for gone in self._sessions.keys() - self.receiver.arrivals.keys():
                 self._emit(self._sessions.pop(gone).close())
             session = self._sessions[frame.device] = self._begin(frame.device)
         frame, outside = self._in_unit(frame)
@@ -185,10 +209,13 @@ class Station:
         session = self._sessions.get(frame.device)
         watcher = self._first if session is None else session.watcher
         whole, _ = self._in_unit(frame)
-        self._relay.send(frame.device, frame.time, frame.values, whole.values, getattr(watcher, "running", None))
+        self._relay.send(
+            frame.device, frame.time, frame.values, whole.values, getattr(watcher, "running", None)
+        )
 
     def _in_unit(self, frame: Frame) -> tuple[Frame, int]:
-        """Return a frame in the unit of the layout, and how many of its readings are outside the range."""
+        """Return a frame in the unit of the layout, and how many of its readings are outside the
+        range."""
         values = frame.values
         if self.calibration is not None:
             values = self.calibration.apply(values)[0].astype(float)
@@ -196,7 +223,13 @@ class Station:
         return replace(frame, values=values), outside
 
     def _begin(self, device: str) -> Session:
-        watcher = self._ready.pop() if self._ready else self._monitor() if self.bundle is None else self._predictor()
+        watcher = (
+            self._ready.pop()
+            if self._ready
+            else self._monitor()
+            if self.bundle is None
+            else self._predictor()
+        )
         recorder = None if self.record is None else Recorder(self.record, self.layout, device)
         session = Session(device, watcher, recorder=recorder, rule=self._rule)
         session.command(self._command)
@@ -206,25 +239,33 @@ class Station:
         return Monitor(SelfDiagnosis(self.layout))
 
     def _predictor(self) -> StreamingPredictor:
-        from adaptfault.robot.predictor import Predictor  # imported here, because monitoring alone needs no model
+        # imported here, because monitoring alone needs no model
+        from adaptfault.prediction.predictor import (
+            Predictor,
+        )
 
         assert self.bundle is not None
         try:
             return Predictor.load(self.bundle, keys=self._keys, least_serial=self._least_serial)
         except ImportError as error:
-            raise ValueError(f"{self.bundle}: classifying needs {error.name}; install it, or give no bundle") from None
+            raise ValueError(
+                f"{self.bundle}: classifying needs {error.name}; install it, or give no bundle"
+            ) from None
 
     def _make_relay(self, address: str, host: str, port: int, ticks: float) -> Relay:
         if self.bundle is None:
             raise ValueError("--relay needs a bundle: cells are restored with its healthy windows")
         if parse_address(address) == (host, port):
-            raise ValueError(f"--relay {address}: this address is listened on; give the consumer another port")
-        from adaptfault.robot.bundle import Bundle
+            raise ValueError(
+                f"--relay {address}: this address is listened on; give the consumer another port"
+            )
+        from adaptfault.bundle.bundle import Bundle
 
         bundle = Bundle.open(self.bundle, keys=self._keys, least_serial=self._least_serial)
         known = bundle.known_faults().fault_set
         self._say(
-            f"relay to {address}: fitting on the healthy windows of {self.bundle}; {len(known)} faulty cells known"
+            f"relay to {address}: fitting on the healthy windows of {self.bundle}; {len(known)}"
+            " faulty cells known"
         )
         return Relay(address, bundle.restorer(), known, calibration=self.calibration, ticks=ticks)
 
@@ -247,7 +288,10 @@ class Station:
             self.on_event(event)
 
     def _print(self, event: Event) -> None:
-        print(json.dumps(event.to_dict(), allow_nan=False) if self.as_json else printable(str(event)), flush=True)
+        print(
+            json.dumps(event.to_dict(), allow_nan=False) if self.as_json else printable(str(event)),
+            flush=True,
+        )
 
     def _say(self, text: str) -> None:
         if not self.quiet:

@@ -14,7 +14,8 @@ from diagnostics import SensorLayout
 from diagnostics.preprocessing.load import LoadDirection
 
 Rule = Callable[[NDArray[np.float64], NDArray[np.bool_], datetime], bool]
-"""Returns whether to record a frame ``[D]``, given the faulty cells (bool ``[D]``) and the local time."""
+"""Returns whether to record a frame ``[D]``, given the faulty cells (bool ``[D]``) and the local
+time."""
 
 _SHARE = 0.05  # of full scale: threshold above which a cell is loaded
 _CELLS = 3  # loaded cells that make a contact; a single one may be noise or a fault
@@ -24,13 +25,16 @@ _HOURS = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)-([01]?\d|2[0-3]):([0-5]\d)", re
 
 @dataclass(frozen=True)
 class Contact:
-    """Record while at least ``cells`` cells without a known fault are loaded by more than ``threshold``."""
+    """Record while at least ``cells`` cells without a known fault are loaded by more than
+    ``threshold``."""
 
     threshold: float
     cells: int = _CELLS
     load: LoadDirection | None = None
 
-    def __call__(self, values: NDArray[np.float64], faulty: NDArray[np.bool_], clock: datetime) -> bool:
+    def __call__(
+        self, values: NDArray[np.float64], faulty: NDArray[np.bool_], clock: datetime
+    ) -> bool:
         """Return whether to record this frame."""
         loads = values if self.load is None else self.load.loads(values)
         return int(np.count_nonzero((loads > self.threshold) & ~faulty)) >= self.cells
@@ -43,7 +47,9 @@ class Daily:
     start: time
     end: time
 
-    def __call__(self, values: NDArray[np.float64], faulty: NDArray[np.bool_], clock: datetime) -> bool:
+    def __call__(
+        self, values: NDArray[np.float64], faulty: NDArray[np.bool_], clock: datetime
+    ) -> bool:
         """Return whether to record this frame."""
         now = clock.time()
         if self.start <= self.end:
@@ -57,7 +63,9 @@ class Constant:
 
     on: bool
 
-    def __call__(self, values: NDArray[np.float64], faulty: NDArray[np.bool_], clock: datetime) -> bool:
+    def __call__(
+        self, values: NDArray[np.float64], faulty: NDArray[np.bool_], clock: datetime
+    ) -> bool:
         """Return whether to record this frame."""
         return self.on
 
@@ -79,7 +87,9 @@ def parse_when(text: str, layout: SensorLayout) -> Rule:
             threshold = -1.0
         if 0 <= threshold < layout.full_scale:
             return Contact(threshold, cells, LoadDirection.declared(layout))
-        raise ValueError(f"--when {text}: expected a threshold from 0 to {layout.full_scale:g} {layout.unit}")
+        raise ValueError(
+            f"--when {text}: expected a threshold from 0 to {layout.full_scale:g} {layout.unit}"
+        )
     if match := _HOURS.fullmatch(text):
         first, second, third, fourth = (int(part) for part in match.groups())
         return Daily(time(first, second), time(third, fourth))
@@ -98,8 +108,11 @@ class Switch:
         self.command: bool | None = None
         self._until = -np.inf
 
-    def __call__(self, values: NDArray[np.float64], faulty: NDArray[np.bool_], at: float, clock: datetime) -> bool:
-        """Return whether to record the frame ``values`` ``[D]``, taken at ``at`` (seconds), at local time ``clock``."""
+    def __call__(
+        self, values: NDArray[np.float64], faulty: NDArray[np.bool_], at: float, clock: datetime
+    ) -> bool:
+        """Return whether to record the frame ``values`` ``[D]``, taken at ``at`` (seconds), at
+        local time ``clock``."""
         if self.command is not None:
             self._until = -np.inf
             return self.command

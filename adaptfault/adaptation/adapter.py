@@ -1,4 +1,5 @@
-"""Adapts the fault-free model to a fault set F, always from the fault-free weights, in stages of increasing cost."""
+"""Adapts the fault-free model to a fault set F, always from the fault-free weights, in stages of
+increasing cost."""
 
 from __future__ import annotations
 
@@ -11,10 +12,10 @@ import torch
 
 from adaptfault.adaptation.fault_free import FaultFreeModel
 from adaptfault.adaptation.forecast import Forecast
-from adaptfault.adaptation.heads import log_likelihood
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.adaptation.stages import Method, Run
 from adaptfault.models.any_model import AnyModel, not_resettable
+from adaptfault.models.heads import log_likelihood
 from diagnostics import FaultSet
 
 
@@ -24,20 +25,23 @@ class Adapter(FaultFreeModel):
     Windows without a label (y = -1) use the fault-free model's probabilities as targets.
 
     Args:
-        model: the fault-free model, any module from x ``[N, T, D]`` (0..1 scale) to logits or values ``[N, n]``. It
-            never changes. Computation is on the CPU, unless :meth:`to` moves it.
-        train, validation: fault-free windows; more than 2500 validation windows are thinned evenly. A regression has
+        model: the fault-free model, any module from x ``[N, T, D]`` (0..1 scale) to logits or
+            values ``[N, n]``. It never changes. Computation is on the CPU, unless :meth:`to` moves
+            it.
+        train, validation: fault-free windows; more than 2500 validation windows are thinned evenly.
+        A regression has
             targets y float ``[N, k]``.
         layout: the array; None: ``model.layout``.
-        features: feature vector for a new head: the name of a layer (its output), or a function of (module, x) that
-            returns ``[N, p]``. None: the input of the last linear layer.
+        features: feature vector for a new head: the name of a layer (its output), or a function of
+            (module, x) that returns ``[N, p]``. None: the input of the last linear layer.
         task: "classification", "regression" or "auto" (from the shape of y).
-        loss: of training, (outputs ``[B, n]``, y) -> scalar. None: cross entropy, or mean squared error.
+        loss: of training, (outputs ``[B, n]``, y) -> scalar. None: cross entropy, or mean squared
+            error.
 
     Raises:
         TypeError: ``model`` is no torch module.
-        ValueError: no windows or no layout; the model fails on a window, its output does not fit the targets, or the
-            named features cannot be found.
+        ValueError: no windows or no layout; the model fails on a window, its output does not fit
+            the targets, or the named features cannot be found.
     """
 
     def adapt(
@@ -49,29 +53,34 @@ class Adapter(FaultFreeModel):
         seed: int = 0,
         progress: bool | None = None,
     ) -> Adaptation:
-        """Return the model adapted to ``fault_set``, always from the fault-free weights: earlier F have no effect.
+        """Return the model adapted to ``fault_set``, always from the fault-free weights: earlier F
+        have no effect.
 
         Args:
             fault_set: F, over the D cells of the layout.
-            method: "fill": the missing cells are imputed from the healthy ones, no training. "head": in addition, a new
-                head is fitted in closed form to the features of the network and the healthy cells. "finetune": in
-                addition, all parameters are trained, front end included, in rounds that each end with a new head.
-                "scratch": a new network is trained on the healthy cells, the paper's protocol. "auto": fill; head,
-                if it improves validation beyond the noise; finetune, if a budget is given and the head keeps less than
-                99 % of the healthy accuracy. With F empty, "fill" and "auto" are the fault-free model, bit for bit;
+            method: "fill": the missing cells are imputed from the healthy ones, no training.
+                "head": in addition, a new head is fitted in closed form to the features of the
+                network and the healthy cells. "finetune": in addition, all parameters are trained,
+                front end included, in rounds that each end with a new head. "scratch": a new
+                network is trained on the healthy cells, the paper's protocol. "auto": fill; head,
+                if it improves validation beyond the noise; finetune, if a budget is given and the
+                head keeps less than 99 % of the healthy accuracy. With F empty, "fill" and "auto"
+                are the fault-free model, bit for bit;
                 :attr:`healthy` is that model with as good a head as a repair gets.
-            budget: seconds for the stages after the fill; a stage that does not fit is left out. None: until
-                validation stops improving.
+            budget: seconds for the stages after the fill; a stage that does not fit is left out.
+                None: until validation stops improving.
             seed: of training.
             progress: show or hide progress on stderr; None shows it on a terminal.
 
         Raises:
-            ValueError: an unknown method, one that this model does not allow, F over another number of cells, or no
-                healthy cell left.
+            ValueError: an unknown method, one that this model does not allow, F over another number
+                of cells, or no healthy cell left.
         """
         self.check(fault_set, method)
         method = "fill" if method == "auto" and not len(fault_set) else method
-        return Run(self, fault_set, budget, seed, progress, lambda: self.fault_free_accuracy).execute(method)
+        return Run(
+            self, fault_set, budget, seed, progress, lambda: self.fault_free_accuracy
+        ).execute(method)
 
     @cached_property
     def _healthy(self) -> Run:
@@ -81,7 +90,8 @@ class Adapter(FaultFreeModel):
 
     @property
     def healthy(self) -> Adaptation:
-        """The model for a sensor without faults: the fault-free model, with a new head where that helps validation.
+        """The model for a sensor without faults: the fault-free model, with a new head where that
+        helps validation.
 
         Repairs are compared with it, so that a sensor does not get better by a fault.
         """
@@ -89,26 +99,31 @@ class Adapter(FaultFreeModel):
 
     @property
     def fault_free_accuracy(self) -> float:
-        """Validation accuracy (R2 of a regression) of :attr:`healthy`, its head fitted without the scored windows."""
+        """Validation accuracy (R2 of a regression) of :attr:`healthy`, its head fitted without the
+        scored windows."""
         return self._healthy.accuracy()
 
     def forecast(self, fault_set: FaultSet, *, recordings: float | None = None) -> Forecast:
-        """Return the accuracy (R2 of a regression) to expect of each stage, from validation windows without F.
+        """Return the accuracy (R2 of a regression) to expect of each stage, from validation windows
+        without F.
 
         It trains and deploys nothing and takes as long as ``method="head"``.
 
         Args:
             fault_set: F.
-            recordings: number of new recordings whose accuracy the intervals hold, at most ``math.inf``: then they are
-                intervals of the expected accuracy. None: as many as validation has.
+            recordings: number of new recordings whose accuracy the intervals hold, at most
+                ``math.inf``: then they are intervals of the expected accuracy. None: as many as
+                validation has.
 
         Raises:
-            ValueError: F over another number of cells, no healthy cell left, or a number of recordings that is not
-                positive.
+            ValueError: F over another number of cells, no healthy cell left, or a number of
+                recordings that is not positive.
         """
         self.check(fault_set)
         if recordings is not None and not recordings > 0:
-            raise ValueError(f"a forecast needs a positive number of new recordings, got {recordings}")
+            raise ValueError(
+                f"a forecast needs a positive number of new recordings, got {recordings}"
+            )
         windows = self.validation
         outputs = {"fault-free": self._healthy.held_out()}
         if len(fault_set):
@@ -125,7 +140,8 @@ class Adapter(FaultFreeModel):
         return Forecast.of(fault_set, windows.y, windows.recording, predicted, recordings, likely)
 
     def to(self, device: str | torch.device) -> Adapter:
-        """Return an adapter that works on a device, as "cuda"; this one stays. Its adaptations are on that device."""
+        """Return an adapter that works on a device, as "cuda"; this one stays. Its adaptations are
+        on that device."""
         other = copy.copy(self)
         other.model = copy.deepcopy(self.model).to(device)
         other.__dict__.pop("compact", None)  # is on its own device
@@ -135,8 +151,8 @@ class Adapter(FaultFreeModel):
         """Refuse an adaptation that is impossible.
 
         Raises:
-            ValueError: an unknown method, one that this model does not allow, F over another number of cells, or no
-                healthy cell left.
+            ValueError: an unknown method, one that this model does not allow, F over another number
+                of cells, or no healthy cell left.
         """
         if method not in get_args(Method):
             raise ValueError(f"unknown method {method!r}: use one of {', '.join(get_args(Method))}")
@@ -145,16 +161,20 @@ class Adapter(FaultFreeModel):
             raise ValueError(f"F is over {fault_set.n_cells} cells, the model over {d}")
         if not self.layout.present.ravel()[fault_set.healthy].any():
             raise ValueError(
-                f"F holds all {int(self.layout.present.sum())} cells: no healthy one is left to predict from;"
-                " replace the sensor"
+                f"F holds all {int(self.layout.present.sum())} cells: no healthy one is left to"
+                " predict from; replace the sensor"
             )
         if isinstance(self.model, AnyModel):
-            name, module = type(self.model.module).__name__, self.model.module
+            name = type(self.model.module).__name__
+            module = self.model.module
             if method == "head" and not self.has_features:
-                raise ValueError(f"{name} has no linear layer to take features from: name a layer with features=")
+                raise ValueError(
+                    f"{name} has no linear layer to take features from: name a layer with features="
+                )
             if method == "scratch" and not any(p.requires_grad for p in module.parameters()):
                 raise ValueError(f"{name} has no trainable parameters: use another method")
             if method == "scratch" and (kinds := not_resettable(module)):
                 raise ValueError(
-                    f"{name} cannot be trained anew: {', '.join(kinds)} has parameters but no reset_parameters()"
+                    f"{name} cannot be trained anew: {', '.join(kinds)} has parameters but no"
+                    " reset_parameters()"
                 )

@@ -1,4 +1,5 @@
-"""The adapter on disk, small enough for a robot: weights and quantised fault-free windows. No pickle."""
+"""The adapter on disk, small enough for a robot: weights and quantised fault-free windows. No
+pickle."""
 
 from __future__ import annotations
 
@@ -31,15 +32,17 @@ _OVERHEAD = 100_000  # bytes for names, labels and JSON
 def save_adapter(path: str | Path, adapter: Adapter, *, limit: int | None = None) -> None:
     """Write everything an adaptation needs into a folder of at most ``limit`` bytes.
 
-    Without a limit these are 20,000,000 bytes, or what a network of a large array needs with 8-bit weights and as many
-    bytes of windows.
+    Without a limit these are 20,000,000 bytes, or what a network of a large array needs with 8-bit
+    weights and as many bytes of windows.
 
-    Readings that are whole converter steps are stored exactly, others with 12 bits. Windows that need more than half of
-    the limit are thinned evenly. The weights use the first format that fits the rest: 32-bit floats, 16-bit floats, or
-    8-bit integers with a scale for each row. ``manifest.json`` records the choices.
+    Readings that are whole converter steps are stored exactly, others with 12 bits. Windows that
+    need more than half of the limit are thinned evenly. The weights use the first format that fits
+    the rest: 32-bit floats, 16-bit floats, or 8-bit integers with a scale for each row.
+    ``manifest.json`` records the choices.
 
     Raises:
-        ValueError: the smallest format does not fit, or the model can not be rebuilt (a module without builder).
+        ValueError: the smallest format does not fit, or the model can not be rebuilt (a module
+            without builder).
     """
     if "module" in adapter.model.config and adapter.model.config["builder"] is None:
         raise ValueError(
@@ -59,7 +62,10 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int | None = None
         limit = max(LIMIT, _OVERHEAD + _bytes(tensors) + int(weights_only / (1 - _SHARE)) + 1)
     room = limit - _OVERHEAD - _bytes(tensors)
     about: dict[str, Any] = {"network": adapter.model.config}
-    parts = {"train": (adapter.train, adapter.targets), "validation": (adapter.validation, adapter.validation_targets)}
+    parts = {
+        "train": (adapter.train, adapter.targets),
+        "validation": (adapter.validation, adapter.validation_targets),
+    }
     n = sum(len(windows) for windows, _ in parts.values())
     for name, (windows, targets) in parts.items():
         packed, packing = _pack_thinned(windows, targets, int(_SHARE * room * len(windows) / n))
@@ -73,16 +79,22 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int | None = None
             break
     else:
         raise ValueError(
-            f"the adapter does not fit into {limit:,} bytes: the weights alone take {_bytes(weights):,} of 8 bits;"
-            " raise limit"
+            f"the adapter does not fit into {limit:,} bytes: the weights alone take"
+            f" {_bytes(weights):,} of 8 bits; raise limit"
         )
     save_tensors(path, SCHEMA, about, {**tensors, **{f"model.{k}": v for k, v in weights.items()}})
 
 
 def save_windows(path: str | Path, windows: Windows, *, limit: int = LIMIT // 4) -> None:
-    """Write windows into a folder as :func:`save_adapter` does, thinned evenly to ``limit`` bytes."""
+    """Write windows into a folder as :func:`save_adapter` does, thinned evenly to ``limit``
+    bytes."""
     packed, packing = _pack_thinned(windows, np.zeros((len(windows), 0), np.float32), limit)
-    save_tensors(path, WINDOWS_SCHEMA, {"windows": packing}, {f"windows.{key}": value for key, value in packed.items()})
+    save_tensors(
+        path,
+        WINDOWS_SCHEMA,
+        {"windows": packing},
+        {f"windows.{key}": value for key, value in packed.items()},
+    )
 
 
 def load_windows(path: str | Path) -> Windows:
@@ -91,7 +103,9 @@ def load_windows(path: str | Path) -> Windows:
     try:
         return _unpack(about["windows"], tensors, "windows")
     except (KeyError, TypeError, ValueError, zlib.error) as error:
-        raise ValueError(f"the windows in {path} are damaged: {str(error).splitlines()[0]}") from None
+        raise ValueError(
+            f"the windows in {path} are damaged: {str(error).splitlines()[0]}"
+        ) from None
 
 
 def load_adapter(path: str | Path) -> Adapter:
@@ -104,8 +118,12 @@ def load_adapter(path: str | Path) -> Adapter:
     about, tensors = load_tensors(path, SCHEMA)
     try:
         model = network_from_config(about["network"])
-        model.load_state_dict(_restore({k.removeprefix("model."): v for k, v in tensors.items() if k[:6] == "model."}))
-        adapter = Adapter(model.eval(), *(_unpack(about[name], tensors, name) for name in ("train", "validation")))
+        model.load_state_dict(
+            _restore({k.removeprefix("model."): v for k, v in tensors.items() if k[:6] == "model."})
+        )
+        adapter = Adapter(
+            model.eval(), *(_unpack(about[name], tensors, name) for name in ("train", "validation"))
+        )
         adapter.targets, adapter.validation_targets = (
             tensors[f"{name}.targets"].float().numpy() for name in ("train", "validation")
         )
@@ -118,7 +136,9 @@ def load_adapter(path: str | Path) -> Adapter:
     except ModelNotAllowed:
         raise
     except (KeyError, TypeError, ValueError, RuntimeError, zlib.error) as error:
-        raise ValueError(f"the adapter in {path} is damaged: {str(error).splitlines()[0]}") from None
+        raise ValueError(
+            f"the adapter in {path} is damaged: {str(error).splitlines()[0]}"
+        ) from None
     return adapter
 
 
@@ -126,7 +146,9 @@ def _bytes(tensors: dict[str, Tensor]) -> int:
     return sum(t.numel() * t.element_size() for t in tensors.values())
 
 
-def _pack_thinned(windows: Windows, targets: NDArray[Any], room: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def _pack_thinned(
+    windows: Windows, targets: NDArray[Any], room: int
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Pack as many windows as fit; return them and the packing parameters."""
     keep = len(windows)
     while True:
@@ -140,7 +162,8 @@ def _pack_thinned(windows: Windows, targets: NDArray[Any], room: int) -> tuple[d
 def _pack(windows: Windows, targets: NDArray[Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
     low, step = _steps(windows.x)
     counts = np.rint((windows.x.astype(np.float64) - low) / step).astype(np.uint16)
-    # Differences between frames and then all low bytes before all high ones: mostly zeros, which deflate well.
+    # Differences between frames and then all low bytes before all high ones: mostly zeros, which
+    # deflate well.
     counts[:, 1:] -= counts[:, :-1].copy()  # modulo 2^16, undone by a cumulative sum modulo 2^16
     data = zlib.compress(counts.view(np.uint8).reshape(-1, 2).T.tobytes(), 6)
     packed = {
@@ -155,7 +178,8 @@ def _pack(windows: Windows, targets: NDArray[Any]) -> tuple[dict[str, Tensor], d
 def _unpack(packing: dict[str, Any], tensors: dict[str, Tensor], name: str) -> Windows:
     n, t, d = packing["shape"]
     size = 2 * n * t * d
-    data = zlib.decompressobj().decompress(tensors[f"{name}.x"].numpy().tobytes(), size)  # at most the expected size
+    # at most the expected size
+    data = zlib.decompressobj().decompress(tensors[f"{name}.x"].numpy().tobytes(), size)
     counts = np.frombuffer(data, np.uint8).reshape(2, -1).T.copy().view(np.uint16).reshape(n, t, d)
     counts = np.cumsum(counts, axis=1, dtype=np.uint16)
     x = (packing["low"] + counts * packing["step"]).astype(np.float32)
@@ -163,9 +187,11 @@ def _unpack(packing: dict[str, Any], tensors: dict[str, Tensor], name: str) -> W
 
 
 def _steps(x: NDArray[np.float32]) -> tuple[float, float]:
-    """Return the lowest reading and the converter step, or a 12-bit step if the readings show none."""
+    """Return the lowest reading and the converter step, or a 12-bit step if the readings show
+    none."""
     values = np.unique(x).astype(np.float64)
-    low, width = float(values[0]), float(values[-1] - values[0])
+    low = float(values[0])
+    width = float(values[-1] - values[0])
     gaps = np.diff(values)
     gaps = gaps[gaps > 1e-6]  # below that, single precision
     if not len(gaps):
@@ -211,5 +237,7 @@ def _restore(state: dict[str, Tensor]) -> dict[str, Tensor]:
         if name.endswith(_SCALE):
             continue
         scale = state.get(name + _SCALE)
-        whole[name] = tensor.float() if scale is None else tensor * scale.view(-1, *[1] * (tensor.dim() - 1))
+        whole[name] = (
+            tensor.float() if scale is None else tensor * scale.view(-1, *[1] * (tensor.dim() - 1))
+        )
     return whole

@@ -1,4 +1,5 @@
-"""Two summaries of the healthy cells of a window, for kernels: each cell by itself, and cells with their neighbours."""
+"""Two summaries of the healthy cells of a window, for kernels: each cell by itself, and cells with
+their neighbours."""
 
 from __future__ import annotations
 
@@ -15,9 +16,9 @@ _REACH = 3  # cells on each side that smoothing with a Gaussian of standard devi
 class CellSummary(nn.Module):
     """Maps windows of the healthy cells to what does not depend on imputation.
 
-    A summary holds the roots of the mean and the maximum over time. The root stabilises the variance: it raises the
-    weight of light contact. A window that is shifted by a cell is far from the original in the readings of the cells,
-    but near to it after smoothing.
+    A summary holds the roots of the mean and the maximum over time. The root stabilises the
+    variance: it raises the weight of light contact. A window that is shifted by a cell is far from
+    the original in the readings of the cells, but near to it after smoothing.
 
     Args:
         layout: the array.
@@ -32,8 +33,10 @@ class CellSummary(nn.Module):
     def __init__(self, layout: SensorLayout, fault_set: FaultSet) -> None:
         super().__init__()
         self.pads, self.rows, self.cols = layout.shape
-        present, healthy = layout.present.ravel(), fault_set.healthy
-        # Where each position of the grid is found in the healthy cells, with a zero behind them for those that lack.
+        present = layout.present.ravel()
+        healthy = fault_set.healthy
+        # Where each position of the grid is found in the healthy cells, with a zero behind them for
+        # those that lack.
         source = np.full(layout.n_cells, len(healthy))
         source[healthy] = np.where(present[healthy], np.arange(len(healthy)), len(healthy))
         steps = torch.arange(-_REACH, _REACH + 1, dtype=torch.float32)
@@ -47,13 +50,16 @@ class CellSummary(nn.Module):
             self.register_buffer(name, values, persistent=False)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Map windows ``[N, T, D-k]`` to ``[N, 2 H]`` of the H healthy cells, and ``[N, 2 (P + pads)]``.
+        """Map windows ``[N, T, D-k]`` to ``[N, 2 H]`` of the H healthy cells, and
+        ``[N, 2 (P + pads)]``.
 
-        The second summary has the readings of all P positions of the array, smoothed with a Gaussian of one cell (dead
-        cells count as 0), and the sum of each pad.
+        The second summary has the readings of all P positions of the array, smoothed with a
+        Gaussian of one cell (dead cells count as 0), and the sum of each pad.
         """
         n, t = x.shape[:2]
-        grid = F.pad(x, (0, 1))[..., self.source].reshape(n * t * self.pads, 1, self.rows, self.cols)
+        grid = F.pad(x, (0, 1))[..., self.source].reshape(
+            n * t * self.pads, 1, self.rows, self.cols
+        )
         along_rows = F.conv2d(grid, self.weights.view(1, 1, 1, -1), padding=(0, _REACH))
         smooth = F.conv2d(along_rows, self.weights.view(1, 1, -1, 1), padding=(_REACH, 0))
         totals = grid.sum((2, 3)).reshape(n, t, self.pads)

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.adaptation.heads import MOST_WINDOWS
+from adaptfault.data.determination import r2
 from adaptfault.data.windows import Windows, evenly
-from adaptfault.evaluation.scores import r2
 from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.imputation.tiled_statistics import LARGE, TiledStatistics
 from adaptfault.models.any_model import AnyModel, Features, device_of
 from adaptfault.models.builders import first_line
 from adaptfault.models.compact import CompactNetwork, compacted
+from adaptfault.models.heads import MOST_WINDOWS
 from adaptfault.models.network import TactileTransformer, as_tensor, logits_of
 from diagnostics import SensorLayout
 
@@ -31,12 +31,15 @@ class FaultFreeModel:
     """A model, fault-free windows, and the statistics that all adaptations share.
 
     Args:
-        model, train, validation, layout, features, task, loss: as in :class:`~adaptfault.adaptation.adapter.Adapter`.
+        model, train, validation, layout, features, task, loss: as in
+        :class:`~adaptfault.adaptation.adapter.Adapter`.
 
     Attributes:
-        model: the network; other modules are wrapped in :class:`~adaptfault.models.any_model.AnyModel`.
+        model: the network; other modules are wrapped in
+            :class:`~adaptfault.models.any_model.AnyModel`.
         task: "classification" or "regression".
-        targets, validation_targets: ``[N, n]``, class indicators or probabilities; values of a regression.
+        targets, validation_targets: ``[N, n]``, class indicators or probabilities; values of a
+        regression.
     """
 
     def __init__(
@@ -51,9 +54,13 @@ class FaultFreeModel:
         loss: Callable[[Tensor, Tensor], Tensor] | None = None,
     ) -> None:
         if not len(train) or not len(validation):
-            raise ValueError("an adapter needs fault-free windows to learn from and to validate on; one set is empty")
+            raise ValueError(
+                "an adapter needs fault-free windows to learn from and to validate on; one set is"
+                " empty"
+            )
         _check_windows(train, validation)
-        self.task, self.loss = _task(task, train, validation), loss
+        self.task = _task(task, train, validation)
+        self.loss = loss
         self.model = _wrapped(model, train, layout, features)
         _check_targets(self.model, self.task, train, validation)
         most = MOST_WINDOWS // 2  # enough to compare accuracies
@@ -75,7 +82,8 @@ class FaultFreeModel:
 
     @cached_property
     def compact(self) -> CompactNetwork | None:
-        """Low-rank form of the paper's network; None for other models, few windows or large arrays."""
+        """Low-rank form of the paper's network; None for other models, few windows or large
+        arrays."""
         return self.compacted(self.model)
 
     def compacted(self, network: Network) -> CompactNetwork | None:
@@ -86,7 +94,11 @@ class FaultFreeModel:
     @cached_property
     def imputation(self) -> CellStatistics | TiledStatistics:
         """The source of front ends: ``statistics``, or tiles on a large array."""
-        return TiledStatistics.fit(self.train, self.layout) if self.layout.n_cells > LARGE else self.statistics
+        return (
+            TiledStatistics.fit(self.train, self.layout)
+            if self.layout.n_cells > LARGE
+            else self.statistics
+        )
 
     def score(self, outputs: Tensor) -> float:
         """Return accuracy or R2 of outputs ``[N, n]`` for the validation windows."""
@@ -107,16 +119,20 @@ class FaultFreeModel:
         return model.fresh(seed)
 
 
-def _wrapped(model: nn.Module, train: Windows, layout: SensorLayout | None, features: Features | None) -> Network:
+def _wrapped(
+    model: nn.Module, train: Windows, layout: SensorLayout | None, features: Features | None
+) -> Network:
     if not isinstance(model, nn.Module):
         raise TypeError(
-            f"an adapter repairs a torch.nn.Module, got {type(model).__name__}; use FaultTolerantClassifier or"
-            " FaultTolerantRegressor for scikit-learn"
+            f"an adapter repairs a torch.nn.Module, got {type(model).__name__}; use"
+            " FaultTolerantClassifier or FaultTolerantRegressor for scikit-learn"
         )
     own = getattr(model, "layout", None)
     layout = own if layout is None else layout
     if not isinstance(layout, SensorLayout):
-        raise ValueError(f"{type(model).__name__} has no layout: give layout=SensorLayout(pads, rows, cols)")
+        raise ValueError(
+            f"{type(model).__name__} has no layout: give layout=SensorLayout(pads, rows, cols)"
+        )
     d = train.x.shape[2]
     if layout.n_cells != d:
         raise ValueError(f"the layout {layout} has {layout.n_cells} cells, the windows have {d}")
@@ -133,12 +149,17 @@ def _check_windows(train: Windows, validation: Windows) -> None:
         raise ValueError(f"training windows are {shapes}: cut both with the same length and layout")
     for name, windows in (("training", train), ("validation", validation)):
         if not np.isfinite(windows.x).all():
-            raise ValueError(f"{name} windows hold NaN or infinity: make_windows holds the last reading of a cell")
+            raise ValueError(
+                f"{name} windows hold NaN or infinity: make_windows holds the last reading of a"
+                " cell"
+            )
 
 
 def _check_loss(model: Network, loss: Callable[[Tensor, Tensor], Tensor], windows: Windows) -> None:
-    few = windows.select(slice(0, model.n_classes + 1))  # more windows than outputs: a wrong shape does not broadcast
-    outputs, y = logits_of(model, few.x), as_tensor(few.y)
+    # more windows than outputs: a wrong shape does not broadcast
+    few = windows.select(slice(0, model.n_classes + 1))
+    outputs = logits_of(model, few.x)
+    y = as_tensor(few.y)
     given = f"outputs {list(outputs.shape)} and y {list(y.shape)}"
     try:
         value = loss(outputs, y.float() if y.ndim == 2 else y)
@@ -155,10 +176,14 @@ def _task(task: str, train: Windows, validation: Windows) -> Task:
     if task not in (*get_args(Task), "auto"):
         raise ValueError(f"unknown task {task!r}: use 'classification', 'regression' or 'auto'")
     if train.y.ndim != validation.y.ndim:
-        raise ValueError("training and validation windows have different targets: classes [N] and values [N, k]")
+        raise ValueError(
+            "training and validation windows have different targets: classes [N] and values [N, k]"
+        )
     found: Task = "regression" if train.y.ndim == 2 else "classification"
     if task not in ("auto", found):
-        raise ValueError(f"task {task!r} needs {'y float [N, k]' if found == 'classification' else 'y int [N]'}")
+        raise ValueError(
+            f"task {task!r} needs {'y float [N, k]' if found == 'classification' else 'y int [N]'}"
+        )
     return found
 
 
@@ -167,18 +192,23 @@ def _check_targets(model: Network, task: Task, *parts: Windows) -> None:
     for windows in parts:
         if task == "regression" and windows.y.shape[1] != model.n_classes:
             k = windows.y.shape[1]
-            raise ValueError(f"{name} has {model.n_classes} outputs, the targets {k} values: give a model with {k}")
+            raise ValueError(
+                f"{name} has {model.n_classes} outputs, the targets {k} values: give a model"
+                f" with {k}"
+            )
         if task == "regression" and not np.isfinite(windows.y).all():
             raise ValueError("the targets hold NaN or infinity: leave these windows out")
         if task == "classification" and windows.y.max() >= model.n_classes:
             n = windows.y.max() + 1
             raise ValueError(
-                f"{name} has {model.n_classes} outputs, labels run to {n - 1}: give a model with at least {n}"
+                f"{name} has {model.n_classes} outputs, labels run to {n - 1}: give a model with at"
+                f" least {n}"
             )
 
 
 def _labelled(model: Network, task: Task, windows: Windows) -> tuple[Windows, NDArray[np.float32]]:
-    """Return windows with classes, and targets ``[N, n]``: without a label the probabilities of the model."""
+    """Return windows with classes, and targets ``[N, n]``: without a label the probabilities of the
+    model."""
     if task == "regression":
         return windows, windows.y.astype(np.float32)
     targets = np.eye(model.n_classes, dtype=np.float32)[np.maximum(windows.y, 0)]

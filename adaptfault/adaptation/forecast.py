@@ -21,9 +21,11 @@ class Expected:
 
     Attributes:
         accuracy: on the validation windows.
-        low, high: 95 % interval of the accuracy on new recordings, whose number is :attr:`Forecast.n_new`.
-        likelihood: mean calibrated probability of the true class (R2 of a regression). It ranks fault sets more
-            reliably than the accuracy, because windows near a decision count in proportion.
+        low, high: 95 % interval of the accuracy on new recordings, whose number is
+        :attr:`Forecast.n_new`.
+        likelihood: mean calibrated probability of the true class (R2 of a regression). It ranks
+            fault sets more reliably than the accuracy, because windows near a decision count in
+            proportion.
     """
 
     accuracy: float
@@ -42,19 +44,25 @@ class Expected:
         new: float | None = None,
         likely: NDArray[np.floating] | None = None,
     ) -> Expected:
-        """Return the accuracy to expect on ``new`` recordings (None: as many) from windows ``[N]`` that are right.
+        """Return the accuracy to expect on ``new`` recordings (None: as many) from windows ``[N]``
+        that are right.
 
-        ``likely`` is the probability of the true class, ``[N]``; None: 1 where the window is right, else 0.
+        ``likely`` is the probability of the true class, ``[N]``; None: 1 where the window is right,
+        else 0.
         """
         likelihood = float((right if likely is None else likely).mean())
         return cls(float(right.mean()), *prediction_interval(right, recording, new=new), likelihood)
 
     @classmethod
-    def of_errors(cls, explained: NDArray[np.floating], recording: NDArray[np.int64], new: float | None) -> Expected:
-        """Return the R2 to expect from the share of the variance that is explained in each window ``[N]``."""
+    def of_errors(
+        cls, explained: NDArray[np.floating], recording: NDArray[np.int64], new: float | None
+    ) -> Expected:
+        """Return the R2 to expect from the share of the variance that is explained in each window
+        ``[N]``."""
         low, high = mean_interval(explained, recording)
         known = len(np.unique(recording))
-        wider, r2 = np.sqrt(1 + known / (known if new is None else new)), float(explained.mean())
+        wider = np.sqrt(1 + known / (known if new is None else new))
+        r2 = float(explained.mean())
         return cls(r2, r2 - wider * (r2 - low), min(1.0, r2 + wider * (high - r2)), r2)
 
 
@@ -64,10 +72,12 @@ class Forecast:
 
     Attributes:
         fault_set: F.
-        stages: "fault-free", "fill" and "head", measured on validation windows with F taken away; "finetune" and
-            "scratch" need training, so they have the accuracy of the best measured stage and an interval that extends
-            to that of the fault-free model. With F empty, "fault-free" alone.
-        worst_class: the class that loses most recall at the best measured stage; None with F empty or a regression.
+        stages: "fault-free", "fill" and "head", measured on validation windows with F taken away;
+            "finetune" and "scratch" need training, so they have the accuracy of the best measured
+            stage and an interval that extends to that of the fault-free model. With F empty,
+            "fault-free" alone.
+        worst_class: the class that loses most recall at the best measured stage; None with F empty
+            or a regression.
         worst_loss: loss of its recall, 0..1.
         n_recordings: number of validation recordings.
         n_new: number of new recordings whose accuracy the intervals hold.
@@ -90,12 +100,15 @@ class Forecast:
         new: float | None = None,
         likely: Mapping[str, NDArray[np.floating]] | None = None,
     ) -> Forecast:
-        """Build a forecast from the classes ``[N]`` that each measured stage predicted for validation windows.
+        """Build a forecast from the classes ``[N]`` that each measured stage predicted for
+        validation windows.
 
         ``likely`` are the probabilities ``[N]`` that each stage gave the true class.
         """
         stages = {
-            name: Expected.of(classes == y, recording, new, None if likely is None else likely[name])
+            name: Expected.of(
+                classes == y, recording, new, None if likely is None else likely[name]
+            )
             for name, classes in predicted.items()
         }
         count = len(np.unique(recording))
@@ -105,7 +118,9 @@ class Forecast:
         best = _add_trained(stages)
         last = predicted["fill" if best is stages["fill"] else "head"]
         classes = np.unique(y)
-        lost = [((predicted["fault-free"] == y) * 1.0 - (last == y))[y == c].mean() for c in classes]
+        lost = [
+            ((predicted["fault-free"] == y) * 1.0 - (last == y))[y == c].mean() for c in classes
+        ]
         worst = int(np.argmax(lost))
         return cls(fault_set, stages, int(classes[worst]), float(lost[worst]), count, new)
 
@@ -118,7 +133,8 @@ class Forecast:
         predicted: Mapping[str, NDArray[np.float32]],
         new: float | None = None,
     ) -> Forecast:
-        """Build a forecast from the values ``[N, k]`` that each measured stage predicted for validation windows."""
+        """Build a forecast from the values ``[N, k]`` that each measured stage predicted for
+        validation windows."""
         total = ((y - y.mean(axis=0)) ** 2).mean(axis=0)
         total = np.where(total > 0, total, 1.0)
         stages = {}
@@ -133,10 +149,16 @@ class Forecast:
     def __str__(self) -> str:
         k = len(self.fault_set)
         many = "many new recordings" if np.isinf(self.n_new) else f"{self.n_new:g} new ones"
-        lines = [f"expected accuracy without {k} cells, from {self.n_recordings} recordings (95 % interval, {many}):"]
+        lines = [
+            f"expected accuracy without {k} cells, from {self.n_recordings} recordings (95 %"
+            f" interval, {many}):"
+        ]
         lines += [f"  {name:10s} {expected}" for name, expected in self.stages.items()]
         if self.worst_class is not None:
-            lines.append(f"  class {self.worst_class} suffers most: its recall falls by {self.worst_loss:.2f}")
+            lines.append(
+                f"  class {self.worst_class} suffers most: its recall falls by"
+                f" {self.worst_loss:.2f}"
+            )
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:

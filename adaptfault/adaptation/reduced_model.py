@@ -1,8 +1,9 @@
 """The reduced-input model: phi drops the faulty cells, a front end imputes them (Section IV).
 
-The D - k inputs of the paper do not form the grid that its convolutions need. The reduced model therefore has a front
-end from the healthy cells to the whole grid (:mod:`adaptfault.imputation.linear`): the identity on healthy cells, the
-conditional mean on missing ones.
+The D - k inputs of the paper do not form the grid that its convolutions need. The reduced model
+therefore has a front end from the healthy cells to the whole grid
+(:mod:`adaptfault.imputation.linear`): the identity on healthy cells, the conditional mean on
+missing ones.
 """
 
 from __future__ import annotations
@@ -14,15 +15,16 @@ from torch import Tensor, nn
 
 from adaptfault.adaptation.cell_summary import CellSummary
 from adaptfault.adaptation.contact_moments import ContactMoments
-from adaptfault.adaptation.heads import AnyHead
 from adaptfault.data.windows import Windows
 from adaptfault.models.any_model import AnyModel
+from adaptfault.models.heads import Head
 from adaptfault.models.network import TactileTransformer
 from diagnostics import FaultSet
 
 
 class ReducedModel(nn.Module):
-    """A model of the D - k healthy cells: front end, network, and a new head or the head of the network.
+    """A model of the D - k healthy cells: front end, network, and a new head or the head of the
+    network.
 
     With F empty there is no front end, and the outputs are those of the network, bit for bit.
 
@@ -38,10 +40,12 @@ class ReducedModel(nn.Module):
         network: TactileTransformer | AnyModel,
         fault_set: FaultSet,
         front: nn.Module | None,
-        head: AnyHead | None = None,
+        head: Head | None = None,
     ) -> None:
         super().__init__()
-        self.network, self.fault_set, self.head = network, fault_set, head
+        self.network = network
+        self.fault_set = fault_set
+        self.head = head
         self.front = front if len(fault_set) else None
         self.summary = CellSummary(network.layout, fault_set)
         self.moments = ContactMoments(network.layout)
@@ -54,7 +58,10 @@ class ReducedModel(nn.Module):
         """
         width = self.fault_set.n_cells - len(self.fault_set)
         if x.dim() != 3 or x.shape[2] != width:
-            raise ValueError(f"expected windows of the {width} healthy cells [N, T, {width}], got {list(x.shape)}")
+            raise ValueError(
+                f"expected windows of the {width} healthy cells [N, T, {width}], got"
+                f" {list(x.shape)}"
+            )
         return x if self.front is None else self.front(x)
 
     def views(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -69,19 +76,25 @@ class ReducedModel(nn.Module):
         return self.network.features(whole), *self.summary(x), self.moments(whole)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map windows of the healthy cells ``[N, T, D-k]``, scaled to 0..1, to logits ``[N, n_classes]``."""
-        logits: Tensor = self.network(self.complete(x)) if self.head is None else self.head(self.views(x))
+        """Map windows of the healthy cells ``[N, T, D-k]``, scaled to 0..1, to logits
+        ``[N, n_classes]``."""
+        logits: Tensor = (
+            self.network(self.complete(x)) if self.head is None else self.head(self.views(x))
+        )
         return logits
 
 
 def phi(x: NDArray[Any], fault_set: FaultSet) -> NDArray[Any]:
-    """The paper's feature selector: drop the faulty cells from ``[..., D]``, giving ``[..., D-k]`` (Section IV).
+    """The paper's feature selector: drop the faulty cells from ``[..., D]``, giving ``[..., D-k]``
+    (Section IV).
 
     Raises:
         ValueError: the last axis is not D.
     """
     if x.shape[-1] != fault_set.n_cells:
-        raise ValueError(f"F is over {fault_set.n_cells} cells, the windows have {x.shape[-1]}: {list(x.shape)}")
+        raise ValueError(
+            f"F is over {fault_set.n_cells} cells, the windows have {x.shape[-1]}: {list(x.shape)}"
+        )
     return x[..., fault_set.healthy]
 
 

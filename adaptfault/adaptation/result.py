@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.adaptation.heads import empty_head
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
 from adaptfault.data.windows import Windows
 from adaptfault.evaluation.scores import Scores, ValueScores
@@ -20,8 +19,9 @@ from adaptfault.imputation.tiled import TiledFill
 from adaptfault.models.accumulation import ContactStatistics
 from adaptfault.models.any_model import network_from_config
 from adaptfault.models.builders import ModelNotAllowed
+from adaptfault.models.heads import Head
 from adaptfault.models.network import logits_of
-from adaptfault.models.store import ADAPTATION, load_tensors, save_tensors
+from adaptfault.models.store import ADAPTATION, load_tensors, load_with_head, save_tensors
 from diagnostics import FaultSet
 
 
@@ -65,12 +65,15 @@ class Adaptation:
     _contact: ContactStatistics | None = field(default=None, repr=False)
 
     def predict(self, x: NDArray[Any] | Tensor) -> NDArray[Any]:
-        """Return the class of each window ``[N, T, D]``, int64 ``[N]``, or its values, float32 ``[N, k]``.
+        """Return the class of each window ``[N, T, D]``, int64 ``[N]``, or its values, float32
+        ``[N, k]``.
 
         The cells in F may hold anything, NaN included.
         """
         outputs = self._logits(x)
-        answers: NDArray[Any] = (outputs if self.task == "regression" else outputs.argmax(1)).numpy()
+        answers: NDArray[Any] = (
+            outputs if self.task == "regression" else outputs.argmax(1)
+        ).numpy()
         return answers
 
     def predict_proba(self, x: NDArray[Any] | Tensor) -> NDArray[np.float32]:
@@ -91,8 +94,8 @@ class Adaptation:
     def scores(self) -> Scores | ValueScores:
         """Scores on the fault-free validation windows without F, computed on first use.
 
-        A head is fitted to the validation windows too. Each fifth of their recordings is scored by a head fitted
-        without it.
+        A head is fitted to the validation windows too. Each fifth of their recordings is scored by
+        a head fitted without it.
         """
         if self._scores is not None:
             return self._scores
@@ -101,7 +104,9 @@ class Adaptation:
         outputs = self._outputs(self._validation)
         if self.task == "regression":
             return ValueScores.of(self._validation.y, outputs.numpy())
-        return Scores.of(self._validation.y, outputs.argmax(1).numpy(), n_classes=self.model.network.n_classes)
+        return Scores.of(
+            self._validation.y, outputs.argmax(1).numpy(), n_classes=self.model.network.n_classes
+        )
 
     def _outputs(self, validation: Windows) -> Tensor:
         """Return the outputs for the validation windows, computed once."""
@@ -112,7 +117,8 @@ class Adaptation:
 
     @property
     def contact(self) -> ContactStatistics | None:
-        """What accumulating probabilities over a contact needs; None for a regression, or where it is not stored."""
+        """What accumulating probabilities over a contact needs; None for a regression, or where it
+        is not stored."""
         if self._contact is not None or self._validation is None or self.task == "regression":
             return self._contact
         windows = self._validation
@@ -126,7 +132,9 @@ class Adaptation:
             "task": self.task,
             "network": model.network.config,
             "fault_set": list(self.fault_set),
-            "reference_frames": len(model.front.roots) if isinstance(model.front, NearestFill) else None,
+            "reference_frames": len(model.front.roots)
+            if isinstance(model.front, NearestFill)
+            else None,
             "patches": model.front.sizes if isinstance(model.front, TiledFill) else None,
             "head": None if model.head is None else model.head.about,
             "stages": [vars(stage) for stage in self.stages],
@@ -136,13 +144,16 @@ class Adaptation:
         save_tensors(path, ADAPTATION, about, model.state_dict())
 
     @classmethod
-    def load(cls, path: str | Path, *, network: nn.Module | None = None, features: Any = None) -> Adaptation:
+    def load(
+        cls, path: str | Path, *, network: nn.Module | None = None, features: Any = None
+    ) -> Adaptation:
         """Read an adaptation written by :meth:`save`.
 
         Args:
             path: the folder.
-            network: an instance of the adapted model; its weights are replaced. None: a ``TactileTransformer``, or a
-                model with an allowed builder (:func:`~adaptfault.models.builders.allow_model`).
+            network: an instance of the adapted model; its weights are replaced. None: a
+                ``TactileTransformer``, or a model with an allowed builder
+                (:func:`~adaptfault.models.builders.allow_model`).
             features: the function that computed its features, if a function was given.
 
         Raises:
@@ -154,7 +165,7 @@ class Adaptation:
             inner = network_from_config(about["network"], network, features)
             fault_set = FaultSet(tuple(about["fault_set"]), inner.layout.n_cells)
             front = _empty_front(about, fault_set)
-            head = None if about["head"] is None else empty_head(about["head"], inner.n_classes)
+            head = None if about["head"] is None else Head.empty(about["head"], inner.n_classes)
             model = ReducedModel(inner, fault_set, front, head)
             model.load_state_dict(tensors)
             stages = tuple(Stage(**stage) for stage in about["stages"])
@@ -165,15 +176,29 @@ class Adaptation:
         except ModelNotAllowed:
             raise
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"the adaptation in {path} is damaged: {str(error).splitlines()[0]}") from None
+            raise ValueError(
+                f"the adaptation in {path} is damaged: {str(error).splitlines()[0]}"
+            ) from None
         return cls(model.eval(), fault_set, stages, task, _scores=scores, _contact=contact)
+
+
+def load_healthy(folder: str | Path) -> Adaptation:
+    """Read the model that :func:`~adaptfault.save_model` wrote, with its head in closed form.
+
+    The result is an adaptation to the empty fault set, without scores. Raises the errors of
+    :func:`~adaptfault.load_model`.
+    """
+    model, head = load_with_head(folder)
+    none = FaultSet((), model.layout.n_cells)
+    return Adaptation(ReducedModel(model, none, None, head).eval(), none, ())
 
 
 def _empty_front(about: dict[str, Any], fault_set: FaultSet) -> nn.Module:
     """Build the front end to load a state into."""
     if about.get("patches") is not None:
         return TiledFill(fault_set, about["patches"])
-    linear, frames = AffineFill.empty(fault_set), about["reference_frames"]
+    linear = AffineFill.empty(fault_set)
+    frames = about["reference_frames"]
     if frames is None:
         return linear
     return NearestFill(fault_set, linear, np.zeros((frames, fault_set.n_cells), "f4"))

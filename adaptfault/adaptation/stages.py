@@ -1,4 +1,5 @@
-"""One adaptation: imputation, a new head, fine-tuning or training anew, each kept only if validation improves."""
+"""One adaptation: imputation, a new head, fine-tuning or training anew, each kept only if
+validation improves."""
 
 from __future__ import annotations
 
@@ -15,12 +16,19 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from adaptfault.adaptation.fault_free import FaultFreeModel, Network
-from adaptfault.adaptation.heads import MOST_WINDOWS, Head, calibrate, fit_head, linear_head, log_likelihood
 from adaptfault.adaptation.reduced_model import ReducedModel, reduce_windows
 from adaptfault.adaptation.result import Adaptation, Stage
 from adaptfault.data.windows import Windows, evenly
 from adaptfault.models.any_model import device_of
 from adaptfault.models.compact import CompactNetwork
+from adaptfault.models.heads import (
+    MOST_WINDOWS,
+    Head,
+    calibrate,
+    fit_head,
+    linear_head,
+    log_likelihood,
+)
 from adaptfault.models.history import History
 from adaptfault.models.network import as_tensor, logits_of
 from adaptfault.models.training import train
@@ -28,16 +36,25 @@ from diagnostics import FaultSet
 
 Method = Literal["auto", "fill", "head", "finetune", "scratch"]
 
-_ENOUGH = 0.99  # auto does not fine-tune a repair that keeps this share of the healthy validation accuracy
+# auto does not fine-tune a repair that keeps this share of the healthy validation accuracy
+_ENOUGH = 0.99
 _NOISE = 1.0  # standard errors of its gain on validation that a stage of auto has to exceed
-_ROUND_EPOCHS, _ROUNDS, _ROUND_PATIENCE = 2, 6, 1  # of fine-tuning
+# of fine-tuning
+_ROUND_EPOCHS = 2
+_ROUNDS = 6
+_ROUND_PATIENCE = 1
 _FOLDS = 5  # of validation recordings, each held out of a head in turn
-_BATCH, _PILOT = 256, 500  # windows run at once; windows of a trial fit that measures the time of a head
-_SCRATCH_EPOCHS, _SCRATCH_PATIENCE = 50, 10  # Section III-B: 50 at most
+# windows run at once; windows of a trial fit that measures the time of a head
+_BATCH = 256
+_PILOT = 500
+# Section III-B: 50 at most
+_SCRATCH_EPOCHS = 50
+_SCRATCH_PATIENCE = 10
 
 
 class Run:
-    """One adaptation in progress: ``reduced`` is the best model so far, ``logits`` its validation outputs.
+    """One adaptation in progress: ``reduced`` is the best model so far, ``logits`` its validation
+    outputs.
 
     The outputs for each validation window come from a head that was fitted without this window.
     """
@@ -51,13 +68,20 @@ class Run:
         progress: bool | None,
         healthy: Callable[[], float] = lambda: 1.0,
     ) -> None:
-        self.fault_free, self.fault_set, self.seed, self.progress = fault_free, fault_set, seed, progress
-        self.budget, self.device = budget, device_of(fault_free.model)
-        self.healthy, self.noise = healthy, 0.0  # accuracy without faults; standard errors that a gain has to exceed
+        self.fault_free = fault_free
+        self.fault_set = fault_set
+        self.seed = seed
+        self.progress = progress
+        self.budget = budget
+        self.device = device_of(fault_free.model)
+        # accuracy without faults; standard errors that a gain has to exceed
+        self.healthy = healthy
+        self.noise = 0.0
         self.training = reduce_windows(fault_free.train, fault_set)
         self.validation = reduce_windows(fault_free.validation, fault_set)
         self.logits: Tensor | None = None
-        self.quick: CompactNetwork | None = None  # low-rank form of the network with its present weights
+        # low-rank form of the network with its present weights
+        self.quick: CompactNetwork | None = None
         self.head_seconds = 0.0
         imputation = fault_free.imputation  # estimated once, not a cost of this F
         began = time.perf_counter()
@@ -84,12 +108,17 @@ class Run:
             case "auto":
                 self.noise = _NOISE
                 self.head()
-                if self.budget is not None and len(self.fault_set) and self.accuracy() < _ENOUGH * self.healthy():
+                if (
+                    self.budget is not None
+                    and len(self.fault_set)
+                    and self.accuracy() < _ENOUGH * self.healthy()
+                ):
                     self.finetune()
         return self.done()
 
     def head(self) -> None:
-        """Fit a new head in closed form; keep it if validation improves. A model without features keeps its own."""
+        """Fit a new head in closed form; keep it if validation improves. A model without features
+        keeps its own."""
         if self.fault_free.has_features:
             linear = self.fault_free.imputation.linear(self.fault_set)
             self._keep_better("head", self._behind(linear, self.reduced.network))
@@ -97,8 +126,8 @@ class Run:
     def finetune(self) -> None:
         """Train all parameters, front end included, in rounds that each end with a new head.
 
-        It stops when rounds no longer improve validation. A larger budget allows more of the same rounds, so its result
-        is never worse.
+        It stops when rounds no longer improve validation. A larger budget allows more of the same
+        rounds, so its result is never worse.
         """
         network = copy.deepcopy(self.fault_free.model)
         reduced = self._behind(self.fault_free.imputation.linear(self.fault_set), network)
@@ -109,13 +138,16 @@ class Run:
                 network.head.weight.copy_(weight)
                 if network.head.bias is not None:
                     network.head.bias.copy_(bias)
-        idle, took = 0, 0.0
+        idle = 0
+        took = 0.0
         for number in range(_ROUNDS):
             if idle > _ROUND_PATIENCE or self.left() < took + self.head_seconds:
                 break
             began = time.perf_counter()
             self.quick = None  # holds other weights
-            history = self._train(reduced, _ROUND_EPOCHS, self.seed * _ROUNDS + number, reserve=self.head_seconds)
+            history = self._train(
+                reduced, _ROUND_EPOCHS, self.seed * _ROUNDS + number, reserve=self.head_seconds
+            )
             if history.stopped == "budget":
                 break
             self.quick = self.fault_free.compacted(network)
@@ -134,7 +166,8 @@ class Run:
         self.logits = None
 
     def held_out(self) -> Tensor:
-        """Return the outputs ``[N, n]`` for the validation windows, each from a head fitted without it."""
+        """Return the outputs ``[N, n]`` for the validation windows, each from a head fitted without
+        it."""
         if self.logits is None:
             self.logits = logits_of(self._quickly(self.reduced), self.validation.x)
         return self.logits
@@ -147,7 +180,8 @@ class Run:
         return accuracy
 
     def _quality(self, outputs: Tensor) -> tuple[float, float]:
-        """Return accuracy and negative cross entropy at its best scale, or R2 and negative mean squared error."""
+        """Return accuracy and negative cross entropy at its best scale, or R2 and negative mean
+        squared error."""
         score = self.fault_free.score(outputs)
         if self.fault_free.task == "regression":
             return score, -float(((outputs.numpy() - self.validation.y) ** 2).mean())
@@ -169,7 +203,8 @@ class Run:
         )
 
     def _keep_better(self, name: str, reduced: ReducedModel, began: float | None = None) -> bool:
-        """Give ``reduced`` a new head and keep it if validation improves; False if it does not, or time is short."""
+        """Give ``reduced`` a new head and keep it if validation improves; False if it does not, or
+        time is short."""
         self.accuracy()
         before = self._quality(self.held_out())
         start = time.perf_counter()
@@ -183,16 +218,18 @@ class Run:
         better = reached > before and self._exceeds_noise(logits)
         if better:
             reduced.head = head
-            self.reduced, self.logits = reduced, logits
+            self.reduced = reduced
+            self.logits = logits
         kept = reached if better else before
         self.stages.append(Stage(name, time.perf_counter() - began, kept[0]))
         return better
 
     def _exceeds_noise(self, outputs: Tensor) -> bool:
-        """Return whether the gain of new validation outputs exceeds its standard error ``noise`` times.
+        """Return whether the gain of new validation outputs exceeds its standard error ``noise``
+        times.
 
-        The gain is that of the logarithm of the probability of the true class, or of the negative squared error. Its
-        standard error is that of a mean of clusters, one for each recording.
+        The gain is that of the logarithm of the probability of the true class, or of the negative
+        squared error. Its standard error is that of a mean of clusters, one for each recording.
         """
         if not self.noise:
             return True
@@ -202,13 +239,17 @@ class Run:
         return bool(gain.mean() > self.noise * np.sqrt((deviation**2).sum()) / len(gain))
 
     def _merit(self, outputs: Tensor) -> NDArray[np.float64]:
-        """Return for each validation window the log probability of its class, or its negative squared error."""
+        """Return for each validation window the log probability of its class, or its negative
+        squared error."""
         if self.fault_free.task == "regression":
-            return np.asarray(-((outputs.numpy() - self.validation.y) ** 2).mean(axis=1, dtype=np.float64))
+            return np.asarray(
+                -((outputs.numpy() - self.validation.y) ** 2).mean(axis=1, dtype=np.float64)
+            )
         return log_likelihood(outputs, self.validation.y)
 
     def _head(self, reduced: ReducedModel) -> tuple[Head | None, Tensor] | None:
-        """Return a head, and the outputs for validation windows of heads fitted without them; None if time is short.
+        """Return a head, and the outputs for validation windows of heads fitted without them; None
+        if time is short.
 
         A model without features keeps its own head.
         """
@@ -217,9 +258,13 @@ class Run:
         if self._too_long(reduced, len(self.training) + len(self.validation)):
             return None
         used = evenly(len(self.training), MOST_WINDOWS - len(self.validation))
-        first, second = (self._views(reduced, of) for of in (self.training.select(used), self.validation))
+        first, second = (
+            self._views(reduced, of) for of in (self.training.select(used), self.validation)
+        )
         recordings = (self.training.recording[used], self.validation.recording)
-        folds = np.concatenate([np.unique(of, return_inverse=True)[1] % _FOLDS for of in recordings])
+        folds = np.concatenate(
+            [np.unique(of, return_inverse=True)[1] % _FOLDS for of in recordings]
+        )
         whole = self._whole(self.fault_free.train.select(used), self.fault_free.validation)
         targets = self.fault_free.targets[used], self.fault_free.validation_targets
         return self._fit(first, second, *targets, folds, whole)
@@ -240,14 +285,17 @@ class Run:
         """Return the moments of windows with all cells, those of F included; None if F is empty."""
         if not len(self.fault_set):
             return None
-        return torch.cat([self.reduced.moments(as_tensor(part.x).to(self.device)) for part in parts])
+        return torch.cat(
+            [self.reduced.moments(as_tensor(part.x).to(self.device)) for part in parts]
+        )
 
     def _behind(self, front: nn.Module | None, network: Network) -> ReducedModel:
         """Return the reduced model of a front end and a network, on the device of the adapter."""
         return ReducedModel(network, self.fault_set, front).to(self.device).eval()
 
     def _quickly(self, reduced: ReducedModel) -> ReducedModel:
-        """Return the same model with its network in low-rank form, if there is one for these weights."""
+        """Return the same model with its network in low-rank form, if there is one for these
+        weights."""
         if self.quick is None:
             return reduced
         same = ReducedModel(reduced.network, self.fault_set, reduced.front, reduced.head)
@@ -258,11 +306,14 @@ class Run:
         """Return the views of windows, computed in batches, on the device of the adapter."""
         quick = self._quickly(reduced.eval())
         with torch.no_grad():
-            views = [quick.views(x.to(self.device)) for x in torch.split(as_tensor(windows.x), _BATCH)]
+            views = [
+                quick.views(x.to(self.device)) for x in torch.split(as_tensor(windows.x), _BATCH)
+            ]
         return tuple(torch.cat(parts) for parts in zip(*views, strict=True))
 
     def _too_long(self, reduced: ReducedModel, n: int) -> bool:
-        """Return whether a head on n windows exceeds the time left, extrapolated from a trial on a few windows."""
+        """Return whether a head on n windows exceeds the time left, extrapolated from a trial on a
+        few windows."""
         if self.budget is None:
             return False
         few = self.training.select(slice(0, _BATCH))
@@ -271,12 +322,14 @@ class Run:
         pace = (time.perf_counter() - began) / len(few)
         m = min(n, _PILOT)
         known = [view[torch.arange(m) % len(few)] for view in views]
-        held, k = m // 5, self.fault_free.targets.shape[1]
+        held = m // 5
+        k = self.fault_free.targets.shape[1]
         targets = np.eye(k, dtype=np.float32)[np.arange(m) % k]
         if self.fault_free.task == "regression":
             targets = self.fault_free.targets[np.arange(m) % len(self.fault_free.targets)]
         began = time.perf_counter()
-        first, second = [v[held:] for v in known], [v[:held] for v in known]
+        first = [v[held:] for v in known]
+        second = [v[:held] for v in known]
         whole = self._whole(self.fault_free.train.select(slice(0, _BATCH)))
         whole = None if whole is None else whole[torch.arange(m) % len(few)].roll(-held, 0)
         self._fit(first, second, targets[held:], targets[:held], np.arange(m) % _FOLDS, whole)
@@ -284,7 +337,13 @@ class Run:
         return bool(pace * n + fit > self.left())
 
     def _train(
-        self, reduced: ReducedModel, epochs: int, seed: int, *, patience: int | None = None, reserve: float = 0.0
+        self,
+        reduced: ReducedModel,
+        epochs: int,
+        seed: int,
+        *,
+        patience: int | None = None,
+        reserve: float = 0.0,
     ) -> History:
         """Train a reduced model; ``reserve`` seconds of the budget stay for a head."""
         return train(

@@ -1,8 +1,10 @@
-"""The faults that would cost most: the expected accuracy after repair without each wire, each pad, and pairs of wires.
+"""The faults that would cost most: the expected accuracy after repair without each wire, each pad,
+and pairs of wires.
 
-Each fault set is removed from the validation windows and forecast (:mod:`adaptfault.adaptation.forecast`). What counts
-is the accuracy after the repair, because a repair takes seconds. All single wires and pads are forecast. Pairs are
-forecast among the worst single wires alone, so the worst of all pairs may be missed.
+Each fault set is removed from the validation windows and forecast
+(:mod:`adaptfault.adaptation.forecast`). What counts is the accuracy after the repair, because a
+repair takes seconds. All single wires and pads are forecast. Pairs are forecast among the worst
+single wires alone, so the worst of all pairs may be missed.
 """
 
 from __future__ import annotations
@@ -64,40 +66,65 @@ class WorstFaults:
         lines = [f"expected accuracy without faults: {self.fault_free}"]
         for name, losses in (("wire", self.wires), ("two wires", self.pairs), ("pad", self.pads)):
             if losses:
-                lines.append(f"worst {name} to lose, after repair: mean probability of the true class; accuracy")
-                lines += [f"  {loss.expected.likelihood:.3f}; {loss.expected}  {loss.what}" for loss in losses[:most]]
+                lines.append(
+                    f"worst {name} to lose, after repair: mean probability of the true class;"
+                    " accuracy"
+                )
+                lines += [
+                    f"  {loss.expected.likelihood:.3f}; {loss.expected}  {loss.what}"
+                    for loss in losses[:most]
+                ]
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
         kinds = {
             name: [
-                {"what": loss.what, "cells": list(loss.fault_set), "expected": asdict(loss.expected)}
+                {
+                    "what": loss.what,
+                    "cells": list(loss.fault_set),
+                    "expected": asdict(loss.expected),
+                }
                 for loss in getattr(self, name)
             ]
             for name in ("wires", "pairs", "pads")
         }
-        return {"schema": SCHEMA, "layout": self.layout.to_dict(), "fault_free": asdict(self.fault_free), **kinds}
+        return {
+            "schema": SCHEMA,
+            "layout": self.layout.to_dict(),
+            "fault_free": asdict(self.fault_free),
+            **kinds,
+        }
 
     def plot(self) -> Any:
-        """Draw what each cell costs with the worse of its two wires; return the matplotlib figure."""
+        """Draw what each cell costs with the worse of its two wires; return the matplotlib
+        figure."""
         from diagnostics.decision.plot import draw_forces, pads_figure
 
         lost = np.full(self.layout.n_cells, np.nan)
         for loss in self.wires:
             cells = list(loss.fault_set)
-            lost[cells] = np.fmax(lost[cells], max(0.0, self.fault_free.likelihood - loss.expected.likelihood))
+            lost[cells] = np.fmax(
+                lost[cells], max(0.0, self.fault_free.likelihood - loss.expected.likelihood)
+            )
         figure, axes = pads_figure(self.layout, n_rows=1)
         top = max(float(np.nanmax(lost)), 1e-3)
         for pad, ax in enumerate(axes[0]):
-            image = draw_forces(ax, self.layout.grid(lost)[pad], self.layout, vmin=0, vmax=top, cmap="Reds")
+            image = draw_forces(
+                ax, self.layout.grid(lost)[pad], self.layout, vmin=0, vmax=top, cmap="Reds"
+            )
             ax.set_title(f"pad {pad}", fontsize=9)
-        figure.colorbar(image, ax=axes[0].tolist(), label="P(true class) lost after repair, worse wire")
+        figure.colorbar(
+            image, ax=axes[0].tolist(), label="P(true class) lost after repair, worse wire"
+        )
         return figure
 
 
-def worst_faults(adapter: Adapter, *, among: int = 5, say: Callable[[str], None] = lambda text: None) -> WorstFaults:
-    """Forecast the loss of each row and column wire, of each pad, and of the pairs among the ``among`` worst wires.
+def worst_faults(
+    adapter: Adapter, *, among: int = 5, say: Callable[[str], None] = lambda text: None
+) -> WorstFaults:
+    """Forecast the loss of each row and column wire, of each pad, and of the pairs among the
+    ``among`` worst wires.
 
     It takes one head in closed form for each fault set: seconds each.
 
@@ -113,7 +140,10 @@ def worst_faults(adapter: Adapter, *, among: int = 5, say: Callable[[str], None]
         for line in layout.lines
         if line.kind in ("row", "column")
     }
-    pads = {f"pad {pad}": [c for c in index if layout.position(c)[0] == pad] for pad in range(layout.pads)}
+    pads = {
+        f"pad {pad}": [c for c in index if layout.position(c)[0] == pad]
+        for pad in range(layout.pads)
+    }
 
     def ranked(sets: Iterable[tuple[str, Iterable[int]]]) -> tuple[Loss, ...]:
         losses = []
@@ -121,7 +151,11 @@ def worst_faults(adapter: Adapter, *, among: int = 5, say: Callable[[str], None]
             faults = FaultSet(tuple(sorted(set(cells))), layout.n_cells)
             if 0 < len(faults) < len(index):
                 stages = adapter.forecast(faults).stages
-                losses.append(Loss(what, faults, max(stages["fill"], stages["head"], key=lambda e: e.accuracy)))
+                losses.append(
+                    Loss(
+                        what, faults, max(stages["fill"], stages["head"], key=lambda e: e.accuracy)
+                    )
+                )
         return tuple(sorted(losses, key=lambda loss: loss.expected.likelihood))
 
     say(f"forecasting {len(wires)} wires")

@@ -1,4 +1,5 @@
-"""The command line: one module a command; results go to stdout, messages to stderr; errors are one line."""
+"""The command line: one module a command; results go to stdout, messages to stderr; errors are one
+line."""
 
 from __future__ import annotations
 
@@ -11,51 +12,37 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from adaptfault import __version__
-from adaptfault.cli import (
-    adapt,
-    convert,
-    demo,
-    diagnose,
-    evaluate,
-    fleet,
-    forecast,
-    history,
-    info,
-    listen,
-    maintain,
-    predict,
-    report,
-    reproduce,
-    restore,
-    rollback,
-    simulate,
-    train,
-)
 from adaptfault.cli.options import LogAboveBars, refuse_missing
+from adaptfault.data.plugins import plugins
 from adaptfault.data.printable import printable
 
-COMMANDS = (
-    info,
-    convert,
-    simulate,
-    diagnose,
-    train,
-    evaluate,
-    predict,
-    forecast,
-    adapt,
-    restore,
-    demo,
-    maintain,
-    rollback,
-    history,
-    report,
-    listen,
-    fleet,
-    reproduce,
-)
+GROUP = "adaptfault.commands"
 
-BAD_INPUT = 3  # exit code for unusable input or usage, as monitoring tools understand it ("unknown")
+BUILT_IN = {
+    "info": "adaptfault.cli.info",
+    "convert": "adaptfault.cli.convert",
+    "simulate": "adaptfault.cli.simulate",
+    "diagnose": "adaptfault.cli.diagnose",
+    "train": "adaptfault.cli.train",
+    "evaluate": "adaptfault.cli.evaluate",
+    "predict": "adaptfault.cli.predict",
+    "forecast": "adaptfault.cli.forecast",
+    "adapt": "adaptfault.cli.adapt",
+    "restore": "adaptfault.cli.restore",
+    "demo": "adaptfault.cli.demo",
+    "maintain": "adaptfault.cli.maintain",
+    "rollback": "adaptfault.cli.rollback",
+    "history": "adaptfault.cli.history",
+    "report": "adaptfault.cli.report",
+    "listen": "adaptfault.cli.listen",
+    "fleet": "adaptfault.cli.fleet",
+    "reproduce": "adaptfault.cli.reproduce",
+}
+"""The commands in the order of ``--help``, as the entry points of this package name them. Another
+package adds one by a module with ``add(subparsers)`` and an entry point in the same group."""
+
+# exit code for unusable input or usage, as monitoring tools understand it ("unknown")
+BAD_INPUT = 3
 
 
 def _number(convert: Callable[[str], float]) -> Callable[[str], float]:
@@ -91,30 +78,52 @@ def _parser() -> _Parser:
     """Return the parser of all commands."""
     parser = _Parser(
         prog="adaptfault",
-        description="Finds the dead cells of a tactile array and repairs the classifier that reads it.",
-        epilog="Try: adaptfault info RECORDINGS on your own files, or adaptfault demo on simulated ones.",
+        description=(
+            "Finds the dead cells of a tactile array and repairs the classifier that reads it."
+        ),
+        epilog=(
+            "Try: adaptfault info RECORDINGS on your own files, or adaptfault demo on simulated"
+            " ones."
+        ),
     )
     parser.add_argument("--version", action="version", version=f"adaptfault {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    for module in COMMANDS:
+    for module in plugins(GROUP, BUILT_IN).values():
         module.add(commands)
     return parser
 
 
+def _with_left_out(args: argparse.Namespace, code: int) -> int:
+    """Return the exit code of a command; where files were left out, it is 1 at least, and the last
+    line says so."""
+    left_out = getattr(args, "left_out", 0)
+    if not left_out:
+        return code
+    were = "1 file or recording was" if left_out == 1 else f"{left_out} files or recordings were"
+    print(f"adaptfault {args.command}: {were} left out; see the errors above", file=sys.stderr)
+    return max(code, 1)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns its exit code: 0 fine, 1 degraded but handled, 2 needs a technician, 3 unusable input."""
+    """Run a command; returns its exit code: 0 fine, 1 degraded but handled, 2 needs a technician, 3
+    unusable input."""
     parser = _parser()
     args = parser.parse_args(argv)
     if args.command is None:
         parser.print_help()
         return 0
-    log, handler = logging.getLogger("adaptfault"), LogAboveBars()
+    log = logging.getLogger("adaptfault")
+    handler = LogAboveBars()
     log.addHandler(handler)
     try:
         refuse_missing(args)
-        return int(args.run(args))
+        code = int(args.run(args))
+        return _with_left_out(args, code)
     except (ValueError, OSError) as error:
-        print(f"adaptfault {args.command}: error: {printable(' '.join(str(error).split()))}", file=sys.stderr)
+        print(
+            f"adaptfault {args.command}: error: {printable(' '.join(str(error).split()))}",
+            file=sys.stderr,
+        )
         return BAD_INPUT
     except MemoryError as error:
         print(f"adaptfault {args.command}: error: not enough memory ({error})", file=sys.stderr)
@@ -122,9 +131,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"adaptfault {args.command}: interrupted", file=sys.stderr)
         return 130
-    except Exception:  # Python's own exit code for a traceback, 1, would read as "degraded but handled"
+    except (
+        Exception
+    ):  # Python's own exit code for a traceback, 1, would read as "degraded but handled"
         traceback.print_exc()
-        print(f"adaptfault {args.command}: internal error; please report the lines above", file=sys.stderr)
+        print(
+            f"adaptfault {args.command}: internal error; please report the lines above",
+            file=sys.stderr,
+        )
         return BAD_INPUT
     finally:
         log.removeHandler(handler)

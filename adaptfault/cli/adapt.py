@@ -32,15 +32,23 @@ _EXAMPLE = """  adaptfault adapt model grasps/ --faults diagnosis.json --out ada
 def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "adapt", "repair a model for a set of faulty cells", _EXAMPLE)
-    parser.add_argument("model", metavar="MODEL", help="folder written by adaptfault train or --keep, or a bundle")
+    parser.add_argument(
+        "model", metavar="MODEL", help="folder written by adaptfault train or --keep, or a bundle"
+    )
     add_recordings(parser, least=0)
-    parser.add_argument("--faults", metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200")
+    parser.add_argument(
+        "--faults", metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200"
+    )
     parser.add_argument("--out", metavar="FOLDER", help="where the adapted model goes")
     parser.add_argument(
-        "--forecast", action="store_true", help="print the accuracy to expect, and adapt only with --out"
+        "--forecast",
+        action="store_true",
+        help="print the accuracy to expect, and adapt only with --out",
     )
     parser.add_argument(
-        "--keep", metavar="FOLDER", help="store everything that later adaptations need, without recordings"
+        "--keep",
+        metavar="FOLDER",
+        help="store everything that later adaptations need, without recordings",
     )
     parser.add_argument(
         "--method",
@@ -58,9 +66,13 @@ def add(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Keep the adapter, forecast, adapt and save, as the options state."""
     if args.faults is None and args.keep is None:
-        raise ValueError("nothing to do: give --faults F with --out or --forecast, or --keep FOLDER")
+        raise ValueError(
+            "nothing to do: give --faults F with --out or --forecast, or --keep FOLDER"
+        )
     if (args.faults is None) != (args.out is None and not args.forecast):
-        raise ValueError("--faults F needs --out FOLDER or --forecast, and either of them needs --faults F")
+        raise ValueError(
+            "--faults F needs --out FOLDER or --forecast, and either of them needs --faults F"
+        )
     adapter = open_adapter(args)
     result: dict[str, Any] = {"schema": "adaptfault.adapt/1"}
     lines: list[str] = []
@@ -74,7 +86,11 @@ def run(args: argparse.Namespace) -> int:
         faults = fault_set(args.faults, adapter.model.layout)
         adapter = adapter.to(device(args))
         if args.forecast:
-            say(args, f"{len(faults)} of {adapter.model.layout.present.sum()} cells are faulty; forecasting")
+            say(
+                args,
+                f"{len(faults)} of {adapter.model.layout.present.sum()} cells are faulty;"
+                " forecasting",
+            )
             forecast = adapter.forecast(faults)
             result["forecast"] = forecast.to_dict()
             lines.append(str(forecast))
@@ -102,17 +118,25 @@ def open_adapter(args: argparse.Namespace) -> Adapter:
     from adaptfault.adaptation.adapter import Adapter
 
     if not args.recordings:
-        raise ValueError(f"{args.model} is a model: give the fault-free recordings that it was trained on, too")
+        raise ValueError(
+            f"{args.model} is a model: give the fault-free recordings that it was trained on, too"
+        )
     trained = TrainedModel.open(args, args.model)
     train, validation, _ = trained.parts(trained.recordings(args, args.recordings))
     return Adapter(trained.network, train, validation)
 
 
 def _adapt(
-    args: argparse.Namespace, adapter: Adapter, faults: FaultSet, result: dict[str, Any], lines: list[str]
+    args: argparse.Namespace,
+    adapter: Adapter,
+    faults: FaultSet,
+    result: dict[str, Any],
+    lines: list[str],
 ) -> None:
     say(args, f"{len(faults)} of {adapter.model.layout.present.sum()} cells are faulty; adapting")
-    adaptation = adapter.adapt(faults, method=args.method, budget=args.budget, seed=args.seed, progress=progress(args))
+    adaptation = adapter.adapt(
+        faults, method=args.method, budget=args.budget, seed=args.seed, progress=progress(args)
+    )
     adaptation.save(args.out)
     result |= {
         "adapted": args.out,

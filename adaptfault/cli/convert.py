@@ -1,4 +1,5 @@
-"""adaptfault convert: recordings of any readable format into .npz, .npy, CSV files or a ROS 2 bag."""
+"""adaptfault convert: recordings of any readable format into .npz, .npy, CSV files or a ROS 2
+bag."""
 
 from __future__ import annotations
 
@@ -7,7 +8,8 @@ import argparse
 from adaptfault.cli.options import Commands, add_recordings, command, emit, load_recordings, say
 from adaptfault.cli.selection import add_selection, select
 
-_EXAMPLE = """  adaptfault convert raw/ --shape 10x10 --full-scale 3.3 --unit V --rate 50 --out grasps.npz
+_EXAMPLE = """\
+  adaptfault convert raw/ --shape 10x10 --full-scale 3.3 --unit V --rate 50 --out grasps.npz
       the archive states the layout: no later command needs these options
   adaptfault convert grasps.npz --out grasps-csv
   adaptfault convert grasps.npz --take ::5 --inject row:0:3=open --out broken.npz"""
@@ -15,10 +17,15 @@ _EXAMPLE = """  adaptfault convert raw/ --shape 10x10 --full-scale 3.3 --unit V 
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "convert", "write recordings in another format, with their layout", _EXAMPLE)
+    parser = command(
+        commands, "convert", "write recordings in another format, with their layout", _EXAMPLE
+    )
     add_recordings(parser)
     parser.add_argument(
-        "--out", required=True, metavar="PATH", help="X.npz, X.npy, X.bag (ROS 2 bag), or a folder for CSV files"
+        "--out",
+        required=True,
+        metavar="PATH",
+        help="X.npz, X.npy, X.bag (ROS 2 bag), or a folder for CSV files",
     )
     add_selection(parser)
     parser.set_defaults(run=run, writes=("out",))

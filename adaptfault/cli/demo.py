@@ -1,4 +1,5 @@
-"""adaptfault demo: training, faults, diagnosis and repair on simulated grasps or on the user's recordings."""
+"""adaptfault demo: training, faults, diagnosis and repair on simulated grasps or on the user's
+recordings."""
 
 from __future__ import annotations
 
@@ -11,8 +12,9 @@ from adaptfault.cli.options import Commands, add_recordings, command, load_recor
 _EXAMPLE = """  adaptfault demo
   adaptfault demo --recordings grasps.npz --epochs 20 --inject random:5=short"""
 
-# The paper has 200 grasps a class and up to 50 epochs at 1e-4. The demo has fewer grasps, a higher learning rate and
-# unpadded convolutions, a third of the cost, so that it ends within about a minute.
+# The paper has 200 grasps a class and up to 50 epochs at 1e-4. The demo has fewer grasps, a higher
+# learning rate and unpadded convolutions, a third of the cost, so that it ends within about a
+# minute.
 SIMULATED_PER_CLASS = 160
 QUICK = {"epochs": 2, "learning_rate": 2e-4, "network": {"padding": "valid", "init": "glorot"}}
 _EPOCHS = 20
@@ -20,11 +22,19 @@ _EPOCHS = 20
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "demo", "train, break the sensor, diagnose, repair, write a report", _EXAMPLE)
+    parser = command(
+        commands, "demo", "train, break the sensor, diagnose, repair, write a report", _EXAMPLE
+    )
     add_recordings(parser, option=True)
-    parser.add_argument("--out", default="adaptfault-demo", metavar="FOLDER", help="default adaptfault-demo")
-    parser.add_argument("--epochs", type=int, help="of training (default: 2 simulated, 20 on recordings)")
-    parser.add_argument("--seed", type=int, default=0, help="random seed of the whole run (default 0)")
+    parser.add_argument(
+        "--out", default="adaptfault-demo", metavar="FOLDER", help="default adaptfault-demo"
+    )
+    parser.add_argument(
+        "--epochs", type=int, help="of training (default: 2 simulated, 20 on recordings)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="random seed of the whole run (default 0)"
+    )
     parser.add_argument("--inject", action="append", metavar="FAULT", help=INJECT_HELP)
     parser.set_defaults(run=run)
 
@@ -57,7 +67,8 @@ def run(args: argparse.Namespace) -> int:
     result = run_demo(
         recordings,
         faults,
-        **({"epochs": _EPOCHS} if args.recordings else QUICK) | ({"epochs": args.epochs} if args.epochs else {}),
+        **({"epochs": _EPOCHS} if args.recordings else QUICK)
+        | ({"epochs": args.epochs} if args.epochs else {}),
         seed=args.seed,
         checkpoint=checkpoint,
         progress=progress(args),

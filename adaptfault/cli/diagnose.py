@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.options import (
@@ -13,46 +12,54 @@ from adaptfault.cli.options import (
     add_recordings,
     add_trust,
     add_untested_code,
+    check_scale,
     command,
     emit,
     fit_diagnoser,
     fitting_bar,
     load_recordings,
-    progress,
+    open_reported,
     report_inferred,
-    stream_recordings,
+    report_range,
+    say,
 )
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from adaptfault.data.recordings import Recordings
-    from adaptfault.data.recordings.blocks import Stream
-    from adaptfault.robot.bundle import Bundle
-    from adaptfault.robot.changed_readings import ChangedReadings
+    from adaptfault.bundle.bundle import Bundle
+    from adaptfault.data.recordings import Opened, Recordings
+    from adaptfault.inspection.inspection import Finding, Inspection
+    from adaptfault.inspection.severity import Reason
     from diagnostics import Diagnosis, SelfDiagnosis
-    from diagnostics.evidence.sensor_change import SensorChange
 
-_EXAMPLE = """  adaptfault diagnose today/ --reference healthy/ --out diagnosis.json --html diagnosis.html
-      without --reference the first half of 32 or more recordings is the reference; with fewer, each cell is compared
-      with the cells around it
+_EXAMPLE = """\
+  adaptfault diagnose today/ --reference healthy/ --out diagnosis.json --html diagnosis.html
+      without --reference the first half of 32 or more recordings is the reference; with fewer,
+      each cell is compared with the cells around it
   adaptfault diagnose today/ --reference robot.bundle
       the healthy model of the bundle
-      exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version excludes, nothing tested, an
-      object that lies still, a frozen stream, another gain or offset of the whole sensor or of a pad;
-      2 a person is needed: a wire, exchanged wires, or a tenth of the cells; 3 unusable input"""
+      exit code: 0 nothing to do; 1 watch: single cells, faults that the bundle's version
+      excludes, nothing tested, an object that lies still, a frozen stream, another gain or
+      offset of the whole sensor or of a pad; 2 a person is needed: a wire, exchanged
+      wires, or a tenth of the cells; 3 unusable input"""
 
-Undo = Callable[["NDArray[Any]"], "NDArray[Any]"]  # returns readings as the running version takes them
-
-_ROWS = 24  # of a map, which is followed by the summary if it has more: the first line has left the screen
+_TOLD_BY_THE_DIAGNOSIS = ("static_load", "frozen", "lost_frames")
+# of a map, which is followed by the summary if it has more: the first line has left the screen
+_ROWS = 24
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "diagnose", "find the faulty cells and wires in a log of recordings", _EXAMPLE)
+    parser = command(
+        commands, "diagnose", "find the faulty cells and wires in a log of recordings", _EXAMPLE
+    )
     add_recordings(parser, labels=False)
     parser.add_argument(
-        "--reference", nargs="+", metavar="FILE", help="fault-free recordings of the same array, or a bundle"
+        "--reference",
+        nargs="+",
+        metavar="FILE",
+        help="fault-free recordings of the same array, or a bundle",
     )
     parser.add_argument("--out", metavar="FILE", help="write the diagnosis as JSON")
     parser.add_argument("--picture", metavar="FILE", help="write the verdict map as PNG")
@@ -64,50 +71,38 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Diagnose; the exit code says who has to act, as that of maintain."""
-    import numpy as np
+    from dataclasses import asdict
 
-    from adaptfault.data.recordings import Recordings
-    from adaptfault.data.recordings.blocks import is_large
+    from adaptfault.inspection.severity import worst
 
     bundle = _bundle(args)
     healthy = load_recordings(args, args.reference) if args.reference and bundle is None else None
     diagnoser = None if bundle is None else bundle.diagnoser()
     known = diagnoser or healthy
-    layout = None if known is None else known.layout
-    log: Recordings | Stream
-    if args.frames is None and is_large(args.recordings):
-        log = stream_recordings(args, args.recordings, layout)
-        report_inferred(args, log.inferred)
-    else:
-        log = load_recordings(args, args.recordings, layout=layout)
+    log = open_reported(args, args.recordings, None if known is None else known.layout)
+    report_inferred(args, log.inferred)
     if healthy is not None:  # fitted once the log is known to be of the same array
         diagnoser = fit_diagnoser(args, healthy)
-    running: Undo = np.asarray if bundle is None else bundle.active().undo
-    changed = change = None
-    if diagnoser is None or not isinstance(log, Recordings):  # nothing to compare with, or too large to be searched
-        diagnosis = _diagnosed(args, diagnoser, log, running)
-    else:
-        changed, change = _compared(log, diagnoser, running, _healthy(bundle, healthy))
-        diagnosis = changed.diagnosis
-    code, notes = _severity(diagnosis, bundle, args.untested_code)
-    if change is not None:
-        code, notes = max(code, 1), [*notes, change.reason]
-    if changed is not None and changed.reason:
-        code = max(code, 1 if changed.rewiring is None else 2)
-        notes = [*notes, f"{changed.reason}; the verdicts are those with the readings put back"]
+    inspection = _inspected(args, log, diagnoser, bundle, _healthy(bundle, healthy))
+    report_range(log)
+    diagnosis = inspection.diagnosis
+    findings = inspection.findings
+    reasons = _reasons(diagnosis, findings, bundle, args.untested_code)
+    code = worst(reasons)
+    notes = [reason.text for reason in reasons if reason.text]
     _write(args, diagnosis, code, notes)
     found = {
         **diagnosis.to_dict(),
-        "rewiring": [] if changed is None else list(changed.told["rewiring"]),
-        "replaced_pads": [] if changed is None else list(changed.told["replaced_pads"]),
-        "change": None if change is None else vars(change),
+        **inspection.told,
+        "findings": [asdict(finding) for finding in findings],
     }
     emit(args, found, "\n".join([text_of(diagnosis), *notes]))
     return code
 
 
 def _write(args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: list[str]) -> None:
-    """Write the files that the options ask for; the page says what the exit code and the notes say."""
+    """Write the files that the options ask for; the page says what the exit code and the notes
+    say."""
     from adaptfault.data.atomic import atomic_write
 
     if args.out:
@@ -117,35 +112,56 @@ def _write(args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: lis
     if args.html:
         from adaptfault.evaluation.html_diagnosis import write_diagnosis
 
-        name, reference = ", ".join(args.recordings), bool(args.reference)
-        write_diagnosis(args.html, diagnosis, name=name, reference=reference, code=code, notes=notes)
+        name = ", ".join(args.recordings)
+        reference = bool(args.reference)
+        write_diagnosis(
+            args.html, diagnosis, name=name, reference=reference, code=code, notes=notes
+        )
 
 
-def _compared(
-    log: Recordings, diagnoser: SelfDiagnosis, running: Undo, healthy: list[NDArray[Any]]
-) -> tuple[ChangedReadings, SensorChange | None]:
-    """Return the exchanged wires and replaced pads that no version undoes yet, and how the sensor changed besides."""
-    import numpy as np
+def _inspected(
+    args: argparse.Namespace,
+    log: Opened,
+    diagnoser: SelfDiagnosis | None,
+    bundle: Bundle | None,
+    healthy: list[NDArray[Any]] | None,
+) -> Inspection:
+    """Inspect a log, as the version of the bundle that runs reads it."""
+    from adaptfault.inspection.long_log import inspect_parts
+    from diagnostics import SelfDiagnosis
 
-    from adaptfault.robot.changed_readings import find_changed_readings, find_sensor_change
+    is_known = diagnoser is not None
+    cold = diagnoser or SelfDiagnosis(log.layout)
+    version = None if bundle is None else bundle.active()
 
-    frames = [running(np.asarray(recording, dtype=np.float64)) for recording in log.frames]
-    changed = find_changed_readings(diagnoser, frames, lambda: healthy)
-    return changed, find_sensor_change(diagnoser, changed.diagnosis, changed.frames, healthy)
+    def parts() -> Iterator[list[NDArray[Any]]]:
+        for i, part in enumerate(log.parts()):
+            if is_known and i == 0:
+                check_scale(args.recordings[0], part, log.layout)
+            yield part if version is None else [version.undo(frames) for frames in part]
+
+    say(args, f"diagnosing {len(log)} recording{'s' * (len(log) != 1)}")
+    with fitting_bar(args) as advance:
+        return inspect_parts(
+            parts(), cold, reference=healthy, n_recordings=len(log), progress=advance
+        )
 
 
-def _healthy(bundle: Bundle | None, recordings: Recordings | None) -> list[NDArray[Any]]:
-    """Return the healthy recordings that were given, else those of the bundle, which then was."""
+def _healthy(bundle: Bundle | None, recordings: Recordings | None) -> list[NDArray[Any]] | None:
+    """Return the healthy recordings that were given, else those of a bundle; None without
+    either."""
     from adaptfault.data.windows import recordings_of
 
     if recordings is not None:
         return list(recordings)
-    assert bundle is not None
-    return list(recordings_of(bundle.parts.adapter().train, bundle.layout))
+    return (
+        None if bundle is None else list(recordings_of(bundle.parts.adapter().train, bundle.layout))
+    )
 
 
 def _bundle(args: argparse.Namespace) -> Bundle | None:
-    """Return the bundle that is given as reference; None for recordings, and without a reference."""
+    """Return the bundle that is given as reference; None for recordings, and without a
+    reference."""
     from adaptfault.cli.trained_model import open_bundle
 
     if len(args.reference or []) == 1:
@@ -155,19 +171,41 @@ def _bundle(args: argparse.Namespace) -> Bundle | None:
     return None
 
 
-def _severity(diagnosis: Diagnosis, bundle: Bundle | None, untested_code: int) -> tuple[int, list[str]]:
-    """Return the exit code, and a sentence where it is another one than that of the faults."""
-    from adaptfault.robot.sensor_state import SensorState, unhandled_cells, untested
+def _reasons(
+    diagnosis: Diagnosis, findings: Sequence[Finding], bundle: Bundle | None, untested_code: int
+) -> list[Reason]:
+    """Return why somebody has to act, in the order of the findings; without text what the diagnosis
+    tells itself."""
+    from adaptfault.inspection.severity import Reason
 
-    code = diagnosis.exit_code
-    reason = untested(diagnosis)
-    if code == 0 and reason is not None:
-        return untested_code, [reason]
-    if code == 2 and bundle is not None:
-        version = bundle.active()
-        if not unhandled_cells(bundle, diagnosis.fault_set, version) and SensorState.of(bundle).exit_code < 2:
-            return 1, [f"handled: version {version.number} of {bundle.path} runs without these cells"]
-    return code, []
+    reasons = [Reason(*_faults(diagnosis, bundle))]
+    for finding in findings:
+        if finding.name in ("fault", "wire"):
+            continue
+        severity = untested_code if finding.name == "untested" else finding.severity
+        text = "" if finding.name in _TOLD_BY_THE_DIAGNOSIS else finding.reason
+        if finding.name in ("rewired", "replaced_pad"):
+            text += "; the verdicts are those with the readings put back"
+        reasons.append(Reason(severity, text))
+    return reasons
+
+
+def _faults(diagnosis: Diagnosis, bundle: Bundle | None) -> tuple[int, str]:
+    """Return the severity of the faults, and a sentence where the bundle's version does without
+    their cells."""
+    from adaptfault.inspection.severity import of_faults
+    from adaptfault.robot.sensor_state import SensorState, unhandled_cells
+
+    severity = of_faults(diagnosis)
+    if severity < 2 or bundle is None:
+        return severity, ""
+    version = bundle.active()
+    if (
+        unhandled_cells(bundle, diagnosis.fault_set, version)
+        or SensorState.of(bundle).exit_code >= 2
+    ):
+        return severity, ""
+    return 1, f"handled: version {version.number} of {bundle.path} runs without these cells"
 
 
 def text_of(diagnosis: Diagnosis) -> str:
@@ -177,42 +215,3 @@ def text_of(diagnosis: Diagnosis) -> str:
     if diagnosis.layout.rows > _ROWS:
         lines.append(lines[0])
     return "\n".join(lines)
-
-
-def _cold(args: argparse.Namespace, log: Recordings | Stream, undo: Undo) -> SelfDiagnosis:
-    """Return a diagnosis without reference; a log of enough recordings that is in memory is its own."""
-    import numpy as np
-
-    from adaptfault.data.recordings import Recordings
-    from diagnostics import SelfDiagnosis
-
-    cold = SelfDiagnosis(log.layout)
-    if not isinstance(log, Recordings):
-        return cold
-    frames = [undo(np.asarray(recording, dtype=np.float64)) for recording in log.frames]
-    with fitting_bar(args) as advance:
-        return cold.for_log(frames, progress=advance)
-
-
-def _diagnosed(
-    args: argparse.Namespace, diagnoser: SelfDiagnosis | None, log: Recordings | Stream, undo: Undo
-) -> Diagnosis:
-    """Diagnose the log recording by recording, or in blocks in constant memory."""
-    import numpy as np
-    from tqdm import tqdm
-
-    from adaptfault.data.recordings import Recordings
-    from diagnostics.threads import one_thread
-
-    fitted = diagnoser or _cold(args, log, undo)
-    stream = fitted.stream()
-    hide = None if (shown := progress(args)) is None else not shown
-    total = len(log) if isinstance(log, Recordings) else None
-    unit = "recording" if isinstance(log, Recordings) else "block"
-    for frames in tqdm(log, total=total, unit=unit, desc="diagnosing", disable=hide, leave=False):
-        with one_thread():
-            stream.extend(undo(np.asarray(frames, dtype=np.float64)))
-    if not isinstance(log, Recordings):
-        for problem in log.problems:
-            print(problem, file=sys.stderr)
-    return fitted.evaluate(stream, n_recordings=len(log))

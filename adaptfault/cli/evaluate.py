@@ -1,11 +1,21 @@
-"""adaptfault evaluate: scores of a model or an adaptation, on healthy recordings or with injected faults."""
+"""adaptfault evaluate: scores of a model or an adaptation, on healthy recordings or with injected
+faults."""
 
 from __future__ import annotations
 
 import argparse
 
 from adaptfault.cli.inject_option import INJECT_HELP, parse_faults
-from adaptfault.cli.options import Commands, add_device, add_recordings, add_trust, command, device, emit, say
+from adaptfault.cli.options import (
+    Commands,
+    add_device,
+    add_recordings,
+    add_trust,
+    command,
+    device,
+    emit,
+    say,
+)
 
 _EXAMPLE = """  adaptfault evaluate model grasps/ --inject random:5=short
   adaptfault evaluate model grasps/ --inject row:0:3=open --adapted adapted"""
@@ -14,18 +24,29 @@ _EXAMPLE = """  adaptfault evaluate model grasps/ --inject random:5=short
 def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "evaluate", "score a model on the test recordings", _EXAMPLE)
-    parser.add_argument("model", metavar="MODEL", help="folder written by adaptfault train, or a bundle")
+    parser.add_argument(
+        "model", metavar="MODEL", help="folder written by adaptfault train, or a bundle"
+    )
     add_recordings(parser)
-    parser.add_argument("--adapted", metavar="FOLDER", help="score this adaptation of the model instead")
+    parser.add_argument(
+        "--adapted", metavar="FOLDER", help="score this adaptation of the model instead"
+    )
     parser.add_argument(
         "--head",
         default="auto",
         choices=("auto", "linear"),
-        help="auto: the head that the model was stored with (default); linear: that of its network, as in the paper",
+        help=(
+            "auto: the head that the model was stored with (default); linear: that of its network,"
+            " as in the paper"
+        ),
     )
     parser.add_argument("--inject", action="append", default=[], metavar="FAULT", help=INJECT_HELP)
-    parser.add_argument("--seed", type=int, default=0, help="random seed of random faults (default 0)")
-    parser.add_argument("--all", action="store_true", help="score on all recordings, not only on the test share")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="random seed of random faults (default 0)"
+    )
+    parser.add_argument(
+        "--all", action="store_true", help="score on all recordings, not only on the test share"
+    )
     add_device(parser)
     add_trust(parser)
     parser.set_defaults(run=run)
@@ -41,16 +62,24 @@ def run(args: argparse.Namespace) -> int:
     from diagnostics import inject
 
     trained = TrainedModel.open(args, args.model)
-    model, recordings = trained.network, trained.rewired(trained.recordings(args, args.recordings))
+    model = trained.network
+    recordings = trained.rewired(trained.recordings(args, args.recordings))
     classifier = Adaptation.load(args.adapted) if args.adapted else trained.adaptation
     if args.head == "linear":
         classifier.model.head = None
     classifier.model.to(device(args))
     if classifier.fault_set.n_cells != model.layout.n_cells:
-        raise ValueError(f"{args.adapted}: an adaptation over {classifier.fault_set.n_cells} cells, not of this model")
+        raise ValueError(
+            f"{args.adapted}: an adaptation over {classifier.fault_set.n_cells} cells, not of this"
+            " model"
+        )
     whole = args.all or trained.split_seed is None
     if whole and not args.all:
-        say(args, f"{args.model} does not store the split of its training: scored on all recordings given")
+        say(
+            args,
+            f"{args.model} does not store the split of its training: scored on all recordings"
+            " given",
+        )
     say_short(args, recordings, model.length)
     windows = trained.windows(recordings) if whole else trained.parts(recordings)[2]
     rng = np.random.default_rng(args.seed)
@@ -80,9 +109,14 @@ def run(args: argparse.Namespace) -> int:
     }
     lines = (
         f"{len(cells)} cells faulty: {scores}" if cells else str(scores),
-        f"95 % interval of the accuracy, clustered by recording: {interval[0]:.3f} to {interval[1]:.3f}",
-        f"whole recordings, all windows of one together: accuracy {whole_recordings.accuracy:.3f}"
-        f" on {whole_recordings.n} recordings",
+        (
+            f"95 % interval of the accuracy, clustered by recording: {interval[0]:.3f} to"
+            f" {interval[1]:.3f}"
+        ),
+        (
+            "whole recordings, all windows of one together: accuracy"
+            f" {whole_recordings.accuracy:.3f} on {whole_recordings.n} recordings"
+        ),
     )
     emit(args, result, "\n".join(lines))
     return 0

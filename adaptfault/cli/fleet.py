@@ -1,18 +1,30 @@
-"""adaptfault fleet: maintains many robots in parallel, reports what the fleet needs and how its sensors age."""
+"""adaptfault fleet: maintains many robots in parallel, reports what the fleet needs and how its
+sensors age."""
 
 from __future__ import annotations
 
 import argparse
 
-from adaptfault.cli.options import Commands, add_sign, add_trust, command, emit, progress, say, trust
+from adaptfault.cli.options import (
+    Commands,
+    add_sign,
+    add_trust,
+    command,
+    emit,
+    progress,
+    say,
+    trust,
+)
 
 _EXAMPLE = """  adaptfault fleet maintain FLEET.toml --jobs 8
-      FLEET.toml lists robots as [[robots]] with name, bundle, recordings (and tags, commissioned = 2025-03-01),
+      FLEET.toml lists robots as [[robots]] with name, bundle, recordings
+      (and tags, commissioned = 2025-03-01),
       or as bundles = "robots/*/robot.bundle" and recordings = "{bundle_dir}/recordings";
       after a crash the same command continues"""
 
 _SURVIVAL = """  adaptfault fleet survival FLEET.toml --picture survival.png
-      from the journals of the bundles: how long wires and cells last, and whom to service in the next 30 days"""
+      from the journals of the bundles: how long wires and cells last,
+      and whom to service in the next 30 days"""
 
 
 def add(commands: Commands) -> None:
@@ -26,26 +38,41 @@ def add(commands: Commands) -> None:
     )
     inner = group.add_subparsers(dest="fleet_command", required=True, metavar="COMMAND")
     parser = command(
-        inner, "maintain", "maintain all robots of a list; exit code 2, 3, 1, 0: the worst of them", _EXAMPLE
+        inner,
+        "maintain",
+        "maintain all robots of a list; exit code 2, 3, 1, 0: the worst of them",
+        _EXAMPLE,
     )
     parser.add_argument("fleet", metavar="FLEET.toml", help="list of the robots")
-    parser.add_argument("--jobs", type=int, metavar="N", help="worker processes (default: as many as cores)")
-    parser.add_argument("--dask", metavar="ADDRESS", help="a Dask scheduler whose workers do it, as tcp://host:8786")
+    parser.add_argument(
+        "--jobs", type=int, metavar="N", help="worker processes (default: as many as cores)"
+    )
+    parser.add_argument(
+        "--dask", metavar="ADDRESS", help="a Dask scheduler whose workers do it, as tcp://host:8786"
+    )
     parser.add_argument("--dry-run", action="store_true", help="report only, change nothing")
-    parser.add_argument("--budget", type=float, metavar="S", help="seconds that one adaptation may take")
+    parser.add_argument(
+        "--budget", type=float, metavar="S", help="seconds that one adaptation may take"
+    )
     parser.add_argument(
         "--limit",
         type=float,
         metavar="S",
         help="seconds that one robot may take; past it, it is an error (default: none)",
     )
-    parser.add_argument("--out", metavar="FOLDER", help="of ledger and reports (default: FLEET.fleet)")
+    parser.add_argument(
+        "--out", metavar="FOLDER", help="of ledger and reports (default: FLEET.fleet)"
+    )
     add_trust(parser)
     add_sign(parser, "each bundle after its run")
     parser.set_defaults(run=run)
-    parser = command(inner, "survival", "how long wires and cells last, and whom to service next", _SURVIVAL)
+    parser = command(
+        inner, "survival", "how long wires and cells last, and whom to service next", _SURVIVAL
+    )
     parser.add_argument("fleet", metavar="FLEET.toml", help="list of the robots")
-    parser.add_argument("--days", type=float, default=30.0, metavar="N", help="time ahead (default 30)")
+    parser.add_argument(
+        "--days", type=float, default=30.0, metavar="N", help="time ahead (default 30)"
+    )
     parser.add_argument("--picture", metavar="FILE", help="write the survival curves as PNG")
     parser.set_defaults(run=survival, writes=("picture",))
 
@@ -73,7 +100,9 @@ def run(args: argparse.Namespace) -> int:
         sign=args.sign,
         progress=progress(args),
     )
-    atomic_write(folder / "report.json", json.dumps(report.to_dict(), indent=1, allow_nan=False).encode())
+    atomic_write(
+        folder / "report.json", json.dumps(report.to_dict(), indent=1, allow_nan=False).encode()
+    )
     page = report.write_page(folder / "report.html")
     say(args, f"report: {page}")
     emit(args, report.to_dict(), str(report))
@@ -82,8 +111,8 @@ def run(args: argparse.Namespace) -> int:
 
 def survival(args: argparse.Namespace) -> int:
     """Tell how the sensors of a fleet age."""
-    from adaptfault.fleet.ageing import FleetSurvival
     from adaptfault.fleet.listing import Fleet
+    from adaptfault.prognosis.lifetimes import FleetSurvival
 
     found = FleetSurvival.of(Fleet.read(args.fleet), args.days)
     if args.picture:

@@ -1,4 +1,5 @@
-"""adaptfault forecast: the accuracy to expect after a repair, for a fault set or for the worst faults of the array."""
+"""adaptfault forecast: the accuracy to expect after a repair, for a fault set or for the worst
+faults of the array."""
 
 from __future__ import annotations
 
@@ -24,18 +25,29 @@ _EXAMPLE = """  adaptfault forecast robot.bundle --worst --picture worst.png
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "forecast", "forecast the accuracy after a repair, before anything breaks", _EXAMPLE)
+    parser = command(
+        commands,
+        "forecast",
+        "forecast the accuracy after a repair, before anything breaks",
+        _EXAMPLE,
+    )
     parser.add_argument(
-        "model", metavar="MODEL", help="folder written by adaptfault train or adapt --keep, or a bundle"
+        "model",
+        metavar="MODEL",
+        help="folder written by adaptfault train or adapt --keep, or a bundle",
     )
     add_recordings(parser, least=0)
-    parser.add_argument("--faults", metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200")
+    parser.add_argument(
+        "--faults", metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200"
+    )
     parser.add_argument(
         "--new",
         type=float,
         metavar="N",
-        help="with --faults: number of new recordings that the intervals are for (default: as many as validation has;"
-        " inf: the expected accuracy itself)",
+        help=(
+            "with --faults: number of new recordings that the intervals are for (default: as many"
+            " as validation has; inf: the expected accuracy itself)"
+        ),
     )
     parser.add_argument(
         "--worst",
@@ -43,9 +55,15 @@ def add(commands: Commands) -> None:
         help="forecast each wire, each pad and pairs of the worst wires; lists the worst",
     )
     parser.add_argument(
-        "--among", type=int, default=5, metavar="N", help="forecast all pairs of the N worst wires (default 5)"
+        "--among",
+        type=int,
+        default=5,
+        metavar="N",
+        help="forecast all pairs of the N worst wires (default 5)",
     )
-    parser.add_argument("--picture", metavar="PNG", help="with --worst: a map of what each wire costs")
+    parser.add_argument(
+        "--picture", metavar="PNG", help="with --worst: a map of what each wire costs"
+    )
     add_device(parser)
     add_trust(parser)
     parser.set_defaults(run=run)

@@ -1,4 +1,5 @@
-"""adaptfault history: lists the maintenance runs and versions of a robot, and what drifts over them."""
+"""adaptfault history: lists the maintenance runs and versions of a robot, and what drifts over
+them."""
 
 from __future__ import annotations
 
@@ -17,19 +18,27 @@ _EXAMPLE = """  adaptfault history robot.bundle --last 10
 def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "history", "list maintenance runs and versions", _EXAMPLE)
-    parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
+    parser.add_argument(
+        "bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle"
+    )
     parser.add_argument("--last", type=int, metavar="N", help="only the last N entries")
-    parser.add_argument("--confirm", action="store_true", help="end the probation of the version that runs")
-    parser.add_argument("--trend", action="store_true", help="what drifts from run to run, in place of the runs")
-    parser.add_argument("--picture", metavar="FILE", help="with --trend: write the drifting series as PNG")
+    parser.add_argument(
+        "--confirm", action="store_true", help="end the probation of the version that runs"
+    )
+    parser.add_argument(
+        "--trend", action="store_true", help="what drifts from run to run, in place of the runs"
+    )
+    parser.add_argument(
+        "--picture", metavar="FILE", help="with --trend: write the drifting series as PNG"
+    )
     add_trust(parser)
     parser.set_defaults(run=run, writes=("picture",))
 
 
 def run(args: argparse.Namespace) -> int:
     """List runs and versions."""
-    from adaptfault.robot.bundle import Bundle
-    from adaptfault.robot.pointer import Pointer
+    from adaptfault.bundle.bundle import Bundle
+    from adaptfault.bundle.pointer import Pointer
 
     bundle = Bundle.open(args.bundle, **trust(args))
     if args.picture and not args.trend:
@@ -37,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     if args.confirm:
         bundle.confirm()
     if args.trend:
-        from adaptfault.robot.ageing import AgeingTable
+        from adaptfault.prognosis.cell_condition import AgeingTable
 
         report = AgeingTable.of(bundle).report()
         if args.picture:

@@ -16,7 +16,9 @@ INJECT_HELP = (
 )
 
 
-def parse_faults(texts: Sequence[str], layout: SensorLayout, rng: np.random.Generator) -> list[Fault]:
+def parse_faults(
+    texts: Sequence[str], layout: SensorLayout, rng: np.random.Generator
+) -> list[Fault]:
     """Read faults such as ``row:0:3=open``, ``cell:1:4:5=stuck:2.5``, ``random:5=short``.
 
     Random cells are drawn from the present ones, none twice.

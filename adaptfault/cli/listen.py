@@ -11,32 +11,52 @@ if TYPE_CHECKING:
     from adaptfault.acquisition import Station
 
 _EXAMPLE = """  adaptfault listen robot.bundle --port 5005 --record today/ --when contact
-      packets: device_id,timestamp,one value a cell; without a bundle cells are monitored, nothing is classified
+      packets: device_id,timestamp,one value a cell;
+      without a bundle cells are monitored, nothing is classified
   adaptfault listen robot.bundle --port 5005 --relay 127.0.0.1:5006
-      a consumer on port 5006 reads whole frames in the same format: faulty cells are restored from the healthy ones
+      a consumer on port 5006 reads whole frames in the same format:
+      faulty cells are restored from the healthy ones
       on stdin: record, stop, auto (as --when states), quit"""
 
 _WHEN = (
-    "always | command (on stdin) | contact or contact:X (cells above X in the array's unit, default 5 %% of full scale)"
-    " | HH:MM-HH:MM (local time); default contact"
+    "always | command (on stdin) | contact or contact:X (cells above X in the array's unit, default"
+    " 5 %% of full scale) | HH:MM-HH:MM (local time); default contact"
 )
 _DEVICE = "listen to this one only, ID or ID@ADDRESS; may be repeated"
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "listen", "monitor, classify and record frames that sensors send over UDP", _EXAMPLE)
-    parser.add_argument("bundle", nargs="?", metavar="BUNDLE", help="the robot's bundle, to classify as well")
-    parser.add_argument("--port", type=int, required=True, help="UDP port; 0 takes a free one and prints it")
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this machine only)")
-    parser.add_argument("--device", action="append", metavar="ID", help=_DEVICE)
-    parser.add_argument("--key", metavar="FILE", help="accept only packets that are authenticated with this key")
+    parser = command(
+        commands,
+        "listen",
+        "monitor, classify and record frames that sensors send over UDP",
+        _EXAMPLE,
+    )
     parser.add_argument(
-        "--ticks", type=float, default=1000.0, help="time stamps count so many a second (default 1000: milliseconds)"
+        "bundle", nargs="?", metavar="BUNDLE", help="the robot's bundle, to classify as well"
+    )
+    parser.add_argument(
+        "--port", type=int, required=True, help="UDP port; 0 takes a free one and prints it"
+    )
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on (default: this machine only)"
+    )
+    parser.add_argument("--device", action="append", metavar="ID", help=_DEVICE)
+    parser.add_argument(
+        "--key", metavar="FILE", help="accept only packets that are authenticated with this key"
+    )
+    parser.add_argument(
+        "--ticks",
+        type=float,
+        default=1000.0,
+        help="time stamps count so many a second (default 1000: milliseconds)",
     )
     parser.add_argument("--record", metavar="FOLDER", help="record into this folder, CSV")
     parser.add_argument(
-        "--relay", metavar="HOST:PORT", help="send repaired packets on; restored values have a plus sign; needs BUNDLE"
+        "--relay",
+        metavar="HOST:PORT",
+        help="send repaired packets on; restored values have a plus sign; needs BUNDLE",
     )
     parser.add_argument("--when", metavar="WHEN", help=_WHEN)
     parser.add_argument("--seconds", type=float, metavar="S", help="end after so long")
@@ -73,11 +93,15 @@ def _station(args: argparse.Namespace) -> Station:
         raise ValueError("--record '': name a folder")
     table = args.calibration
     if args.bundle and not table:
-        from adaptfault.robot.bundle import Bundle
+        from adaptfault.bundle.bundle import Bundle
 
         table = Bundle.open(args.bundle, **trust(args)).parts.calibration
     tables = Calibration.read(table) if table else None
-    layout = layout_of(args) if tables is None else layout_of(args, full_scale=tables.full_scale, unit="N")
+    layout = (
+        layout_of(args)
+        if tables is None
+        else layout_of(args, full_scale=tables.full_scale, unit="N")
+    )
     return Station(
         None if args.bundle else layout,
         args.port,

@@ -1,24 +1,46 @@
-"""adaptfault maintain: diagnoses new recordings of a robot, adapts its model, deploys or keeps it."""
+"""adaptfault maintain: diagnoses new recordings of a robot, adapts its model, deploys or keeps
+it."""
 
 from __future__ import annotations
 
 import argparse
 
-from adaptfault.cli.options import Commands, add_sign, add_trust, add_untested_code, command, emit, say, trust
+from adaptfault.cli.options import (
+    Commands,
+    add_sign,
+    add_trust,
+    add_untested_code,
+    command,
+    emit,
+    say,
+    trust,
+)
 
 _EXAMPLE = """  adaptfault maintain robot.bundle today/
       recordings seen before are skipped
-      exit code: 0 nothing to do, 1 faults that are handled, or a warning, 2 a person is needed, 3 unusable input
+      exit code: 0 nothing to do, 1 faults that are handled, or a warning,
+      2 a person is needed, 3 unusable input
   adaptfault maintain robot.bundle today/ --dry-run --report report.html"""
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "maintain", "diagnose new recordings and update the model that the robot runs", _EXAMPLE)
-    parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
-    parser.add_argument("recordings", nargs="+", metavar="RECORDINGS", help="file or folder of recordings")
+    parser = command(
+        commands,
+        "maintain",
+        "diagnose new recordings and update the model that the robot runs",
+        _EXAMPLE,
+    )
+    parser.add_argument(
+        "bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle"
+    )
+    parser.add_argument(
+        "recordings", nargs="+", metavar="RECORDINGS", help="file or folder of recordings"
+    )
     parser.add_argument("--dry-run", action="store_true", help="report only, change nothing")
-    parser.add_argument("--budget", type=float, metavar="S", help="seconds that an adaptation may take")
+    parser.add_argument(
+        "--budget", type=float, metavar="S", help="seconds that an adaptation may take"
+    )
     add_untested_code(parser)
     parser.add_argument("--report", metavar="FILE", help="write the technician's report (HTML)")
     add_trust(parser)
@@ -30,10 +52,10 @@ def run(args: argparse.Namespace) -> int:
     """Maintain; the exit code gives the state of the sensor."""
     import sys
 
-    from adaptfault.robot.bundle import Bundle
+    from adaptfault.bundle.bundle import Bundle
+    from adaptfault.bundle.signing import sign_bundle
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.new_recordings import load_new_recordings
-    from adaptfault.robot.signature import sign_bundle
 
     bundle = Bundle.open(args.bundle, **trust(args))
     incoming = load_new_recordings(bundle, args.recordings)

@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 from adaptfault.data.printable import printable
 
 if TYPE_CHECKING:
-    from adaptfault.data.recordings import Loaded, Recordings
-    from adaptfault.data.recordings.blocks import Stream
+    from numpy.typing import NDArray
+
+    from adaptfault.data.recordings import Loaded, Opened, Problem, Recordings
     from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
 Commands = Any  # argparse's private type of subparsers
@@ -39,20 +40,29 @@ def command(commands: Commands, name: str, summary: str, example: str) -> argpar
 def add_recordings(
     parser: argparse.ArgumentParser, *, option: bool = False, labels: bool = True, least: int = 1
 ) -> None:
-    """Add the paths of recordings, as ``least`` arguments or as an ``option``, and how they are read."""
+    """Add the paths of recordings, as ``least`` arguments or as an ``option``, and how they are
+    read."""
     help_ = "file or folder of recordings (.csv, .npz, .npy; ROS 2 bags: folder, .mcap, .db3)"
     if option:
         parser.add_argument("--recordings", nargs="+", metavar="FILE", help=help_)
     else:
-        parser.add_argument("recordings", nargs="+" if least else "*", metavar="RECORDINGS", help=help_)
+        parser.add_argument(
+            "recordings", nargs="+" if least else "*", metavar="RECORDINGS", help=help_
+        )
     group = add_array(parser)
     if labels:
-        group.add_argument("--labels", metavar="TABLE", help="CSV table with the columns file,label")
+        group.add_argument(
+            "--labels", metavar="TABLE", help="CSV table with the columns file,label"
+        )
     group.add_argument("--topic", metavar="NAME", help="topic of a bag that holds the readings")
     group.add_argument(
-        "--field", metavar="PATH", help="array in its messages that holds them, as data or sensors.values"
+        "--field",
+        metavar="PATH",
+        help="array in its messages that holds them, as data or sensors.values",
     )
-    group.add_argument("--frames", type=int, metavar="T", help="refuse recordings of another length")
+    group.add_argument(
+        "--frames", type=int, metavar="T", help="refuse recordings of another length"
+    )
 
 
 def add_untested_code(parser: argparse.ArgumentParser) -> None:
@@ -63,7 +73,10 @@ def add_untested_code(parser: argparse.ArgumentParser) -> None:
         default=1,
         choices=range(4),
         metavar="CODE",
-        help="exit code where no fault is found and less than 5 %% of the cells are tested (default 1)",
+        help=(
+            "exit code where no fault is found and less than 5 %% of the cells are tested"
+            " (default 1)"
+        ),
     )
 
 
@@ -77,17 +90,23 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
         help="PEM file of a public ed25519 key that must have signed the bundle; may be repeated",
     )
     group.add_argument(
-        "--least-serial", type=int, metavar="N", help="with --trust: smallest serial number of the signature"
+        "--least-serial",
+        type=int,
+        metavar="N",
+        help="with --trust: smallest serial number of the signature",
     )
 
 
 def add_sign(parser: argparse.ArgumentParser, when: str) -> None:
     """Add the key that signs a bundle."""
-    parser.add_argument("--sign", metavar="KEY", help=f"sign {when} with this private ed25519 key (PEM)")
+    parser.add_argument(
+        "--sign", metavar="KEY", help=f"sign {when} with this private ed25519 key (PEM)"
+    )
 
 
 def trust(args: argparse.Namespace) -> dict[str, Any]:
-    """Return whose signature a bundle needs, as ``Bundle.open`` takes it; the key that signs is trusted, too.
+    """Return whose signature a bundle needs, as ``Bundle.open`` takes it; the key that signs is
+    trusted, too.
 
     Raises:
         ValueError: a serial number without a key.
@@ -103,7 +122,9 @@ def trust(args: argparse.Namespace) -> dict[str, Any]:
 
 def add_device(parser: argparse.ArgumentParser) -> None:
     """Add the option of the device that trains networks."""
-    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default auto: cuda where there is one)")
+    parser.add_argument(
+        "--device", default="auto", help="auto, cpu or cuda (default auto: cuda where there is one)"
+    )
 
 
 def device(args: argparse.Namespace) -> str:
@@ -120,26 +141,40 @@ def device(args: argparse.Namespace) -> str:
     try:
         torch.empty(1, device=name)
     except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"--device {name}: {str(error).splitlines()[0]}; use auto, cpu or cuda") from None
+        raise ValueError(
+            f"--device {name}: {str(error).splitlines()[0]}; use auto, cpu or cuda"
+        ) from None
     return name
 
 
-def add_array(parser: argparse.ArgumentParser, *, calibration: bool = True) -> argparse._ArgumentGroup:
+def add_array(
+    parser: argparse.ArgumentParser, *, calibration: bool = True
+) -> argparse._ArgumentGroup:
     """Add the options that describe the array; returns their group."""
     group = parser.add_argument_group("how recordings are read" if calibration else "the array")
     group.add_argument(
-        "--layout", metavar="FILE", help="layout of the array, its wiring and direction of load: a JSON or TOML file"
+        "--layout",
+        metavar="FILE",
+        help="layout of the array, its wiring and direction of load: a JSON or TOML file",
     )
-    group.add_argument("--shape", metavar="PxRxC", help="shape: pads x rows x columns, as 2x13x6; 10x10 is one pad")
-    group.add_argument("--full-scale", type=float, metavar="X", help="largest value a cell can report")
+    group.add_argument(
+        "--shape", metavar="PxRxC", help="shape: pads x rows x columns, as 2x13x6; 10x10 is one pad"
+    )
+    group.add_argument(
+        "--full-scale", type=float, metavar="X", help="largest value a cell can report"
+    )
     group.add_argument("--unit", metavar="U", help="unit of the recordings, as N or count")
     group.add_argument("--rate", type=float, metavar="HZ", help="frames per second")
     if calibration:
-        group.add_argument("--calibration", metavar="TABLE", help="CSV table cell,raw,force: raw counts to newtons")
+        group.add_argument(
+            "--calibration", metavar="TABLE", help="CSV table cell,raw,force: raw counts to newtons"
+        )
     return group
 
 
-def layout_of(args: argparse.Namespace, *, full_scale: float | None = None, unit: str | None = None) -> SensorLayout:
+def layout_of(
+    args: argparse.Namespace, *, full_scale: float | None = None, unit: str | None = None
+) -> SensorLayout:
     """Return the array that the options describe, the paper's where they state nothing.
 
     Args:
@@ -151,7 +186,7 @@ def layout_of(args: argparse.Namespace, *, full_scale: float | None = None, unit
     """
     from dataclasses import replace
 
-    from adaptfault.data.recordings.resolve import given_array
+    from adaptfault.data.recordings.facts.resolve import given_array
     from diagnostics import SensorLayout
 
     array = given_array(_array(args)) or SensorLayout.paper()
@@ -165,7 +200,11 @@ def layout_of(args: argparse.Namespace, *, full_scale: float | None = None, unit
 
 
 def load_recordings(
-    args: argparse.Namespace, paths: Sequence[str], *, labelled: bool = False, layout: SensorLayout | None = None
+    args: argparse.Namespace,
+    paths: Sequence[str],
+    *,
+    labelled: bool = False,
+    layout: SensorLayout | None = None,
 ) -> Recordings:
     """Read recordings as the options state; problems and inferred facts go to stderr.
 
@@ -173,44 +212,82 @@ def load_recordings(
         args: the options of :func:`add_recordings`.
         paths: files and folders.
         labelled: whether labels are required.
-        layout: the layout that the recordings must have, as a model's; options and files may not contradict it.
+        layout: the layout that the recordings must have, as a model's; options and files may not
+            contradict it.
 
     Raises:
-        ValueError: nothing could be read, labels are required and missing, or an option contradicts ``layout``.
+        ValueError: nothing could be read, labels are required and missing, or an option contradicts
+            ``layout``.
     """
     loaded = load_reported(args, paths, layout)
     report_inferred(args, loaded.inferred)
     if labelled and loaded.recordings.labels is None:
         raise ValueError(
-            f"{paths[0]}: the recordings have no labels; give --labels TABLE, one folder for each class,"
-            " or labels in the .npz"
+            f"{paths[0]}: the recordings have no labels; give --labels TABLE, one folder for each"
+            " class, or labels in the .npz"
         )
     return loaded.recordings
 
 
-def load_reported(args: argparse.Namespace, paths: Sequence[str], layout: SensorLayout | None = None) -> Loaded:
+def load_reported(
+    args: argparse.Namespace, paths: Sequence[str], layout: SensorLayout | None = None
+) -> Loaded:
     """Read recordings as :func:`load_recordings`; only the problems are printed."""
     from adaptfault.data.recordings import load
 
-    options = _array_options(args) if layout is None else {**_agreeing(args, layout), "layout": layout, "strict": True}
-    loaded = load(paths, labels=getattr(args, "labels", None), frames=args.frames, **options)
-    for problem in loaded.problems:
-        print(problem, file=sys.stderr)
+    labels = getattr(args, "labels", None)
+    loaded = load(paths, labels=labels, frames=args.frames, **_options_of(args, layout))
+    _report(args, loaded.problems)
     if layout is not None:
-        _check_scale(paths[0], loaded.recordings)
+        check_scale(paths[0], loaded.recordings, layout)
     return loaded
 
 
-def stream_recordings(args: argparse.Namespace, paths: Sequence[str], layout: SensorLayout | None = None) -> Stream:
-    """Open recordings that are too large to be loaded, as the options state.
+def open_reported(
+    args: argparse.Namespace, paths: Sequence[str], layout: SensorLayout | None = None
+) -> Opened:
+    """Open recordings of any size, as the options state; the problems found so far are printed.
+
+    Args:
+        args: the options of :func:`add_recordings`.
+        paths: files and folders.
+        layout: as for :func:`load_recordings`.
 
     Raises:
         ValueError: nothing could be read, or an option contradicts ``layout``.
     """
-    from adaptfault.data.recordings.blocks import Stream
+    from adaptfault.data.recordings import open_recordings
 
-    options = _array_options(args) if layout is None else {**_agreeing(args, layout), "layout": layout}
-    return Stream(paths, **options)
+    with reading_bar(args) as advance:
+        opened = open_recordings(
+            paths,
+            labels=getattr(args, "labels", None),
+            frames=args.frames,
+            progress=advance,
+            **_options_of(args, layout),
+        )
+    _report(args, opened.problems)
+    return opened
+
+
+def report_range(opened: Opened) -> None:
+    """Print what the last reading of recordings found, after their problems were printed."""
+    for problem in opened.late_problems:
+        print(problem, file=sys.stderr)
+
+
+def _options_of(args: argparse.Namespace, layout: SensorLayout | None) -> dict[str, Any]:
+    """Return how recordings are read, as :func:`adaptfault.load` takes it."""
+    if layout is None:
+        return _array_options(args)
+    return {**_agreeing(args, layout), "layout": layout, "strict": True}
+
+
+def _report(args: argparse.Namespace, problems: Sequence[Problem]) -> None:
+    """Print the problems; recordings that are left out make the exit code 1 at least."""
+    for problem in problems:
+        print(problem, file=sys.stderr)
+    args.left_out = getattr(args, "left_out", 0) + sum(p.level == "error" for p in problems)
 
 
 def report_inferred(args: argparse.Namespace, inferred: Sequence[str]) -> None:
@@ -225,7 +302,7 @@ def _array(args: argparse.Namespace) -> str | tuple[int, int, int] | None:
     Raises:
         ValueError: both are given, or the shape is none.
     """
-    from adaptfault.data.recordings.layout_file import parse_shape
+    from adaptfault.data.recordings.facts.layout_file import parse_shape
 
     if args.layout and args.shape:
         raise ValueError("--layout and --shape both given: one of them is enough")
@@ -240,47 +317,62 @@ def _array_options(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _agreeing(args: argparse.Namespace, layout: SensorLayout) -> dict[str, Any]:
-    """Return the options that remain where the layout is known, after a check that none contradicts it."""
-    from adaptfault.data.recordings.resolve import given_array, same_rate
+    """Return the options that remain where the layout is known, after a check that none contradicts
+    it."""
+    from adaptfault.data.recordings.facts.resolve import given_array, same_rate
     from diagnostics import SensorLayout
 
     options = _array_options(args)
     array = given_array(options["layout"])
     shape = array.shape if isinstance(array, SensorLayout) else array
     if shape is not None and shape != layout.shape:
-        raise ValueError(f"--shape or --layout gives {' x '.join(map(str, shape))} cells, expected {layout}")
+        raise ValueError(
+            f"--shape or --layout gives {' x '.join(map(str, shape))} cells, expected {layout}"
+        )
     if args.full_scale is not None and args.full_scale != layout.full_scale:
-        raise ValueError(f"--full-scale {args.full_scale:g} given, expected {layout.full_scale:g} {layout.unit}")
+        raise ValueError(
+            f"--full-scale {args.full_scale:g} given, expected {layout.full_scale:g} {layout.unit}"
+        )
     if args.rate is not None and not same_rate(args.rate, layout.rate):
         raise ValueError(f"--rate {args.rate:g} given, expected {layout.rate:g} Hz")
     return {name: options[name] for name in ("calibration", "topic", "field")}
 
 
-def _check_scale(path: str, recordings: Recordings) -> None:
+def check_scale(path: str, recordings: Iterable[NDArray[Any]], layout: SensorLayout) -> None:
     """Refuse readings most of which exceed the full scale; warn if none comes near it.
+
+    Args:
+        path: for messages.
+        recordings: ``[T, D]`` each.
+        layout: that of a model or of a reference.
 
     Raises:
         ValueError: more than half of the readings above 0 exceed the full scale.
     """
     import numpy as np
 
-    layout = recordings.layout
     # A cell that reads the same all the time shows no unit: it may be broken.
     moving = [
-        frames[:, np.nanmin(frames, axis=0, initial=np.inf) < np.nanmax(frames, axis=0, initial=-np.inf)]
+        frames[
+            :,
+            np.nanmin(frames, axis=0, initial=np.inf) < np.nanmax(frames, axis=0, initial=-np.inf),
+        ]
         for frames in recordings
     ]
     readings = np.concatenate([frames[frames > 0] for frames in moving])
     if not readings.size:
         return
-    full, largest = layout.full_scale, float(readings.max())
+    full = layout.full_scale
+    largest = float(readings.max())
     if np.median(readings) > 1.02 * full:
         raise ValueError(
             f"{path}: readings reach {largest:.4g} where the full scale is {full:g} {layout.unit};"
             " use recordings in the same unit"
         )
     if largest < 0.1 * full:
-        what = f"the largest reading is {largest:.4g} where the full scale is {full:g} {layout.unit}"
+        what = (
+            f"the largest reading is {largest:.4g} where the full scale is {full:g} {layout.unit}"
+        )
         print(f"warning: {path}: {what}; is it the same unit?", file=sys.stderr)
 
 
@@ -289,37 +381,55 @@ def refuse_missing(args: argparse.Namespace) -> None:
 
     Checked are the inputs of every command, and the folders of the files that it writes.
     """
-    many = [path for name in ("recordings", "reference", "trust") for path in getattr(args, name, None) or []]
+    many = [
+        path
+        for name in ("recordings", "reference", "trust")
+        for path in getattr(args, name, None) or []
+    ]
     names = ("labels", "layout", "calibration", "adapted", "model", "fleet", "sign")
     one = [getattr(args, name, None) for name in names]
     for path in (path for path in (*many, *one) if path is not None):
-        if not os.path.lexists(path):  # an empty path, as of a shell variable that is not set, is none either
+        # an empty path, as of a shell variable that is not set, is none either
+        if not os.path.lexists(path):
             raise ValueError(f"{path or repr(path)}: is not there; check the path")
     model = getattr(args, "model", None)
-    if model is not None and not is_bundle(model) and not os.path.isfile(os.path.join(model, "manifest.json")):
+    if (
+        model is not None
+        and not is_bundle(model)
+        and not os.path.isfile(os.path.join(model, "manifest.json"))
+    ):
         raise ValueError(
-            f"{model}: expected a model, a folder with manifest.json as adaptfault train writes it, or a bundle"
+            f"{model}: expected a model, a folder with manifest.json as adaptfault train writes it,"
+            " or a bundle"
         )
     bundle = getattr(args, "bundle", None)
     if bundle is not None and not is_bundle(bundle):
-        what = "expected a bundle, a folder with bundle.json; adaptfault train --out X.bundle makes one"
+        what = (
+            "expected a bundle, a folder with bundle.json; adaptfault train --out X.bundle"
+            " makes one"
+        )
         raise ValueError(f"{bundle}: {what}")
     for name in getattr(args, "writes", ()):
         path = getattr(args, name)
         if path == "":  # as of a shell variable that is not set: nothing would be written
-            raise ValueError(f"--{name} '': name a file")
+            raise ValueError(f"--{name.replace('_', '-')} '': name a file")
         folder = os.path.dirname(path) if path else ""
         if folder and not os.path.isdir(folder):
-            raise ValueError(f"--{name} {path}: the folder {folder} is not there; create it first")
+            option = name.replace("_", "-")
+            what = f"the folder {folder} is not there; create it first"
+            raise ValueError(f"--{option} {path}: {what}")
 
 
 def is_bundle(folder: str | os.PathLike[str]) -> bool:
     """Return whether a folder holds the document of a bundle, or its copy."""
-    return any(os.path.isfile(os.path.join(folder, name)) for name in ("bundle.json", "bundle.copy.json"))
+    return any(
+        os.path.isfile(os.path.join(folder, name)) for name in ("bundle.json", "bundle.copy.json")
+    )
 
 
 def fault_set(text: str, layout: SensorLayout) -> FaultSet:
-    """Read F: a diagnosis written by ``adaptfault diagnose --out``, or cell indices as ``3,17,200`` ("" = none).
+    """Read F: a diagnosis written by ``adaptfault diagnose --out``, or cell indices as ``3,17,200``
+    ("" = none).
 
     Raises:
         ValueError: neither, or F is over another array.
@@ -334,7 +444,7 @@ def fault_set(text: str, layout: SensorLayout) -> FaultSet:
 
 
 def _diagnosed(path: Path, layout: SensorLayout) -> FaultSet:
-    from adaptfault.data.recordings.text import read_json_object
+    from adaptfault.data.recordings.formats.text import read_json_object
     from diagnostics import Diagnosis
 
     if not path.is_file():
@@ -342,9 +452,13 @@ def _diagnosed(path: Path, layout: SensorLayout) -> FaultSet:
     try:
         diagnosis = Diagnosis.from_dict(read_json_object(path))
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: not a diagnosis ({error}); write one with adaptfault diagnose --out") from None
+        raise ValueError(
+            f"{path}: not a diagnosis ({error}); write one with adaptfault diagnose --out"
+        ) from None
     if diagnosis.layout.shape != layout.shape:
-        raise ValueError(f"{path}: a diagnosis of {diagnosis.layout}, but the model is for {layout}")
+        raise ValueError(
+            f"{path}: a diagnosis of {diagnosis.layout}, but the model is for {layout}"
+        )
     return diagnosis.fault_set
 
 
@@ -364,7 +478,8 @@ def fit_diagnoser(args: argparse.Namespace, recordings: Recordings) -> SelfDiagn
 
 @contextmanager
 def fitting_bar(args: argparse.Namespace) -> Iterator[Callable[[float], None]]:
-    """Show a bar while something is fitted; it is called with the share of the work that is done."""
+    """Show a bar while something is fitted; it is called with the share of the work that is
+    done."""
     from tqdm import tqdm
 
     form = "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]"
@@ -373,6 +488,20 @@ def fitting_bar(args: argparse.Namespace) -> Iterator[Callable[[float], None]]:
 
         def advance(share: float) -> None:
             bar.update(share - bar.n)
+
+        yield advance
+
+
+@contextmanager
+def reading_bar(args: argparse.Namespace) -> Iterator[Callable[[int], None]]:
+    """Show the frames that are read; it is called with the number of more frames."""
+    from tqdm import tqdm
+
+    hide = None if (shown := progress(args)) is None else not shown
+    with tqdm(unit="frame", desc="reading", disable=hide, leave=False, unit_scale=True) as bar:
+
+        def advance(frames: int) -> None:
+            bar.update(frames)
 
         yield advance
 
@@ -395,7 +524,8 @@ def above_bars(text: str) -> None:
 
 
 class LogAboveBars(logging.Handler):
-    """Prints warnings of the library as :func:`say` prints steps: a line of its own, above a progress bar."""
+    """Prints warnings of the library as :func:`say` prints steps: a line of its own, above a
+    progress bar."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a message."""

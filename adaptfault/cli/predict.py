@@ -42,8 +42,12 @@ def run(args: argparse.Namespace) -> int:
     trained = TrainedModel.open(args, args.model or args.bundle)
     if args.calibration is None and trained.calibration is not None:
         args.calibration = str(trained.calibration)
-    recordings = trained.rewired(load_recordings(args, args.recordings, layout=trained.network.layout))
-    windows = make_windows(recordings.frames, None, recordings.layout, length=trained.network.length)
+    recordings = trained.rewired(
+        load_recordings(args, args.recordings, layout=trained.network.layout)
+    )
+    windows = make_windows(
+        recordings.frames, None, recordings.layout, length=trained.network.length
+    )
     trained.adaptation.model.to(device(args))
     probabilities = trained.adaptation.predict_proba(windows.x)
     names = trained.class_names or tuple(f"class {i}" for i in range(probabilities.shape[1]))
@@ -57,8 +61,12 @@ def run(args: argparse.Namespace) -> int:
                 "class": None if mean is None else names[int(mean.argmax())],
                 "probability": None if mean is None else float(mean.max()),
                 "windows": len(own),
-                "agreeing_windows": 0 if mean is None else int(np.sum(own.argmax(axis=1) == mean.argmax())),
-                "label": None if recordings.labels is None else recordings.class_names[recordings.labels[i]],
+                "agreeing_windows": 0
+                if mean is None
+                else int(np.sum(own.argmax(axis=1) == mean.argmax())),
+                "label": None
+                if recordings.labels is None
+                else recordings.class_names[recordings.labels[i]],
             }
         )
     result = {
@@ -73,16 +81,24 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _table(results: list[dict[str, object]]) -> str:
-    """Return one line a recording: name, class, probability, windows, and the label where there is one."""
+    """Return one line a recording: name, class, probability, windows, and the label where there is
+    one."""
     labelled = any(result["label"] is not None for result in results)
     rows = [("recording", "class", "P", "windows that agree", *(["label"] if labelled else []))]
     for one in results:
         agreeing = f"{one['agreeing_windows']} of {one['windows']}"
         known = one["class"] is not None
-        row = (str(one["class"]), f"{one['probability']:.2f}", agreeing) if known else ("shorter than a window", "", "")
+        row = (
+            (str(one["class"]), f"{one['probability']:.2f}", agreeing)
+            if known
+            else ("shorter than a window", "", "")
+        )
         rows.append((str(one["recording"]), *row, *([str(one["label"])] if labelled else [])))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(text.ljust(n) for text, n in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines = [
+        "  ".join(text.ljust(n) for text, n in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
     if labelled:
         right = sum(one["class"] == one["label"] for one in results)
         lines.append(f"{right} of {len(results)} recordings are predicted as labelled")

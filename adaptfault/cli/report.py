@@ -10,17 +10,23 @@ from adaptfault.cli.options import Commands, add_trust, command, emit, trust
 def add(commands: Commands) -> None:
     """Add the command."""
     example = "  adaptfault report robot.bundle --out report.html"
-    parser = command(commands, "report", "write the technician's report: what is broken, what to check", example)
-    parser.add_argument("bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle")
+    parser = command(
+        commands, "report", "write the technician's report: what is broken, what to check", example
+    )
+    parser.add_argument(
+        "bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle"
+    )
     parser.add_argument("--out", default="report.html", metavar="FILE", help="default report.html")
-    parser.add_argument("--name", metavar="NAME", help="of the robot (default: of the bundle or its folder)")
+    parser.add_argument(
+        "--name", metavar="NAME", help="of the robot (default: of the bundle or its folder)"
+    )
     add_trust(parser)
     parser.set_defaults(run=run)  # the folder of the page is made
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the page."""
-    from adaptfault.robot.bundle import Bundle
+    from adaptfault.bundle.bundle import Bundle
     from adaptfault.robot.technician_report import write_report
 
     path = write_report(args.out, Bundle.open(args.bundle, **trust(args)), name=args.name)

@@ -1,4 +1,5 @@
-"""adaptfault reproduce: the paper's figures and claims, on simulated grasps or on the user's own recordings."""
+"""adaptfault reproduce: the paper's figures and claims, on simulated grasps or on the user's own
+recordings."""
 
 from __future__ import annotations
 
@@ -24,7 +25,9 @@ _EXAMPLE = """  adaptfault reproduce --quick
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "reproduce", "repeat the paper's experiments: figures, claims, a page", _EXAMPLE)
+    parser = command(
+        commands, "reproduce", "repeat the paper's experiments: figures, claims, a page", _EXAMPLE
+    )
     add_recordings(parser, option=True)
     parser.add_argument(
         "--figure",
@@ -34,16 +37,26 @@ def add(commands: Commands) -> None:
         help="only this figure of the paper (7: its future work); may be given several times",
     )
     size = parser.add_mutually_exclusive_group()
-    size.add_argument("--quick", action="store_true", help="about 14 minutes on two free cores (default)")
-    size.add_argument("--full", action="store_true", help="as the paper: 50 epochs, 200k samples; for a GPU")
+    size.add_argument(
+        "--quick", action="store_true", help="about 14 minutes on two free cores (default)"
+    )
+    size.add_argument(
+        "--full", action="store_true", help="as the paper: 50 epochs, 200k samples; for a GPU"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", help="default 0 1 2")
     parser.add_argument("--grasps", type=int, help="simulated grasps of each class (default 200)")
     parser.add_argument("--epochs", type=int, help="of the fault-free network")
     parser.add_argument(
-        "--samples", type=int, nargs="+", metavar="N", help="windows added in fault-aware training (--quick: 10000)"
+        "--samples",
+        type=int,
+        nargs="+",
+        metavar="N",
+        help="windows added in fault-aware training (--quick: 10000)",
     )
     add_device(parser)
-    parser.add_argument("--out", default="adaptfault-paper", metavar="FOLDER", help="default adaptfault-paper")
+    parser.add_argument(
+        "--out", default="adaptfault-paper", metavar="FOLDER", help="default adaptfault-paper"
+    )
     parser.set_defaults(run=run)
 
 
@@ -55,9 +68,14 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.paper.settings import Settings
 
     if args.recordings:
-        recordings, source = load_recordings(args, args.recordings, labelled=True), Path(args.recordings[0]).name
+        recordings, source = (
+            load_recordings(args, args.recordings, labelled=True),
+            Path(args.recordings[0]).name,
+        )
     if args.samples and min(args.samples) < 1:
-        raise ValueError(f"--samples {min(args.samples)}: fault-aware training adds 1 window or more")
+        raise ValueError(
+            f"--samples {min(args.samples)}: fault-aware training adds 1 window or more"
+        )
     settings = Settings.full() if args.full else Settings.quick(simulated=not args.recordings)
     settings = replace(
         settings,
@@ -70,7 +88,8 @@ def run(args: argparse.Namespace) -> int:
         from adaptfault.data.simulated_grasps import simulate
 
         say(args, f"simulating {settings.grasps} grasps of each class")
-        recordings, source = simulate(settings.grasps), "simulated grasps"
+        recordings = simulate(settings.grasps)
+        source = "simulated grasps"
     say(args, "loading torch")
 
     from adaptfault.paper.run import FIGURES, reproduce

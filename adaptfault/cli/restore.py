@@ -10,22 +10,33 @@ from pathlib import Path
 from adaptfault.cli.options import Commands, add_trust, command, emit, say, trust
 
 _EXAMPLE = """  adaptfault restore today/ --bundle robot.bundle --out restored/
-      writes restored.npz, readable by every command, and restored.json with the deviation of each restored cell
+      writes restored.npz, readable by every command,
+      and restored.json with the deviation of each restored cell
   adaptfault restore today/ --bundle robot.bundle --out restored/ --faults 3,17,200"""
 
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "restore", "replace faulty cells by estimates from the healthy ones", _EXAMPLE)
-    parser.add_argument("recordings", nargs="+", metavar="RECORDINGS", help="file or folder of recordings")
+    parser = command(
+        commands, "restore", "replace faulty cells by estimates from the healthy ones", _EXAMPLE
+    )
     parser.add_argument(
-        "--bundle", required=True, metavar="BUNDLE", help="folder with the healthy windows of the array"
+        "recordings", nargs="+", metavar="RECORDINGS", help="file or folder of recordings"
+    )
+    parser.add_argument(
+        "--bundle",
+        required=True,
+        metavar="BUNDLE",
+        help="folder with the healthy windows of the array",
     )
     parser.add_argument("--out", required=True, metavar="FOLDER", help="folder to write")
     parser.add_argument(
         "--faults",
         metavar="F",
-        help="a diagnosis (JSON), or cell indices as 3,17,200 (default: the faulty cells that the bundle lists)",
+        help=(
+            "a diagnosis (JSON), or cell indices as 3,17,200 (default: the faulty cells that the"
+            " bundle lists)"
+        ),
     )
     add_trust(parser)
     parser.set_defaults(run=run)
@@ -35,18 +46,24 @@ def run(args: argparse.Namespace) -> int:
     """Restore the faulty cells and missing readings of each recording."""
     import numpy as np
 
+    from adaptfault.bundle.bundle import Bundle
     from adaptfault.cli.options import fault_set
     from adaptfault.data.recordings import Recordings, save_npz
-    from adaptfault.robot.bundle import Bundle
     from adaptfault.robot.new_recordings import load_new_recordings
 
     bundle = Bundle.open(args.bundle, **trust(args))
     layout = bundle.layout
-    faults = bundle.known_faults().fault_set if args.faults is None else fault_set(args.faults, layout)
+    faults = (
+        bundle.known_faults().fault_set if args.faults is None else fault_set(args.faults, layout)
+    )
     incoming = load_new_recordings(bundle, args.recordings)
     for problem in incoming.problems:
         print(problem, file=sys.stderr)
-    say(args, f"{len(faults)} of {layout.present.sum()} cells are faulty; restoring {len(incoming.frames)} recordings")
+    say(
+        args,
+        f"{len(faults)} of {layout.present.sum()} cells are faulty; restoring"
+        f" {len(incoming.frames)} recordings",
+    )
     restorer = bundle.restorer()
     version = bundle.active()  # wires are put back and pads recalibrated, as it does
     given = [version.undo(layout.check_recording(frames)) for frames in incoming.frames]
@@ -66,11 +83,15 @@ def run(args: argparse.Namespace) -> int:
         "restored": str(folder / "restored.npz"),
     }
     (folder / "restored.json").write_text(json.dumps(result, indent=1, allow_nan=False))
-    typical = f", typical deviation {np.median(deviation[list(faults)]):.3g} {layout.unit}" if len(faults) else ""
+    typical = (
+        f", typical deviation {np.median(deviation[list(faults)]):.3g} {layout.unit}"
+        if len(faults)
+        else ""
+    )
     emit(
         args,
         result,
-        f"{len(restored)} recordings: {len(faults)} cells and {missing} other missing readings restored{typical}\n"
-        f"restored recordings: {folder / 'restored.npz'}",
+        f"{len(restored)} recordings: {len(faults)} cells and {missing} other missing readings"
+        f" restored{typical}\nrestored recordings: {folder / 'restored.npz'}",
     )
     return 0

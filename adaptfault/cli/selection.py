@@ -13,17 +13,22 @@ if TYPE_CHECKING:
 
 def add_selection(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
-    parser.add_argument("--take", metavar="SLICE", help="only these recordings, as a Python slice: 0:100, ::5")
+    parser.add_argument(
+        "--take", metavar="SLICE", help="only these recordings, as a Python slice: 0:100, ::5"
+    )
     parser.add_argument("--leave", metavar="SLICE", help="all recordings but these")
     parser.add_argument("--inject", action="append", default=[], metavar="FAULT", help=INJECT_HELP)
-    parser.add_argument("--fault-seed", type=int, default=0, metavar="N", help="random seed of faults (default 0)")
+    parser.add_argument(
+        "--fault-seed", type=int, default=0, metavar="N", help="random seed of faults (default 0)"
+    )
 
 
 def select(args: argparse.Namespace, recordings: Recordings) -> Recordings:
     """Return the selected recordings, with the faults injected.
 
     Raises:
-        ValueError: a slice of another form, or one that selects nothing; a fault that the layout does not have.
+        ValueError: a slice of another form, or one that selects nothing; a fault that the layout
+            does not have.
     """
     import numpy as np
 
@@ -35,16 +40,25 @@ def select(args: argparse.Namespace, recordings: Recordings) -> Recordings:
     if args.leave is not None:
         chosen = np.setdiff1d(chosen, everything[_slice("--leave", args.leave)])
     if not chosen.size:
-        raise ValueError(f"--take {args.take} --leave {args.leave}: none of {len(recordings)} recordings is selected")
+        raise ValueError(
+            f"--take {args.take} --leave {args.leave}: none of {len(recordings)} recordings is"
+            " selected"
+        )
     selected = recordings.select(chosen)
     faults = parse_faults(args.inject, recordings.layout, np.random.default_rng(args.fault_seed))
     if not faults:
         return selected
     seeds = (args.fault_seed + int(i) for i in chosen)
     layout = recordings.layout
-    frames = [inject(one, faults, layout, seed=seed) for one, seed in zip(selected, seeds, strict=True)]
+    frames = [
+        inject(one, faults, layout, seed=seed) for one, seed in zip(selected, seeds, strict=True)
+    ]
     return Recordings(
-        tuple(one.astype(np.float32) for one in frames), layout, selected.labels, selected.class_names, selected.names
+        tuple(one.astype(np.float32) for one in frames),
+        layout,
+        selected.labels,
+        selected.class_names,
+        selected.names,
     )
 
 

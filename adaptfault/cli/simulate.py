@@ -14,15 +14,30 @@ _EXAMPLE = """  adaptfault simulate --out grasps.npz
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "simulate", "write simulated grasps to try every command with", _EXAMPLE)
-    parser.add_argument(
-        "--out", required=True, metavar="PATH", help="X.npz, X.npy, X.bag (ROS 2 bag), or a folder for CSV files"
+    parser = command(
+        commands, "simulate", "write simulated grasps to try every command with", _EXAMPLE
     )
-    parser.add_argument("--grasps", type=int, default=40, metavar="N", help="recordings of each class (default 40)")
-    parser.add_argument("--frames", type=int, default=100, metavar="T", help="frames of a recording (default 100)")
-    parser.add_argument("--classes", nargs="+", metavar="NAME", help="only these classes (default: all seven)")
-    parser.add_argument("--seed", type=int, default=0, help="of objects, grasps and noise (default 0)")
-    parser.add_argument("--sensor-seed", type=int, default=0, help="of the gain and offset of each cell (default 0)")
+    parser.add_argument(
+        "--out",
+        required=True,
+        metavar="PATH",
+        help="X.npz, X.npy, X.bag (ROS 2 bag), or a folder for CSV files",
+    )
+    parser.add_argument(
+        "--grasps", type=int, default=40, metavar="N", help="recordings of each class (default 40)"
+    )
+    parser.add_argument(
+        "--frames", type=int, default=100, metavar="T", help="frames of a recording (default 100)"
+    )
+    parser.add_argument(
+        "--classes", nargs="+", metavar="NAME", help="only these classes (default: all seven)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of objects, grasps and noise (default 0)"
+    )
+    parser.add_argument(
+        "--sensor-seed", type=int, default=0, help="of the gain and offset of each cell (default 0)"
+    )
     add_array(parser, calibration=False)
     add_selection(parser)
     parser.set_defaults(run=run, writes=("out",))
@@ -31,13 +46,16 @@ def add(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Simulate and write."""
     from adaptfault.data.recordings import save
-    from adaptfault.data.recordings.sizes import MOST_BYTES
+    from adaptfault.data.recordings.facts.sizes import MOST_BYTES
     from adaptfault.data.simulated_grasps import CLASS_NAMES, simulate
 
     layout = layout_of(args)
     classes = args.classes or CLASS_NAMES
     if (size := 4 * len(classes) * args.grasps * args.frames * layout.n_cells) > MOST_BYTES:
-        raise ValueError(f"--grasps {args.grasps} --frames {args.frames}: {size:,} bytes, more than {MOST_BYTES:,}")
+        raise ValueError(
+            f"--grasps {args.grasps} --frames {args.frames}: {size:,} bytes, more than"
+            f" {MOST_BYTES:,}"
+        )
     say(args, f"simulating {args.grasps} grasps of each class on {layout}")
     recordings = simulate(
         args.grasps,

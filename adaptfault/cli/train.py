@@ -43,34 +43,55 @@ _EXAMPLE = """  adaptfault train grasps/ --out model --epochs 20
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "train", "train the paper's network on fault-free recordings", _EXAMPLE)
-    add_recordings(parser)
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="where the model goes; X.bundle: a bundle")
-    parser.add_argument("--epochs", type=int, default=50, help="at most so many epochs (default 50)")
-    parser.add_argument(
-        "--learning-rate", type=float, default=1e-4, metavar="X", help="of Adam (default 1e-4; small models need more)"
+    parser = command(
+        commands, "train", "train the paper's network on fault-free recordings", _EXAMPLE
     )
-    parser.add_argument("--seed", type=int, default=0, help="random seed of split, weights and training (default 0)")
+    add_recordings(parser)
+    parser.add_argument(
+        "--out", required=True, metavar="FOLDER", help="where the model goes; X.bundle: a bundle"
+    )
+    parser.add_argument(
+        "--epochs", type=int, default=50, help="at most so many epochs (default 50)"
+    )
+    parser.add_argument(
+        "--learning-rate",
+        type=float,
+        default=1e-4,
+        metavar="X",
+        help="of Adam (default 1e-4; small models need more)",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="random seed of split, weights and training (default 0)"
+    )
     parser.add_argument("--length", type=int, default=10, help="frames in a window (default 10)")
     parser.add_argument(
         "--repairable",
         action="store_true",
-        help="remove random cells while training: imputation alone then repairs more; needs about twice the epochs",
+        help=(
+            "remove random cells while training: imputation alone then repairs more; needs about"
+            " twice the epochs"
+        ),
     )
     parser.add_argument(
         "--head",
         default="auto",
         choices=("auto", "linear"),
-        help="auto: after training, a head in closed form where it improves validation (default);"
-        " linear: the network alone, as in the paper",
+        help=(
+            "auto: after training, a head in closed form where it improves validation (default);"
+            " linear: the network alone, as in the paper"
+        ),
     )
-    parser.add_argument("--strict", action="store_true", help="exit code 1 if the training shows a sign of failure")
+    parser.add_argument(
+        "--strict", action="store_true", help="exit code 1 if the training shows a sign of failure"
+    )
     parser.add_argument(
         "--model",
         dest="builder",
         metavar="PACKAGE:FUNCTION",
-        help="train the torch module that this function returns for (layout, n_classes, length)"
-        " (default: the paper's network)",
+        help=(
+            "train the torch module that this function returns for (layout, n_classes, length)"
+            " (default: the paper's network)"
+        ),
     )
     add_sign(parser, "X.bundle")
     add_device(parser)
@@ -82,7 +103,8 @@ def run(args: argparse.Namespace) -> int:
     out = Path(args.out)
     bundled = out.suffix == ".bundle"
     _check_options(args, out, bundled)
-    recordings, where = load_recordings(args, args.recordings, labelled=True), device(args)
+    recordings = load_recordings(args, args.recordings, labelled=True)
+    where = device(args)
 
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.cli.trained_model import say_short
@@ -92,7 +114,9 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.models.store import save_model
     from diagnostics import FaultSet
 
-    windows = make_windows(recordings.frames, recordings.labels, recordings.layout, length=args.length)
+    windows = make_windows(
+        recordings.frames, recordings.labels, recordings.layout, length=args.length
+    )
     parts = split(windows, seed=args.seed)
     say(args, f"{recordings.layout}; {windows}")
     say_short(args, recordings, args.length)
@@ -106,7 +130,9 @@ def run(args: argparse.Namespace) -> int:
     history = _trained(args, model.to(where), parts, folder)
     adapter = Adapter(model.cpu(), parts[0], parts[1])
     healthy = (
-        adapter.healthy if args.head == "auto" else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
+        adapter.healthy
+        if args.head == "auto"
+        else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
     )
     scores = Scores.of(parts[2].y, healthy.predict(parts[2].x), n_classes=n_classes)
     extra = {"split_seed": args.seed, "test_scores": scores.to_dict(), "history": history.to_dict()}
@@ -114,7 +140,9 @@ def run(args: argparse.Namespace) -> int:
         _bundle(args, out, recordings, adapter, parts)
         shutil.rmtree(folder)
     else:
-        save_model(out, model, class_names=recordings.class_names, extra=extra, head=healthy.model.head)
+        save_model(
+            out, model, class_names=recordings.class_names, extra=extra, head=healthy.model.head
+        )
         (folder / _CHECKPOINT).unlink()  # the run is complete: nothing is left to resume
     problems = _told(args, out, bundled, scores, history, recordings.class_names, extra)
     return int(args.strict and bool(problems))
@@ -125,7 +153,7 @@ def _check_options(args: argparse.Namespace, out: Path, bundled: bool) -> None:
     if bundled and out.exists():
         raise ValueError(f"{out} exists: choose another name, or remove it")
     if args.sign is not None:
-        from adaptfault.robot.signature import read_private_key
+        from adaptfault.bundle.signature import read_private_key
 
         if not bundled:
             raise ValueError("--sign signs bundles: give --out X.bundle")
@@ -178,13 +206,21 @@ def _told(
         print(f"warning: {problem}", file=sys.stderr)
     emit(
         args,
-        {"schema": "adaptfault.train/1", kind: str(out), **extra, "picture": str(picture), "problems": list(problems)},
+        {
+            "schema": "adaptfault.train/1",
+            kind: str(out),
+            **extra,
+            "picture": str(picture),
+            "problems": list(problems),
+        },
         f"test: {scores}\ntraining: {history}\n{kind}: {out}\npicture: {picture}",
     )
     return problems
 
 
-def _built(builder: str, windows: Windows, layout: SensorLayout, n_classes: int) -> TactileTransformer | AnyModel:
+def _built(
+    builder: str, windows: Windows, layout: SensorLayout, n_classes: int
+) -> TactileTransformer | AnyModel:
     """Build the user's model; naming the builder on the command line allows it."""
     from adaptfault.models.any_model import AnyModel
     from adaptfault.models.builders import allow_model, build_model
@@ -194,7 +230,10 @@ def _built(builder: str, windows: Windows, layout: SensorLayout, n_classes: int)
     model = build_model(builder, layout, n_classes, length=windows.x.shape[1])
     wrapped = AnyModel.probe(model, layout, as_tensor(windows.x[:8]))
     if wrapped.n_classes != n_classes:
-        raise ValueError(f"--model {builder} has {wrapped.n_classes} outputs, the recordings have {n_classes} classes")
+        raise ValueError(
+            f"--model {builder} has {wrapped.n_classes} outputs, the recordings have {n_classes}"
+            " classes"
+        )
     return wrapped
 
 
@@ -208,9 +247,9 @@ def _bundle(
     """Make the bundle; new versions are tested on the windows of the test recordings."""
     import numpy as np
 
+    from adaptfault.bundle.bundle import Bundle
+    from adaptfault.bundle.signing import sign_bundle
     from adaptfault.data.calibration import Calibration
-    from adaptfault.robot.bundle import Bundle
-    from adaptfault.robot.signature import sign_bundle
 
     training, _, test = parts
     bundle = Bundle.create(

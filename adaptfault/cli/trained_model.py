@@ -1,4 +1,5 @@
-"""A trained model, from a folder of ``adaptfault train`` or from a bundle, and the recordings that belong to it."""
+"""A trained model, from a folder of ``adaptfault train`` or from a bundle, and the recordings that
+belong to it."""
 
 from __future__ import annotations
 
@@ -11,15 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from adaptfault.adaptation.fault_free import Network
-from adaptfault.adaptation.result import Adaptation
+from adaptfault.adaptation.result import Adaptation, load_healthy
 from adaptfault.cli.options import is_bundle, load_recordings, say, trust
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, make_windows, split
-from adaptfault.models.store import SCHEMA, load_healthy, read_manifest
+from adaptfault.models.store import SCHEMA, read_manifest
 
 if TYPE_CHECKING:
-    from adaptfault.robot.bundle import Bundle
-    from adaptfault.robot.versions import Version
+    from adaptfault.bundle.bundle import Bundle
+    from adaptfault.bundle.versions import Version
 
 
 @dataclass(frozen=True)
@@ -29,9 +30,10 @@ class TrainedModel:
     Attributes:
         network: the fault-free model, with its layout and window length.
         class_names: one name a class, or none.
-        split_seed: of the split into training, validation and test recordings; None where it is not stored.
-        adaptation: the version that a bundle runs; of a model, its form for the healthy sensor, with the head in closed
-            form if it has one.
+        split_seed: of the split into training, validation and test recordings; None where it is not
+            stored.
+        adaptation: the version that a bundle runs; of a model, its form for the healthy sensor,
+            with the head in closed form if it has one.
         calibration: the bundle's table from raw counts to the layout's unit.
         version: that a bundle runs; None of a model.
     """
@@ -62,13 +64,21 @@ class TrainedModel:
             return cls(healthy.model.network, tuple(manifest["class_names"]), seed, healthy)
         version = bundle.active()
         active = Adaptation.load(version.folder)
-        return cls(active.model.network, bundle.class_names, None, active, bundle.parts.calibration, version)
+        return cls(
+            active.model.network,
+            bundle.class_names,
+            None,
+            active,
+            bundle.parts.calibration,
+            version,
+        )
 
     def recordings(self, args: argparse.Namespace, paths: Sequence[str]) -> Recordings:
         """Read labelled recordings in the layout of the model.
 
         Raises:
-            ValueError: they contradict the layout or the classes of the model; both values are named.
+            ValueError: they contradict the layout or the classes of the model; both values are
+                named.
         """
         if args.calibration is None and self.calibration is not None:
             args.calibration = str(self.calibration)
@@ -78,25 +88,37 @@ class TrainedModel:
         return recordings
 
     def rewired(self, recordings: Recordings) -> Recordings:
-        """Return recordings as the version that a bundle runs reads them on the robot; see ``Version.undo``."""
+        """Return recordings as the version that a bundle runs reads them on the robot; see
+        ``Version.undo``."""
         if self.version is None:
             return recordings
-        return replace(recordings, frames=tuple(self.version.undo(np.asarray(frames)) for frames in recordings.frames))
+        return replace(
+            recordings,
+            frames=tuple(self.version.undo(np.asarray(frames)) for frames in recordings.frames),
+        )
 
     def _in_order(self, recordings: Recordings) -> Recordings:
         """Return the recordings with the classes of the model, in the order of the model."""
         unknown = sorted(set(recordings.class_names) - set(self.class_names))
         if unknown:
             classes = ", ".join(self.class_names)
-            raise ValueError(f"the recordings have the class {unknown[0]!r}, the model has {classes}")
+            raise ValueError(
+                f"the recordings have the class {unknown[0]!r}, the model has {classes}"
+            )
         assert recordings.labels is not None
-        index = np.array([self.class_names.index(name) for name in recordings.class_names], dtype=np.int64)
+        index = np.array(
+            [self.class_names.index(name) for name in recordings.class_names], dtype=np.int64
+        )
         labels = index[recordings.labels]
-        return Recordings(recordings.frames, recordings.layout, labels, self.class_names, recordings.names)
+        return Recordings(
+            recordings.frames, recordings.layout, labels, self.class_names, recordings.names
+        )
 
     def windows(self, recordings: Recordings) -> Windows:
         """Cut recordings into the windows that the model takes."""
-        return make_windows(recordings.frames, recordings.labels, recordings.layout, length=self.network.length)
+        return make_windows(
+            recordings.frames, recordings.labels, recordings.layout, length=self.network.length
+        )
 
     def parts(self, recordings: Recordings) -> tuple[Windows, Windows, Windows]:
         """Return training, validation and test windows, the same as in training."""
@@ -104,10 +126,15 @@ class TrainedModel:
 
 
 def say_short(args: argparse.Namespace, recordings: Recordings, length: int) -> None:
-    """Say on stderr how many recordings are shorter than a window of ``length`` frames, if any is."""
+    """Say on stderr how many recordings are shorter than a window of ``length`` frames, if any
+    is."""
     if short := sum(len(frames) < length for frames in recordings.frames):
         many = "is" if short == 1 else "are"
-        say(args, f"{short} of {len(recordings)} recordings {many} shorter than a window of {length} frames: not used")
+        say(
+            args,
+            f"{short} of {len(recordings)} recordings {many} shorter than a window of {length}"
+            " frames: not used",
+        )
 
 
 def open_bundle(args: argparse.Namespace, folder: str) -> Bundle | None:
@@ -118,13 +145,14 @@ def open_bundle(args: argparse.Namespace, folder: str) -> Bundle | None:
         folder: of the bundle, a model, or recordings.
 
     Raises:
-        FileNotFoundError, ValueError: the bundle is damaged or not signed by a trusted key; or no bundle, with --trust.
+        FileNotFoundError, ValueError: the bundle is damaged or not signed by a trusted key; or no
+        bundle, with --trust.
     """
     trusted = trust(args)
     if not is_bundle(folder):
         if trusted["keys"]:
             raise ValueError(f"--trust: {folder} is no bundle, and only bundles are signed")
         return None
-    from adaptfault.robot.bundle import Bundle
+    from adaptfault.bundle.bundle import Bundle
 
     return Bundle.open(folder, **trusted)

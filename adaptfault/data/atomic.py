@@ -1,4 +1,5 @@
-"""Writes that survive a power failure: a file holds its old content or the new, a new folder is there."""
+"""Writes that survive a power failure: a file holds its old content or the new, a new folder is
+there."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from pathlib import Path
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write a file so that after any crash, power loss included, it holds the old content or the new, never a part.
+    """Write a file so that after any crash, power loss included, it holds the old content or the
+    new, never a part.
 
     A device or a pipe is written to, not replaced.
 
@@ -18,7 +20,8 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
         OSError: the folder does not exist or cannot be written; nothing is left behind.
     """
     path = Path(path)
-    if path.exists() and not path.is_file() and not path.is_dir():  # renaming a file to /dev/null would end it
+    # renaming a file to /dev/null would end it
+    if path.exists() and not path.is_file() and not path.is_dir():
         path.write_bytes(data)
         return
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from adaptfault.data.atomic import atomic_write
 from adaptfault.data.recordings.errors import InputError
-from adaptfault.data.recordings.layout_file import MOST_CELLS
-from adaptfault.data.recordings.text import numbered_lines, read_text
+from adaptfault.data.recordings.facts.layout_file import MOST_CELLS
+from adaptfault.data.recordings.formats.text import numbered_lines, read_text
 from diagnostics import SensorLayout
 
 _BLOCK = 4096
@@ -46,15 +46,16 @@ class OutOfRange:
 class Calibration:
     """One table a cell: at ``raw`` counts the cell was loaded with ``force`` newtons.
 
-    Rows are padded with NaN where a cell has fewer points. A cell without any point reads 0 N: only positions where the
-    layout has no cell may go without, see :meth:`check`.
+    Rows are padded with NaN where a cell has fewer points. A cell without any point reads 0 N: only
+    positions where the layout has no cell may go without, see :meth:`check`.
 
     Attributes:
         raw: float64 ``[D, P]``, strictly increasing along each row.
         force: float64 ``[D, P]``, in newton, never decreasing along each row.
 
     Raises:
-        ValueError: other shapes; a cell with one point; points that are infinite, or not in that order.
+        ValueError: other shapes; a cell with one point; points that are infinite, or not in that
+            order.
     """
 
     raw: NDArray[np.float64]
@@ -64,13 +65,16 @@ class Calibration:
         raw, force = (np.array(table, dtype=np.float64) for table in (self.raw, self.force))
         if raw.ndim != 2 or raw.shape != force.shape:
             raise ValueError(
-                f"expected raw and force of one shape [D, P], got {list(raw.shape)} and {list(force.shape)}"
+                f"expected raw and force of one shape [D, P], got {list(raw.shape)} and"
+                f" {list(force.shape)}"
             )
         for cell, (counts, newtons) in enumerate(zip(raw, force, strict=True)):
             points = int((~np.isnan(counts)).sum())
             for name, values in (("raw", counts), ("force", newtons)):
                 if np.isnan(values[:points]).any() or not np.isnan(values[points:]).all():
-                    raise ValueError(f"cell {cell}: NaN in {name} may only pad the end, in raw and force alike")
+                    raise ValueError(
+                        f"cell {cell}: NaN in {name} may only pad the end, in raw and force alike"
+                    )
             if points == 1:
                 raise ValueError(f"cell {cell}: 1 point; a table needs at least 2")
             if problem := _disorder(counts[:points], newtons[:points]):
@@ -97,12 +101,17 @@ class Calibration:
     def check(self, layout: SensorLayout) -> None:
         """Raise ValueError unless there is a table for each cell that ``layout`` has."""
         if self.n_cells != layout.n_cells:
-            raise ValueError(f"tables for {self.n_cells} cells, but the layout has {layout.n_cells}")
+            raise ValueError(
+                f"tables for {self.n_cells} cells, but the layout has {layout.n_cells}"
+            )
         if (lacking := np.flatnonzero(layout.present.ravel() & ~self.calibrated)).size:
-            raise ValueError(f"cell {lacking[0]} has no table ({lacking.size} cells have none); calibrate it")
+            raise ValueError(
+                f"cell {lacking[0]} has no table ({lacking.size} cells have none); calibrate it"
+            )
 
     def apply(self, counts: ArrayLike) -> tuple[NDArray[np.float32], OutOfRange]:
-        """Return newtons, float32 of the shape of ``counts`` (``[T, D]`` or ``[D]``), and the clamped readings.
+        """Return newtons, float32 of the shape of ``counts`` (``[T, D]`` or ``[D]``), and the
+        clamped readings.
 
         Readings outside a cell's table get the force at its end. NaN stays NaN.
 
@@ -111,12 +120,15 @@ class Calibration:
         """
         counts = np.asarray(counts)
         if counts.ndim not in (1, 2) or counts.shape[-1] != self.n_cells:
-            raise ValueError(f"expected counts [T, {self.n_cells}] or [{self.n_cells}], got {list(counts.shape)}")
+            raise ValueError(
+                f"expected counts [T, {self.n_cells}] or [{self.n_cells}], got {list(counts.shape)}"
+            )
         frames = np.atleast_2d(counts)
         newtons = np.empty(frames.shape, dtype=np.float32)
         below, above = np.zeros((2, self.n_cells), dtype=np.int64)
         for start in range(0, len(frames), _BLOCK):
-            cells = np.array(frames[start : start + _BLOCK].T, dtype=np.float64, order="C")  # [D, block]
+            # [D, block]
+            cells = np.array(frames[start : start + _BLOCK].T, dtype=np.float64, order="C")
             forces = np.zeros(cells.shape, dtype=np.float32)
             for cell, raw, force in self._tables:
                 forces[cell] = np.interp(cells[cell], raw, force)
@@ -126,7 +138,8 @@ class Calibration:
         return newtons.reshape(counts.shape), OutOfRange(below, above)
 
     def invert(self, newtons: ArrayLike) -> NDArray[np.float64]:
-        """Return counts at which :meth:`apply` gives these newtons ``[D]``; of several, any. 0 without a table."""
+        """Return counts at which :meth:`apply` gives these newtons ``[D]``; of several, any. 0
+        without a table."""
         forces = np.asarray(newtons, dtype=np.float64)
         counts = np.zeros(self.n_cells)
         for cell, raw, force in self._tables:
@@ -137,7 +150,10 @@ class Calibration:
     def _tables(self) -> list[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
         """The calibrated cells and their points without the padding."""
         points = (~np.isnan(self.raw)).sum(axis=1)
-        return [(int(c), self.raw[c, : points[c]], self.force[c, : points[c]]) for c in np.flatnonzero(points)]
+        return [
+            (int(c), self.raw[c, : points[c]], self.force[c, : points[c]])
+            for c in np.flatnonzero(points)
+        ]
 
     @classmethod
     def read(cls, path: str | PathLike[str], layout: SensorLayout | None = None) -> Calibration:
@@ -145,7 +161,8 @@ class Calibration:
 
         Args:
             path: the table.
-            layout: the array, each cell of which must have a table. None: cells run from 0 to the highest named.
+            layout: the array, each cell of which must have a table. None: cells run from 0 to the
+                highest named.
 
         Raises:
             InputError: the file cannot be read, or a line or a cell is wrong; named.
@@ -156,11 +173,14 @@ class Calibration:
         width = highest + 1 if layout is None else layout.n_cells
         if highest >= width:
             line = points[highest][0][2]
-            raise InputError.at(path, f"cell {highest}, but the layout has {width} cells, from 0", f"line {line}")
+            raise InputError.at(
+                path, f"cell {highest}, but the layout has {width} cells, from 0", f"line {line}"
+            )
         most = max(map(len, points.values()))
         if width * most > _MOST_POINTS:
             what = (
-                f"{most} points of one cell and {width} cells need a table of over {_MOST_POINTS:,} points; thin them"
+                f"{most} points of one cell and {width} cells need a table of over {_MOST_POINTS:,}"
+                " points; thin them"
             )
             raise InputError.at(path, what)
         raw = np.full((width, most), np.nan)
@@ -176,10 +196,13 @@ class Calibration:
         return cls(raw, force)
 
     def write(self, path: str | PathLike[str]) -> None:
-        """Write the table so that :meth:`read` returns the same values. OSError if the file cannot be written."""
+        """Write the table so that :meth:`read` returns the same values. OSError if the file cannot
+        be written."""
         lines = ["cell,raw,force"]
         for cell, raw, force in self._tables:
-            lines += (f"{cell},{r!r},{f!r}" for r, f in zip(raw.tolist(), force.tolist(), strict=True))
+            lines += (
+                f"{cell},{r!r},{f!r}" for r, f in zip(raw.tolist(), force.tolist(), strict=True)
+            )
         text = "\n".join(lines) + "\n"
         atomic_write(path, text.encode())
 
@@ -197,20 +220,27 @@ def _disorder(raw: NDArray[np.float64], force: NDArray[np.float64]) -> str:
         return f"raw must increase from point to point, but {raw[i + 1]:g} comes after {raw[i]:g}"
     if (steps := np.flatnonzero(np.diff(force) < 0)).size:
         i = steps[0]
-        return f"force falls from {force[i]:g} to {force[i + 1]:g} while raw rises from {raw[i]:g} to {raw[i + 1]:g}"
+        return (
+            f"force falls from {force[i]:g} to {force[i + 1]:g} while raw rises from {raw[i]:g} to"
+            f" {raw[i + 1]:g}"
+        )
     return ""
 
 
 def _check_rows(path: Path, cell: int, rows: Sequence[_Point]) -> None:
     """Raise InputError, with the line, unless the sorted points of a cell make a table."""
     if len(rows) == 1:
-        raise InputError.at(path, f"cell {cell} has 1 point; a table needs at least 2", f"line {rows[0][2]}")
+        raise InputError.at(
+            path, f"cell {cell} has 1 point; a table needs at least 2", f"line {rows[0][2]}"
+        )
     for before, after in pairwise(rows):
         pair = (np.array(values) for values in zip(before[:2], after[:2], strict=True))
         if problem := _disorder(*pair):
             where = f"line {max(before[2], after[2])}"
             raise InputError.at(
-                path, f"cell {cell}: {problem} (line {min(before[2], after[2])}); measure it again", where
+                path,
+                f"cell {cell}: {problem} (line {min(before[2], after[2])}); measure it again",
+                where,
             )
 
 
@@ -220,14 +250,19 @@ def _read_points(path: Path) -> dict[int, list[_Point]]:
     header = [name.strip().strip('"').casefold() for name in lines[0].split(",")] if lines else []
     if header != ["cell", "raw", "force"]:
         where = f"line {numbers[0] if numbers else 1}"
-        raise InputError.at(path, "expected a first line 'cell,raw,force', separated by commas; add it", where)
+        raise InputError.at(
+            path, "expected a first line 'cell,raw,force', separated by commas; add it", where
+        )
     points: dict[int, list[_Point]] = {}
     for line, number in zip(lines[1:], numbers[1:], strict=True):
-        where, cells = f"line {number}", line.split(",")
+        where = f"line {number}"
+        cells = line.split(",")
         if len(cells) != 3:
             raise InputError.at(path, f"{len(cells)} values, expected 3: cell,raw,force", where)
         try:
-            cell, raw, force = int(cells[0]), float(cells[1]), float(cells[2])
+            cell = int(cells[0])
+            raw = float(cells[1])
+            force = float(cells[2])
         except ValueError:
             raise InputError.at(
                 path, "expected three numbers: cell (whole), raw, force (newton); correct it", where

@@ -35,7 +35,9 @@ class Lines:
             try:
                 documents.append(json.loads(line))
             except ValueError as error:
-                raise ValueError(f"{self.path}, line {number}: not JSON ({error}); remove the file") from None
+                raise ValueError(
+                    f"{self.path}, line {number}: not JSON ({error}); remove the file"
+                ) from None
         return documents
 
     def add(self, document: Any) -> None:

@@ -1,8 +1,9 @@
-"""Summarises recordings before anything is fitted: shape, range, step, rest level, classes, silent cells."""
+"""Summarises recordings before anything is fitted: shape, range, step, rest level, classes, silent
+cells."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -27,10 +28,12 @@ class Summary:
     Attributes:
         layout: the array.
         lengths: int ``[n]``, frames of each recording.
-        mean, lowest, highest: float ``[D]``, of the finite readings of each cell; NaN where it has none.
-        rest: float ``[D]``, the reading that a cell has in the 10 % of frames in which it is least loaded (their
-            median).
-        step: the least difference between two readings that are not equal; None where no cell changes.
+        mean, lowest, highest: float ``[D]``, of the finite readings of each cell; NaN where it has
+        none.
+        rest: float ``[D]``, the reading that a cell has in the 10 % of frames in which it is least
+            loaded (their median).
+        step: the least difference between two readings that are not equal; None where no cell
+            changes.
         missing: int ``[D]``, missing readings.
         classes: recordings of each class; empty without labels.
         inferred: see :class:`~adaptfault.data.recordings.load.Loaded`.
@@ -75,12 +78,19 @@ class Summary:
 
     def __str__(self) -> str:
         layout, present = self.layout, self.layout.present.ravel()
-        least, most = int(self.lengths.min()), int(self.lengths.max())
+        least = int(self.lengths.min())
+        most = int(self.lengths.max())
         missing = int(self.missing[present].sum())
         each = " each" * (len(self.lengths) > 1)
-        frames = f"{least} frame{'s' * (least != 1)}{each}" if least == most else f"{least} to {most} frames each"
+        frames = (
+            f"{least} frame{'s' * (least != 1)}{each}"
+            if least == most
+            else f"{least} to {most} frames each"
+        )
         rows = {
-            "recordings": f"{len(self.lengths)} of {frames}, {self.lengths.sum() / layout.rate:.0f} s in all",
+            "recordings": (
+                f"{len(self.lengths)} of {frames}, {self.lengths.sum() / layout.rate:.0f} s in all"
+            ),
             "array": str(layout),
             "readings": self._readings(),
             "rest level": f"{_number(_median(self.rest[present]))} (median over the cells)",
@@ -93,7 +103,8 @@ class Summary:
 
     def _readings(self) -> str:
         present = self.layout.present.ravel()
-        low, high = _least(self.lowest[present]), _most(self.highest[present])
+        low = _least(self.lowest[present])
+        high = _most(self.highest[present])
         if low is None or high is None:
             return "none"
         step = "" if self.step is None else f", least step {self.step:.3g}"
@@ -107,7 +118,10 @@ class Summary:
         places = [self.layout.place(int(c)) for c in silent[:_LISTED]]
         more = [f"and {silent.size - _LISTED} more"] if silent.size > _LISTED else []
         change = "changes" if silent.size == 1 else "change"
-        text = f"{silent.size} of {int(self.layout.present.sum())} cells never {change} (not loaded, or faulty)"
+        text = (
+            f"{silent.size} of {int(self.layout.present.sum())} cells never {change} (not loaded,"
+            " or faulty)"
+        )
         return f"{text}: {'; '.join([*places, *more])}"
 
     def _classes(self) -> str:
@@ -124,12 +138,16 @@ class Summary:
         layout = self.layout
         figure, axes = pads_figure(layout, n_rows=2)
         size = layout.rows * layout.shape[2]
-        for (name, values), row in zip({"mean": self.mean, "peak": self.highest}.items(), axes, strict=True):
+        for (name, values), row in zip(
+            {"mean": self.mean, "peak": self.highest}.items(), axes, strict=True
+        ):
             shown = np.where(layout.present.ravel(), values, np.nan)
             top = _most(shown) or layout.full_scale
             for pad, ax in enumerate(row):
                 silent = [int(c) - pad * size for c in self.silent if c // size == pad]
-                image = draw_forces(ax, layout.grid(shown)[pad], layout, silent, vmin=0, vmax=top, cmap="viridis")
+                image = draw_forces(
+                    ax, layout.grid(shown)[pad], layout, silent, vmin=0, vmax=top, cmap="viridis"
+                )
                 ax.set_title(f"{name}, pad {pad}", fontsize=9)
             figure.colorbar(image, ax=row.tolist(), label=layout.unit)
         if self.silent.size:
@@ -141,46 +159,52 @@ def summarise(
     recordings: Iterable[NDArray[Any]],
     layout: SensorLayout,
     *,
+    lengths: Sequence[int] | None = None,
     classes: dict[str, int] | None = None,
     inferred: tuple[str, ...] = (),
 ) -> Summary:
-    """Summarise recordings, or blocks of them, in one pass and constant memory.
+    """Summarise recordings, or pieces of them, in one pass and constant memory.
 
     Args:
         recordings: arrays ``[T, D]`` in the layout's unit; NaN = missing.
         layout: the array.
+        lengths: frames of each recording, where pieces are given; None: those of the arrays.
         classes, inferred: stored in the summary.
 
     Raises:
         ValueError: no recording, or one that does not fit the layout.
     """
     width = layout.n_cells
-    total, finite, lengths = np.zeros(width), np.zeros(width, np.int64), []
-    lowest, highest = np.full(width, np.inf), np.full(width, -np.inf)
+    total = np.zeros(width)
+    finite = np.zeros(width, np.int64)
+    seen_frames = []
+    lowest = np.full(width, np.inf)
+    highest = np.full(width, -np.inf)
     sample: list[NDArray[np.float64]] = []
-    given = layout.recordings(recordings) if isinstance(recordings, np.ndarray) else recordings  # or read one by one
+    # or read one by one
+    given = layout.recordings(recordings) if isinstance(recordings, np.ndarray) else recordings
     for i, recording in enumerate(given):
         frames = layout.check_recording(recording, f"recording {i}")
         known = np.isfinite(frames)
-        lengths.append(len(frames))
+        seen_frames.append(len(frames))
         total += np.sum(frames, axis=0, where=known)
         finite += known.sum(axis=0)
         lowest = np.minimum(lowest, np.min(frames, axis=0, initial=np.inf, where=known))
         highest = np.maximum(highest, np.max(frames, axis=0, initial=-np.inf, where=known))
         if sum(map(len, sample)) < _SAMPLE:
             sample.append(frames[: _SAMPLE // 10])
-    if not lengths:
+    if not seen_frames:
         raise ValueError("no recording to summarise")
     seen = finite > 0
     return Summary(
         layout=layout,
-        lengths=np.array(lengths, dtype=np.int64),
+        lengths=np.array(seen_frames if lengths is None else lengths, dtype=np.int64),
         mean=np.where(seen, total / np.maximum(finite, 1), np.nan),
         lowest=np.where(seen, lowest, np.nan),
         highest=np.where(seen, highest, np.nan),
         rest=_rest(np.concatenate(sample)),
         step=_step(np.concatenate(sample)[:, layout.present.ravel()]),
-        missing=np.int64(sum(lengths)) - finite,
+        missing=np.int64(sum(seen_frames)) - finite,
         classes=dict(classes or {}),
         inferred=inferred,
     )

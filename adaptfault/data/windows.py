@@ -19,8 +19,8 @@ class Windows:
 
     Attributes:
         x: float32 ``[N, T, D]``, readings divided by the layout's full scale: 0..1.
-        y: int64 ``[N]``, class of each window, -1 where there is no label; or float32 ``[N, k]``, the target
-            values of a regression.
+        y: int64 ``[N]``, class of each window, -1 where there is no label; or float32 ``[N, k]``,
+            the target values of a regression.
         recording: int64 ``[N]``, which recording a window came from; splits keep these together.
 
     Raises:
@@ -42,7 +42,9 @@ class Windows:
                 object.__setattr__(self, name, values.astype(np.float32, copy=False))
                 continue
             if values.shape != (len(x),):
-                raise ValueError(f"{len(x)} windows need {name} of shape [{len(x)}], got {list(values.shape)}")
+                raise ValueError(
+                    f"{len(x)} windows need {name} of shape [{len(x)}], got {list(values.shape)}"
+                )
             object.__setattr__(self, name, values.astype(np.int64, copy=False))
 
     def __len__(self) -> int:
@@ -50,7 +52,8 @@ class Windows:
 
     def __str__(self) -> str:
         n, t, d = self.x.shape
-        classes, recordings = len(np.unique(self.y[self.y >= 0])), len(np.unique(self.recording))
+        classes = len(np.unique(self.y[self.y >= 0]))
+        recordings = len(np.unique(self.recording))
         return f"{n} windows of {t} frames x {d} cells, {recordings} recordings, {classes} classes"
 
     def select(self, which: NDArray[Any] | Sequence[int] | slice) -> Windows:
@@ -62,7 +65,8 @@ class Windows:
 
 
 def evenly(n: int, most: int) -> NDArray[np.intp]:
-    """Return at most ``most`` of the indices 0 to n - 1, the first and the last among them where there are two."""
+    """Return at most ``most`` of the indices 0 to n - 1, the first and the last among them where
+    there are two."""
     return np.linspace(0, n - 1, min(n, most)).astype(np.intp)
 
 
@@ -75,11 +79,16 @@ def scale(frames: ArrayLike, layout: SensorLayout) -> NDArray[np.float32]:
 
 
 def hold_missing(frames: NDArray[Any]) -> NDArray[Any]:
-    """Return ``frames [T, D]`` with each NaN replaced by the last reading of that cell, 0 before its first.
+    """Return ``frames [T, D]`` with each NaN replaced by the last reading of that cell, 0 before
+    its first.
 
     A single NaN would turn the whole output of the network into NaN.
     """
-    return held(frames, np.zeros(frames.shape[1], frames.dtype))[1:] if np.isnan(frames).any() else frames
+    return (
+        held(frames, np.zeros(frames.shape[1], frames.dtype))[1:]
+        if np.isnan(frames).any()
+        else frames
+    )
 
 
 def make_windows(
@@ -92,18 +101,21 @@ def make_windows(
 ) -> Windows:
     """Cut recordings into windows on the 0..1 scale.
 
-    Missing readings (NaN) are held from the last frame of their recording (:func:`hold_missing`). Frames after
-    the last whole window are dropped; a recording shorter than one window gives none.
+    Missing readings (NaN) are held from the last frame of their recording (:func:`hold_missing`).
+    Frames after the last whole window are dropped; a recording shorter than one window gives none.
 
     Args:
-        recordings: in the layout's unit, as :meth:`SensorLayout.recordings` takes them; lengths may differ.
+        recordings: in the layout's unit, as :meth:`SensorLayout.recordings` takes them; lengths may
+            differ.
         labels: int ``[n]``, one class a recording; None gives y = -1.
         layout: the array they come from.
         length: frames in a window, 10 in Section VI-C.
-        stride: frames between the starts of two windows; None means ``length``, windows that do not overlap.
+        stride: frames between the starts of two windows; None means ``length``, windows that do not
+            overlap.
 
     Raises:
-        ValueError: a recording that does not fit the layout, another number of labels, no window at all.
+        ValueError: a recording that does not fit the layout, another number of labels, no window at
+            all.
     """
     recordings = layout.recordings(recordings)
     stride = length if stride is None else stride
@@ -111,7 +123,9 @@ def make_windows(
         raise ValueError(f"windows need length >= 1 and stride >= 1, got {length} and {stride}")
     classes = np.full(len(recordings), -1) if labels is None else np.asarray(labels)
     if classes.shape != (len(recordings),):
-        raise ValueError(f"{len(recordings)} recordings need as many labels, got {list(classes.shape)}")
+        raise ValueError(
+            f"{len(recordings)} recordings need as many labels, got {list(classes.shape)}"
+        )
     pieces: list[NDArray[np.float32]] = []
     counts = np.zeros(len(recordings), dtype=np.int64)
     longest = 0
@@ -119,21 +133,25 @@ def make_windows(
         frames = hold_missing(scale(layout.check_recording(recording, f"recording {i}"), layout))
         longest = max(longest, len(frames))
         if len(frames) >= length:
-            views = np.lib.stride_tricks.sliding_window_view(frames, length, axis=0)[::stride]  # [n, D, T]
+            # [n, D, T]
+            views = np.lib.stride_tricks.sliding_window_view(frames, length, axis=0)[::stride]
             pieces.append(views.transpose(0, 2, 1))
             counts[i] = len(views)
     if not pieces:
         raise ValueError(
-            f"no windows: a window needs {length} frames, the longest of {len(recordings)} recordings has {longest}"
+            f"no windows: a window needs {length} frames, the longest of {len(recordings)}"
+            f" recordings has {longest}"
         )
     x = np.ascontiguousarray(np.concatenate(pieces), dtype=np.float32)
     return Windows(x, np.repeat(classes, counts), np.repeat(np.arange(len(recordings)), counts))
 
 
 def recordings_of(windows: Windows, layout: SensorLayout) -> list[NDArray[np.float64]]:
-    """Return the frames of the windows of each recording, one after the other, ``[T, D]`` in the layout's unit."""
+    """Return the frames of the windows of each recording, one after the other, ``[T, D]`` in the
+    layout's unit."""
     return [
-        windows.x[windows.recording == number].reshape(-1, layout.n_cells) * float(layout.full_scale)
+        windows.x[windows.recording == number].reshape(-1, layout.n_cells)
+        * float(layout.full_scale)
         for number in np.unique(windows.recording)
     ]
 
@@ -143,46 +161,60 @@ def split(
 ) -> tuple[Windows, Windows, Windows]:
     """Return ``(train, validation, test)``, split by recording and stratified by class.
 
-    ``validation`` is a share of the recordings outside the test set, so the defaults give 64 %, 16 % and 20 %
-    (Section VI-C). Every class has a recording on each side, which plain stratification does not guarantee for small
-    classes; a share of 0 leaves that side empty.
+    ``validation`` is a share of the recordings outside the test set, so the defaults give 64 %, 16
+    % and 20 % (Section VI-C). Every class has a recording on each side, which plain stratification
+    does not guarantee for small classes; a share of 0 leaves that side empty.
 
     Raises:
-        ValueError: a share outside [0, 1), a class with too few recordings, a recording with two labels.
+        ValueError: a share outside [0, 1), a class with too few recordings, a recording with two
+            labels.
     """
     for name, share in (("test", test), ("validation", validation)):
         if not 0 <= share < 1:
             raise ValueError(f"the {name} share must lie in [0, 1), got {share}")
-    recordings, first, inverse = np.unique(windows.recording, return_index=True, return_inverse=True)
+    recordings, first, inverse = np.unique(
+        windows.recording, return_index=True, return_inverse=True
+    )
     classes = windows.y[first]  # of each recording
     if (mixed := classes[inverse] != windows.y).any():
         raise ValueError(
-            f"recording {windows.recording[mixed][0]} has windows of two classes: give each its own number"
+            f"recording {windows.recording[mixed][0]} has windows of two classes: give each its own"
+            " number"
         )
     sides = 1 + (test > 0) + (validation > 0)
     for label, count in zip(*np.unique(classes, return_counts=True), strict=True):
         if count < sides:
-            raise ValueError(f"class {label} has {count} recordings: a split into {sides} parts needs at least {sides}")
+            raise ValueError(
+                f"class {label} has {count} recordings: a split into {sides} parts needs at least"
+                f" {sides}"
+            )
     rng = np.random.default_rng(seed)
     rest = np.arange(len(recordings))
     chosen = _draw(rest, classes, test, 1 + (validation > 0), rng)
     rest = np.setdiff1d(rest, chosen)
     held_out = _draw(rest, classes, validation, 1, rng)
     side = np.zeros(len(recordings), dtype=np.int64)
-    side[held_out], side[chosen] = 1, 2
+    side[held_out] = 1
+    side[chosen] = 2
     train, val, tested = (windows.select(side[inverse] == i) for i in range(3))
     return train, val, tested
 
 
 def _draw(
-    candidates: NDArray[np.intp], classes: NDArray[np.int64], share: float, leave: int, rng: np.random.Generator
+    candidates: NDArray[np.intp],
+    classes: NDArray[np.int64],
+    share: float,
+    leave: int,
+    rng: np.random.Generator,
 ) -> NDArray[np.intp]:
-    """Draw ``share`` of the candidates: of each class at least one, and at least ``leave`` left over."""
+    """Draw ``share`` of the candidates: of each class at least one, and at least ``leave`` left
+    over."""
     if share == 0:
         return candidates[:0]
     _, of, counts = np.unique(classes[candidates], return_inverse=True, return_counts=True)
     take = np.clip(np.floor(share * counts), 1, counts - leave).astype(int)
-    # Largest remainders first: the total then matches the share although recordings are indivisible.
+    # Largest remainders first: the total then matches the share although recordings are
+    # indivisible.
     for i in np.argsort(take - share * counts, kind="stable"):
         if take.sum() < round(share * len(candidates)) and take[i] < counts[i] - leave:
             take[i] += 1

@@ -19,7 +19,16 @@ from adaptfault.evaluation.scores import Scores, accuracy_interval
 from adaptfault.models.history import History
 from adaptfault.models.network import TactileTransformer
 from adaptfault.models.training import train
-from diagnostics import Diagnosis, Fault, FaultKind, FaultSet, SelfDiagnosis, SensorLayout, inject, line_fault
+from diagnostics import (
+    Diagnosis,
+    Fault,
+    FaultKind,
+    FaultSet,
+    SelfDiagnosis,
+    SensorLayout,
+    inject,
+    line_fault,
+)
 
 _LOG_RECORDINGS = 20  # of the broken sensor, for the diagnosis
 _SHOWN = 8  # faults printed of each list; the report has all
@@ -33,7 +42,8 @@ class DemoResult:
         recordings: the input.
         seed: of the whole run.
         injected: the known faults.
-        fault_free, broken, repaired: scores of the test windows: healthy sensor; broken sensor and the fault-free
+        fault_free, broken, repaired: scores of the test windows: healthy sensor; broken sensor and
+        the fault-free
             model; broken sensor and the adapted model.
         intervals: 95 % of the accuracy of these three, clustered by recording.
         history: of training.
@@ -131,17 +141,23 @@ def run_demo(
     layout = recordings.layout
     if recordings.labels is None:
         raise ValueError("the recordings have no labels: the demo trains a classifier")
-    clock, rng = _Clock({}), np.random.default_rng(seed)
+    clock = _Clock({})
+    rng = np.random.default_rng(seed)
     windows = make_windows(recordings.frames, recordings.labels, layout)
     training, validation, test = split(windows, seed=seed)
     healthy = [recordings.frames[i] for i in np.unique(training.recording)]
-    say(f"recordings   {len(recordings)} of {layout}; {len(recordings.class_names)} classes, {len(windows)} windows")
+    say(
+        f"recordings   {len(recordings)} of {layout}; {len(recordings.class_names)} classes,"
+        f" {len(windows)} windows"
+    )
 
     # Train.
     model = TactileTransformer(layout, len(recordings.class_names), seed=seed, **(network or {}))
     options: dict[str, Any] = {"checkpoint": checkpoint, "progress": progress, "seed": seed}
     with clock("training"):
-        history = train(model, training, validation, epochs=epochs, learning_rate=learning_rate, **options)
+        history = train(
+            model, training, validation, epochs=epochs, learning_rate=learning_rate, **options
+        )
     say(f"training     {history}")
     adapter = Adapter(model, training, validation)
     deployed = adapter.healthy
@@ -178,7 +194,9 @@ def run_demo(
         adaptation=adaptation,
         n_log=len(log),
         seconds=clock.seconds,
-        maps=_force_maps([recordings.frames[i] for i in np.unique(test.recording)], broken, adaptation, layout),
+        maps=_force_maps(
+            [recordings.frames[i] for i in np.unique(test.recording)], broken, adaptation, layout
+        ),
     )
     say(f"repaired     {result.repaired}")
     say(_summary(result))
@@ -195,7 +213,10 @@ def _broken(
 
 
 def _diagnosed(
-    layout: SensorLayout, healthy: Sequence[NDArray[Any]], log: Sequence[NDArray[np.float64]], clock: _Clock
+    layout: SensorLayout,
+    healthy: Sequence[NDArray[Any]],
+    log: Sequence[NDArray[np.float64]],
+    clock: _Clock,
 ) -> Diagnosis:
     """Fit the healthy model, and diagnose the log."""
     with clock("fitting the healthy model"):
@@ -208,7 +229,10 @@ def _summary(result: DemoResult) -> str:
     """Return the accuracy before the faults, with them, and after the repair, in one line."""
     steps = {"fault-free": result.fault_free, "broken": result.broken, "repaired": result.repaired}
     sequence = " -> ".join(f"{scores.accuracy:.3f} {name}" for name, scores in steps.items())
-    return f"accuracy     {sequence} ({result.recovered:.0%} of fault-free) in {result.seconds['adaptation']:.1f} s"
+    return (
+        f"accuracy     {sequence} ({result.recovered:.0%} of fault-free) in"
+        f" {result.seconds['adaptation']:.1f} s"
+    )
 
 
 def _list(say: Callable[[str], None], lines: Sequence[str]) -> None:
@@ -219,52 +243,68 @@ def _list(say: Callable[[str], None], lines: Sequence[str]) -> None:
 
 
 def _found(diagnosis: Diagnosis, injected: Sequence[Fault], n_log: int, seconds: float) -> str:
-    """Return the number of injected faults that were found, and of those that the log cannot show."""
+    """Return the number of injected faults that were found, and of those that the log cannot
+    show."""
     true = {cell for fault in injected for cell in fault.cells}
     false = len(diagnosis.fault_set - true)
     missed = len(true & set(diagnosis.coverage.untested.tolist()))
     logs = "1 recording" if n_log == 1 else f"{n_log} recordings"
     untested = f" ({missed} not tested by the log)" if missed else ""
     return (
-        f"diagnosis    found {len(diagnosis.fault_set & true)} of {len(true)} broken cells{untested},"
-        f" {false} false alarm{'' if false == 1 else 's'}, from {logs} in {seconds:.2f} s;"
-        f" {diagnosis.coverage}"
+        f"diagnosis    found {len(diagnosis.fault_set & true)} of {len(true)} broken"
+        f" cells{untested}, {false} false alarm{'' if false == 1 else 's'}, from {logs} in"
+        f" {seconds:.2f} s; {diagnosis.coverage}"
     )
 
 
-def default_faults(recordings: Sequence[NDArray[Any]], layout: SensorLayout, rng: np.random.Generator) -> list[Fault]:
-    """Draw a broken row, a short, an open and a cell stuck in mid-range, where the recordings show contact.
+def default_faults(
+    recordings: Sequence[NDArray[Any]], layout: SensorLayout, rng: np.random.Generator
+) -> list[Fault]:
+    """Draw a broken row, a short, an open and a cell stuck in mid-range, where the recordings show
+    contact.
 
     On an array without three cells besides the row, what still finds a place is returned.
     """
-    touched = np.mean([np.nan_to_num(r).max(axis=0) > 0.02 * layout.full_scale for r in recordings], axis=0)
+    touched = np.mean(
+        [np.nan_to_num(r).max(axis=0) > 0.02 * layout.full_scale for r in recordings], axis=0
+    )
     rows = [line for line in layout.lines if line.kind == "row" and len(layout.cells_on(line))]
     activity = np.array([touched[layout.cells_on(line)].mean() for line in rows])
     busy = np.flatnonzero(activity >= np.quantile(activity, 0.75))
     faults = [line_fault(layout, rows[int(rng.choice(busy))], FaultKind.OPEN)]
     others = np.setdiff1d(np.flatnonzero(layout.present), faults[0].cells)
     busiest = rng.permutation(others[np.argsort(-touched[others])][: max(3, len(others) // 2)])
-    for cell, kind in zip(busiest, (FaultKind.SHORT, FaultKind.OPEN, FaultKind.STUCK), strict=False):
+    for cell, kind in zip(
+        busiest, (FaultKind.SHORT, FaultKind.OPEN, FaultKind.STUCK), strict=False
+    ):
         value = layout.full_scale / 2 if kind is FaultKind.STUCK else None
         faults.append(Fault(kind, (int(cell),), value=value))
     return faults
 
 
-def _score(model: TactileTransformer | Adaptation, windows: Windows) -> tuple[Scores, tuple[float, float]]:
+def _score(
+    model: TactileTransformer | Adaptation, windows: Windows
+) -> tuple[Scores, tuple[float, float]]:
     """Return scores and the 95 % interval of the accuracy."""
     predicted = model.predict(windows.x)
-    return Scores.of(windows.y, predicted), accuracy_interval(predicted == windows.y, windows.recording)
+    return Scores.of(windows.y, predicted), accuracy_interval(
+        predicted == windows.y, windows.recording
+    )
 
 
 def _labelled(windows: Windows, which: NDArray[np.int64], recordings: Recordings) -> Windows:
-    """Give windows, numbered within a selection of recordings, the labels and numbers of those recordings."""
+    """Give windows, numbered within a selection of recordings, the labels and numbers of those
+    recordings."""
     assert recordings.labels is not None
     recording = which[windows.recording]
     return Windows(windows.x, recordings.labels[recording], recording)
 
 
 def _force_maps(
-    normal: Sequence[NDArray[Any]], broken: Sequence[NDArray[Any]], adaptation: Adaptation, layout: SensorLayout
+    normal: Sequence[NDArray[Any]],
+    broken: Sequence[NDArray[Any]],
+    adaptation: Adaptation,
+    layout: SensorLayout,
 ) -> dict[str, NDArray[np.float64]]:
     """Return mean forces ``[D]`` of the healthy sensor, of the broken one, and after imputation."""
     import torch
@@ -274,7 +314,9 @@ def _force_maps(
 
     frames = hold_missing(np.concatenate([scale(r, layout) for r in broken]))
     with torch.no_grad():
-        filled = adaptation.model.complete(torch.from_numpy(phi(frames, adaptation.fault_set))[None])[0].numpy()
+        filled = adaptation.model.complete(
+            torch.from_numpy(phi(frames, adaptation.fault_set))[None]
+        )[0].numpy()
     return {
         "normal": np.nanmean(np.concatenate(normal), axis=0, dtype=np.float64),
         "broken": np.nanmean(np.concatenate(broken), axis=0),

@@ -22,15 +22,21 @@ _TESTED = 0.5  # below this share of tested cells, a log without a fault is no p
 
 
 def verdict(diagnosis: Diagnosis, code: int | None = None) -> Verdict:
-    """Return the verdict of a diagnosis: ``"call"`` for a wire or a tenth of the cells, ``"watch"`` for single cells.
+    """Return the verdict of a diagnosis: ``"call"`` for a wire or a tenth of the cells, ``"watch"``
+    for single cells.
 
-    A log without a fault that tested less than half of the cells gives ``"watch"`` as well. ``code`` is the exit code
-    of ``adaptfault diagnose``, where more is known than the faults: 2 gives ``"call"``, 1 at least ``"watch"``.
+    A log without a fault that tested less than half of the cells gives ``"watch"`` as well.
+    ``code`` is the exit code of ``adaptfault diagnose``, where more is known than the faults: 2
+    gives ``"call"``, 1 at least ``"watch"``.
     """
     code = diagnosis.exit_code if code is None else code
     if code >= 2:
         return "call"
-    return "watch" if code or diagnosis.exit_code or diagnosis.coverage.test_coverage < _TESTED else "nothing"
+    return (
+        "watch"
+        if code or diagnosis.exit_code or diagnosis.coverage.test_coverage < _TESTED
+        else "nothing"
+    )
 
 
 def write_diagnosis(
@@ -50,7 +56,8 @@ def write_diagnosis(
         name: of the log.
         reference: whether the diagnosis had fault-free recordings to compare with.
         code: the exit code of the command; None: that of the diagnosis.
-        notes: sentences below the verdict: a changed sensor, exchanged wires, faults that are handled.
+        notes: sentences below the verdict: a changed sensor, exchanged wires, faults that are
+            handled.
 
     Raises:
         OSError: the folder cannot be written.
@@ -61,13 +68,18 @@ def write_diagnosis(
         headline = "Watch: the running version handles the faults"
     elif state == "watch" and not diagnosis.faults:
         untested = diagnosis.coverage.test_coverage < _TESTED
-        headline = "No fault found, but " + ("most cells were not tested" if untested else "see the reason")
+        headline = "No fault found, but " + (
+            "most cells were not tested" if untested else "see the reason"
+        )
     return render(
         path,
         "diagnosis.html",
         name=name,
         state=state,
-        notes=[note[0].upper() + note[1:] for note in (*notes, *(load.reason for load in diagnosis.static_loads))],
+        notes=[
+            note[0].upper() + note[1:]
+            for note in (*notes, *(load.reason for load in diagnosis.static_loads))
+        ],
         headline=headline,
         diagnosis=diagnosis,
         layout=diagnosis.layout,

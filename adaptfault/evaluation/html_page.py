@@ -29,7 +29,9 @@ def render(path: str | Path, template: str, **values: Any) -> Path:
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    environment = Environment(loader=PackageLoader("adaptfault.evaluation"), autoescape=True, undefined=StrictUndefined)
+    environment = Environment(
+        loader=PackageLoader("adaptfault.evaluation"), autoescape=True, undefined=StrictUndefined
+    )
     environment.filters["percent"] = percent
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -53,7 +55,9 @@ class Picture:
     def of(cls, plot: Callable[[float], Figure]) -> Picture:
         """Draw the figure with ``plot``, a function of the width of the page in inches."""
         wide = plot(PAGE)
-        return cls(_embedded(wide), _embedded(plot(_NARROW)) if wide.get_figwidth() > _NARROW else "")
+        return cls(
+            _embedded(wide), _embedded(plot(_NARROW)) if wide.get_figwidth() > _NARROW else ""
+        )
 
 
 def _embedded(figure: Figure) -> str:

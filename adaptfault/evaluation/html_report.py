@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Row:
-    """An injected fault, with the number of its cells that were found and that the log did not test."""
+    """An injected fault, with the number of its cells that were found and that the log did not
+    test."""
 
     injected: str
     cells: int
@@ -45,13 +46,17 @@ def write_report(path: str | Path, result: DemoResult) -> Path:
         alarms=_false_alarm_texts(result),
         forces=Picture.of(lambda page: _draw_maps(result, page)),
         verdicts=Picture.of(result.diagnosis.plot),
-        versions=", ".join(f"{name} {version_of(name)}" for name in ("adaptfault", "torch", "numpy", "scikit-learn")),
+        versions=", ".join(
+            f"{name} {version_of(name)}"
+            for name in ("adaptfault", "torch", "numpy", "scikit-learn")
+        ),
         python=platform.python_version(),
     )
 
 
 def _rows(result: DemoResult) -> list[_Row]:
-    faulty, untested = result.diagnosis.fault_set, set(result.diagnosis.coverage.untested.tolist())
+    faulty = result.diagnosis.fault_set
+    untested = set(result.diagnosis.coverage.untested.tolist())
     rows = []
     for fault in result.injected:
         causes = tuple(f.reason for f in result.diagnosis.faults if set(f.cells) & set(fault.cells))
@@ -77,7 +82,10 @@ def _draw_maps(result: DemoResult, page: float) -> Figure:
     """Draw mean forces as the paper's Figure 3, with a third row: the forces after imputation."""
     layout = result.recordings.layout
     figure, axes = pads_figure(layout, n_rows=len(result.maps), page=page)
-    masked = {name: np.where(layout.present.ravel(), values, np.nan) for name, values in result.maps.items()}
+    masked = {
+        name: np.where(layout.present.ravel(), values, np.nan)
+        for name, values in result.maps.items()
+    }
     # One colour scale for all, from the healthy map: a short is then off the scale.
     top = float(np.nanmax(masked["normal"])) or layout.full_scale
     marks = {"normal": FaultSet((), layout.n_cells), "broken": result.injected_set}
@@ -86,7 +94,9 @@ def _draw_maps(result: DemoResult, page: float) -> Figure:
         for pad, ax in enumerate(row):
             size = layout.rows * layout.shape[2]
             on_pad = [c - pad * size for c in dead if c // size == pad]
-            image = draw_forces(ax, layout.grid(values)[pad], layout, on_pad, vmin=0, vmax=top, cmap="viridis")
+            image = draw_forces(
+                ax, layout.grid(values)[pad], layout, on_pad, vmin=0, vmax=top, cmap="viridis"
+            )
             ax.set_title(f"{name}, pad {pad}", fontsize=9)
         figure.colorbar(image, ax=row.tolist(), label=layout.unit, extend="max")
     return figure

@@ -1,4 +1,5 @@
-"""Scores of a model: accuracy and macro averages of classes (Section III-B), R2 and absolute error of values."""
+"""Scores of a model: accuracy and macro averages of classes (Section III-B), R2 and absolute error
+of values."""
 
 from __future__ import annotations
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 
+from adaptfault.data.determination import r2
 from adaptfault.data.windows import Windows
 
 SCHEMA = "adaptfault.scores/1"
@@ -27,8 +29,8 @@ class Classifier(Protocol):
 class Scores:
     """Scores of a classifier on labelled windows.
 
-    Precision, recall and F1 are macro averages over the classes that occur or were predicted; 0 where one is undefined
-    (a class that was never predicted has precision 0).
+    Precision, recall and F1 are macro averages over the classes that occur or were predicted; 0
+    where one is undefined (a class that was never predicted has precision 0).
 
     Attributes:
         accuracy, precision, recall, f1: 0..1.
@@ -45,23 +47,32 @@ class Scores:
 
     @classmethod
     def of(cls, true: ArrayLike, predicted: ArrayLike, *, n_classes: int | None = None) -> Scores:
-        """Score predicted against true classes, both int ``[N]``; ``n_classes`` is the least size of the confusion.
+        """Score predicted against true classes, both int ``[N]``; ``n_classes`` is the least size
+        of the confusion.
 
         Raises:
             ValueError: no windows, a window without a label, arrays of different lengths.
         """
-        t, p = np.asarray(true), np.asarray(predicted)
+        t = np.asarray(true)
+        p = np.asarray(predicted)
         if t.ndim != 1 or t.shape != p.shape:
-            raise ValueError(f"expected one predicted class for each of {t.size} windows, got shape {list(p.shape)}")
+            raise ValueError(
+                f"expected one predicted class for each of {t.size} windows, got shape"
+                f" {list(p.shape)}"
+            )
         if not len(t):
             raise ValueError("no windows to score")
         if t.min() < 0:
             raise ValueError(f"{int((t < 0).sum())} of {len(t)} windows have no label")
         size = max(int(t.max()) + 1, int(p.max()) + 1, n_classes or 0)
-        precision, recall, f1, _ = precision_recall_fscore_support(t, p, average="macro", zero_division=0)
+        precision, recall, f1, _ = precision_recall_fscore_support(
+            t, p, average="macro", zero_division=0
+        )
         confusion = confusion_matrix(t, p, labels=np.arange(size)).astype(np.int64)
         confusion.setflags(write=False)
-        return cls(float((t == p).mean()), float(precision), float(recall), float(f1), confusion, len(t))
+        return cls(
+            float((t == p).mean()), float(precision), float(recall), float(f1), confusion, len(t)
+        )
 
     def __eq__(self, other: object) -> bool:
         return self.to_dict() == other.to_dict() if isinstance(other, Scores) else NotImplemented
@@ -71,8 +82,8 @@ class Scores:
 
     def __str__(self) -> str:
         return (
-            f"accuracy {self.accuracy:.3f}, precision {self.precision:.3f}, recall {self.recall:.3f}, "
-            f"F1 {self.f1:.3f} on {self.n} windows"
+            f"accuracy {self.accuracy:.3f}, precision {self.precision:.3f}, recall"
+            f" {self.recall:.3f}, F1 {self.f1:.3f} on {self.n} windows"
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -96,7 +107,10 @@ class Scores:
 
     def plot(self, ax: Any = None, *, class_names: Sequence[str] | None = None) -> Any:
         """Draw the confusion as shares of each true class; return matplotlib's axes."""
-        from matplotlib.figure import Figure  # loaded only here: evaluation must stay quick to import
+        # loaded only here: evaluation must stay quick to import
+        from matplotlib.figure import (
+            Figure,
+        )
 
         ax = Figure(layout="constrained").subplots() if ax is None else ax
         total = np.maximum(self.confusion.sum(axis=1, keepdims=True), 1)
@@ -113,8 +127,8 @@ class ValueScores:
     """Scores of a regression of k values.
 
     Attributes:
-        r2: coefficient of determination, mean over the values (``sklearn.metrics.r2_score``); 1 is perfect, 0 is the
-            mean of the values.
+        r2: coefficient of determination, mean over the values (``sklearn.metrics.r2_score``); 1 is
+            perfect, 0 is the mean of the values.
         mae: mean absolute error of each value, in its unit.
         n: number of windows.
     """
@@ -130,9 +144,12 @@ class ValueScores:
         Raises:
             ValueError: no windows, or arrays of different shapes.
         """
-        t, p = np.asarray(true, dtype=np.float64), np.asarray(predicted, dtype=np.float64)
+        t = np.asarray(true, dtype=np.float64)
+        p = np.asarray(predicted, dtype=np.float64)
         if t.ndim != 2 or t.shape != p.shape or not len(t):
-            raise ValueError(f"expected values of shape {list(t.shape)} [N, k], got {list(p.shape)}")
+            raise ValueError(
+                f"expected values of shape {list(t.shape)} [N, k], got {list(p.shape)}"
+            )
         return cls(r2(t, p), tuple(np.abs(t - p).mean(axis=0).tolist()), len(t))
 
     def __str__(self) -> str:
@@ -155,16 +172,9 @@ class ValueScores:
         return cls(d["r2"], tuple(d["mae"]), d["n"])
 
 
-def r2(true: ArrayLike, predicted: ArrayLike) -> float:
-    """Return the coefficient of determination of values ``[N, k]``, mean over those that vary; 0 if none varies."""
-    t, p = np.asarray(true, dtype=np.float64), np.asarray(predicted, dtype=np.float64)
-    total = ((t - t.mean(axis=0)) ** 2).sum(axis=0)
-    varies = total > 0
-    return float((1 - ((t - p) ** 2).sum(axis=0)[varies] / total[varies]).mean()) if varies.any() else 0.0
-
-
 def recording_scores(probabilities: ArrayLike, windows: Windows) -> Scores:
-    """Score one decision for each recording: the class with the largest product of its windows' probabilities.
+    """Score one decision for each recording: the class with the largest product of its windows'
+    probabilities.
 
     Args:
         probabilities: ``[N, n_classes]`` of the windows.
@@ -185,7 +195,8 @@ def recording_scores(probabilities: ArrayLike, windows: Windows) -> Scores:
 
 
 def chance(y: ArrayLike) -> tuple[float, float]:
-    """Return the accuracy m of always naming the most frequent class, and the least that exceeds it beyond chance.
+    """Return the accuracy m of always naming the most frequent class, and the least that exceeds it
+    beyond chance.
 
     The latter is m + 2 sqrt(m (1 - m) / n), two standard errors of n windows, classes ``y [n]``.
     """
@@ -194,26 +205,35 @@ def chance(y: ArrayLike) -> tuple[float, float]:
     return share, share + 2 * float(np.sqrt(share * (1 - share) / counts.sum()))
 
 
-def mean_interval(values: ArrayLike, recording: ArrayLike, *, level: float = 0.95) -> tuple[float, float]:
-    """Return the cluster-robust t interval of the mean of ``values [N]``, clustered by recording ``[N]``.
+def mean_interval(
+    values: ArrayLike, recording: ArrayLike, *, level: float = 0.95
+) -> tuple[float, float]:
+    """Return the cluster-robust t interval of the mean of ``values [N]``, clustered by recording
+    ``[N]``.
 
     A single recording has no spread between recordings; its interval is unbounded.
     """
     from statsmodels.regression.linear_model import OLS
 
-    v, recording = np.asarray(values, dtype=float), np.asarray(recording)
+    v = np.asarray(values, dtype=float)
+    recording = np.asarray(recording)
     if len(np.unique(recording)) < 2:
         return -np.inf, np.inf
-    fit = OLS(v, np.ones((len(v), 1))).fit(cov_type="cluster", cov_kwds={"groups": recording}, use_t=True)
+    fit = OLS(v, np.ones((len(v), 1))).fit(
+        cov_type="cluster", cov_kwds={"groups": recording}, use_t=True
+    )
     low, high = fit.conf_int(1 - level)[0]
     return float(low), float(high)
 
 
-def accuracy_interval(right: ArrayLike, recording: ArrayLike, *, level: float = 0.95) -> tuple[float, float]:
+def accuracy_interval(
+    right: ArrayLike, recording: ArrayLike, *, level: float = 0.95
+) -> tuple[float, float]:
     """Return the confidence interval of an accuracy, clustered by recording.
 
-    Windows of one recording are correlated, so the recordings count as samples: a cluster-robust t interval, or the
-    exact binomial interval over recordings where all windows are right or all are wrong.
+    Windows of one recording are correlated, so the recordings count as samples: a cluster-robust t
+    interval, or the exact binomial interval over recordings where all windows are right or all are
+    wrong.
 
     Args:
         right: bool ``[N]``, whether each window was classified correctly.
@@ -222,7 +242,8 @@ def accuracy_interval(right: ArrayLike, recording: ArrayLike, *, level: float = 
     """
     from statsmodels.stats.proportion import proportion_confint
 
-    right, recording = np.asarray(right, dtype=bool), np.asarray(recording)
+    right = np.asarray(right, dtype=bool)
+    recording = np.asarray(recording)
     count = len(np.unique(recording))
     if right.all() or not right.any() or count < 2:
         low, high = proportion_confint(count * int(right.all()), count, 1 - level, method="beta")
@@ -236,9 +257,9 @@ def prediction_interval(
 ) -> tuple[float, float]:
     """Return the interval of the accuracy on ``new`` recordings that are like the known ones.
 
-    The score prediction interval of Krishnamoorthy and Peng (2011), with t quantiles. The windows count as their
-    effective number, n_e = p (1 - p) / (cluster-robust variance of p) (Korn and Graubard 1998). With infinitely many
-    new recordings it is the score interval of Wilson (1927).
+    The score prediction interval of Krishnamoorthy and Peng (2011), with t quantiles. The windows
+    count as their effective number, n_e = p (1 - p) / (cluster-robust variance of p) (Korn and
+    Graubard 1998). With infinitely many new recordings it is the score interval of Wilson (1927).
 
     Args:
         right: bool ``[N]``, whether each window was classified correctly.
@@ -251,23 +272,34 @@ def prediction_interval(
     """
     from scipy import stats
 
-    right, recording = np.asarray(right, dtype=bool), np.asarray(recording)
+    right = np.asarray(right, dtype=bool)
+    recording = np.asarray(recording)
     known = len(np.unique(recording))
     new = known if new is None else new
     if known < 2:
         return 0.0, 1.0
-    p, quantile = float(right.mean()), float(stats.t.ppf((1 + level) / 2, known - 1))
+    p = float(right.mean())
+    quantile = float(stats.t.ppf((1 + level) / 2, known - 1))
     low, high = mean_interval(right, recording, level=level)
     variance = ((high - low) / 2 / quantile) ** 2
-    # Where all windows are right, nothing shows how alike those of a recording are: a recording then counts as one.
-    effective = known if p in (0.0, 1.0) else min(len(right), p * (1 - p) / max(variance, np.finfo(float).tiny))
-    # All a with (p - a)^2 <= scale q (1 - q), where q = share p + (1 - share) a is the accuracy of both samples.
-    scale, share = quantile**2 / effective * (1 + known / new), known / (known + new)
+    # Where all windows are right, nothing shows how alike those of a recording are: a recording
+    # then counts as one.
+    effective = (
+        known
+        if p in (0.0, 1.0)
+        else min(len(right), p * (1 - p) / max(variance, np.finfo(float).tiny))
+    )
+    # All a with (p - a)^2 <= scale q (1 - q), where q = share p + (1 - share) a is the accuracy of
+    # both samples.
+    scale = quantile**2 / effective * (1 + known / new)
+    share = known / (known + new)
     square = 1 + scale * (1 - share) ** 2
     half = p + scale * (1 - share) * (1 - 2 * share * p) / 2
     root = np.sqrt(max(0.0, half**2 - square * (p**2 - scale * share * p * (1 - share * p))))
-    low, high = (half - root) / square, (half + root) / square
-    return float(np.clip(low, 0.0, p)), float(np.clip(high, p, 1.0))  # p itself solves it, but for rounding
+    low = (half - root) / square
+    high = (half + root) / square
+    # p itself solves it, but for rounding
+    return float(np.clip(low, 0.0, p)), float(np.clip(high, p, 1.0))
 
 
 def _evaluate_values(model: Any, windows: Windows) -> ValueScores:
@@ -281,10 +313,12 @@ def _evaluate_values(model: Any, windows: Windows) -> ValueScores:
 
 
 def evaluate(model: Classifier | Any, windows: Windows) -> Any:
-    """Score ``model`` on labelled windows: :class:`Scores` of classes, :class:`ValueScores` of values.
+    """Score ``model`` on labelled windows: :class:`Scores` of classes, :class:`ValueScores` of
+    values.
 
     Args:
-        model: anything with ``predict(x [N, T, D]) -> int [N]``, or a torch module that returns logits.
+        model: anything with ``predict(x [N, T, D]) -> int [N]``, or a torch module that returns
+            logits.
         windows: what to score it on.
 
     Raises:
@@ -301,6 +335,8 @@ def evaluate(model: Classifier | Any, windows: Windows) -> Any:
     from adaptfault.models.network import logits_of
 
     if not isinstance(model, nn.Module):
-        raise TypeError(f"expected something with predict(x) or a torch module, got {type(model).__name__}")
+        raise TypeError(
+            f"expected something with predict(x) or a torch module, got {type(model).__name__}"
+        )
     logits = logits_of(model, windows.x)
     return Scores.of(windows.y, logits.argmax(1).numpy(), n_classes=logits.shape[1])

@@ -1,8 +1,9 @@
-"""Sensitivity to single faults: accuracy lost when a cell, row, column or address bit is stuck (the paper's abstract).
+"""Sensitivity to single faults: accuracy lost when a cell, row, column or address bit is stuck (the
+paper's abstract).
 
-The result is exact: each cell is stuck at each value in each window. For the paper's network a low-rank form
-(:mod:`adaptfault.evaluation.stuck_cell_logits`) takes a tenth of the time of full passes (a third with unpadded
-convolutions).
+The result is exact: each cell is stuck at each value in each window. For the paper's network a
+low-rank form (:mod:`adaptfault.evaluation.stuck_cell_logits`) takes a tenth of the time of full
+passes (a third with unpadded convolutions).
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ _NUMBERED = 5  # worst cells that the map numbers
 _BATCH = 512  # stuck cells at once
 
 Floats = NDArray[np.float64]
-# windows [N, T, D] -> probability of each class [N, C]; window [T, D], cells [P], values [P] -> the same, [P, C]
+# windows [N, T, D] -> probability of each class [N, C]; window [T, D], cells [P], values [P] -> the
+# same, [P, C]
 _Answer = Callable[[NDArray[np.float32]], Floats]
 _StuckAnswers = Callable[[NDArray[np.float32], NDArray[np.intp], NDArray[np.float32]], Floats]
 
@@ -41,7 +43,8 @@ class WireLoss:
 
     Attributes:
         line: the wire.
-        value: reading of its cells on the 0..1 scale; for an address bit the level that it is stuck at.
+        value: reading of its cells on the 0..1 scale; for an address bit the level that it is stuck
+            at.
         cells: number of cells affected.
         accuracy_lost, confidence_lost: as in :class:`Sensitivity`.
     """
@@ -53,14 +56,18 @@ class WireLoss:
     confidence_lost: float
 
     def __str__(self) -> str:
-        return f"{self.line} stuck at {self.value:g}: accuracy {-self.accuracy_lost:+.3f}, {self.cells} cells"
+        return (
+            f"{self.line} stuck at {self.value:g}: accuracy {-self.accuracy_lost:+.3f},"
+            f" {self.cells} cells"
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
     """Loss of a classifier by single faults. V values, D cells, C classes.
 
-    "Lost" is fault-free minus faulty, so positive is worse. Confidence is the probability of the true class.
+    "Lost" is fault-free minus faulty, so positive is worse. Confidence is the probability of the
+    true class.
 
     Attributes:
         layout: the array.
@@ -68,9 +75,11 @@ class Sensitivity:
         n: number of windows.
         accuracy, confidence: fault-free.
         accuracy_lost, confidence_lost: ``[V, D]``; 0 for positions without a cell.
-        accuracy_lost_by_class, confidence_lost_by_class: ``[V, D, C]``, among the windows of one class; NaN for a class
+        accuracy_lost_by_class, confidence_lost_by_class: ``[V, D, C]``, among the windows of one
+        class; NaN for a class
             without windows.
-        gradient: ``[V, D]``, the first-order estimate of the loss (rise of the cross entropy), from one backward pass.
+        gradient: ``[V, D]``, the first-order estimate of the loss (rise of the cross entropy), from
+            one backward pass.
         wires: broken wires, the worst first; empty with ``wires=False``.
     """
 
@@ -88,26 +97,37 @@ class Sensitivity:
 
     @property
     def rank_correlation(self) -> Floats:
-        """Spearman correlation of the gradient estimate and the exact confidence lost, over present cells, ``[V]``."""
+        """Spearman correlation of the gradient estimate and the exact confidence lost, over present
+        cells, ``[V]``."""
         from scipy.stats import spearmanr
 
         present = self.layout.present.ravel()
         pairs = zip(self.gradient[:, present], self.confidence_lost[:, present], strict=True)
-        return np.array([spearmanr(a, b).statistic if np.ptp(a) and np.ptp(b) else np.nan for a, b in pairs])
+        return np.array(
+            [spearmanr(a, b).statistic if np.ptp(a) and np.ptp(b) else np.nan for a, b in pairs]
+        )
 
     def worst(self, n: int = _NUMBERED) -> list[tuple[int, float, float]]:
-        """Return the n single faults that cost most accuracy: (cell, value, accuracy lost); ties by confidence."""
-        order = np.argsort(-(self.accuracy_lost + 1e-9 * self.confidence_lost), axis=None, kind="stable")
+        """Return the n single faults that cost most accuracy: (cell, value, accuracy lost); ties by
+        confidence."""
+        order = np.argsort(
+            -(self.accuracy_lost + 1e-9 * self.confidence_lost), axis=None, kind="stable"
+        )
         places = [divmod(int(i), self.layout.n_cells) for i in order[:n]]
         return [(cell, self.values[v], float(self.accuracy_lost[v, cell])) for v, cell in places]
 
     def __str__(self) -> str:
-        lines = [f"accuracy {self.accuracy:.3f}, confidence {self.confidence:.3f} on {self.n} windows, fault-free"]
-        for value, lost, rho in zip(self.values, self.accuracy_lost, self.rank_correlation, strict=True):
+        lines = [
+            f"accuracy {self.accuracy:.3f}, confidence {self.confidence:.3f} on {self.n} windows,"
+            " fault-free"
+        ]
+        for value, lost, rho in zip(
+            self.values, self.accuracy_lost, self.rank_correlation, strict=True
+        ):
             present = lost[self.layout.present.ravel()]
             lines.append(
-                f"one cell at {value:g}: accuracy {-present.mean():+.3f} on average, {-present.max():+.3f} at worst;"
-                f" gradient estimate: rank correlation {rho:.2f}"
+                f"one cell at {value:g}: accuracy {-present.mean():+.3f} on average,"
+                f" {-present.max():+.3f} at worst; gradient estimate: rank correlation {rho:.2f}"
             )
         for cell, value, lost in self.worst():
             lines.append(f"  {_place(self.layout, cell)} at {value:g}: {-lost:+.3f}")
@@ -120,21 +140,37 @@ class Sensitivity:
         figure, axes = pads_figure(self.layout, n_rows=len(self.values))
         shown = np.where(self.layout.present.ravel(), self.accuracy_lost, np.nan)
         for value, losses, row in zip(self.values, shown, axes, strict=True):
-            top = max(float(np.nanmax(losses)), 1 / self.n)  # each value on its own scale: a short costs far more
+            # each value on its own scale: a short costs far more
+            top = max(float(np.nanmax(losses)), 1 / self.n)
             for pad, ax in enumerate(row):
-                image = draw_forces(ax, self.layout.grid(losses)[pad], self.layout, vmin=0, vmax=top, cmap="Reds")
+                image = draw_forces(
+                    ax, self.layout.grid(losses)[pad], self.layout, vmin=0, vmax=top, cmap="Reds"
+                )
                 ax.set_title(f"stuck at {value:g}, pad {pad}", fontsize=9)
             figure.colorbar(image, ax=row.tolist(), label="accuracy lost")
         for rank, (cell, value, lost) in enumerate(self.worst(), start=1):
             pad, at, col = self.layout.position(cell)
             if lost > 0:
                 ax = axes[self.values.index(value), pad]
-                ax.text(col, at, str(rank), ha="center", va="center", fontsize=8, color="white", fontweight="bold")
+                ax.text(
+                    col,
+                    at,
+                    str(rank),
+                    ha="center",
+                    va="center",
+                    fontsize=8,
+                    color="white",
+                    fontweight="bold",
+                )
         return figure
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
-        d: dict[str, Any] = {"schema": SCHEMA, "layout": self.layout.to_dict(), "values": list(self.values)}
+        d: dict[str, Any] = {
+            "schema": SCHEMA,
+            "layout": self.layout.to_dict(),
+            "values": list(self.values),
+        }
         d |= {"n": self.n, "accuracy": self.accuracy, "confidence": self.confidence}
         for name in ("accuracy_lost", "confidence_lost", "gradient"):
             d[name] = getattr(self, name).tolist()
@@ -156,7 +192,8 @@ def sensitivity(
     values: Sequence[float] = (0.0, 1.0),
     progress: bool | None = False,
 ) -> Floats:
-    """Return the accuracy lost when one cell is stuck at one value, ``[len(values), D]``; negative is a gain.
+    """Return the accuracy lost when one cell is stuck at one value, ``[len(values), D]``; negative
+    is a gain.
 
     Args:
         model: a network, or anything with ``predict(x) -> int [N]``.
@@ -180,7 +217,8 @@ def analyse(
     wires: bool = True,
     progress: bool | None = False,
 ) -> Sensitivity:
-    """Return the loss by each single fault: of a cell, and with ``wires`` also of a row, a column, an address bit.
+    """Return the loss by each single fault: of a cell, and with ``wires`` also of a row, a column,
+    an address bit.
 
     The wires of the paper's array take as long as its cells. Otherwise as :func:`sensitivity`.
 
@@ -191,7 +229,10 @@ def analyse(
     from adaptfault.models.network import TactileTransformer
 
     if not isinstance(model, TactileTransformer):
-        raise TypeError(f"the analysis needs a TactileTransformer, got {type(model).__name__}; sensitivity() does not")
+        raise TypeError(
+            f"the analysis needs a TactileTransformer, got {type(model).__name__}; sensitivity()"
+            " does not"
+        )
     usual, stuck = _enumerate(model, windows, values, progress)
     return Sensitivity(
         layout=model.layout,
@@ -202,14 +243,16 @@ def analyse(
         accuracy_lost=usual.accuracy - stuck.accuracy,
         confidence_lost=usual.mean_confidence - stuck.mean_confidence,
         accuracy_lost_by_class=usual.by_class(usual.right) - stuck.by_class(stuck.right),
-        confidence_lost_by_class=usual.by_class(usual.confidence) - stuck.by_class(stuck.confidence),
+        confidence_lost_by_class=usual.by_class(usual.confidence)
+        - stuck.by_class(stuck.confidence),
         gradient=_gradient(model, windows, values),
         wires=_wires(model, windows, values, usual, progress) if wires else (),
     )
 
 
 class _Tally:
-    """Right answers and confidence of V x D faulty sensors, summed over the windows of each class, ``[V, D, C]``."""
+    """Right answers and confidence of V x D faulty sensors, summed over the windows of each class,
+    ``[V, D, C]``."""
 
     def __init__(self, n_values: int, n_cells: int, n_classes: int) -> None:
         self.right = np.zeros((n_values, n_cells, n_classes))
@@ -238,14 +281,17 @@ class _Tally:
 def _enumerate(
     model: Classifier | nn.Module, windows: Windows, values: Sequence[float], progress: bool | None
 ) -> tuple[_Tally, _Tally]:
-    """Return the tallies of the fault-free sensor, ``[1, 1, C]``, and of every single fault, ``[V, D, C]``."""
+    """Return the tallies of the fault-free sensor, ``[1, 1, C]``, and of every single fault,
+    ``[V, D, C]``."""
     if not len(windows) or windows.y.min() < 0 or not len(values):
         raise ValueError("sensitivity needs labelled windows and at least one value to be stuck at")
-    levels, n_cells = np.asarray(values, np.float32), windows.x.shape[2]
+    levels = np.asarray(values, np.float32)
+    n_cells = windows.x.shape[2]
     answer, stuck_answers, n_classes = _answers(model, windows)
     layout = getattr(model, "layout", None)
     present = layout.present.ravel() if isinstance(layout, SensorLayout) else np.ones(n_cells, bool)
-    usual, stuck = _Tally(1, 1, n_classes), _Tally(len(levels), n_cells, n_classes)
+    usual = _Tally(1, 1, n_classes)
+    stuck = _Tally(len(levels), n_cells, n_classes)
     hide = None if progress is None else not progress
     for which, labels in tqdm(_distinct(windows), desc="stuck cells", unit="window", disable=hide):
         window = windows.x[which]
@@ -262,7 +308,8 @@ def _enumerate(
 
 
 def _distinct(windows: Windows) -> list[tuple[int, dict[int, int]]]:
-    """Return an index for each distinct window (idle ones are often alike), and its count of each label."""
+    """Return an index for each distinct window (idle ones are often alike), and its count of each
+    label."""
     alike: dict[bytes, tuple[int, dict[int, int]]] = {}
     for i, (x, label) in enumerate(zip(windows.x, windows.y.tolist(), strict=True)):
         labels = alike.setdefault(x.tobytes(), (i, {}))[1]
@@ -290,20 +337,27 @@ def _answers(model: Classifier | nn.Module, windows: Windows) -> tuple[_Answer, 
         n_classes = int(windows.y.max()) + 2  # the last one stands for any other prediction
 
         def answer(x: NDArray[np.float32]) -> Floats:
-            return np.asarray(np.asarray(classifier.predict(x))[:, None] == np.arange(n_classes), float)
+            return np.asarray(
+                np.asarray(classifier.predict(x))[:, None] == np.arange(n_classes), float
+            )
 
     else:
-        raise TypeError(f"expected something with predict(x) or a torch module, got {type(model).__name__}")
+        raise TypeError(
+            f"expected something with predict(x) or a torch module, got {type(model).__name__}"
+        )
     return answer, _one_by_one(answer), n_classes
 
 
 def _one_by_one(answer: _Answer) -> _StuckAnswers:
     """Return a function that runs the classifier once for each stuck cell."""
 
-    def answers(window: NDArray[np.float32], cells: NDArray[np.intp], levels: NDArray[np.float32]) -> Floats:
+    def answers(
+        window: NDArray[np.float32], cells: NDArray[np.intp], levels: NDArray[np.float32]
+    ) -> Floats:
         parts = []
         for start in range(0, len(cells), _BATCH):
-            c, v = cells[start : start + _BATCH], levels[start : start + _BATCH]
+            c = cells[start : start + _BATCH]
+            v = levels[start : start + _BATCH]
             stuck = np.repeat(window[None], len(c), axis=0)
             stuck[np.arange(len(c)), :, c] = v[:, None]
             parts.append(answer(stuck))
@@ -318,11 +372,15 @@ def _by_coordinates(model: TactileTransformer) -> _StuckAnswers:
 
     from adaptfault.evaluation.stuck_cell_logits import StuckCells
 
-    short, device = StuckCells(model), model.head.weight.device
+    short = StuckCells(model)
+    device = model.head.weight.device
 
-    def answers(window: NDArray[np.float32], cells: NDArray[np.intp], levels: NDArray[np.float32]) -> Floats:
+    def answers(
+        window: NDArray[np.float32], cells: NDArray[np.intp], levels: NDArray[np.float32]
+    ) -> Floats:
         x = torch.from_numpy(window.copy()).to(device)
-        which, at = torch.from_numpy(cells).to(device), torch.from_numpy(levels).to(device)
+        which = torch.from_numpy(cells).to(device)
+        at = torch.from_numpy(levels).to(device)
         return np.asarray(short.logits(x, which, at).double().softmax(1).cpu().numpy())
 
     return answers
@@ -333,26 +391,35 @@ def _gradient(model: TactileTransformer, windows: Windows, values: Sequence[floa
     import torch
 
     frozen = copy.deepcopy(model).eval().requires_grad_(False)
-    device, rise = model.head.weight.device, np.zeros((len(values), windows.x.shape[2]))
+    device = model.head.weight.device
+    rise = np.zeros((len(values), windows.x.shape[2]))
     for start in range(0, len(windows), _BATCH):
         x = torch.from_numpy(windows.x[start : start + _BATCH].copy()).to(device).requires_grad_()
         y = torch.from_numpy(windows.y[start : start + _BATCH].copy()).to(device)
-        (slope,) = torch.autograd.grad(torch.nn.functional.cross_entropy(frozen(x), y, reduction="sum"), x)
+        (slope,) = torch.autograd.grad(
+            torch.nn.functional.cross_entropy(frozen(x), y, reduction="sum"), x
+        )
         for i, value in enumerate(values):
             rise[i] += ((value - x.detach()) * slope).sum((0, 1)).double().cpu().numpy()
     return rise / len(windows)
 
 
 def _wires(
-    model: TactileTransformer, windows: Windows, values: Sequence[float], usual: _Tally, progress: bool | None
+    model: TactileTransformer,
+    windows: Windows,
+    values: Sequence[float],
+    usual: _Tally,
+    progress: bool | None,
 ) -> tuple[WireLoss, ...]:
     """Return the loss by each broken wire, the worst first."""
-    answer, hide = _answers(model, windows)[0], None if progress is None else not progress
+    answer = _answers(model, windows)[0]
+    hide = None if progress is None else not progress
     losses: list[WireLoss] = []
     for line in tqdm(model.layout.lines, desc="wires", unit="wire", disable=hide):
         address = line.kind.endswith("address")
         for value in (0.0, 1.0) if address else values:
-            cells, x = model.layout.cells_on(line), windows.x.copy()
+            cells = model.layout.cells_on(line)
+            x = windows.x.copy()
             if address:
                 cells, sources = model.layout.misaddressed(line, int(value))
                 x[..., cells] = np.where(sources >= 0, windows.x[..., np.maximum(sources, 0)], 0.0)
@@ -363,6 +430,9 @@ def _wires(
             p = answer(x)
             accuracy = float((p.argmax(1) == windows.y).mean())
             confidence = float(p[np.arange(len(x)), windows.y].mean())
-            lost = float(usual.accuracy[0, 0]) - accuracy, float(usual.mean_confidence[0, 0]) - confidence
+            lost = (
+                float(usual.accuracy[0, 0]) - accuracy,
+                float(usual.mean_confidence[0, 0]) - confidence,
+            )
             losses.append(WireLoss(line, float(value), len(cells), *lost))
     return tuple(sorted(losses, key=lambda wire: (-wire.accuracy_lost, -wire.confidence_lost)))

@@ -18,13 +18,17 @@ _FALL = 0.02
 """A training loss that falls by less than this share has not fallen."""
 
 
-def training_problems(scores: Scores, history: History, class_names: Sequence[str]) -> tuple[str, ...]:
-    """Return one sentence for each sign of a failed training, with likely causes; empty if there is none.
+def training_problems(
+    scores: Scores, history: History, class_names: Sequence[str]
+) -> tuple[str, ...]:
+    """Return one sentence for each sign of a failed training, with likely causes; empty if there is
+    none.
 
-    The signs are a test accuracy near chance, a class without a window, a class that is never predicted, and a training
-    loss that did not fall.
-    An accuracy is near chance if it is below the limit of :func:`adaptfault.evaluation.scores.chance`. A run on
-    unbalanced classes may be useful below that limit; the sentence names both numbers.
+    The signs are a test accuracy near chance, a class without a window, a class that is never
+    predicted, and a training loss that did not fall.
+    An accuracy is near chance if it is below the limit of
+    :func:`adaptfault.evaluation.scores.chance`. A run on unbalanced classes may be useful below
+    that limit; the sentence names both numbers.
 
     Args:
         scores: of the test windows.
@@ -36,8 +40,9 @@ def training_problems(scores: Scores, history: History, class_names: Sequence[st
     share, limit = chance(np.repeat(np.arange(len(counts)), counts))
     if scores.accuracy < limit:
         problems.append(
-            f"test accuracy {scores.accuracy:.3f} is near chance ({share:.3f}): train longer (--epochs), and check the"
-            " labels, the full scale (adaptfault info) and that the classes differ in contact"
+            f"test accuracy {scores.accuracy:.3f} is near chance ({share:.3f}): train longer"
+            " (--epochs), and check the labels, the full scale (adaptfault info) and that the"
+            " classes differ in contact"
         )
     absent = np.flatnonzero(counts == 0)
     if absent.size:
@@ -50,8 +55,8 @@ def training_problems(scores: Scores, history: History, class_names: Sequence[st
     losses = history.train_loss
     if len(losses) > 1 and min(losses[1:]) > (1 - _FALL) * losses[0]:
         problems.append(
-            f"the training loss did not fall ({losses[0]:.3f} to {losses[-1]:.3f}): check the full scale"
-            " (adaptfault info) and the labels"
+            f"the training loss did not fall ({losses[0]:.3f} to {losses[-1]:.3f}): check the full"
+            " scale (adaptfault info) and the labels"
         )
     return tuple(problems)
 
@@ -63,7 +68,8 @@ def _classes(which: NDArray[np.intp], what: str, class_names: Sequence[str]) -> 
 
 
 def plot_training(scores: Scores, history: History, class_names: Sequence[str]) -> Figure:
-    """Draw loss and accuracy by epoch, and the confusion matrix of the test windows, rows summing to 1."""
+    """Draw loss and accuracy by epoch, and the confusion matrix of the test windows, rows summing
+    to 1."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
@@ -72,14 +78,24 @@ def plot_training(scores: Scores, history: History, class_names: Sequence[str]) 
     figure = Figure(figsize=(4.5 + side + 2.0, max(5.0, side + 2.0)), layout="constrained")
     parts = figure.add_gridspec(2, 2, width_ratios=[4.5, side + 2.0])
     epochs = np.arange(1, history.epochs + 1)
-    loss, accuracy = figure.add_subplot(parts[0, 0]), figure.add_subplot(parts[1, 0])
+    loss = figure.add_subplot(parts[0, 0])
+    accuracy = figure.add_subplot(parts[1, 0])
     loss.plot(epochs, history.train_loss, ".-", label="training")
     loss.plot(epochs, history.validation_loss, ".-", label="validation")
     loss.set_ylabel("cross entropy")
     loss.legend(fontsize=8)
-    accuracy.plot(epochs, history.validation_accuracy, ".-", label="validation, network in training")
-    # A head in closed form, added after the training, may lift the finished model far above the curve.
-    accuracy.axhline(scores.accuracy, color="0.5", lw=1, ls="--", label=f"test, finished model: {scores.accuracy:.3f}")
+    accuracy.plot(
+        epochs, history.validation_accuracy, ".-", label="validation, network in training"
+    )
+    # A head in closed form, added after the training, may lift the finished model far above the
+    # curve.
+    accuracy.axhline(
+        scores.accuracy,
+        color="0.5",
+        lw=1,
+        ls="--",
+        label=f"test, finished model: {scores.accuracy:.3f}",
+    )
     accuracy.set(xlabel="epoch", ylabel="accuracy", ylim=(0, 1))
     for curves in (loss, accuracy):
         curves.xaxis.set_major_locator(MaxNLocator(integer=True))

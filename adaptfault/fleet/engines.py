@@ -1,4 +1,5 @@
-"""Parallel execution over robots: joblib threads on this machine, or a Dask cluster; one process per robot."""
+"""Parallel execution over robots: joblib threads on this machine, or a Dask cluster; one process
+per robot."""
 
 from __future__ import annotations
 
@@ -51,13 +52,16 @@ def engine(task: Task, *, jobs: int | None, dask: str | None) -> Iterator[Engine
         from distributed import Client
     except ImportError:
         raise ValueError("a Dask cluster needs Dask: pip install 'adaptfault[fleet]'") from None
-    if not _ADDRESS.fullmatch(dask):  # a client of a wrong address waits for a minute before it fails
+    # a client of a wrong address waits for a minute before it fails
+    if not _ADDRESS.fullmatch(dask):
         raise ValueError(f"{dask!r}: expected the address of a Dask scheduler, as tcp://host:8786")
     with Client(dask, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, timeout=_WAIT)
         except Exception as error:  # its own TimeoutError, which differs between versions
-            raise OSError(f"the Dask scheduler at {dask} has no worker after {_WAIT} s ({error})") from None
+            raise OSError(
+                f"the Dask scheduler at {dask} has no worker after {_WAIT} s ({error})"
+            ) from None
         yield partial(_on_dask, client, task)
 
 
@@ -75,8 +79,11 @@ def _on_joblib(task: Task, guards: Sequence[Guard], robots: Sequence[Robot]) -> 
         finally:
             free.put(guard)
 
-    # Threads that wait for the guards' processes: a crash in joblib's own process pool would end the whole pool.
-    parallel = Parallel(len(guards), backend="threading", return_as="generator_unordered", batch_size=1)
+    # Threads that wait for the guards' processes: a crash in joblib's own process pool would end
+    # the whole pool.
+    parallel = Parallel(
+        len(guards), backend="threading", return_as="generator_unordered", batch_size=1
+    )
     yield from parallel(delayed(done)(robot) for robot in robots)
 
 
@@ -88,12 +95,16 @@ def _on_dask(client: Client, task: Task, robots: Sequence[Robot]) -> Iterator[Ou
             suspects.append(robot)
         else:
             yield outcome
-    for suspect in suspects:  # one at a time: some only shared a worker with the robot that crashes it
+    for (
+        suspect
+    ) in suspects:  # one at a time: some only shared a worker with the robot that crashes it
         for robot, outcome in _finished(client, task, [suspect]):
             yield outcome or Outcome.error(robot, _DIED)
 
 
-def _finished(client: Client, task: Task, robots: Sequence[Robot]) -> Iterator[tuple[Robot, Outcome | None]]:
+def _finished(
+    client: Client, task: Task, robots: Sequence[Robot]
+) -> Iterator[tuple[Robot, Outcome | None]]:
     """Yield robots in order of completion, with None where their workers died.
 
     Raises:
@@ -101,12 +112,18 @@ def _finished(client: Client, task: Task, robots: Sequence[Robot]) -> Iterator[t
     """
     from distributed import as_completed
 
-    robot_of = dict(zip(client.map(partial(do_on_worker, task), robots, pure=False), robots, strict=True))
-    coming, seen = as_completed(list(robot_of), loop=client.loop), time.monotonic()
+    robot_of = dict(
+        zip(client.map(partial(do_on_worker, task), robots, pure=False), robots, strict=True)
+    )
+    coming = as_completed(list(robot_of), loop=client.loop)
+    seen = time.monotonic()
     while robot_of:
         for future in coming.next_batch(block=False):
             if future.cancelled():
-                raise OSError("the Dask scheduler went away or was restarted; start the run again to resume it")
+                raise OSError(
+                    "the Dask scheduler went away or was restarted; start the run again to"
+                    " resume it"
+                )
             yield (robot := robot_of.pop(future)), _outcome(future, robot)
         if not coming.has_ready():
             time.sleep(_LOOK)
@@ -114,7 +131,9 @@ def _finished(client: Client, task: Task, robots: Sequence[Robot]) -> Iterator[t
             if client.nthreads():
                 seen = time.monotonic()
             elif idle > _WAIT:
-                raise OSError(f"no Dask worker for {_WAIT} s; start workers, then the run again to resume it")
+                raise OSError(
+                    f"no Dask worker for {_WAIT} s; start workers, then the run again to resume it"
+                )
 
 
 def _outcome(future: Future, robot: Robot) -> Outcome | None:
@@ -124,4 +143,8 @@ def _outcome(future: Future, robot: Robot) -> Outcome | None:
         outcome: Outcome = future.result()
         return outcome
     error = future.exception()
-    return None if isinstance(error, KilledWorker) else Outcome.error(robot, f"{type(error).__name__}: {error}")
+    return (
+        None
+        if isinstance(error, KilledWorker)
+        else Outcome.error(robot, f"{type(error).__name__}: {error}")
+    )

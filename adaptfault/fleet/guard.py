@@ -48,7 +48,8 @@ class Guard:
         self._executor: ProcessPoolExecutor | None = None
 
     def do(self, task: Task, robot: Robot) -> Outcome:
-        """Return the robot's outcome; an error if its process died, raised, or had to be killed at the limit."""
+        """Return the robot's outcome; an error if its process died, raised, or had to be killed at
+        the limit."""
         began = time.perf_counter()
         try:
             self._call(_START, task.ready)
@@ -59,7 +60,8 @@ class Guard:
 
     def close(self) -> None:
         """Kill the process; a waiting caller gets an error."""
-        executor, self._executor = self._executor, None
+        executor = self._executor
+        self._executor = None
         if executor is not None:
             executor.shutdown(kill_workers=True)
 
@@ -71,7 +73,9 @@ class Guard:
             error = future.exception(seconds)
         except TimeoutError:
             self.close()
-            raise _Lost(f"not finished after {seconds:g} s, so its process was killed; check its recordings") from None
+            raise _Lost(
+                f"not finished after {seconds:g} s, so its process was killed; check its recordings"
+            ) from None
         except BrokenExecutor as broken:  # it died between two robots
             error = broken
         if isinstance(error, BrokenExecutor):
@@ -87,9 +91,12 @@ class _Lost(Exception):
 
 
 def quiet() -> None:
-    """Ignore loky's warning that a process ended; raised as an error it would stop loky's thread."""
+    """Ignore loky's warning that a process ended; raised as an error it would stop loky's
+    thread."""
     # loky ends a process that grew by 300 MB, and an idle one, between two robots.
-    warnings.filterwarnings("ignore", message="A worker (stopped|was restarted) while some jobs were given")
+    warnings.filterwarnings(
+        "ignore", message="A worker (stopped|was restarted) while some jobs were given"
+    )
 
 
 _here = threading.local()
@@ -109,11 +116,14 @@ def do_on_worker(task: Task, robot: Robot) -> Outcome:
 def _process() -> ProcessPoolExecutor:
     from loky import ProcessPoolExecutor
 
-    return ProcessPoolExecutor(1, timeout=_IDLE, initializer=_begin, initargs=(os.getpid(),), env=_ONE_THREAD)
+    return ProcessPoolExecutor(
+        1, timeout=_IDLE, initializer=_begin, initargs=(os.getpid(),), env=_ONE_THREAD
+    )
 
 
 def _begin(parent: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C stops the parent, not the robot's maintenance
+    # Ctrl-C stops the parent, not the robot's maintenance
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 

@@ -1,4 +1,5 @@
-"""The list of a fleet, a TOML file: bundle and recordings of each robot, as entries or by a pattern."""
+"""The list of a fleet, a TOML file: bundle and recordings of each robot, as entries or by a
+pattern."""
 
 from __future__ import annotations
 
@@ -18,11 +19,14 @@ else:
     import tomli as tomllib
 
 from adaptfault.data.recordings.errors import InputError
-from adaptfault.data.recordings.sizes import check_file
+from adaptfault.data.recordings.facts.sizes import check_file
 
 _ENTRY = {"name", "bundle", "recordings", "tags", "commissioned"}
 _LISTING = {"bundles", "recordings", "tags", "robots"}
-_EXPECTED = 'expected [[robots]] with name, bundle, recordings, or bundles = "robots/*/robot.bundle" and recordings'
+_EXPECTED = (
+    'expected [[robots]] with name, bundle, recordings, or bundles = "robots/*/robot.bundle" and'
+    " recordings"
+)
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,9 @@ class Robot:
         """
         found: list[str] = []
         for pattern in self.recordings:
-            fitting = sorted(glob.glob(pattern, recursive=True)) if glob.has_magic(pattern) else [pattern]
+            fitting = (
+                sorted(glob.glob(pattern, recursive=True)) if glob.has_magic(pattern) else [pattern]
+            )
             if not fitting:
                 raise FileNotFoundError(f"{pattern}: no recording matches this pattern")
             found += fitting
@@ -81,10 +87,15 @@ class Fleet:
         where = f"{self.source}: " if self.source else ""
         if not self.robots:
             raise ValueError(f"{where}it lists no robot; {_EXPECTED}")
-        for what, values in (("name", [r.name for r in self.robots]), ("bundle", [r.bundle for r in self.robots])):
+        for what, values in (
+            ("name", [r.name for r in self.robots]),
+            ("bundle", [r.bundle for r in self.robots]),
+        ):
             value, times = Counter(values).most_common(1)[0]
             if times > 1:
-                raise ValueError(f"{where}{times} robots have the {what} {value!r}; each needs its own")
+                raise ValueError(
+                    f"{where}{times} robots have the {what} {value!r}; each needs its own"
+                )
 
     def __len__(self) -> int:
         return len(self.robots)
@@ -105,16 +116,16 @@ class Fleet:
             tags = ["hall 3"]                   # optional
             commissioned = 2025-03-01           # optional: faults by age
 
-        or by a pattern, where the text matched by the stars is the robot's name; ``{bundle_dir}`` is the folder that
-        holds the bundle, ``{name}`` the robot's name::
+        or by a pattern, where the text matched by the stars is the robot's name; ``{bundle_dir}``
+        is the folder that holds the bundle, ``{name}`` the robot's name::
 
             bundles = "robots/*/robot.bundle"
             recordings = "{bundle_dir}/recordings"
 
         Raises:
             OSError: the file cannot be read.
-            ValueError: it is no file or not TOML, a key is missing, unknown or of the wrong type, or robots are not
-                distinct.
+            ValueError: it is no file or not TOML, a key is missing, unknown or of the wrong type,
+                or robots are not distinct.
         """
         path = Path(path)
         try:
@@ -133,7 +144,9 @@ class Fleet:
         if "bundles" in listed:
             robots += _matching(listed, home, path)
         elif "recordings" in listed or "tags" in listed:
-            raise ValueError(f"{path}: `recordings` and `tags` outside [[robots]] need `bundles`; {_EXPECTED}")
+            raise ValueError(
+                f"{path}: `recordings` and `tags` outside [[robots]] need `bundles`; {_EXPECTED}"
+            )
         return cls(tuple(robots), str(path))
 
 
@@ -141,12 +154,18 @@ def _robot(entry: Mapping[str, Any], home: Path, where: str) -> Robot:
     name = _text(entry, "name", where)
     where = f"{where} ({name!r})"
     _known(entry, _ENTRY, where)
-    bundle, recordings = _text(entry, "bundle", where), _texts(entry, "recordings", where)
+    bundle = _text(entry, "bundle", where)
+    recordings = _texts(entry, "recordings", where)
     if not recordings:
-        raise ValueError(f"{where}: `recordings` is missing or empty; name a file, a folder or a pattern")
+        raise ValueError(
+            f"{where}: `recordings` is missing or empty; name a file, a folder or a pattern"
+        )
     commissioned = entry.get("commissioned")
     if commissioned is not None and not isinstance(commissioned, date):
-        raise ValueError(f"{where}: `commissioned` is {commissioned!r}; expected a date as 2025-03-01, without quotes")
+        raise ValueError(
+            f"{where}: `commissioned` is {commissioned!r}; expected a date as 2025-03-01, without"
+            " quotes"
+        )
     day = commissioned.date() if isinstance(commissioned, datetime) else commissioned
     return Robot(
         name,
@@ -159,14 +178,18 @@ def _robot(entry: Mapping[str, Any], home: Path, where: str) -> Robot:
 
 def _matching(listed: Mapping[str, Any], home: Path, path: Path) -> Iterator[Robot]:
     """Yield the robots whose bundles match the pattern, sorted."""
-    pattern, recordings = _text(listed, "bundles", str(path)), _texts(listed, "recordings", str(path))
+    pattern = _text(listed, "bundles", str(path))
+    recordings = _texts(listed, "recordings", str(path))
     if not recordings:
-        raise ValueError(f'{path}: `bundles` needs `recordings`, as recordings = "{{bundle_dir}}/recordings"')
+        raise ValueError(
+            f'{path}: `bundles` needs `recordings`, as recordings = "{{bundle_dir}}/recordings"'
+        )
     found = sorted(glob.glob(pattern, root_dir=home, recursive=True))
     if not found:
         raise ValueError(f"{path}: no bundle matches {pattern}")
     for fitting in found:
-        bundle, name = os.path.normpath(home / fitting), _name(fitting, pattern)
+        bundle = os.path.normpath(home / fitting)
+        name = _name(fitting, pattern)
         values = {"bundle_dir": glob.escape(os.path.dirname(bundle)), "name": glob.escape(name)}
         try:
             filled = tuple(_pattern(home, text.format(**values)) for text in recordings)
@@ -182,18 +205,25 @@ def _name(bundle: str, pattern: str) -> str:
     if "**" in stars:
         kept = parts[next(i for i, part in enumerate(stars) if glob.has_magic(part)) :]
     else:
-        kept = tuple(part for part, star in zip(parts, stars, strict=True) if glob.has_magic(star)) or parts[-1:]
+        kept = (
+            tuple(part for part, star in zip(parts, stars, strict=True) if glob.has_magic(star))
+            or parts[-1:]
+        )
     return "/".join(kept).removesuffix(".bundle")
 
 
 def _pattern(home: Path, pattern: str) -> str:
     # A star in the name of the list's own folder is literal.
-    return os.path.normpath(pattern if os.path.isabs(pattern) else os.path.join(glob.escape(str(home)), pattern))
+    return os.path.normpath(
+        pattern if os.path.isabs(pattern) else os.path.join(glob.escape(str(home)), pattern)
+    )
 
 
 def _known(table: Mapping[str, Any], keys: set[str], where: str) -> None:
     if unknown := sorted(set(table) - keys):
-        raise ValueError(f"{where}: unknown key {', '.join(unknown)}; expected {', '.join(sorted(keys))}")
+        raise ValueError(
+            f"{where}: unknown key {', '.join(unknown)}; expected {', '.join(sorted(keys))}"
+        )
 
 
 def _text(table: Mapping[str, Any], key: str, where: str) -> str:

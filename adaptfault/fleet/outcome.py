@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from adaptfault.fleet.listing import Robot
 
 if TYPE_CHECKING:  # passing outcomes on needs no torch
-    from adaptfault.robot.bundle import Bundle
+    from adaptfault.bundle.bundle import Bundle
     from adaptfault.robot.maintenance_report import Decision, MaintenanceReport
     from diagnostics import Fault
 
@@ -52,7 +52,8 @@ class Outcome:
         version: that runs now; None for an error, as the following.
         cells, faulty: number of cells, and of known faulty ones.
         shape: of the array, as "2 x 11 x 10".
-        accuracy, fault_free_accuracy: of the running version, with and without the faults; None if never measured.
+        accuracy, fault_free_accuracy: of the running version, with and without the faults; None if
+        never measured.
         causes: known root causes.
         notes: first recordings left out, and damage.
         recordings: number of new recordings used.
@@ -76,14 +77,23 @@ class Outcome:
 
     @classmethod
     def of(
-        cls, robot: Robot, bundle: Bundle, report: MaintenanceReport, *, notes: tuple[str, ...], seconds: float
+        cls,
+        robot: Robot,
+        bundle: Bundle,
+        report: MaintenanceReport,
+        *,
+        notes: tuple[str, ...],
+        seconds: float,
     ) -> Outcome:
-        """Summarise a report; without a measurement in this run, the accuracy is the last one measured."""
-        accuracy, free = report.accuracy, report.fault_free_accuracy
+        """Summarise a report; without a measurement in this run, the accuracy is the last one
+        measured."""
+        accuracy = report.accuracy
+        free = report.fault_free_accuracy
         if accuracy is None and report.decision != "refused":
             runs = [run for run in bundle.journal.runs() if run.get("accuracy") is not None]
             if runs and runs[-1]["version"] == report.version:
-                accuracy, free = runs[-1]["accuracy"], runs[-1]["fault_free_accuracy"]
+                accuracy = runs[-1]["accuracy"]
+                free = runs[-1]["fault_free_accuracy"]
         every = (*notes, *report.left_out, *report.warnings)
         more = (f"and {len(every) - _NOTES} more",) if len(every) > _NOTES else ()
         return cls(
@@ -122,6 +132,10 @@ class Outcome:
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Outcome:
         """Rebuild from :meth:`to_dict`, also after JSON."""
-        robot = {**d["robot"], "recordings": tuple(d["robot"]["recordings"]), "tags": tuple(d["robot"]["tags"])}
+        robot = {
+            **d["robot"],
+            "recordings": tuple(d["robot"]["recordings"]),
+            "tags": tuple(d["robot"]["tags"]),
+        }
         causes = tuple(Cause(**cause) for cause in d["causes"])
         return cls(**{**d, "robot": Robot(**robot), "causes": causes, "notes": tuple(d["notes"])})

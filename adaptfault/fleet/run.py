@@ -1,4 +1,5 @@
-"""Maintains a fleet on worker processes; each outcome is stored at once, so that a killed run resumes."""
+"""Maintains a fleet on worker processes; each outcome is stored at once, so that a killed run
+resumes."""
 
 from __future__ import annotations
 
@@ -12,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from adaptfault.bundle.bundle import now
+from adaptfault.bundle.lock import locked
 from adaptfault.data.json_lines import Lines
 from adaptfault.fleet.engines import engine
 from adaptfault.fleet.guard import Task
 from adaptfault.fleet.listing import Fleet, Robot
 from adaptfault.fleet.outcome import Outcome
 from adaptfault.fleet.work import maintain_robot, ready
-from adaptfault.robot.bundle import now
-from adaptfault.robot.lock import locked
 
 if TYPE_CHECKING:
     from adaptfault.fleet.summary import FleetReport
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
 SCHEMA = "adaptfault.fleet-ledger/1"
 LEDGER = "ledger.jsonl"
 
-_OVER = timedelta(hours=12)  # a run without progress for longer is not resumed, because the robots have recorded since
+# a run without progress for longer is not resumed, because the robots have recorded since
+_OVER = timedelta(hours=12)
 
 
 def maintain_fleet(
@@ -44,10 +46,12 @@ def maintain_fleet(
     sign: str | None = None,
     progress: bool | None = None,
 ) -> FleetReport:
-    """Run ``maintain`` over all robots; one that fails is an error in the report, and the others go on.
+    """Run ``maintain`` over all robots; one that fails is an error in the report, and the others go
+    on.
 
-    Each outcome is appended to ``folder/ledger.jsonl``. Called again after a kill with the same options, it processes
-    the remaining robots; after a run that ended, or without progress for 12 hours, it starts a new run.
+    Each outcome is appended to ``folder/ledger.jsonl``. Called again after a kill with the same
+    options, it processes the remaining robots; after a run that ended, or without progress for 12
+    hours, it starts a new run.
 
     Args:
         fleet: the robots. Their paths must be valid on every worker (a shared folder, with Dask).
@@ -56,22 +60,28 @@ def maintain_fleet(
         dask: address of a Dask scheduler whose workers are used instead, as "tcp://host:8786".
         dry_run: report only, change nothing.
         budget: seconds that one adaptation may take.
-        limit: seconds per robot, after which its process is killed and the robot is an error. None: no limit.
-        keys, least_serial: whose signature each bundle needs, see :class:`Bundle`. The files must be there on every
+        limit: seconds per robot, after which its process is killed and the robot is an error. None:
+            no limit.
+        keys, least_serial: whose signature each bundle needs, see :class:`Bundle`. The files must
+        be there on every
             worker.
-        sign: PEM file of the private key that signs each bundle after its run, with ``keys``; None: none is signed.
+        sign: PEM file of the private key that signs each bundle after its run, with ``keys``; None:
+            none is signed.
         progress: show or hide it on stderr; None shows it on a terminal.
 
     Raises:
-        ValueError: ``jobs`` is below 1 or given with ``dask``, ``limit`` is not above 0, Dask is not installed, the
-            ledger has another schema, or ``sign`` comes without ``keys``.
+        ValueError: ``jobs`` is below 1 or given with ``dask``, ``limit`` is not above 0, Dask is
+            not installed, the ledger has another schema, or ``sign`` comes without ``keys``.
         Busy: another process maintains the fleet in this folder.
         OSError: the scheduler does not answer.
     """
     from adaptfault.fleet.summary import FleetReport
 
     if jobs is not None and (jobs < 1 or dask is not None):
-        raise ValueError(f"jobs {jobs}: expected at least 1, and none with a Dask cluster, which has its own workers")
+        raise ValueError(
+            f"jobs {jobs}: expected at least 1, and none with a Dask cluster, which has its own"
+            " workers"
+        )
     if limit is not None and not limit > 0:
         raise ValueError(f"limit {limit}: expected seconds, more than 0")
     if sign is not None and not keys:  # whatever lies in the bundle would be signed
@@ -80,7 +90,12 @@ def maintain_fleet(
     folder.mkdir(parents=True, exist_ok=True)
     with locked(folder / "run.lock", patience=0):
         lines = Lines(folder / LEDGER)
-        options: dict[str, Any] = {"dry_run": dry_run, "budget": budget, "least_serial": least_serial, "sign": sign}
+        options: dict[str, Any] = {
+            "dry_run": dry_run,
+            "budget": budget,
+            "least_serial": least_serial,
+            "sign": sign,
+        }
         options["keys"] = None if keys is None else list(map(str, keys))
         began, done = _resumed(lines.read(), fleet, options)
         if not done:
@@ -90,23 +105,31 @@ def maintain_fleet(
         hide = None if progress is None else not progress
         with (
             tqdm(total=len(fleet), initial=len(done), unit="robot", disable=hide) as bar,
-            engine(Task(partial(maintain_robot, **options), ready, limit), jobs=jobs, dask=dask) as work,
+            engine(
+                Task(partial(maintain_robot, **options), ready, limit), jobs=jobs, dask=dask
+            ) as work,
         ):
             for outcome in work(left):
                 lines.add({"time": now(), "outcome": outcome.to_dict()})
                 done[outcome.robot.name] = outcome
                 bar.update()
         lines.add({"time": now(), "ended": True})
-    return FleetReport(tuple(done[robot.name] for robot in fleet.robots), began, now(), dry_run, fleet.source)
+    return FleetReport(
+        tuple(done[robot.name] for robot in fleet.robots), began, now(), dry_run, fleet.source
+    )
 
 
-def _resumed(documents: list[Any], fleet: Fleet, options: dict[str, Any]) -> tuple[str, dict[str, Outcome]]:
+def _resumed(
+    documents: list[Any], fleet: Fleet, options: dict[str, Any]
+) -> tuple[str, dict[str, Outcome]]:
     """Return the start and the outcomes of the run in the ledger; empty if a new run is due."""
     if not documents:
         return "", {}
     head, *entries = documents
     if not isinstance(head, dict) or head.get("schema") != SCHEMA:
-        raise ValueError(f"the ledger in the run's folder begins with no {SCHEMA!r}; give another folder")
+        raise ValueError(
+            f"the ledger in the run's folder begins with no {SCHEMA!r}; give another folder"
+        )
     last = datetime.fromisoformat(entries[-1]["time"] if entries else head["began"])
     over = bool(entries) and "ended" in entries[-1]
     if over or head["options"] != options or datetime.now(timezone.utc) - last > _OVER:
@@ -114,7 +137,11 @@ def _resumed(documents: list[Any], fleet: Fleet, options: dict[str, Any]) -> tup
     earlier = [Outcome.from_dict(entry["outcome"]) for entry in entries]
     # A robot whose paths changed is processed again.
     listed = {_identity(robot): robot for robot in fleet.robots}
-    done = {robot.name: replace(o, robot=robot) for o in earlier if (robot := listed.get(_identity(o.robot)))}
+    done = {
+        robot.name: replace(o, robot=robot)
+        for o in earlier
+        if (robot := listed.get(_identity(o.robot)))
+    }
     return head["began"], done
 
 

@@ -1,4 +1,5 @@
-"""The state of a fleet: robots that need a technician, wires that fail most often, failed robots."""
+"""The state of a fleet: robots that need a technician, wires that fail most often, failed
+robots."""
 
 from __future__ import annotations
 
@@ -66,7 +67,10 @@ class AgeGroup:
 
     def __str__(self) -> str:
         worst = f"; most often {self.worst}" if self.worst else ""
-        robots = f"{self.robots} robot{'s' * (self.robots != 1)} {'has' if self.degraded == 1 else 'have'}"
+        robots = (
+            f"{self.robots} robot{'s' * (self.robots != 1)}"
+            f" {'has' if self.degraded == 1 else 'have'}"
+        )
         return (
             f"{self.years} to {self.years + 1} years: {self.degraded} of {robots} faults,"
             f" {self.wires:.2f} wires and {self.cells:.1f} cells each{worst}"
@@ -92,7 +96,8 @@ class FleetReport:
 
     @property
     def exit_code(self) -> int:
-        """The worst of the robots: 2 if one needs a technician, else 3 if one is unknown, else 1, else 0.
+        """The worst of the robots: 2 if one needs a technician, else 3 if one is unknown, else 1,
+        else 0.
 
         A robot known to be degraded outranks one in an unknown state.
         """
@@ -106,9 +111,12 @@ class FleetReport:
 
     @cached_property
     def technician(self) -> tuple[Outcome, ...]:
-        """Robots that need a technician, most urgent first: by remaining accuracy, then by share of faulty cells."""
+        """Robots that need a technician, most urgent first: by remaining accuracy, then by share of
+        faulty cells."""
         needy = [o for o in self.outcomes if o.exit_code == 2]
-        return tuple(sorted(needy, key=lambda o: (o.kept, -(o.faulty or 0) / (o.cells or 1), o.robot.name)))
+        return tuple(
+            sorted(needy, key=lambda o: (o.kept, -(o.faulty or 0) / (o.cells or 1), o.robot.name))
+        )
 
     @property
     def errors(self) -> tuple[Outcome, ...]:
@@ -117,7 +125,8 @@ class FleetReport:
 
     @property
     def needy(self) -> tuple[Outcome, ...]:
-        """Robots that need somebody, worst first: those for a technician, then those in an unknown state."""
+        """Robots that need somebody, worst first: those for a technician, then those in an unknown
+        state."""
         return (*self.technician, *self.errors)
 
     @property
@@ -142,8 +151,11 @@ class FleetReport:
 
     @property
     def families(self) -> dict[str, int]:
-        """Root causes by kind of wire (row, column, address lines, converter) or single cells, most frequent first."""
-        causes = Counter(cause.family or "single cells" for o in self.outcomes for cause in o.causes)
+        """Root causes by kind of wire (row, column, address lines, converter) or single cells, most
+        frequent first."""
+        causes = Counter(
+            cause.family or "single cells" for o in self.outcomes for cause in o.causes
+        )
         return dict(causes.most_common())
 
     @cached_property
@@ -165,12 +177,18 @@ class FleetReport:
     def __str__(self) -> str:
         status = ("OK", "WARNING", "CRITICAL", "UNKNOWN")[self.exit_code]
         counts = ", ".join(f"{n} {state}" for state, n in self.counts.items() if n) or "none"
-        measured = " ".join(f"{state}={n};;;0;{len(self.outcomes)}" for state, n in self.counts.items())
+        measured = " ".join(
+            f"{state}={n};;;0;{len(self.outcomes)}" for state, n in self.counts.items()
+        )
         would = " (dry run: nothing was changed)" if self.dry_run else ""
         robots = f"{len(self.outcomes)} robot{'s' * (len(self.outcomes) != 1)}"
         lines = [f"ADAPTFAULT FLEET {status} - {robots}: {counts}{would} | {measured}"]
-        lines += _listed("need a technician, the most urgent first", [_needy(o) for o in self.technician])
-        lines += _listed("weak base models, better repaired than healthy", [o.robot.name for o in self.weak])
+        lines += _listed(
+            "need a technician, the most urgent first", [_needy(o) for o in self.technician]
+        )
+        lines += _listed(
+            "weak base models, better repaired than healthy", [o.robot.name for o in self.weak]
+        )
         lines += _listed("most frequent faults", [str(wire) for wire in self.wires])
         lines += _listed("by age", [str(group) for group in self.ages])
         lines += _listed("unknown state", [f"{o.robot.name}: {o.reason}" for o in self.errors])

@@ -7,11 +7,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
+from adaptfault.bundle.lock import Busy
 from adaptfault.fleet.listing import Robot
 from adaptfault.fleet.outcome import Outcome
-from adaptfault.robot.lock import Busy
 
-_PATIENCE, _PAUSE = 120, 0.5  # s to wait for a robot that another process maintains, and between two attempts
+# s to wait for a robot that another process maintains, and between two attempts
+_PATIENCE = 120
+_PAUSE = 0.5
 
 
 def ready() -> None:
@@ -34,7 +36,8 @@ def maintain_robot(
         dry_run: report only.
         budget: seconds that an adaptation may take.
         keys, least_serial: whose signature the bundle needs, see :class:`Bundle`.
-        sign: PEM file of the private key that signs the bundle after the run; None: it is not signed.
+        sign: PEM file of the private key that signs the bundle after the run; None: it is not
+            signed.
     """
     work = partial(_maintained, robot, dry_run, budget, keys, least_serial, sign)
     began = time.perf_counter()
@@ -67,10 +70,10 @@ def _maintained(
     sign: str | None,
     began: float,
 ) -> Outcome:
-    from adaptfault.robot.bundle import Bundle
+    from adaptfault.bundle.bundle import Bundle
+    from adaptfault.bundle.signing import sign_bundle
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.new_recordings import load_new_recordings
-    from adaptfault.robot.signature import sign_bundle
 
     bundle = Bundle.open(robot.bundle, keys=keys, least_serial=least_serial)
     incoming = load_new_recordings(bundle, robot.paths())

@@ -28,11 +28,15 @@ class CrossFitted:
     def __init__(self, frames: NDArray[Any], fold: NDArray[np.bool_]) -> None:
         self._whole = CellStatistics.of_frames(frames)
         self._halves = [CellStatistics.of_frames(frames[fold == side]) for side in (False, True)]
-        self._held_out = [(of := frames[fold == side])[evenly(len(of), _HELD_OUT)] for side in (True, False)]
+        self._held_out = [
+            (of := frames[fold == side])[evenly(len(of), _HELD_OUT)] for side in (True, False)
+        ]
 
     def affine(self, fault_set: FaultSet) -> tuple[Floats, Floats, Floats]:
-        """Return weight ``[k, D-k]``, bias ``[k]`` and standard deviation of the error ``[k]`` for F."""
-        healthy, missing = fault_set.healthy, np.flatnonzero(fault_set.mask)
+        """Return weight ``[k, D-k]``, bias ``[k]`` and standard deviation of the error ``[k]`` for
+        F."""
+        healthy = fault_set.healthy
+        missing = np.flatnonzero(fault_set.mask)
         mean = self._whole.mean[missing]
         pairs = []
         for half, frames in zip(self._halves, self._held_out, strict=True):

@@ -1,4 +1,5 @@
-"""Training augmentation: random cells are removed and imputed, so that the model tolerates imputed cells."""
+"""Training augmentation: random cells are removed and imputed, so that the model tolerates imputed
+cells."""
 
 from __future__ import annotations
 
@@ -20,8 +21,9 @@ _VALIDATED = 16  # fault sets of validation, each applied to a share of the reco
 def random_fault_set(layout: SensorLayout, rng: np.random.Generator) -> FaultSet:
     """Draw a fault set of any shape and size: scattered cells, lines, a block or a whole pad.
 
-    Lines are rows or columns, up to half of them, at random or adjacent, of one pad or at the same index on all pads
-    (as a broken address wire does). A whole pad is lost only if there are several. At least one cell stays healthy.
+    Lines are rows or columns, up to half of them, at random or adjacent, of one pad or at the same
+    index on all pads (as a broken address wire does). A whole pad is lost only if there are
+    several. At least one cell stays healthy.
     """
     pads, rows, cols = layout.shape
     lost = np.zeros(layout.shape, dtype=bool)
@@ -34,10 +36,16 @@ def random_fault_set(layout: SensorLayout, rng: np.random.Generator) -> FaultSet
             n = layout.shape[axis]
             many = int(rng.integers(1, max(2, n // 2 + 1)))
             first = int(rng.integers(n - many + 1))
-            lines = np.arange(first, first + many) if shape == "band" else rng.choice(n, many, replace=False)
+            lines = (
+                np.arange(first, first + many)
+                if shape == "band"
+                else rng.choice(n, many, replace=False)
+            )
             np.moveaxis(lost[which], axis, 0)[lines] = True
         case "block":
-            (top, bottom), (left, right) = (np.sort(rng.choice(n + 1, 2, replace=False)) for n in (rows, cols))
+            (top, bottom), (left, right) = (
+                np.sort(rng.choice(n + 1, 2, replace=False)) for n in (rows, cols)
+            )
             lost[which, top:bottom, left:right] = True
         case "pad":
             lost[rng.integers(pads)] = True
@@ -48,7 +56,8 @@ def random_fault_set(layout: SensorLayout, rng: np.random.Generator) -> FaultSet
 
 
 class RandomRepairs:
-    """The ``augment`` of training: each part of a batch loses a random fault set, imputed by the conditional mean.
+    """The ``augment`` of training: each part of a batch loses a random fault set, imputed by the
+    conditional mean.
 
     Args:
         layout: the array.
@@ -56,24 +65,34 @@ class RandomRepairs:
     """
 
     def __init__(self, layout: SensorLayout, statistics: CellStatistics) -> None:
-        self.layout, self.statistics = layout, statistics
+        self.layout = layout
+        self.statistics = statistics
 
     def __call__(self, x: Tensor, generator: torch.Generator) -> Tensor:
         """Map windows ``[B, T, D]`` on the 0..1 scale to windows of the same shape."""
         rng = np.random.default_rng(int(torch.randint(2**62, (1,), generator=generator)))
-        return torch.cat([x if rng.random() < _WHOLE else self._repair(x, rng) for x in torch.chunk(x, _PARTS)])
+        return torch.cat(
+            [x if rng.random() < _WHOLE else self._repair(x, rng) for x in torch.chunk(x, _PARTS)]
+        )
 
     def beside(self, windows: Windows, seed: int) -> Windows:
-        """Return windows twice: as they are, and imputed after random losses; the same for each seed."""
+        """Return windows twice: as they are, and imputed after random losses; the same for each
+        seed."""
         rng = np.random.default_rng(seed)
         group = np.unique(windows.recording, return_inverse=True)[1] % _VALIDATED
         repaired = windows.x.copy()
         for i in range(min(_VALIDATED, group.max() + 1)):
             repaired[group == i] = self._repair(torch.from_numpy(repaired[group == i]), rng).numpy()
-        return Windows(np.concatenate([windows.x, repaired]), np.tile(windows.y, 2), np.tile(windows.recording, 2))
+        return Windows(
+            np.concatenate([windows.x, repaired]),
+            np.tile(windows.y, 2),
+            np.tile(windows.recording, 2),
+        )
 
     @torch.no_grad()
     def _repair(self, x: Tensor, rng: np.random.Generator) -> Tensor:
         faults = random_fault_set(self.layout, rng)
-        filled: Tensor = AffineFill(faults, *self.statistics.conditional_mean(faults))(x[..., faults.healthy])
+        filled: Tensor = AffineFill(faults, *self.statistics.conditional_mean(faults))(
+            x[..., faults.healthy]
+        )
         return filled

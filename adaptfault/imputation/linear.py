@@ -1,8 +1,10 @@
-"""Front ends that map the healthy cells to all cells: conditional mean, optionally with a kernel regression.
+"""Front ends that map the healthy cells to all cells: conditional mean, optionally with a kernel
+regression.
 
-The linear front end is the Gaussian conditional mean. Folding it into the first linear layer of a network equals
-optimal-brain-surgeon deletion of the missing inputs. It cannot represent that contact is thresholded and has edges. The
-nearest-neighbour front end adds a kernel regression of its residuals on healthy frames.
+The linear front end is the Gaussian conditional mean. Folding it into the first linear layer of a
+network equals optimal-brain-surgeon deletion of the missing inputs. It cannot represent that
+contact is thresholded and has edges. The nearest-neighbour front end adds a kernel regression of
+its residuals on healthy frames.
 """
 
 from __future__ import annotations
@@ -14,14 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.imputation.statistics import near_distance
+from adaptfault.imputation.kernel import bandwidth
 from diagnostics import FaultSet
-
-_WIDTH = 0.05  # of the kernel, in units of the typical squared distance of a near neighbour
 
 
 class AffineFill(nn.Module):
-    """Front end from the healthy cells to all: healthy cells pass unchanged, missing ones are an affine map of them.
+    """Front end from the healthy cells to all: healthy cells pass unchanged, missing ones are an
+    affine map of them.
 
     Args:
         fault_set: F.
@@ -33,7 +34,9 @@ class AffineFill(nn.Module):
 
     def __init__(self, fault_set: FaultSet, weight: NDArray[Any], bias: NDArray[Any]) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.as_tensor(np.ascontiguousarray(weight), dtype=torch.float32))
+        self.weight = nn.Parameter(
+            torch.as_tensor(np.ascontiguousarray(weight), dtype=torch.float32)
+        )
         self.bias = nn.Parameter(torch.as_tensor(np.ascontiguousarray(bias), dtype=torch.float32))
         # Position of each cell in [healthy, missing].
         order = np.argsort(np.concatenate([fault_set.healthy, np.flatnonzero(fault_set.mask)]))
@@ -46,11 +49,13 @@ class AffineFill(nn.Module):
         return cls(fault_set, np.zeros((k, fault_set.n_cells - k)), np.zeros(k))
 
     def missing(self, x: Tensor) -> Tensor:
-        """Map ``[..., D-k]`` to the imputed readings of the missing cells, ``[..., k]``, not clipped."""
+        """Map ``[..., D-k]`` to the imputed readings of the missing cells, ``[..., k]``, not
+        clipped."""
         return torch.nn.functional.linear(x, self.weight, self.bias)
 
     def merge(self, x: Tensor, filled: Tensor) -> Tensor:
-        """Put healthy cells ``[..., D-k]`` and imputed ones ``[..., k]`` in the order of the array, ``[..., D]``."""
+        """Put healthy cells ``[..., D-k]`` and imputed ones ``[..., k]`` in the order of the array,
+        ``[..., D]``."""
         return torch.cat([x, filled.clamp(0.0, 1.0)], dim=-1)[..., self.order]
 
     def forward(self, x: Tensor) -> Tensor:
@@ -61,8 +66,8 @@ class AffineFill(nn.Module):
 class NearestFill(nn.Module):
     """Front end that adds a kernel regression of the residuals of the linear front end.
 
-    The Nadaraya-Watson estimator (Nadaraya 1964, Watson 1964) on the square roots of the healthy cells. The bandwidth
-    is the typical distance of a near neighbour. It has no trained parameters.
+    The Nadaraya-Watson estimator (Nadaraya 1964, Watson 1964) on the square roots of the healthy
+    cells. The bandwidth is the typical distance of a near neighbour. It has no trained parameters.
 
     Args:
         fault_set: F.
@@ -74,20 +79,27 @@ class NearestFill(nn.Module):
     residuals: Tensor
     width: Tensor
 
-    def __init__(self, fault_set: FaultSet, linear: AffineFill, frames: NDArray[np.float32]) -> None:
+    def __init__(
+        self, fault_set: FaultSet, linear: AffineFill, frames: NDArray[np.float32]
+    ) -> None:
         super().__init__()
         self.linear = linear
-        healthy, missing = frames[:, fault_set.healthy], frames[:, np.flatnonzero(fault_set.mask)]
+        healthy = frames[:, fault_set.healthy]
+        missing = frames[:, np.flatnonzero(fault_set.mask)]
         with torch.no_grad():
             expected = linear.missing(torch.from_numpy(healthy)).numpy()
         roots = np.sqrt(np.maximum(healthy, 0.0))
         self.register_buffer("roots", torch.from_numpy(roots))
         self.register_buffer("residuals", torch.from_numpy(missing - expected))
-        self.register_buffer("width", torch.tensor(_WIDTH * near_distance(roots), dtype=torch.float32))
+        self.register_buffer("width", torch.tensor(bandwidth(roots), dtype=torch.float32))
 
     def forward(self, x: Tensor) -> Tensor:
         """Map ``[N, T, D-k]`` to ``[N, T, D]``; imputed readings are clipped to 0..1."""
         # The squared norm of the frame itself cancels in the softmax.
-        roots, own = x.clamp_min(0.0).sqrt() * (2 / self.width), self.roots.square().sum(1) / -self.width
-        weights = torch.softmax(nn.functional.linear(roots, self.roots, own), dim=-1)  # (N, T, M), in one pass
+        roots, own = (
+            x.clamp_min(0.0).sqrt() * (2 / self.width),
+            self.roots.square().sum(1) / -self.width,
+        )
+        # (N, T, M), in one pass
+        weights = torch.softmax(nn.functional.linear(roots, self.roots, own), dim=-1)
         return self.linear.merge(x, self.linear.missing(x) + weights @ self.residuals)

@@ -1,4 +1,5 @@
-"""Restores whole frames from the healthy cells, for software that reads frames. Numpy only, no torch."""
+"""Restores whole frames from the healthy cells, for software that reads frames. Numpy only, no
+torch."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class _Map:
-    """Affine map from cells ``known [h]`` to cells ``missing [m]``, and the standard deviation of its error ``[m]``."""
+    """Affine map from cells ``known [h]`` to cells ``missing [m]``, and the standard deviation of
+    its error ``[m]``."""
 
     known: NDArray[np.intp]
     missing: NDArray[np.intp]
@@ -36,9 +38,9 @@ class _Map:
 class Restorer:
     """Replaces missing and faulty readings by their conditional mean given the healthy cells.
 
-    The prediction is the Gaussian conditional mean (of the whole array, or on more than 1000 cells of the surroundings
-    of each cell), recalibrated on held-out recordings: where the healthy cells predict nothing, it is the mean of the
-    cell, and the deviation is the deviation of the cell.
+    The prediction is the Gaussian conditional mean (of the whole array, or on more than 1000 cells
+    of the surroundings of each cell), recalibrated on held-out recordings: where the healthy cells
+    predict nothing, it is the mean of the cell, and the deviation is the deviation of the cell.
 
     Readings are in the unit of the layout. Restored ones are clipped to 0..full scale.
 
@@ -56,13 +58,16 @@ class Restorer:
         self.layout = layout
 
     def fit(self, recordings: NDArray[Any] | Sequence[NDArray[Any]]) -> Restorer:
-        """Estimate from healthy recordings, ``[T, D]`` or a list of them; NaN counts as the last reading of the cell.
+        """Estimate from healthy recordings, ``[T, D]`` or a list of them; NaN counts as the last
+        reading of the cell.
 
         Raises:
             ValueError: fewer than 4 frames, or recordings that do not fit the layout.
         """
         frames = [
-            hold_missing(scale(self.layout.check_recording(recording, f"recording {i}"), self.layout))
+            hold_missing(
+                scale(self.layout.check_recording(recording, f"recording {i}"), self.layout)
+            )
             for i, recording in enumerate(self.layout.recordings(recordings))
         ]
         total = sum(map(len, frames))
@@ -71,7 +76,8 @@ class Restorer:
         x = np.nan_to_num(np.concatenate(frames))
         numbers = np.repeat(np.arange(len(frames)), [len(of) for of in frames])
         which = evenly(len(x), _MOST_FRAMES)
-        x, fold = x[which], two_folds(numbers[which])
+        x = x[which]
+        fold = two_folds(numbers[which])
         if self.layout.n_cells > LARGE:
             self._tiled: TiledStatistics | None = TiledStatistics(x, fold, self.layout)
         else:
@@ -83,7 +89,11 @@ class Restorer:
 
     @overload
     def transform(
-        self, recording: ArrayLike, fault_set: FaultSet | None = ..., *, return_std: Literal[False] = ...
+        self,
+        recording: ArrayLike,
+        fault_set: FaultSet | None = ...,
+        *,
+        return_std: Literal[False] = ...,
     ) -> Floats: ...
     @overload
     def transform(
@@ -97,7 +107,8 @@ class Restorer:
         Args:
             recording: readings in the unit of the layout; the cells in F may hold anything.
             fault_set: F; None restores NaN only.
-            return_std: also return the standard deviation of each reading, ``[T, D]``: 0 where it is not restored.
+            return_std: also return the standard deviation of each reading, ``[T, D]``: 0 where it
+                is not restored.
         """
         frames = np.array(self.layout.check_recording(recording), dtype=np.float64)
         missing = self._missing(frames, fault_set)
@@ -111,15 +122,17 @@ class Restorer:
                 of = rows[group.ravel() == number]
                 for part in self._plan(mask):
                     healthy = frames[np.ix_(of, part.known)].astype(np.float32)
-                    frames[np.ix_(of, part.missing)] = self._clip(healthy @ part.weight.T + part.bias)
+                    frames[np.ix_(of, part.missing)] = self._clip(
+                        healthy @ part.weight.T + part.bias
+                    )
                     deviation[np.ix_(of, part.missing)] = part.deviation
         return (frames, deviation) if return_std else frames
 
     def update(self, frame: ArrayLike, fault_set: FaultSet | None = None) -> Floats:
         """Return one ``frame [D]`` with the cells in F and all NaN restored.
 
-        The first frame with a new set of missing cells takes the time of a linear solve; the next ones take one
-        matrix-vector product.
+        The first frame with a new set of missing cells takes the time of a linear solve; the next
+        ones take one matrix-vector product.
         """
         x = self.layout.check_frame(frame).copy()
         mask = self._missing(x, fault_set)
@@ -130,7 +143,8 @@ class Restorer:
         return x
 
     def deviation(self, fault_set: FaultSet) -> Floats:
-        """Return the standard deviation of the error of each cell with F missing, ``[D]``; 0 for healthy cells."""
+        """Return the standard deviation of the error of each cell with F missing, ``[D]``; 0 for
+        healthy cells."""
         out = np.zeros(self.layout.n_cells)
         for part in self._plan(self._missing(out, fault_set)):
             out[part.missing] = part.deviation
@@ -146,17 +160,22 @@ class Restorer:
         missing = np.isnan(frames)
         if fault_set is not None:
             if fault_set.n_cells != self.layout.n_cells:
-                raise ValueError(f"F is over {fault_set.n_cells} cells, the layout has {self.layout.n_cells}")
+                raise ValueError(
+                    f"F is over {fault_set.n_cells} cells, the layout has {self.layout.n_cells}"
+                )
             missing |= fault_set.mask
         return missing
 
     def _plan(self, mask: NDArray[np.bool_]) -> tuple[_Map, ...]:
-        """Return the maps for a mask ``[D]`` of missing cells, from the cache if they were used recently."""
+        """Return the maps for a mask ``[D]`` of missing cells, from the cache if they were used
+        recently."""
         key = mask.tobytes()
         plan = self._plans.get(key)
         if plan is None:
             fault_set = FaultSet(tuple(np.flatnonzero(mask).tolist()), len(mask))
-            plan = self._tile_maps(fault_set) if self._tiled is not None else (self._map(fault_set),)
+            plan = (
+                self._tile_maps(fault_set) if self._tiled is not None else (self._map(fault_set),)
+            )
             self._plans[key] = plan
             if len(self._plans) > _PLANS:
                 self._plans.popitem(last=False)
@@ -165,21 +184,28 @@ class Restorer:
         return plan
 
     def _map(self, fault_set: FaultSet) -> _Map:
-        return self._in_unit(fault_set.healthy, np.flatnonzero(fault_set.mask), *self._whole.affine(fault_set))
+        return self._in_unit(
+            fault_set.healthy, np.flatnonzero(fault_set.mask), *self._whole.affine(fault_set)
+        )
 
     def _tile_maps(self, fault_set: FaultSet) -> tuple[_Map, ...]:
         assert self._tiled is not None  # for the type checker
-        healthy, missing = fault_set.healthy, np.flatnonzero(fault_set.mask)
+        healthy = fault_set.healthy
+        missing = np.flatnonzero(fault_set.mask)
         parts, average = self._tiled.parts(fault_set)
         maps = []
         for part in parts:
             cells = part.known < len(healthy)
-            known, weight = healthy[part.known[cells]], part.weight[:, cells]
+            known = healthy[part.known[cells]]
+            weight = part.weight[:, cells]
             if not cells.all():  # the mean loads of the pads, written as sums over their cells
                 dense = part.weight[:, ~cells] @ average.T
                 dense[:, part.known[cells]] += weight
-                known, weight = healthy, dense
-            maps.append(self._in_unit(known, missing[part.missing], weight, part.bias, part.deviation))
+                known = healthy
+                weight = dense
+            maps.append(
+                self._in_unit(known, missing[part.missing], weight, part.bias, part.deviation)
+            )
         return tuple(maps)
 
     def _in_unit(

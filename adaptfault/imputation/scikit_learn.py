@@ -29,12 +29,14 @@ Faults = FaultSet | Sequence[int] | None
 class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Imputes NaN, and the cells of F, by the conditional mean given the other features.
 
-    Equivalent to one step of ``sklearn.impute.IterativeImputer`` with a multivariate Gaussian (Ledoit-Wolf
-    covariance), recalibrated so that it is no worse than the mean of the feature on held-out samples.
+    Equivalent to one step of ``sklearn.impute.IterativeImputer`` with a multivariate Gaussian
+    (Ledoit-Wolf covariance), recalibrated so that it is no worse than the mean of the feature on
+    held-out samples.
 
     Args:
-        fault_set: F, imputed in each sample whatever it holds; cell indices, or a FaultSet over D cells. X may have a
-            multiple of D columns, as ``[mean of each cell, maximum of each cell]``. None: NaN only.
+        fault_set: F, imputed in each sample whatever it holds; cell indices, or a FaultSet over D
+            cells. X may have a multiple of D columns, as
+            ``[mean of each cell, maximum of each cell]``. None: NaN only.
 
     Attributes:
         mean_: ``[n_features]``, mean of each feature.
@@ -45,8 +47,11 @@ class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # typ
         self.fault_set = fault_set
 
     def fit(self, X: ArrayLike, y: object = None) -> CellImputer:
-        """Estimate from healthy samples ``[n, D]``, n at least 2; NaN counts as the mean of the feature."""
-        x = validate_data(self, X, dtype=np.float64, ensure_all_finite="allow-nan", ensure_min_samples=2)
+        """Estimate from healthy samples ``[n, D]``, n at least 2; NaN counts as the mean of the
+        feature."""
+        x = validate_data(
+            self, X, dtype=np.float64, ensure_all_finite="allow-nan", ensure_min_samples=2
+        )
         known = ~np.isnan(x)
         count = np.maximum(known.sum(axis=0), 1)
         mean = np.where(known, x, 0).sum(axis=0) / count
@@ -55,7 +60,9 @@ class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # typ
         spread = x.std(axis=0)
         self._scale = np.where(spread > 0, spread, 1.0)
         self._model = CrossFitted((x - mean) / self._scale, np.arange(len(x)) % 2 == 1)
-        self._maps: dict[bytes, tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]] = {}
+        self._maps: dict[
+            bytes, tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+        ] = {}
         return self
 
     def transform(self, X: ArrayLike) -> NDArray[np.float64]:
@@ -66,12 +73,16 @@ class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # typ
             X = np.array(X, dtype=np.float64)
             if X.ndim == 2 and X.shape[1] == len(faulty):
                 X[:, faulty] = np.nan
-        x = validate_data(self, X, dtype=np.float64, ensure_all_finite="allow-nan", reset=False, copy=True)
+        x = validate_data(
+            self, X, dtype=np.float64, ensure_all_finite="allow-nan", reset=False, copy=True
+        )
         missing = np.isnan(x)
         rows = np.flatnonzero(missing.any(axis=1))
         if not len(rows):
             return np.asarray(x)
-        _, first, group = np.unique(np.packbits(missing[rows], axis=1), axis=0, return_index=True, return_inverse=True)
+        _, first, group = np.unique(
+            np.packbits(missing[rows], axis=1), axis=0, return_index=True, return_inverse=True
+        )
         for number, mask in enumerate(missing[rows[first]]):
             of = rows[group.ravel() == number]
             weight, bias, _ = self._map(mask)
@@ -79,12 +90,16 @@ class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # typ
             x[np.ix_(of, mask)] = (healthy @ weight.T + bias) * self._scale[mask] + self.mean_[mask]
         return np.asarray(x)
 
-    def _map(self, mask: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _map(
+        self, mask: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         key = mask.tobytes()
         if key not in self._maps:
             if len(self._maps) >= 64:
                 self._maps.clear()
-            self._maps[key] = self._model.affine(FaultSet(tuple(np.flatnonzero(mask).tolist()), len(mask)))
+            self._maps[key] = self._model.affine(
+                FaultSet(tuple(np.flatnonzero(mask).tolist()), len(mask))
+            )
         return self._maps[key]
 
     def __sklearn_tags__(self) -> Any:
@@ -97,14 +112,17 @@ def columns_of(fault_set: Faults, n_features: int) -> NDArray[np.bool_]:
     """Return bool ``[n_features]``, the columns that belong to the cells of F.
 
     Raises:
-        ValueError: the number of features is no multiple of the number of cells, or an index is out of range.
+        ValueError: the number of features is no multiple of the number of cells, or an index is out
+            of range.
     """
     if fault_set is None:
         return np.zeros(n_features, dtype=bool)
     if not isinstance(fault_set, FaultSet):
         fault_set = FaultSet(tuple(int(cell) for cell in fault_set), n_features)
     if n_features % fault_set.n_cells:
-        raise ValueError(f"F is over {fault_set.n_cells} cells, X has {n_features} columns: no multiple of it")
+        raise ValueError(
+            f"F is over {fault_set.n_cells} cells, X has {n_features} columns: no multiple of it"
+        )
     return np.tile(fault_set.mask, n_features // fault_set.n_cells)
 
 
@@ -113,10 +131,12 @@ def _estimator_has(name: str) -> Callable[[Any], bool]:
 
 
 class _FaultTolerant(MetaEstimatorMixin, BaseEstimator):  # type: ignore[misc]
-    """An estimator with healthy data, which adapts to F by imputation or by a refit on the healthy cells."""
+    """An estimator with healthy data, which adapts to F by imputation or by a refit on the healthy
+    cells."""
 
     def __init__(self, estimator: Any, *, cv: int = 3) -> None:
-        self.estimator, self.cv = estimator, cv
+        self.estimator = estimator
+        self.cv = cv
 
     def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Any:
         """Fit the estimator to healthy samples; they are kept for :meth:`set_faults`.
@@ -124,13 +144,22 @@ class _FaultTolerant(MetaEstimatorMixin, BaseEstimator):  # type: ignore[misc]
         Args:
             X: ``[n, D]``, or a multiple of D columns (:class:`CellImputer`); NaN is imputed.
             y: targets, ``[n]``.
-            groups: ``[n]``, recording of each sample; samples of one recording stay together in validation.
+            groups: ``[n]``, recording of each sample; samples of one recording stay together in
+                validation.
         """
         x, targets = validate_data(
-            self, X, y, dtype=np.float64, multi_output=True, ensure_all_finite="allow-nan", ensure_min_samples=2
+            self,
+            X,
+            y,
+            dtype=np.float64,
+            multi_output=True,
+            ensure_all_finite="allow-nan",
+            ensure_min_samples=2,
         )
-        x, y = CellImputer().fit(x).transform(x), np.asarray(targets)
-        self._x, self._y = x, y
+        x = CellImputer().fit(x).transform(x)
+        y = np.asarray(targets)
+        self._x = x
+        self._y = y
         self._groups = None if groups is None else np.asarray(groups)
         self._fitted = clone(self.estimator).fit(x, y)
         self._imputer = CellImputer().fit(x)
@@ -142,26 +171,35 @@ class _FaultTolerant(MetaEstimatorMixin, BaseEstimator):  # type: ignore[misc]
     def set_faults(self, fault_set: Faults) -> Any:
         """Adapt to F from the healthy data; earlier F have no effect. Returns self.
 
-        Cross-validation compares imputing F in front of the fitted estimator with a refit on the healthy columns. The
-        better one is used (``choice_``), of equals the imputation; ``validation_scores_`` holds both scores.
+        Cross-validation compares imputing F in front of the fitted estimator with a refit on the
+        healthy columns. The better one is used (``choice_``), of equals the imputation;
+        ``validation_scores_`` holds both scores.
         """
         check_is_fitted(self)
         mask = columns_of(fault_set, self.n_features_in_)
         if mask.all():
-            raise ValueError("F holds all cells: no healthy one is left to predict from; replace the sensor")
-        self.fault_set_, self._mask = fault_set, mask
+            raise ValueError(
+                "F holds all cells: no healthy one is left to predict from; replace the sensor"
+            )
+        self.fault_set_ = fault_set
+        self._mask = mask
         self.estimator_ = self._fitted
         self.choice_: Literal["none", "impute", "refit"] = "none"
         self.validation_scores_: dict[str, float] = {}
         if mask.any():
             self.validation_scores_ = self._validate(mask)
-            self.choice_ = "refit" if self.validation_scores_["refit"] > self.validation_scores_["impute"] else "impute"
+            self.choice_ = (
+                "refit"
+                if self.validation_scores_["refit"] > self.validation_scores_["impute"]
+                else "impute"
+            )
             if self.choice_ == "refit":
                 self.estimator_ = clone(self.estimator).fit(self._x[:, ~mask], self._y)
         return self
 
     def predict(self, X: ArrayLike) -> NDArray[Any]:
-        """Return predictions ``[n]`` for samples ``[n, D]``; the columns of F may hold anything, NaN included."""
+        """Return predictions ``[n]`` for samples ``[n, D]``; the columns of F may hold anything,
+        NaN included."""
         x = self._input(X)
         return np.asarray(self.estimator_.predict(x))
 
@@ -179,13 +217,23 @@ class _FaultTolerant(MetaEstimatorMixin, BaseEstimator):  # type: ignore[misc]
             self._folds = []
             for train, test in self._split():
                 imputer = CellImputer().fit(self._x[train])
-                self._folds.append((train, test, clone(self.estimator).fit(self._x[train], self._y[train]), imputer))
+                self._folds.append(
+                    (
+                        train,
+                        test,
+                        clone(self.estimator).fit(self._x[train], self._y[train]),
+                        imputer,
+                    )
+                )
         scores = np.zeros(2)
         for train, test, whole, imputer in self._folds:
             x = self._x[test].copy()
             x[:, mask] = np.nan
             refit = clone(self.estimator).fit(self._x[train][:, ~mask], self._y[train])
-            scores += whole.score(imputer.transform(x), self._y[test]), refit.score(x[:, ~mask], self._y[test])
+            scores += (
+                whole.score(imputer.transform(x), self._y[test]),
+                refit.score(x[:, ~mask], self._y[test]),
+            )
         return dict(zip(("impute", "refit"), (scores / len(self._folds)).tolist(), strict=True))
 
     def _split(self) -> Any:

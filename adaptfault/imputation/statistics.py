@@ -1,4 +1,5 @@
-"""Mean and covariance of healthy frames, and the conditional mean of missing cells given the others. Numpy only."""
+"""Mean and covariance of healthy frames, and the conditional mean of missing cells given the
+others. Numpy only."""
 
 from __future__ import annotations
 
@@ -17,9 +18,8 @@ if TYPE_CHECKING:
 
 _MOST_FRAMES = 20_000  # frames of a covariance; more are thinned evenly
 _REFERENCE_FRAMES = 3_000  # frames for the kernel regression
-_PROBES = 100  # frames whose neighbour distances are measured
-_NEAR = 0.01  # share of frames that count as near neighbours
-_STILL = np.finfo(float).tiny ** 0.25  # added to the variance: cells that never moved have covariance 0
+# added to the variance: cells that never moved have covariance 0
+_STILL = np.finfo(float).tiny ** 0.25
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,12 @@ class CellStatistics:
         """Estimate from healthy frames ``[M, D]`` on the 0..1 scale."""
         from sklearn.covariance import LedoitWolf
 
-        estimate = LedoitWolf(store_precision=False).fit(frames[evenly(len(frames), _MOST_FRAMES)].astype(np.float64))
-        return cls(estimate.location_, estimate.covariance_, frames[evenly(len(frames), _REFERENCE_FRAMES)])
+        estimate = LedoitWolf(store_precision=False).fit(
+            frames[evenly(len(frames), _MOST_FRAMES)].astype(np.float64)
+        )
+        return cls(
+            estimate.location_, estimate.covariance_, frames[evenly(len(frames), _REFERENCE_FRAMES)]
+        )
 
     @staticmethod
     def reference(windows: Windows) -> NDArray[np.float32]:
@@ -62,19 +66,24 @@ class CellStatistics:
         return AffineFill(fault_set, *self.conditional_mean(fault_set))
 
     def nearest(self, fault_set: FaultSet) -> NearestFill:
-        """Return the linear front end for F plus a kernel regression of its residuals, a torch module."""
+        """Return the linear front end for F plus a kernel regression of its residuals, a torch
+        module."""
         from adaptfault.imputation.linear import NearestFill
 
         return NearestFill(fault_set, self.linear(fault_set), self.frames)
 
-    def conditional_mean(self, fault_set: FaultSet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return ``weight [k, D-k]`` and ``bias [k]`` of E[missing | healthy] = weight @ healthy + bias.
+    def conditional_mean(
+        self, fault_set: FaultSet
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return ``weight [k, D-k]`` and ``bias [k]`` of E[missing | healthy] = weight @ healthy +
+        bias.
 
         The Gaussian conditional mean, S_FR S_RR^-1, R being the healthy cells.
         """
         from scipy.linalg import cho_factor, cho_solve
 
-        missing, healthy = np.flatnonzero(fault_set.mask), fault_set.healthy
+        missing = np.flatnonzero(fault_set.mask)
+        healthy = fault_set.healthy
         if not len(missing) or not len(healthy):
             return np.zeros((len(missing), len(healthy))), self.mean[missing]
         between = self.covariance[np.ix_(healthy, missing)]
@@ -91,10 +100,11 @@ class CellStatistics:
         return np.asarray(cho_solve(factor, np.eye(len(self.mean))))
 
     def expected(self, frames: NDArray[Any], missing: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return the conditional mean ``[n, k]`` of the ``missing [D]`` cells of ``frames [n, D]``, not clipped.
+        """Return the conditional mean ``[n, k]`` of the ``missing [D]`` cells of ``frames [n, D]``,
+        not clipped.
 
-        Equal to :meth:`conditional_mean`, computed from the precision P: mean_F - P_FF^-1 P_FR (x_R - mean_R). Faster
-        for few missing cells that differ between frames.
+        Equal to :meth:`conditional_mean`, computed from the precision P: mean_F - P_FF^-1 P_FR (x_R
+        - mean_R). Faster for few missing cells that differ between frames.
         """
         deviation = np.where(missing, 0.0, frames - self.mean) @ self.precision[:, missing]
         within = self.precision[np.ix_(missing, missing)]
@@ -103,20 +113,12 @@ class CellStatistics:
 
 
 def _regular(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a covariance whose variances are raised by the error of its factorization (Higham 2002, theorem 10.3).
+    """Return a covariance whose variances are raised by the error of its factorization (Higham
+    2002, theorem 10.3).
 
-    The shrinkage is 0 where every frame deviates as far from the mean as any other, as of readings of two levels.
+    The shrinkage is 0 where every frame deviates as far from the mean as any other, as of readings
+    of two levels.
     """
     n = len(covariance)
     error: float = (n + 1) * np.finfo(float).eps * np.trace(covariance)
     return covariance + (error + _STILL) * np.eye(n)
-
-
-def near_distance(roots: NDArray[np.float32]) -> float:
-    """Return the median squared distance to a near neighbour among frames ``[M, R]``; never 0."""
-    from sklearn.metrics.pairwise import euclidean_distances
-
-    distance = euclidean_distances(roots[evenly(len(roots), _PROBES)], roots, squared=True)
-    rank = min(1 + round(_NEAR * len(roots)), len(roots) - 1)  # the nearest is the frame itself
-    near = np.partition(distance, rank, axis=1)[:, rank]
-    return float(np.median(near[near > 0])) if (near > 0).any() else 1.0

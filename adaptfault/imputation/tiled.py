@@ -1,4 +1,5 @@
-"""The front end of large arrays: conditional mean and kernel regression tile by tile, as one torch module."""
+"""The front end of large arrays: conditional mean and kernel regression tile by tile, as one torch
+module."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.imputation.tiled_statistics import WIDTH, TilePart
+from adaptfault.imputation.kernel import WIDTH
+from adaptfault.imputation.tile_part import TilePart
 from diagnostics import FaultSet
 
 _VALUES = 1 << 24  # processed at once
@@ -21,8 +23,8 @@ class TiledFill(nn.Module):
 
     Args:
         fault_set: F.
-        sizes: number of tiles; the largest number of predictors, missing cells and kernel frames of a tile; number of
-            pads whose mean loads are predictors.
+        sizes: number of tiles; the largest number of predictors, missing cells and kernel frames of
+            a tile; number of pads whose mean loads are predictors.
     """
 
     index: Tensor
@@ -38,7 +40,8 @@ class TiledFill(nn.Module):
     def __init__(self, fault_set: FaultSet, sizes: Sequence[int]) -> None:
         super().__init__()
         p, h, m, n, pads = self.sizes = tuple(int(size) for size in sizes)
-        self.weight, self.bias = nn.Parameter(torch.zeros(p, m, h)), nn.Parameter(torch.zeros(p, m))
+        self.weight = nn.Parameter(torch.zeros(p, m, h))
+        self.bias = nn.Parameter(torch.zeros(p, m))
         self.register_buffer("index", torch.zeros(p, h, dtype=torch.long))
         self.register_buffer("valid", torch.zeros(p, h))
         self.register_buffer("slot", torch.zeros(len(fault_set), dtype=torch.long))
@@ -52,7 +55,9 @@ class TiledFill(nn.Module):
         self.register_buffer("order", torch.from_numpy(order), persistent=False)
 
     @classmethod
-    def of(cls, fault_set: FaultSet, parts: Sequence[TilePart], average: NDArray[np.float32]) -> TiledFill:
+    def of(
+        cls, fault_set: FaultSet, parts: Sequence[TilePart], average: NDArray[np.float32]
+    ) -> TiledFill:
         """Build the front end from the imputation of each tile and the map to pad means."""
         most = [
             max((len(x) for x in each), default=0)
@@ -68,9 +73,13 @@ class TiledFill(nn.Module):
         with torch.no_grad():
             self.average.copy_(torch.from_numpy(average))
             for i, part in enumerate(parts):
-                h, k, n = len(part.known), len(part.missing), len(part.roots)
-                self.weight[i, :k, :h], self.bias[i, :k] = torch.from_numpy(part.weight), torch.from_numpy(part.bias)
-                self.index[i, :h], self.valid[i, :h] = torch.from_numpy(part.known), 1.0
+                h = len(part.known)
+                k = len(part.missing)
+                n = len(part.roots)
+                self.weight[i, :k, :h] = torch.from_numpy(part.weight)
+                self.bias[i, :k] = torch.from_numpy(part.bias)
+                self.index[i, :h] = torch.from_numpy(part.known)
+                self.valid[i, :h] = 1.0
                 self.slot[torch.from_numpy(part.missing)] = i * m + torch.arange(k)
                 self.roots[i, :n, :h] = torch.from_numpy(part.roots)
                 self.squares[i, :n] = self.roots[i, :n].square().sum(1)
@@ -83,15 +92,22 @@ class TiledFill(nn.Module):
         frames = x.reshape(-1, x.shape[-1])
         at_once = max(1, _VALUES // max(1, p * (h + n + m)))
         filled = torch.cat([self._missing(some) for some in torch.split(frames, at_once)])
-        return torch.cat([frames, filled.clamp(0.0, 1.0)], dim=-1)[:, self.order].reshape(*x.shape[:-1], -1)
+        return torch.cat([frames, filled.clamp(0.0, 1.0)], dim=-1)[:, self.order].reshape(
+            *x.shape[:-1], -1
+        )
 
     def _missing(self, x: Tensor) -> Tensor:
         """Map ``[B, D-k]`` to the imputed readings ``[B, k]``, not clipped."""
-        around = (torch.cat([x, x @ self.average], dim=1)[:, self.index] * self.valid).transpose(0, 1)  # (P, B, h)
+        # (P, B, h)
+        around = (torch.cat([x, x @ self.average], dim=1)[:, self.index] * self.valid).transpose(
+            0, 1
+        )
         filled = torch.baddbmm(self.bias[:, None], around, self.weight.transpose(1, 2))  # (P, B, m)
         if self.sizes[3]:
-            loads, width = around.clamp_min(0.0), self.width[:, None, None]
-            nearness = 2 * loads.sqrt() @ self.roots.transpose(1, 2) - self.squares[:, None]  # (P, B, M)
+            loads = around.clamp_min(0.0)
+            width = self.width[:, None, None]
+            # (P, B, M)
+            nearness = 2 * loads.sqrt() @ self.roots.transpose(1, 2) - self.squares[:, None]
             # One more reference at the typical distance of a near neighbour, with residual 0.
             usual = loads.sum(-1, keepdim=True) - width / WIDTH
             weights = torch.softmax(torch.cat([nearness, usual], dim=-1) / width, dim=-1)[..., :-1]

@@ -1,12 +1,15 @@
-"""One decision for a whole contact: class probabilities accumulated over its windows, reset at its release.
+"""One decision for a whole contact: class probabilities accumulated over its windows, reset at its
+release.
 
-The windows of one contact are dependent. With n windows of independent frames so far, the accumulated probabilities are
+The windows of one contact are dependent. With n windows of independent frames so far, the
+accumulated probabilities are
 
     log p(c) = n_eff mean_t log p_t(c) + const,    n_eff = n / (1 + (n - 1) rho)
 
-n_eff is the effective sample size of a mean of equally correlated values (design effect, Kish 1965). With rho = 1 the
-result is the geometric mean of the windows, with rho = 0 their product. rho minimises the cross entropy of the
-accumulated probabilities on validation recordings, so that these are calibrated.
+n_eff is the effective sample size of a mean of equally correlated values (design effect, Kish
+1965). With rho = 1 the result is the geometric mean of the windows, with rho = 0 their product. rho
+minimises the cross entropy of the accumulated probabilities on validation recordings, so that these
+are calibrated.
 """
 
 from __future__ import annotations
@@ -31,7 +34,8 @@ class ContactStatistics:
 
     Attributes:
         rest: ``[D]``, reading of each cell without contact, on the 0..1 scale.
-        begins: load at which a contact begins. The load is the mean excess of the healthy cells over ``rest``.
+        begins: load at which a contact begins. The load is the mean excess of the healthy cells
+            over ``rest``.
         dependence: rho.
     """
 
@@ -41,25 +45,36 @@ class ContactStatistics:
 
     @classmethod
     def fit(
-        cls, x: NDArray[np.float32], probabilities: NDArray[Any], y: NDArray[np.int64], recording: NDArray[np.int64]
+        cls,
+        x: NDArray[np.float32],
+        probabilities: NDArray[Any],
+        y: NDArray[np.int64],
+        recording: NDArray[np.int64],
     ) -> ContactStatistics:
         """Estimate from windows that do not overlap.
 
         Args:
             x: windows ``[N, T, D]``.
-            probabilities: of the classes of each window ``[N, n_classes]``, by a model that was fitted without it.
+            probabilities: of the classes of each window ``[N, n_classes]``, by a model that was
+                fitted without it.
             y: class of each window ``[N]``.
             recording: of each window ``[N]``; its windows are in the order of time.
         """
-        x = np.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0)  # positions without a cell may hold anything
+        # positions without a cell may hold anything
+        x = np.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0)
         rest = np.quantile(x.reshape(-1, x.shape[2]), _REST, axis=0).astype(np.float32)
         load = np.maximum(x - rest, 0.0).mean(axis=2).max(axis=1)
         peaks = [load[recording == number].max() for number in np.unique(recording)]
-        return cls(tuple(rest.tolist()), float(_BEGINS * np.median(peaks)), _dependence(probabilities, y, recording))
+        return cls(
+            tuple(rest.tolist()),
+            float(_BEGINS * np.median(peaks)),
+            _dependence(probabilities, y, recording),
+        )
 
     @classmethod
     def unknown(cls, n_cells: int) -> ContactStatistics:
-        """Return the cautious values for a model that was stored without: any load is a contact, rho is 1."""
+        """Return the cautious values for a model that was stored without: any load is a contact,
+        rho is 1."""
         return cls((0.0,) * n_cells, 0.0, 1.0)
 
     @classmethod
@@ -75,9 +90,10 @@ class ContactStatistics:
 class ContactDecision:
     """Accumulates the probabilities of windows that end within one contact.
 
-    A contact begins where the load rises by ``begins`` over its lowest value since the last release, and ends where
-    30 % of its load is left. It does not see that one object is exchanged for another without a release, and a cell
-    that is stuck at a high reading and not in F may hide a release.
+    A contact begins where the load rises by ``begins`` over its lowest value since the last
+    release, and ends where 30 % of its load is left. It does not see that one object is exchanged
+    for another without a release, and a cell that is stuck at a high reading and not in F may hide
+    a release.
 
     Args:
         statistics: of the model.
@@ -85,8 +101,15 @@ class ContactDecision:
         length: frames in a window; windows that overlap count as one for each ``length`` of them.
     """
 
-    def __init__(self, statistics: ContactStatistics, healthy: Sequence[bool] | NDArray[np.bool_], length: int) -> None:
-        self.statistics, self.healthy, self.length = statistics, np.asarray(healthy, dtype=bool), length
+    def __init__(
+        self,
+        statistics: ContactStatistics,
+        healthy: Sequence[bool] | NDArray[np.bool_],
+        length: int,
+    ) -> None:
+        self.statistics = statistics
+        self.healthy = np.asarray(healthy, dtype=bool)
+        self.length = length
         self._rest = np.asarray(statistics.rest, dtype=np.float32)
         self.reset()
 
@@ -107,7 +130,8 @@ class ContactDecision:
 
         Args:
             frame: ``[D]``, on the 0..1 scale, without NaN.
-            probabilities: ``[n_classes]`` of the window that ends with it; None: no window is full yet.
+            probabilities: ``[n_classes]`` of the window that ends with it; None: no window is full
+                yet.
 
         Returns:
             The probabilities ``[n_classes]`` of the contact so far; None without contact or window.
@@ -129,19 +153,25 @@ class ContactDecision:
             self._highest = max(self._highest, load)
             if load - self._lowest > _RELEASED * (self._highest - self._lowest):
                 return
-            self._contact, self._lowest = False, load
+            self._contact = False
+            self._lowest = load
             self._forget()
         self._lowest = min(self._lowest, load)
         if load - self._lowest > self.statistics.begins:
-            self._contact, self._highest = True, load
+            self._contact = True
+            self._highest = load
 
 
-def _dependence(probabilities: NDArray[Any], y: NDArray[np.int64], recording: NDArray[np.int64]) -> float:
-    """Return the rho with the lowest cross entropy of the probabilities accumulated over each first n windows."""
+def _dependence(
+    probabilities: NDArray[Any], y: NDArray[np.int64], recording: NDArray[np.int64]
+) -> float:
+    """Return the rho with the lowest cross entropy of the probabilities accumulated over each first
+    n windows."""
     from scipy.optimize import minimize_scalar
 
     logs = np.log(np.maximum(np.asarray(probabilities, dtype=np.float64), _LEAST))
-    means, n = np.empty_like(logs), np.empty(len(logs))
+    means = np.empty_like(logs)
+    n = np.empty(len(logs))
     for number in np.unique(recording):
         of_it = np.flatnonzero(recording == number)
         n[of_it] = np.arange(1, len(of_it) + 1)
@@ -151,4 +181,6 @@ def _dependence(probabilities: NDArray[Any], y: NDArray[np.int64], recording: ND
         likely = softmax((n / (1 + (n - 1) * rho))[:, None] * means, axis=1)
         return float(-np.log(np.maximum(likely[np.arange(len(y)), y], _LEAST)).mean())
 
-    return float(minimize_scalar(loss, bounds=(0.0, 1.0), method="bounded").x) if n.max() > 1 else 1.0
+    return (
+        float(minimize_scalar(loss, bounds=(0.0, 1.0), method="bounded").x) if n.max() > 1 else 1.0
+    )

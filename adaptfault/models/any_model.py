@@ -1,4 +1,5 @@
-"""Wraps any torch module from windows to logits or values, and finds the features that a new head can use."""
+"""Wraps any torch module from windows to logits or values, and finds the features that a new head
+can use."""
 
 from __future__ import annotations
 
@@ -20,14 +21,16 @@ _PROBE = 3  # windows of the test run; not 1 or 2, so that a batch axis in anoth
 
 
 class AnyModel(nn.Module):
-    """A module from windows ``[N, T, D]`` to outputs ``[N, n]``, with the attributes that an adaptation needs.
+    """A module from windows ``[N, T, D]`` to outputs ``[N, n]``, with the attributes that an
+    adaptation needs.
 
     Args:
         module: the model.
         layout: the array.
         length: T, frames in a window.
         n_classes: n, number of logits or values.
-        layer: name of the layer whose input (``last_linear`` True) or output is the feature vector; None: no features.
+        layer: name of the layer whose input (``last_linear`` True) or output is the feature vector;
+            None: no features.
         last_linear: ``layer`` is the last linear layer.
         function: computes the features from (module, x) instead of ``layer``.
     """
@@ -44,76 +47,106 @@ class AnyModel(nn.Module):
         function: Callable[[nn.Module, Tensor], Tensor] | None = None,
     ) -> None:
         super().__init__()
-        self.module, self.layout, self.length, self.n_classes = module, layout, length, n_classes
-        self.layer, self.last_linear, self.function = layer, last_linear, function
+        self.module = module
+        self.layout = layout
+        self.length = length
+        self.n_classes = n_classes
+        self.layer = layer
+        self.last_linear = last_linear
+        self.function = function
 
     @classmethod
-    def probe(cls, module: nn.Module, layout: SensorLayout, x: Tensor, features: Features | None = None) -> AnyModel:
+    def probe(
+        cls, module: nn.Module, layout: SensorLayout, x: Tensor, features: Features | None = None
+    ) -> AnyModel:
         """Run a module on windows ``x [N, T, D]`` and wrap it.
 
         Args:
             module: the model.
             layout: the array.
             x: some windows; the first 3 are used.
-            features: name of the layer whose output is the feature vector, or a function of (module, x [N, T, D]) that
-                returns ``[N, p]``. None: the input of the last linear layer, if there is one.
+            features: name of the layer whose output is the feature vector, or a function of
+                (module, x [N, T, D]) that returns ``[N, p]``. None: the input of the last linear
+                layer, if there is one.
 
         Raises:
-            ValueError: the forward pass fails, its output is not ``[N, n]``, or the named features cannot be found.
+            ValueError: the forward pass fails, its output is not ``[N, n]``, or the named features
+                cannot be found.
         """
         shape = list(x[:_PROBE].shape)
         wrapped = cls(module, layout, shape[1], 1)
         name = type(module).__name__
         x = x[:_PROBE].to(device_of(module))
-        linear: dict[nn.Module, str] = {of: at for at, of in module.named_modules() if isinstance(of, nn.Linear)}
+        linear: dict[nn.Module, str] = {
+            of: at for at, of in module.named_modules() if isinstance(of, nn.Linear)
+        }
         used: list[tuple[nn.Module, Tensor]] = []
-        hooks = [of.register_forward_hook(lambda of, _, out: used.append((of, out))) for of in linear]
+        hooks = [
+            of.register_forward_hook(lambda of, _, out: used.append((of, out))) for of in linear
+        ]
         try:
             outputs = _evaluate(module, lambda: module(x))
         except Exception as error:  # a model may raise anything
             raise ValueError(
-                f"{name} fails on windows of shape {shape}: {first_line(error)};"
-                " an adapter needs a module from [N, T, D] to [N, n], so wrap one that takes another shape"
+                f"{name} fails on windows of shape {shape}: {first_line(error)}; an adapter needs a"
+                " module from [N, T, D] to [N, n], so wrap one that takes another shape"
             ) from None
         finally:
             for hook in hooks:
                 hook.remove()
         if not isinstance(outputs, Tensor) or outputs.dim() != 2 or len(outputs) != len(x):
             given = list(outputs.shape) if isinstance(outputs, Tensor) else type(outputs).__name__
-            raise ValueError(f"{name} returns {given} for windows of shape {shape}: expected [{len(x)}, n]")
+            raise ValueError(
+                f"{name} returns {given} for windows of shape {shape}: expected [{len(x)}, n]"
+            )
         if not torch.isfinite(outputs).all():
-            raise ValueError(f"{name} returns NaN or infinity for finite windows: give a model with finite weights")
+            raise ValueError(
+                f"{name} returns NaN or infinity for finite windows: give a model with finite"
+                " weights"
+            )
         wrapped.n_classes = outputs.shape[1]
         if isinstance(features, str):
             wrapped.layer = features
         elif features is not None:
             wrapped.function = features
         elif used:
-            wrapped.layer, wrapped.last_linear = linear[used[-1][0]], True
+            wrapped.layer = linear[used[-1][0]]
+            wrapped.last_linear = True
         wrapped._check_features(x, features)
         return wrapped
 
     def _check_features(self, x: Tensor, given: Features | None) -> None:
-        """Run the features once. What was found without being named is dropped if it is unusable."""
+        """Run the features once. What was found without being named is dropped if it is
+        unusable."""
         if self.layer is None and self.function is None:
             return
         name = type(self.module).__name__
         try:
             found: Any = _evaluate(self, lambda: self.features(x))
             shape = list(found.shape) if isinstance(found, Tensor) else type(found).__name__
-            problem = None if isinstance(found, Tensor) and found.dim() == 2 and len(found) == len(x) else shape
+            problem = (
+                None
+                if isinstance(found, Tensor) and found.dim() == 2 and len(found) == len(x)
+                else shape
+            )
         except Exception as error:
             problem = first_line(error)
         if problem is None:
             return
         if given is not None:
             layers = [at for at, _ in self.module.named_modules() if at]
-            given = given if isinstance(given, str) else getattr(given, "__name__", type(given).__name__)
-            raise ValueError(
-                f"the features {given!r} of {name} are not [{len(x)}, p] for {len(x)} windows: {problem};"
-                f" name one of its layers ({', '.join(layers[:8])}{', ...' if len(layers) > 8 else ''})"
+            given = (
+                given
+                if isinstance(given, str)
+                else getattr(given, "__name__", type(given).__name__)
             )
-        self.layer, self.last_linear = None, False
+            raise ValueError(
+                f"the features {given!r} of {name} are not [{len(x)}, p] for {len(x)} windows:"
+                f" {problem}; name one of its layers"
+                f" ({', '.join(layers[:8])}{', ...' if len(layers) > 8 else ''})"
+            )
+        self.layer = None
+        self.last_linear = False
 
     @property
     def has_features(self) -> bool:
@@ -126,14 +159,19 @@ class AnyModel(nn.Module):
         if not self.last_linear or self.layer is None:
             return None
         layer = self.module.get_submodule(self.layer)
-        return layer if isinstance(layer, nn.Linear) and layer.out_features == self.n_classes else None
+        return (
+            layer if isinstance(layer, nn.Linear) and layer.out_features == self.n_classes else None
+        )
 
     def features(self, x: Tensor) -> Tensor:
-        """Map windows ``[N, T, D]`` to features ``[N, p]``; features of each frame are averaged over time."""
+        """Map windows ``[N, T, D]`` to features ``[N, p]``; features of each frame are averaged
+        over time."""
         if self.function is not None:
             return self.function(self.module, x)
         if self.layer is None:
-            raise ValueError(f"{type(self.module).__name__} has no features: name a layer with features=")
+            raise ValueError(
+                f"{type(self.module).__name__} has no features: name a layer with features="
+            )
         seen: list[Any] = []
         layer = self.module.get_submodule(self.layer)
         if self.last_linear:
@@ -146,7 +184,8 @@ class AnyModel(nn.Module):
             hook.remove()
         if not seen:
             raise ValueError(f"the layer {self.layer!r} does not run in the forward pass")
-        values: Tensor = seen[-1][0] if isinstance(seen[-1], tuple) else seen[-1]  # recurrent layers return tuples
+        # recurrent layers return tuples
+        values: Tensor = seen[-1][0] if isinstance(seen[-1], tuple) else seen[-1]
         return values if values.dim() < 3 else values.flatten(1, -2).mean(1)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -179,17 +218,24 @@ class AnyModel(nn.Module):
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any], module: nn.Module | None = None, function: Any = None) -> AnyModel:
-        """Wrap ``module``, an instance of the class that ``config["module"]`` names; None: from its builder.
+    def from_config(
+        cls, config: Mapping[str, Any], module: nn.Module | None = None, function: Any = None
+    ) -> AnyModel:
+        """Wrap ``module``, an instance of the class that ``config["module"]`` names; None: from its
+        builder.
 
         Raises:
             ValueError: there is neither a module nor an allowed builder.
         """
         layout = SensorLayout.from_dict(config["layout"])
         if module is None and config.get("builder") is None:
-            raise ModelNotAllowed(f"the model is a {config['module']}: give an instance of it as network=")
+            raise ModelNotAllowed(
+                f"the model is a {config['module']}: give an instance of it as network="
+            )
         if module is None:
-            module = build_model(config["builder"], layout, config["n_classes"], length=config["length"])
+            module = build_model(
+                config["builder"], layout, config["n_classes"], length=config["length"]
+            )
         return cls(
             module,
             layout,
@@ -208,8 +254,8 @@ class AnyModel(nn.Module):
         """
         if kinds := not_resettable(self.module):
             raise ValueError(
-                f"{type(self.module).__name__} cannot be trained anew: {', '.join(kinds)} has parameters but no"
-                " reset_parameters()"
+                f"{type(self.module).__name__} cannot be trained anew: {', '.join(kinds)} has"
+                " parameters but no reset_parameters()"
             )
         copied = copy.deepcopy(self)
         with torch.random.fork_rng(devices=[]):
@@ -224,18 +270,22 @@ class AnyModel(nn.Module):
 def network_from_config(
     config: Mapping[str, Any], module: nn.Module | None = None, function: Any = None
 ) -> TactileTransformer | AnyModel:
-    """Build a network, without its weights, from the ``config`` of either class; see :meth:`AnyModel.from_config`."""
+    """Build a network, without its weights, from the ``config`` of either class; see
+    :meth:`AnyModel.from_config`."""
     if "module" not in config:
         return TactileTransformer.from_config(config)
     return AnyModel.from_config(config, module, function)
 
 
 def not_resettable(module: nn.Module) -> list[str]:
-    """Return the classes of layers that hold trainable parameters and cannot draw new initial weights."""
+    """Return the classes of layers that hold trainable parameters and cannot draw new initial
+    weights."""
     lacking = (
         type(layer).__name__
         for layer in module.modules()
-        if _trainable(layer) and not hasattr(layer, "reset_parameters") and not hasattr(layer, "_reset_parameters")
+        if _trainable(layer)
+        and not hasattr(layer, "reset_parameters")
+        and not hasattr(layer, "_reset_parameters")
     )
     return list(dict.fromkeys(lacking))
 

@@ -1,4 +1,5 @@
-"""A training run on disk: tensors and JSON in one safetensors file, valid for one set of training settings."""
+"""A training run on disk: tensors and JSON in one safetensors file, valid for one set of training
+settings."""
 
 from __future__ import annotations
 
@@ -21,7 +22,11 @@ SCHEMA = "adaptfault.training/1"
 
 
 def write_checkpoint(
-    path: Path, tensors: Mapping[str, Tensor], *, settings: Mapping[str, Any], state: Mapping[str, Any]
+    path: Path,
+    tensors: Mapping[str, Tensor],
+    *,
+    settings: Mapping[str, Any],
+    state: Mapping[str, Any],
 ) -> None:
     """Write a checkpoint; a crash at any moment leaves the earlier one.
 
@@ -35,11 +40,14 @@ def write_checkpoint(
     atomic_write(path, save({name: tensor.cpu() for name, tensor in tensors.items()}, about))
 
 
-def read_checkpoint(path: Path, settings: Mapping[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read_checkpoint(
+    path: Path, settings: Mapping[str, Any]
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Return tensors and state of a checkpoint.
 
     Raises:
-        ValueError: the file is damaged or no checkpoint, or the settings differ; the message names them.
+        ValueError: the file is damaged or no checkpoint, or the settings differ; the message names
+            them.
     """
     mend = "delete it or give another path"
     try:
@@ -49,8 +57,12 @@ def read_checkpoint(path: Path, settings: Mapping[str, Any]) -> tuple[dict[str, 
                 raise ValueError(f"{path} is not a training checkpoint of this version: {mend}")
             if about["settings"] != _json(settings):
                 was = json.loads(about["settings"])
-                changed = sorted(name for name in {*settings, *was} if settings.get(name) != was.get(name))
-                raise ValueError(f"checkpoint {path} is of a run with another {', '.join(changed)}: {mend}")
+                changed = sorted(
+                    name for name in {*settings, *was} if settings.get(name) != was.get(name)
+                )
+                raise ValueError(
+                    f"checkpoint {path} is of a run with another {', '.join(changed)}: {mend}"
+                )
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
             return tensors, json.loads(about["state"])
     except SafetensorError as error:

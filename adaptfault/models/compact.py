@@ -1,10 +1,11 @@
 """Exact low-rank form of the paper's network: a third of the multiplications and of the weights.
 
-The residual stream of the paper's network has d = 3520 values for its sensor, but spans a subspace of a few hundred
-dimensions. The convolutions are linear, so the stream starts as an affine map of the cells. Attention and feed-forward
-block each add an affine map of 256 and 128 values. A frame is therefore stored as coordinates y with
-x = y @ basis + offset, and each layer that reads x is multiplied with the basis. LayerNorm needs only the variance of
-x. With an orthonormal basis of the centred vectors (QR decomposition) the variance is the squared length of y over d.
+The residual stream of the paper's network has d = 3520 values for its sensor, but spans a subspace
+of a few hundred dimensions. The convolutions are linear, so the stream starts as an affine map of
+the cells. Attention and feed-forward block each add an affine map of 256 and 128 values. A frame is
+therefore stored as coordinates y with x = y @ basis + offset, and each layer that reads x is
+multiplied with the basis. LayerNorm needs only the variance of x. With an orthonormal basis of the
+centred vectors (QR decomposition) the variance is the squared length of y over d.
 """
 
 from __future__ import annotations
@@ -15,9 +16,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from adaptfault.models.network import BLOCKS, HEAD_DIM, HEADS, HIDDEN, EncoderBlock, TactileTransformer, attend
+from adaptfault.models.network import (
+    BLOCKS,
+    HEAD_DIM,
+    HEADS,
+    HIDDEN,
+    EncoderBlock,
+    TactileTransformer,
+    attend,
+)
 
-_UPDATES = BLOCKS * (HEADS * HEAD_DIM + HIDDEN + 2)  # numbers that the blocks add to those of a frame's cells
+# numbers that the blocks add to those of a frame's cells
+_UPDATES = BLOCKS * (HEADS * HEAD_DIM + HIDDEN + 2)
 _MOST = 20_000_000  # values in a basis; a larger decomposition costs more time than it saves
 _ROWS = 128  # of a triangular matrix, multiplied at once
 _DEPENDENT = 1e-5  # relative Cholesky diagonal below which the columns count as linearly dependent
@@ -25,19 +35,23 @@ _WORTH = 2000  # windows from which on the decomposition saves time: about twice
 
 
 class _Wide:
-    """Affine subspace of the residual stream: ``x = y @ basis + offset``, ``[k, d]`` and ``[d]``, both double."""
+    """Affine subspace of the residual stream: ``x = y @ basis + offset``, ``[k, d]`` and ``[d]``,
+    both double."""
 
     def __init__(self, basis: Tensor, offset: Tensor) -> None:
-        self.basis, self.offset = basis, offset
+        self.basis = basis
+        self.offset = offset
 
     def fold(self, layer: nn.Linear) -> nn.Linear:
         """Return the layer whose output for y equals the output of ``layer`` for x."""
         return _linear(layer.weight @ self.basis.T, layer.weight @ self.offset + layer.bias)
 
     def add_and_norm(self, layer: nn.Linear, norm: nn.LayerNorm) -> tuple[CompactNorm, _Wide]:
-        """Return the map from y and the inputs of ``layer`` to the new y of ``norm(x + layer(inputs))``."""
+        """Return the map from y and the inputs of ``layer`` to the new y of
+        ``norm(x + layer(inputs))``."""
         rows = torch.cat([self.basis, layer.weight.T, (self.offset + layer.bias)[None]])
-        directions, lengths = _orthonormal((rows - rows.mean(1, keepdim=True)).T)  # (d, k'), (k', rows)
+        # (d, k'), (k', rows)
+        directions, lengths = _orthonormal((rows - rows.mean(1, keepdim=True)).T)
         folded = CompactNorm(lengths[:, :-1], lengths[:, -1], rows.shape[1], norm.eps)
         return folded, _Wide(directions.T * norm.weight, norm.bias)
 
@@ -45,7 +59,8 @@ class _Wide:
 class CompactNorm(nn.Module):
     """Residual sum and LayerNorm of ``width`` values, computed on coordinates.
 
-    The matrix of the sum is upper triangular: blocks of its rows leave out the zeros below the diagonal.
+    The matrix of the sum is upper triangular: blocks of its rows leave out the zeros below the
+    diagonal.
 
     Args:
         matrix: ``[k', k + u]``, upper triangular.
@@ -56,9 +71,11 @@ class CompactNorm(nn.Module):
 
     def __init__(self, matrix: Tensor, offset: Tensor, width: int, eps: float) -> None:
         super().__init__()
-        self.width, self.eps = width, eps
+        self.width = width
+        self.eps = eps
         self.rows = nn.ModuleList(
-            _linear(matrix[i : i + _ROWS, i:], offset[i : i + _ROWS]) for i in range(0, len(matrix), _ROWS)
+            _linear(matrix[i : i + _ROWS, i:], offset[i : i + _ROWS])
+            for i in range(0, len(matrix), _ROWS)
         )
 
     def forward(self, y: Tensor, update: Tensor) -> Tensor:
@@ -71,9 +88,14 @@ class CompactNorm(nn.Module):
 class CompactBlock(nn.Module):
     """Encoder block computed on coordinates."""
 
-    def __init__(self, qkv: nn.Linear, norm1: CompactNorm, up: nn.Linear, norm2: CompactNorm) -> None:
+    def __init__(
+        self, qkv: nn.Linear, norm1: CompactNorm, up: nn.Linear, norm2: CompactNorm
+    ) -> None:
         super().__init__()
-        self.qkv, self.norm1, self.up, self.norm2 = qkv, norm1, up, norm2
+        self.qkv = qkv
+        self.norm1 = norm1
+        self.up = up
+        self.norm2 = norm2
 
     @classmethod
     def fold(cls, block: EncoderBlock, wide: _Wide) -> tuple[CompactBlock, _Wide]:
@@ -92,7 +114,8 @@ class CompactBlock(nn.Module):
 
 
 class CompactNetwork(nn.Module):
-    """Low-rank form of a :class:`TactileTransformer`: the same features and logits in eval mode, up to rounding.
+    """Low-rank form of a :class:`TactileTransformer`: the same features and logits in eval mode, up
+    to rounding.
 
     Args:
         network: the network; it is copied. Dropout is left out.
@@ -103,19 +126,23 @@ class CompactNetwork(nn.Module):
     @torch.no_grad()
     def __init__(self, network: TactileTransformer) -> None:
         super().__init__()
-        self.layout, self.length, self.n_classes = network.layout, network.length, network.n_classes
+        self.layout = network.layout
+        self.length = network.length
+        self.n_classes = network.n_classes
         precise = copy.deepcopy(network).cpu().double()
         self.register_buffer("present", precise.present.nonzero().flatten())
         frames = torch.eye(self.layout.n_cells, dtype=torch.float64)[self.present]
         frames = torch.cat([frames, torch.zeros_like(frames[:1])]).reshape(-1, *self.layout.shape)
-        seen = precise.conv2(precise.conv1(frames)).flatten(1)  # (cells + 1, d): one cell at 1 each, and no cell
+        # (cells + 1, d): one cell at 1 each, and no cell
+        seen = precise.conv2(precise.conv1(frames)).flatten(1)
         wide = _Wide(seen[:-1] - seen[-1], seen[-1])
         self.blocks = nn.ModuleList()
         for block in precise.blocks:
             assert isinstance(block, EncoderBlock)  # for the type checker
             compact, wide = CompactBlock.fold(block, wide)
             self.blocks.append(compact)
-        self.dense, self.head = wide.fold(precise.dense), copy.deepcopy(network.head).cpu()
+        self.dense = wide.fold(precise.dense)
+        self.head = copy.deepcopy(network.head).cpu()
         self.float().eval()
 
     @staticmethod
@@ -137,14 +164,16 @@ class CompactNetwork(nn.Module):
 
 
 def compacted(network: TactileTransformer, n: int) -> CompactNetwork | None:
-    """Return the low-rank network on the same device if it saves time for ``n`` windows, else None."""
+    """Return the low-rank network on the same device if it saves time for ``n`` windows, else
+    None."""
     if n < _WORTH or not CompactNetwork.suits(network):
         return None
     return CompactNetwork(network).to(network.head.weight.device)
 
 
 def _orthonormal(columns: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the QR decomposition of double ``columns [d, n]``; Cholesky QR where the columns are well conditioned."""
+    """Return the QR decomposition of double ``columns [d, n]``; Cholesky QR where the columns are
+    well conditioned."""
     root, failed = torch.linalg.cholesky_ex(columns.T @ columns)
     left = root.diagonal()
     if failed or left.min() < _DEPENDENT * left.max():

@@ -14,10 +14,12 @@ class History:
     """Record of a training run.
 
     Attributes:
-        train_loss, validation_loss, validation_accuracy, seconds: one number an epoch: mean losses (cross entropy, or
+        train_loss, validation_loss, validation_accuracy, seconds: one number an epoch: mean losses
+        (cross entropy, or
             mean squared error of values), accuracy (R2 of values), wall clock.
         best_epoch: epoch of the selected weights, counted from 1; 0 = the starting weights.
-        stopped: "epochs" (all done), "patience" (no improvement), "budget" (time is up, also within an epoch).
+        stopped: "epochs" (all done), "patience" (no improvement), "budget" (time is up, also within
+            an epoch).
         start: validation loss and accuracy of the starting weights, if evaluated.
     """
 
@@ -49,7 +51,8 @@ class History:
         )
 
     def longer(self, train_loss: float, scores: tuple[float, float], seconds: float) -> History:
-        """Return the history with one more epoch. The best epoch has the highest accuracy, of equals the lowest loss.
+        """Return the history with one more epoch. The best epoch has the highest accuracy, of
+        equals the lowest loss.
 
         Args:
             train_loss: mean loss of the epoch.
@@ -57,7 +60,9 @@ class History:
             seconds: wall clock.
         """
         loss, accuracy = scores
-        earlier = list(zip(self.validation_accuracy, (-v for v in self.validation_loss), strict=True))
+        earlier = list(
+            zip(self.validation_accuracy, (-v for v in self.validation_loss), strict=True)
+        )
         if self.start is not None:
             earlier.append((self.start[1], -self.start[0]))
         return replace(
@@ -66,7 +71,9 @@ class History:
             validation_loss=(*self.validation_loss, loss),
             validation_accuracy=(*self.validation_accuracy, accuracy),
             seconds=(*self.seconds, seconds),
-            best_epoch=self.epochs + 1 if all((accuracy, -loss) > e for e in earlier) else self.best_epoch,
+            best_epoch=self.epochs + 1
+            if all((accuracy, -loss) > e for e in earlier)
+            else self.best_epoch,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -76,5 +83,7 @@ class History:
     @classmethod
     def from_dict(cls, d: dict[str, Any]) -> History:
         """Build a history from the dict of :meth:`to_dict`, also after JSON."""
-        fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in d.items()}
+        fields: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in d.items()
+        }
         return cls(**fields)

@@ -1,4 +1,5 @@
-"""The paper's network (Section III-A): convolutions over each frame, a transformer over time, for any tactile array."""
+"""The paper's network (Section III-A): convolutions over each frame, a transformer over time, for
+any tactile array."""
 
 from __future__ import annotations
 
@@ -15,9 +16,12 @@ from diagnostics import SensorLayout
 
 FILTERS = (16, 32)  # of the two 3 x 3 convolutions
 BLOCKS = 2
-HEADS, HEAD_DIM = 4, 64  # 256 wide inside the attention, whatever d is
+# 256 wide inside the attention, whatever d is
+HEADS = 4
+HEAD_DIM = 64
 HIDDEN = 128  # of the feed-forward blocks and of the head
-NORM_EPS = 1e-3  # Keras's default; frames with hardly any contact are not amplified to unit variance
+# Keras's default; frames with hardly any contact are not amplified to unit variance
+NORM_EPS = 1e-3
 
 Batch = Tensor | NDArray[Any]
 
@@ -25,8 +29,8 @@ Batch = Tensor | NDArray[Any]
 class Dropout(nn.Module):
     """Drop a share ``p`` of the values while training and scale up the rest.
 
-    Equivalent to ``torch.nn.Dropout``. One 64-bit draw decides four values, because torch's generator takes a sixth of
-    a training step on a CPU.
+    Equivalent to ``torch.nn.Dropout``. One 64-bit draw decides four values, because torch's
+    generator takes a sixth of a training step on a CPU.
     """
 
     def __init__(self, p: float) -> None:
@@ -39,20 +43,24 @@ class Dropout(nn.Module):
         """Map a tensor to one of the same shape; in eval mode to itself."""
         if not (self.training and self.cut):
             return x
-        draws = torch.empty((x.numel() + 3) // 4, dtype=torch.int64, device=x.device).random_(-(2**63), None)
+        draws = torch.empty((x.numel() + 3) // 4, dtype=torch.int64, device=x.device).random_(
+            -(2**63), None
+        )
         kept = draws.view(torch.int16)[: x.numel()].view(x.shape) >= self.cut - 2**15
         return x * (kept * (2**16 / (2**16 - self.cut)))
 
 
 class EncoderBlock(nn.Module):
-    """Post-norm transformer block of width d: attention, then d -> 128 -> d, a residual and LayerNorm after each."""
+    """Post-norm transformer block of width d: attention, then d -> 128 -> d, a residual and
+    LayerNorm after each."""
 
     def __init__(self, d: int, dropout: float) -> None:
         super().__init__()
         self.qkv = nn.Linear(d, 3 * HEADS * HEAD_DIM)
         self.out = nn.Linear(HEADS * HEAD_DIM, d)  # W^O
         self.norm1 = nn.LayerNorm(d, eps=NORM_EPS)
-        # The paper prints Dense_128(ReLU(Dense_d(x))), whose 128 values could not be added to the d of the residual.
+        # The paper prints Dense_128(ReLU(Dense_d(x))), whose 128 values could not be added to the d
+        # of the residual.
         self.up = nn.Linear(d, HIDDEN)
         self.down = nn.Linear(HIDDEN, d)
         self.norm2 = nn.LayerNorm(d, eps=NORM_EPS)
@@ -66,8 +74,10 @@ class EncoderBlock(nn.Module):
 
 
 def attend(qkv: Tensor) -> Tensor:
-    """Map queries, keys and values ``[N, T, 768]`` to the attended values of each frame, ``[N, T, 256]``."""
-    q, k, v = torch.unflatten(qkv, -1, (3, HEADS, HEAD_DIM)).permute(2, 0, 3, 1, 4)  # each (N, heads, T, 64)
+    """Map queries, keys and values ``[N, T, 768]`` to the attended values of each frame,
+    ``[N, T, 256]``."""
+    # each (N, heads, T, 64)
+    q, k, v = torch.unflatten(qkv, -1, (3, HEADS, HEAD_DIM)).permute(2, 0, 3, 1, 4)
     attended = F.scaled_dot_product_attention(q, k, v)  # (N, heads, T, 64)
     return attended.transpose(1, 2).flatten(2)
 
@@ -75,12 +85,14 @@ def attend(qkv: Tensor) -> Tensor:
 class TactileTransformer(nn.Module):
     """Classifier of tactile windows, Section III-A, for any layout.
 
-    The pads are the channels of the convolutions, which see each frame alone; attention runs over the frames. There is
-    no positional encoding: the paper has none, so the order of the frames does not matter. The paper's formulas write
-    out every ReLU and put none after the convolutions, nor does Keras, so they are linear here. Their padding is not
-    stated: "same" also suits pads of fewer than 5 rows. The dropout of 0.1 is stated for the head only; the blocks use
-    the same. The initial weights are not stated either. The initialisation of Keras ("glorot") has larger weights and
-    trains several times faster; on real grasps it reached 0.05 to 0.1 less accuracy (one seed) than the default, torch.
+    The pads are the channels of the convolutions, which see each frame alone; attention runs over
+    the frames. There is no positional encoding: the paper has none, so the order of the frames does
+    not matter. The paper's formulas write out every ReLU and put none after the convolutions, nor
+    does Keras, so they are linear here. Their padding is not stated: "same" also suits pads of
+    fewer than 5 rows. The dropout of 0.1 is stated for the head only; the blocks use the same. The
+    initial weights are not stated either. The initialisation of Keras ("glorot") has larger weights
+    and trains several times faster; on real grasps it reached 0.05 to 0.1 less accuracy (one seed)
+    than the default, torch.
 
     Positions that the layout lacks cannot influence the output, whatever they hold, NaN included.
 
@@ -89,7 +101,8 @@ class TactileTransformer(nn.Module):
         n_classes: number of outputs.
         length: T, frames in a window.
         padding: "same" or "valid" (no padding, needs 5 x 5 cells).
-        init: "torch" (uniform, by the number of inputs) or "glorot" (uniform, by inputs and outputs).
+        init: "torch" (uniform, by the number of inputs) or "glorot" (uniform, by inputs and
+            outputs).
         dropout: share of values dropped while training.
         seed: of the initial weights; the global generator is left alone.
 
@@ -115,19 +128,30 @@ class TactileTransformer(nn.Module):
     ) -> None:
         super().__init__()
         if n_classes < 1 or length < 1:
-            raise ValueError(f"the network needs n_classes >= 1 and length >= 1, got {n_classes} and {length}")
+            raise ValueError(
+                f"the network needs n_classes >= 1 and length >= 1, got {n_classes} and {length}"
+            )
         if padding not in ("same", "valid"):
             raise ValueError(f"unknown padding {padding!r}: use 'same' or 'valid'")
         if init not in ("torch", "glorot"):
             raise ValueError(f"unknown init {init!r}: use 'torch' or 'glorot'")
-        lost = 0 if padding == "same" else 2 * len(FILTERS)  # each unpadded 3 x 3 takes one cell from every edge
+        # each unpadded 3 x 3 takes one cell from every edge
+        lost = 0 if padding == "same" else 2 * len(FILTERS)
         if min(layout.shape[1:]) <= lost:
             raise ValueError(
-                f"padding 'valid' needs pads of 5 x 5, these have {layout.rows} x {layout.shape[2]}: use 'same'"
+                f"padding 'valid' needs pads of 5 x 5, these have {layout.rows} x"
+                f" {layout.shape[2]}: use 'same'"
             )
-        self.layout, self.n_classes, self.length = layout, n_classes, length
-        self.padding, self.init, self.p_dropout, self.seed = padding, init, dropout, seed
-        self.register_buffer("present", torch.from_numpy(layout.present.ravel().copy()), persistent=False)
+        self.layout = layout
+        self.n_classes = n_classes
+        self.length = length
+        self.padding = padding
+        self.init = init
+        self.p_dropout = dropout
+        self.seed = seed
+        self.register_buffer(
+            "present", torch.from_numpy(layout.present.ravel().copy()), persistent=False
+        )
         d = FILTERS[-1] * (layout.rows - lost) * (layout.shape[2] - lost)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
@@ -172,13 +196,15 @@ class TactileTransformer(nn.Module):
         return classes
 
     def predict_proba(self, x: Batch) -> NDArray[np.float32]:
-        """Return the probability of each class for windows ``[N, T, D]``, float32 ``[N, n_classes]``."""
+        """Return the probability of each class for windows ``[N, T, D]``, float32
+        ``[N, n_classes]``."""
         probabilities: NDArray[np.float32] = logits_of(self, x).softmax(1).numpy()
         return probabilities
 
     @property
     def config(self) -> dict[str, Any]:
-        """Arguments of :meth:`from_config` that rebuild this network without its weights; JSON-safe."""
+        """Arguments of :meth:`from_config` that rebuild this network without its weights;
+        JSON-safe."""
         return {
             "layout": self.layout.to_dict(),
             "n_classes": self.n_classes,
@@ -202,7 +228,8 @@ def as_tensor(array: NDArray[Any]) -> Tensor:
 
 
 def logits_of(model: nn.Module, x: Batch, *, batch_size: int = 256) -> Tensor:
-    """Return the logits ``[N, n]`` of any module for ``x [N, ...]``: in eval mode, in batches, without gradients.
+    """Return the logits ``[N, n]`` of any module for ``x [N, ...]``: in eval mode, in batches,
+    without gradients.
 
     The result is on the CPU. Each module of ``model`` returns to its earlier mode.
     """
@@ -226,6 +253,8 @@ def _glorot(module: nn.Module) -> None:
         nn.init.xavier_uniform_(module.weight)
         if module.bias is not None:
             nn.init.zeros_(module.bias)
-    elif isinstance(module, EncoderBlock):  # after its layers: queries, keys and values each have their own fan-out
+    elif isinstance(
+        module, EncoderBlock
+    ):  # after its layers: queries, keys and values each have their own fan-out
         for weight in torch.split(module.qkv.weight, HEADS * HEAD_DIM):
             nn.init.xavier_uniform_(weight)

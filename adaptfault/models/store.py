@@ -1,4 +1,5 @@
-"""Models on disk: a folder with weights (safetensors) and a manifest (JSON) with their hash. No pickle."""
+"""Models on disk: a folder with weights (safetensors) and a manifest (JSON) with their hash. No
+pickle."""
 
 from __future__ import annotations
 
@@ -16,9 +17,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-    from adaptfault.adaptation.heads import AnyHead
-    from adaptfault.adaptation.result import Adaptation
     from adaptfault.models.any_model import AnyModel
+    from adaptfault.models.heads import Head
     from adaptfault.models.network import TactileTransformer
 
 SCHEMA = "adaptfault.model/1"
@@ -27,11 +27,14 @@ MANIFEST = "manifest.json"
 _HEAD = "closed form head."  # begins the names of its tensors; no module's name holds a space
 
 
-def save_tensors(folder: str | Path, schema: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-    """Write tensors and a manifest into a folder; the folder is created, and earlier content is replaced.
+def save_tensors(
+    folder: str | Path, schema: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]
+) -> None:
+    """Write tensors and a manifest into a folder; the folder is created, and earlier content is
+    replaced.
 
-    The tensors go to a file named by their hash, and ``manifest.json`` names that file. Replacing the manifest switches
-    from the old content to the new in one step.
+    The tensors go to a file named by their hash, and ``manifest.json`` names that file. Replacing
+    the manifest switches from the old content to the new in one step.
 
     Raises:
         ValueError: ``about`` does not fit into JSON.
@@ -39,10 +42,17 @@ def save_tensors(folder: str | Path, schema: str, about: Mapping[str, Any], tens
     from safetensors.torch import save
 
     # Copies: safetensors refuses tensors that share memory or are not contiguous.
-    _save(folder, schema, about, save({k: tensor.detach().cpu().clone().contiguous() for k, tensor in tensors.items()}))
+    _save(
+        folder,
+        schema,
+        about,
+        save({k: tensor.detach().cpu().clone().contiguous() for k, tensor in tensors.items()}),
+    )
 
 
-def save_arrays(folder: str | Path, schema: str, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+def save_arrays(
+    folder: str | Path, schema: str, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+) -> None:
     """Write arrays as :func:`save_tensors` writes tensors. Needs no torch.
 
     Raises:
@@ -50,7 +60,12 @@ def save_arrays(folder: str | Path, schema: str, about: Mapping[str, Any], array
     """
     from safetensors.numpy import save
 
-    _save(folder, schema, about, save({name: np.ascontiguousarray(array) for name, array in arrays.items()}))
+    _save(
+        folder,
+        schema,
+        about,
+        save({name: np.ascontiguousarray(array) for name, array in arrays.items()}),
+    )
 
 
 def _save(folder: str | Path, schema: str, about: Mapping[str, Any], data: bytes) -> None:
@@ -89,7 +104,9 @@ def read_manifest(folder: str | Path, schema: str) -> dict[str, Any]:
     """
     manifest = _manifest(Path(folder))
     if manifest["schema"] != schema:
-        raise ValueError(f"{Path(folder) / MANIFEST} has schema {manifest['schema']!r}, expected {schema!r}")
+        raise ValueError(
+            f"{Path(folder) / MANIFEST} has schema {manifest['schema']!r}, expected {schema!r}"
+        )
     return manifest
 
 
@@ -101,7 +118,9 @@ def _manifest(folder: Path) -> dict[str, Any]:
         manifest = json.loads(path.read_bytes())
         manifest["schema"]
     except (ValueError, TypeError, KeyError, RecursionError):
-        raise ValueError(f"{path} is damaged or from another program: expected JSON with a schema") from None
+        raise ValueError(
+            f"{path} is damaged or from another program: expected JSON with a schema"
+        ) from None
     return dict(manifest)
 
 
@@ -119,7 +138,8 @@ def load_tensors(folder: str | Path, schema: str) -> tuple[dict[str, Any], dict[
 
 
 def load_arrays(folder: str | Path, schema: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Read what :func:`save_arrays` wrote; raises what :func:`load_tensors` raises. Needs no torch."""
+    """Read what :func:`save_arrays` wrote; raises what :func:`load_tensors` raises. Needs no
+    torch."""
     from safetensors.numpy import load
 
     manifest, data = _load(Path(folder), schema)
@@ -132,14 +152,18 @@ def _load(folder: Path, schema: str) -> tuple[dict[str, Any], bytes]:
 
 
 def attach(folder: str | Path, key: str, name: str, data: bytes) -> Path:
-    """Write one more file into a folder with a manifest, add its hash to the manifest as ``key``, return its path.
+    """Write one more file into a folder with a manifest, add its hash to the manifest as ``key``,
+    return its path.
 
     Raises:
         FileNotFoundError: there is no ``manifest.json``.
         ValueError: it is damaged.
     """
     folder = Path(folder)
-    manifest = {**_manifest(folder), key: {"file": name, "sha256": hashlib.sha256(data).hexdigest()}}
+    manifest = {
+        **_manifest(folder),
+        key: {"file": name, "sha256": hashlib.sha256(data).hexdigest()},
+    }
     atomic_write(folder / name, data)
     atomic_write(folder / MANIFEST, json.dumps(manifest, indent=1, allow_nan=False).encode())
     return folder / name
@@ -154,7 +178,8 @@ def read_attached(folder: str | Path, manifest: Mapping[str, Any], key: str) -> 
     """
     folder = Path(folder)
     try:
-        name, digest = manifest[key]["file"], manifest[key]["sha256"]
+        name = manifest[key]["file"]
+        digest = manifest[key]["sha256"]
         path = folder / Path(name).name  # a manifest cannot point outside its folder
     except (KeyError, TypeError) as error:
         raise ValueError(f"{folder / MANIFEST} is damaged: {error}") from None
@@ -172,7 +197,7 @@ def save_model(
     *,
     class_names: Sequence[str] = (),
     extra: Mapping[str, Any] | None = None,
-    head: AnyHead | None = None,
+    head: Head | None = None,
 ) -> None:
     """Write a model into a folder; an earlier model there is replaced in one step.
 
@@ -181,14 +206,17 @@ def save_model(
         model: saved as weights and :attr:`~adaptfault.models.network.TactileTransformer.config`.
         class_names: one name a class, or none.
         extra: JSON-safe values to store beside the model.
-        head: fitted in closed form to the healthy model, for :func:`load_healthy`; None: the model has its own alone.
+        head: fitted in closed form to the healthy model, for :func:`~adaptfault.load_healthy`;
+            None: the model has its own alone.
 
     Raises:
-        ValueError: another number of class names than classes, a module without builder, or ``extra`` does not fit into
-            JSON.
+        ValueError: another number of class names than classes, a module without builder, or
+            ``extra`` does not fit into JSON.
     """
     if class_names and len(class_names) != model.n_classes:
-        raise ValueError(f"{model.n_classes} classes need as many class names, got {len(class_names)}")
+        raise ValueError(
+            f"{model.n_classes} classes need as many class names, got {len(class_names)}"
+        )
     if "module" in model.config and model.config["builder"] is None:
         raise ValueError(
             f"{model.config['module']} cannot be rebuilt from a file: make it with"
@@ -207,39 +235,35 @@ def load_model(folder: str | Path) -> TactileTransformer | AnyModel:
 
     Raises:
         FileNotFoundError: a file is missing.
-        ValueError: a file is damaged, the weights do not fit the network, or its builder is not allowed.
+        ValueError: a file is damaged, the weights do not fit the network, or its builder is not
+            allowed.
     """
-    return _load_model(folder)[0]
+    return load_with_head(folder)[0]
 
 
-def load_healthy(folder: str | Path) -> Adaptation:
-    """Read the model that :func:`save_model` wrote, with its head in closed form if it has one.
+def load_with_head(folder: str | Path) -> tuple[TactileTransformer | AnyModel, Head | None]:
+    """Read the model that :func:`save_model` wrote, and its head in closed form if it has one.
 
-    The result is an adaptation to the empty fault set, without scores. Raises the errors of :func:`load_model`.
+    Raises the errors of :func:`load_model`.
     """
-    from adaptfault.adaptation.reduced_model import ReducedModel
-    from adaptfault.adaptation.result import Adaptation
-    from diagnostics import FaultSet
-
-    model, head = _load_model(folder)
-    none = FaultSet((), model.layout.n_cells)
-    return Adaptation(ReducedModel(model, none, None, head).eval(), none, ())
-
-
-def _load_model(folder: str | Path) -> tuple[TactileTransformer | AnyModel, AnyHead | None]:
-    from adaptfault.adaptation.heads import empty_head
     from adaptfault.models.any_model import network_from_config
     from adaptfault.models.builders import ModelNotAllowed
+    from adaptfault.models.heads import Head
 
     manifest, tensors = load_tensors(folder, SCHEMA)
     try:
-        model, head = network_from_config(manifest["config"]), None
+        model = network_from_config(manifest["config"])
+        head = None
         if (about := manifest.get("head")) is not None:
-            head = empty_head(about, model.n_classes)
-            head.load_state_dict({k.removeprefix(_HEAD): v for k, v in tensors.items() if k.startswith(_HEAD)})
+            head = Head.empty(about, model.n_classes)
+            head.load_state_dict(
+                {k.removeprefix(_HEAD): v for k, v in tensors.items() if k.startswith(_HEAD)}
+            )
         model.load_state_dict({k: v for k, v in tensors.items() if not k.startswith(_HEAD)})
     except ModelNotAllowed:
         raise
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"the model in {folder} is damaged: {str(error).splitlines()[0]}") from None
+        raise ValueError(
+            f"the model in {folder} is damaged: {str(error).splitlines()[0]}"
+        ) from None
     return model.eval(), head

@@ -9,10 +9,13 @@ from contextlib import contextmanager
 
 
 class Clock:
-    """Decides when to stop, so that the next batch and the validation after it fit into the budget."""
+    """Decides when to stop, so that the next batch and the validation after it fit into the
+    budget."""
 
     def __init__(self, budget: float | None) -> None:
-        self.began, self.budget, self.spent = time.perf_counter(), math.inf if budget is None else budget, 0.0
+        self.began = time.perf_counter()
+        self.budget = math.inf if budget is None else budget
+        self.spent = 0.0
         self.pace = 0.0  # seconds of training per window
         self.close = 0.0  # seconds of the last validation and checkpoint
         self.over = False  # an epoch was cut short
@@ -26,4 +29,7 @@ class Clock:
 
     def late(self, batch: int) -> bool:
         """Return whether another batch of this many windows would exceed the budget."""
-        return time.perf_counter() - self.began + self.spent + self.close + self.pace * batch > self.budget
+        return (
+            time.perf_counter() - self.began + self.spent + self.close + self.pace * batch
+            > self.budget
+        )

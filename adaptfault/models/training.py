@@ -1,4 +1,5 @@
-"""The training loop: Adam, early stopping, a time budget and crash-safe checkpoints (Section III-B)."""
+"""The training loop: Adam, early stopping, a time budget and crash-safe checkpoints (Section
+III-B)."""
 
 from __future__ import annotations
 
@@ -17,11 +18,16 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from adaptfault.data.determination import r2
 from adaptfault.data.windows import Windows
-from adaptfault.evaluation.scores import r2
 from adaptfault.imputation.dropout import RandomRepairs
 from adaptfault.imputation.statistics import CellStatistics
-from adaptfault.models.checkpoint import fingerprint_weights, fingerprint_windows, read_checkpoint, write_checkpoint
+from adaptfault.models.checkpoint import (
+    fingerprint_weights,
+    fingerprint_windows,
+    read_checkpoint,
+    write_checkpoint,
+)
 from adaptfault.models.history import History, Stopped
 from adaptfault.models.network import as_tensor, logits_of
 from adaptfault.models.time_budget import Clock
@@ -63,13 +69,15 @@ def train(
     on_epoch: Callable[[History], None] | None = None,
     progress: bool | None = None,
 ) -> History:
-    """Train ``model`` in place and leave it in eval mode with the weights that are best on ``validation``.
+    """Train ``model`` in place and leave it in eval mode with the weights that are best on
+    ``validation``.
 
-    Best is the highest validation accuracy (R2 for values), of equals the lowest loss. The loss alone is a worse
-    criterion: it rises while the accuracy still improves (0.681 against 0.702 on the test, five runs on real grasps).
-    Parameters with ``requires_grad`` False stay as they are. The model also holds the best weights after an exception,
-    Ctrl-C included. A seed gives bit-identical results on one machine with the same number of threads. The global
-    random state does not change.
+    Best is the highest validation accuracy (R2 for values), of equals the lowest loss. The loss
+    alone is a worse criterion: it rises while the accuracy still improves (0.681 against 0.702 on
+    the test, five runs on real grasps). Parameters with ``requires_grad`` False stay as they are.
+    The model also holds the best weights after an exception, Ctrl-C included. A seed gives
+    bit-identical results on one machine with the same number of threads. The global random state
+    does not change.
 
     Args:
         model: maps windows float32 ``[B, T, D]`` to logits or values ``[B, n]``.
@@ -77,28 +85,34 @@ def train(
         epochs, learning_rate, batch_size: of Adam; Section III-B has 50 at most, 1e-4 and 32.
         seed: of the order of the windows, of dropout and of ``augment``.
         patience: epochs without a better validation before stopping; None trains all epochs.
-        averaging: the exponential average of the weights over the last 1 / (1 - averaging) steps (fewer at first) is
-            validated and kept; it varies less than the weights of a single step. 0 keeps the weights of the last step,
-            as Section III-B does.
-        loss: (outputs ``[B, n]``, y ``[B]`` or ``[B, k]``) -> scalar. None: cross entropy, or the mean squared error of
-            values.
-        budget: seconds, validation included. The first epoch is cut short to fit, a later one that does not fit is left
-            out, so a larger budget never gives a worse result. Time before a resume counts.
-        evaluate_start: the starting weights are a candidate too, so that fine-tuning never makes validation worse.
-        augment: ``(x [B, T, D], generator) -> x``, applied to each training batch, a copy that it may change.
-        repairable: train a model that loses less when cells are imputed: in parts of each batch random cells, lines,
-            blocks or a pad are removed and imputed, as :class:`~adaptfault.adaptation.adapter.Adapter` does.
-            Validation uses each window twice, whole and imputed. Needs about twice the epochs.
+        averaging: the exponential average of the weights over the last 1 / (1 - averaging) steps
+            (fewer at first) is validated and kept; it varies less than the weights of a single
+            step. 0 keeps the weights of the last step, as Section III-B does.
+        loss: (outputs ``[B, n]``, y ``[B]`` or ``[B, k]``) -> scalar. None: cross entropy, or the
+            mean squared error of values.
+        budget: seconds, validation included. The first epoch is cut short to fit, a later one that
+            does not fit is left out, so a larger budget never gives a worse result. Time before a
+            resume counts.
+        evaluate_start: the starting weights are a candidate too, so that fine-tuning never makes
+            validation worse.
+        augment: ``(x [B, T, D], generator) -> x``, applied to each training batch, a copy that it
+            may change.
+        repairable: train a model that loses less when cells are imputed: in parts of each batch
+            random cells, lines, blocks or a pad are removed and imputed, as
+            :class:`~adaptfault.adaptation.adapter.Adapter` does. Validation uses each window twice,
+            whole and imputed. Needs about twice the epochs.
         more: additional training windows, generated on demand; an epoch uses all of them.
-        checkpoint: file written after each epoch. If it exists, training continues from it, with the same result as
-            without the interruption; ``epochs``, ``patience`` and ``budget`` may differ from the earlier run's.
+        checkpoint: file written after each epoch. If it exists, training continues from it, with
+            the same result as without the interruption; ``epochs``, ``patience`` and ``budget`` may
+            differ from the earlier run's.
         on_epoch: called with the history after each epoch, once the checkpoint is on disk.
-        progress: True or False shows or hides the bar on stderr: batches of all epochs, and the time that remains if no
-            epoch is left out; None shows it on a terminal.
+        progress: True or False shows or hides the bar on stderr: batches of all epochs, and the
+            time that remains if no epoch is left out; None shows it on a terminal.
 
     Raises:
-        ValueError: windows that are empty or not finite, or labels beyond the outputs of the model; a checkpoint of
-            another run; a loss that is not finite; ``repairable`` together with ``augment``.
+        ValueError: windows that are empty or not finite, or labels beyond the outputs of the model;
+            a checkpoint of another run; a loss that is not finite; ``repairable`` together with
+            ``augment``.
         TypeError: ``repairable`` for a model without a layout.
     """
     _check_options(epochs, batch_size, learning_rate, averaging)
@@ -106,9 +120,13 @@ def train(
     _check(model, train, validation)
     if repairable:
         if augment is not None:
-            raise ValueError("repairable is an augmentation itself: give augment or repairable, not both")
+            raise ValueError(
+                "repairable is an augmentation itself: give augment or repairable, not both"
+            )
         augment, validation = _random_repairs(model, train, validation, seed)
-    run = _Run(model, learning_rate, averaging, Path(checkpoint) if checkpoint is not None else None)
+    run = _Run(
+        model, learning_rate, averaging, Path(checkpoint) if checkpoint is not None else None
+    )
     run.loss = _default_loss(train) if loss is None else loss
     if run.path is not None:
         options: dict[str, Any] = {
@@ -126,14 +144,21 @@ def train(
     try:
         _begin(run, validation, clock, evaluate_start)
         batches = -(-len(source.y) // batch_size)
-        with tqdm(total=epochs * batches, initial=run.history.epochs * batches, unit="batch", disable=hide) as bar:
+        with tqdm(
+            total=epochs * batches, initial=run.history.epochs * batches, unit="batch", disable=hide
+        ) as bar:
             while (stopped := _stop(run.history, epochs, patience, clock, len(source.y))) is None:
                 bar.set_description(f"epoch {run.history.epochs + 1} of {epochs}", refresh=False)
-                history = _epoch(run, source, validation, batch_size, seed, augment, clock, bar.update)
+                history = _epoch(
+                    run, source, validation, batch_size, seed, augment, clock, bar.update
+                )
                 if history is None:
                     continue
-                last, accuracy = history.train_loss[-1], history.validation_accuracy[-1]
-                bar.set_postfix(loss=f"{last:.4f}", accuracy=f"{accuracy:.4f}", best=history.best_epoch)
+                last = history.train_loss[-1]
+                accuracy = history.validation_accuracy[-1]
+                bar.set_postfix(
+                    loss=f"{last:.4f}", accuracy=f"{accuracy:.4f}", best=history.best_epoch
+                )
                 if on_epoch is not None:
                     on_epoch(history)
     finally:
@@ -150,7 +175,8 @@ def _settings(
     augment: Augment | None,
     more: MoreWindows | None,
 ) -> dict[str, Any]:
-    """Return what identifies a run beside its numbers: a checkpoint with other settings is of another run."""
+    """Return what identifies a run beside its numbers: a checkpoint with other settings is of
+    another run."""
 
     def name(function: Callable[..., Any]) -> str:
         return str(getattr(function, "__qualname__", type(function).__qualname__))
@@ -165,7 +191,8 @@ def _settings(
 
 
 def _begin(run: _Run, validation: Windows, clock: Clock, evaluate_start: bool) -> None:
-    """Validate the starting weights if they are a candidate; else, with a budget, measure the time of a validation."""
+    """Validate the starting weights if they are a candidate; else, with a budget, measure the time
+    of a validation."""
     if evaluate_start and run.history.start is None:
         with clock.closing():
             run.record(replace(run.history, start=_validate(run.model, validation, run.loss)))
@@ -186,7 +213,9 @@ def _epoch(
     on_batch: Callable[[], object],
 ) -> History | None:
     """Train for an epoch, validate and record; None if time ran out within a later epoch."""
-    began, n, device = time.perf_counter(), len(source.y), next(run.model.parameters()).device
+    began = time.perf_counter()
+    n = len(source.y)
+    device = next(run.model.parameters()).device
     run.model.train()
     with seeded(seed, run.history.epochs, device) as generator:
         order = torch.split(torch.randperm(n, generator=generator), batch_size)
@@ -210,19 +239,29 @@ def _pass(
     clock: Clock,
     on_batch: Callable[[], object],
 ) -> tuple[float, int]:
-    """Train on batches until they or the time run out; return the mean loss and the number of windows used."""
-    device, total, seen, began = next(run.model.parameters()).device, 0.0, 0, time.perf_counter()
+    """Train on batches until they or the time run out; return the mean loss and the number of
+    windows used."""
+    device = next(run.model.parameters()).device
+    total = 0.0
+    seen = 0
+    began = time.perf_counter()
     for index in order:
         if seen and clock.late(len(index)):
             clock.over = True
             break
-        x, y = source.take(index), source.y[index]  # copies
+        # copies
+        x = source.take(index)
+        y = source.y[index]
         x = x if augment is None else augment(x, generator)
         loss = run.loss(run.model(x.to(device)), y.to(device))
         run.step(loss)
-        total, seen = total + loss.item() * len(index), seen + len(index)
+        total = total + loss.item() * len(index)
+        seen = seen + len(index)
         if not math.isfinite(total):
-            raise ValueError(f"the loss became {loss.item()} in epoch {run.history.epochs + 1}: lower learning_rate")
+            raise ValueError(
+                f"the loss became {loss.item()} in epoch {run.history.epochs + 1}: lower"
+                " learning_rate"
+            )
         clock.pace = (time.perf_counter() - began) / seen
         on_batch()
     return total / seen, seen
@@ -232,7 +271,9 @@ class _Source:
     """The training windows and the additional ones."""
 
     def __init__(self, windows: Windows, more: MoreWindows | None) -> None:
-        self.x, self.more, self.known = as_tensor(windows.x), more, len(windows)
+        self.x = as_tensor(windows.x)
+        self.more = more
+        self.known = len(windows)
         self.y = as_tensor(windows.y if more is None else np.concatenate([windows.y, more.y]))
 
     def take(self, index: Tensor) -> Tensor:
@@ -252,7 +293,9 @@ class Optimisation:
         self.averaging = averaging
         self.trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
         if not self.trained:
-            raise ValueError("nothing to train: every parameter of the model has requires_grad False")
+            raise ValueError(
+                "nothing to train: every parameter of the model has requires_grad False"
+            )
         # Fused: one pass over weights, gradients and moments, 2 to 5 times faster than the default.
         self.optimizer = torch.optim.Adam(self.trained.values(), lr=learning_rate, fused=True)
         self.average = {name: p.detach().clone() for name, p in self.trained.items()}
@@ -269,7 +312,8 @@ class Optimisation:
     def _follow(self) -> None:
         """Update the average after a step."""
         self.steps += 1
-        kept = min(self.averaging, self.steps / (self.steps + 10))  # at first over the last tenth of few steps
+        # at first over the last tenth of few steps
+        kept = min(self.averaging, self.steps / (self.steps + 10))
         torch._foreach_lerp_(list(self.average.values()), list(self.trained.values()), 1 - kept)
 
     @contextmanager
@@ -287,26 +331,36 @@ class Optimisation:
 
 
 class _Run(Optimisation):
-    """State of a run: model, best weights, moments of Adam and history, also on disk if a path is given."""
+    """State of a run: model, best weights, moments of Adam and history, also on disk if a path is
+    given."""
 
-    def __init__(self, model: nn.Module, learning_rate: float, averaging: float, path: Path | None) -> None:
+    def __init__(
+        self, model: nn.Module, learning_rate: float, averaging: float, path: Path | None
+    ) -> None:
         super().__init__(model, learning_rate, averaging)
-        self.model, self.path, self.history = model, path, History()
+        self.model = model
+        self.path = path
+        self.history = History()
         frozen = {name for name, p in model.named_parameters() if not p.requires_grad}
-        self.names = [name for name in model.state_dict() if name not in frozen]  # training changes these
+        # training changes these
+        self.names = [name for name in model.state_dict() if name not in frozen]
         self.best = self._weights()
         self.settings: dict[str, Any] = {}
         self.loss: Loss = F.cross_entropy
 
     def _weights(self) -> dict[str, Tensor]:
         state = self.model.state_dict()
-        return {name: state[name].detach().clone(memory_format=torch.contiguous_format) for name in self.names}
+        return {
+            name: state[name].detach().clone(memory_format=torch.contiguous_format)
+            for name in self.names
+        }
 
     def restore_best(self) -> None:
         self.model.load_state_dict(self.best, strict=False)
 
     def record(self, history: History, *, save: bool = True) -> None:
-        """Set the history, store the weights if the last epoch is the best, write the checkpoint."""
+        """Set the history, store the weights if the last epoch is the best, write the
+        checkpoint."""
         if history.best_epoch == history.epochs:
             with self.averaged():
                 self.best = self._weights()
@@ -317,7 +371,10 @@ class _Run(Optimisation):
         tensors |= {f"best.{name}": tensor for name, tensor in self.best.items()}
         for name, parameter in self.trained.items():
             tensors[f"average.{name}"] = self.average[name]
-            tensors |= {f"adam.{key}.{name}": value for key, value in self.optimizer.state[parameter].items()}
+            tensors |= {
+                f"adam.{key}.{name}": value
+                for key, value in self.optimizer.state[parameter].items()
+            }
         write_checkpoint(self.path, tensors, settings=self.settings, state=history.to_dict())
 
     def resume(self) -> None:
@@ -340,7 +397,8 @@ class _Run(Optimisation):
 def _check_options(epochs: int, batch_size: int, learning_rate: float, averaging: float) -> None:
     if epochs < 1 or batch_size < 1 or not learning_rate > 0:
         raise ValueError(
-            f"training needs epochs, batch_size, learning_rate > 0, got {epochs}, {batch_size}, {learning_rate}"
+            f"training needs epochs, batch_size, learning_rate > 0, got {epochs}, {batch_size},"
+            f" {learning_rate}"
         )
     if not 0 <= averaging < 1:
         raise ValueError(f"averaging must lie in [0, 1), got {averaging}")
@@ -353,20 +411,26 @@ def _check(model: nn.Module, train: Windows, validation: Windows) -> None:
             raise ValueError(f"no {name} windows")
         if bad := int((~np.isfinite(windows.x)).any(axis=(1, 2)).sum()):
             raise ValueError(
-                f"{bad} of {len(windows)} {name} windows hold NaN or infinite readings: make_windows holds them"
+                f"{bad} of {len(windows)} {name} windows hold NaN or infinite readings:"
+                " make_windows holds them"
             )
         n = logits_of(model, windows.x[:1]).shape[1]
         if windows.y.ndim == 2:
             if windows.y.shape[1] != n or not np.isfinite(windows.y).all():
-                raise ValueError(f"{name} targets need {n} finite values a window, got {list(windows.y.shape)}")
+                raise ValueError(
+                    f"{name} targets need {n} finite values a window, got {list(windows.y.shape)}"
+                )
             continue
         if windows.y.min() < 0 or windows.y.max() >= n:
             raise ValueError(
-                f"{name} labels run from {windows.y.min()} to {windows.y.max()}, the model has {n} classes"
+                f"{name} labels run from {windows.y.min()} to {windows.y.max()}, the model has {n}"
+                " classes"
             )
 
 
-def _random_repairs(model: nn.Module, train: Windows, validation: Windows, seed: int) -> tuple[RandomRepairs, Windows]:
+def _random_repairs(
+    model: nn.Module, train: Windows, validation: Windows, seed: int
+) -> tuple[RandomRepairs, Windows]:
     layout = getattr(model, "layout", None)
     if not isinstance(layout, SensorLayout):
         raise TypeError(f"repairable needs a network of a known layout, got {type(model).__name__}")
@@ -380,7 +444,8 @@ def _default_loss(windows: Windows) -> Loss:
 
 def _validate(model: nn.Module, windows: Windows, criterion: Loss) -> tuple[float, float]:
     """Return loss, and accuracy or R2."""
-    logits, labels = logits_of(model, windows.x), as_tensor(windows.y)
+    logits = logits_of(model, windows.x)
+    labels = as_tensor(windows.y)
     loss = criterion(logits, labels).item()
     if not math.isfinite(loss):
         raise ValueError(f"the validation loss became {loss}: lower learning_rate")
@@ -389,8 +454,11 @@ def _validate(model: nn.Module, windows: Windows, criterion: Loss) -> tuple[floa
     return loss, (logits.argmax(1) == labels).double().mean().item()
 
 
-def _stop(history: History, epochs: int, patience: int | None, clock: Clock, whole: int) -> Stopped | None:
-    """Return why the run ends; None while it continues. After the first epoch a whole epoch has to fit."""
+def _stop(
+    history: History, epochs: int, patience: int | None, clock: Clock, whole: int
+) -> Stopped | None:
+    """Return why the run ends; None while it continues. After the first epoch a whole epoch has to
+    fit."""
     if clock.over:
         return "budget"
     if patience is not None and history.epochs - history.best_epoch >= patience:
@@ -402,8 +470,11 @@ def _stop(history: History, epochs: int, patience: int | None, clock: Clock, who
 
 @contextmanager
 def seeded(seed: int, epoch: int, device: torch.device) -> Iterator[torch.Generator]:
-    """Seed an epoch, dropout included, so that a resumed run draws the same numbers as an uninterrupted one."""
-    state = int(np.random.SeedSequence([seed, epoch]).generate_state(1, np.uint64)[0] >> np.uint64(1))
+    """Seed an epoch, dropout included, so that a resumed run draws the same numbers as an
+    uninterrupted one."""
+    state = int(
+        np.random.SeedSequence([seed, epoch]).generate_state(1, np.uint64)[0] >> np.uint64(1)
+    )
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         torch.default_generator.manual_seed(state)
         if device.type == "cuda":
@@ -414,4 +485,6 @@ def seeded(seed: int, epoch: int, device: torch.device) -> Iterator[torch.Genera
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors whose names start with a prefix, without the prefix."""
-    return {name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+    return {
+        name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)
+    }

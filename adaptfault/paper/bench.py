@@ -1,4 +1,5 @@
-"""Experiments of one seed: split, networks, faults and strategies; networks are stored in the folder of the run."""
+"""Experiments of one seed: split, networks, faults and strategies; networks are stored in the
+folder of the run."""
 
 from __future__ import annotations
 
@@ -27,7 +28,9 @@ from adaptfault.models.training import train
 from adaptfault.paper.settings import WIRING, Settings, Task, is_aware
 from diagnostics import Fault, FaultKind, FaultSet, SelfDiagnosis, inject
 
-_LOG, _REFERENCE = 20, 200  # recordings of the faulty sensor for the diagnosis; healthy recordings for its fit
+# recordings of the faulty sensor for the diagnosis; healthy recordings for its fit
+_LOG = 20
+_REFERENCE = 200
 _SPREAD = 50_000  # offset between the seeds of different draws
 
 Floats = NDArray[np.float32]
@@ -61,13 +64,18 @@ class Bench:
     """Data, networks and faults of one seed, created on first use."""
 
     def __init__(self, setup: Setup, seed: int) -> None:
-        self.setup, self.seed, self.layout = setup, seed, setup.recordings.layout
+        self.setup = setup
+        self.seed = seed
+        self.layout = setup.recordings.layout
         self.train, validation, self.whole = split(setup.windows, seed=seed)
         self.validation = validation.select(evenly(len(validation), setup.settings.judged))
         starts = np.unique(self.whole.recording, return_index=True)[1]
         sizes = np.diff([*starts, len(self.whole)])
         rng = np.random.default_rng(seed)
-        few = [s + np.sort(rng.permutation(n)[: setup.settings.windows]) for s, n in zip(starts, sizes, strict=True)]
+        few = [
+            s + np.sort(rng.permutation(n)[: setup.settings.windows])
+            for s, n in zip(starts, sizes, strict=True)
+        ]
         self.kept = np.concatenate(few)  # which windows of each recording are tested
         self.test = self.whole.select(self.kept)
         self.present = np.flatnonzero(self.layout.present)
@@ -114,16 +122,18 @@ class Bench:
     # Faults
 
     def broken(self, faults: str, k: int) -> Floats:
-        """Return the test windows ``[N, T, D]`` with k faults in each recording, drawn independently.
+        """Return the test windows ``[N, T, D]`` with k faults in each recording, drawn
+        independently.
 
-        One pass averages over as many fault sets as there are recordings. Open and short faults affect the same cells,
-        and the cells of a smaller k are a subset of those of a larger k.
+        One pass averages over as many fault sets as there are recordings. Open and short faults
+        affect the same cells, and the cells of a smaller k are a subset of those of a larger k.
         """
         x = self.whole.x.copy()
         frames = np.arange(x.shape[1])
         for number in np.unique(self.whole.recording).tolist():
             rng = np.random.default_rng([self.seed, number])
-            cells, ends = rng.permutation(self.present)[:k], rng.integers(0, 2, len(self.present))[:k]
+            cells = rng.permutation(self.present)[:k]
+            ends = rng.integers(0, 2, len(self.present))[:k]
             of = self.whole.recording == number
             if faults in WIRING:
                 for wired, end in self._wiring(faults, k, rng):
@@ -133,7 +143,9 @@ class Bench:
                 x[np.ix_(of, frames, cells)] = value
         return x
 
-    def _wiring(self, kind: str, k: int, rng: np.random.Generator) -> list[tuple[NDArray[np.intp], float]]:
+    def _wiring(
+        self, kind: str, k: int, rng: np.random.Generator
+    ) -> list[tuple[NDArray[np.intp], float]]:
         """Draw k broken lines or blocks: their cells and readings on the 0..1 scale."""
         return RandomFaults(self.layout, cast("FaultPattern", kind)).draw(k, rng)
 
@@ -147,18 +159,23 @@ class Bench:
     @cached_property
     def base(self) -> TactileTransformer:
         """The fault-free network."""
-        name, epochs = f"base{self.seed}", self.setup.settings.epochs
+        name = f"base{self.seed}"
+        epochs = self.setup.settings.epochs
         return self._kept(
             name,
             self._fresh(self.seed),
-            lambda model: train(model, self.train, self.validation, epochs=epochs, **self._options(name)),
+            lambda model: train(
+                model, self.train, self.validation, epochs=epochs, **self._options(name)
+            ),
         )
 
     def aware(self, n: int, kind: str = "cells") -> TactileTransformer:
-        """Return the network trained with n additional windows with faults of a kind; n = 0: the base network."""
+        """Return the network trained with n additional windows with faults of a kind; n = 0: the
+        base network."""
         if not n:
             return self.base
-        settings, name = self.setup.settings, f"aware{self.seed}-{n}-{kind}"
+        settings = self.setup.settings
+        name = f"aware{self.seed}-{n}-{kind}"
 
         def fit(model: TactileTransformer) -> None:
             train_fault_aware(
@@ -212,10 +229,14 @@ class Bench:
         return Adapter(self.base, self.train, self.validation)
 
     def _adapted(self, faults: FaultSet, x: Floats | None = None) -> Classes:
-        """Predict by the base network adapted to F; the cells in F read NaN unless ``x`` is given."""
+        """Predict by the base network adapted to F; the cells in F read NaN unless ``x`` is
+        given."""
         if faults not in self._adaptations:
-            method: Method = "auto" if len(faults) else "fill"  # without faults the paper's network alone
-            self._adaptations[faults] = self.adapter.adapt(faults, method=method, seed=self.seed, progress=False)
+            # without faults the paper's network alone
+            method: Method = "auto" if len(faults) else "fill"
+            self._adaptations[faults] = self.adapter.adapt(
+                faults, method=method, seed=self.seed, progress=False
+            )
         if x is None:
             x = self.test.x.copy()
             x[..., list(faults)] = np.nan
@@ -226,8 +247,11 @@ class Bench:
         return {}
 
     def _trained_anew(self, faults: FaultSet) -> Classes:
-        """Predict by a network trained on the healthy cells alone, the paper's protocol (Section IV)."""
-        reduced = ReducedModel(self._fresh(self.seed + 1), faults, self.adapter.statistics.linear(faults))
+        """Predict by a network trained on the healthy cells alone, the paper's protocol (Section
+        IV)."""
+        reduced = ReducedModel(
+            self._fresh(self.seed + 1), faults, self.adapter.statistics.linear(faults)
+        )
         name = f"anew{self.seed}-{len(faults)}"
         train(
             reduced.to(self.setup.device),
@@ -240,14 +264,18 @@ class Bench:
         (self.setup.folder / "models" / f"{name}.training").unlink(missing_ok=True)
         return predicted
 
-    # Noise, drift, intermittency, wiring: the same faults in all recordings, as a diagnosis needs them
+    # Noise, drift, intermittency, wiring: the same faults in all recordings, as a diagnosis needs
+    # them
 
     def causes(self, kind: str, k: int) -> list[Fault]:
         """Return k faults of one kind for this seed."""
         if kind not in WIRING:
             return [Fault(FaultKind(kind), (cell,)) for cell in self.fault_set(k)]
         drawn = self._wiring(kind, k, np.random.default_rng(_SPREAD + self.seed))
-        return [Fault(FaultKind.SHORT if end else FaultKind.OPEN, tuple(cells.tolist())) for cells, end in drawn]
+        return [
+            Fault(FaultKind.SHORT if end else FaultKind.OPEN, tuple(cells.tolist()))
+            for cells, end in drawn
+        ]
 
     def _against(self, task: Task) -> Classes:
         """Predict the test recordings of a sensor with k faults of one kind."""
@@ -262,7 +290,8 @@ class Bench:
 
     def _injected(self, faults: list[Fault]) -> Windows:
         """Return all windows of the test recordings with these faults, in order."""
-        frames, length = self.setup.recordings.frames, self.whole.x.shape[1]
+        frames = self.setup.recordings.frames
+        length = self.whole.x.shape[1]
         broken = [
             inject(frames[i], faults, self.layout, seed=_SPREAD * self.seed + i)
             for i in np.unique(self.whole.recording).tolist()
@@ -270,12 +299,14 @@ class Bench:
         return make_windows(broken, None, self.layout, length=length)
 
     def _combined(self, x: Floats) -> Classes:
-        """Correct the first recordings, diagnose from them, adapt, and predict the rest with the adapted model."""
+        """Correct the first recordings, diagnose from them, adapt, and predict the rest with the
+        adapted model."""
         numbers = np.unique(self.whole.recording)
         log = np.random.default_rng(self.seed).permutation(numbers)[: min(_LOG, len(numbers) // 2)]
         full_scale = self.layout.full_scale
         frames = [
-            x[self.whole.recording == i].reshape(-1, x.shape[2]).astype(np.float64) * full_scale for i in log.tolist()
+            x[self.whole.recording == i].reshape(-1, x.shape[2]).astype(np.float64) * full_scale
+            for i in log.tolist()
         ]
         found = self.diagnoser.diagnose(frames).fault_set
         first = np.isin(self.test.recording, log)

@@ -11,7 +11,10 @@ from adaptfault.paper.ledger import Ledger, Mean
 from adaptfault.paper.settings import Settings, aware
 
 Verdict = Literal["holds", "holds in part", "does not hold"]
-_NEAR, _MODERATE, _HIGH = 0.1, 0.8, 0.9  # shares of the fault-free accuracy (above chance, for the first)
+# shares of the fault-free accuracy (above chance, for the first)
+_NEAR = 0.1
+_MODERATE = 0.8
+_HIGH = 0.9
 
 
 @dataclass(frozen=True)
@@ -36,11 +39,21 @@ def judge(ledger: Ledger, settings: Settings, *, n_classes: int, present: int) -
     free = ledger.mean(2, "none", 0, "nothing") or ledger.mean(4, "none", 0, aware(0))
     if free is None:
         return []
-    rules: list[Callable[..., Iterator[Claim]]] = [_shorts, _opens, _samples, _adaptation, _correction]
-    return [claim for rule in rules for claim in rule(ledger, settings, free, 1 / n_classes, present)]
+    rules: list[Callable[..., Iterator[Claim]]] = [
+        _shorts,
+        _opens,
+        _samples,
+        _adaptation,
+        _correction,
+    ]
+    return [
+        claim for rule in rules for claim in rule(ledger, settings, free, 1 / n_classes, present)
+    ]
 
 
-def _shorts(ledger: Ledger, settings: Settings, free: Mean, chance: float, present: int) -> Iterator[Claim]:
+def _shorts(
+    ledger: Ledger, settings: Settings, free: Mean, chance: float, present: int
+) -> Iterator[Claim]:
     short = ledger.mean(2, "short", 5, "nothing")
     if short is not None:
         near = short.accuracy <= chance + _NEAR * (free.accuracy - chance)
@@ -53,8 +66,11 @@ def _shorts(ledger: Ledger, settings: Settings, free: Mean, chance: float, prese
         )
 
 
-def _opens(ledger: Ledger, settings: Settings, free: Mean, chance: float, present: int) -> Iterator[Claim]:
-    opened, short = ledger.mean(2, "open", 5, "nothing"), ledger.mean(2, "short", 5, "nothing")
+def _opens(
+    ledger: Ledger, settings: Settings, free: Mean, chance: float, present: int
+) -> Iterator[Claim]:
+    opened = ledger.mean(2, "open", 5, "nothing")
+    short = ledger.mean(2, "short", 5, "nothing")
     if opened is not None and short is not None:
         keeps = opened.accuracy >= _MODERATE * free.accuracy
         yield Claim(
@@ -65,8 +81,14 @@ def _opens(ledger: Ledger, settings: Settings, free: Mean, chance: float, presen
         )
 
 
-def _samples(ledger: Ledger, settings: Settings, free: Mean, chance: float, present: int) -> Iterator[Claim]:
-    rows = [(n, m) for n in (0, *settings.samples) if (m := ledger.mean(4, "mixed", 5, aware(n))) is not None]
+def _samples(
+    ledger: Ledger, settings: Settings, free: Mean, chance: float, present: int
+) -> Iterator[Claim]:
+    rows = [
+        (n, m)
+        for n in (0, *settings.samples)
+        if (m := ledger.mean(4, "mixed", 5, aware(n))) is not None
+    ]
     if len(rows) > 1:
         (_, first), (n, last) = rows[0], rows[-1]
         control = ledger.mean(4, "mixed", 5, aware(n, "none"))
@@ -74,32 +96,44 @@ def _samples(ledger: Ledger, settings: Settings, free: Mean, chance: float, pres
         beside = f"; as many without faults: {control}" if control else ""
         yield Claim(
             "More fault-injected training samples make the network more robust (VI-E)",
-            "; ".join(f"{n} samples: {m}" for n, m in rows) + beside + " (five cells open or short)",
-            "holds"
-            if rising and last.low > (control or first).high
-            else "holds in part"
-            if last.low > first.high
-            else "does not hold",
-            "the accuracy rises with each step and ends clearly above that of as many steps on fault-free samples;"
-            " in part: clearly above the first",
+            "; ".join(f"{n} samples: {m}" for n, m in rows)
+            + beside
+            + " (five cells open or short)",
+            (
+                "holds"
+                if rising and last.low > (control or first).high
+                else "holds in part"
+                if last.low > first.high
+                else "does not hold"
+            ),
+            "the accuracy rises with each step and ends clearly above that of as many steps on"
+            " fault-free samples; in part: clearly above the first",
         )
 
 
-def _adaptation(ledger: Ledger, settings: Settings, free: Mean, chance: float, present: int) -> Iterator[Claim]:
+def _adaptation(
+    ledger: Ledger, settings: Settings, free: Mean, chance: float, present: int
+) -> Iterator[Claim]:
     k = max(settings.sizes(settings.adapted, present), default=0)
-    for strategy, name in (("adapted", "repaired without gradients"), ("trained anew", "trained anew")):
+    for strategy, name in (
+        ("adapted", "repaired without gradients"),
+        ("trained anew", "trained anew"),
+    ):
         adapted = ledger.mean(5, "mixed", k, strategy)
         if adapted is not None:
             share = adapted.accuracy / free.accuracy
             yield Claim(
-                f"Without the faulty cells the network keeps a high accuracy, even without 200 of 220 (VI-F): {name}",
+                "Without the faulty cells the network keeps a high accuracy, even without 200 of"
+                f" 220 (VI-F): {name}",
                 f"{adapted} without {k} of {present} cells, {share:.0%} of fault-free",
                 "holds" if share >= _HIGH else "holds in part" if share >= 0.5 else "does not hold",
                 "90 % of the fault-free accuracy; in part: half of it",
             )
 
 
-def _correction(ledger: Ledger, settings: Settings, free: Mean, chance: float, present: int) -> Iterator[Claim]:
+def _correction(
+    ledger: Ledger, settings: Settings, free: Mean, chance: float, present: int
+) -> Iterator[Claim]:
     pairs = [
         (k, corrected, opened)
         for k in settings.sizes(settings.counts, present)
@@ -111,7 +145,8 @@ def _correction(ledger: Ledger, settings: Settings, free: Mean, chance: float, p
         k, corrected, opened = pairs[-1]
         yield Claim(
             "Short cells corrected to 0 are as good as open ones, for the same number (VI-G)",
-            f"largest difference {gap:.4f}; with {k} cells {corrected.accuracy:.3f} and {opened.accuracy:.3f}",
+            f"largest difference {gap:.4f}; with {k} cells {corrected.accuracy:.3f} and"
+            f" {opened.accuracy:.3f}",
             "holds" if gap < 0.005 else "holds in part" if gap < 0.05 else "does not hold",
             "the same within 0.005 for every k; in part: within 0.05",
         )

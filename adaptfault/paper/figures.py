@@ -33,7 +33,8 @@ Row = tuple[Task, Mean]
 
 
 def rows(ledger: Ledger, figure: int) -> list[Row]:
-    """Return each condition of a figure, by the task of its first seed, with its mean over the seeds."""
+    """Return each condition of a figure, by the task of its first seed, with its mean over the
+    seeds."""
     conditions: dict[tuple[str, int, str], list[Any]] = {}
     for result in ledger.of(figure):
         task = result.task
@@ -48,7 +49,15 @@ def table(found: Sequence[Row]) -> str:
     numbers = ("accuracy", "low", "high", "precision", "recall", "f1", "spread")
     writer.writerow(["strategy", "faults", "k", *numbers, "seeds"])
     for task, m in found:
-        writer.writerow([task.strategy, task.faults, task.k, *(f"{getattr(m, name):.4f}" for name in numbers), m.seeds])
+        writer.writerow(
+            [
+                task.strategy,
+                task.faults,
+                task.k,
+                *(f"{getattr(m, name):.4f}" for name in numbers),
+                m.seeds,
+            ]
+        )
     return text.getvalue()
 
 
@@ -59,7 +68,8 @@ def draw(ledger: Ledger, figure: int) -> Figure:
     if figure == 4:
         return _samples(rows(ledger, 4))
     picture = Figure(figsize=(7.5, 4.2), layout="constrained")
-    ax, found = picture.subplots(), rows(ledger, figure)
+    ax = picture.subplots()
+    found = rows(ledger, figure)
     match figure:
         case 2:
             for kind in ("open", "short"):
@@ -82,12 +92,19 @@ def draw(ledger: Ledger, figure: int) -> Figure:
     if figure in (2, 5, 6):
         ax.set_xlabel("faulty cells")
         ax.set_xticks(sorted({t.k for t, _ in found}))
-    picture.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    picture.legend(
+        *ax.get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=3,
+        frameon=False,
+        fontsize=8,
+    )
     return picture
 
 
 def _samples(found: Sequence[Row]) -> Figure:
-    """Draw Figure 4: a panel for each test, accuracy over the number of samples that were added in training."""
+    """Draw Figure 4: a panel for each test, accuracy over the number of samples that were added in
+    training."""
     from matplotlib.figure import Figure
 
     tests = list(dict.fromkeys((t.faults, t.k) for t, _ in found))
@@ -98,11 +115,17 @@ def _samples(found: Sequence[Row]) -> Figure:
     numbers = sorted({n for (n, _), _, _ in known})
     for ax, test in zip(axes, tests, strict=False):
         for kind in dict.fromkeys(kind for (_, kind), _, _ in known):
-            of = [(numbers.index(n), m) for (n, own), at, m in known if at == test and (own == kind or n == 0)]
+            of = [
+                (numbers.index(n), m)
+                for (n, own), at, m in known
+                if at == test and (own == kind or n == 0)
+            ]
             style = {"linestyle": "--", "color": "0.4"} if kind == "none" else {}
             label = "without faults (control)" if kind == "none" else f"with faulty {kind}"
             _line(ax, of, label, **style)
-        ax.set_title("no fault" if not test[1] else f"{test[1]} {_NAMES.get(test[0], test[0])}", fontsize=9)
+        ax.set_title(
+            "no fault" if not test[1] else f"{test[1]} {_NAMES.get(test[0], test[0])}", fontsize=9
+        )
         ax.set(ylim=(0, 1), xticks=range(len(numbers)))
         ax.set_xticklabels([f"{n // 1000}k" if n >= 1000 else str(n) for n in numbers])
     for ax in axes[len(tests) :]:
@@ -111,7 +134,13 @@ def _samples(found: Sequence[Row]) -> Figure:
     picture.supylabel("test accuracy")
     for ax in axes[: len(tests)][-columns:]:
         ax.set_xlabel("training windows added", fontsize=9)
-    picture.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    picture.legend(
+        *axes[0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=4,
+        frameon=False,
+        fontsize=8,
+    )
     return picture
 
 
@@ -120,7 +149,15 @@ def _line(ax: Axes, points: Sequence[tuple[int, Mean]], label: str, **style: Any
     if points:
         reached = np.array([m.accuracy for _, m in points])
         around = [reached - [m.low for _, m in points], [m.high for _, m in points] - reached]
-        ax.errorbar([k for k, _ in points], reached, np.maximum(around, 0), marker="o", capsize=3, label=label, **style)
+        ax.errorbar(
+            [k for k, _ in points],
+            reached,
+            np.maximum(around, 0),
+            marker="o",
+            capsize=3,
+            label=label,
+            **style,
+        )
 
 
 def _bars(ax: Axes, found: Sequence[Row]) -> None:
@@ -130,11 +167,22 @@ def _bars(ax: Axes, found: Sequence[Row]) -> None:
     width = 0.8 / max(len(strategies), 1)
     for i, strategy in enumerate(strategies):
         of = {(t.faults, t.k): m for t, m in found if t.strategy == strategy}
-        at = [j + (i - (len(strategies) - 1) / 2) * width for j, group in enumerate(groups) if group in of]
+        at = [
+            j + (i - (len(strategies) - 1) / 2) * width
+            for j, group in enumerate(groups)
+            if group in of
+        ]
         shown = [of[group] for group in groups if group in of]
         reached = np.array([m.accuracy for m in shown])
         around = [reached - [m.low for m in shown], [m.high for m in shown] - reached]
-        ax.bar(at, reached, width, yerr=np.maximum(around, 0), label=strategy, error_kw={"elinewidth": 1})
+        ax.bar(
+            at,
+            reached,
+            width,
+            yerr=np.maximum(around, 0),
+            label=strategy,
+            error_kw={"elinewidth": 1},
+        )
     names = [f"{k} {kind}" if kind in WIRING else kind for kind, k in groups]
     ax.set_xticks(range(len(groups)), names, fontsize=9)
 
@@ -142,7 +190,8 @@ def _bars(ax: Axes, found: Sequence[Row]) -> None:
 def force_maps(
     frames: NDArray[np.floating[Any]], layout: SensorLayout, seed: int, k: int = 10
 ) -> tuple[Figure, dict[str, NDArray[np.float64]]]:
-    """Draw Figure 3 from fault-free ``frames [n, D]`` in the layout's unit; return the maps ``[D]`` as well."""
+    """Draw Figure 3 from fault-free ``frames [n, D]`` in the layout's unit; return the maps ``[D]``
+    as well."""
     present = np.flatnonzero(layout.present)
     cells = np.random.default_rng(seed).permutation(present)[: min(k, len(present))]
     normal = np.asarray(np.nanmean(frames, axis=0, dtype=np.float64))

@@ -1,4 +1,5 @@
-"""Results of a run: a line of JSON for each task, so that an interrupted run repeats no measurement."""
+"""Results of a run: a line of JSON for each task, so that an interrupted run repeats no
+measurement."""
 
 from __future__ import annotations
 
@@ -44,7 +45,15 @@ class Result:
         for number in np.unique(test.recording).tolist():
             of = test.recording == number
             counts.append((number, int(of.sum()), int(right[of].sum())))
-        return cls(task, scores.accuracy, scores.precision, scores.recall, scores.f1, tuple(counts), seconds)
+        return cls(
+            task,
+            scores.accuracy,
+            scores.precision,
+            scores.recall,
+            scores.f1,
+            tuple(counts),
+            seconds,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict that :meth:`from_dict` reads."""
@@ -92,9 +101,12 @@ def mean(results: Iterable[Result]) -> Mean:
         raise ValueError("no results to average")
     number, n, right = np.array([c for result in results for c in result.recordings]).T
     wrong_then_right = np.stack([n - right, right], axis=1).ravel()
-    low, high = accuracy_interval(np.repeat(np.tile([False, True], len(n)), wrong_then_right), np.repeat(number, n))
+    low, high = accuracy_interval(
+        np.repeat(np.tile([False, True], len(n)), wrong_then_right), np.repeat(number, n)
+    )
     averages = {
-        name: float(np.mean([getattr(r, name) for r in results])) for name in ("accuracy", "precision", "recall", "f1")
+        name: float(np.mean([getattr(r, name) for r in results]))
+        for name in ("accuracy", "precision", "recall", "f1")
     }
     spread = float(np.std([r.accuracy for r in results], ddof=1)) if len(results) > 1 else 0.0
     return Mean(low=low, high=high, spread=spread, seeds=len(results), **averages)
@@ -126,7 +138,11 @@ class Ledger:
     def of(self, figure: int, **fields: Any) -> list[Result]:
         """Return the results of a figure whose tasks have these fields."""
         wanted = {"figure": figure, **fields}
-        return [r for r in self.results.values() if all(getattr(r.task, k) == v for k, v in wanted.items())]
+        return [
+            r
+            for r in self.results.values()
+            if all(getattr(r.task, k) == v for k, v in wanted.items())
+        ]
 
     def mean(self, figure: int, faults: str, k: int, strategy: str) -> Mean | None:
         """Return a condition's mean over the seeds; None where nothing was measured."""

@@ -1,4 +1,5 @@
-"""A reproduction: run the tasks without a result, then draw the figures, decide the claims and write the page."""
+"""A reproduction: run the tasks without a result, then draw the figures, decide the claims and
+write the page."""
 
 from __future__ import annotations
 
@@ -58,7 +59,11 @@ def reproduce(
     if recordings.labels is None:
         raise ValueError("the recordings have no labels: the experiments train a classifier")
     windows = make_windows(recordings.frames, recordings.labels, recordings.layout)
-    config: dict[str, Any] = {"schema": SCHEMA, "recordings": source, "settings": settings.to_dict()}
+    config: dict[str, Any] = {
+        "schema": SCHEMA,
+        "recordings": source,
+        "settings": settings.to_dict(),
+    }
     config["windows"] = fingerprint_windows(windows)
     folder.mkdir(parents=True, exist_ok=True)
     _settle(folder / "config.json", config)
@@ -77,7 +82,9 @@ def _settle(path: Path, config: dict[str, Any]) -> None:
     if path.exists():
         known = json.loads(path.read_text())
         if changed := sorted(k for k in {*known, *config} if known.get(k) != config.get(k)):
-            raise ValueError(f"{path.parent} holds a run with other {', '.join(changed)}: give another --out")
+            raise ValueError(
+                f"{path.parent} holds a run with other {', '.join(changed)}: give another --out"
+            )
     else:
         atomic_write(path, json.dumps(config, indent=1).encode())
 
@@ -101,5 +108,8 @@ def _measure(setup: Setup, ledger: Ledger, figures: tuple[int, ...]) -> None:
             result = Result.of(task, bench.test, predicted, time.perf_counter() - began)
             ledger.add(result)
             bar.update()
-            setup.say(f"{task.strategy}, {task.k} {task.faults}, seed {task.seed}: accuracy {result.accuracy:.3f}")
+            setup.say(
+                f"{task.strategy}, {task.k} {task.faults}, seed {task.seed}: accuracy"
+                f" {result.accuracy:.3f}"
+            )
     ledger.arrange(setup.settings.tasks(present, FIGURES))

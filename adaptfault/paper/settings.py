@@ -7,7 +7,14 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 PAPER_CELLS = 220
-FUTURE = ("open", "short", "noisy", "drift", "intermittent")  # the last three are the paper's future work
+# the last three are the paper's future work
+FUTURE = (
+    "open",
+    "short",
+    "noisy",
+    "drift",
+    "intermittent",
+)
 WIRING = ("lines", "blocks")  # faults of real arrays; the paper has scattered cells only
 
 CORRECTIONS = ("correct to 0", "correct to half", "correct to the mean", "correct to 0, wait 5")
@@ -20,7 +27,8 @@ class Task:
     Attributes:
         figure: number of the figure in the paper; 7 is the paper's future work.
         seed: of split, weights, training and faults.
-        faults: "none", "open", "short", "mixed" (each with equal chance), a kind of :data:`FUTURE` or :data:`WIRING`.
+        faults: "none", "open", "short", "mixed" (each with equal chance), a kind of :data:`FUTURE`
+            or :data:`WIRING`.
         k: number of faulty cells (of lines or blocks, for :data:`WIRING`).
         strategy: the repair.
     """
@@ -78,12 +86,14 @@ class Settings:
 
     @classmethod
     def full(cls) -> Settings:
-        """As the paper: up to 50 epochs, 10k to 200k samples, a network trained anew for each F. For a GPU."""
+        """As the paper: up to 50 epochs, 10k to 200k samples, a network trained anew for each F.
+        For a GPU."""
         return cls()
 
     @classmethod
     def quick(cls, *, simulated: bool) -> Settings:
-        """All but the networks trained anew, smaller: about 14 minutes on two free cores on simulated grasps.
+        """All but the networks trained anew, smaller: about 14 minutes on two free cores on
+        simulated grasps.
 
         Most of the time is training: three base networks, three fault-aware networks, one control.
         """
@@ -101,8 +111,15 @@ class Settings:
             "windows": 2,
             "single": 50,
         }
-        if simulated:  # unpadded convolutions take a third of the time; Keras's initial weights train in three epochs
-            return cls(epochs=3, learning_rate=2e-4, network={"padding": "valid", "init": "glorot"}, **small)
+        # unpadded convolutions take a third of the time; Keras's initial weights train in three
+        # epochs
+        if simulated:
+            return cls(
+                epochs=3,
+                learning_rate=2e-4,
+                network={"padding": "valid", "init": "glorot"},
+                **small,
+            )
         return cls(epochs=20, **small)
 
     def to_dict(self) -> dict[str, Any]:
@@ -110,17 +127,25 @@ class Settings:
         return asdict(self)
 
     def sizes(self, counts: tuple[int, ...], present: int) -> tuple[int, ...]:
-        """Return |F| for an array of another size: up to 50 as on the paper's, beyond that the same share of it."""
+        """Return |F| for an array of another size: up to 50 as on the paper's, beyond that the same
+        share of it."""
         scaled = (k if k <= 50 else round(k * present / PAPER_CELLS) for k in counts)
         return tuple(sorted({k for k in scaled if k < present}))
 
     def tasks(self, present: int, figures: tuple[int, ...]) -> Iterator[Task]:
-        """Yield the tasks of these figures on an array of ``present`` cells, those with most training last.
+        """Yield the tasks of these figures on an array of ``present`` cells, those with most
+        training last.
 
         Figure 6 also shows curves of Figure 2, and so needs its tasks.
         """
         figures = (*figures, 2) if 6 in figures else figures
-        for part in (self._stuck, self._adapted, self._future, self._fault_aware, self._trained_anew):
+        for part in (
+            self._stuck,
+            self._adapted,
+            self._future,
+            self._fault_aware,
+            self._trained_anew,
+        ):
             for seed in self.seeds:
                 for task in part(seed, present):
                     if task.figure in figures:
@@ -143,11 +168,20 @@ class Settings:
 
     def _future(self, seed: int, present: int) -> Iterator[Task]:
         for kind, k in self._kinds():
-            for strategy in ("nothing", "correct to 0", "correct to the mean", "adapted", "combined"):
+            for strategy in (
+                "nothing",
+                "correct to 0",
+                "correct to the mean",
+                "adapted",
+                "combined",
+            ):
                 yield Task(7, seed, kind, k, strategy)
 
     def _kinds(self) -> list[tuple[str, int]]:
-        return [*((kind, self.future) for kind in FUTURE), *((kind, self.wiring) for kind in WIRING)]
+        return [
+            *((kind, self.future) for kind in FUTURE),
+            *((kind, self.wiring) for kind in WIRING),
+        ]
 
     def _fault_aware(self, seed: int, present: int) -> Iterator[Task]:
         wiring = [(kind, self.wiring) for kind in WIRING]
@@ -167,7 +201,8 @@ class Settings:
 
 
 def aware(n: int, kind: str = "cells") -> str:
-    """Return the name of the strategy: training with n more windows, which have such faults ("none": the control)."""
+    """Return the name of the strategy: training with n more windows, which have such faults
+    ("none": the control)."""
     if kind == "none":
         return f"fault-free {n}"
     return f"fault-aware {n}" if kind == "cells" else f"fault-aware {n} {kind}"

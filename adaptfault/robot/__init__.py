@@ -1,1 +1,1 @@
-"""Deployment on a robot: the bundle, its model versions, maintenance, and prediction."""
+"""Deployment on a robot: maintenance, repair, comparison of versions, and the pages about them."""

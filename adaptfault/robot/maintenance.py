@@ -1,46 +1,46 @@
-"""Maintenance: diagnose new recordings, merge with the known faults, adapt, compare, deploy or keep."""
+"""Maintenance: inspect new recordings, repair the model, compare it with the running one, deploy or
+keep."""
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.data.printable import printable
-from adaptfault.data.windows import recordings_of
-from adaptfault.evaluation.scores import chance
-from adaptfault.robot.ageing import encode
-from adaptfault.robot.bundle import Bundle, now
-from adaptfault.robot.changed_readings import ChangedReadings, as_loads, find_changed_readings
-from adaptfault.robot.checksummed_json import Damaged
-from adaptfault.robot.converter_range import within_range
-from adaptfault.robot.deployment_test import Judgement, compare_candidate, with_faults
-from adaptfault.robot.journal import Entry
-from adaptfault.robot.known_faults import KnownFaults
+from adaptfault.bundle.bundle import Bundle, now
+from adaptfault.bundle.journal import Entry
+from adaptfault.bundle.known_faults import KnownFaults
+from adaptfault.bundle.pointer import Pointer
+from adaptfault.inspection.changed_readings import ChangedReadings, as_loads, find_sensor_change
+from adaptfault.inspection.incoming import IncomingRecording, incoming_recordings
+from adaptfault.inspection.inspection import Inspection, inspect
+from adaptfault.inspection.plausibility import contradiction
+from adaptfault.inspection.severity import (
+    UNKNOWN,
+    UNREADABLE,
+    Reason,
+    of_accuracy,
+    of_change,
+    of_known,
+)
+from adaptfault.prognosis.cell_condition import encode
 from adaptfault.robot.maintenance_report import Decision, MaintenanceReport
-from adaptfault.robot.plausibility import contradiction, implausible
-from adaptfault.robot.pointer import Pointer
-from adaptfault.robot.sensor_state import TECHNICIAN_BELOW, UNTESTED, judged_before, unhandled_cells
-from adaptfault.robot.versions import Version
-from diagnostics import Diagnosis, FaultSet, SelfDiagnosis
-from diagnostics.evidence.ageing import cell_condition
-from diagnostics.evidence.sensor_change import find_change
-
-if TYPE_CHECKING:
-    from adaptfault.adaptation.adapter import Adapter
-    from adaptfault.adaptation.result import Adaptation
-    from adaptfault.data.windows import Windows
-    from diagnostics import SensorLayout
+from adaptfault.robot.maintenance_run import MaintenanceRun, Robot
+from adaptfault.robot.model_comparison import Judgement, compare_candidate, with_faults
+from adaptfault.robot.repair import Candidate, repair
+from adaptfault.robot.sensor_state import judged_before, unhandled_cells
+from diagnostics import FaultSet
+from diagnostics.sensor.ageing import cell_condition
+from diagnostics.sensor.sensor_change import SensorChange
 
 _CONTRADICTORY = 1.0  # residual variance ratio at which other cells predict no better than the mean
-_UNKNOWN = 3
+
+_DECIDED = ("fault", "wire", "rewired", "replaced_pad", "gain", "offset")
+"""Findings that a run acts upon, or measures the effect of: it gives the reason itself."""
 
 
 def maintain(
@@ -53,11 +53,12 @@ def maintain(
     untested_code: int = 1,
     say: Callable[[str], None] = lambda text: None,
 ) -> MaintenanceReport:
-    """Diagnose new recordings and update the running version where that is needed.
+    """Inspect new recordings and update the running version where that is needed.
 
-    Recordings that an earlier run used are skipped; the journal identifies them by the SHA-256 of their content. A new
-    version is deployed only if it is significantly better than the running one on held-out windows with the known
-    faults injected (paired bootstrap over recordings), and no class collapses.
+    Recordings that an earlier run used are skipped; the journal identifies them by the SHA-256 of
+    their content. A new version is deployed only if it is significantly better than the running one
+    on held-out windows with the known faults injected (paired bootstrap over recordings), and no
+    class collapses.
 
     Args:
         bundle: of the robot.
@@ -65,7 +66,8 @@ def maintain(
         names: of the recordings, for messages.
         dry_run: report only, change nothing.
         budget: seconds that an adaptation may take.
-        untested_code: exit code where no fault is known and the recordings test less than 5 % of the cells.
+        untested_code: exit code where no fault is known and the recordings test less than 5 % of
+            the cells.
         say: receives one line of progress before each long step.
 
     Raises:
@@ -74,458 +76,451 @@ def maintain(
     """
     began = time.perf_counter()
     with bundle.maintenance(dry_run=dry_run):
-        report = _Maintenance(bundle, dry_run, budget, untested_code, say).run(_checked(recordings, names, bundle))
+        if not dry_run:
+            bundle.sweep()
+        warnings = tuple(bundle.problems(repair=not dry_run))
+        fresh = _fresh(incoming_recordings(recordings, names, bundle.layout), bundle)
+        run = MaintenanceRun(
+            robot=Robot(bundle),
+            version=bundle.active(),
+            known=bundle.known_faults(),
+            dry_run=dry_run,
+            budget=budget,
+            say=say,
+            warnings=warnings,
+            left_out=tuple(text for one in fresh if (text := one.left_out(bundle.layout))),
+        )
+        usable = [recording for recording in fresh if recording.problem is None]
+        report = _maintained(run, usable, untested_code) if usable else _idle(run, fresh)
     return replace(report, seconds=time.perf_counter() - began)
 
 
-@dataclass
-class _InputRecording:
-    """A recording given to maintenance, and the reason why it cannot be used, if any."""
+@dataclass(frozen=True)
+class _Outcome:
+    """What was decided.
 
-    name: str
-    frames: NDArray[np.float64] | None
-    digest: str
-    problem: str | None
-    outside: int = 0  # readings out of the converter's range, missing in ``frames``
+    Attributes:
+        decision: see :class:`MaintenanceReport`.
+        reasons: of the decision.
+        known: the known faults from now on.
+        readings: of the log, as the version that runs from now on takes them; None: nothing was
+            diagnosed.
+        told: changed readings that this version undoes, or that are refused.
+        used: whether the log teaches something about this sensor.
+        deploys: number of the version that runs from now on; None: the running one stays.
+        judged: comparison that the next run need not repeat.
+        measured: further fields of the report.
+    """
 
-    def left_out(self, layout: SensorLayout) -> str:
-        """Return what is not used of it and why, in one sentence; empty: all is used."""
-        if self.problem is not None:
-            return f"{self.name}: {self.problem}"
-        range_ = f"0 to {layout.full_scale:g} {layout.unit}"
-        return f"{self.name}: {self.outside} readings outside {range_} are missing" if self.outside else ""
-
-
-def _checked(
-    recordings: ArrayLike | Sequence[ArrayLike], names: Sequence[str], bundle: Bundle
-) -> list[_InputRecording]:
-    incoming = []
-    for i, recording in enumerate(bundle.layout.recordings(recordings)):
-        name = printable(names[i]) if i < len(names) else f"recording {i}"
-        raw = np.ascontiguousarray(recording, dtype=np.float64)
-        digest = hashlib.sha256(repr(raw.shape).encode() + raw.tobytes()).hexdigest()
-        try:
-            frames = bundle.layout.check_recording(raw, name)
-            problem = implausible(frames, bundle.layout) if len(frames) else "it holds no frame"
-        except ValueError as error:
-            frames, problem = None, str(error)
-        outside = 0
-        if frames is not None and problem is None:
-            frames, outside = within_range(frames, bundle.layout)
-        incoming.append(_InputRecording(name, frames, digest, problem, outside))
-    return incoming
+    decision: Decision
+    reasons: tuple[Reason, ...]
+    known: KnownFaults
+    readings: ChangedReadings | None = None
+    told: ChangedReadings | None = None
+    used: bool = True
+    deploys: int | None = None
+    judged: dict[str, Any] | None = None
+    measured: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass
-class _Maintenance:
-    """State of one maintenance run."""
+def _fresh(incoming: Sequence[IncomingRecording], bundle: Bundle) -> list[IncomingRecording]:
+    """Return the recordings that no earlier run used, each once."""
+    seen = bundle.journal.seen([recording.digest for recording in incoming])
+    return list(
+        {
+            recording.digest: recording for recording in incoming if recording.digest not in seen
+        }.values()
+    )
 
-    bundle: Bundle
-    dry_run: bool
-    budget: float | None
-    untested_code: int
-    say: Callable[[str], None]
-    warnings: tuple[str, ...] = field(default=(), init=False)
-    judged: dict[str, Any] | None = field(default=None, init=False)
-    condition: bytes | None = field(default=None, init=False)
-    next: int | None = field(default=None, init=False)  # number of the version that runs after this run, if another
 
-    def run(self, incoming: Sequence[_InputRecording]) -> MaintenanceReport:
-        """Diagnose recordings that no earlier run used, decide, and journal the run unless it is a dry run."""
-        bundle = self.bundle
-        if not self.dry_run:
-            bundle.sweep()
-        self.warnings = tuple(bundle.problems(repair=not self.dry_run))
-        self.version = bundle.active()
-        self.before = bundle.known_faults()
-        seen = bundle.journal.seen([r.digest for r in incoming])
-        fresh = list({r.digest: r for r in incoming if r.digest not in seen}.values())
-        usable = [r for r in fresh if r.problem is None]
-        self.left_out = tuple(text for r in fresh if (text := r.left_out(bundle.layout)))
-        if not fresh:
-            code = self._code(self.before.fault_set)
-            return self._report("unchanged", code, "all recordings were used before", self.before)
-        if not usable:
-            return self._report("refused", _UNKNOWN, "no recording is usable", self.before)
-        self.say(f"diagnosing {len(usable)} new recordings")
-        frames = [self.version.undo(r.frames) for r in usable if r.frames is not None]
-        changed = find_changed_readings(self.diagnoser, frames, lambda: self.healthy)
-        report = self._decide_readings(changed, frames, tuple(r.name for r in usable))
-        loads, healthy = self._loads(frames if report.diagnosis is changed.as_found else changed.frames)
-        report = self._with_change(self._with_coverage(_with_transport(report)), loads, healthy)
-        report = self._with_chance(self._with_static_loads(report))
-        if report.used and report.diagnosis is not None:
-            self.condition = encode(cell_condition(loads, healthy, bundle.layout), report.diagnosis.verdicts)
-        if not self.dry_run:
-            self._write(report, usable)
-        return report
-
-    @cached_property
-    def diagnoser(self) -> SelfDiagnosis:
-        """The fitted diagnosis of the bundle."""
-        return self.bundle.diagnoser()
-
-    @cached_property
-    def adapter(self) -> Adapter:
-        """The adapter of the bundle, with the fault-free model and windows."""
-        return self.bundle.parts.adapter()
-
-    @cached_property
-    def healthy(self) -> list[NDArray[np.float64]]:
-        """Healthy recordings of the bundle, ``[T, D]`` each."""
-        return recordings_of(self.adapter.train, self.bundle.layout)
-
-    def _loads(self, frames: list[NDArray[np.float64]]) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
-        """Return new recordings, and the healthy ones of the bundle, as loads, ``[T, D]`` each."""
-        return as_loads(self.diagnoser, frames), as_loads(self.diagnoser, self.healthy)
-
-    def _decide_readings(
-        self, changed: ChangedReadings, frames: list[NDArray[np.float64]], used: tuple[str, ...]
-    ) -> MaintenanceReport:
-        """Decide about exchanged wires or replaced pads first, as about any version, then about the faults.
-
-        Nothing is deployed where the recordings are refused, or where the running version is as good without it.
-        """
-        if not changed.reason:
-            return self._decide(changed.diagnosis, changed.frames, used)
-        before = self.before
-        if changed.recalibration is not None:
-            self.before = before.without(changed.recalibration.on(self.bundle.layout))
-        known = self.before.merged(changed.diagnosis)
-        refusal = self._refusal(changed.diagnosis, changed.frames, known)
-        judgement = None
-        if refusal is not None:
-            decision: Decision = "refused"
-            why = f"not undone: {refusal}"
-        else:
-            judgement = self._judged_readings(changed, known)
-            decision = "kept"
-            why = f"not undone: version {self.version.number} is as good without it, {judgement}"
-            if self._rolled_back(changed):
-                why = "not undone: a version that undid it was rolled back before"
-            elif judgement.better and not judgement.collapsed:
-                decision = "deployed"
-        if decision == "deployed":
-            self._deploy_readings(changed)
-            return self._with_new_readings(self._decide(changed.diagnosis, changed.frames, used), changed, judgement)
-        self.before = before
-        if changed.as_found is not None and refusal is None:  # pads are used as they read now
-            report = self._decide(changed.as_found, frames, used)
-            return replace(
-                report, exit_code=max(1, report.exit_code), reason=f"{changed.reason}; {why}; {report.reason}"
-            )
-        found: dict[str, Any] = {"diagnosis": changed.diagnosis, **changed.told}
-        return self._report(decision, 2, f"{changed.reason}; {why}", before, **found)
-
-    def _judged_readings(self, changed: ChangedReadings, known: KnownFaults) -> Judgement:
-        """Compare the running version with and without the change undone, on windows that are changed likewise."""
-        from adaptfault.adaptation.result import Adaptation
-
-        model, top = Adaptation.load(self.version.folder), self.bundle.layout.full_scale
-        windows = with_faults(self.bundle.parts.check_windows(), known.faults, self.bundle.layout)
-        windows = replace(windows, x=changed.changed(windows.x, top))
-        return compare_candidate(model.predict, lambda x: model.predict(changed.undone(x, top)), windows)
-
-    def _rolled_back(self, changed: ChangedReadings) -> bool:
-        """Return whether a version that undid the same change was rolled back, or never confirmed."""
-        runs = self.bundle.journal.runs()
-        left = {run["from"] for run in runs if run["what"] == "rollback"}
-        told = {name: list(values) for name, values in changed.told.items()}
-        return any(
-            run["what"] == "deployed" and run["version"] in left and {name: run.get(name) for name in told} == told
-            for run in runs
+def _idle(run: MaintenanceRun, fresh: Sequence[IncomingRecording]) -> MaintenanceReport:
+    """Return the report on a log without any usable recording."""
+    if fresh:
+        return _report(
+            run, _Outcome("refused", (Reason(UNKNOWN, "no recording is usable"),), run.known)
         )
+    reason = Reason(_severity(run, run.known.fault_set), "all recordings were used before")
+    return _report(run, _Outcome("unchanged", (reason,), run.known))
 
-    def _deploy_readings(self, changed: ChangedReadings) -> None:
-        """Deploy the running model as a version that undoes the change; a dry run changes nothing."""
-        from adaptfault.adaptation.result import Adaptation
 
-        if self.dry_run:
-            return
-        self.say(changed.reason)
-        about = {**self.version.about, "reason": changed.reason, **changed.readings(self.version)}
-        self.version = self.bundle.write_version(Adaptation.load(self.version.folder), about)
-        self.next = self.version.number
+def _maintained(
+    run: MaintenanceRun, usable: Sequence[IncomingRecording], untested_code: int
+) -> MaintenanceReport:
+    """Inspect usable recordings, decide, and journal the run unless it is a dry run."""
+    run.say(f"inspecting {len(usable)} new recordings")
+    frames = [
+        run.version.undo(recording.frames) for recording in usable if recording.frames is not None
+    ]
+    inspection = inspect(frames, run.robot.diagnoser, reference=run.robot.healthy)
+    outcome = _decide(run, inspection)
+    report = _report(run, outcome, inspection, untested_code)
+    if outcome.used:
+        report = replace(report, used=tuple(recording.name for recording in usable))
+    if not run.dry_run:
+        _write(run, outcome, report, usable)
+    return report
 
-    def _with_new_readings(
-        self, report: MaintenanceReport, changed: ChangedReadings, judgement: Judgement | None
-    ) -> MaintenanceReport:
-        """Return the report with a change that a deployed version undoes."""
-        undone = "a new version would undo it" if self.dry_run else f"version {self.version.number} undoes it"
-        return replace(
-            report,
-            decision="deployed",
-            exit_code=max(1, report.exit_code),
-            reason=f"{changed.reason}; {undone}; {report.reason}",
-            judgement=report.judgement or judgement,
-            **changed.told,
+
+def _decide(run: MaintenanceRun, inspection: Inspection) -> _Outcome:
+    """Decide about changed readings first, as about any version, then about the faults."""
+    unreadable = [finding for finding in inspection.findings if finding.name in UNREADABLE]
+    if unreadable:  # told as a finding
+        return _Outcome("refused", (), run.known, inspection.readings, used=False)
+    if inspection.readings.reason:
+        return _decide_readings(run, inspection.readings)
+    return _decide_faults(run, inspection.readings)
+
+
+def _decide_readings(run: MaintenanceRun, changed: ChangedReadings) -> _Outcome:
+    """Decide about exchanged wires or replaced pads; nothing is deployed where the running version
+    is as good."""
+    renewed = run
+    if changed.recalibration is not None:
+        renewed = replace(run, known=run.known.without(changed.recalibration.on(run.robot.layout)))
+    known = renewed.known.merged(changed.diagnosis)
+    refusal = _refusal(run, changed, known)
+    if refusal is not None:
+        reason = Reason(2, f"{changed.reason}; not undone: {refusal}")
+        return _Outcome("refused", (reason,), run.known, changed, changed, used=False)
+    judgement = _judged_readings(run, changed, known)
+    if _was_rolled_back(run, changed):
+        why = "not undone: a version that undid it was rolled back before"
+    elif judgement.better and not judgement.collapsed:
+        return _undone(renewed, changed, judgement)
+    else:
+        why = f"not undone: version {run.version.number} is as good without it, {judgement}"
+    if changed.as_found is None:
+        return _Outcome(
+            "kept",
+            (Reason(2, f"{changed.reason}; {why}"),),
+            run.known,
+            changed,
+            changed,
+            used=False,
         )
+    outcome = _decide_faults(run, changed.as_found)  # pads are used as they read now
+    return replace(outcome, reasons=(Reason(1, f"{changed.reason}; {why}"), *outcome.reasons))
 
-    def _with_coverage(self, report: MaintenanceReport) -> MaintenanceReport:
-        """Return the report with the exit code of recordings that test nothing."""
-        diagnosis = report.diagnosis
-        if diagnosis is None or report.exit_code != 0 or diagnosis.coverage.test_coverage >= UNTESTED:
-            return report
-        share = diagnosis.coverage.test_coverage
-        reason = f"the recordings test only {share:.0%} of the cells, so faults may be hidden; {report.reason}"
-        return replace(report, exit_code=self.untested_code, reason=reason)
 
-    def _with_static_loads(self, report: MaintenanceReport) -> MaintenanceReport:
-        """Return the report with the objects that lie still on the array: its model reads them as contact."""
-        loads = () if report.diagnosis is None else report.diagnosis.static_loads
-        reason = "; ".join([*(load.reason for load in loads), report.reason])
-        return replace(report, exit_code=max(1, report.exit_code), reason=reason) if loads else report
-
-    def _with_chance(self, report: MaintenanceReport) -> MaintenanceReport:
-        """Return the report with exit code 2 where the accuracy that was measured is that of guessing."""
-        if report.accuracy is None:
-            return report
-        share, limit = chance(self.bundle.parts.check_windows().y)
-        if report.accuracy >= limit:
-            return report
-        reason = (
-            f"the model is at chance: accuracy {report.accuracy:.3f}, where always naming the most frequent class gives"
-            f" {share:.3f}; {report.reason}"
+def _undone(run: MaintenanceRun, changed: ChangedReadings, judgement: Judgement) -> _Outcome:
+    """Return the outcome with a version that undoes the change; a dry run writes none."""
+    undone = "a new version would undo it"
+    if not run.dry_run:
+        run.say(changed.reason)
+        about = {**run.version.about, "reason": changed.reason, **changed.readings(run.version)}
+        run = replace(
+            run, version=run.robot.bundle.write_version(run.robot.model(run.version), about)
         )
-        return replace(report, exit_code=2, reason=reason)
+        undone = f"version {run.version.number} undoes it"
+    outcome = _decide_faults(run, changed)
+    deploys = None if run.dry_run else run.version.number
+    return replace(
+        outcome,
+        decision="deployed",
+        reasons=(Reason(1, f"{changed.reason}; {undone}"), *outcome.reasons),
+        told=changed,
+        deploys=deploys if outcome.deploys is None else outcome.deploys,
+        judged=None,
+        measured={"judgement": judgement, **outcome.measured},
+    )
 
-    def _with_change(
-        self, report: MaintenanceReport, loads: list[NDArray[Any]], reference: list[NDArray[Any]]
-    ) -> MaintenanceReport:
-        """Return the report with a change of pad or sensor, and its effect on the accuracy; see :meth:`_loads`."""
-        from adaptfault.adaptation.result import Adaptation
 
-        layout, load = self.bundle.layout, self.diagnoser.load_
-        disturbed = FaultSet((), layout.n_cells) if report.diagnosis is None else report.diagnosis.disturbed
-        change = find_change(loads, reference, layout, report.fault_set | disturbed)
-        if change is None:
-            return report
-        gain, offset = change.of_cells(layout)
-        windows = with_faults(self.bundle.parts.check_windows(), report.faults, layout)
-        model = Adaptation.load(self.bundle.versions[report.version].folder)
-        before = float((model.predict(windows.x) == windows.y).mean())
-        changed = (windows.x * gain + offset / layout.full_scale).astype(np.float32)
-        if load is not None:
-            readings = windows.x.astype(np.float64) * layout.full_scale
-            changed_loads = load.loads(readings) * gain + offset
-            changed = (load.readings(changed_loads, readings < load.rest) / layout.full_scale).astype(np.float32)
-        after = float((model.predict(changed) == windows.y).mean())
-        effect = f"{change.reason}; accuracy of version {report.version} {before:.3f} -> {after:.3f} with this change"
-        code = max(report.exit_code, 2 if after < TECHNICIAN_BELOW * before else 1)
-        return replace(report, change=change, exit_code=code, reason=f"{effect}; {report.reason}")
+def _judged_readings(
+    run: MaintenanceRun, changed: ChangedReadings, known: KnownFaults
+) -> Judgement:
+    """Compare the running version with and without the change undone, on windows that are changed
+    likewise."""
+    model = run.robot.model(run.version)
+    top = run.robot.layout.full_scale
+    windows = with_faults(run.robot.windows, known.faults, run.robot.layout)
+    windows = replace(windows, x=changed.changed(windows.x, top))
+    return compare_candidate(
+        model.predict, lambda x: model.predict(changed.undone(x, top)), windows
+    )
 
-    def _decide(
-        self, diagnosis: Diagnosis, frames: list[NDArray[np.float64]], used: tuple[str, ...]
-    ) -> MaintenanceReport:
-        """Decide about a diagnosis; deploy where the decision is to."""
-        known = self.before.merged(diagnosis)
-        faulty = known.fault_set
-        found: dict[str, Any] = {"diagnosis": diagnosis, "used": used}
-        adapter = self.adapter
-        refusal = self._refusal(diagnosis, frames, known)
-        if refusal is not None:
-            working = bool(self._present - faulty)  # recordings that contradict the sensor teach nothing of its faults
-            found["used"] = () if working else used
-            return self._report("refused", 2, refusal, self.before if working else known, **found)
-        if faulty == self.version.fault_set:
-            reason = f"version {self.version.number} excludes these cells already" if faulty else "no faulty cell"
-            return self._report("unchanged", self._code(faulty), reason, known, **found)
-        if (judged := judged_before(self.bundle, faulty, self.version.number)) is not None:
-            self.judged = judged
-            return self._report("kept", judged["exit_code"], f"compared before: {judged['reason']}", known, **found)
-        if faulty.cells in Pointer.read(self.bundle.path).rejected:
-            unhandled = len(faulty - self.version.fault_set)
-            reason = (
-                f"a version for these faults was rolled back before, so version {self.version.number} runs,"
-                f" which uses {unhandled} of the {len(faulty)} faulty cells"
-            )
-            return self._report("kept", self._code(faulty), reason, known, **found)
-        return self._adapt(adapter, known, found)
 
-    def _refusal(self, diagnosis: Diagnosis, frames: list[NDArray[np.float64]], known: KnownFaults) -> str | None:
-        """Return why no version can be made from these recordings; None where one can."""
-        faulty = known.fault_set
-        if not self._present - faulty:
-            return "no healthy cell is left to predict from: replace the sensor"
-        untrue = faulty | diagnosis.statically_loaded  # neither says what the other cells should read
-        strange = contradiction(frames, untrue, self.adapter.statistics, self.bundle.layout)
-        if strange <= _CONTRADICTORY:
-            return None
-        return (
-            f"residual variance ratio {strange:.2f} of the cells taken as healthy exceeds {_CONTRADICTORY:g}:"
-            " wrong sensor, or changed wiring"
+def _was_rolled_back(run: MaintenanceRun, changed: ChangedReadings) -> bool:
+    """Return whether a version that undid the same change was rolled back, or never confirmed."""
+    runs = run.robot.bundle.journal.runs()
+    left = {one["from"] for one in runs if one["what"] == "rollback"}
+    told = {name: list(values) for name, values in changed.told.items()}
+    return any(
+        one["what"] == "deployed"
+        and one["version"] in left
+        and {name: one.get(name) for name in told} == told
+        for one in runs
+    )
+
+
+def _decide_faults(run: MaintenanceRun, readings: ChangedReadings) -> _Outcome:
+    """Decide about the faults of a log: refuse, keep, or repair, compare and deploy."""
+    known = run.known.merged(readings.diagnosis)
+    faulty = known.fault_set
+    number = run.version.number
+    refusal = _refusal(run, readings, known)
+    if refusal is not None:
+        # a log that contradicts the sensor teaches nothing of its faults
+        working = bool(run.robot.present - faulty)
+        reasons = (Reason(2, refusal),)
+        return _Outcome(
+            "refused", reasons, run.known if working else known, readings, used=not working
         )
-
-    @cached_property
-    def _present(self) -> FaultSet:
-        layout = self.bundle.layout
-        return FaultSet(tuple(np.flatnonzero(layout.present).tolist()), layout.n_cells)
-
-    def _adapt(self, adapter: Adapter, known: KnownFaults, found: dict[str, Any]) -> MaintenanceReport:
-        """Adapt and compare: method "auto" first; where a class collapses, imputation alone."""
-        from adaptfault.adaptation.result import Adaptation
-
-        faulty = known.fault_set
-        windows = self.bundle.parts.check_windows()
-        if (earlier := self._version_for(faulty)) is not None:
-            return self._return_to(earlier, windows, known, found)
-        broken = with_faults(windows, known.faults, self.bundle.layout)
-        running = Adaptation.load(self.version.folder)
-        free = self._fault_free_accuracy(windows)
-        self.say(f"{len(faulty)} of {self.bundle.layout.present.sum()} cells are faulty; adapting")
-        for method in ("auto", "fill"):
-            adaptation = adapter.adapt(faulty, method=method, budget=self.budget, progress=False)
-            judgement = compare_candidate(running.predict, adaptation.predict, broken)
-            found["stages"] = tuple(str(stage) for stage in adaptation.stages)
-            if not judgement.collapsed:
-                break
-        found |= {"judgement": judgement, "fault_free_accuracy": free}
-        if judgement.collapsed:
-            names = ", ".join(self._class_name(c) for c in judgement.collapsed)
-            code = self._code(faulty, judgement.running, free)
-            reason = f"the adapted model loses more than half of the recall of {names}"
-            return self._report("refused", max(1, code), reason, known, accuracy=judgement.running, **found)
-        if not judgement.better:
-            code = self._code(faulty, judgement.running, free)
-            reason = (
-                f"version {self.version.number} is as good under these faults as the adapted model"
-                " (90 % interval of the gain includes 0)"
-            )
-            return self._report("kept", code, reason, known, accuracy=judgement.running, **found)
-        code = self._code(faulty, judgement.candidate, free)
-        reason = (
-            f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f} under the faults known now"
-            f" ({free:.3f} without any)"
+    if faulty == run.version.fault_set:
+        text = f"version {number} excludes these cells already" if faulty else "no faulty cell"
+        return _Outcome("unchanged", (Reason(_severity(run, faulty), text),), known, readings)
+    judged = judged_before(run.robot.bundle, faulty, number)
+    if judged is not None:
+        reason = Reason(judged["exit_code"], f"compared before: {judged['reason']}")
+        return _Outcome("kept", (reason,), known, readings, judged=judged)
+    if faulty.cells in Pointer.read(run.robot.bundle.path).rejected:
+        unhandled = len(faulty - run.version.fault_set)
+        text = (
+            f"a version for these faults was rolled back before, so version {number} runs,"
+            f" which uses {unhandled} of the {len(faulty)} faulty cells"
         )
-        number = self.version.number if self.dry_run else self._deploy(adaptation, known, judgement, free)
-        return self._report("deployed", code, reason, known, accuracy=judgement.candidate, number=number, **found)
+        return _Outcome("kept", (Reason(_severity(run, faulty), text),), known, readings)
+    candidate, judgement = _best(run, known)
+    return replace(_decide_candidate(run, known, candidate, judgement), readings=readings)
 
-    def _fault_free_accuracy(self, windows: Windows) -> float:
-        """Return the accuracy of version 1, the model of the healthy sensor, on windows without faults."""
-        from adaptfault.adaptation.result import Adaptation
 
-        try:
-            model = Adaptation.load(self.bundle.versions[1].folder)
-        except (Damaged, FileNotFoundError):
-            return float((self.adapter.model.predict(windows.x) == windows.y).mean())
-        return float((model.predict(windows.x) == windows.y).mean())
+def _best(run: MaintenanceRun, known: KnownFaults) -> tuple[Candidate, Judgement]:
+    """Return the first candidate in which no class collapses, else the last one, and its
+    comparison."""
+    windows = with_faults(run.robot.windows, known.faults, run.robot.layout)
+    running = run.robot.model(run.version)
+    for candidate in repair(run, known.fault_set):
+        judgement = compare_candidate(running.predict, candidate.model.predict, windows)
+        if not judgement.collapsed:
+            break
+    return candidate, judgement
 
-    def _version_for(self, faulty: FaultSet) -> Version | None:
-        """Return the latest version for exactly this F, where the running one also excludes recovered cells."""
-        if not set(faulty) < set(self.version.fault_set):
-            return None
-        for number in reversed(self.bundle.versions.numbers):
-            with suppress(Damaged, FileNotFoundError):
-                version = self.bundle.versions[number]
-                if version.fault_set == faulty and version.readings == self.version.readings:
-                    return version
-        return None
 
-    def _return_to(
-        self, earlier: Version, windows: Windows, known: KnownFaults, found: dict[str, Any]
-    ) -> MaintenanceReport:
-        """Return to a version that uses the recovered cells, unless it is less accurate than the running one."""
-        from adaptfault.adaptation.result import Adaptation
-
-        broken = with_faults(windows, known.faults, self.bundle.layout)
-        running, candidate = Adaptation.load(self.version.folder), Adaptation.load(earlier.folder)
-        judgement = compare_candidate(running.predict, candidate.predict, broken)
-        free = self._fault_free_accuracy(windows)
-        found |= {"judgement": judgement, "fault_free_accuracy": free}
-        recovered = len(self.version.fault_set) - len(known.fault_set)
-        accuracies = f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}"
-        if judgement.gain < 0 or judgement.collapsed:
-            code = self._code(known.fault_set, judgement.running, free)
-            reason = (
-                f"{recovered} cells recovered, but version {earlier.number}, which uses them, is worse: {accuracies}"
-            )
-            return self._report("kept", code, reason, known, accuracy=judgement.running, **found)
-        if not self.dry_run:
-            self.next = earlier.number
-        code = self._code(known.fault_set, judgement.candidate, free)
-        number = self.version.number if self.dry_run else earlier.number
-        reason = f"{recovered} cells recovered; version {earlier.number} uses them again ({accuracies})"
-        return self._report("deployed", code, reason, known, accuracy=judgement.candidate, number=number, **found)
-
-    def _deploy(self, adaptation: Adaptation, known: KnownFaults, judgement: Judgement, free: float) -> int:
-        about = {
-            "reason": f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}",
-            "knowledge": known.to_dict(),
-            **self.version.readings,
-            "accuracy": judgement.candidate,
-            "fault_free_accuracy": free,
-            "chance": chance(self.bundle.parts.check_windows().y)[1],
+def _decide_candidate(
+    run: MaintenanceRun, known: KnownFaults, candidate: Candidate, judgement: Judgement
+) -> _Outcome:
+    """Deploy a candidate where it is better; one that uses recovered cells again, where it is no
+    worse."""
+    free = run.robot.fault_free_accuracy
+    measured: dict[str, Any] = {
+        "judgement": judgement,
+        "fault_free_accuracy": free,
+        "stages": candidate.stages,
+    }
+    obstacle = _obstacle(run, candidate, judgement)
+    if obstacle is not None:
+        severity = _measured_severity(run.robot, known, judgement.running)
+        decision: Decision = "kept"
+        if judgement.collapsed and candidate.stored is None:
+            decision = "refused"
+            severity = max(1, severity)
+        judged = {
+            "version": run.version.number,
+            "exit_code": severity,
+            "reason": obstacle,
+            "fault_set": list(known.fault_set),
         }
-        version = self.bundle.write_version(adaptation, about)
-        self.next = version.number
-        return version.number
-
-    def _write(self, report: MaintenanceReport, usable: Sequence[_InputRecording]) -> None:
-        """Deploy and journal the run in one step.
-
-        After a crash before this the recordings are diagnosed again, with the same result.
-        """
-        document = {**report.to_dict(), "knowledge": self.known.to_dict(), "judged": self._judgement_of(report)}
-        used = [(r.digest, r.name) for r in usable] if report.used else []  # refused ones are diagnosed again
-        entry = Entry(now(), report.decision, document, used, self.condition)
-        if self.next is None:
-            self.bundle.journal.add(entry)
-        else:
-            self.bundle.deploy(self.next, entry)
-
-    def _judgement_of(self, report: MaintenanceReport) -> dict[str, Any] | None:
-        """Return what the next run needs so that it does not repeat the same comparison."""
-        if report.judgement is None or report.decision == "deployed":
-            return self.judged
-        about = {"version": report.version, "exit_code": report.exit_code, "reason": report.reason}
-        return {**about, "fault_set": list(report.fault_set)}
-
-    def _report(
-        self,
-        decision: Decision,
-        code: int,
-        reason: str,
-        known: KnownFaults,
-        *,
-        number: int | None = None,
-        **found: Any,
-    ) -> MaintenanceReport:
-        self.known = known
-        return MaintenanceReport(
-            decision=decision,
-            exit_code=code,
-            reason=reason,
-            fault_set=known.fault_set,
-            version=self.version.number if number is None else number,
-            faults=known.faults,
-            left_out=self.left_out,
-            warnings=self.warnings,
-            dry_run=self.dry_run,
-            n_cells=int(self.bundle.layout.present.sum()),
-            **found,
+        measured["accuracy"] = judgement.running
+        return _Outcome(
+            decision, (Reason(severity, obstacle),), known, judged=judged, measured=measured
         )
-
-    def _code(self, faulty: FaultSet, accuracy: float | None = None, free: float | None = None) -> int:
-        """Return 0: no known fault; 1: handled; 2: not handled, or too little accuracy."""
-        if accuracy is None or free is None:
-            if unhandled_cells(self.bundle, faulty, self.version):
-                return 2
-            about = self.version.about
-            accuracy, free = about.get("accuracy"), about.get("fault_free_accuracy")
-            if accuracy is not None and accuracy < about.get("chance", 0):
-                return 2
-        if accuracy is not None and free is not None and accuracy < TECHNICIAN_BELOW * free:
-            return 2
-        return 1 if len(faulty) else 0
-
-    def _class_name(self, number: int) -> str:
-        names = self.bundle.class_names
-        return names[number] if names else f"class {number}"
+    measured["accuracy"] = judgement.candidate
+    severity = _measured_severity(run.robot, known, judgement.candidate)
+    accuracies = f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}"
+    text = f"{accuracies} under the faults known now ({free:.3f} without any)"
+    if candidate.stored is not None:
+        recovered = len(run.version.fault_set) - len(known.fault_set)
+        text = (
+            f"{recovered} cells recovered; version {candidate.stored.number} uses them again"
+            f" ({accuracies})"
+        )
+    deploys = None if run.dry_run else _deploy(run, candidate, known, judgement)
+    return _Outcome(
+        "deployed", (Reason(severity, text),), known, deploys=deploys, measured=measured
+    )
 
 
-def _with_transport(report: MaintenanceReport) -> MaintenanceReport:
-    """Return the report with the exit code and the reason of a stream that was frozen."""
-    if report.diagnosis is None or not report.diagnosis.frozen:
-        return report
-    reason = f"{report.diagnosis.frozen[0].reason}; {report.reason}"
-    return replace(report, exit_code=max(1, report.exit_code), reason=reason)
+def _obstacle(run: MaintenanceRun, candidate: Candidate, judgement: Judgement) -> str | None:
+    """Return why a candidate does not run; None where it does."""
+    number = run.version.number
+    if candidate.stored is not None:
+        if judgement.gain >= 0 and not judgement.collapsed:
+            return None
+        recovered = len(run.version.fault_set) - len(candidate.stored.fault_set)
+        return (
+            f"{recovered} cells recovered, but version {candidate.stored.number}, which uses them,"
+            f" is worse: accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}"
+        )
+    if judgement.collapsed:
+        names = ", ".join(run.robot.class_name(c) for c in judgement.collapsed)
+        return f"the adapted model loses more than half of the recall of {names}"
+    if judgement.better:
+        return None
+    return (
+        f"version {number} is as good under these faults as the adapted model (90 % interval of the"
+        " gain includes 0)"
+    )
+
+
+def _deploy(
+    run: MaintenanceRun, candidate: Candidate, known: KnownFaults, judgement: Judgement
+) -> int:
+    """Return the number of the version that holds a candidate; it is written where there is
+    none."""
+    if candidate.stored is not None:
+        return candidate.stored.number
+    about = {
+        "reason": f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}",
+        "knowledge": known.to_dict(),
+        **run.version.readings,
+        "accuracy": judgement.candidate,
+        "fault_free_accuracy": run.robot.fault_free_accuracy,
+        "chance": run.robot.chance[1],
+    }
+    return run.robot.bundle.write_version(candidate.model, about).number
+
+
+def _refusal(run: MaintenanceRun, readings: ChangedReadings, known: KnownFaults) -> str | None:
+    """Return why no version can be made from a log; None where one can."""
+    faulty = known.fault_set
+    if not run.robot.present - faulty:
+        return "no healthy cell is left to predict from: replace the sensor"
+    # neither says what the other cells should read
+    untrue = faulty | readings.diagnosis.statically_loaded
+    strange = contradiction(readings.frames, untrue, run.robot.adapter.statistics, run.robot.layout)
+    if strange <= _CONTRADICTORY:
+        return None
+    return (
+        f"residual variance ratio {strange:.2f} of the cells taken as healthy exceeds"
+        f" {_CONTRADICTORY:g}: wrong sensor, or changed wiring"
+    )
+
+
+def _severity(run: MaintenanceRun, faulty: FaultSet) -> int:
+    """Return the severity of known faults, from what was measured of the running version when it
+    was made."""
+    about = run.version.about
+    accuracy = about.get("accuracy")
+    measured = of_accuracy(accuracy, about.get("fault_free_accuracy"), about.get("chance", 0.0))
+    return max(of_known(faulty, unhandled_cells(run.robot.bundle, faulty, run.version)), measured)
+
+
+def _measured_severity(robot: Robot, known: KnownFaults, accuracy: float) -> int:
+    """Return the severity of known faults from the accuracy that a model was just measured to have
+    with them."""
+    handled = of_known(known.fault_set, unhandled=FaultSet((), known.n_cells))
+    return max(handled, of_accuracy(accuracy, robot.fault_free_accuracy, robot.chance[1]))
+
+
+def _report(
+    run: MaintenanceRun,
+    outcome: _Outcome,
+    inspection: Inspection | None = None,
+    untested_code: int = 1,
+) -> MaintenanceReport:
+    """Return the report; what is told of the log comes before the decision, and the worst first."""
+    robot = run.robot
+    readings = outcome.readings
+    number = run.version.number if outcome.deploys is None else outcome.deploys
+    change = None
+    reasons: list[Reason] = []
+    if inspection is not None and readings is not None:
+        change = inspection.change
+        if readings is not inspection.readings:  # pads are used as they read now
+            change = find_sensor_change(robot.diagnoser, readings, robot.healthy)
+        reasons += _of_chance(robot, outcome.measured.get("accuracy"))
+        reasons += _of_findings(inspection, untested_code)
+        reasons += [] if change is None else [_of_change(robot, change, outcome.known, number)]
+    reasons = sorted([*reasons, *outcome.reasons], key=lambda reason: -reason.severity)
+    return MaintenanceReport(
+        decision=outcome.decision,
+        reasons=tuple(reasons),
+        fault_set=outcome.known.fault_set,
+        version=number,
+        faults=outcome.known.faults,
+        diagnosis=None if readings is None else readings.diagnosis,
+        change=change,
+        dry_run=run.dry_run,
+        n_cells=len(robot.present),
+        **({} if outcome.told is None else outcome.told.told),
+        left_out=run.left_out,
+        warnings=run.warnings,
+        **outcome.measured,
+    )
+
+
+def _of_chance(robot: Robot, accuracy: float | None) -> list[Reason]:
+    """Return that the accuracy which was measured is that of guessing."""
+    if accuracy is None:
+        return []
+    share, limit = robot.chance
+    severity = of_accuracy(accuracy, None, limit)
+    if severity == 0:
+        return []
+    guessing = f"always naming the most frequent class gives {share:.3f}"
+    return [Reason(severity, f"the model is at chance: accuracy {accuracy:.3f}, where {guessing}")]
+
+
+def _of_findings(inspection: Inspection, untested_code: int) -> list[Reason]:
+    """Return what an inspection tells, but for what the run decides about."""
+    reasons = []
+    for finding in inspection.findings:
+        severity = untested_code if finding.name == "untested" else finding.severity
+        if finding.name not in _DECIDED and finding.name != "lost_frames":
+            reasons.append(Reason(severity, finding.reason))
+    return reasons
+
+
+def _of_change(robot: Robot, change: SensorChange, known: KnownFaults, number: int) -> Reason:
+    """Return a change of pad or sensor, and its effect on the accuracy of the version that runs
+    from now on."""
+    layout = robot.layout
+    windows = with_faults(robot.windows, known.faults, layout)
+    model = robot.model(robot.bundle.versions[number])
+    before = float((model.predict(windows.x) == windows.y).mean())
+    after = float((model.predict(_changed(robot, change, windows.x)) == windows.y).mean())
+    effect = f"accuracy of version {number} {before:.3f} -> {after:.3f} with this change"
+    return Reason(of_change(before, after), f"{change.reason}; {effect}")
+
+
+def _changed(robot: Robot, change: SensorChange, x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return scaled windows as a changed sensor reads them."""
+    layout = robot.layout
+    load = robot.diagnoser.load_
+    gain, offset = change.of_cells(layout)
+    if load is None:
+        return (x * gain + offset / layout.full_scale).astype(np.float32)
+    readings = x.astype(np.float64) * layout.full_scale
+    loads = load.loads(readings) * gain + offset
+    return (load.readings(loads, readings < load.rest) / layout.full_scale).astype(np.float32)
+
+
+def _condition(run: MaintenanceRun, readings: ChangedReadings) -> bytes:
+    """Return the condition of each cell, for the prognosis; see
+    :mod:`diagnostics.sensor.ageing`."""
+    robot = run.robot
+    loads = as_loads(robot.diagnoser, readings.frames)
+    healthy = as_loads(robot.diagnoser, robot.healthy)
+    return encode(cell_condition(loads, healthy, robot.layout), readings.diagnosis.verdicts)
+
+
+def _write(
+    run: MaintenanceRun,
+    outcome: _Outcome,
+    report: MaintenanceReport,
+    usable: Sequence[IncomingRecording],
+) -> None:
+    """Deploy and journal the run in one step.
+
+    After a crash before this the recordings are inspected again, with the same result.
+    """
+    document = {**report.to_dict(), "knowledge": outcome.known.to_dict(), "judged": outcome.judged}
+    used = []
+    condition = None
+    if outcome.used and outcome.readings is not None:  # refused recordings are inspected again
+        used = [(recording.digest, recording.name) for recording in usable]
+        condition = _condition(run, outcome.readings)
+    entry = Entry(now(), report.decision, document, used, condition)
+    if outcome.deploys is None:
+        run.robot.bundle.journal.add(entry)
+    else:
+        run.robot.bundle.deploy(outcome.deploys, entry)

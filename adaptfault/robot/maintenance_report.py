@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from adaptfault.robot.deployment_test import Judgement
+from adaptfault.inspection.severity import Reason, worst
+from adaptfault.robot.model_comparison import Judgement
 from adaptfault.robot.sensor_state import weak_base
 from diagnostics import Diagnosis, Fault, FaultSet
-from diagnostics.evidence.sensor_change import SensorChange
+from diagnostics.sensor.sensor_change import SensorChange
 
 SCHEMA = "adaptfault.maintenance/1"
 Decision = Literal["unchanged", "deployed", "kept", "refused"]
@@ -19,24 +20,28 @@ class MaintenanceReport:
     """Result of a maintenance run.
 
     Attributes:
-        decision: "unchanged": no new fault, or the running version already excludes all faulty cells. "deployed": a new
-            version runs, on probation. "kept": no candidate is better than the running version. "refused": the
-            recordings do not fit this sensor, or no working model is left.
-        exit_code: 0 no fault known; 1 faults that are handled, or a warning; 2 a person is needed; 3 unusable
-            recordings.
-        reason: why, in one sentence.
+        decision: "unchanged": no new fault, or the running version already excludes all faulty
+            cells. "deployed": a new version runs, on probation. "kept": no candidate is better than
+            the running version. "refused": the recordings do not fit this sensor, or no working
+            model is left.
+        reasons: why, and who has to act; the worst first.
         fault_set: F, as known now.
         version: number of the version that runs after this run.
         faults: known faults after this run, one for each root cause.
         diagnosis: of the new recordings; None without new recordings.
-        judgement: comparison of the last candidate with the running version; None without a candidate.
-        accuracy: of the version that runs now, under the known faults, on the held-out windows; None if not measured.
+        judgement: comparison of the last candidate with the running version; None without a
+            candidate.
+        accuracy: of the version that runs now, under the known faults, on the held-out windows;
+            None if not measured.
         fault_free_accuracy: of version 1 on the same windows without faults; None if not measured.
-        change: of a pad, or of the whole sensor, against the reference (gain, offset); None where none was found.
-        rewiring: rows, columns or pads that answer in each other's place, as text; the deployed version undoes it.
+        change: of a pad, or of the whole sensor, against the reference (gain, offset); None where
+            none was found.
+        rewiring: rows, columns or pads that answer in each other's place, as text; the deployed
+            version undoes it.
         replaced_pads: pads that read otherwise; the deployed version recalibrates them.
         stages: cost and result of each adaptation stage, as text.
-        used: names of the recordings whose diagnosis entered the known faults; empty where they were refused.
+        used: names of the recordings whose diagnosis entered the known faults; empty where they
+            were refused.
         left_out: recordings, or readings of them, that were not used, with the reason.
         warnings: damage found in the bundle.
         dry_run: nothing was changed.
@@ -45,8 +50,7 @@ class MaintenanceReport:
     """
 
     decision: Decision
-    exit_code: int
-    reason: str
+    reasons: tuple[Reason, ...]
     fault_set: FaultSet
     version: int
     faults: tuple[Fault, ...] = ()
@@ -65,18 +69,36 @@ class MaintenanceReport:
     seconds: float = 0.0
     n_cells: int = 0
 
+    @property
+    def exit_code(self) -> int:
+        """The worst severity of the reasons; see :mod:`adaptfault.inspection.severity`."""
+        return worst(self.reasons)
+
+    @property
+    def reason(self) -> str:
+        """The reasons in one line."""
+        return "; ".join(reason.text for reason in self.reasons)
+
     def __str__(self) -> str:
         status = ("OK", "WARNING", "CRITICAL", "UNKNOWN")[self.exit_code]
-        n, faulty = self.n_cells or self.fault_set.n_cells, len(self.fault_set)
+        n = self.n_cells or self.fault_set.n_cells
+        faulty = len(self.fault_set)
         measured = [f"faulty={faulty};;;0;{n}"]
         if self.accuracy is not None:
             measured.append(f"accuracy={self.accuracy:.4f};;;0;1")
         would = " (dry run: nothing was changed)" if self.dry_run else ""
-        lines = [f"ADAPTFAULT {status} - {self.decision}: {self.reason}{would} | {' '.join(measured)}"]
-        lines.append(f"version {self.version} runs; {faulty} of {n} cells {'is' if faulty == 1 else 'are'} faulty")
+        lines = [
+            f"ADAPTFAULT {status} - {self.decision}: {self.reason}{would} | {' '.join(measured)}"
+        ]
+        lines.append(
+            f"version {self.version} runs; {faulty} of {n} cells {'is' if faulty == 1 else 'are'}"
+            " faulty"
+        )
         if weak_base(self.accuracy, self.fault_free_accuracy):
             both = f"{self.accuracy:.3f} repaired, {self.fault_free_accuracy:.3f} healthy"
-            lines.append(f"  weak base model: accuracy {both}; train it longer or on more recordings")
+            lines.append(
+                f"  weak base model: accuracy {both}; train it longer or on more recordings"
+            )
         if self.diagnosis is not None:
             lines += [f"  {fault.reason}" for fault in self.diagnosis.faults]
             lines += [f"  {wire.reason}" for wire in self.diagnosis.possible]
@@ -98,6 +120,7 @@ class MaintenanceReport:
             "decision": self.decision,
             "exit_code": self.exit_code,
             "reason": self.reason,
+            "reasons": [asdict(reason) for reason in self.reasons],
             "fault_set": list(self.fault_set),
             "version": self.version,
             "faults": [fault.to_dict() for fault in self.faults],

@@ -1,4 +1,5 @@
-"""Reads new recordings for a bundle: in the layout's unit, or raw counts through the bundle's calibration."""
+"""Reads new recordings for a bundle: in the layout's unit, or raw counts through the bundle's
+calibration."""
 
 from __future__ import annotations
 
@@ -10,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.bundle.bundle import Bundle
 from adaptfault.data.recordings.errors import Problem
 from adaptfault.data.recordings.load import load
-from adaptfault.robot.bundle import Bundle
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +34,8 @@ class NewRecordings:
 def load_new_recordings(bundle: Bundle, paths: Sequence[str | PathLike[str]]) -> NewRecordings:
     """Read files and folders of recordings for a bundle.
 
-    Recordings of ``adaptfault listen`` lie beside a ``layout.json`` and are in its unit. All others are raw and are
-    converted with the bundle's calibration where it has one.
+    Recordings of ``adaptfault listen`` lie beside a ``layout.json`` and are in its unit. All others
+    are raw and are converted with the bundle's calibration where it has one.
 
     Raises:
         InputError: a path does not exist, or nothing could be read.
@@ -44,7 +45,9 @@ def load_new_recordings(bundle: Bundle, paths: Sequence[str | PathLike[str]]) ->
     ready = [p for p in given if ((p if p.is_dir() else p.parent) / "layout.json").exists()]
     raw = [p for p in given if p not in ready]
     parts = [
-        load(p, layout=bundle.layout, calibration=t) for p, t in ((ready, None), (raw, bundle.parts.calibration)) if p
+        load(p, layout=bundle.layout, calibration=t)
+        for p, t in ((ready, None), (raw, bundle.parts.calibration))
+        if p
     ]
     return NewRecordings(
         tuple(frames for part in parts for frames in part.recordings.frames),

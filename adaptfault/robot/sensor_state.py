@@ -1,32 +1,20 @@
-"""The state of a robot's sensor as its bundle knows it: which known faults the running version handles.
-
-Exit codes mean the same in every command: 0 nothing to do; 1 watch: faults that are handled, or a warning; 2 a person
-is needed; 3 unknown, because the input or the usage is wrong.
-"""
+"""The state of a robot's sensor as its bundle knows it: which known faults the running version
+handles."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-from adaptfault.robot.bundle import Bundle
-from adaptfault.robot.known_faults import KnownFaults
-from adaptfault.robot.versions import Version
-from diagnostics import Diagnosis, Fault, FaultSet
+from adaptfault.bundle.bundle import Bundle
+from adaptfault.bundle.known_faults import KnownFaults
+from adaptfault.bundle.versions import Version
+from adaptfault.inspection.severity import of_accuracy, of_known
+from diagnostics import Fault, FaultSet
 
-TECHNICIAN_BELOW = 0.9
-"""Share of the fault-free accuracy below which a person is needed."""
-
-UNTESTED = 0.05
-"""Test coverage below which recordings test nothing."""
-
-_WEAK = 0.02  # by so much more accuracy than the healthy model's, a repaired one shows that the healthy one is weak
-
-
-def untested(diagnosis: Diagnosis) -> str | None:
-    """Return that a log tests too few of the cells, in one sentence; None where it tests enough."""
-    share = diagnosis.coverage.test_coverage
-    return f"only {share:.0%} of the cells were tested, so faults may be hidden" if share < UNTESTED else None
+# by so much more accuracy than the healthy model's, a repaired one shows that the healthy one is
+# weak
+_WEAK = 0.02
 
 
 def judged_before(bundle: Bundle, faulty: FaultSet, version: int) -> dict[str, Any] | None:
@@ -38,14 +26,16 @@ def judged_before(bundle: Bundle, faulty: FaultSet, version: int) -> dict[str, A
 
 
 def unhandled_cells(bundle: Bundle, faulty: FaultSet, version: Version) -> FaultSet:
-    """Return the faulty cells that a version still uses, without having been measured to be as good with them."""
+    """Return the faulty cells that a version still uses, without having been measured to be as good
+    with them."""
     judged = judged_before(bundle, faulty, version.number)
     tolerated = judged is not None and judged["exit_code"] < 2
     return FaultSet((), faulty.n_cells) if tolerated else faulty - version.fault_set
 
 
 def weak_base(accuracy: float | None, fault_free: float | None) -> bool:
-    """Return whether a repaired model exceeds the healthy one, which then has not learned what the data offer."""
+    """Return whether a repaired model exceeds the healthy one, which then has not learned what the
+    data offer."""
     return accuracy is not None and fault_free is not None and accuracy > fault_free + _WEAK
 
 
@@ -58,7 +48,8 @@ class SensorState:
         known: the known faults.
         version: the running version.
         unhandled: known faults, with the cells that the running version uses.
-        accuracy, fault_free_accuracy: of the running version, under the known faults and without; None if not measured.
+        accuracy, fault_free_accuracy: of the running version, under the known faults and without;
+        None if not measured.
         reason: of the last maintenance run, while the same version runs; otherwise empty.
     """
 
@@ -73,18 +64,19 @@ class SensorState:
     @classmethod
     def of(cls, bundle: Bundle) -> SensorState:
         """Return the state of the sensor of a bundle; raises Damaged."""
-        known, version, runs = bundle.known_faults(), bundle.active(), bundle.journal.runs()
+        known = bundle.known_faults()
+        version = bundle.active()
+        runs = bundle.journal.runs()
         faulty = known.fault_set
         cells = unhandled_cells(bundle, faulty, version)
         unhandled = tuple(fault for fault in known.faults if cells & set(fault.cells))
         accuracy, free = _measured(runs, faulty, version.number)
-        code = 2 if unhandled else int(bool(faulty))
-        if accuracy is not None and free is not None and accuracy < TECHNICIAN_BELOW * free:
-            code = 2
+        code = max(of_known(faulty, cells), of_accuracy(accuracy, free))
         last = next((run for run in reversed(runs) if run["what"] != "confirmed"), None)
         reason = ""
         if last is not None and last.get("version") == version.number and "exit_code" in last:
-            code, reason = max(code, last["exit_code"]), last["reason"]
+            code = max(code, last["exit_code"])
+            reason = last["reason"]
         return cls(code, known, version, unhandled, accuracy, free, reason)
 
     @property
@@ -93,17 +85,29 @@ class SensorState:
         return weak_base(self.accuracy, self.fault_free_accuracy)
 
 
-def _measured(runs: list[dict[str, Any]], faulty: FaultSet, version: int) -> tuple[float | None, float | None]:
+def _measured(
+    runs: list[dict[str, Any]], faulty: FaultSet, version: int
+) -> tuple[float | None, float | None]:
     """Return accuracy and fault-free accuracy of a version in the last run that measured it.
 
-    After a rollback this is the run that deployed the version that was left: it was compared with this one.
+    After a rollback this is the run that deployed the version that was left: it was compared with
+    this one.
     """
     before: dict[str, Any] = {}
     for run in reversed(runs):
         if run.get("accuracy") is not None and run["version"] == version:
             return run["accuracy"], run["fault_free_accuracy"]
-        left = run["what"] == "deployed" and before.get("what") == "rollback" and before.get("from") == run["version"]
-        if left and before["to"] == version and run["fault_set"] == list(faulty) and run.get("judgement"):
+        left = (
+            run["what"] == "deployed"
+            and before.get("what") == "rollback"
+            and before.get("from") == run["version"]
+        )
+        if (
+            left
+            and before["to"] == version
+            and run["fault_set"] == list(faulty)
+            and run.get("judgement")
+        ):
             return run["judgement"]["running"], run["fault_free_accuracy"]
         if run["what"] != "confirmed":
             before = run

@@ -1,4 +1,5 @@
-"""The technician's report: one self-contained HTML file about a robot's sensor and its running version."""
+"""The technician's report: one self-contained HTML file about a robot's sensor and its running
+version."""
 
 from __future__ import annotations
 
@@ -8,9 +9,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from adaptfault.bundle.bundle import Bundle
+from adaptfault.bundle.pointer import Pointer
 from adaptfault.evaluation.html_page import Picture, render, version_of
-from adaptfault.robot.bundle import Bundle
-from adaptfault.robot.pointer import Pointer
 from adaptfault.robot.sensor_state import SensorState, unhandled_cells
 from diagnostics import Diagnosis
 
@@ -52,7 +53,8 @@ def write_report(
     if diagnosis is None:
         diagnosed = [one["diagnosis"] for one in runs if one.get("diagnosis")]
         diagnosis = Diagnosis.from_dict(diagnosed[-1]) if diagnosed else None
-    state, problems = SensorState.of(bundle), bundle.problems(repair=False)
+    state = SensorState.of(bundle)
+    problems = bundle.problems(repair=False)
     if run is not None:
         state = _state_after(run, bundle, state)
     headline = _HEADLINES[state.exit_code]
@@ -87,7 +89,8 @@ def write_report(
 
 
 def robot_name(bundle: Path) -> str:
-    """Return the name of a bundle, or of the folder that holds it where the bundle is called robot.bundle."""
+    """Return the name of a bundle, or of the folder that holds it where the bundle is called
+    robot.bundle."""
     path = bundle.resolve()
     return path.parent.name if path.stem == "robot" and path.parent.name else path.stem
 
@@ -98,7 +101,9 @@ def _state_after(run: MaintenanceReport, bundle: Bundle, state: SensorState) -> 
     if run.dry_run:
         cells = unhandled_cells(bundle, run.fault_set, state.version)
         handled = run.decision == "deployed" or run.exit_code < 2
-        unhandled = () if handled else tuple(fault for fault in run.faults if cells & set(fault.cells))
+        unhandled = (
+            () if handled else tuple(fault for fault in run.faults if cells & set(fault.cells))
+        )
     measured = run.accuracy is not None
     return replace(
         state,

@@ -14,7 +14,9 @@ def main() -> None:
     try:
         import rclpy  # noqa: F401
     except ImportError as error:
-        mend = "source /opt/ros/<distro>/setup.bash, or on Python 3.11 pip install 'adaptfault[ros2]'"
+        mend = (
+            "source /opt/ros/<distro>/setup.bash, or on Python 3.11 pip install 'adaptfault[ros2]'"
+        )
         print(f"no ROS 2 here ({error}): {mend}", file=sys.stderr)
         sys.exit(3)
     from adaptfault.ros2.node import run

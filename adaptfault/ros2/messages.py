@@ -1,4 +1,5 @@
-"""Message types by name, their arrays of numbers, and DiagnosticArrays. Needs the packages of the messages."""
+"""Message types by name, their arrays of numbers, and DiagnosticArrays. Needs the packages of the
+messages."""
 
 from __future__ import annotations
 
@@ -7,7 +8,11 @@ from collections.abc import Iterable, Mapping
 from importlib import import_module
 from typing import Any
 
-_NUMBERS = {"float", "double", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
+_NUMBERS = {
+    "float",
+    "double",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+}
 _SEQUENCE = re.compile(r"sequence<(.+?)(?:, \d+)?>|(.+)\[\d+\]")
 
 
@@ -22,7 +27,8 @@ def message_type(name: str) -> Any:
         return getattr(import_module(f"{package}.msg"), kind)
     except (ImportError, AttributeError, ValueError, TypeError):
         raise ValueError(
-            f"topic_type {name!r}: there is no such message; name one as sensor_msgs/msg/Image, of a sourced package"
+            f"topic_type {name!r}: there is no such message; name one as sensor_msgs/msg/Image, of"
+            " a sourced package"
         ) from None
 
 
@@ -75,7 +81,9 @@ def diagnostics_message(content: Mapping[str, Any]) -> Any:
     statuses = []
     for one in content["status"]:
         pairs = [KeyValue(**pair) for pair in one["values"]]
-        statuses.append(DiagnosticStatus(**{**one, "level": bytes([one["level"]]), "values": pairs}))
+        statuses.append(
+            DiagnosticStatus(**{**one, "level": bytes([one["level"]]), "values": pairs})
+        )
     return DiagnosticArray(
         header=Header(stamp=Time(**header["stamp"]), frame_id=header["frame_id"]),
         status=statuses,

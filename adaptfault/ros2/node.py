@@ -15,7 +15,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from adaptfault.data.recordings.message_arrays import arrays_at, join, put
+from adaptfault.data.recordings.formats.message_arrays import arrays_at, join, put
 from adaptfault.ros2.messages import choose_field, diagnostics_message, message_type, stamp_of
 from adaptfault.ros2.parameters import DEFAULTS, Parameters, quoted
 from adaptfault.ros2.sensor import Follower
@@ -27,9 +27,11 @@ _DEPTH = 50  # frames that may wait to be restored; a longer queue would only ma
 
 
 class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
-    """Monitors a topic of tactile frames, publishes their faults on /diagnostics, and whole frames on another topic.
+    """Monitors a topic of tactile frames, publishes their faults on /diagnostics, and whole frames
+    on another topic.
 
-    A best-effort subscription takes frames of every publisher. A reliable publisher serves every subscriber.
+    A best-effort subscription takes frames of every publisher. A reliable publisher serves every
+    subscriber.
 
     Raises:
         ValueError: a parameter has no value of its type.
@@ -38,7 +40,10 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
     def __init__(self) -> None:
         super().__init__(NAME)
         any_type = ParameterDescriptor(dynamic_typing=True, read_only=True)
-        values = {name: self.declare_parameter(name, value, any_type).value for name, value in DEFAULTS.items()}
+        values = {
+            name: self.declare_parameter(name, value, any_type).value
+            for name, value in DEFAULTS.items()
+        }
         self.parameters = Parameters.from_values(values)
         self._publishers_made: list[Any] = []
         self._subscription: Any = None
@@ -68,8 +73,12 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
         self._whole = None
         if sensor.restorer is not None:
             if self.resolve_topic_name(given.restored) == topic:
-                raise ValueError(f"topic and restored are both {given.topic}: restored frames would come back")
-            self._whole = self.create_lifecycle_publisher(self._type, given.restored, QoSProfile(depth=_DEPTH))
+                raise ValueError(
+                    f"topic and restored are both {given.topic}: restored frames would come back"
+                )
+            self._whole = self.create_lifecycle_publisher(
+                self._type, given.restored, QoSProfile(depth=_DEPTH)
+            )
             self._publishers_made.append(self._whole)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -78,7 +87,9 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
         qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.watch.begin()
         self._timer = self.create_timer(1.0, self._each_second)
-        self._subscription = self.create_subscription(self._type, self.parameters.topic, self._take, qos)
+        self._subscription = self.create_subscription(
+            self._type, self.parameters.topic, self._take, qos
+        )
         return done
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -122,7 +133,8 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
         self._taken = True
 
     def spin(self) -> None:
-        """Restore frames as they come, and monitor them in between; raises ExternalShutdownException at the end."""
+        """Restore frames as they come, and monitor them in between; raises
+        ExternalShutdownException at the end."""
         executor = rclpy.get_global_executor()
         executor.add_node(self)
         while True:
@@ -137,16 +149,22 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
         sensor = self._follower.poll()
         if sensor is not None:
             self.watch.switch(sensor)
-            self.get_logger().info(f"{sensor.version} of the bundle, {len(sensor.known)} known faulty cells")
+            self.get_logger().info(
+                f"{sensor.version} of the bundle, {len(sensor.known)} known faulty cells"
+            )
         if self.watch.left_out:
-            what = f"monitoring is behind: {self.watch.left_out} frames were restored and not monitored"
+            what = (
+                f"monitoring is behind: {self.watch.left_out} frames were restored and not"
+                " monitored"
+            )
             self.get_logger().warning(what, throttle_duration_sec=10.0)
         now = self.get_clock().now().nanoseconds / 1e9
         self._diagnostics.publish(diagnostics_message(self.watch.diagnostics(now)))
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the node until it is shut down; return the exit code, 3 for parameters or a bundle that cannot be used."""
+    """Run the node until it is shut down; return the exit code, 3 for parameters or a bundle that
+    cannot be used."""
     rclpy.init(args=quoted(arguments))
     try:
         try:

@@ -1,7 +1,9 @@
-"""The parameters of the node, and what they are when YAML read their text as another type. Needs no ROS.
+"""The parameters of the node, and what they are when YAML read their text as another type. Needs no
+ROS.
 
-A ROS parameter is YAML: ``-p unit:=N`` is a bool, ``-p full_scale:=5`` an integer. On the command line the text is
-still there, and is put in quotes where text is expected (:func:`quoted`). Values of a parameter file are converted.
+A ROS parameter is YAML: ``-p unit:=N`` is a bool, ``-p full_scale:=5`` an integer. On the command
+line the text is still there, and is put in quotes where text is expected (:func:`quoted`). Values
+of a parameter file are converted.
 """
 
 from __future__ import annotations
@@ -25,11 +27,12 @@ class Parameters:
     Attributes:
         topic: of the frames.
         topic_type: of its messages, as "sensor_msgs/msg/Image".
-        field: the array of numbers in a message that holds the readings, dotted, as "sensors.values"; "" = the only
-            one.
-        bundle: folder of ``adaptfault train --out X.bundle``: layout, healthy model, calibration, known faults, and how
-            the active version undoes exchanged wires and replaced pads.
-        trust: PEM file of the public key that must have signed the bundle; "" = signatures are not checked.
+        field: the array of numbers in a message that holds the readings, dotted, as
+            "sensors.values"; "" = the only one.
+        bundle: folder of ``adaptfault train --out X.bundle``: layout, healthy model, calibration,
+            known faults, and how the active version undoes exchanged wires and replaced pads.
+        trust: PEM file of the public key that must have signed the bundle; "" = signatures are not
+            checked.
         restored: topic of the restored frames; "" = none. Needs a bundle.
         layout: without a bundle: a layout file, or a shape as 2x11x10.
         full_scale, unit, rate: override those of ``layout``; 0 and "" keep them.
@@ -59,7 +62,9 @@ class Parameters:
         Raises:
             ValueError: a value cannot be converted to the type of its parameter.
         """
-        given = {name: _converted(name, value) for name, value in values.items() if value is not None}
+        given = {
+            name: _converted(name, value) for name, value in values.items() if value is not None
+        }
         return cls(**given)
 
 
@@ -67,7 +72,8 @@ DEFAULTS: dict[str, Any] = {field.name: field.default for field in fields(Parame
 
 
 def quoted(arguments: Sequence[str]) -> list[str]:
-    """Return command line arguments with the values of text parameters in quotes, so that YAML reads them as text.
+    """Return command line arguments with the values of text parameters in quotes, so that YAML
+    reads them as text.
 
     Args:
         arguments: as ``["--ros-args", "-p", "unit:=N"]``; what is in quotes already stays.

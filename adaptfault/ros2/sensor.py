@@ -1,4 +1,5 @@
-"""What the node knows of its sensor: from the bundle, and again after each maintenance run. Needs no ROS."""
+"""What the node knows of its sensor: from the bundle, and again after each maintenance run. Needs
+no ROS."""
 
 from __future__ import annotations
 
@@ -10,17 +11,17 @@ from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
+from adaptfault.bundle.pointer import file_stamp
 from adaptfault.data.recordings import parse_shape, read_layout
-from adaptfault.data.recordings.layout_file import looks_like_shape
-from adaptfault.robot.pointer import file_stamp
+from adaptfault.data.recordings.facts.layout_file import looks_like_shape
 from adaptfault.ros2.parameters import Parameters
 from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
+    from adaptfault.bundle.bundle import Bundle
+    from adaptfault.bundle.versions import Version
     from adaptfault.data.calibration import Calibration
     from adaptfault.imputation.restorer import Restorer
-    from adaptfault.robot.bundle import Bundle
-    from adaptfault.robot.versions import Version
 
 _RETRY = 60.0  # seconds until the next attempt after the bundle could not be read
 _STATED = ("full_scale", "unit", "rate")
@@ -35,7 +36,8 @@ class Sensor:
     Attributes:
         diagnoser: with the healthy reference of the bundle, or without one.
         known: cells that are faulty whatever a monitor finds.
-        version: the active one of the bundle, which undoes exchanged wires and replaced pads; None without a bundle.
+        version: the active one of the bundle, which undoes exchanged wires and replaced pads; None
+            without a bundle.
         restorer: fitted on the healthy windows of the bundle; None: no frame is restored.
         calibration: from received values to the layout's unit; None: they are in that unit.
         parts: hashes of the files of the bundle that no maintenance changes.
@@ -63,15 +65,21 @@ class Sensor:
         """Return the sensor of the bundle, or of the layout.
 
         Raises:
-            ValueError: neither bundle nor layout, or both; a bundle that is damaged or not signed by the trusted key.
+            ValueError: neither bundle nor layout, or both; a bundle that is damaged or not signed
+                by the trusted key.
             OSError: bundle or layout cannot be read.
         """
         if bool(parameters.bundle) == bool(parameters.layout):
-            raise ValueError("give the parameter bundle, or the parameter layout (a layout file or a shape as 2x11x10)")
+            raise ValueError(
+                "give the parameter bundle, or the parameter layout (a layout file or a shape as"
+                " 2x11x10)"
+            )
         stated = {name: getattr(parameters, name) for name in _STATED if getattr(parameters, name)}
         if parameters.bundle:
             if stated:
-                raise ValueError(f"the bundle states {' and '.join(stated)}; leave the parameter out")
+                raise ValueError(
+                    f"the bundle states {' and '.join(stated)}; leave the parameter out"
+                )
             return cls._from_bundle(_open(parameters), restores=bool(parameters.restored))
         text = parameters.layout
         layout = SensorLayout(*parse_shape(text)) if looks_like_shape(text) else read_layout(text)
@@ -125,7 +133,8 @@ class Follower:
     """
 
     def __init__(self, parameters: Parameters, clock: Callable[[], float] = monotonic) -> None:
-        self.parameters, self.clock = parameters, clock
+        self.parameters = parameters
+        self.clock = clock
         self._stamp = self._look()
         self.sensor = Sensor.from_parameters(parameters)
         self._next_look = clock()
@@ -156,8 +165,8 @@ class Follower:
 
     def _look(self) -> tuple[object, ...]:
         """Return what changes where a version is deployed, or known faults are written."""
-        from adaptfault.robot.journal import NAME as JOURNAL
-        from adaptfault.robot.pointer import NAME as POINTER
+        from adaptfault.bundle.journal import NAME as JOURNAL
+        from adaptfault.bundle.pointer import NAME as POINTER
 
         home = Path(self.parameters.bundle)
         return tuple(file_stamp(home / name) for name in (POINTER, JOURNAL))
@@ -168,10 +177,14 @@ class Follower:
         except Exception as error:  # whatever it is, the node goes on with what it has
             self._stamp = ()
             self._next_look = self.clock() + _RETRY
-            _log.warning("%s could not be read, the node goes on as before: %s", self.parameters.bundle, error)
+            _log.warning(
+                "%s could not be read, the node goes on as before: %s",
+                self.parameters.bundle,
+                error,
+            )
 
 
 def _open(parameters: Parameters) -> Bundle:
-    from adaptfault.robot.bundle import Bundle
+    from adaptfault.bundle.bundle import Bundle
 
     return Bundle.open(parameters.bundle, keys=[parameters.trust] if parameters.trust else None)

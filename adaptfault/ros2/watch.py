@@ -1,4 +1,5 @@
-"""The work of the node: restores frames, monitors them, and states their diagnosis. Needs no ROS."""
+"""The work of the node: restores frames, monitors them, and states their diagnosis. Needs no
+ROS."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from adaptfault.acquisition import FrameRepair
 from adaptfault.acquisition.ros import Level, diagnostic_array, stale_array
-from adaptfault.robot.converter_range import within_range
+from adaptfault.inspection.converter_range import within_range
 from adaptfault.ros2.sensor import Sensor
 from diagnostics import Diagnosis, Fault, FaultSet, Monitor
 
@@ -21,7 +22,8 @@ SILENCE = 2.0  # seconds without a frame, after which everything is STALE; at le
 _PERIODS = 5
 WAITING = 1000  # most frames that wait to be monitored; fewer of large arrays:
 _BYTES = 16_000_000
-DIAGNOSED = 10.0  # seconds between two diagnoses of all cells; the last one is published every second
+# seconds between two diagnoses of all cells; the last one is published every second
+DIAGNOSED = 10.0
 _RATED = 5.0  # seconds over which the rate is counted, at least so many frames:
 _FEWEST = 10
 
@@ -43,7 +45,9 @@ class Watch:
         hardware_id: str = "tactile",
         clock: Callable[[], float] = monotonic,
     ) -> None:
-        self.name, self.hardware_id, self.clock = name, hardware_id, clock
+        self.name = name
+        self.hardware_id = hardware_id
+        self.clock = clock
         self.sensor = sensor
         self.layout = sensor.layout
         self.faulty = np.zeros(self.layout.n_cells, bool)  # as the monitor finds
@@ -66,10 +70,12 @@ class Watch:
         self._diagnosed = -np.inf
 
     def switch(self, sensor: Sensor) -> None:
-        """Go on with what a maintenance run wrote: known faults, and how readings reach their cells."""
+        """Go on with what a maintenance run wrote: known faults, and how readings reach their
+        cells."""
         before = self.sensor
         self.sensor = sensor
-        if before.parts != sensor.parts or before.readings != sensor.readings:  # the frames so far read otherwise
+        # the frames so far read otherwise
+        if before.parts != sensor.parts or before.readings != sensor.readings:
             self.faulty[:] = False
             self.monitor = Monitor(sensor.diagnoser)
             self._monitored = False
@@ -86,7 +92,9 @@ class Watch:
         if self.repair is None or received.size != self.layout.n_cells:
             return None
         readings = within_range(self._readings(received), self.layout)[0]
-        whole, _, _ = self.repair.in_place(received, readings, self.sensor.version, self.sensor.calibration)
+        whole, _, _ = self.repair.in_place(
+            received, readings, self.sensor.version, self.sensor.calibration
+        )
         return whole
 
     def put(self, received: NDArray[np.float64], time: float | None = None) -> None:
@@ -116,7 +124,8 @@ class Watch:
         return bool(self._waiting)
 
     def work(self) -> tuple[Fault, ...]:
-        """Monitor the frame that waits longest, if one waits; return the faults that are new, changed or gone."""
+        """Monitor the frame that waits longest, if one waits; return the faults that are new,
+        changed or gone."""
         if not self._waiting:
             return ()
         received, time = self._waiting.popleft()
@@ -134,8 +143,8 @@ class Watch:
     def diagnostics(self, stamp: float) -> dict[str, Any]:
         """Return the content of the DiagnosticArray to publish now.
 
-        Before the first frame everything is WARN in a time of grace, then STALE. Later everything is STALE after 2 s
-        without a frame.
+        Before the first frame everything is WARN in a time of grace, then STALE. Later everything
+        is STALE after 2 s without a frame.
 
         Args:
             stamp: seconds since 1970.
@@ -169,7 +178,9 @@ class Watch:
 
     def _readings(self, received: NDArray[np.float64]) -> NDArray[np.float64]:
         calibration = self.sensor.calibration
-        return received if calibration is None else calibration.apply(received)[0].astype(np.float64)
+        return (
+            received if calibration is None else calibration.apply(received)[0].astype(np.float64)
+        )
 
     def _repair(self) -> FrameRepair | None:
         restorer = self.sensor.restorer

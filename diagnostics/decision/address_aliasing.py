@@ -1,9 +1,10 @@
 """Address aliasing: the cause of pairs of lines that read the same.
 
-Detects a stuck address bit (pairs whose indices differ in one bit), a bridge of two neighbouring lines, and one line
-read twice. A bit explains several pairs with one fault and is preferred; it is refuted when another pair of the same
-bit differs later. The level of a bit follows from the log ratio of the plausibility of the lines that it leaves intact,
-under the healthy model; below 3 both levels are reported. Lines that nothing loads are not detected here.
+Detects a stuck address bit (pairs whose indices differ in one bit), a bridge of two neighbouring
+lines, and one line read twice. A bit explains several pairs with one fault and is preferred; it is
+refuted when another pair of the same bit differs later. The level of a bit follows from the log
+ratio of the plausibility of the lines that it leaves intact, under the healthy model; below 3 both
+levels are reported. Lines that nothing loads are not detected here.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.faults import Fault, FaultKind
-from diagnostics.layout import Line, address_bits
+from diagnostics.layout import address_bits
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, SUSPICIOUS
+from diagnostics.wiring import Line
 
 if TYPE_CHECKING:
     from diagnostics.evidence.duplicate_lines import DuplicatePair
@@ -26,44 +28,68 @@ Cells = NDArray[np.intp]
 
 
 def find_aliasing(stream: StreamState) -> tuple[list[Fault], NDArray[np.bool_]]:
-    """Return the causes of all lines that read the same, and the cells that are or may be misread, bool ``[D]``."""
+    """Return the causes of all lines that read the same, and the cells that are or may be misread,
+    bool ``[D]``."""
     pairs = stream.duplicates.duplicate_pairs(stream.reference.duplicates)
-    faults, misread = list[Fault](), np.zeros(stream.layout.n_cells, bool)
+    faults = list[Fault]()
+    misread = np.zeros(stream.layout.n_cells, bool)
     for of in sorted({(pair.pad, pair.kind) for pair in pairs}):
-        for fault, cells in _on_pad([pair for pair in pairs if (pair.pad, pair.kind) == of], stream):
+        for fault, cells in _on_pad(
+            [pair for pair in pairs if (pair.pad, pair.kind) == of], stream
+        ):
             faults.append(fault)
             misread[cells] = True
     return faults, misread
 
 
 def _on_pad(pairs: list[DuplicatePair], stream: StreamState) -> Iterator[tuple[Fault, Cells]]:
-    """Yield the causes of pairs of rows, or of columns, of one pad, each with the cells that it may misread."""
-    layout, pad, kind = stream.layout, pairs[0].pad, pairs[0].kind
+    """Yield the causes of pairs of rows, or of columns, of one pad, each with the cells that it may
+    misread."""
+    layout = stream.layout
+    pad = pairs[0].pad
+    kind = pairs[0].kind
     count = layout.rows if kind == "row" else layout.cols
     for bit in range(address_bits(count)):
-        joined = [(i, i | 1 << bit) for i in range(count) if not i & 1 << bit and (i | 1 << bit) < count]
+        joined = [
+            (i, i | 1 << bit) for i in range(count) if not i & 1 << bit and (i | 1 << bit) < count
+        ]
         by_bit = [pair for pair in pairs if (pair.first, pair.second) in joined]
         if not by_bit:
             continue
-        onset = max(stream.duplicates.apart_since(pad, kind, first, second) for first, second in joined)
-        # The bit was stuck when the first pair agreed, so no other pair of this bit may differ after that.
+        onset = max(
+            stream.duplicates.apart_since(pad, kind, first, second) for first, second in joined
+        )
+        # The bit was stuck when the first pair agreed, so no other pair of this bit may differ
+        # after that.
         refuted = onset > min(pair.seen_by for pair in by_bit)
         # A single pair of neighbours is rather bridged: bit 0 would join all of them.
         if refuted or (len(by_bit) == 1 and bit == 0 and len(joined) > 1):
             continue
         pairs = [pair for pair in pairs if pair not in by_bit]
-        yield _stuck_bit(Line(pad, "row_address" if kind == "row" else "column_address", bit), by_bit, onset, stream)
+        yield _stuck_bit(
+            Line(pad, "row_address" if kind == "row" else "column_address", bit),
+            by_bit,
+            onset,
+            stream,
+        )
     for pair in pairs:
-        line, other = Line(pad, kind, pair.first), Line(pad, kind, pair.second)
+        line = Line(pad, kind, pair.first)
+        other = Line(pad, kind, pair.second)
         cells = np.concatenate([layout.cells_on(line), layout.cells_on(other)])
         text = f"{line} and {kind} {other.index} are bridged: both always read the same"
         check = f"the solder and the flex cable between {kind}s {line.index} and {other.index}"
         also = (f"{line} reads {other}, or the other way round: an address fault of this one line",)
-        yield _fault(line, other.index, cells, pair.since, [pair], text, check, also, layout.rate), cells
+        yield (
+            _fault(line, other.index, cells, pair.since, [pair], text, check, also, layout.rate),
+            cells,
+        )
 
 
-def _stuck_bit(line: Line, pairs: list[DuplicatePair], onset: int, stream: StreamState) -> tuple[Fault, Cells]:
-    """Return the fault of an address bit, and the cells that it may misread: at either level if that is in doubt."""
+def _stuck_bit(
+    line: Line, pairs: list[DuplicatePair], onset: int, stream: StreamState
+) -> tuple[Fault, Cells]:
+    """Return the fault of an address bit, and the cells that it may misread: at either level if
+    that is in doubt."""
     layout = stream.layout
     ratio = _level_ratio(line, onset, stream)
     level = int(ratio > 0)
@@ -75,11 +101,15 @@ def _stuck_bit(line: Line, pairs: list[DuplicatePair], onset: int, stream: Strea
         moved = layout.position(cell)[across]
         # A position without a cell reads nothing, its line is read still.
         copies[moved] = max(read, copies.get(moved, -1))
-    reads = ", ".join(f"{name} {i} reads {f'{name} {j}' if j >= 0 else 'nothing'}" for i, j in sorted(copies.items()))
+    reads = ", ".join(
+        f"{name} {i} reads {f'{name} {j}' if j >= 0 else 'nothing'}"
+        for i, j in sorted(copies.items())
+    )
     clear = abs(ratio) >= SUSPICIOUS
     also = () if clear else (f"{line} is stuck at {1 - level}",)
     misread = cells if clear else np.union1d(cells, layout.misaddressed(line, 1 - level)[0])
-    text, check = f"{line} is stuck at {level}: {reads}", f"the {name} multiplexer and its address wires"
+    text = f"{line} is stuck at {level}: {reads}"
+    check = f"the {name} multiplexer and its address wires"
     return _fault(line, level, cells, onset, pairs, text, check, also, layout.rate), misread
 
 
@@ -94,7 +124,8 @@ def _fault(
     alternatives: tuple[str, ...],
     rate: float,
 ) -> Fault:
-    """Return the fault with its reason: ``text``, since when, how often the lines agreed, and what to ``check``."""
+    """Return the fault with its reason: ``text``, since when, how often the lines agreed, and what
+    to ``check``."""
     coincidences = sum(pair.coincidences for pair in pairs)
     by_chance = -sum(pair.coincidences * np.log2(pair.chance) for pair in pairs)  # in bits
     since = "" if onset == 0 else f" from frame {onset} on ({onset / rate:.1f} s)"
@@ -114,13 +145,15 @@ def _fault(
 def _level_ratio(line: Line, onset: int, stream: StreamState) -> float:
     """Return the log ratio of a bit stuck at 1 against stuck at 0.
 
-    Each level leaves other lines intact; the ratio compares their pseudo-likelihoods under the healthy model.
+    Each level leaves other lines intact; the ratio compares their pseudo-likelihoods under the
+    healthy model.
     """
     layout = stream.layout
     ratio = 0.0
     for level, sign in ((0, -1.0), (1, 1.0)):
         wrong, sources = layout.misaddressed(line, level)
-        intact, empty = np.unique(sources[sources >= 0]), wrong[sources < 0]
+        intact = np.unique(sources[sources >= 0])
+        empty = wrong[sources < 0]
         predictors = stream.present.copy()
         predictors[wrong] = False
         loaded = False

@@ -1,22 +1,26 @@
-"""Calibration: log likelihood ratios to probabilities, fitted on faults injected into the fault-free recordings.
+"""Calibration: log likelihood ratios to probabilities, fitted on faults injected into the
+fault-free recordings.
 
-Estimates, for each of three kinds of constant cells (never moved; came to rest; came to hold a load),
+Estimates, for each of three kinds of constant cells (never moved; came to rest; came to hold a
+load),
 
     log odds = logit(prevalence) + a q + b spatial + d temporal
 
-Raw ratios are overconfident, because events are few and correlated and models err at edges of objects. The reference is
-split; models of one part diagnose logs made of the other part, with known faults. Equals Platt scaling (Platt 1999),
-scikit-learn's ``CalibratedClassifierCV(method="sigmoid")``, with the default weights as prior means of b and d. q is 1;
-in a cold start it is 0 for cells of which no event tells anything: these keep their prior. The prevalence is not
-calibrated: it is estimated from each log by expectation maximisation (Saerens et al. 2002). The faulty set is the
-largest one whose expected false discovery rate meets the limit (:func:`faulty_at`). Faults unlike the injected ones are
-calibrated as well as these only by assumption.
+Raw ratios are overconfident, because events are few and correlated and models err at edges of
+objects. The reference is split; models of one part diagnose logs made of the other part, with known
+faults. Equals Platt scaling (Platt 1999), scikit-learn's
+``CalibratedClassifierCV(method="sigmoid")``, with the default weights as prior means of b and d. q
+is 1; in a cold start it is 0 for cells of which no event tells anything: these keep their prior.
+The prevalence is not calibrated: it is estimated from each log by expectation maximisation (Saerens
+et al. 2002). The faulty set is the largest one whose expected false discovery rate meets the limit
+(:func:`faulty_at`). Faults unlike the injected ones are calibrated as well as these only by
+assumption.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -31,21 +35,32 @@ from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.calibration_subset import calibration_subset
 from diagnostics.healthy.cross_fitting import FOLDS
-from diagnostics.preprocessing.levels import EXPECTED, EXPECTED_CELLS, EXPECTED_LATE, FEWEST, SUSPICIOUS
+from diagnostics.preprocessing.levels import (
+    EXPECTED,
+    EXPECTED_CELLS,
+    EXPECTED_LATE,
+    FEWEST,
+    SUSPICIOUS,
+)
 from diagnostics.simulation.injection import inject
 
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
-_LOGS, _LOGS_OF_LARGE = 192, 32  # simulated logs: sizes; large arrays have more cells in each
+# simulated logs: sizes; large arrays have more cells in each
+_LOGS = 192
+_LOGS_OF_LARGE = 32
 _LOG_SIZES = 1 << np.arange(4)  # recordings in each, in turn
 _DEAD_SHARES = 0.04 * _LOG_SIZES  # of the cells, in turn
 _ENOUGH = 100  # recordings that are held out in all, over the splits
 _FEW = 32  # recordings: fewer are cut into pieces, so that one long recording can be split
 _PIECE = 100  # frames of a piece, at least
-_REFERENCE_TIME = 50  # of fitting a reference, in diagnoses of a simulated log; for the progress only
+# of fitting a reference, in diagnoses of a simulated log; for the progress only
+_REFERENCE_TIME = 50
 _MOST_FRAMES = 600  # of a recording in one simulated log: a size
-_MAX_DISCOUNT, _HALF_DISCOUNT = 0.5, 22.0  # of the slopes; recordings held out that halve it (one split)
+# of the slopes; recordings held out that halve it (one split)
+_MAX_DISCOUNT = 0.5
+_HALF_DISCOUNT = 22.0
 _PRIOR_VARIANCE = 10.0  # of the weights
 _CLIP = 6.0  # raw log ratios are clipped here for the fit: outliers must not steer the slope
 
@@ -53,7 +68,8 @@ Floats = NDArray[np.float64]
 
 
 class _Trial(NamedTuple):
-    """Evidence of the constant cells of a simulated log, ``[n]`` each, and of drift of the working cells."""
+    """Evidence of the constant cells of a simulated log, ``[n]`` each, and of drift of the working
+    cells."""
 
     kind: NDArray[np.intp]
     ratio: Floats
@@ -65,7 +81,8 @@ class _Trial(NamedTuple):
 
 @dataclass(frozen=True)
 class Calibrator:
-    """Calibrated log ratio of each kind of constant cell; the defaults are those of too few recordings to fit any.
+    """Calibrated log ratio of each kind of constant cell; the defaults are those of too few
+    recordings to fit any.
 
     Kind 0 never moved in the log, kind 1 came to rest, kind 2 came to hold a load.
 
@@ -81,13 +98,14 @@ class Calibrator:
     slope: tuple[float, ...] = (0.6, 0.6, 0.6)
     temporal: tuple[float, ...] = (1.0, 0.5, 0.5)
     gains: float = 1.0
-    baselines: float = field(default=1.0, metadata={"newer": True})
+    baselines: float = 1.0
 
     @classmethod
     def cold(cls) -> Calibrator:
         """Return the calibration of a cold start; kind 3 never moved and holds a load.
 
-        That of kind 0 is fitted to simulated grasps and postures (``benchmarks/cold_calibration.py``).
+        That of kind 0 is fitted to simulated grasps and postures
+        (``benchmarks/cold_calibration.py``).
         """
         return cls((-1.4, -1.0, -1.0, 0.0), (1.0, 0.6, 0.6, 0.6), (1.0, 0.5, 0.5, 1.0))
 
@@ -111,7 +129,9 @@ class Calibrator:
         recordings = [
             piece
             for i in rng.permutation(len(recordings)).tolist()
-            for piece in np.array_split(recordings[i], np.clip(len(recordings[i]) // _PIECE, 1, cuts))
+            for piece in np.array_split(
+                recordings[i], np.clip(len(recordings[i]) // _PIECE, 1, cuts)
+            )
         ]
         if len(recordings) < FEWEST:
             return cls()
@@ -136,17 +156,21 @@ class Calibrator:
             share = float(_DEAD_SHARES[i // len(_LOG_SIZES) % len(_DEAD_SHARES)])
             onset = int(rng.uniform(0, 0.8) * len(log)) if i % 2 else None
             logs.append((log, _random_faults(layout, share, onset, rng), layout, references[turn]))
-        # Evidence depends on the exclusion threshold and that on the calibration: fit roughly, then with all logs.
+        # Evidence depends on the exclusion threshold and that on the calibration: fit roughly, then
+        # with all logs.
         weights = default = cls()
         done = _REFERENCE_TIME * turns
         for n in stages:
             trials = []
             for simulated in logs[:n]:
-                trials.append(_trial(*simulated, weights.exclusion._replace(baselines=1.0, gains=1.0)))
+                trials.append(
+                    _trial(*simulated, weights.exclusion._replace(baselines=1.0, gains=1.0))
+                )
                 done += 1
                 progress(done / n_steps)
             weights = cls._of(trials)
-        # Few held-out recordings contain few unusual events; repeated splits are correlated and count for less.
+        # Few held-out recordings contain few unusual events; repeated splits are correlated and
+        # count for less.
         counts = 1 - _MAX_DISCOUNT / (1 + turns * (held_out / _HALF_DISCOUNT) ** 2)
         measured = np.array(weights.slope) != default.slope
         slope = np.where(measured, counts * np.array(weights.slope), weights.slope)
@@ -162,7 +186,8 @@ class Calibrator:
         default = cls()
         found = list(zip(default.offset, default.slope, default.temporal, strict=True))
         for k in range(len(found)):
-            of, same_origin = kind == k, (kind > 0) == (k > 0)
+            of = kind == k
+            same_origin = (kind > 0) == (k > 0)
             if min(dead[of].sum(), (~dead[of]).sum()) >= FEWEST:
                 base = float(logit(dead[same_origin].mean()))
                 found[k] = _bounded_logistic(evidence[of], dead[of], base, found[k][1:])
@@ -172,11 +197,18 @@ class Calibrator:
 
     @property
     def exclusion(self) -> Exclusion:
-        """The raw log ratio from which on a cell is excluded from the predictors, and the factors of drift."""
-        return Exclusion((SUSPICIOUS - self.offset[0]) / max(self.slope[0], 1e-9), self.baselines, self.gains)
+        """The raw log ratio from which on a cell is excluded from the predictors, and the factors
+        of drift."""
+        return Exclusion(
+            (SUSPICIOUS - self.offset[0]) / max(self.slope[0], 1e-9), self.baselines, self.gains
+        )
 
     def calibrate(
-        self, ratio: Floats, temporal: Floats, kind: NDArray[np.intp], tested: NDArray[np.bool_] | bool = True
+        self,
+        ratio: Floats,
+        temporal: Floats,
+        kind: NDArray[np.intp],
+        tested: NDArray[np.bool_] | bool = True,
     ) -> Floats:
         """Return the calibrated log likelihood ratio faulty : healthy, ``[D]``.
 
@@ -187,11 +219,15 @@ class Calibrator:
             tested: bool ``[D]``, of which cells the events tell anything, q.
         """
         known = np.where(kind < len(self.slope), kind, 0)
-        offset, slope, share = (np.array(of)[known] for of in (self.offset, self.slope, self.temporal))
+        offset, slope, share = (
+            np.array(of)[known] for of in (self.offset, self.slope, self.temporal)
+        )
         log_ratio: Floats = offset * tested + slope * ratio + share * temporal
         return log_ratio
 
-    def probability(self, log_ratio: Floats, kind: NDArray[np.intp], scored: NDArray[np.bool_]) -> Floats:
+    def probability(
+        self, log_ratio: Floats, kind: NDArray[np.intp], scored: NDArray[np.bool_]
+    ) -> Floats:
         """Return P(stuck), ``[D]``.
 
         Args:
@@ -201,16 +237,19 @@ class Calibrator:
         """
         probability = np.zeros(len(log_ratio))
         began = (kind == 1) | (kind == 2)  # its run within the log
-        late, early = scored & began, scored & ~began
+        late = scored & began
+        early = scored & ~began
         probability[late] = _posterior(log_ratio[late], EXPECTED_LATE, EXPECTED_CELLS)
-        # Cells that never moved failed before the log, or in it at the same rate as cells that moved.
+        # Cells that never moved failed before the log, or in it at the same rate as cells that
+        # moved.
         broke = probability[late].sum() / (began.sum() + EXPECTED_CELLS)
         probability[early] = _posterior(log_ratio[early], EXPECTED + float(broke), EXPECTED_CELLS)
         return probability
 
 
 def _posterior(log_ratio: Floats, expected: float, cells: float) -> Floats:
-    """Return P(faulty) ``[n]``; prevalence by EM, with the prior share ``expected`` worth ``cells`` cells."""
+    """Return P(faulty) ``[n]``; prevalence by EM, with the prior share ``expected`` worth ``cells``
+    cells."""
     share = expected
     for _ in range(100):
         posterior = expit(log_ratio + logit(share))
@@ -226,8 +265,9 @@ def _bounded_logistic(
 ) -> tuple[float, float, float]:
     """Return a, b and d of a logistic regression with a <= 0, b >= 0, 0 <= d <= 1.
 
-    Without evidence the log ratio is never above 0, however few healthy cells a small reference has in this state.
-    Where one kind of evidence tells all cells apart, the other keeps about its expected weight.
+    Without evidence the log ratio is never above 0, however few healthy cells a small reference has
+    in this state. Where one kind of evidence tells all cells apart, the other keeps about its
+    expected weight.
 
     Args:
         evidence: ``[n, 2]``, spatial and temporal log ratio.
@@ -244,7 +284,11 @@ def _bounded_logistic(
         odds = base + x @ weights
         residual = expit(odds) - dead
         differs = np.where([False, True, True], weights - beforehand, 0.0)
-        value = np.logaddexp(0, odds).sum() - odds[dead].sum() + 0.5 * (differs @ differs) / _PRIOR_VARIANCE
+        value = (
+            np.logaddexp(0, odds).sum()
+            - odds[dead].sum()
+            + 0.5 * (differs @ differs) / _PRIOR_VARIANCE
+        )
         return float(value), x.T @ residual + differs / _PRIOR_VARIANCE
 
     bounds = [(None, 0.0), (0.0, None), (0.0, 1.0)]  # a jump alone proves no fault
@@ -265,7 +309,11 @@ def kinds(stream: StreamState) -> NDArray[np.intp]:
 
 
 def _trial(
-    log: Floats, faults: Sequence[Fault], layout: SensorLayout, reference: Reference, exclusion: Exclusion
+    log: Floats,
+    faults: Sequence[Fault],
+    layout: SensorLayout,
+    reference: Reference,
+    exclusion: Exclusion,
 ) -> _Trial:
     """Return the evidence of a log with ``faults`` injected."""
     stream = StreamState(layout, reference, exclusion)
@@ -275,22 +323,31 @@ def _trial(
     broken = np.zeros(layout.n_cells, bool)
     broken[[c for fault in faults for c in fault.cells]] = True
     scored = spatial.scored
-    offset, gain = (float(np.where(broken, 0.0, evidence).max()) for evidence in (spatial.offset, spatial.gain))
-    constant = kinds(stream)[scored], spatial.evidence[scored], stream.temporal()[scored], broken[scored]
+    offset, gain = (
+        float(np.where(broken, 0.0, evidence).max()) for evidence in (spatial.offset, spatial.gain)
+    )
+    constant = (
+        kinds(stream)[scored],
+        spatial.evidence[scored],
+        stream.temporal()[scored],
+        broken[scored],
+    )
     return _Trial(*constant, offset, gain)
 
 
 def faulty_at(probability: Floats, false_discovery_rate: float) -> NDArray[np.bool_]:
     """Return the faulty set at a Bayesian false discovery rate, bool ``[D]`` (Newton et al. 2004).
 
-    Cells are taken in order of P(faulty) while the expected number of false ones, sum(1 - P), is as near as possible to
-    rate times size: an excess is accepted up to the shortfall before it, because sets are small and always stopping
-    below would meet only a fraction of the rate. The first cell must meet the rate, and each has P(faulty) > 0.5.
+    Cells are taken in order of P(faulty) while the expected number of false ones, sum(1 - P), is as
+    near as possible to rate times size: an excess is accepted up to the shortfall before it,
+    because sets are small and always stopping below would meet only a fraction of the rate. The
+    first cell must meet the rate, and each has P(faulty) > 0.5.
     """
     order = np.argsort(-probability, kind="stable")
     false = np.cumsum(1 - probability[order])  # expected among the first 1, 2, ...
     accepted = false_discovery_rate * np.arange(1, len(order) + 1)
-    excess, shortfall = false - accepted, accepted - np.concatenate([[0.0], false[:-1]])
+    excess = false - accepted
+    shortfall = accepted - np.concatenate([[0.0], false[:-1]])
     shortfall[:1] = 0.0
     within = np.logical_and.accumulate(excess <= np.maximum(shortfall, 0.0))
     chosen = np.zeros(len(probability), bool)
@@ -298,13 +355,19 @@ def faulty_at(probability: Floats, false_discovery_rate: float) -> NDArray[np.bo
     return chosen & (probability > 0.5)
 
 
-def _random_faults(layout: SensorLayout, share: float, onset: int | None, rng: np.random.Generator) -> list[Fault]:
+def _random_faults(
+    layout: SensorLayout, share: float, onset: int | None, rng: np.random.Generator
+) -> list[Fault]:
     """Draw stuck cells: a third open, a third short, a third at any value."""
     cells = np.flatnonzero(layout.present)
     count = max(1, round(share * len(cells)))
     kinds = rng.choice([FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK], count)
     values = rng.uniform(0, layout.full_scale, count)
     return [
-        Fault(kind, (int(cell),), value=float(value) if kind == FaultKind.STUCK else None, onset=onset)
-        for cell, kind, value in zip(rng.choice(cells, count, replace=False), kinds, values, strict=True)
+        Fault(
+            kind, (int(cell),), value=float(value) if kind == FaultKind.STUCK else None, onset=onset
+        )
+        for cell, kind, value in zip(
+            rng.choice(cells, count, replace=False), kinds, values, strict=True
+        )
     ]

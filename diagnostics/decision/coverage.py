@@ -21,9 +21,10 @@ class Coverage:
     """Coverage of a log, in the terms of integrated-circuit testing (Bushnell and Agrawal 2000).
 
     Attributes:
-        fault_coverage: estimated share of the faulty cells that are in F, 0 to 1: (sum of P(faulty) over F + test
-            coverage) / (sum of P(faulty) over all cells + 1). The 1 is a pseudo-count of one fault anywhere: a log that
-            tests nothing has coverage 0, one that tests all cells and finds no fault has 1.
+        fault_coverage: estimated share of the faulty cells that are in F, 0 to 1: (sum of P(faulty)
+            over F + test coverage) / (sum of P(faulty) over all cells + 1). The 1 is a pseudo-count
+            of one fault anywhere: a log that tests nothing has coverage 0, one that tests all cells
+            and finds no fault has 1.
         test_coverage: share of the cells with a verdict other than UNTESTED, 0 to 1.
         untested: int ``[u]``, indices of the cells without a verdict.
         advice: where to press to test them, one sentence per region, the largest first.
@@ -35,10 +36,14 @@ class Coverage:
     advice: tuple[str, ...]
 
     def __str__(self) -> str:
-        tested, others = f"{percent(self.test_coverage)}% of the cells tested", len(self.untested)
+        tested = f"{percent(self.test_coverage)}% of the cells tested"
+        others = len(self.untested)
         if not others:
             return tested
-        return f"{tested}; a fault of the other {'cell' if others == 1 else f'{others} cells'} would not be found"
+        return (
+            f"{tested}; a fault of the other {'cell' if others == 1 else f'{others} cells'} would"
+            " not be found"
+        )
 
 
 def percent(share: float) -> int:
@@ -47,7 +52,10 @@ def percent(share: float) -> int:
 
 
 def coverage(
-    untested: NDArray[np.bool_], faulty: NDArray[np.bool_], probability: NDArray[np.float64], layout: SensorLayout
+    untested: NDArray[np.bool_],
+    faulty: NDArray[np.bool_],
+    probability: NDArray[np.float64],
+    layout: SensorLayout,
 ) -> Coverage:
     """Return the coverage of a diagnosis.
 
@@ -70,21 +78,31 @@ def coverage(
 
 
 def _advice(untested: NDArray[np.bool_], layout: SensorLayout) -> tuple[str, ...]:
-    """Return one sentence per connected region of untested cells, or per group or pad, the largest first."""
+    """Return one sentence per connected region of untested cells, or per group or pad, the largest
+    first."""
     if layout.is_matrix:
         region_of = layout.connected(untested)
-        regions = np.split(np.argsort(region_of, kind="stable"), np.cumsum(np.bincount(region_of)))[1:-1]
-        found = [(len(cells), f"{where(cells, layout)} ({len(cells)} {_cells(cells)} untested)") for cells in regions]
+        regions = np.split(np.argsort(region_of, kind="stable"), np.cumsum(np.bincount(region_of)))[
+            1:-1
+        ]
+        found = [
+            (len(cells), f"{where(cells, layout)} ({len(cells)} {_cells(cells)} untested)")
+            for cells in regions
+        ]
     else:
         groups: dict[str, list[str]] = {}
         for cell in np.flatnonzero(untested).tolist():
             groups.setdefault(layout.place(cell).rpartition(", ")[0], []).append(str(cell))
-        found = [(len(of), f"{group}, {_cells(of)} {_listed(of)} ({len(of)} untested)") for group, of in groups.items()]
+        found = [
+            (len(of), f"{group}, {_cells(of)} {_listed(of)} ({len(of)} untested)")
+            for group, of in groups.items()
+        ]
     return tuple(f"press {text}" for _, text in sorted(found, key=lambda region: -region[0]))
 
 
 def where(cells: NDArray[np.intp], layout: SensorLayout) -> str:
-    """Return the place of neighbouring cells of one pad in words: the rows and columns around them, or their names."""
+    """Return the place of neighbouring cells of one pad in words: the rows and columns around them,
+    or their names."""
     if not layout.is_matrix:
         return _listed([layout.place(cell) for cell in cells.tolist()])
     pad, row, col = np.unravel_index(cells, layout.shape)
@@ -100,5 +118,6 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _span(name: str, at: NDArray[np.intp]) -> str:
-    first, last = at.min(), at.max()
+    first = at.min()
+    last = at.max()
     return f"{name} {first}" if first == last else f"{name}s {first}-{last}"

@@ -1,16 +1,19 @@
-"""Line cover: the most probable set of broken wires and single faulty cells that explains the findings.
+"""Line cover: the most probable set of broken wires and single faulty cells that explains the
+findings.
 
-Costs are negative log probabilities: log 200 for a broken wire, -log q for a single fault of prevalence q, and log 1000
-for each working cell on a broken wire. A cell that is not certainly faulty supports its wire with
+Costs are negative log probabilities: log 200 for a broken wire, -log q for a single fault of
+prevalence q, and log 1000 for each working cell on a broken wire. A cell that is not certainly
+faulty supports its wire with
 
     c (w - log(1 - q + q exp w)),        c = 1 / (1 + rho (n - 1))
 
-the log ratio of "broken wire" against "single fault or none", where w is its log likelihood ratio and c discounts the
-correlation rho of the n uncertain cells on the wire (design effect, Kish 1965): neighbours at the edge of a contact err
-together. Minimum weight set cover, solved by enumeration or by ``scipy.optimize.milp``; q is re-estimated from the
-solution until it no longer changes, between 1 in 200 and one half. Wires with fewer than three tested cells, or two
-thirds of those behind the break, are not found. Wires that are more likely broken than not, at odds below 9, are
-returned as possible: one more contact tells.
+the log ratio of "broken wire" against "single fault or none", where w is its log likelihood ratio
+and c discounts the correlation rho of the n uncertain cells on the wire (design effect, Kish 1965):
+neighbours at the edge of a contact err together. Minimum weight set cover, solved by enumeration or
+by ``scipy.optimize.milp``; q is re-estimated from the solution until it no longer changes, between
+1 in 200 and one half. Wires with fewer than three tested cells, or two thirds of those behind the
+break, are not found. Wires that are more likely broken than not, at odds below 9, are returned as
+possible: one more contact tells.
 
 With declared wiring the wires are buses and nested groups (``SensorLayout.groups``), which are
 broken as a whole. Of those that explain the same cells the innermost is named.
@@ -25,15 +28,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from diagnostics.layout import Line, SensorLayout
+from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import EXPECTED_LATE, MAJORITY, RARE, SUSPICIOUS, TESTED
+from diagnostics.wiring import Line
 
-_LINE_COST = -np.log(EXPECTED_LATE)  # of a broken wire, and of the rarest single fault: few cells cannot estimate it
+# of a broken wire, and of the rarest single fault: few cells cannot estimate it
+_LINE_COST = -np.log(EXPECTED_LATE)
 _MOST_CONTRADICTIONS = 1  # working cells on a wire that can still be broken
 _MIN_OF_GROUP = 2  # supporting cells of a group that is tested again as a whole
 _MIN_SUPPORT = 3  # supporting cells of a broken wire, or two thirds of those behind the break
-_CORRELATION, _MAX_CORRELATION = 0.0125, 0.3  # rho per cell on the line (long lines run along edges), and at most
-PROVEN = np.log(9.0)  # log odds from which on a wire is reported, without a certain cell twice that: edges err together
+# rho per cell on the line (long lines run along edges), and at most
+_CORRELATION = 0.0125
+_MAX_CORRELATION = 0.3
+PROVEN = np.log(
+    9.0
+    # log odds from which on a wire is reported, without a certain cell twice that: edges err
+    # together
+)
 _ROUNDS = 5  # of re-estimating q, at most: a size
 # Wires that may be broken; address wires: see ``address_aliasing``.
 _WIRES = "row", "column", "converter", "position", "bus", "group"
@@ -51,7 +62,8 @@ class Cause:
         line: the wire; None for a single cell.
         cells: the cells it makes faulty, ascending.
         seen: those of them with evidence of their own; the others are inferred.
-        probability: P(the wire is broken rather than all of ``seen`` by chance); 1 for single cells.
+        probability: P(the wire is broken rather than all of ``seen`` by chance); 1 for single
+            cells.
         whole: False where the wire is broken in its middle.
         proven: False for a wire that is only possible; its cells are single faults too, or work.
     """
@@ -86,7 +98,8 @@ def solve(
     Args:
         faulty: bool ``[D]``, certainly faulty cells.
         consistent: bool ``[D]``, cells that could have this fault; includes ``faulty``.
-        contradicting: bool ``[D]``, cells that contradict a broken wire. Cells that are neither may be inferred faulty.
+        contradicting: bool ``[D]``, cells that contradict a broken wire. Cells that are neither may
+            be inferred faulty.
         weight: float ``[D]``, log likelihood ratio faulty : healthy of each consistent cell.
         layout: the array.
         common: lower limit of the prevalence of single faults of one kind.
@@ -97,12 +110,17 @@ def solve(
     for i in np.unique(part[consistent]).tolist():
         on = layout.present.ravel() & (part == i)
         lines = [line for line in layout.lines if line.pad == i or not layout.is_matrix]
-        causes += _explain(faulty & on, consistent & on, contradicting & on, weight, layout, lines, common)
+        causes += _explain(
+            faulty & on, consistent & on, contradicting & on, weight, layout, lines, common
+        )
     return tuple(causes)
 
 
 def candidate_groups(
-    consistent: NDArray[np.bool_], contradicting: NDArray[np.bool_], weight: NDArray[np.float64], layout: SensorLayout
+    consistent: NDArray[np.bool_],
+    contradicting: NDArray[np.bool_],
+    weight: NDArray[np.float64],
+    layout: SensorLayout,
 ) -> list[NDArray[np.intp]]:
     """Return the groups of cells that one fault would explain, where enough of them support it.
 
@@ -129,13 +147,15 @@ def _least_support(behind: int) -> int:
 
 
 def _silenced(line: Line, contradicting: Mask, layout: SensorLayout) -> Sequence[NDArray[np.intp]]:
-    """Return the cells that each possible break of a wire would make dead, where none of them is alive."""
+    """Return the cells that each possible break of a wire would make dead, where none of them is
+    alive."""
     cells = layout.cells_on(line)
     return _ends(line, cells, contradicting) if contradicting[cells].any() else (cells,)
 
 
 def _ends(line: Line, cells: NDArray[np.intp], contradicting: Mask) -> tuple[NDArray[np.intp], ...]:
-    """Return the cells beyond the last working one, seen from either end of a wire; none if none works.
+    """Return the cells beyond the last working one, seen from either end of a wire; none if none
+    works.
 
     A converter, bus or group cannot be broken in its middle.
     """
@@ -161,19 +181,26 @@ def _explain(
     candidates = []
     for line in lines if supporting.any() else ():
         if line.kind in _WIRES:
-            candidates += _candidates(line, layout.cells_on(line), contradicting, supporting, faulty)
+            candidates += _candidates(
+                line, layout.cells_on(line), contradicting, supporting, faulty
+            )
     if not layout.is_matrix:  # of groups that explain the same cells, the innermost: it comes first
-        candidates = list({tuple(c.cells[supporting[c.cells]].tolist()): c for c in candidates[::-1]}.values())
+        candidates = list(
+            {tuple(c.cells[supporting[c.cells]].tolist()): c for c in candidates[::-1]}.values()
+        )
     found = np.flatnonzero(faulty)
     tested = int(contradicting.sum()) + len(found)
     chosen_wires: list[_Candidate] = []
     discount = _discount(candidates, tested_cells & ~faulty)
-    support, cell_cost = weight, float(_LINE_COST)
+    support = weight
+    cell_cost = float(_LINE_COST)
     singles = 0
     for _ in range(_ROUNDS if candidates else 0):
         prevalence = np.clip(max(singles / max(tested, 1), common), np.exp(-_LINE_COST), MAJORITY)
         cell_cost = float(-np.log(prevalence))
-        support = discount * (weight - np.logaddexp(np.log1p(-np.exp(-cell_cost)), weight - cell_cost))
+        support = discount * (
+            weight - np.logaddexp(np.log1p(-np.exp(-cell_cost)), weight - cell_cost)
+        )
         chosen_wires = _cheapest(candidates, found, faulty, support, cell_cost)
         behind = np.zeros(layout.n_cells, bool)
         for candidate in chosen_wires:
@@ -187,13 +214,16 @@ def _explain(
     def cause(c: _Candidate, gain: float, proven: bool) -> Cause:
         cells = c.cells[~contradicting[c.cells]]
         seen = cells[supporting[cells]]
-        return Cause(c.line, tuple(cells.tolist()), tuple(seen.tolist()), float(expit(gain)), c.whole, proven)
+        return Cause(
+            c.line, tuple(cells.tolist()), tuple(seen.tolist()), float(expit(gain)), c.whole, proven
+        )
 
     for c in chosen_wires:
         causes.append(cause(c, _gain(c, faulty, support, cell_cost), True))
         explained[list(causes[-1].cells)] = True
     causes += [Cause(None, (cell,), (cell,), 1.0) for cell in found.tolist() if not explained[cell]]
-    left, support = faulty & ~explained, np.where(explained, 0.0, support)
+    left = faulty & ~explained
+    support = np.where(explained, 0.0, support)
     more = _cheapest(candidates, np.flatnonzero(left), left, support, cell_cost, 0.0)
     return causes + [cause(c, _gain(c, left, support, cell_cost), False) for c in more]
 
@@ -205,7 +235,8 @@ def _candidates(
     supporting: NDArray[np.bool_],
     faulty: NDArray[np.bool_],
 ) -> list[_Candidate]:
-    """Return the wire broken as a whole, and in its middle with either end working, where enough cells support it."""
+    """Return the wire broken as a whole, and in its middle with either end working, where enough
+    cells support it."""
 
     def proven(behind: NDArray[np.intp]) -> bool:
         return bool(supporting[behind].sum() >= _least_support(len(behind)))
@@ -216,7 +247,11 @@ def _candidates(
     contradictions = int(contradicting[cells].sum())
     found = []
     if contradictions <= _MOST_CONTRADICTIONS and proven(cells):
-        found.append(_Candidate(line, cells, cost(cells) + np.log(1 / RARE) * contradictions, True, len(cells)))
+        found.append(
+            _Candidate(
+                line, cells, cost(cells) + np.log(1 / RARE) * contradictions, True, len(cells)
+            )
+        )
     for behind in _ends(line, cells, contradicting):  # from the first supporting cell on
         seen = np.flatnonzero(supporting[behind])
         if len(seen):
@@ -227,7 +262,8 @@ def _candidates(
 
 
 def _discount(candidates: Sequence[_Candidate], uncertain: Mask) -> NDArray[np.float64]:
-    """Return the discount c of the evidence of each uncertain cell, ``[D]``: the inverse of Kish's design effect."""
+    """Return the discount c of the evidence of each uncertain cell, ``[D]``: the inverse of Kish's
+    design effect."""
     discount = np.ones(len(uncertain))
     for c in candidates:
         n = int(uncertain[c.cells].sum())
@@ -236,7 +272,9 @@ def _discount(candidates: Sequence[_Candidate], uncertain: Mask) -> NDArray[np.f
     return discount
 
 
-def _gain(c: _Candidate, faulty: NDArray[np.bool_], support: NDArray[np.float64], cell_cost: float) -> float:
+def _gain(
+    c: _Candidate, faulty: NDArray[np.bool_], support: NDArray[np.float64], cell_cost: float
+) -> float:
     uncertain = c.cells[~faulty[c.cells]]
     return float(faulty[c.cells].sum()) * cell_cost + float(support[uncertain].sum()) - c.cost
 
@@ -251,7 +289,9 @@ def _cheapest(
 ) -> list[_Candidate]:
     """Return the wires of the cover of least cost, with log odds above ``least``."""
     # A wire that costs more than it can save is in no optimal cover.
-    candidates = [c for c in candidates if _gain(c, faulty, np.maximum(support, 0), cell_cost) > least]
+    candidates = [
+        c for c in candidates if _gain(c, faulty, np.maximum(support, 0), cell_cost) > least
+    ]
     if candidates:
         on_any = np.concatenate([c.cells for c in candidates])
         uncertain = np.unique(on_any[~faulty[on_any]])
@@ -265,13 +305,16 @@ def _cheapest(
     return [c for c in candidates if _gain(c, faulty, support, cell_cost) > least]
 
 
-def cheapest_of_few(cost: NDArray[np.float64], covers: NDArray[np.bool_], saves: NDArray[np.float64]) -> Mask:
+def cheapest_of_few(
+    cost: NDArray[np.float64], covers: NDArray[np.bool_], saves: NDArray[np.float64]
+) -> Mask:
     """Return the set of wires of least cost, bool ``[wires]``, by enumeration.
 
     Args:
         cost: float ``[wires]``.
         covers: bool ``[wires, cells]``.
-        saves: float ``[cells]``, saved once if any wire of the set covers the cell; may be negative.
+        saves: float ``[cells]``, saved once if any wire of the set covers the cell; may be
+            negative.
     """
     sets = (np.arange(1 << len(cost))[:, None] >> np.arange(len(cost)) & 1).astype(np.float64)
     net = ((sets @ covers) > 0) @ saves - sets @ cost
@@ -279,7 +322,9 @@ def cheapest_of_few(cost: NDArray[np.float64], covers: NDArray[np.bool_], saves:
     return best
 
 
-def cheapest_of_many(cost: NDArray[np.float64], covers: NDArray[np.bool_], saves: NDArray[np.float64]) -> Mask:
+def cheapest_of_many(
+    cost: NDArray[np.float64], covers: NDArray[np.bool_], saves: NDArray[np.float64]
+) -> Mask:
     """Return the same set by integer programming: slower for few wires, feasible for many."""
     from scipy import sparse
     from scipy.optimize import Bounds, LinearConstraint, milp
@@ -287,11 +332,15 @@ def cheapest_of_many(cost: NDArray[np.float64], covers: NDArray[np.bool_], saves
     n, cells = covers.shape
     wires = sparse.csr_array(covers.T.astype(float))
     which, cell = np.nonzero(covers)
-    of_wire, of_cell = sparse.eye_array(n, format="csr")[which], sparse.eye_array(cells, format="csr")[cell]
+    of_wire = sparse.eye_array(n, format="csr")[which]
+    of_cell = sparse.eye_array(cells, format="csr")[cell]
     # A cell is covered if and only if a wire through it is chosen.
     only_if = LinearConstraint(sparse.hstack([wires, -sparse.eye_array(cells)]), lb=0)
     if_ = LinearConstraint(sparse.hstack([-of_wire, of_cell]), lb=0)
     objective = np.concatenate([cost, -saves])
-    solution = milp(objective, constraints=[only_if, if_], integrality=np.ones(n + cells), bounds=Bounds(0, 1))
-    chosen: Mask = np.asarray(solution.x)[:n] > 0.5  # feasible by construction: no wire at all is a solution
+    solution = milp(
+        objective, constraints=[only_if, if_], integrality=np.ones(n + cells), bounds=Bounds(0, 1)
+    )
+    # feasible by construction: no wire at all is a solution
+    chosen: Mask = np.asarray(solution.x)[:n] > 0.5
     return chosen

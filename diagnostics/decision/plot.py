@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from diagnostics.decision.result import Diagnosis
-    from diagnostics.faults import FaultKind
+    from diagnostics.faults import Fault, FaultKind
     from diagnostics.layout import SensorLayout
 
 PAGE = 10.0
@@ -22,23 +21,34 @@ PAGE = 10.0
 _WIDE = 5.0
 """Width of a map whose legend fits on one line, in inches."""
 
-_ALIVE, _FAULTY, _UNTESTED, _ABSENT = "#8fbf8f", "#c0392b", "#d9d9d9", "#ffffff"
+_ALIVE = "#8fbf8f"
+_FAULTY = "#c0392b"
+_UNTESTED = "#d9d9d9"
+_ABSENT = "#ffffff"
 
 
-def draw(diagnosis: Diagnosis, letters: Mapping[FaultKind, str], page: float) -> Figure:
-    """Draw each pad: green alive, red faulty, grey untested; the legend explains the letters that are on the map.
+def draw(
+    layout: SensorLayout,
+    verdicts: NDArray[np.object_],
+    faults: Sequence[Fault],
+    letters: Mapping[FaultKind, str],
+    page: float,
+) -> Figure:
+    """Draw each pad: green alive, red faulty, grey untested; the legend explains the letters that
+    are on the map.
 
     Args:
-        diagnosis: what is drawn.
+        layout: the array.
+        verdicts: of its cells, ``[D]``.
+        faults: in it.
         letters: letter of each fault kind.
         page: width of the page, in inches.
     """
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    layout = diagnosis.layout
     figure, ((*axes,),) = pads_figure(layout, n_rows=1, scale=False, page=page)
-    colours = np.where(layout.present.ravel(), diagnosis.verdicts.astype(np.intp), 3)
+    colours = np.where(layout.present.ravel(), verdicts.astype(np.intp), 3)
     palette = ListedColormap([_ALIVE, _FAULTY, _UNTESTED, _ABSENT])
     cell_points = 72 * _cell(layout, page)
     for pad, ax in enumerate(axes):
@@ -50,13 +60,21 @@ def draw(diagnosis: Diagnosis, letters: Mapping[FaultKind, str], page: float) ->
         ax.grid(which="minor", color="white", linewidth=min(1.5, 0.1 * cell_points))
         ax.tick_params(which="minor", length=0)
         ax.spines[:].set_visible(False)
-    kind_of = {cell: fault.kind for fault in diagnosis.faults for cell in fault.cells}
+    kind_of = {cell: fault.kind for fault in faults for cell in fault.cells}
     size = min(8.0, 0.6 * cell_points)
     for cell, kind in kind_of.items():
         pad, row, col = (int(i) for i in np.unravel_index(cell, layout.shape))
-        axes[pad].text(col, row, letters[kind], ha="center", va="center", color="white", fontsize=size)
-    shown = ", ".join(f"{letter} {kind.value}" for kind, letter in letters.items() if kind in kind_of.values())
-    legend = {"alive": _ALIVE, f"faulty: {shown}" if shown else "faulty": _FAULTY, "untested": _UNTESTED}
+        axes[pad].text(
+            col, row, letters[kind], ha="center", va="center", color="white", fontsize=size
+        )
+    shown = ", ".join(
+        f"{letter} {kind.value}" for kind, letter in letters.items() if kind in kind_of.values()
+    )
+    legend = {
+        "alive": _ALIVE,
+        f"faulty: {shown}" if shown else "faulty": _FAULTY,
+        "untested": _UNTESTED,
+    }
     figure.legend(
         handles=[Patch(color=colour, label=name) for name, colour in legend.items()],
         loc="outside lower center",
@@ -66,8 +84,11 @@ def draw(diagnosis: Diagnosis, letters: Mapping[FaultKind, str], page: float) ->
     return figure
 
 
-def draw_forces(ax: Axes, values: ArrayLike, layout: SensorLayout, dead: Iterable[int] = (), **imshow: Any) -> Any:
-    """Draw one pad's values ``[rows, cols]`` as a heatmap, a cross on each of the ``dead`` (row, col) flat positions.
+def draw_forces(
+    ax: Axes, values: ArrayLike, layout: SensorLayout, dead: Iterable[int] = (), **imshow: Any
+) -> Any:
+    """Draw one pad's values ``[rows, cols]`` as a heatmap, a cross on each of the ``dead`` (row,
+    col) flat positions.
 
     Returns the image, for a colour bar.
     """
@@ -79,8 +100,11 @@ def draw_forces(ax: Axes, values: ArrayLike, layout: SensorLayout, dead: Iterabl
     return image
 
 
-def pads_figure(layout: SensorLayout, *, n_rows: int, scale: bool = True, page: float = PAGE) -> tuple[Figure, Any]:
-    """Return a figure and its axes ``[n_rows, pads]``, sized to the pads; pads that do not fit a page go below.
+def pads_figure(
+    layout: SensorLayout, *, n_rows: int, scale: bool = True, page: float = PAGE
+) -> tuple[Figure, Any]:
+    """Return a figure and its axes ``[n_rows, pads]``, sized to the pads; pads that do not fit a
+    page go below.
 
     Args:
         layout: the array.
@@ -90,14 +114,17 @@ def pads_figure(layout: SensorLayout, *, n_rows: int, scale: bool = True, page: 
     """
     from matplotlib.figure import Figure
 
-    cell, beside = _cell(layout, page), 1.2 if scale else 0.0
-    height, width = layout.rows * cell + 0.7, max(layout.shape[2] * cell, 1.8) + 0.5
+    cell = _cell(layout, page)
+    beside = 1.2 if scale else 0.0
+    height = layout.rows * cell + 0.7
+    width = max(layout.shape[2] * cell, 1.8) + 0.5
     columns = max(1, min(layout.pads, int(page // width)))
     rows = -(-layout.pads // columns)
     across = max(columns * width, 3.0) + beside
     below = 0.6 if scale else 0.5 if across > _WIDE else 0.9
     figure = Figure(figsize=(across, n_rows * rows * height + below))
-    figure.set_layout_engine("constrained", h_pad=0.08)  # inches: the first layout lets titles stick out a little
+    # inches: the first layout lets titles stick out a little
+    figure.set_layout_engine("constrained", h_pad=0.08)
     axes = figure.subplots(n_rows * rows, columns, squeeze=False).reshape(n_rows, rows * columns)
     for ax in axes[:, layout.pads :].ravel():
         ax.set_visible(False)
@@ -105,7 +132,8 @@ def pads_figure(layout: SensorLayout, *, n_rows: int, scale: bool = True, page: 
 
 
 def _cell(layout: SensorLayout, page: float) -> float:
-    """Return the size of a cell on the verdict map, in inches: less where the pad would not fit a page."""
+    """Return the size of a cell on the verdict map, in inches: less where the pad would not fit a
+    page."""
     return min(0.28, 0.8 * page / layout.shape[2], 0.8 * PAGE / layout.rows)
 
 

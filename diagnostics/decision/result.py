@@ -1,4 +1,5 @@
-"""Result of a diagnosis: a verdict for each cell, the root causes, the fault set F, and the coverage."""
+"""Result of a diagnosis: a verdict for each cell, the root causes, the fault set F, and the
+coverage."""
 
 from __future__ import annotations
 
@@ -39,7 +40,8 @@ LETTERS = {
 
 
 class Verdict(IntEnum):
-    """Verdict on one cell. UNTESTED is neither healthy nor faulty: no event of the log tested the cell."""
+    """Verdict on one cell. UNTESTED is neither healthy nor faulty: no event of the log tested the
+    cell."""
 
     ALIVE = 0
     FAULTY = 1
@@ -60,12 +62,14 @@ class Diagnosis:
         tested: bool ``[D]``, the log tested whether the cell works.
         n_frames: number of frames in the log.
         n_recordings: number of recordings in the log.
-        possible: wires that are more likely broken than not, but not proven. Their cells are in F only as faults of
-            their own.
+        possible: wires that are more likely broken than not, but not proven. Their cells are in F
+            only as faults of their own.
         static_loads: objects that lie still on the array. Their cells are UNTESTED.
-        transport: lost frames, frozen streams and invalid readings: faults of the link, not of cells.
-        evidence: float ``[D]`` each: ``"spatial"`` and ``"temporal"``, log likelihood ratios faulty : healthy (0: no
-            evidence), and ``"events"``, number of events that tested the cell. Evidence of wires is in ``faults``.
+        transport: lost frames, frozen streams and invalid readings: faults of the link, not of
+            cells.
+        evidence: float ``[D]`` each: ``"spatial"`` and ``"temporal"``, log likelihood ratios faulty
+            : healthy (0: no evidence), and ``"events"``, number of events that tested the cell.
+            Evidence of wires is in ``faults``.
     """
 
     layout: SensorLayout
@@ -83,7 +87,9 @@ class Diagnosis:
     @cached_property
     def fault_set(self) -> FaultSet:
         """F: the cells of all faults; an adapter must not use their readings."""
-        return FaultSet(tuple({c for fault in self.faults for c in fault.cells}), self.layout.n_cells)
+        return FaultSet(
+            tuple({c for fault in self.faults for c in fault.cells}), self.layout.n_cells
+        )
 
     @property
     def frozen(self) -> tuple[TransportFault, ...]:
@@ -92,23 +98,33 @@ class Diagnosis:
 
     @cached_property
     def statically_loaded(self) -> FaultSet:
-        """The cells of all static loads: healthy as far as the log tells, but their readings are not of contact."""
-        return FaultSet(tuple({c for load in self.static_loads for c in load.cells}), self.layout.n_cells)
+        """The cells of all static loads: healthy as far as the log tells, but their readings are
+        not of contact."""
+        return FaultSet(
+            tuple({c for load in self.static_loads for c in load.cells}), self.layout.n_cells
+        )
 
     @property
     def disturbed(self) -> FaultSet:
-        """The statically loaded cells and those beside them, which the edge of an object may load."""
+        """The statically loaded cells and those beside them, which the edge of an object may
+        load."""
         beside = self.layout.beside[list(self.statically_loaded)].ravel()
-        return self.statically_loaded | FaultSet(tuple(beside[beside >= 0].tolist()), self.layout.n_cells)
+        return self.statically_loaded | FaultSet(
+            tuple(beside[beside >= 0].tolist()), self.layout.n_cells
+        )
 
     def suspects(self, probability: float = 0.02) -> FaultSet:
-        """Return F and every tested cell with at least this P(faulty): the cells that a classifier should ignore.
+        """Return F and every tested cell with at least this P(faulty): the cells that a classifier
+        should ignore.
 
-        F limits the false discovery rate. For a classifier that imputes cells, losing a healthy cell costs little and
-        keeping a faulty one much; ``examples/wrong_fault_set.py`` measures both. On real grasps the two costs are equal
-        at a probability of 0.02 for cells that read 0, and at 0.001 for full scale.
+        F limits the false discovery rate. For a classifier that imputes cells, losing a healthy
+        cell costs little and keeping a faulty one much; ``examples/wrong_fault_set.py`` measures
+        both. On real grasps the two costs are equal at a probability of 0.02 for cells that read 0,
+        and at 0.001 for full scale.
         """
-        likely = np.flatnonzero(self.tested & (self.probability >= probability) & self.layout.present.ravel())
+        likely = np.flatnonzero(
+            self.tested & (self.probability >= probability) & self.layout.present.ravel()
+        )
         return self.fault_set | FaultSet(tuple(likely.tolist()), self.layout.n_cells)
 
     @cached_property
@@ -122,11 +138,14 @@ class Diagnosis:
     @cached_property
     def coverage(self) -> Coverage:
         """Which cells were tested, which were not, and where to press to test them."""
-        return coverage(self.verdicts == Verdict.UNTESTED, self.fault_set.mask, self.probability, self.layout)
+        return coverage(
+            self.verdicts == Verdict.UNTESTED, self.fault_set.mask, self.probability, self.layout
+        )
 
     @property
     def exit_code(self) -> int:
-        """0: no fault. 1: single cells, a static load or a frozen stream. 2: a wire, or a tenth of the cells."""
+        """0: no fault. 1: single cells, a static load or a frozen stream. 2: a wire, or a tenth of
+        the cells."""
         few = len(self.fault_set) < 0.1 * self.layout.present.sum()
         if not self.faults:
             return 1 if self.static_loads or self.frozen else 0
@@ -135,24 +154,36 @@ class Diagnosis:
     def map(self) -> str:
         """Return the verdicts drawn as text, the pads side by side.
 
-        ``.`` alive, ``?`` untested, O open, S short, K stuck, A alias, I intermittent, N noisy, D drift,
-        F floating, L late, C copy, M clamped, W weak.
+        ``.`` alive, ``?`` untested, O open, S short, K stuck, A alias, I intermittent, N noisy, D
+        drift, F floating, L late, C copy, M clamped, W weak.
         """
         signs = np.where(self.verdicts == Verdict.UNTESTED, "?", ".")
         for fault in self.faults:
             signs[list(fault.cells)] = LETTERS[fault.kind]
         grid = self.layout.grid(np.where(self.layout.present.ravel(), signs, " "))
         width = max(2 * self.layout.shape[2] - 1, len(f"pad {self.layout.pads - 1}"))
-        lines = ["   ".join(["    ", *(f"pad {p}".ljust(width) for p in range(self.layout.pads))]).rstrip()]
+        lines = [
+            "   ".join(
+                ["    ", *(f"pad {p}".ljust(width) for p in range(self.layout.pads))]
+            ).rstrip()
+        ]
         for row in range(self.layout.rows):
             cells = [" ".join(grid[pad, row]).ljust(width) for pad in range(self.layout.pads)]
             lines.append("   ".join([f"{row:4d}", *cells]).rstrip())
         return "\n".join(lines)
 
     def __str__(self) -> str:
-        found = f"{len(self.fault_set)} faulty cells" if len(self.fault_set) != 1 else "1 faulty cell"
-        reasons = [line for fault in self.faults for line in (fault.reason, *(f"  or {a}" for a in fault.alternatives))]
-        reasons += [wire.reason for wire in self.possible] + [load.reason for load in self.static_loads]
+        found = (
+            f"{len(self.fault_set)} faulty cells" if len(self.fault_set) != 1 else "1 faulty cell"
+        )
+        reasons = [
+            line
+            for fault in self.faults
+            for line in (fault.reason, *(f"  or {a}" for a in fault.alternatives))
+        ]
+        reasons += [wire.reason for wire in self.possible] + [
+            load.reason for load in self.static_loads
+        ]
         reasons += [fault.reason for fault in self.transport]
         recordings = "1 recording" if self.n_recordings == 1 else f"{self.n_recordings} recordings"
         frames = "1 frame" if self.n_frames == 1 else f"{self.n_frames} frames"
@@ -160,10 +191,11 @@ class Diagnosis:
         return "\n".join([head, self.map(), *reasons])
 
     def plot(self, page: float = 10.0) -> Figure:
-        """Return the verdict map as a matplotlib Figure; pads that do not fit ``page`` inches side by side go below."""
+        """Return the verdict map as a matplotlib Figure; pads that do not fit ``page`` inches side
+        by side go below."""
         from diagnostics.decision.plot import draw
 
-        return draw(self, LETTERS, page)
+        return draw(self.layout, self.verdicts, self.faults, LETTERS, page)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict (no NaN) that :meth:`from_dict` reads."""
@@ -193,7 +225,8 @@ class Diagnosis:
         """Rebuild a diagnosis from :meth:`to_dict`.
 
         Raises:
-            ValueError: not a diagnosis, one of another version, or one with fields of a wrong kind or size.
+            ValueError: not a diagnosis, one of another version, or one with fields of a wrong kind
+                or size.
         """
         if not isinstance(d, Mapping) or d.get("schema") != SCHEMA:
             found = repr(d.get("schema")) if isinstance(d, Mapping) else str(d)[:60]
@@ -206,28 +239,50 @@ class Diagnosis:
                 tested=np.asarray([v != Verdict.UNTESTED.name for v in d["verdicts"]]),
                 n_frames=d["n_frames"],
                 n_recordings=d["n_recordings"],
-                evidence={kind: np.asarray(values, dtype=np.float64) for kind, values in d.get("evidence", {}).items()},
+                evidence={
+                    kind: np.asarray(values, dtype=np.float64)
+                    for kind, values in d.get("evidence", {}).items()
+                },
                 transport=tuple(TransportFault.from_dict(f) for f in d.get("transport", ())),
                 possible=tuple(Fault.from_dict(f) for f in d.get("possible", ())),
-                static_loads=tuple(StaticLoad.from_dict(load) for load in d.get("static_loads", ())),
+                static_loads=tuple(
+                    StaticLoad.from_dict(load) for load in d.get("static_loads", ())
+                ),
                 contradicting=float(d.get("contradicting", 0.0)),
             )
         except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"the diagnosis is damaged: {type(error).__name__} {error}") from None
         size = (diagnosis.layout.n_cells,)
-        vectors = {"probability": diagnosis.probability, "verdicts": diagnosis.tested, **diagnosis.evidence}
+        vectors = {
+            "probability": diagnosis.probability,
+            "verdicts": diagnosis.tested,
+            **diagnosis.evidence,
+        }
         for name, vector in vectors.items():
             if vector.shape != size:
                 raise ValueError(
-                    f"the diagnosis is damaged: {name} has shape {list(vector.shape)}, expected {list(size)}"
+                    f"the diagnosis is damaged: {name} has shape {list(vector.shape)}, expected"
+                    f" {list(size)}"
                 )
         if not ((diagnosis.probability >= 0) & (diagnosis.probability <= 1)).all():
             raise ValueError("the diagnosis is damaged: a probability is not between 0 and 1")
-        if not all(isinstance(n, int) and n >= 0 for n in (diagnosis.n_frames, diagnosis.n_recordings)):
-            raise ValueError("the diagnosis is damaged: n_frames and n_recordings must be whole numbers >= 0")
-        if not all(isinstance(t.reason, str) and isinstance(t.kind, str) for t in diagnosis.transport):
-            raise ValueError("the diagnosis is damaged: a transport fault needs a kind and a reason")
+        if not all(
+            isinstance(n, int) and n >= 0 for n in (diagnosis.n_frames, diagnosis.n_recordings)
+        ):
+            raise ValueError(
+                "the diagnosis is damaged: n_frames and n_recordings must be whole numbers >= 0"
+            )
+        if not all(
+            isinstance(t.reason, str) and isinstance(t.kind, str) for t in diagnosis.transport
+        ):
+            raise ValueError(
+                "the diagnosis is damaged: a transport fault needs a kind and a reason"
+            )
         if not all(np.isfinite(values).all() for values in diagnosis.evidence.values()):
             raise ValueError("the diagnosis is damaged: evidence must be finite")
-        _ = diagnosis.statically_loaded, diagnosis.fault_set  # raise ValueError for cells of another layout
+        # raise ValueError for cells of another layout
+        _ = (
+            diagnosis.statically_loaded,
+            diagnosis.fault_set,
+        )
         return diagnosis

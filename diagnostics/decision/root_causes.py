@@ -1,9 +1,11 @@
-"""Root causes: one fault per cause, with its wire or cell, onset, probability, reason, and what to check.
+"""Root causes: one fault per cause, with its wire or cell, onset, probability, reason, and what to
+check.
 
-Cells with the same kind of fault and the same value form a group. Each group is explained by the line cover
-(:mod:`~diagnostics.decision.line_cover`); pairs of lines that read the same by address aliasing. Causes that act
-through more than one group, as a broken supply wire of several chips, are reported as several faults. With declared
-wiring the wires are buses and nested groups, see :mod:`~diagnostics.wiring`.
+Cells with the same kind of fault and the same value form a group. Each group is explained by the
+line cover (:mod:`~diagnostics.decision.line_cover`); pairs of lines that read the same by address
+aliasing. Causes that act through more than one group, as a broken supply wire of several chips, are
+reported as several faults. With declared wiring the wires are buses and nested groups, see
+:mod:`~diagnostics.wiring`.
 """
 
 from __future__ import annotations
@@ -16,12 +18,18 @@ from numpy.typing import NDArray
 
 from diagnostics.decision.line_cover import Cause, solve
 from diagnostics.faults import Fault, FaultKind
-from diagnostics.layout import LineKind, SensorLayout
+from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import ANYWHERE, SLIGHT, SUSPICIOUS
-from diagnostics.wiring import action, counted
+from diagnostics.wiring import LineKind, action, counted
 
 # Of the cells that are refuted, in the order of ``evidence.life.FAULTS``.
-REFUTED_KINDS = (FaultKind.FLOATING, FaultKind.INTERMITTENT, FaultKind.LATE, FaultKind.COPY, FaultKind.CLAMPED)
+REFUTED_KINDS = (
+    FaultKind.FLOATING,
+    FaultKind.INTERMITTENT,
+    FaultKind.LATE,
+    FaultKind.COPY,
+    FaultKind.CLAMPED,
+)
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -40,14 +48,15 @@ class CellFindings:
         zero: constant cells at 0, and not at their baseline; None for sensors that rest low.
         intermittent, noisy, drifting: cells that move, but wrongly.
         gain: float, gain relative to the reference of cells with a changed gain; NaN: others.
-        value: float, reading (not load) of constant cells, and reading to which intermittent cells blink; NaN: none.
+        value: float, reading (not load) of constant cells, and reading to which intermittent cells
+            blink; NaN: none.
         since: int, number of the first frame of the fault.
         probability: float, P(faulty).
         weight: float, log likelihood ratio faulty : healthy.
         events: int, number of events that tested the cell, or number of its blinks.
         known: cells that were dead in the reference already.
-        refuted: int, number of the fault in ``evidence.life.FAULTS`` of cells that move and are proved not to be alive;
-            -1: others.
+        refuted: int, number of the fault in ``evidence.life.FAULTS`` of cells that move and are
+            proved not to be alive; -1: others.
         share: float, of the contacts in which such a cell was dead.
     """
 
@@ -72,13 +81,17 @@ class CellFindings:
 
     def of(self, cells: NDArray[np.intp]) -> CellFindings:
         """Return the findings in the order of ``cells``."""
-        return replace(self, **{name: values[cells] for name, values in vars(self).items() if values is not None})
+        return replace(
+            self,
+            **{name: values[cells] for name, values in vars(self).items() if values is not None},
+        )
 
 
 def root_causes(
     found: CellFindings, aliases: Sequence[Fault], layout: SensorLayout
 ) -> tuple[tuple[Fault, ...], tuple[Fault, ...]]:
-    """Return the root causes of the faulty cells, one fault each, the one with most cells first; and possible wires.
+    """Return the root causes of the faulty cells, one fault each, the one with most cells first;
+    and possible wires.
 
     The cells of ``aliases``, the faults of lines that read the same, have no other cause.
     """
@@ -87,22 +100,33 @@ def root_causes(
     causes = _causes(found, aliased, layout, 0.0)
     singles = sum(cause.line is None for _, _, cause in causes)
     if 0 < singles < sum(cause.proven for _, _, cause in causes):
-        # With many single faults, some are neighbours on a wire by chance: solve again with a higher prevalence.
+        # With many single faults, some are neighbours on a wire by chance: solve again with a
+        # higher prevalence.
         common = (1 - ANYWHERE) / 2 * singles / int((found.alive | found.faulty).sum())
         causes = _causes(found, aliased, layout, common)
-    proven = [_fault(kind, value, cause, found, layout) for kind, value, cause in causes if cause.proven]
+    proven = [
+        _fault(kind, value, cause, found, layout) for kind, value, cause in causes if cause.proven
+    ]
     faults = _addresses_of_dead_rows([*aliases, *proven], found, layout)
-    possible = [_fault(kind, value, cause, found, layout) for kind, value, cause in causes if not cause.proven]
-    return tuple(sorted(faults, key=lambda fault: (-len(fault.cells), fault.cells))), tuple(possible)
+    possible = [
+        _fault(kind, value, cause, found, layout)
+        for kind, value, cause in causes
+        if not cause.proven
+    ]
+    return tuple(sorted(faults, key=lambda fault: (-len(fault.cells), fault.cells))), tuple(
+        possible
+    )
 
 
 def _causes(
     found: CellFindings, aliased: Mask, layout: SensorLayout, common: float
 ) -> list[tuple[FaultKind, float | None, Cause]]:
-    """Return kind, value and cause of each fault; ``common``: lower limit of the prevalence of one kind."""
+    """Return kind, value and cause of each fault; ``common``: lower limit of the prevalence of one
+    kind."""
     causes = []
     for kind, faulty, consistent, value in _groups(found, layout.full_scale):
-        # A working cell contradicts a broken wire; so does one with another fault, or another value.
+        # A working cell contradicts a broken wire; so does one with another fault, or another
+        # value.
         contradicting = found.alive | (found.faulty & ~consistent) | aliased
         if kind in (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK):
             # A cell that became constant before the wire broke does not contradict it.
@@ -110,18 +134,25 @@ def _causes(
             begun = int(np.median(found.since[leading])) if leading.any() else 0
             contradicting &= ~(consistent & ~faulty & (found.since <= begun) & (begun > 0))
             contradicting |= ~consistent & ~found.silent
-        explained = _explained(faulty & ~aliased, consistent & ~aliased, contradicting, found, layout, common)
+        explained = _explained(
+            faulty & ~aliased, consistent & ~aliased, contradicting, found, layout, common
+        )
         causes += [(kind, value, cause) for cause in explained]
     return causes
 
 
 def _explained(
-    faulty: Mask, consistent: Mask, contradicting: Mask, found: CellFindings, layout: SensorLayout, common: float
+    faulty: Mask,
+    consistent: Mask,
+    contradicting: Mask,
+    found: CellFindings,
+    layout: SensorLayout,
+    common: float,
 ) -> tuple[Cause, ...]:
     """Return the causes of cells with the same fault; see ``solve``.
 
-    Cells that were dead in the reference are no evidence for a wire that broke later, though they may lie on it. A wire
-    that was broken in the reference explains such cells only.
+    Cells that were dead in the reference are no evidence for a wire that broke later, though they
+    may lie on it. A wire that was broken in the reference explains such cells only.
     """
     known = found.known & faulty
 
@@ -133,9 +164,13 @@ def _explained(
     return causes + of(known, known, ~known)
 
 
-def _groups(found: CellFindings, full_scale: float) -> list[tuple[FaultKind, Mask, Mask, float | None]]:
-    """Return (kind, certainly faulty cells, all consistent cells, value) of each group that may share a cause."""
-    faulty, value = found.faulty, found.value
+def _groups(
+    found: CellFindings, full_scale: float
+) -> list[tuple[FaultKind, Mask, Mask, float | None]]:
+    """Return (kind, certainly faulty cells, all consistent cells, value) of each group that may
+    share a cause."""
+    faulty = found.faulty
+    value = found.value
     moving = found.intermittent | found.noisy | found.drifting | (found.refuted >= 0)
     constant = faulty & ~found.silent & ~moving
     of_gain = found.drifting & np.isfinite(found.gain)
@@ -147,7 +182,10 @@ def _groups(found: CellFindings, full_scale: float) -> list[tuple[FaultKind, Mas
         *([] if found.zero is None else [(FaultKind.OPEN, constant & found.zero, found.zero, 0.0)]),
         (FaultKind.INTERMITTENT, faulty & found.intermittent, found.intermittent, None),
         (FaultKind.NOISY, faulty & found.noisy, found.noisy, None),
-        *((FaultKind.DRIFT, faulty & drifting, drifting, None) for drifting in (of_offset, of_gain)),
+        *(
+            (FaultKind.DRIFT, faulty & drifting, drifting, None)
+            for drifting in (of_offset, of_gain)
+        ),
     ]
     for number, kind in enumerate(REFUTED_KINDS):
         refuted = found.refuted == number
@@ -155,7 +193,9 @@ def _groups(found: CellFindings, full_scale: float) -> list[tuple[FaultKind, Mas
     at_an_end = found.full if found.zero is None else found.full | found.zero
     intermediate = np.flatnonzero(constant & ~found.rests & ~at_an_end)
     intermediate = intermediate[np.argsort(value[intermediate])]
-    for cells in np.split(intermediate, np.flatnonzero(np.diff(value[intermediate]) > SLIGHT * full_scale) + 1):
+    for cells in np.split(
+        intermediate, np.flatnonzero(np.diff(value[intermediate]) > SLIGHT * full_scale) + 1
+    ):
         if len(cells):
             mask = np.zeros(len(faulty), bool)
             mask[cells] = True
@@ -163,16 +203,34 @@ def _groups(found: CellFindings, full_scale: float) -> list[tuple[FaultKind, Mas
     return [group for group in groups if group[2].any()]
 
 
-def _fault(kind: FaultKind, value: float | None, cause: Cause, found: CellFindings, layout: SensorLayout) -> Fault:
+def _fault(
+    kind: FaultKind, value: float | None, cause: Cause, found: CellFindings, layout: SensorLayout
+) -> Fault:
     seen = list(cause.seen)
-    own = (FaultKind.STUCK, FaultKind.OPEN, FaultKind.INTERMITTENT, FaultKind.LATE, FaultKind.COPY, FaultKind.CLAMPED)
+    own = (
+        FaultKind.STUCK,
+        FaultKind.OPEN,
+        FaultKind.INTERMITTENT,
+        FaultKind.LATE,
+        FaultKind.COPY,
+        FaultKind.CLAMPED,
+    )
     if kind in own and not found.silent[seen[0]]:
         value = float(np.median(found.value[seen]))
         if np.isnan(value):  # a copy of no single cell
             value = None
-        elif found.zero is not None and kind is FaultKind.OPEN:  # at rest, which is not the lower end
-            low, high = SLIGHT * layout.full_scale, (1 - SLIGHT) * layout.full_scale
-            kind = FaultKind.SHORT if value >= high else FaultKind.OPEN if value <= low else FaultKind.STUCK
+        elif (
+            found.zero is not None and kind is FaultKind.OPEN
+        ):  # at rest, which is not the lower end
+            low = SLIGHT * layout.full_scale
+            high = (1 - SLIGHT) * layout.full_scale
+            kind = (
+                FaultKind.SHORT
+                if value >= high
+                else FaultKind.OPEN
+                if value <= low
+                else FaultKind.STUCK
+            )
     start = int(np.median(found.since[seen]))
     fault = Fault(
         kind,
@@ -180,7 +238,9 @@ def _fault(kind: FaultKind, value: float | None, cause: Cause, found: CellFindin
         line=cause.line,
         value=value,
         onset=start if start > 0 else None,
-        probability=float(found.probability[cause.cells[0]]) if cause.line is None else cause.probability,
+        probability=(
+            float(found.probability[cause.cells[0]]) if cause.line is None else cause.probability
+        ),
         evidence=int(found.events[seen].sum()),
     )
     fault = replace(fault, reason=_reason(fault, cause, found, layout))
@@ -195,7 +255,9 @@ _DOING = {
     FaultKind.DRIFT: "moves, but never returns to its baseline",
     FaultKind.FLOATING: "moves by itself, whatever the cells around it read",
     FaultKind.LATE: "follows the cells around it about {value:.0f} frames late",
-    FaultKind.CLAMPED: "never reads more than {value:.4g} {unit}, however much the cells around it are loaded",
+    FaultKind.CLAMPED: (
+        "never reads more than {value:.4g} {unit}, however much the cells around it are loaded"
+    ),
 }
 
 
@@ -214,13 +276,23 @@ _CHECKS = {
 def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
     gain = found.gain[list(fault.cells)]
     if fault.kind is FaultKind.DRIFT and np.isfinite(gain).any():
-        return f"is loaded when the others are, but reads about {np.nanmedian(gain):.2g} times what it should"
+        return (
+            f"is loaded when the others are, but reads about {np.nanmedian(gain):.2g} times what it"
+            " should"
+        )
     if fault.kind is FaultKind.COPY:
-        source = "the mean of the cells beside it" if fault.value is None else layout.place(int(fault.value))
+        source = (
+            "the mean of the cells beside it"
+            if fault.value is None
+            else layout.place(int(fault.value))
+        )
         return f"repeats {source}"
     if fault.kind is FaultKind.INTERMITTENT and found.refuted[fault.cells[0]] >= 0:
         share = float(np.median(found.share[list(fault.cells)]))
-        return f"reads nothing in {share:.0%} of the contacts that load the cells around it, and its load in the others"
+        return (
+            f"reads nothing in {share:.0%} of the contacts that load the cells around it, and its"
+            " load in the others"
+        )
     if fault.kind in _DOING:
         return _DOING[fault.kind].format(value=fault.value or 0.0, unit=layout.unit)
     if found.silent[fault.cells[0]]:
@@ -234,25 +306,41 @@ def _reason(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayou
     if not cause.proven:
         few = f"{len(cause.seen)} cells on it" if len(cause.seen) > 1 else "1 cell on it"
         return (
-            f"{fault.line} may be {fault.kind}{_where(fault, cause, layout)} (P = {fault.probability:.2f}), or only "
-            f"{few}, each of which {does}: one more contact along it will tell"
+            f"{fault.line} may be {fault.kind}{_where(fault, cause, layout)} (P ="
+            f" {fault.probability:.2f}), or only {few}, each of which {does}: one more contact"
+            " along it will tell"
         )
     already = ", and did so in the reference already" if found.known[list(cause.seen)].all() else ""
-    since = "" if fault.onset is None else f" from frame {fault.onset} on ({fault.onset / layout.rate:.1f} s)"
+    since = (
+        ""
+        if fault.onset is None
+        else f" from frame {fault.onset} on ({fault.onset / layout.rate:.1f} s)"
+    )
     if fault.line is None:
-        whatever = "" if fault.kind in _DOING or found.silent[fault.cells[0]] else ", whatever touches it"
+        whatever = (
+            "" if fault.kind in _DOING or found.silent[fault.cells[0]] else ", whatever touches it"
+        )
         check = _CHECKS.get(fault.kind, "the cell and its traces for a short circuit")
-        return f"{layout.place(fault.cells[0])} is {fault.kind}: it {does}{since}{whatever}{already}; check {check}"
+        return (
+            f"{layout.place(fault.cells[0])} is {fault.kind}: it {does}{since}{whatever}{already};"
+            f" check {check}"
+        )
     inferred = len(cause.cells) - len(cause.seen)
     are = "is" if inferred == 1 else "are"
     if fault.line.kind in ("position", "bus", "group"):
-        silent = "are silent" if found.silent[fault.cells[0]] else f"are {fault.kind}: each cell {does}"
+        silent = (
+            "are silent" if found.silent[fault.cells[0]] else f"are {fault.kind}: each cell {does}"
+        )
         also = f"; {inferred} of the cells, not tested, {are} inferred" if inferred else ""
         return f"{action(fault.line)}: {_behind(fault, layout)} {silent}{since}{already}{also}"
     also = f"; {inferred} more, not tested, {are} inferred from the wire" if inferred else ""
     seen = f"each of {len(cause.seen)} cells on it {does}{since}{already}{also}"
     of_converter = fault.line.kind == "converter"
-    check = "the converter channel and its cable" if of_converter else f"the {fault.line.kind} wire and its address"
+    check = (
+        "the converter channel and its cable"
+        if of_converter
+        else f"the {fault.line.kind} wire and its address"
+    )
     return f"{fault.line} is {fault.kind}{_where(fault, cause, layout)}: {seen}; check {check}"
 
 
@@ -269,17 +357,25 @@ def _behind(fault: Fault, layout: SensorLayout) -> str:
 
 
 def _where(fault: Fault, cause: Cause, layout: SensorLayout) -> str:
-    """Return the part of its line that a fault affects, as " from column 5 on" or " up to column 4"; "": all of it."""
+    """Return the part of its line that a fault affects, as " from column 5 on" or " up to column
+    4"; "": all of it."""
     if cause.whole or fault.line is None:
         return ""
     across, name = (2, "column") if fault.line.kind == "row" else (1, "row")
     dead = [layout.position(cell)[across] for cell in fault.cells]
     on_line = [layout.position(cell)[across] for cell in layout.cells_on(fault.line).tolist()]
-    return f" from {name} {min(dead)} on" if max(dead) == max(on_line) else f" up to {name} {max(dead)}"
+    return (
+        f" from {name} {min(dead)} on"
+        if max(dead) == max(on_line)
+        else f" up to {name} {max(dead)}"
+    )
 
 
-def _alternatives(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayout) -> tuple[str, ...]:
-    """Return other causes with the same findings: the address of a dead line, or a break further along it."""
+def _alternatives(
+    fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayout
+) -> tuple[str, ...]:
+    """Return other causes with the same findings: the address of a dead line, or a break further
+    along it."""
     assert fault.line is not None
     others = []
     cells = layout.cells_on(fault.line)
@@ -298,8 +394,11 @@ def _alternatives(fault: Fault, cause: Cause, found: CellFindings, layout: Senso
     return tuple(others)
 
 
-def _addresses_of_dead_rows(faults: list[Fault], found: CellFindings, layout: SensorLayout) -> list[Fault]:
-    """Merge dead lines that one stuck address bit would explain: it selects lines without contact instead."""
+def _addresses_of_dead_rows(
+    faults: list[Fault], found: CellFindings, layout: SensorLayout
+) -> list[Fault]:
+    """Merge dead lines that one stuck address bit would explain: it selects lines without contact
+    instead."""
     for line in layout.lines:
         if line.kind not in ("row_address", "column_address"):
             continue
@@ -316,12 +415,19 @@ def _addresses_of_dead_rows(faults: list[Fault], found: CellFindings, layout: Se
             cells, sources = layout.misaddressed(line, level)
             moved = _index(cells, kind, layout)
             dead = {index: whole[index] for index in moved if index in whole}
-            # One stuck bit is likelier than two broken wires. All lines that it moves must be dead or untested.
-            if len(dead) < max(2, len(moved) / 2) or found.alive[[*cells, *sources[sources >= 0]]].any():
+            # One stuck bit is likelier than two broken wires. All lines that it moves must be dead
+            # or untested.
+            if (
+                len(dead) < max(2, len(moved) / 2)
+                or found.alive[[*cells, *sources[sources >= 0]]].any()
+            ):
                 continue
             reads = _index(sources[sources >= 0], kind, layout)
             instead = f"untouched {_named(kind, reads)}" if reads else f"addresses without a {kind}"
-            text = f"{line} is stuck at {level}: {_named(kind, moved)} read nothing, as {instead} would"
+            text = (
+                f"{line} is stuck at {level}: {_named(kind, moved)} read nothing, as {instead}"
+                " would"
+            )
             merged = Fault(
                 FaultKind.ALIAS,
                 tuple(cells.tolist()),
@@ -331,7 +437,12 @@ def _addresses_of_dead_rows(faults: list[Fault], found: CellFindings, layout: Se
                 probability=min(f.probability or 0.0 for f in dead.values()),
                 reason=f"{text}; check the {kind} multiplexer and its address wires",
                 evidence=sum(f.evidence or 0 for f in dead.values()),
-                alternatives=(f"the wires of {_named(kind, list(dead))} are open, independently of each other",),
+                alternatives=(
+                    (
+                        f"the wires of {_named(kind, list(dead))} are open, independently of each"
+                        " other"
+                    ),
+                ),
             )
             faults = [f for f in faults if f not in dead.values()] + [merged]
     return faults

@@ -1,7 +1,9 @@
-"""Writes any dataclass of numbers and arrays as JSON and named arrays, and reads it back bit for bit. No pickle.
+"""Writes any dataclass of numbers and arrays as JSON and named arrays, and reads it back bit for
+bit. No pickle.
 
-The types of the fields say how each value is read: numbers, booleans, arrays, other dataclasses, tuples of these, and
-``| None``. A :class:`~diagnostics.layout.SensorLayout` is written by its own ``to_dict``.
+The types of the fields say how each value is read: numbers, booleans, arrays, other dataclasses,
+tuples of these, and ``| None``. A :class:`~diagnostics.layout.SensorLayout` is written by its own
+``to_dict``.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ T = TypeVar("T")
 
 
 def to_state(value: object) -> tuple[Any, Arrays]:
-    """Return a JSON-safe description of ``value``, and its arrays by dotted name, as :func:`from_state` reads them."""
+    """Return a JSON-safe description of ``value``, and its arrays by dotted name, as
+    :func:`from_state` reads them."""
     arrays: Arrays = {}
     return _packed(value, "", arrays), arrays
 
@@ -43,15 +46,24 @@ def _packed(value: Any, name: str, arrays: Arrays) -> Any:
     if isinstance(value, np.ndarray):
         arrays[name] = np.array(value, order="C")
         finite = bool(np.isfinite(value).all())
-        return {"array": name, "dtype": str(value.dtype), "shape": list(value.shape), "finite": finite}
+        return {
+            "array": name,
+            "dtype": str(value.dtype),
+            "shape": list(value.shape),
+            "finite": finite,
+        }
     if is_dataclass(value):
         prefix = f"{name}." if name else ""
-        return {f.name: _packed(getattr(value, f.name), f"{prefix}{f.name}", arrays) for f in fields(value)}
+        return {
+            f.name: _packed(getattr(value, f.name), f"{prefix}{f.name}", arrays)
+            for f in fields(value)
+        }
     if isinstance(value, tuple):
         return [_packed(item, f"{name}.{i}", arrays) for i, item in enumerate(value)]
     if isinstance(value, np.generic):
         value = value.item()
-    return value if not isinstance(value, float) or np.isfinite(value) else str(value)  # JSON has no infinity
+    # JSON has no infinity
+    return value if not isinstance(value, float) or np.isfinite(value) else str(value)
 
 
 def _read(kind: Any, about: Any, arrays: Mapping[str, ArrayLike], name: str) -> Any:
@@ -70,9 +82,9 @@ def _read(kind: Any, about: Any, arrays: Mapping[str, ArrayLike], name: str) -> 
         if not isinstance(about, Mapping):
             raise TypeError(f"expected the fields of {name}, got {about!r}")
         hints = get_type_hints(kind)
-        # A file of an earlier version may lack newer fields.
-        given = [f.name for f in fields(kind) if f.name in about or "newer" not in f.metadata]
-        return kind(**{key: _read(hints[key], about[key], arrays, key) for key in given})
+        return kind(
+            **{f.name: _read(hints[f.name], about[f.name], arrays, f.name) for f in fields(kind)}
+        )
     if isinstance(about, bool) != (kind is bool) or not isinstance(about, int | float | str):
         raise TypeError(f"expected {kind.__name__} for {name}, got {about!r}")
     return kind(about)
@@ -80,10 +92,12 @@ def _read(kind: Any, about: Any, arrays: Mapping[str, ArrayLike], name: str) -> 
 
 def _array(about: Any, arrays: Mapping[str, ArrayLike]) -> NDArray[Any]:
     """Return a copy of its own, as the fitted arrays are."""
-    name, array = about["array"], np.asarray(arrays[about["array"]])
+    name = about["array"]
+    array = np.asarray(arrays[about["array"]])
     if str(array.dtype) != about["dtype"] or list(array.shape) != about["shape"]:
         raise ValueError(
-            f"expected {about['dtype']} {about['shape']} for {name}, got {array.dtype} {list(array.shape)}"
+            f"expected {about['dtype']} {about['shape']} for {name}, got {array.dtype}"
+            f" {list(array.shape)}"
         )
     if about["finite"] and not np.isfinite(array).all():
         raise ValueError(f"{name} holds numbers that are not finite")

@@ -1,18 +1,22 @@
-"""Static loads: an object or a strap that lies still on the array looks like stuck cells, and is no fault.
+"""Static loads: an object or a strap that lies still on the array looks like stuck cells, and is no
+fault.
 
-Tests neighbouring cells that hold a load since the same time: an object, or independent faults? All other cells were
-unloaded at some time since, so that the loads that are left are those of the object alone. The log odds of an object,
-by the chain rule over the cells i of the group,
+Tests neighbouring cells that hold a load since the same time: an object, or independent faults? All
+other cells were unloaded at some time since, so that the loads that are left are those of the
+object alone. The log odds of an object, by the chain rule over the cells i of the group,
 
-    log P(object) + sum over i of  log P(v_i | object, cells before i, other cells unloaded) - log P(i stuck at v_i)
+    log P(object)
+        + sum over i of  log P(v_i | object, cells before i, other cells unloaded)
+                         - log P(i stuck at v_i)
 
-take the first probability from the healthy model, in which the loads of a contact support each other, and the second
-from the share of cells that are stuck elsewhere on the array. The cells with the highest sum are the object; its
-probability is the logistic function of the log odds. Cells of an object are neither faulty nor tested.
+take the first probability from the healthy model, in which the loads of a contact support each
+other, and the second from the share of cells that are stuck elsewhere on the array. The cells with
+the highest sum are the object; its probability is the logistic function of the log odds. Cells of
+an object are neither faulty nor tested.
 
-Not detected: objects on fewer than three cells; objects of a shape or load that no contact of the reference had;
-objects without a reference. Cells that are stuck at values that an object could have look like one, unless they lost
-noise that they had in the reference.
+Not detected: objects on fewer than three cells; objects of a shape or load that no contact of the
+reference had; objects without a reference. Cells that are stuck at values that an object could have
+look like one, unless they lost noise that they had in the reference.
 """
 
 from __future__ import annotations
@@ -48,7 +52,8 @@ Cells = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class StaticLoad:
-    """An object or a strap that lies still on some cells: neither these are faulty, nor does the log test them.
+    """An object or a strap that lies still on some cells: neither these are faulty, nor does the
+    log test them.
 
     Attributes:
         cells: ascending.
@@ -65,16 +70,19 @@ class StaticLoad:
     @classmethod
     def on(cls, cells: Cells, probability: float, since: int, layout: SensorLayout) -> StaticLoad:
         """Return the load with its sentence."""
-        n, from_when = len(cells), f"since about frame {since}" if since else "from the start"
+        n = len(cells)
+        from_when = f"since about frame {since}" if since else "from the start"
         reason = (
-            f"something lies still on {where(cells, layout)} {from_when} ({n} cells, P = {probability:.2f});"
-            " these cells are not tested: remove it and record again"
+            f"something lies still on {where(cells, layout)} {from_when} ({n} cells, P ="
+            f" {probability:.2f}); these cells are not tested: remove it and record again"
         )
         return cls(tuple(cells.tolist()), probability, since or None, reason)
 
     def of(self, order: Cells, layout: SensorLayout) -> StaticLoad:
         """Return the same load with cell i at ``order[i]`` of a layout."""
-        return self.on(np.unique(order[list(self.cells)]), self.probability, self.onset or 0, layout)
+        return self.on(
+            np.unique(order[list(self.cells)]), self.probability, self.onset or 0, layout
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict that :meth:`from_dict` reads."""
@@ -103,15 +111,16 @@ def find_static_loads(
         faulty: bool ``[D]``, cells that look faulty; a new load has to explain one of them.
         excluded: bool ``[D]``, cells that are explained otherwise.
         known: loads found before.
-        beside: whether a faulty cell beside the load suffices. Cells that move on an object are healthy, but mislead
-            the test of the cells around it.
+        beside: whether a faulty cell beside the load suffices. Cells that move on an object are
+            healthy, but mislead the test of the cells around it.
     """
     if stream.reference.model is None or not faulty.any():
         return list(known)
     held = _HeldLoads.of(stream, spatial, faulty, excluded)
     blamed = held.faulty & (held.root > 0)
     broken = _on_broken_wires(blamed & spatial.scored, stream)
-    broken |= stream.without_noise() & np.isfinite(held.values.high)  # an object takes noise away at full scale only
+    # an object takes noise away at full scale only
+    broken |= stream.without_noise() & np.isfinite(held.values.high)
     loaded = _mask([cell for load in known for cell in load.cells], len(faulty))
     holding = (held.root > 0) & ~broken
 
@@ -139,7 +148,11 @@ def find_static_loads(
         otherwise = held.without_object(blamed & ~group)
         cells, odds = held.most_likely(group, otherwise, supported, first, float(expected))
         if own or (odds > PROVEN and len(cells) >= _FEWEST and explains(_mask(cells, len(faulty)))):
-            found.append(StaticLoad.on(cells, float(expit(odds)), int(np.median(held.since[cells])), stream.layout))
+            found.append(
+                StaticLoad.on(
+                    cells, float(expit(odds)), int(np.median(held.since[cells])), stream.layout
+                )
+            )
     return found
 
 
@@ -168,26 +181,39 @@ class _HeldLoads:
     @classmethod
     def of(cls, stream: StreamState, spatial: Spatial, faulty: Mask, excluded: Mask) -> _HeldLoads:
         """Return the loads of a log; the arguments are those of :func:`find_static_loads`."""
-        scale, runs = stream.scale, stream.runs
+        scale = stream.scale
+        runs = stream.runs
         least, since = stream.least_loads()
         value = np.minimum(np.nan_to_num(runs.value), scale.baseline + scale.full_scale)
         root = np.where(spatial.scored, scale.root_load(value), least)
-        since = np.where(spatial.scored, np.where(least > 0, np.minimum(runs.start, since), runs.start), since)
-        root[since >= max(stream.begun, default=0)] = 0.0  # the load of the last contact, which may still go on
+        since = np.where(
+            spatial.scored, np.where(least > 0, np.minimum(runs.start, since), runs.start), since
+        )
+        root[since >= max(stream.begun, default=0)] = (
+            0.0  # the load of the last contact, which may still go on
+        )
         root[excluded | ~stream.present | (stream.reference.dead > 0) | (root**2 < SLIGHT)] = 0.0
-        values = HeldValues.of(scale.baseline + root**2 * scale.full_scale, scale, stream.reference.tolerance)
+        values = HeldValues.of(
+            scale.baseline + root**2 * scale.full_scale, scale, stream.reference.tolerance
+        )
         faulty = faulty & ~(np.isfinite(spatial.factor) & (spatial.since < since))
         return cls(stream, spatial, faulty, excluded, root, since, values)
 
     @cached_property
     def surprisal(self) -> Floats:
-        """-log P(these readings | healthy, no object) of cells with a load: as a value, drift or unbroken contacts."""
+        """-log P(these readings | healthy, no object) of cells with a load: as a value, drift or
+        unbroken contacts."""
         drift = self.spatial.offset + np.maximum(self.spatial.gain, 0.0)
-        return np.maximum(self.spatial.surprisal + drift, self.stream.never_unloaded(self.root > 0, self.others))
+        return np.maximum(
+            self.spatial.surprisal + drift, self.stream.never_unloaded(self.root > 0, self.others)
+        )
 
     def without_object(self, blamed: Mask) -> Floats:
-        """Return the log likelihood without an object, ``[D]``; ``blamed`` (bool ``[D]``) are the faults elsewhere."""
-        full, constant, present = np.isinf(self.values.high), self.spatial.scored, self.stream.present
+        """Return the log likelihood without an object, ``[D]``; ``blamed`` (bool ``[D]``) are the
+        faults elsewhere."""
+        full = np.isinf(self.values.high)
+        constant = self.spatial.scored
+        present = self.stream.present
         anywhere = 4 * self.stream.reference.tolerance / self.stream.scale.full_scale
         alternatives = (
             (full, (1 - ANYWHERE) / 2, 1.0),
@@ -201,13 +227,16 @@ class _HeldLoads:
         return log_likely
 
     def with_object(self, chosen: Sequence[int] | Cells) -> Floats:
-        """Return the log likelihood of each load, ``[D]``, with an object on it and the ``chosen`` cells."""
+        """Return the log likelihood of each load, ``[D]``, with an object on it and the ``chosen``
+        cells."""
         held = np.flatnonzero(self.root > 0)
         predictors = self.others | _mask(chosen, len(self.root))
         log_likely = np.zeros(len(self.root))
         of_model = np.exp(self.stream.log_held(self.root, predictors, self.values)[held])
         any_shape = np.where(np.isnan(of_model), 1.0, _ANY_SHAPE)
-        log_likely[held] = np.log((1 - any_shape) * np.nan_to_num(of_model) + any_shape * _BESIDE * self.width[held])
+        log_likely[held] = np.log(
+            (1 - any_shape) * np.nan_to_num(of_model) + any_shape * _BESIDE * self.width[held]
+        )
         return log_likely
 
     @cached_property
@@ -224,31 +253,41 @@ class _HeldLoads:
         return np.maximum(width, P_MIN)  # full scale has none
 
     def most_likely(
-        self, group: Mask, otherwise: Floats, supported: Floats, first: Sequence[int], expected: float
+        self,
+        group: Mask,
+        otherwise: Floats,
+        supported: Floats,
+        first: Sequence[int],
+        expected: float,
     ) -> tuple[Cells, float]:
-        """Return the cells of a group that one object explains best, and the log odds of the object.
+        """Return the cells of a group that one object explains best, and the log odds of the
+        object.
 
         Args:
             group: bool ``[D]``, neighbouring cells that hold a load.
             otherwise: float ``[D]``, log likelihood of each without an object.
             supported: float ``[D]``, the same with an object, given all other cells of the group.
             first: cells that are known to lie under the object.
-            expected: log odds of the object with these; of one at a given place where there are none.
+            expected: log odds of the object with these; of one at a given place where there are
+                none.
         """
-        chosen, sums = list(first), [expected]
+        chosen = list(first)
+        sums = [expected]
         if not chosen:
             gain = np.where(group, supported - otherwise, -np.inf)
             best = int(gain.argmax())
             begin = expected + float(np.log(self.width[best]) - otherwise[best])
             if begin + np.maximum(gain, 0.0).sum() - gain[best] <= 0:
                 return np.flatnonzero(group), -np.inf
-            chosen, sums = [best], [begin]
+            chosen = [best]
+            sums = [begin]
         known = len(chosen)
         while len(chosen) < group.sum():
             on = _mask(chosen, len(group))
             beside = self.stream.layout.with_neighbours(on) & ~on & group
             gain = np.where(beside, self.with_object(chosen) - otherwise, -np.inf)
-            # As many again as are known: few predictions, and cells that join together do not support each other.
+            # As many again as are known: few predictions, and cells that join together do not
+            # support each other.
             more = np.argsort(-gain, kind="stable")[: min(len(chosen), int(beside.sum()))]
             if not len(more):
                 break
@@ -265,13 +304,17 @@ def _mask(cells: Cells | Sequence[int], n: int) -> Mask:
 
 
 def _on_broken_wires(blamed: Mask, stream: StreamState) -> Mask:
-    """Return the ``blamed`` cells (bool ``[D]``) that read the same as most cells on one of their wires do."""
-    explained, value = np.zeros(len(blamed), bool), stream.runs.value
+    """Return the ``blamed`` cells (bool ``[D]``) that read the same as most cells on one of their
+    wires do."""
+    explained = np.zeros(len(blamed), bool)
+    value = stream.runs.value
     for line in stream.layout.lines:
         cells = stream.layout.cells_on(line)
         held = cells[blamed[cells]]
         if len(held) > max(2, len(cells) / 2):
-            same = held[np.abs(value[held] - np.median(value[held])) <= stream.reference.tolerance / 2]
+            same = held[
+                np.abs(value[held] - np.median(value[held])) <= stream.reference.tolerance / 2
+            ]
             if len(same) > max(2, len(cells) / 2):
                 explained[same] = True
     return explained

@@ -4,9 +4,10 @@ Finds, for each cell, the longest run at the end of the log within +- tolerance 
 
     start = min { s : max(x_s..x_T) - min(x_s..x_T) <= 2 tolerance }
 
-A stuck cell is constant from its onset on, up to the dither of the converter. So is a healthy cell without contact, or
-under a static load: a constant run alone is no evidence of a fault. The spatial test
-(:mod:`~diagnostics.evidence.spatial`) and the size of the jump (:mod:`~diagnostics.evidence.jumps`) decide.
+A stuck cell is constant from its onset on, up to the dither of the converter. So is a healthy cell
+without contact, or under a static load: a constant run alone is no evidence of a fault. The spatial
+test (:mod:`~diagnostics.evidence.spatial`) and the size of the jump
+(:mod:`~diagnostics.evidence.jumps`) decide.
 """
 
 from __future__ import annotations
@@ -34,9 +35,12 @@ class ConstantRuns:
     Attributes:
         start: int ``[D]``, number of the first frame of the run; 0 where the cell never moved.
         length: int ``[D]``, frames of the run with a reading.
-        low, high: float ``[D]``, range of the readings in the run; inf and -inf before the first reading.
-        jump: float ``[D]``, change of the reading in the step into the run; 0 where the cell never moved.
-        company: float ``[D]``, share of the loaded cells that jumped in the same direction in the same step.
+        low, high: float ``[D]``, range of the readings in the run; inf and -inf before the first
+        reading.
+        jump: float ``[D]``, change of the reading in the step into the run; 0 where the cell never
+            moved.
+        company: float ``[D]``, share of the loaded cells that jumped in the same direction in the
+            same step.
         last: float ``[D]``, the last reading; NaN: none yet.
         same: int ``[D]``, consecutive frames with exactly that reading.
         missed: int ``[D]``, consecutive frames without a reading, up to now.
@@ -57,12 +61,18 @@ class ConstantRuns:
     @classmethod
     def begin(cls, n_cells: int) -> ConstantRuns:
         """Return the state before any frame."""
-        zero, nothing = np.zeros(n_cells, np.intp), np.full(n_cells, np.inf)
-        jump, last = np.zeros(n_cells), np.full(n_cells, np.nan)
+        zero = np.zeros(n_cells, np.intp)
+        nothing = np.full(n_cells, np.inf)
+        jump = np.zeros(n_cells)
+        last = np.full(n_cells, np.nan)
         return cls(zero, zero, nothing, -nothing, jump, jump, last, zero, zero, zero)
 
     def extend(
-        self, frames: Floats, numbers: NDArray[np.intp], tolerance: float, baseline: Floats | float = 0.0
+        self,
+        frames: Floats,
+        numbers: NDArray[np.intp],
+        tolerance: float,
+        baseline: Floats | float = 0.0,
     ) -> ConstantRuns:
         """Return the runs after more frames.
 
@@ -76,49 +86,71 @@ class ConstantRuns:
         any_missing = bool(missing.any())
         top = np.where(missing, -np.inf, frames) if any_missing else frames
         bottom = np.where(missing, np.inf, frames) if any_missing else frames
-        low, high = np.minimum(self.low, bottom.min(axis=0)), np.maximum(self.high, top.max(axis=0))
+        low = np.minimum(self.low, bottom.min(axis=0))
+        high = np.maximum(self.high, top.max(axis=0))
         received = (~missing).sum(axis=0) if any_missing else np.full(len(self.low), len(frames))
         readings = held(frames, self.last)
-        start, length, jump, company = self.start, self.length + received, self.jump, self.company
+        start = self.start
+        length = self.length + received
+        jump = self.jump
+        company = self.company
         broke = np.flatnonzero(high - low > 2 * tolerance)
         if len(broke):
-            start, length, jump, company = start.copy(), length.copy(), jump.copy(), company.copy()
+            start = start.copy()
+            length = length.copy()
+            jump = jump.copy()
+            company = company.copy()
             # The first frame of the new run lies in this block: search backwards.
             highest = np.maximum.accumulate(top[::-1, broke], axis=0)
             lowest = np.minimum.accumulate(bottom[::-1, broke], axis=0)
-            count = (highest - lowest <= 2 * tolerance).sum(axis=0)  # the spread only grows: a prefix of True
+            # the spread only grows: a prefix of True
+            count = (highest - lowest <= 2 * tolerance).sum(axis=0)
             at = np.arange(len(broke))
             first = len(frames) - count
             if any_missing:  # it begins with a reading
-                first = (~missing[:, broke] & (np.arange(len(frames))[:, None] >= first)).argmax(axis=0)
+                first = (~missing[:, broke] & (np.arange(len(frames))[:, None] >= first)).argmax(
+                    axis=0
+                )
             start[broke] = numbers[first]
             length[broke] = np.minimum(count, received[broke])
             # The changes of all cells in the steps into these runs.
             steps = np.flatnonzero(np.bincount(first))
             which = np.searchsorted(steps, first)
-            before, after = readings[steps], readings[steps + 1]
-            step, size = after - before, np.fmax(after, before) - baseline
+            before = readings[steps]
+            after = readings[steps + 1]
+            step = after - before
+            size = np.fmax(after, before) - baseline
             drastic = np.maximum(0.5 * size, 4 * tolerance)
             # Cells that never moved may be broken from the start and could not have jumped.
             able = (high - low > 2 * tolerance) | self.moved
             able |= self.length < _RECENT
             loaded = np.maximum(_in_each((size > 4 * tolerance) & able), 1)
-            # At a release all cells fall, at a grasp all rise; when many break at once, some fall and some rise. So
-            # only changes in the same direction count.
+            # At a release all cells fall, at a grasp all rise; when many break at once, some fall
+            # and some rise. So only changes in the same direction count.
             share = np.array([_in_each(step < -drastic), _in_each(step > drastic)]) / loaded
-            low[broke], high[broke] = lowest[count - 1, at], highest[count - 1, at]
+            low[broke] = lowest[count - 1, at]
+            high[broke] = highest[count - 1, at]
             into = step[which, broke]
             jump[broke] = np.where(np.isnan(into), 0.0, into)
             company[broke] = share[(jump[broke] > 0).astype(np.intp), which]
-        latest = (_changed(readings) * np.arange(1, len(readings), dtype=np.int32)[:, None]).max(axis=0)
+        latest = (_changed(readings) * np.arange(1, len(readings), dtype=np.int32)[:, None]).max(
+            axis=0
+        )
         same = np.where(latest > 0, len(readings) - latest, self.same + len(frames))
-        missed, since = self._missed(missing, numbers) if any_missing else (np.zeros_like(same), self.missed_since)
-        return ConstantRuns(start, length, low, high, jump, company, readings[-1].copy(), same, missed, since)
+        missed, since = (
+            self._missed(missing, numbers)
+            if any_missing
+            else (np.zeros_like(same), self.missed_since)
+        )
+        return ConstantRuns(
+            start, length, low, high, jump, company, readings[-1].copy(), same, missed, since
+        )
 
     def _missed(
         self, missing: NDArray[np.bool_], numbers: NDArray[np.intp]
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the consecutive frames without a reading of each cell, and the number of the first."""
+        """Return the consecutive frames without a reading of each cell, and the number of the
+        first."""
         all_of_them = missing.all(axis=0)
         missed = np.where(all_of_them, self.missed + len(missing), (~missing[::-1]).argmax(axis=0))
         since = numbers[len(missing) - np.clip(missed, 1, len(missing))]
@@ -143,7 +175,8 @@ class ConstantRuns:
 
     @property
     def alone(self) -> NDArray[np.bool_]:
-        """bool ``[D]``, False where many cells jumped together with the cell, as when a grasp ends."""
+        """bool ``[D]``, False where many cells jumped together with the cell, as when a grasp
+        ends."""
         alone: NDArray[np.bool_] = self.company < _COMPANY
         return alone
 
@@ -170,14 +203,16 @@ def _changed(readings: Floats) -> NDArray[np.bool_]:
 
 def _in_each(which: NDArray[np.bool_]) -> NDArray[np.int32]:
     """Return the number of True cells in each frame of ``[t, D]``."""
-    count: NDArray[np.int32] = which.sum(axis=1, dtype=np.int32)  # int32: faster than NumPy's default
+    # int32: faster than NumPy's default
+    count: NDArray[np.int32] = which.sum(axis=1, dtype=np.int32)
     return count
 
 
 def segments(
     recording: Floats, scale: Scale, length: int = SEGMENT
 ) -> Iterator[tuple[Floats, NDArray[np.intp], ConstantRuns]]:
-    """Yield pieces of a healthy recording ``[T, D]``: frames, their numbers, and the constant runs at their end."""
+    """Yield pieces of a healthy recording ``[T, D]``: frames, their numbers, and the constant runs
+    at their end."""
     runs = ConstantRuns.begin(recording.shape[1])
     for first in range(0, len(recording), length):
         frames = recording[first : first + length]

@@ -1,15 +1,17 @@
 """Contact events: a log is segmented into contacts, each summarised by the load of every cell.
 
-Frames of one contact are strongly correlated, so evidence adds up over events, not over frames. An event ends when
+Frames of one contact are strongly correlated, so evidence adds up over events, not over frames. An
+event ends when
 
-    sum_i load_i(t) - min <= 0.3 (max - min)        over the cells that move: its load is released, or
+    sum_i load_i(t) - min <= 0.3 (max - min)    over the cells that move: its load is released, or
     cos(mean load, load of the next part) < 0.6     its load has moved elsewhere, or
-    a fifth of the load moves in one frame          another contact begins, as where another recording begins.
+    a fifth of the load moves in one frame      another contact begins, as where a recording begins.
 
-A static hold is one event, however long it lasts. An online change detection with hysteresis, as in onset detection;
-offline, ``ruptures.Pelt`` on the total load finds similar boundaries. Each event keeps at most six parts, so that a
-cell that fails within an event can be tested on the parts after the failure. Two contacts at the same time are one
-event, and loads below 10 % of the strongest event are not events.
+A static hold is one event, however long it lasts. An online change detection with hysteresis, as in
+onset detection; offline, ``ruptures.Pelt`` on the total load finds similar boundaries. Each event
+keeps at most six parts, so that a cell that fails within an event can be tested on the parts after
+the failure. Two contacts at the same time are one event, and loads below 10 % of the strongest
+event are not events.
 """
 
 from __future__ import annotations
@@ -29,10 +31,14 @@ _RELEASED = 0.3  # share of the load that is left when an event ends
 _MIN_AMPLITUDE = 0.1  # root load, summed over the cells: smaller changes are noise
 _WEAKEST = 0.1  # of the largest amplitude so far: smaller changes do not end an event
 _LEAST_OF_HELD = 0.05  # of the constant load: smaller changes are not its release
-_MOVING = 0.25  # share of the load that must move, and share that must be gone, at the end of an event
-_EXCHANGED = 0.2  # share of the load that vanishes and appears elsewhere in one frame where another event begins
+# share of the load that must move, and share that must be gone, at the end of an event
+_MOVING = 0.25
+# share of the load that vanishes and appears elsewhere in one frame where another event begins
+_EXCHANGED = 0.2
 # In a static hold less suffices: 0.06 of the load and three times the 0.9 quantile over the frames.
-_MIN_EXCHANGED, _OUTLYING, _QUANTILE = 0.06, 3.0, 0.9
+_MIN_EXCHANGED = 0.06
+_OUTLYING = 3.0
+_QUANTILE = 0.9
 _PERSISTING = 0.65  # share of the loaded cells that hold their value: then the event continues
 _SAME_PLACE = 0.6  # cosine between mean loads from which on two events load the same cells
 THE_SAME = 0.95  # cosine from which on they are the same
@@ -72,8 +78,16 @@ class Summary:
         )
 
     def features(self) -> Array:
-        """Return ``[4, D]``: highest root load, mean root load, 1 if ever loaded, share of the frames loaded."""
-        return np.stack([self.most, self.total / self.n, (self.loaded > 0).astype(np.float32), self.loaded / self.n])
+        """Return ``[4, D]``: highest root load, mean root load, 1 if ever loaded, share of the
+        frames loaded."""
+        return np.stack(
+            [
+                self.most,
+                self.total / self.n,
+                (self.loaded > 0).astype(np.float32),
+                self.loaded / self.n,
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -83,8 +97,8 @@ class ContactEvent:
     Attributes:
         parts: at most six consecutive summaries.
         lowest, highest: float ``[D]``, range of the root load of each cell in the event.
-        since: a load that is constant since this frame, or later, may belong to this event; one that is constant for
-            longer outlasted the event before.
+        since: a load that is constant since this frame, or later, may belong to this event; one
+            that is constant for longer outlasted the event before.
     """
 
     parts: tuple[Summary, ...]
@@ -117,7 +131,8 @@ class ContactEvent:
         return self.suffixes()[0]
 
     def suffixes(self) -> list[Summary]:
-        """Return the summaries from the start of each part to the end of the event, the whole event first."""
+        """Return the summaries from the start of each part to the end of the event, the whole event
+        first."""
         ends = [self.parts[-1]]
         for part in self.parts[-2::-1]:
             ends.append(part + ends[-1])
@@ -131,27 +146,36 @@ class ContactEvent:
             i = int(np.argmin(sizes))
             parts[i : i + 2] = [parts[i] + parts[i + 1]]
         return ContactEvent(
-            tuple(parts), np.minimum(self.lowest, lowest), np.maximum(self.highest, highest), self.since
+            tuple(parts),
+            np.minimum(self.lowest, lowest),
+            np.maximum(self.highest, highest),
+            self.since,
         )
 
     def same_location(self, part: Summary, lowest: Array) -> bool:
         """Return whether ``part`` loads about the same cells; True where either has no load."""
         floor = np.minimum(self.lowest, lowest)
-        before, now = self.mean() - floor, part.total / part.n - floor
+        before = self.mean() - floor
+        now = part.total / part.n - floor
         size = float(np.sqrt((before @ before) * (now @ now)))
         return size <= _MIN_AMPLITUDE**2 or float(before @ now) >= _SAME_PLACE * size
 
-    def persists(self, part: Summary, root_near: float, start: NDArray[np.intp], jumped: NDArray[np.bool_]) -> bool:
-        """Return whether most of its loaded cells hold the same value in ``part``; see ``EventLog.extend``.
+    def persists(
+        self, part: Summary, root_near: float, start: NDArray[np.intp], jumped: NDArray[np.bool_]
+    ) -> bool:
+        """Return whether most of its loaded cells hold the same value in ``part``; see
+        ``EventLog.extend``.
 
-        Cells that never moved, or that are constant for longer than the event lasts, may be broken and do not count.
+        Cells that never moved, or that are constant for longer than the event lasts, may be broken
+        and do not count.
         """
         own = (self.mean() > root_near) & (start >= self.since) & ~jumped
         held = own & (start > 0) & (start < self.end) & (part.most > root_near)
         return int(held.sum()) > _PERSISTING * int(own.sum())
 
     def released_since(self, part: Summary, ongoing: bool) -> int:
-        """Return the first frame at which its load may have been released, if the next event begins with ``part``.
+        """Return the first frame at which its load may have been released, if the next event begins
+        with ``part``.
 
         An ``ongoing`` event was released at some frame of the segment before.
         """
@@ -169,7 +193,8 @@ class EventLog:
     Attributes:
         kept: the events in time order; the last may continue.
         largest: the largest amplitude of a completed event.
-        releasing: whether the load of the last event is being released; such frames belong to no event.
+        releasing: whether the load of the last event is being released; such frames belong to no
+            event.
         last: root loads ``[D]`` of the last frame.
     """
 
@@ -192,16 +217,21 @@ class EventLog:
             root: root loads ``[t, D]`` of the frames, t >= 1.
             numbers: int ``[t]``, of the frames, ascending.
             root_near: the root load from which on a cell counts as loaded.
-            start: int ``[D]``, first frame of the constant run of each cell. Only cells that move in these frames
-                decide whether a load is released: broken cells hold their value.
-            jumped: bool ``[D]``, cells that jumped to their value and may be broken. They do not count for the size of
-                the load; another part begins at the frame in which most of them jumped.
+            start: int ``[D]``, first frame of the constant run of each cell. Only cells that move
+                in these frames decide whether a load is released: broken cells hold their value.
+            jumped: bool ``[D]``, cells that jumped to their value and may be broken. They do not
+                count for the size of the load; another part begins at the frame in which most of
+                them jumped.
         """
-        kept, largest, releasing, last = list(self.kept), self.largest, self.releasing, self.last
+        kept = list(self.kept)
+        largest = self.largest
+        releasing = self.releasing
+        last = self.last
         ongoing = bool(kept) and not releasing  # the next part belongs to the last event
         begin = 0
         constant = start <= numbers[0]
-        weights = np.stack([~constant, ~(constant & jumped)], axis=1).astype(np.float32)  # (moving, not broken)
+        # (moving, not broken)
+        weights = np.stack([~constant, ~(constant & jumped)], axis=1).astype(np.float32)
         before = np.concatenate([root[:1] if last is None else last[None], root[:-1]])
         begins = self._begins(root, before, numbers, root_near, start)
         broke = _most_common(start[jumped & ~constant])
@@ -214,7 +244,8 @@ class EventLog:
                 releasing = ongoing = False
             edges = [edge for edge in edges if edge > begin]
             ahead = root[begin : edges[0]]
-            lowest, highest = so_far(np.minimum, ahead), so_far(np.maximum, ahead)
+            lowest = so_far(np.minimum, ahead)
+            highest = so_far(np.maximum, ahead)
             if begin in begins:
                 ongoing = False
                 # The load of this event rose in one frame, from the frame before.
@@ -224,11 +255,14 @@ class EventLog:
                 highest = np.maximum(highest, kept[-1].highest)
             # Loads that are constant since the event began would have to be released.
             held = constant & (start >= (kept[-1].since if ongoing else numbers[begin]))
-            weakest = max(_WEAKEST * largest, _MIN_AMPLITUDE, _LEAST_OF_HELD * float(ahead[0] @ held))
+            weakest = max(
+                _WEAKEST * largest, _MIN_AMPLITUDE, _LEAST_OF_HELD * float(ahead[0] @ held)
+            )
             end = _release(ahead @ weights, lowest @ weights, highest @ weights, weakest)
             if end:
                 part = Summary.of(ahead[:end], int(numbers[begin]), root_near)
-                low, high = lowest[end - 1], highest[end - 1]
+                low = lowest[end - 1]
+                high = highest[end - 1]
                 # Cells that broke do not begin another event.
                 same = ongoing and (part.first == broke or kept[-1].same_location(part, low))
                 follows = bool(kept) and begin not in begins
@@ -242,20 +276,29 @@ class EventLog:
                 ongoing = True
             begin += end
             if begin < edges[0]:
-                releasing, last = True, root[begin]
+                releasing = True
+                last = root[begin]
                 begin += 1
         return EventLog(tuple(kept), largest, releasing, root[-1])
 
     def _begins(
-        self, root: Array, before: Array, numbers: NDArray[np.intp], root_near: float, start: NDArray[np.intp]
+        self,
+        root: Array,
+        before: Array,
+        numbers: NDArray[np.intp],
+        root_near: float,
+        start: NDArray[np.intp],
     ) -> list[int]:
-        """Return the frames in which a load vanishes and another appears elsewhere, as where a recording begins."""
+        """Return the frames in which a load vanishes and another appears elsewhere, as where a
+        recording begins."""
         step = root - before
         step -= np.clip(step, -root_near, root_near)  # smaller changes are noise
         # Cells that are constant from a frame before on hold their value, or are broken.
         moving = ((start >= numbers[:, None]) & (start > 0)).astype(np.float32)
         step *= moving
-        exchanged = (np.abs(step).sum(axis=1) - np.abs(step.sum(axis=1))) / 2  # vanished here and appeared there
+        exchanged = (
+            np.abs(step).sum(axis=1) - np.abs(step.sum(axis=1))
+        ) / 2  # vanished here and appeared there
         load = np.maximum((root * moving).sum(axis=1), (before * moving).sum(axis=1))
         share = exchanged / np.maximum(load, np.float32(1e-9))
         at = np.flatnonzero((share >= _MIN_EXCHANGED) & (exchanged >= _MIN_AMPLITUDE))
@@ -275,14 +318,18 @@ class EventLog:
 
 
 def count_repeats(
-    events: Sequence[ContactEvent], least: float = _SAME_PLACE, among: NDArray[np.bool_] | slice = slice(None)
+    events: Sequence[ContactEvent],
+    least: float = _SAME_PLACE,
+    among: NDArray[np.bool_] | slice = slice(None),
 ) -> NDArray[np.intp]:
-    """Return for each event the number of earlier events that load about the same cells, int ``[n]``.
+    """Return for each event the number of earlier events that load about the same cells, int
+    ``[n]``.
 
     Args:
         events: in time order.
         least: cosine between mean loads from which on two events load the same cells.
-        among: bool ``[D]``, the cells compared; cells stuck under load would make all events similar.
+        among: bool ``[D]``, the cells compared; cells stuck under load would make all events
+            similar.
     """
     if not events:
         return np.zeros(0, np.intp)
@@ -293,19 +340,24 @@ def count_repeats(
 
 
 def so_far(extreme: np.ufunc, frames: Array) -> Array:
-    """Return ``extreme.accumulate(frames)``, ``[t, D]``, of np.minimum or np.maximum, in half its time."""
-    # Parallel prefix scan over 1, 2, 4, ... frames (Hillis and Steele, Data parallel algorithms, 1986).
-    running, reach = frames, 1
+    """Return ``extreme.accumulate(frames)``, ``[t, D]``, of np.minimum or np.maximum, in half its
+    time."""
+    # Parallel prefix scan over 1, 2, 4, ... frames (Hillis and Steele, Data parallel algorithms,
+    # 1986).
+    running = frames
+    reach = 1
     while reach < len(frames):
         further = np.empty_like(running)
         further[:reach] = running[:reach]
         extreme(running[reach:], running[:-reach], out=further[reach:])
-        running, reach = further, 2 * reach
+        running = further
+        reach = 2 * reach
     return running
 
 
 def _release(load: Array, lowest: Array, highest: Array, weakest: float) -> int:
-    """Return the first frame in which the load of an event is released; the number of frames, if in none.
+    """Return the first frame in which the load of an event is released; the number of frames, if in
+    none.
 
     Args:
         load: root load, summed over the moving and over the working cells, ``[t, 2]``.
@@ -313,7 +365,8 @@ def _release(load: Array, lowest: Array, highest: Array, weakest: float) -> int:
         weakest: smaller changes are no release.
     """
     (floor, lowest_of_all), (peak, highest_of_all) = lowest.T, highest.T
-    now, moving = load[:, 0], peak - floor
+    now = load[:, 0]
+    moving = peak - floor
     enough = np.maximum(_MOVING * (highest_of_all - lowest_of_all), weakest)
     # A relaxing load is also lowest at its end, but most of it remains.
     gone = peak - now >= _MOVING * peak

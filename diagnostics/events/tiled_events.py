@@ -32,9 +32,14 @@ class TiledEvents:
     _needed: tuple[int, ...]
 
     @classmethod
-    def begin(cls, all_tiles: tuple[Tile, ...], needed: NDArray[np.bool_] | None = None) -> TiledEvents:
-        """Return the state before any frame. Tiles without a ``needed`` output (bool ``[D]``) are skipped."""
-        scored = (i for i, tile in enumerate(all_tiles) if needed is None or needed[tile.outputs].any())
+    def begin(
+        cls, all_tiles: tuple[Tile, ...], needed: NDArray[np.bool_] | None = None
+    ) -> TiledEvents:
+        """Return the state before any frame. Tiles without a ``needed`` output (bool ``[D]``) are
+        skipped."""
+        scored = (
+            i for i, tile in enumerate(all_tiles) if needed is None or needed[tile.outputs].any()
+        )
         return cls(all_tiles, (EventLog(),) * len(all_tiles), tuple(scored))
 
     def extend(
@@ -45,20 +50,27 @@ class TiledEvents:
         start: Cells,
         jumped: NDArray[np.bool_],
     ) -> TiledEvents:
-        """Return the events after more frames, see ``EventLog.extend``; tiles in which nothing moves do not change."""
+        """Return the events after more frames, see ``EventLog.extend``; tiles in which nothing
+        moves do not change."""
         if len(self.tiles) == 1:
             return self.replaced([self.of[0].extend(root, numbers, root_near, start, jumped)])
-        of, moving = list(self.of), start > numbers[0]
+        of = list(self.of)
+        moving = start > numbers[0]
         for i in self._needed:
             cells = self.tiles[i].inputs
             if moving[cells].any():
-                of[i] = of[i].extend(root[:, cells], numbers, root_near, start[cells], jumped[cells])
+                of[i] = of[i].extend(
+                    root[:, cells], numbers, root_near, start[cells], jumped[cells]
+                )
         return self.replaced(of)
 
     def split(self, most: int, keep: int) -> tuple[TiledEvents, TiledEvents]:
-        """Return (the events to drop, those to keep): in tiles with more than ``most``, the last ``keep`` stay."""
+        """Return (the events to drop, those to keep): in tiles with more than ``most``, the last
+        ``keep`` stay."""
         none = EventLog()
-        parts = [events.split(keep) if len(events.kept) > most else (none, events) for events in self.of]
+        parts = [
+            events.split(keep) if len(events.kept) > most else (none, events) for events in self.of
+        ]
         return self.replaced([old for old, _ in parts]), self.replaced([kept for _, kept in parts])
 
     def replaced(self, of: Sequence[EventLog]) -> TiledEvents:
@@ -66,7 +78,8 @@ class TiledEvents:
         return replace(self, of=tuple(of))
 
     def holding(self, cells: NDArray[np.bool_]) -> Iterator[int]:
-        """Yield the needed tiles that have one of the ``cells`` (bool ``[D]``) among their outputs."""
+        """Yield the needed tiles that have one of the ``cells`` (bool ``[D]``) among their
+        outputs."""
         return (i for i in self._needed if cells[self.tiles[i].outputs].any())
 
     def kept(self) -> Iterator[tuple[int, EventLog]]:

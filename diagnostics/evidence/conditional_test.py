@@ -1,17 +1,19 @@
-"""Conditional test: probability of the constant value of each cell in each event, given the readings of the predictors.
+"""Conditional test: probability of the constant value of each cell in each event, given the
+readings of the predictors.
 
 Computes for event e and constant cell i the surprisal
 
     -w_e log P(cell i reads v_i throughout e | healthy, predictors)
 
-with weight w_e = 1 / (1 + 0.15 r_e), r_e earlier events that load the same cells (effective sample size, Kish 1965);
-Where the model knows the surroundings of a cell only (cold start), repeats tell nothing new: w_e = u_e = 1 / (1 + r_e);
-for a cell at rest w_e = 2.5 u_e / (1 + 0.15 (sum u - 1)), as any two events share the errors (design effect).
-P is the predicted probability of staying unloaded for a cell at its baseline, and of staying loaded near v_i for one
-that holds a load. In unusual events the model errs about many cells at once. So the probability is averaged over powers
-0.25 to 1 of the odds (tempered likelihoods), each with its posterior given the moving cells of the same event (Bayesian
-model averaging); the spread of loads is inflated by their median error. Errors that no moving cell shows are not
-recognised.
+with weight w_e = 1 / (1 + 0.15 r_e), r_e earlier events that load the same cells (effective sample
+size, Kish 1965); Where the model knows the surroundings of a cell only (cold start), repeats tell
+nothing new: w_e = u_e = 1 / (1 + r_e); for a cell at rest w_e = 2.5 u_e / (1 + 0.15 (sum u - 1)),
+as any two events share the errors (design effect). P is the predicted probability of staying
+unloaded for a cell at its baseline, and of staying loaded near v_i for one that holds a load. In
+unusual events the model errs about many cells at once. So the probability is averaged over powers
+0.25 to 1 of the odds (tempered likelihoods), each with its posterior given the moving cells of the
+same event (Bayesian model averaging); the spread of loads is inflated by their median error. Errors
+that no moving cell shows are not recognised.
 """
 
 from __future__ import annotations
@@ -31,9 +33,12 @@ from diagnostics.preprocessing.levels import ANYWHERE, P_MIN
 from diagnostics.preprocessing.scale import Array, Scale
 
 _POWERS = (0.25, 0.5, 0.75, 1.0)  # of the likelihood of the model, in one event
-_PRIOR_CELLS, _MAX_INFLATION = 4, 4.0  # pseudo-count of cells with a usual error; upper limit: all cells may be dead
+# pseudo-count of cells with a usual error; upper limit: all cells may be dead
+_PRIOR_CELLS = 4
+_MAX_INFLATION = 4.0
 _REPEATS = 0.15  # correlation of events that are the same
-_COLD_SCALE = 2.5  # of an event without a reference; benchmarks/cold_calibration.py fits 2.9, at less precision
+# of an event without a reference; benchmarks/cold_calibration.py fits 2.9, at less precision
+_COLD_SCALE = 2.5
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -49,7 +54,8 @@ class CellState:
         scale: baseline and full scale.
         tolerance: a reading within 2 tolerances of a value counts as that value.
         accumulated: float, evidence of earlier events for the runs that still last.
-        temporal: float, log likelihood ratio of the run and of the jump into it, if the cell jumped alone.
+        temporal: float, log likelihood ratio of the run and of the jump into it, if the cell jumped
+            alone.
         eligible: bool, cells that are present and not known to be faulty.
     """
 
@@ -62,8 +68,11 @@ class CellState:
 
     def of(self, cells: NDArray[np.intp]) -> CellState:
         """Return the state of some cells."""
-        runs, scale = self.runs.of(cells), self.scale.of(cells)
-        accumulated, temporal, eligible = self.accumulated[cells], self.temporal[cells], self.eligible[cells]
+        runs = self.runs.of(cells)
+        scale = self.scale.of(cells)
+        accumulated = self.accumulated[cells]
+        temporal = self.temporal[cells]
+        eligible = self.eligible[cells]
         return CellState(runs, scale, self.tolerance, accumulated, temporal, eligible)
 
     @property
@@ -128,14 +137,20 @@ class ConditionalTest:
     def of(cls, events: Sequence[ContactEvent], cells: CellState, model: Model) -> ConditionalTest:
         """Prepare the test of one event or more."""
         features, begins, counted = _excerpts(events, cells.runs, cells.scored)
-        repeats = count_repeats(events, THE_SAME, cells.values.rests | ~cells.scored)[begins.cumsum() - 1, None]
+        repeats = count_repeats(events, THE_SAME, cells.values.rests | ~cells.scored)[
+            begins.cumsum() - 1, None
+        ]
         return cls(cells, model, cells.eligible, features, begins, counted, repeats)
 
     def score(self, predictors: Mask) -> tuple[Prediction, Floats]:
-        """Return the prediction of the ``predictors`` (bool ``[D]``), and the surprisal of each excerpt ``[n, D]``."""
-        expected, values = self.model(self.features, predictors), self.cells.values
+        """Return the prediction of the ``predictors`` (bool ``[D]``), and the surprisal of each
+        excerpt ``[n, D]``."""
+        expected = self.model(self.features, predictors)
+        values = self.cells.values
         held = np.flatnonzero(self.cells.scored & ~values.rests)
-        likely = _tempered(expected.never, self.features[:, 2] == 0, predictors & self.cells.runs.moved)
+        likely = _tempered(
+            expected.never, self.features[:, 2] == 0, predictors & self.cells.runs.moved
+        )
         inflation = _inflation(expected, self.features, predictors)
         within = expected.within(values.low[held], values.high[held], held, inflation)
         likely[:, held] = expected.always[:, held] * within
@@ -143,11 +158,13 @@ class ConditionalTest:
         return expected, np.where(self.counted, surprisal, 0.0)
 
     def novelty(self, own: bool) -> Floats:
-        """Return the weight w_e of each excerpt, ``[n, 1]``; ``own``: whether predictions are specific to each cell."""
+        """Return the weight w_e of each excerpt, ``[n, 1]``; ``own``: whether predictions are
+        specific to each cell."""
         return novelty(self.repeats, own)
 
     def _weights(self, own: bool) -> Floats:
-        """Return the weight of each excerpt for each cell, ``[n, D]`` or ``[n, 1]``, see the module."""
+        """Return the weight of each excerpt for each cell, ``[n, D]`` or ``[n, 1]``, see the
+        module."""
         weights = self.novelty(own)
         if own:
             return weights
@@ -160,17 +177,22 @@ class ConditionalTest:
 
 
 def novelty(repeats: NDArray[np.intp], own: bool = True) -> Floats:
-    """Return the weight w_e of events with so many ``repeats`` before them; ``own``: predictions are of each cell."""
+    """Return the weight w_e of events with so many ``repeats`` before them; ``own``: predictions
+    are of each cell."""
     return np.asarray(1 / (1 + (_REPEATS if own else 1.0) * repeats))
 
 
-def _excerpts(events: Sequence[ContactEvent], runs: ConstantRuns, scored: Mask) -> tuple[Array, Mask, Mask]:
+def _excerpts(
+    events: Sequence[ContactEvent], runs: ConstantRuns, scored: Mask
+) -> tuple[Array, Mask, Mask]:
     """Return the excerpts of events that carry evidence.
 
-    For each ``scored`` cell (bool ``[D]``) one excerpt of each event counts: the longest within its constant run.
+    For each ``scored`` cell (bool ``[D]``) one excerpt of each event counts: the longest within its
+    constant run.
 
     Returns:
-        Features ``[n, 4, D]``, whether the excerpt is a whole event ``[n]``, whether it counts for a cell ``[n, D]``.
+        Features ``[n, 4, D]``, whether the excerpt is a whole event ``[n]``, whether it counts for
+        a cell ``[n, D]``.
     """
     suffixes = [suffix for event in events for suffix in event.suffixes()]
     first = np.array([suffix.first for suffix in suffixes])
@@ -190,14 +212,17 @@ def _inflation(expected: Prediction, features: Array, working: Mask) -> Floats:
     known = working & np.isfinite(expected.spread)
     loaded = features[:, 2, known] > 0
     error = np.abs(features[:, 1, known] - expected.mean[:, known]) / expected.spread[known]
-    error = np.column_stack([np.where(loaded, error, np.inf), np.full((len(features), _PRIOR_CELLS), MEDIAN_ERROR)])
+    error = np.column_stack(
+        [np.where(loaded, error, np.inf), np.full((len(features), _PRIOR_CELLS), MEDIAN_ERROR)]
+    )
     middle = (loaded.sum(axis=1) + _PRIOR_CELLS) // 2
     half: Floats = np.sort(error, axis=1)[np.arange(len(features)), middle]
     return np.clip(half / MEDIAN_ERROR, 1.0, _MAX_INFLATION)
 
 
 def _tempered(never: Floats, unloaded: NDArray[np.bool_], working: NDArray[np.bool_]) -> Floats:
-    """Return P(unloaded throughout) ``[n, D]``, tempered in events in which the model errs about the working cells.
+    """Return P(unloaded throughout) ``[n, D]``, tempered in events in which the model errs about
+    the working cells.
 
     Args:
         never: ``[n, D]``, the probability predicted.
@@ -205,9 +230,12 @@ def _tempered(never: Floats, unloaded: NDArray[np.bool_], working: NDArray[np.bo
         working: bool ``[D]``, cells that are known to work.
     """
     odds = logit(np.maximum(never, P_MIN))
-    right = np.where(unloaded | np.isinf(odds), odds, -odds)[:, working]  # infinite odds: no model of the cell
+    # infinite odds: no model of the cell
+    right = np.where(unloaded | np.isinf(odds), odds, -odds)[:, working]
     likelihood = -np.stack([np.log1p(np.exp(-power * right)).sum(axis=1) for power in _POWERS])
     share = softmax(likelihood, axis=0)  # (powers, n)
-    averaged = np.sum([p[:, None] * expit(w * odds) for p, w in zip(share, _POWERS, strict=True)], axis=0)
+    averaged = np.sum(
+        [p[:, None] * expit(w * odds) for p, w in zip(share, _POWERS, strict=True)], axis=0
+    )
     tempered: Floats = np.maximum(never, averaged)  # tempering never adds evidence against a cell
     return tempered

@@ -1,15 +1,17 @@
-"""Drift: cells that move, but never return to their baseline (offset), or scale every load wrongly (gain).
+"""Drift: cells that move, but never return to their baseline (offset), or scale every load wrongly
+(gain).
 
-The evidence of an offset is the sum of -log P(loaded throughout | other cells) over the last events, as far as the cell
-is loaded throughout each; repeated events count for less (``ConditionalTest.novelty``). That of a
-gain g is the log likelihood ratio
+The evidence of an offset is the sum of -log P(loaded throughout | other cells) over the last
+events, as far as the cell is loaded throughout each; repeated events count for less
+(``ConditionalTest.novelty``). That of a gain g is the log likelihood ratio
 
-    log sum_{g, s} P(g) P(s) L_s(g) / max_{1/1.3 <= h <= 1.3} L_s(h),    L_s(g) = prod_{e >= s} t_4(y_e; sqrt(g) m_e)
+    log sum_{g, s} P(g) P(s) L_s(g) / max_{1/1.3 <= h <= 1.3} L_s(h),
+    L_s(g) = prod_{e >= s} t_4(y_e; sqrt(g) m_e)
 
-over gains g and change points s, for root loads y and predicted means m, with a contaminated Student t: Bayesian change
-point detection (Barry and Hartigan 1993) for one change of scale. Both need several events, because objects have edges
-and a reading may hold a residue of the last load. Offsets below 2 % of full scale and gains
-between 1/1.3 and 1.3 are not detected.
+over gains g and change points s, for root loads y and predicted means m, with a contaminated
+Student t: Bayesian change point detection (Barry and Hartigan 1993) for one change of scale. Both
+need several events, because objects have edges and a reading may hold a residue of the last load.
+Offsets below 2 % of full scale and gains between 1/1.3 and 1.3 are not detected.
 """
 
 from __future__ import annotations
@@ -28,9 +30,11 @@ if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Array
 
 FEWEST_EVENTS = 3  # fewer prove no gain
-_OUTLIERS = 0.05  # share of events that are independent of gain and offset: none brings more than log 20
+# share of events that are independent of gain and offset: none brings more than log 20
+_OUTLIERS = 0.05
 _GAIN = float(-np.log(RARE))  # log evidence from which on a cell has another gain: three events
-_OFFSET = float(-np.log(P_MIN))  # the same, of an offset: four events, as a reading may hold a residue of the last load
+# the same, of an offset: four events, as a reading may hold a residue of the last load
+_OFFSET = float(-np.log(P_MIN))
 _GAINS = np.array([0.1, 0.2, 0.35, 0.5, 2.0, 3.0])  # faulty gains: a grid
 GAIN = 1.3  # up or down: a smaller change is no fault, the mean may err by as much
 
@@ -74,8 +78,9 @@ def gain_evidence(
 ) -> Gain:
     """Return the evidence of a changed gain.
 
-    Events that leave a cell unloaded do not count (the spatial test covers these). A prediction that is not specific to
-    the cell (``Prediction.own``: not in a cold start) carries no evidence of its gain.
+    Events that leave a cell unloaded do not count (the spatial test covers these). A prediction
+    that is not specific to the cell (``Prediction.own``: not in a cold start) carries no evidence
+    of its gain.
 
     Args:
         whole: features ``[n, 4, D]`` of n events (see ``Summary.features``), in time order.
@@ -85,15 +90,22 @@ def gain_evidence(
         counts: ``[n, 1]``, weight of each event, see :func:`drift_counts`.
     """
     informative = (
-        moved & np.isfinite(expected.spread) & expected.own & (whole[:, 2] > 0) & (expected.mean > MARGIN * root_near)
+        moved
+        & np.isfinite(expected.spread)
+        & expected.own
+        & (whole[:, 2] > 0)
+        & (expected.mean > MARGIN * root_near)
     )
     n, d = informative.shape
     result = Gain(np.zeros(d), np.ones(d), np.zeros(d, np.intp), np.zeros(d, np.intp))
     cells = np.flatnonzero(informative.sum(axis=0) >= FEWEST_EVENTS)
     if not len(cells):
         return result
-    informative, root = informative[:, cells], whole[:, 1, cells]
-    mean, spread = (of.astype(np.float32) for of in (expected.mean[:, cells], expected.spread[cells]))
+    informative = informative[:, cells]
+    root = whole[:, 1, cells]
+    mean, spread = (
+        of.astype(np.float32) for of in (expected.mean[:, cells], expected.spread[cells])
+    )
     # The error of the predictions in this log is estimated from all cells.
     spread *= max(1.0, float(np.median(np.abs((root - mean) / spread)[informative])) / MEDIAN_ERROR)
 
@@ -118,24 +130,28 @@ def gain_evidence(
 
 
 def drift_counts(offset: float, gain: float) -> tuple[float, float]:
-    """Return the factors on the evidence that keep ``offset`` and ``gain``, the most of healthy cells, below a limit.
+    """Return the factors on the evidence that keep ``offset`` and ``gain``, the most of healthy
+    cells, below a limit.
 
-    That is the threshold / 1.5. Events may be correlated, contacts so small that the neighbours do not determine the
-    load of a cell, and cells always loaded where those beside them are not.
+    That is the threshold / 1.5. Events may be correlated, contacts so small that the neighbours do
+    not determine the load of a cell, and cells always loaded where those beside them are not.
     """
     return _OFFSET / max(_OFFSET, MARGIN * offset), _GAIN / max(_GAIN, MARGIN * gain)
 
 
 def drifting(offset: Floats, gain: Floats | float = 0.0) -> Mask:
-    """Return the cells whose evidence of an offset or a gain, ``[D]`` each, exceeds the threshold, bool ``[D]``."""
+    """Return the cells whose evidence of an offset or a gain, ``[D]`` each, exceeds the threshold,
+    bool ``[D]``."""
     certain: Mask = (offset >= _OFFSET) | (gain >= _GAIN)
     return certain
 
 
 def misleading(offset: Floats, gain: Floats, known: Mask) -> Mask:
-    """Return the drifting cells to exclude next from the predictors, bool ``[D]``, without those ``known`` already.
+    """Return the drifting cells to exclude next from the predictors, bool ``[D]``, without those
+    ``known`` already.
 
-    A wrong gain makes the gains of its neighbours look wrong: only the cell with most evidence is excluded at a time.
+    A wrong gain makes the gains of its neighbours look wrong: only the cell with most evidence is
+    excluded at a time.
     """
     gain = np.where(known, 0.0, gain)
     strongest = np.arange(len(gain)) == gain.argmax()

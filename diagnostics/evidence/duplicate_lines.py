@@ -1,16 +1,19 @@
-"""Duplicate lines: pairs of rows or columns that read the same, as with a stuck address bit or a bridge.
+"""Duplicate lines: pairs of rows or columns that read the same, as with a stuck address bit or a
+bridge.
 
-Detects, among the pairs that one address bit or one bridge can join, those that agree within a tolerance in every frame
-while informative cells (loaded, moving, not saturated) support the agreement: a *coincidence*. With p the chance that
-two lines agree, n coincidences count n log2(1 / p), and at most n: models err. p is the share of the other pairs on the
-pad, rows and columns, that agreed where they could, in the same frames; what moves all cells alike is no evidence. A
-pair is found when it counts 3 more than any healthy pair, and when its difference d is white noise around zero, as of
-one cell read twice:
+Detects, among the pairs that one address bit or one bridge can join, those that agree within a
+tolerance in every frame while informative cells (loaded, moving, not saturated) support the
+agreement: a *coincidence*. With p the chance that two lines agree, n coincidences count n log2(1 /
+p), and at most n: models err. p is the share of the other pairs on the pad, rows and columns, that
+agreed where they could, in the same frames; what moves all cells alike is no evidence. A pair is
+found when it counts 3 more than any healthy pair, and when its difference d is white noise around
+zero, as of one cell read twice:
 
     sqrt(n) sum d_t d_{t-1} / sum d^2 <= 3
 
-This is a one-sided test of the lag-1 autocorrelation (Box and Pierce 1970). Two cells under equal loads differ by a
-constant or a slow difference, which is correlated with itself. Lines that nothing loads are not detected.
+This is a one-sided test of the lag-1 autocorrelation (Box and Pierce 1970). Two cells under equal
+loads differ by a constant or a slow difference, which is correlated with itself. Lines that nothing
+loads are not detected.
 """
 
 from __future__ import annotations
@@ -24,7 +27,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.layout import LineKind, SensorLayout, address_bits
+from diagnostics.layout import SensorLayout, address_bits
+from diagnostics.wiring import LineKind
 
 if TYPE_CHECKING:
     from diagnostics.preprocessing.scale import Scale
@@ -83,9 +87,12 @@ class _Comparison(NamedTuple):
 
 @cache
 def pairs(count: int) -> tuple[tuple[int, int], ...]:
-    """Return the pairs out of ``count`` lines that one address bit or one bridge can join, each once."""
+    """Return the pairs out of ``count`` lines that one address bit or one bridge can join, each
+    once."""
     bits = [1 << b for b in range(address_bits(count))]
-    by_bit = {(i, i | bit) for bit in bits for i in range(count) if not i & bit and (i | bit) < count}
+    by_bit = {
+        (i, i | bit) for bit in bits for i in range(count) if not i & bit and (i | bit) < count
+    }
     return tuple(sorted(by_bit | set(pairwise(range(count)))))
 
 
@@ -97,9 +104,10 @@ class _Pairs:
         first, second: int ``[pairs]``, indices of the lines.
         there: bool ``[pads, pairs, positions]``, where both lines have a cell.
         since, seen_by, coincidences: int ``[pads, pairs]``, see :class:`DuplicatePair`.
-        sums: float ``[3, pads, pairs]``, over the informative cells and frames since: the square of the difference,
-            its product with the one before, and 1.
-        others: int ``[2, pads, pairs]``, how many other pairs could agree when these did, and how many of them agreed.
+        sums: float ``[3, pads, pairs]``, over the informative cells and frames since: the square of
+            the difference, its product with the one before, and 1.
+        others: int ``[2, pads, pairs]``, how many other pairs could agree when these did, and how
+            many of them agreed.
     """
 
     first: NDArray[np.intp]
@@ -113,15 +121,21 @@ class _Pairs:
 
     @classmethod
     def begin(cls, present: Mask) -> _Pairs:
-        """Return the state before any frame, for cells ``present`` (bool ``[pads, lines, positions]``)."""
+        """Return the state before any frame, for cells ``present`` (bool
+        ``[pads, lines, positions]``)."""
         first, second = np.array(pairs(present.shape[1]), dtype=np.intp).reshape(-1, 2).T
         there = present[:, first] & present[:, second]
         nothing = np.zeros(there.shape[:2], np.intp)
-        sums, others = np.zeros((3, *nothing.shape), np.float32), np.zeros((2, *nothing.shape), np.intp)
+        sums = np.zeros((3, *nothing.shape), np.float32)
+        others = np.zeros((2, *nothing.shape), np.intp)
         return cls(first, second, there, nothing, nothing, nothing, sums, others)
 
     def compare(
-        self, lines: NDArray[np.float32], numbers: NDArray[np.intp], informative: Mask, tolerance: float
+        self,
+        lines: NDArray[np.float32],
+        numbers: NDArray[np.intp],
+        informative: Mask,
+        tolerance: float,
     ) -> _Comparison:
         """Compare readings ``[t, pads, lines, positions]`` of frames ``numbers``."""
         # Missing readings and positions without a cell do not differ from anything.
@@ -144,36 +158,57 @@ class _Pairs:
         totals: NDArray[np.intp],
         tolerance: float,
     ) -> _Pairs:
-        """Return the pairs after readings ``[t, pads, lines, positions]``, the last of them in frame ``number``.
+        """Return the pairs after readings ``[t, pads, lines, positions]``, the last of them in
+        frame ``number``.
 
-        ``totals``, int ``[2, pads]``: pairs of the pad that could agree in these frames, and those that did.
+        ``totals``, int ``[2, pads]``: pairs of the pad that could agree in these frames, and those
+        that did.
         """
-        ever, both = compared.ever, compared.both
+        ever = compared.ever
+        both = compared.both
         since = np.where(ever, compared.since, self.since)
-        seen_by, coincidences, sums, others = self.seen_by, self.coincidences, self.sums, self.others
+        seen_by = self.seen_by
+        coincidences = self.coincidences
+        sums = self.sums
+        others = self.others
         agree = compared.supported & ~ever
         if agree.any() or (ever & (coincidences > 0)).any():
-            coincidences = np.where(ever, 0, coincidences + np.minimum(both.sum(axis=2), _MOST_AT_ONCE))
+            coincidences = np.where(
+                ever, 0, coincidences + np.minimum(both.sum(axis=2), _MOST_AT_ONCE)
+            )
             seen_by = np.where(agree & (self.coincidences == 0), number, seen_by)
-            sums = np.where(ever, np.float32(0), sums) + self._summed(lines, both & ~ever[..., None], tolerance)
+            sums = np.where(ever, np.float32(0), sums) + self._summed(
+                lines, both & ~ever[..., None], tolerance
+            )
             others = np.where(ever, 0, others + agree * (totals[..., None] - 1))
-        return _Pairs(self.first, self.second, self.there, since, seen_by, coincidences, sums, others)
+        return _Pairs(
+            self.first, self.second, self.there, since, seen_by, coincidences, sums, others
+        )
 
     @property
     def chance(self) -> NDArray[np.float64]:
-        """Probability that two lines agree which are not joined (Laplace), at least 1/2, ``[pads, pairs]``."""
+        """Probability that two lines agree which are not joined (Laplace), at least 1/2,
+        ``[pads, pairs]``."""
         could, did = self.others
         chance: NDArray[np.float64] = np.maximum((did + 1) / (could + 2), _LEAST_CHANCE)
         return chance
 
-    def _summed(self, lines: NDArray[np.float32], both: Mask, tolerance: float) -> NDArray[np.float32]:
-        """Return the sums over the informative cells (``both``) in more frames, ``[3, pads, pairs]``."""
+    def _summed(
+        self, lines: NDArray[np.float32], both: Mask, tolerance: float
+    ) -> NDArray[np.float32]:
+        """Return the sums over the informative cells (``both``) in more frames,
+        ``[3, pads, pairs]``."""
         pad, pair, position = np.nonzero(both)
-        difference = lines[:, pad, self.first[pair], position] - lines[:, pad, self.second[pair], position]
+        difference = (
+            lines[:, pad, self.first[pair], position] - lines[:, pad, self.second[pair], position]
+        )
         difference[np.isnan(difference)] = 0
-        least, more = np.float32(_STEP * tolerance), np.zeros_like(self.sums)
+        least = np.float32(_STEP * tolerance)
+        more = np.zeros_like(self.sums)
         products = difference[1:] * difference[:-1]
-        for total, values in zip(more, (difference**2 + least**2, products, np.ones_like(products)), strict=True):
+        for total, values in zip(
+            more, (difference**2 + least**2, products, np.ones_like(products)), strict=True
+        ):
             np.add.at(total, (pad, pair), values.sum(axis=0))
         return more
 
@@ -183,7 +218,8 @@ class _Pairs:
         return np.asarray(self.coincidences * -np.log2(self.chance), dtype=np.intp)
 
     def matching(self, needed: int) -> list[tuple[int, int]]:
-        """Return (pad, pair) of the pairs that count at least ``needed`` and differ by noise only."""
+        """Return (pad, pair) of the pairs that count at least ``needed`` and differ by noise
+        only."""
         often = self.counted >= needed
         if not often.any():
             return []
@@ -208,14 +244,21 @@ class DuplicateLines:
 
     @classmethod
     def begin(cls, layout: SensorLayout) -> DuplicateLines:
-        """Return the state before any frame. With declared wiring there are no rows and columns to compare."""
+        """Return the state before any frame. With declared wiring there are no rows and columns to
+        compare."""
         present = layout.present
         if not layout.is_matrix:
             return cls(layout, {})
-        return cls(layout, {"row": _Pairs.begin(present), "column": _Pairs.begin(present.swapaxes(1, 2))})
+        return cls(
+            layout, {"row": _Pairs.begin(present), "column": _Pairs.begin(present.swapaxes(1, 2))}
+        )
 
     def extend(
-        self, frames: NDArray[np.float64], numbers: NDArray[np.intp], informative: Mask, tolerance: float
+        self,
+        frames: NDArray[np.float64],
+        numbers: NDArray[np.intp],
+        informative: Mask,
+        tolerance: float,
     ) -> DuplicateLines:
         """Return the pairs after more frames.
 
@@ -229,7 +272,10 @@ class DuplicateLines:
             return self
         # With the last frame, in which informative cells are loaded.
         some = slice((len(frames) - 1) % _EVERY, None, _EVERY)
-        grid, loaded = self.layout.grid(frames[some].astype(np.float32)), self.layout.grid(informative)
+        grid, loaded = (
+            self.layout.grid(frames[some].astype(np.float32)),
+            self.layout.grid(informative),
+        )
         lines: dict[LineKind, tuple[NDArray[np.float32], Mask]] = {
             "row": (grid, loaded),
             "column": (grid.swapaxes(2, 3), loaded.swapaxes(1, 2)),
@@ -243,10 +289,16 @@ class DuplicateLines:
             supported = each.supported
             totals += np.stack([supported.sum(axis=1), (supported & ~each.ever).sum(axis=1)])
         of: dict[LineKind, _Pairs] = {
-            kind: self.of[kind].extend(readings, int(numbers[some][-1]), compared[kind], totals, tolerance)
+            kind: self.of[kind].extend(
+                readings, int(numbers[some][-1]), compared[kind], totals, tolerance
+            )
             for kind, (readings, _) in lines.items()
         }
-        more = [int(each.counted[place]) for each in of.values() for place in each.matching(self.most + 1)]
+        more = [
+            int(each.counted[place])
+            for each in of.values()
+            for place in each.matching(self.most + 1)
+        ]
         return DuplicateLines(self.layout, of, max([self.most, *more]))
 
     def duplicate_pairs(self, usual: int) -> list[DuplicatePair]:
@@ -279,5 +331,7 @@ class DuplicateLines:
 def informative(frames: NDArray[np.float64], still: Mask, scale: Scale) -> Mask:
     """Return the cells ``[D]`` that are loaded, not saturated, and move in ``frames``."""
     now = frames[-1]  # comparisons with NaN are False
-    found: Mask = ~still & (now > scale.baseline + scale.near) & (now < scale.full_scale - scale.near)
+    found: Mask = (
+        ~still & (now > scale.baseline + scale.near) & (now < scale.full_scale - scale.near)
+    )
     return found

@@ -1,25 +1,29 @@
 """Intermittency and noise: cells that move, but blink to a rail or have excess noise.
 
-Detects both with a CUSUM of log likelihood ratios over segments of 32 frames (Page 1954), so that a fault is found
-whenever it begins, and cleared when it has gone:
+Detects both with a CUSUM of log likelihood ratios over segments of 32 frames (Page 1954), so that a
+fault is found whenever it begins, and cleared when it has gone:
 
     S <- clip(S + c g, 0, 40),    faulty if S >= 14
-    blinks:  g = n log(0.05 / r) - m (0.05 - r)         n blinks in m loaded frames, Poisson, healthy rate r
-    noise:   g = log(0.8 / 0.002) if noisier than the limit of its load, else log(0.2 / 0.998)       Bernoulli
+    blinks:  g = n log(0.05 / r) - m (0.05 - r)
+             n blinks in m loaded frames, Poisson, healthy rate r
+    noise:   g = log(0.8 / 0.002) if noisier than the limit of its load, else log(0.2 / 0.998)
+             Bernoulli
 
-A blink leaves a load in one step and returns to it in one step within 6 frames. The load must exceed 1.5 times the
-lowest load that any cell shows: where a threshold hides small loads, weak ones come and go in one step. Cells at the
-edge of most contacts blink more often than others: r is the posterior mean of a cell under a gamma prior with the mean
-of the array and shape 1/2, that of Jeffreys' prior of a Poisson rate (1946). Noise is the median absolute second
-difference. The factor c <= 1 keeps all but 1 % of healthy cells below 14 / 1.5, at the rates of other recordings
-(overdispersion, as in a quasi-likelihood: McCullagh and Nelder 1989). Segments in which many cells blink or are noisy
-together do not count: the contact moves. Blinks without load, and noise of constant cells, are not detected.
+A blink leaves a load in one step and returns to it in one step within 6 frames. The load must
+exceed 1.5 times the lowest load that any cell shows: where a threshold hides small loads, weak ones
+come and go in one step. Cells at the edge of most contacts blink more often than others: r is the
+posterior mean of a cell under a gamma prior with the mean of the array and shape 1/2, that of
+Jeffreys' prior of a Poisson rate (1946). Noise is the median absolute second difference. The factor
+c <= 1 keeps all but 1 % of healthy cells below 14 / 1.5, at the rates of other recordings
+(overdispersion, as in a quasi-likelihood: McCullagh and Nelder 1989). Segments in which many cells
+blink or are noisy together do not count: the contact moves. Blinks without load, and noise of
+constant cells, are not detected.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -38,20 +42,29 @@ Floats = NDArray[np.float64]
 
 _BLINK_RATE = 0.05  # blinks per loaded frame of a loose contact
 LONGEST_BLINK = 6  # frames
-_ON_ROW, _ON_COLUMN = [3, 4], [1, 6]  # neighbours on the same row and column, see SensorLayout.beside
-ALIKE = 0.3  # of a load: largest change during a blink; and of its change: a neighbour that changes as much shares it
+# neighbours on the same row and column, see SensorLayout.beside
+_ON_ROW = [3, 4]
+_ON_COLUMN = [1, 6]
+# of a load: largest change during a blink; and of its change: a neighbour that changes as much
+# shares it
+ALIKE = 0.3
 _PRIOR_BLINKS = 0.5  # shape of the gamma prior of the rates
-_RARE = 0.002  # healthy blinks per loaded frame, in a cold start; share of healthy segments above the limit of noise
+# healthy blinks per loaded frame, in a cold start; share of healthy segments above the limit of
+# noise
+_RARE = 0.002
 _NOISY_SHARE = 0.8  # share of the segments of a noisy cell above the limit
-_LEVELS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8])  # of the mean root load, bin edges: noise grows with load
-_CROWD = 0.25  # share of the loaded cells, and of all, that may be noisy together: with more the contact moves
+# of the mean root load, bin edges: noise grows with load
+_LEVELS = np.array([0.0, 0.05, 0.2, 0.4, 0.6, 0.8])
+# share of the loaded cells, and of all, that may be noisy together: with more the contact moves
+_CROWD = 0.25
 _THRESHOLD = 14.0  # of the CUSUM: a prior of one in a thousand, and P(faulty) = 0.999
 _MAX = 40.0  # upper limit of the CUSUM, so that a repaired cell is cleared soon
 _HEALTHY = 0.99  # quantile of the cells, of the largest CUSUM in the reference
 
 
 class _Counts(NamedTuple):
-    """Blinks and loaded frames of each cell in one recording, ``[D]``; noise and load level by segment, ``[n]``."""
+    """Blinks and loaded frames of each cell in one recording, ``[D]``; noise and load level by
+    segment, ``[n]``."""
 
     blinks: Floats
     loaded: Floats
@@ -59,16 +72,22 @@ class _Counts(NamedTuple):
     level: NDArray[np.intp]
 
     @classmethod
-    def of(cls, recording: Floats, scale: Scale, layout: SensorLayout, alone: bool, lowest: float) -> _Counts:
+    def of(
+        cls, recording: Floats, scale: Scale, layout: SensorLayout, alone: bool, lowest: float
+    ) -> _Counts:
         """Count; ``alone``, ``lowest``: see :func:`_measure`."""
-        every, blinks, loaded = np.arange(layout.n_cells), np.zeros(layout.n_cells), np.zeros(layout.n_cells)
-        noise, levels = [np.zeros(0)], [np.zeros(0, np.intp)]
+        every = np.arange(layout.n_cells)
+        blinks = np.zeros(layout.n_cells)
+        loaded = np.zeros(layout.n_cells)
+        noise = [np.zeros(0)]
+        levels = [np.zeros(0, np.intp)]
         for first in range(0, len(recording), SEGMENT):
             frames = recording[first : first + SEGMENT]
             low, high, under_load, noise_level, level = _measure(
                 frames, scale.root_load(frames), scale, every, layout, alone, lowest
             )
-            blinks, loaded = blinks + low + high, loaded + under_load
+            blinks = blinks + low + high
+            loaded = loaded + under_load
             if len(frames) >= SHORTEST_RUN:
                 noise.append(noise_level)
                 levels.append(level)
@@ -93,8 +112,8 @@ class HealthyRates:
     blinks_count: float = 1.0
     noise_counts: float = 1.0
     alone: bool = True
-    lowest: float = field(default=np.inf, metadata={"newer": True})
-    of_cells: Floats | None = field(default=None, metadata={"newer": True})
+    lowest: float = np.inf
+    of_cells: Floats | None = None
 
     @classmethod
     def fit(cls, recordings: Sequence[Floats], scale: Scale, layout: SensorLayout) -> HealthyRates:
@@ -102,11 +121,14 @@ class HealthyRates:
         usual = cls._counted(recordings, scale, layout, alone=False)
         if usual.blinks_count == usual.noise_counts == 1:
             return usual
-        # Contacts cause blinks and noise here. Comparing neighbours misses adjacent faults: only where needed.
+        # Contacts cause blinks and noise here. Comparing neighbours misses adjacent faults: only
+        # where needed.
         return cls._counted(recordings, scale, layout, alone=True)
 
     @classmethod
-    def _counted(cls, recordings: Sequence[Floats], scale: Scale, layout: SensorLayout, alone: bool) -> HealthyRates:
+    def _counted(
+        cls, recordings: Sequence[Floats], scale: Scale, layout: SensorLayout, alone: bool
+    ) -> HealthyRates:
         lowest = min((_lowest_load(recording, scale) for recording in recordings), default=np.inf)
         counts = [_Counts.of(recording, scale, layout, alone, lowest) for recording in recordings]
         # Cross-fitting: new recordings may exceed the rates of few others.
@@ -123,28 +145,37 @@ class HealthyRates:
                         frames, scale.root_load(frames), numbers, scale, usual, constant, np.inf
                     )
                     reached = np.maximum(reached, [intermittency.blinking, intermittency.noisy])
-        factors = _THRESHOLD / np.maximum(_THRESHOLD, MARGIN * np.quantile(reached, _HEALTHY, axis=1))
+        factors = _THRESHOLD / np.maximum(
+            _THRESHOLD, MARGIN * np.quantile(reached, _HEALTHY, axis=1)
+        )
         usual = cls._of(counts, scale, alone, lowest)
         return replace(usual, blinks_count=float(factors[0]), noise_counts=float(factors[1]))
 
     @classmethod
-    def _of(cls, counts: Sequence[_Counts], scale: Scale, alone: bool, lowest: float) -> HealthyRates:
+    def _of(
+        cls, counts: Sequence[_Counts], scale: Scale, alone: bool, lowest: float
+    ) -> HealthyRates:
         """Return the rates in some recordings."""
         limit = np.zeros(len(_LEVELS))
         for k in range(len(_LEVELS)):
-            # One pseudo-sample with the noise of a cold start: rare noise is not seen in few samples.
+            # One pseudo-sample with the noise of a cold start: rare noise is not seen in few
+            # samples.
             samples = [c.noise[c.level == k] for c in counts]
             limit[k] = np.quantile(np.concatenate([*samples, [LIGHT]]), 1 - _RARE)
         # Readings within +- tolerance (near / 2) have second differences up to 2 near.
         limit = np.maximum.accumulate(np.maximum(limit, 2 * scale.near / scale.full_scale))
-        blinks, loaded = sum(c.blinks for c in counts), sum(c.loaded for c in counts)
+        blinks = sum(c.blinks for c in counts)
+        loaded = sum(c.loaded for c in counts)
         # One pseudo-blink, in as many frames as it takes at the rate of a cold start.
         mean = max(0.1 * _RARE, (float(np.sum(blinks)) + 1) / (float(np.sum(loaded)) + 1 / _RARE))
-        of_cells = np.maximum(0.1 * _RARE, (blinks + _PRIOR_BLINKS) / (loaded + _PRIOR_BLINKS / mean))
+        of_cells = np.maximum(
+            0.1 * _RARE, (blinks + _PRIOR_BLINKS) / (loaded + _PRIOR_BLINKS / mean)
+        )
         return cls(mean, limit, alone=alone, lowest=lowest, of_cells=of_cells)
 
     def with_noise(self, shared: float) -> HealthyRates:
-        """Return the rates where noise that all cells share raises the limits by ``shared`` of full scale."""
+        """Return the rates where noise that all cells share raises the limits by ``shared`` of full
+        scale."""
         return replace(self, noise=self.noise + shared) if shared else self
 
     @classmethod
@@ -178,7 +209,8 @@ class Intermittency:
     @classmethod
     def begin(cls, layout: SensorLayout) -> Intermittency:
         """Return the state before any frame."""
-        zero, none = np.zeros(layout.n_cells), np.zeros(layout.n_cells, np.intp)
+        zero = np.zeros(layout.n_cells)
+        none = np.zeros(layout.n_cells, np.intp)
         return cls(layout, zero, zero, none, none, none, none)
 
     def extend(
@@ -207,9 +239,15 @@ class Intermittency:
         moving = np.flatnonzero(~constant)
         lowest = min(
             self.lowest,
-            usual.lowest if np.isfinite(usual.lowest) else _lowest_load(frames[:, moving], scale.of(moving)),
+            (
+                usual.lowest
+                if np.isfinite(usual.lowest)
+                else _lowest_load(frames[:, moving], scale.of(moving))
+            ),
         )
-        low, high, loaded, noise_level, level = _measure(frames, root, scale, moving, self.layout, usual.alone, lowest)
+        low, high, loaded, noise_level, level = _measure(
+            frames, root, scale, moving, self.layout, usual.alone, lowest
+        )
         events = low + high
         crowd = max(1.0, _CROWD * float((loaded > 0).sum()))
         if (events > 0).sum() > crowd:
@@ -225,9 +263,12 @@ class Intermittency:
         more = usual.noise_counts * np.log(_NOISY_SHARE / _RARE)
         noisy[moving] = np.where(noisier, self.noisy[moving] + more, noisy[moving])
         noisy = np.clip(noisy, 0.0, full)
-        blinks, to_full = np.zeros(len(constant), np.intp), np.zeros(len(constant), np.intp)
-        blinks[moving], to_full[moving] = events, np.where(events > 0, high, 0)
-        calm, quiet = self.blinking == 0, self.noisy == 0
+        blinks = np.zeros(len(constant), np.intp)
+        to_full = np.zeros(len(constant), np.intp)
+        blinks[moving] = events
+        to_full[moving] = np.where(events > 0, high, 0)
+        calm = self.blinking == 0
+        quiet = self.noisy == 0
         return Intermittency(
             self.layout,
             blinking,
@@ -239,11 +280,15 @@ class Intermittency:
             lowest,
         )
 
-    def _noisier(self, noise: Floats, limit: Floats, moving: NDArray[np.intp], alone: bool) -> NDArray[np.bool_]:
-        """Return which of the ``moving`` cells have more noise than the limit, bool ``[n]``; ``alone``: unshared."""
+    def _noisier(
+        self, noise: Floats, limit: Floats, moving: NDArray[np.intp], alone: bool
+    ) -> NDArray[np.bool_]:
+        """Return which of the ``moving`` cells have more noise than the limit, bool ``[n]``;
+        ``alone``: unshared."""
         noisier = noise > limit
         if alone and noisier.any():
-            every, which = np.zeros(self.layout.n_cells), np.flatnonzero(noisier)
+            every = np.zeros(self.layout.n_cells)
+            which = np.flatnonzero(noisier)
             every[moving] = noise
             neighbours = self.layout.beside[moving[which]]
             noisier[which] = ~_shared(neighbours, every[neighbours], noise[which])
@@ -263,19 +308,31 @@ class Intermittency:
 
 
 def _measure(
-    frames: Floats, root: Array, scale: Scale, cells: NDArray[np.intp], layout: SensorLayout, alone: bool, lowest: float
+    frames: Floats,
+    root: Array,
+    scale: Scale,
+    cells: NDArray[np.intp],
+    layout: SensorLayout,
+    alone: bool,
+    lowest: float,
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, Floats, NDArray[np.intp]]:
-    """Return for each of the ``cells``: blinks to the baseline, blinks to full scale, loaded frames, noise, load level.
+    """Return for each of the ``cells``: blinks to the baseline, blinks to full scale, loaded
+    frames, noise, load level.
 
     With ``alone``, blinks that a neighbour shares do not count.
     """
-    every, frames, root, scale = frames, frames.take(cells, axis=1), root.take(cells, axis=1), scale.of(cells)
+    every = frames
+    frames = frames.take(cells, axis=1)
+    root = root.take(cells, axis=1)
+    scale = scale.of(cells)
     x = (frames - scale.baseline).astype(np.float32)
     if np.isnan(x).any():
         x = np.nan_to_num(x)
-    near, top = scale.near, scale.full_scale - scale.near
+    top = scale.full_scale - scale.near
+    near = scale.near
     loaded = x > max(LIGHT * scale.full_scale, MARGIN * lowest, MARGIN * near)
-    rests, full = x <= near, frames >= top
+    rests = x <= near
+    full = frames >= top
     moderate = loaded & ~full
 
     def blinks(initial: NDArray[np.bool_], away: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -287,33 +344,44 @@ def _measure(
         some = np.flatnonzero(left.any(axis=0) & (away[:-1] & initial[1:]).any(axis=0))
         if not len(some):
             return count
-        loaded_before, absent, of = initial[:, some], away[:, some], x[:, some]
+        loaded_before = initial[:, some]
+        absent = away[:, some]
+        of = x[:, some]
         missing = absent
         for gap in range(1, min(LONGEST_BLINK, len(x) - 2) + 1):
-            before, after = of[: -gap - 1], of[gap + 1 :]
+            before = of[: -gap - 1]
+            after = of[gap + 1 :]
             same_load = np.abs(after - before) <= ALIKE * before
-            when, which = np.nonzero(loaded_before[: -gap - 1] & missing[1:-1] & loaded_before[gap + 1 :] & same_load)
+            when, which = np.nonzero(
+                loaded_before[: -gap - 1] & missing[1:-1] & loaded_before[gap + 1 :] & same_load
+            )
             which = some[which]
             if alone and len(which):
                 neighbours = layout.beside[cells[which]]
-                change = np.abs(every[when[:, None] + 1, neighbours] - every[when[:, None], neighbours])
+                change = np.abs(
+                    every[when[:, None] + 1, neighbours] - every[when[:, None], neighbours]
+                )
                 which = which[~_shared(neighbours, change, x[when, which])]
             np.add.at(count, which, 1)
             missing = missing[:-1] & absent[gap:]
         return count
 
     step = x[1:] - x[:-1]
-    curvature = np.abs(step[1:] - step[:-1]) if len(x) > 2 else np.zeros((1, x.shape[1]), np.float32)
+    curvature = (
+        np.abs(step[1:] - step[:-1]) if len(x) > 2 else np.zeros((1, x.shape[1]), np.float32)
+    )
     noise_level = _median(curvature) / scale.full_scale
     level = np.searchsorted(_LEVELS, root.sum(axis=0) / np.float32(len(root)), side="right") - 1
     # A load near full scale may reach it without a fault.
     far = moderate & ((1 + ALIKE) * x < (top - scale.baseline).astype(np.float32))
-    low, high = blinks(moderate, rests), blinks(far, full)
+    low = blinks(moderate, rests)
+    high = blinks(far, full)
     return low, high, loaded.sum(axis=0, dtype=np.float64), noise_level, np.maximum(level, 0)
 
 
 def _lowest_load(frames: Floats, scale: Scale) -> float:
-    """Return the lowest load above the noise in frames ``[t, D]``, in the layout's unit; inf without any."""
+    """Return the lowest load above the noise in frames ``[t, D]``, in the layout's unit; inf
+    without any."""
     load = frames - scale.baseline
     return float(np.min(load, where=load > scale.near, initial=np.inf))
 
@@ -321,7 +389,8 @@ def _lowest_load(frames: Floats, scale: Scale) -> float:
 def _shared(neighbours: NDArray[np.intp], change: Floats, own: Floats | Array) -> NDArray[np.bool_]:
     """Return which changes of single cells a neighbour shares, bool ``[n]``.
 
-    Exactly both neighbours on one row, or on one column, do not count: they may lie on the same bad wire.
+    Exactly both neighbours on one row, or on one column, do not count: they may lie on the same bad
+    wire.
 
     Args:
         neighbours: int ``[n, 8]``, see ``SensorLayout.beside``.
@@ -335,7 +404,9 @@ def _shared(neighbours: NDArray[np.intp], change: Floats, own: Floats | Array) -
 
 def _median(values: NDArray[np.float32]) -> Floats:
     """Return ``np.median(values, axis=0)`` in a quarter of its time; without NaN."""
-    ordered = np.sort(np.ascontiguousarray(values.T), axis=1)  # faster than a partition for so few values
-    below, above = ordered[:, (len(values) - 1) // 2], ordered[:, len(values) // 2]
+    # faster than a partition for so few values
+    ordered = np.sort(np.ascontiguousarray(values.T), axis=1)
+    below = ordered[:, (len(values) - 1) // 2]
+    above = ordered[:, len(values) // 2]
     median: Floats = (below.astype(np.float64) + above) / 2
     return median

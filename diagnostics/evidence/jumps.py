@@ -1,8 +1,9 @@
 """Jumps: the size of the step into a constant run, compared with the steps of healthy cells.
 
-Detects cells that broke under load. The statistic is ``log(0.5 + 0.5 p(jump | fault) / p(jump | healthy))``, at most 3,
-with a uniform density for faults and a histogram with one pseudo-count a bin for healthy cells. A broken cell jumps by
-any amount; a healthy cell is mostly released gradually, or together with its neighbours. It does not detect jumps
+Detects cells that broke under load. The statistic is
+``log(0.5 + 0.5 p(jump | fault) / p(jump | healthy))``, at most 3, with a uniform density for faults
+and a histogram with one pseudo-count a bin for healthy cells. A broken cell jumps by any amount; a
+healthy cell is mostly released gradually, or together with its neighbours. It does not detect jumps
 together with many cells, as at the end of a grasp, and cells that broke without load.
 """
 
@@ -33,7 +34,8 @@ class JumpHistogram:
     """Sizes of the jumps of healthy cells into constant runs.
 
     Attributes:
-        log_ratio: float ``[2, bins]``, log likelihood ratio fault : healthy of a fall and of a rise of each size.
+        log_ratio: float ``[2, bins]``, log likelihood ratio fault : healthy of a fall and of a rise
+            of each size.
     """
 
     log_ratio: Floats
@@ -44,12 +46,18 @@ class JumpHistogram:
         healthy = np.ones((2, len(_JUMPS) - 1))
         for recording in recordings:
             for _, _, runs in segments(recording, scale, SHORTEST_RUN):
-                fresh = runs.moved & (runs.length >= SHORTEST_RUN) & (runs.length < 2 * SHORTEST_RUN) & runs.alone
+                fresh = (
+                    runs.moved
+                    & (runs.length >= SHORTEST_RUN)
+                    & (runs.length < 2 * SHORTEST_RUN)
+                    & runs.alone
+                )
                 for up in (0, 1):
                     jumps = runs.jump[fresh & ((runs.jump > 0) == up)]
                     healthy[up] += np.histogram(np.abs(jumps) / scale.full_scale, _JUMPS)[0]
         ratio = np.diff(_JUMPS) / (healthy / healthy.sum(axis=1, keepdims=True))
-        # A cell that was unloaded when it broke did not jump: half of the faults look healthy. A jump proves no fault.
+        # A cell that was unloaded when it broke did not jump: half of the faults look healthy. A
+        # jump proves no fault.
         return cls(np.minimum(np.log(0.5 + 0.5 * ratio), SUSPICIOUS))
 
     @classmethod
@@ -58,10 +66,12 @@ class JumpHistogram:
         return cls(np.zeros((2, len(_JUMPS) - 1)))
 
     def evidence(self, cells: ConstantCells) -> Floats:
-        """Return the log likelihood ratio, ``[D]``; 0 for cells that never moved or jumped with others."""
+        """Return the log likelihood ratio, ``[D]``; 0 for cells that never moved or jumped with
+        others."""
         return np.where(cells.runs.alone, self.size(cells.runs, cells.full_scale), 0.0)
 
     def size(self, runs: ConstantRuns, full_scale: float) -> Floats:
-        """Return the log likelihood ratio ``[D]`` as if each cell jumped alone; 0 where it never moved."""
+        """Return the log likelihood ratio ``[D]`` as if each cell jumped alone; 0 where it never
+        moved."""
         which = np.searchsorted(_JUMPS[1:-1], np.abs(runs.jump) / full_scale, side="right")
         return np.where(runs.moved, self.log_ratio[(runs.jump > 0).astype(np.intp), which], 0.0)

@@ -1,14 +1,17 @@
-"""Noise loss: cells that read exactly the same for longer than any healthy cell, on arrays with noise without contact.
+"""Noise loss: cells that read exactly the same for longer than any healthy cell, on arrays with
+noise without contact.
 
-Detects broken cells without any contact, whatever value they hold. The statistic is the number r of consecutive frames
-with an identical reading, against the longest run L of the cell in the reference:
+Detects broken cells without any contact, whatever value they hold. The statistic is the number r of
+consecutive frames with an identical reading, against the longest run L of the cell in the
+reference:
 
     12   if r >= max(2 L, 1.5 recordings)          (log likelihood ratio fault : healthy)
     -3   if the constant run is as long but r <= L
     0    else
 
-A runs test for a sensor "flatline", as in data quality control (QARTOD 2020). It detects nothing on arrays that
-threshold their readings, or whose converter step is larger than the noise; then it is switched off.
+A runs test for a sensor "flatline", as in data quality control (QARTOD 2020). It detects nothing on
+arrays that threshold their readings, or whose converter step is larger than the noise; then it is
+switched off.
 """
 
 from __future__ import annotations
@@ -49,25 +52,37 @@ class NoiseLoss:
 
     @classmethod
     def fit(cls, recordings: Sequence[Floats], present: NDArray[np.bool_]) -> NoiseLoss:
-        """Fit to fault-free recordings, ``[T, D]`` each, of the ``present`` cells (bool ``[D]``)."""
+        """Fit to fault-free recordings, ``[T, D]`` each, of the ``present`` cells (bool
+        ``[D]``)."""
         every = np.arange(len(present))
-        longest, same = np.zeros(len(present), np.intp), np.zeros(len(present), np.intp)
+        longest = np.zeros(len(present), np.intp)
+        same = np.zeros(len(present), np.intp)
         value, last = np.full((2, len(present)), np.nan)
-        lowest, highest = np.inf, -np.inf
+        lowest = np.inf
+        highest = -np.inf
         for frames in RecordingBlocks.of(recordings).blocks():
             readings = held(frames, last)
             of_each = same_for(readings, same)
             at = of_each.argmax(axis=0)
             value = np.where(of_each[at, every] > longest, readings[at + 1, every], value)
             longest = np.maximum(longest, of_each[at, every])
-            same, last = of_each[-1], readings[-1]
+            same = of_each[-1]
+            last = readings[-1]
             lowest = np.fmin.reduce(frames, None, initial=lowest)
             highest = np.fmax.reduce(frames, None, initial=highest)
         recording = float(np.median([len(r) for r in recordings]))
         has_noise = longest <= _CALM * recording
         quiet = ~has_noise & (value > lowest) & (value < highest)
-        few = len(recordings) < FEWEST or has_noise[present].mean() < MAJORITY or quiet[present].mean() > _QUIET
-        return cls.unknown(len(present)) if few else cls(np.where(has_noise, longest, np.inf), recording)
+        few = (
+            len(recordings) < FEWEST
+            or has_noise[present].mean() < MAJORITY
+            or quiet[present].mean() > _QUIET
+        )
+        return (
+            cls.unknown(len(present))
+            if few
+            else cls(np.where(has_noise, longest, np.inf), recording)
+        )
 
     @classmethod
     def unknown(cls, n_cells: int) -> NoiseLoss:
@@ -77,10 +92,14 @@ class NoiseLoss:
     def evidence(self, cells: ConstantCells) -> Floats:
         """Return the log likelihood ratio faulty : healthy, ``[D]``.
 
-        Where all cells at rest read less than in the reference, they may lie at the low rail, and have no noise there.
+        Where all cells at rest read less than in the reference, they may lie at the low rail, and
+        have no noise there.
         """
-        runs, present, sunk = cells.runs, cells.present, cells.lower < -cells.tolerance
+        runs = cells.runs
+        present = cells.present
+        sunk = cells.lower < -cells.tolerance
         too_long = np.maximum(_LONGER * self.longest, MARGIN * self.recording)
-        calm = present & (np.minimum(runs.same, runs.length) >= too_long)  # missing readings are not identical ones
+        # missing readings are not identical ones
+        calm = present & (np.minimum(runs.same, runs.length) >= too_long)
         as_ever = present & cells.rests & (runs.length >= too_long) & (runs.same <= self.longest)
         return untouched_evidence(calm, calm & ~(cells.rests & sunk), as_ever, present)

@@ -1,9 +1,10 @@
-"""The reference: everything fitted on fault-free recordings, and default values for a cold start."""
+"""The reference: everything fitted on fault-free recordings, and default values for a cold
+start."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,7 +31,8 @@ from diagnostics.preprocessing.transport import Patience
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
-_TOLERANCE = 0.005  # of full scale: half the range of a stuck cell's reading, the dither of a converter
+# of full scale: half the range of a stuck cell's reading, the dither of a converter
+_TOLERANCE = 0.005
 _DUPLICATES = 5  # coincidences that two healthy lines may have, in a cold start
 _MANY = 250  # recordings after which the largest count seen is the limit; one more for each halving
 
@@ -68,10 +70,10 @@ class Reference:
     duplicates: int
     model: HealthyModel | None
     dead: NDArray[np.float64]
-    loaded_patience: int = field(default=0, metadata={"newer": True})
-    beside: PadLimit | None = field(default=None, metadata={"newer": True})
-    life: LifeModel | None = field(default=None, metadata={"newer": True})
-    noise: UsualNoise | None = field(default=None, metadata={"newer": True})
+    loaded_patience: int = 0
+    beside: PadLimit | None = None
+    life: LifeModel | None = None
+    noise: UsualNoise | None = None
 
     def repeats(self, layout: SensorLayout) -> Patience:
         """Return how often healthy frames repeat."""
@@ -86,9 +88,17 @@ class Reference:
             ValueError: a number is not positive, or a cell is not covered once.
         """
         rates = (self.usual.blinks, self.usual.blinks_count, self.usual.noise_counts)
-        positive = (self.tolerance, self.scale.near, self.noise_loss.recording, self.patience, *rates)
+        positive = (
+            self.tolerance,
+            self.scale.near,
+            self.noise_loss.recording,
+            self.patience,
+            *rates,
+        )
         if not min(positive) > 0:
-            raise ValueError(f"expected positive tolerance, near, recording, patience and rates, got {positive}")
+            raise ValueError(
+                f"expected positive tolerance, near, recording, patience and rates, got {positive}"
+            )
         if self.model is not None:
             self.model.check(living(layout, self.dead))
         if self.life is not None:
@@ -96,9 +106,13 @@ class Reference:
 
     @classmethod
     def fit(
-        cls, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, dead: NDArray[np.float64] | None = None
+        cls,
+        recordings: Sequence[NDArray[np.float64]],
+        layout: SensorLayout,
+        dead: NDArray[np.float64] | None = None,
     ) -> Reference:
-        """Fit to fault-free recordings, ``[T, D]`` each, without the cells that are ``dead`` (P(dead) ``[D]``)."""
+        """Fit to fault-free recordings, ``[T, D]`` each, without the cells that are ``dead``
+        (P(dead) ``[D]``)."""
         tolerance = tolerance_of(recordings, layout)
         dead = np.zeros(layout.n_cells) if dead is None else dead
         layout = living(layout, dead)
@@ -132,15 +146,23 @@ class Reference:
             noise=UsualNoise.fit(recordings, present, converter_step(recordings, layout)),
         )
 
-    def with_life(self, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> Reference:
-        """Return the reference with the model of the proof of life, fitted to the same recordings."""
+    def with_life(
+        self, recordings: Sequence[NDArray[np.float64]], layout: SensorLayout
+    ) -> Reference:
+        """Return the reference with the model of the proof of life, fitted to the same
+        recordings."""
         layout = living(layout, self.dead)
-        recordings = levelled(recordings, levels(recordings, layout.present.ravel(), layout.full_scale))
-        return replace(self, life=fit_life(recordings, layout, self.scale, self.offset, self.tolerance))
+        recordings = levelled(
+            recordings, levels(recordings, layout.present.ravel(), layout.full_scale)
+        )
+        return replace(
+            self, life=fit_life(recordings, layout, self.scale, self.offset, self.tolerance)
+        )
 
     @classmethod
     def unknown(cls, layout: SensorLayout, rest: NDArray[np.float64] | None = None) -> Reference:
-        """Return the defaults of a cold start: baselines ``rest`` (``[D]``; None: 0), no evidence from jumps."""
+        """Return the defaults of a cold start: baselines ``rest`` (``[D]``; None: 0), no evidence
+        from jumps."""
         tolerance = _TOLERANCE * layout.full_scale
         rest = np.zeros(layout.n_cells) if rest is None else rest
         scale = Scale(rest, 2 * tolerance, layout.full_scale)
@@ -161,20 +183,26 @@ class Reference:
 
 def living(layout: SensorLayout, dead: NDArray[np.float64]) -> SensorLayout:
     """Return a layout without the cells that are ``dead`` (P(dead) ``[D]``)."""
-    return replace(layout, present=layout.present & ~layout.grid(dead > 0)) if dead.any() else layout
+    return (
+        replace(layout, present=layout.present & ~layout.grid(dead > 0)) if dead.any() else layout
+    )
 
 
 def highest_reading(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
-    """Return the highest reading of a present cell that moves; full scale, if none moves above 0."""
+    """Return the highest reading of a present cell that moves; full scale, if none moves above
+    0."""
     low, high = RecordingBlocks.of(recordings).extremes()
     moved = layout.present.ravel() & (high > low) & (high > 0)
     return float(high[moved].max()) if moved.any() else layout.full_scale
 
 
 def tolerance_of(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
-    """Return the half range of a constant reading: 1.5 converter steps, within 0.5 to 1 % of full scale."""
+    """Return the half range of a constant reading: 1.5 converter steps, within 0.5 to 1 % of full
+    scale."""
     step = converter_step(recordings, layout)
-    return max(_TOLERANCE * layout.full_scale, min(MARGIN * step, 2 * _TOLERANCE * layout.full_scale))
+    return max(
+        _TOLERANCE * layout.full_scale, min(MARGIN * step, 2 * _TOLERANCE * layout.full_scale)
+    )
 
 
 def converter_step(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout) -> float:
@@ -186,8 +214,11 @@ def converter_step(recordings: Sequence[NDArray[np.float64]], layout: SensorLayo
     return float(steps.min()) if len(steps) else 0.0
 
 
-def _usual_duplicates(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale) -> int:
-    """Return how many coincidences two healthy lines may have: the largest count seen, plus log2(250 / recordings)."""
+def _usual_duplicates(
+    recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale
+) -> int:
+    """Return how many coincidences two healthy lines may have: the largest count seen, plus
+    log2(250 / recordings)."""
     most = 0
     for recording in recordings:
         duplicates = DuplicateLines.begin(layout)

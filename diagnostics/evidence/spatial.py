@@ -1,19 +1,23 @@
-"""Spatial evidence: does a healthy cell hold this value in these contact events, given the other cells?
+"""Spatial evidence: does a healthy cell hold this value in these contact events, given the other
+cells?
 
-Detects cells that hold one value v from frame s to the end of the log: open, short, or stuck anywhere. Every contact
-event e after s adds to the log likelihood ratio of stuck against healthy
+Detects cells that hold one value v from frame s to the end of the log: open, short, or stuck
+anywhere. Every contact event e after s adds to the log likelihood ratio of stuck against healthy
 
-    sum_e  w_e * -log P(cell reads v throughout e | healthy, readings of the other cells)  +  log P(v | stuck)
+    sum_e  w_e * -log P(cell reads v throughout e | healthy, readings of the other cells)
+           + log P(v | stuck)
 
-The prior of v counts once: broken cells mostly stick to a rail, a healthy cell under a constant load reads any value.
-Without an event the ratio of a load is 1; that of a rest is its prior, as any healthy cell may be at rest.
-The ratio equals a sequence of conditional tests as in pseudo-likelihood estimation (Besag 1975). It does not detect
-cells that no event loads and that no event leaves unloaded among loaded neighbours: they stay untested.
+The prior of v counts once: broken cells mostly stick to a rail, a healthy cell under a constant
+load reads any value. Without an event the ratio of a load is 1; that of a rest is its prior, as any
+healthy cell may be at rest. The ratio equals a sequence of conditional tests as in
+pseudo-likelihood estimation (Besag 1975). It does not detect cells that no event loads and that no
+event leaves unloaded among loaded neighbours: they stay untested.
 
-Which cells may serve as predictors depends on which cells are faulty, so the test is iterated: cells that moved are
-the first predictors; then constant cells whose value is plausible join them, and cells that look stuck leave, until
-nothing changes. Cells that failed together corroborate each other as predictors, so groups that one broken line would
-explain are scored once more with the whole group excluded.
+Which cells may serve as predictors depends on which cells are faulty, so the test is iterated:
+cells that moved are the first predictors; then constant cells whose value is plausible join them,
+and cells that look stuck leave, until nothing changes. Cells that failed together corroborate each
+other as predictors, so groups that one broken line would explain are scored once more with the
+whole group excluded.
 """
 
 from __future__ import annotations
@@ -41,7 +45,8 @@ Floats = NDArray[np.float64]
 
 
 class Exclusion(NamedTuple):
-    """When a cell is excluded from the predictors; the defaults are those of a cold start and of tiles.
+    """When a cell is excluded from the predictors; the defaults are those of a cold start and of
+    tiles.
 
     Attributes:
         threshold: log evidence from which on a cell is excluded.
@@ -59,14 +64,19 @@ class Spatial:
     """Result of the spatial test.
 
     Attributes:
-        evidence: float ``[D]``, log likelihood ratio stuck : healthy; 0 for cells that are not constant.
+        evidence: float ``[D]``, log likelihood ratio stuck : healthy; 0 for cells that are not
+            constant.
         surprisal: float ``[D]``, the part of it that the events add.
-        initial: float ``[D]``, the same in the first round, when only cells that moved were predictors.
+        initial: float ``[D]``, the same in the first round, when only cells that moved were
+            predictors.
         scored: bool ``[D]``, the cells that are constant now.
         events: int ``[D]``, number of events that carry evidence about each cell.
-        offset: float ``[D]``, log likelihood ratio that a moving cell never returns to its baseline; 0 elsewhere.
-        gain: float ``[D]``, log likelihood ratio that a moving cell has another gain; 0: too few events.
-        factor: float ``[D]``, that gain relative to the reference, where it is certain; NaN elsewhere.
+        offset: float ``[D]``, log likelihood ratio that a moving cell never returns to its
+            baseline; 0 elsewhere.
+        gain: float ``[D]``, log likelihood ratio that a moving cell has another gain; 0: too few
+            events.
+        factor: float ``[D]``, that gain relative to the reference, where it is certain; NaN
+            elsewhere.
         since: int ``[D]``, first frame of the changed gain; 0: from the start, or unknown.
     """
 
@@ -89,13 +99,19 @@ class Spatial:
     def before(cls, cells: CellState) -> Spatial:
         """Return the result without any event since earlier events were accumulated."""
         scored, d = cells.scored, len(cells.scored)
-        accumulated, nothing, none = np.where(scored, cells.accumulated, 0.0), np.zeros(d), np.zeros(d, np.intp)
-        evidence, unknown = _with_prior(accumulated, cells), np.full(d, np.nan)
-        return cls(evidence, accumulated, accumulated, scored, none, nothing, nothing, unknown, none)
+        accumulated = np.where(scored, cells.accumulated, 0.0)
+        nothing = np.zeros(d)
+        none = np.zeros(d, np.intp)
+        evidence = _with_prior(accumulated, cells)
+        unknown = np.full(d, np.nan)
+        return cls(
+            evidence, accumulated, accumulated, scored, none, nothing, nothing, unknown, none
+        )
 
 
 class SpatialTest:
-    """The iterated test; each :meth:`step` is one round, so that a control loop can spread it over frames.
+    """The iterated test; each :meth:`step` is one round, so that a control loop can spread it over
+    frames.
 
     Args:
         events: the contact events, in time order.
@@ -119,12 +135,14 @@ class SpatialTest:
         self.result = None if events else Spatial.before(cells)
         if not events:
             return
-        self._events, self._cells, self._exclusion = events, cells, exclusion
+        self._events = events
+        self._cells = cells
+        self._exclusion = exclusion
         self._test = ConditionalTest.of(events, cells, model)
         if misleading is not None:
             self._test = replace(self._test, eligible=self._test.eligible & ~misleading)
-        # First predictors: cells that moved, unless their load outlasts an event, or they jumped alone. Few of the
-        # cells at rest are broken.
+        # First predictors: cells that moved, unless their load outlasts an event, or they jumped
+        # alone. Few of the cells at rest are broken.
         fresh = cells.runs.start >= events[-1].since
         plausible = cells.values.rests | (fresh & (cells.temporal < SUDDEN_JUMP))
         self._predictors: Mask = cells.eligible & cells.runs.moved & plausible
@@ -133,7 +151,8 @@ class SpatialTest:
         self._rounds = self._exclusions = 0
 
     def step(self) -> bool:
-        """Score all cells once and update the predictors, or look for drift. Return whether there is a result."""
+        """Score all cells once and update the predictors, or look for drift. Return whether there
+        is a result."""
         if self.result is None:
             if self._agreed is None:
                 self._update()
@@ -148,23 +167,30 @@ class SpatialTest:
         return self.result
 
     def _update(self) -> None:
-        test, before = self._test, self._predictors & self._test.eligible
+        test = self._test
+        before = self._predictors & self._test.eligible
         expected, surprisal = test.score(before)
         self._summed.append(test.summed(surprisal))
         evidence = _with_prior(self._summed[-1], self._cells)
-        self._predictors = test.eligible & (evidence + self._cells.temporal < self._exclusion.threshold)
+        self._predictors = test.eligible & (
+            evidence + self._cells.temporal < self._exclusion.threshold
+        )
         self._rounds += 1
         if self._rounds == _MOST_ROUNDS or (self._predictors == before).all():
             self._agreed = expected, surprisal
 
     def _look_for_drift(self, expected: Prediction, surprisal: Floats) -> None:
-        """Exclude cells with another offset or gain and start again, or set the result if there is no new one."""
-        test, first = self._test, np.array([event.first for event in self._events])
+        """Exclude cells with another offset or gain and start again, or set the result if there is
+        no new one."""
+        test = self._test
+        first = np.array([event.first for event in self._events])
         offset, gain = _drift(first, test, expected, self._exclusion)
         more = misleading(offset, gain.evidence, ~test.eligible)
         self._exclusions += 1
         if more.any() and self._exclusions < _MOST_ROUNDS:
-            self._test, self._agreed, self._rounds = replace(test, eligible=test.eligible & ~more), None, 0
+            self._test = replace(test, eligible=test.eligible & ~more)
+            self._agreed = None
+            self._rounds = 0
             return
         of_gain = drifting(offset, gain.evidence) & ~drifting(offset)
         self.result = Spatial(
@@ -193,18 +219,21 @@ def _drift(
     """
     runs = test.cells.runs
     moved = test.cells.eligible & runs.moved & (first[:, None] <= runs.start)
-    whole, on_whole = test.features[test.begins], expected.on(test.begins)
+    whole = test.features[test.begins]
+    on_whole = expected.on(test.begins)
     novelty = test.novelty(expected.own)[test.begins]
     moving = moved[-1] & np.isfinite(on_whole.spread)
     offset = offset_evidence(whole, on_whole.always, moving, exclusion.baselines * novelty)
-    return offset, gain_evidence(whole, on_whole, moved, test.cells.scale.root_near, exclusion.gains * novelty)
+    return offset, gain_evidence(
+        whole, on_whole, moved, test.cells.scale.root_near, exclusion.gains * novelty
+    )
 
 
 def _with_prior(surprisal: Floats, cells: CellState) -> Floats:
     """Return the evidence ``[D]``.
 
-    A load that no event tests tells nothing, nor does a cell at rest that never moved. That one came to rest does: any
-    healthy cell may.
+    A load that no event tests tells nothing, nor does a cell at rest that never moved. That one
+    came to rest does: any healthy cell may.
     """
     came_to_rest = cells.values.rests & cells.runs.moved
     tells = cells.scored & (came_to_rest | (surprisal > 0))
@@ -214,18 +243,28 @@ def _with_prior(surprisal: Floats, cells: CellState) -> Floats:
 def held_load_evidence(cells: CellState, outlasted: NDArray[np.intp], model: Model) -> Floats:
     """Return the log likelihood ratio ``[D]`` of loads that are held where nothing moves.
 
-    All cells are predictors here, so an object that rests on the skin is no fault: its cells support each other.
+    All cells are predictors here, so an object that rests on the skin is no fault: its cells
+    support each other.
 
     Args:
         cells: state of each cell.
-        outlasted: int ``[D]``, number of events elsewhere on the skin that each constant load has outlasted.
+        outlasted: int ``[D]``, number of events elsewhere on the skin that each constant load has
+            outlasted.
         model: the healthy model.
     """
-    held, root = np.flatnonzero(outlasted), cells.scale.root_load(np.nan_to_num(cells.runs.value))
+    held = np.flatnonzero(outlasted)
+    root = cells.scale.root_load(np.nan_to_num(cells.runs.value))
     loaded = (root > cells.scale.root_near).astype(np.float32)
     expected = model(np.stack([root, root, loaded, loaded])[None], cells.eligible)
-    likely = expected.always[0, held] * expected.within(cells.values.low[held], cells.values.high[held], held)[0]
+    likely = (
+        expected.always[0, held]
+        * expected.within(cells.values.low[held], cells.values.high[held], held)[0]
+    )
     # One load is tested, however many events there were elsewhere.
     evidence = np.zeros(len(outlasted))
-    evidence[held] = -np.log(np.maximum(likely, P_MIN)) * outlasted[held] / (1 + _ONE_LOAD * (outlasted[held] - 1))
+    evidence[held] = (
+        -np.log(np.maximum(likely, P_MIN))
+        * outlasted[held]
+        / (1 + _ONE_LOAD * (outlasted[held] - 1))
+    )
     return evidence

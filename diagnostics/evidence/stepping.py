@@ -1,4 +1,5 @@
-"""Work in small steps, for a control loop: a generator yields between them and returns the result."""
+"""Work in small steps, for a control loop: a generator yields between them and returns the
+result."""
 
 from __future__ import annotations
 

@@ -1,11 +1,13 @@
-"""The state of a log: fed frame by frame, of constant size, and independent of how the frames are split into blocks.
+"""The state of a log: fed frame by frame, of constant size, and independent of how the frames are
+split into blocks.
 
-Frames are processed in segments of 32. The state keeps the constant run of every cell and the last contact events of
-every tile (see ``events.tiles``; an array of up to 400 cells is one tile). Older events are scored, and only their
-summed evidence is kept.
+Frames are processed in segments of 32. The state keeps the constant run of every cell and the last
+contact events of every tile (see ``events.tiles``; an array of up to 400 cells is one tile). Older
+events are scored, and only their summed evidence is kept.
 
-A tile cannot tell which cells of its halo are faulty, but their own tiles can. So several tiles are scored twice:
-first with the moving cells as predictors, then without the cells that their own tile suspects.
+A tile cannot tell which cells of its halo are faulty, but their own tiles can. So several tiles are
+scored twice: first with the moving cells as predictors, then without the cells that their own tile
+suspects.
 """
 
 from __future__ import annotations
@@ -23,7 +25,13 @@ from diagnostics.events.constant_runs import ConstantRuns
 from diagnostics.events.contact_events import THE_SAME, EventLog, count_repeats
 from diagnostics.events.tiled_events import TiledEvents
 from diagnostics.events.tiles import Rectangle, Tile, tiles
-from diagnostics.evidence.conditional_test import CellState, ConditionalTest, HeldValues, Model, novelty
+from diagnostics.evidence.conditional_test import (
+    CellState,
+    ConditionalTest,
+    HeldValues,
+    Model,
+    novelty,
+)
 from diagnostics.evidence.drift import offset_evidence
 from diagnostics.evidence.duplicate_lines import DuplicateLines, informative
 from diagnostics.evidence.intermittency import Intermittency
@@ -50,9 +58,14 @@ if TYPE_CHECKING:
     from diagnostics.preprocessing.load import LoadDirection
     from diagnostics.preprocessing.scale import Array, Scale
 
-MAX_EVENTS, KEPT_EVENTS = 40, 32  # with more events in a tile, all but the last are scored and dropped
-_SILENT, _NEVER_RECEIVED = 2 * SEGMENT, SEGMENT // 2  # consecutive frames without a reading: not chance any more
-_PAUSE = SEGMENT // 2  # frames of a segment after which old events are scored, a part with each frame
+# with more events in a tile, all but the last are scored and dropped
+MAX_EVENTS = 40
+KEPT_EVENTS = 32
+# consecutive frames without a reading: not chance any more
+_SILENT = 2 * SEGMENT
+_NEVER_RECEIVED = SEGMENT // 2
+# frames of a segment after which old events are scored, a part with each frame
+_PAUSE = SEGMENT // 2
 _CLEAR = 4.0  # times the tolerance of two equal lines: lighter loads are equal by chance
 _STEPS = 8  # in which one pass over all tiles is split: a monitor does one step a frame
 
@@ -67,7 +80,8 @@ class StreamState:
         layout: the array.
         reference: the healthy reference.
         exclusion: when a cell is excluded from the predictors.
-        needed: bool ``[D]``, the cells to be scored; None: all. Tiles without such a cell are skipped.
+        needed: bool ``[D]``, the cells to be scored; None: all. Tiles without such a cell are
+            skipped.
         load: how readings become loads; None: they are.
         order: int ``[D]``, which reading of a frame each cell is; None: they are in order.
 
@@ -75,7 +89,8 @@ class StreamState:
         transport: lost and repeated frames.
         runs: the constant run of each cell.
         local: the last contact events of each tile.
-        accumulated: float ``[D]``, evidence from dropped events, for the constant runs that still last.
+        accumulated: float ``[D]``, evidence from dropped events, for the constant runs that still
+            last.
         intermittency: blinks and excess noise.
         duplicates: pairs of lines that read the same.
         touched: bool ``[D]``, cells that were loaded at least once.
@@ -94,13 +109,21 @@ class StreamState:
         order: Cells | None = None,
     ) -> None:
         model = reference.model
-        every = tiles(layout) if model is None else tuple(Tile(r.inputs, r.outputs) for r in model.local_regressions)
-        self.layout, self.reference = layout, reference
+        every = (
+            tiles(layout)
+            if model is None
+            else tuple(Tile(r.inputs, r.outputs) for r in model.local_regressions)
+        )
+        self.layout = layout
+        self.reference = reference
         self.tiled = len(every) > 1
         self.exclusion = exclusion._replace(threshold=SUSPICIOUS) if self.tiled else exclusion
         self.present = layout.present.ravel()
-        self.order, self.load, self.below = order, load, np.zeros(layout.n_cells, bool)
-        self.transport, self._patience = TransportState(), reference.repeats(layout)
+        self.order = order
+        self.load = load
+        self.below = np.zeros(layout.n_cells, bool)
+        self.transport = TransportState()
+        self._patience = reference.repeats(layout)
         self.runs = ConstantRuns.begin(layout.n_cells)
         self.local = TiledEvents.begin(every if self.tiled else tiles(layout), needed)
         self.accumulated = np.zeros(layout.n_cells)
@@ -108,10 +131,13 @@ class StreamState:
         self.duplicates = DuplicateLines.begin(layout)
         self.touched = np.zeros(layout.n_cells, bool)
         self.scale: Scale = reference.scale
-        self._skin, self._begun = EventLog(), list[int]()  # of the whole skin, if there are several tiles
+        # of the whole skin, if there are several tiles
+        self._skin = EventLog()
+        self._begun = list[int]()
         self._offsets = OffsetTracker.begin(layout.n_cells)
         self._noise = NoiseNow()
-        self._rest, self._response = RestOfLog(), WeakResponse.begin(layout.n_cells)
+        self._rest = RestOfLog()
+        self._response = WeakResponse.begin(layout.n_cells)
         self._level = RestLevel.begin(layout.n_cells)
         self.life = LifeRecord()
         self._of_pad = PadLevel.begin(layout.n_cells)
@@ -119,7 +145,8 @@ class StreamState:
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
         self._filled = 0
-        self._dropping: tuple[Test, TiledEvents] | None = None  # the test of old events, and the events to keep
+        # the test of old events, and the events to keep
+        self._dropping: tuple[Test, TiledEvents] | None = None
         self._models: dict[int, Model] = {}
 
     @property
@@ -139,10 +166,12 @@ class StreamState:
             frames = np.where(self.present, frames, self.reference.scale.baseline)
         wrong = invalid(frames, self.layout.full_scale)
         if wrong is not None:
-            frames, self.transport = np.where(wrong, np.nan, frames), self.transport.dropped(wrong)
+            frames = np.where(wrong, np.nan, frames)
+            self.transport = self.transport.dropped(wrong)
         before = self.transport.seen
         self.transport, new = self.transport.receive(frames, self.present, self._patience)
-        completed, taken = False, 0
+        completed = False
+        taken = 0
         if self._dropping is not None and self._dropping[0].step():
             self._drop()
         while taken < len(new):
@@ -171,7 +200,8 @@ class StreamState:
             self.transport = self.transport.without(frames)
 
     def complete(self) -> StreamState:
-        """Return a state in which the frames of the unfinished segment are processed; this state stays as it is."""
+        """Return a state in which the frames of the unfinished segment are processed; this state
+        stays as it is."""
         if not self._filled:
             return self
         self._drop()
@@ -191,27 +221,36 @@ class StreamState:
     @property
     def silent(self) -> Mask:
         """Cells that deliver no reading, or no longer do, bool ``[D]``."""
-        return self.present & (self.runs.missed >= np.where(self.received, _SILENT, _NEVER_RECEIVED))
+        return self.present & (
+            self.runs.missed >= np.where(self.received, _SILENT, _NEVER_RECEIVED)
+        )
 
     @property
     def noisier(self) -> bool:
-        """Whether all cells have more noise than in the reference: how they depend on each other is unknown then."""
+        """Whether all cells have more noise than in the reference: how they depend on each other is
+        unknown then."""
         usual = self.reference.noise
         return usual is not None and usual.raises(self._noise) > 0
 
     def rests(self) -> Mask:
         """Cells whose constant run lies at their baseline, bool ``[D]``."""
-        return np.isfinite(self.runs.value) & (self.scale.root_load(self.runs.value) <= self.scale.root_near)
+        return np.isfinite(self.runs.value) & (
+            self.scale.root_load(self.runs.value) <= self.scale.root_near
+        )
 
     def temporal(self) -> NDArray[np.float64]:
-        """Log likelihood ratio of the constant run, its level and noise, and the jump into it, ``[D]``."""
-        reference, cells = self.reference, self._constant_cells()
+        """Log likelihood ratio of the constant run, its level and noise, and the jump into it,
+        ``[D]``."""
+        reference = self.reference
+        cells = self._constant_cells()
         if reference.model is None:
             return self._level.evidence(cells)
         terms: tuple[Term, ...] = reference.jumps_seen, reference.least, reference.noise_loss
         jump, low, noise = (term.evidence(cells) for term in terms)
         if reference.beside is not None:
-            low = np.maximum(low, reference.beside.evidence(cells, reference.scale.baseline, self._of_pad.level))
+            low = np.maximum(
+                low, reference.beside.evidence(cells, reference.scale.baseline, self._of_pad.level)
+            )
         return jump + np.where(np.abs(noise) > np.abs(low), noise, low)
 
     def without_noise(self) -> Mask:
@@ -220,22 +259,29 @@ class StreamState:
 
     def _constant_cells(self) -> ConstantCells:
         """Return what the terms of constant cells are given."""
-        reference, rests = self.reference, self.rests()
+        reference = self.reference
+        rests = self.rests()
         lower = reference.least.lower(self.runs, rests & self.present)
-        return ConstantCells(self.layout, reference.scale.full_scale, reference.tolerance, self.runs, rests, lower)
+        return ConstantCells(
+            self.layout, reference.scale.full_scale, reference.tolerance, self.runs, rests, lower
+        )
 
     def model_of(self, i: int, events: EventLog) -> Model:
         """Return the healthy model of tile i; without a reference, a model of its ``events``."""
         known = self.reference.model
         if not self.tiled:
-            return (known or NearestNeighbours.of(events.kept, self.layout, self.scale.root_near)).predict
+            return (
+                known or NearestNeighbours.of(events.kept, self.layout, self.scale.root_near)
+            ).predict
         if i in self._models:
             return self._models[i]
         own = self.local.tiles[i].rectangle(self.layout)
         if known is None:
             model = NearestNeighbours.of(events.kept, own.layout, self.scale.root_near)
             return _on_rectangle(replace(model, log=own.on(model.log)).predict, own)
-        return self._models.setdefault(i, _on_rectangle(known.of_tile(i, own.cells, own.layout).predict, own))
+        return self._models.setdefault(
+            i, _on_rectangle(known.of_tile(i, own.cells, own.layout).predict, own)
+        )
 
     @property
     def lowest(self) -> NDArray[np.float64]:
@@ -245,7 +291,8 @@ class StreamState:
     def views(self, onset: int) -> Iterator[tuple[Array, Cells, Cells, Model]]:
         """Yield, for each tile, its events since frame ``onset`` as features ``[n, 4, k]``.
 
-        With them the k cells, the places among these of the cells that the model predicts, and the model.
+        With them the k cells, the places among these of the cells that the model predicts, and the
+        model.
         """
         for i, events in self.local.kept():
             tile = self.local.tiles[i]
@@ -254,7 +301,8 @@ class StreamState:
                 yield np.stack(suffixes), tile.inputs, tile.place, self.model_of(i, events)
 
     def evidence_of_life(self) -> EvidenceOfLog | None:
-        """Return what the log says of how cells depend on each other; the reference must have a model of it."""
+        """Return what the log says of how cells depend on each other; the reference must have a
+        model of it."""
         assert self.reference.life is not None
         return EvidenceOfLog.of(self.life, self.reference.life, self.layout.beside)
 
@@ -280,7 +328,8 @@ class StreamState:
     def spatial(self, explained: Mask | None = None, misleading: Mask | None = None) -> Test:
         """Return the spatial test of all constant cells.
 
-        Cells already ``explained`` (bool ``[D]``) are left out; those that are ``misleading`` predict no others.
+        Cells already ``explained`` (bool ``[D]``) are left out; those that are ``misleading``
+        predict no others.
         """
         cells = self.cells(explained)
         cells = self._with_held_loads(cells) if self.tiled else cells
@@ -289,22 +338,27 @@ class StreamState:
     def each_excluded(
         self, spatial: Spatial, explained: Mask, groups: Sequence[Cells]
     ) -> Iterator[NDArray[np.float64]]:
-        """Yield, for each group of cells, the summed surprisal ``[D]`` with these excluded from the predictors.
+        """Yield, for each group of cells, the summed surprisal ``[D]`` with these excluded from the
+        predictors.
 
         Args:
             spatial: the result of the test with all cells that are not suspected as predictors.
             explained: bool ``[D]``, cells already explained.
             groups: cells that one fault would explain, int ``[k]`` each.
         """
-        every, predictors = self.cells(explained), ~self.suspected(spatial)
+        every = self.cells(explained)
+        predictors = ~self.suspected(spatial)
 
         @cache  # no group changes it
         def prepared(i: int) -> ConditionalTest:
             events = self.local.of[i]
-            return ConditionalTest.of(events.kept, every.of(self.local.tiles[i].inputs), self.model_of(i, events))
+            return ConditionalTest.of(
+                events.kept, every.of(self.local.tiles[i].inputs), self.model_of(i, events)
+            )
 
         for group in groups:
-            total, among = self.accumulated.copy(), np.zeros(len(predictors), bool)
+            total = self.accumulated.copy()
+            among = np.zeros(len(predictors), bool)
             among[group] = True
             for i, _ in self.local.kept():
                 tile = self.local.tiles[i]
@@ -315,25 +369,30 @@ class StreamState:
             yield total
 
     def least_loads(self) -> tuple[NDArray[np.float64], Cells]:
-        """Return the least root load of each cell since an event last left it unloaded, ``[D]``; 0: the last one did.
+        """Return the least root load of each cell since an event last left it unloaded, ``[D]``; 0:
+        the last one did.
 
         With it the first frame of these events, 0 where these are all that are kept.
         """
-        least, since = np.zeros(self.layout.n_cells), np.zeros(self.layout.n_cells, np.intp)
+        least = np.zeros(self.layout.n_cells)
+        since = np.zeros(self.layout.n_cells, np.intp)
         for i, events in self.local.kept():
             tile = self.local.tiles[i]
             lowest = np.stack([event.lowest[tile.place] for event in events.kept])
             lasting = np.logical_and.accumulate((lowest > self.scale.root_near)[::-1])[::-1]
             first = np.array([event.first for event in events.kept])[lasting.argmax(axis=0)]
-            least[tile.outputs] = np.where(lasting[-1], np.where(lasting, lowest, 1.0).min(axis=0), 0.0)
+            least[tile.outputs] = np.where(
+                lasting[-1], np.where(lasting, lowest, 1.0).min(axis=0), 0.0
+            )
             since[tile.outputs] = np.where(lasting[-1] & ~lasting[0], first, 0)
         return least, since
 
     def never_unloaded(self, cells: Mask, predictors: Mask) -> NDArray[np.float64]:
-        """Return -log P(a healthy cell stays loaded in all events since one last left it unloaded) ``[D]``.
+        """Return -log P(a healthy cell stays loaded in all events since one last left it unloaded)
+        ``[D]``.
 
-        Given the readings of the ``predictors`` (bool ``[D]``) alone: cells on one object would support each other.
-        Repeated events count for less.
+        Given the readings of the ``predictors`` (bool ``[D]``) alone: cells on one object would
+        support each other. Repeated events count for less.
         Tiles without one of the ``cells`` (bool ``[D]``) are left out.
         """
         surprisal = np.zeros(self.layout.n_cells)
@@ -345,20 +404,30 @@ class StreamState:
             always = self.model_of(i, events)(whole, predictors[tile.inputs]).always
             likely = np.maximum(always, OUTLIERS)
             counts = novelty(count_repeats(events.kept, THE_SAME))[:, None]
-            surprisal[tile.outputs] = offset_evidence(whole, likely, self.present[tile.inputs], counts)[tile.place]
+            surprisal[tile.outputs] = offset_evidence(
+                whole, likely, self.present[tile.inputs], counts
+            )[tile.place]
         return surprisal
 
-    def log_held(self, root: NDArray[np.float64], predictors: Mask, values: HeldValues) -> NDArray[np.float64]:
-        """Return log P(a healthy cell holds its value) ``[D]``, given the root loads ``[D]`` of the ``predictors``.
+    def log_held(
+        self, root: NDArray[np.float64], predictors: Mask, values: HeldValues
+    ) -> NDArray[np.float64]:
+        """Return log P(a healthy cell holds its value) ``[D]``, given the root loads ``[D]`` of the
+        ``predictors``.
 
-        0: cells without load; NaN: cells that no reference event loaded, so that the model knows no load of them.
+        0: cells without load; NaN: cells that no reference event loaded, so that the model knows no
+        load of them.
         """
         features = np.stack([root, root, root > 0, root > 0]).astype(np.float32)
-        likely, loaded = np.ones(len(root)), root > 0
+        likely = np.ones(len(root))
+        loaded = root > 0
         for i, tile in enumerate(self.local.tiles):
             if loaded[tile.outputs].any():
-                inputs, own = tile.inputs, tile.place[loaded[tile.outputs]]
-                e = self.model_of(i, self.local.of[i])(features[None, :, inputs], predictors[inputs])
+                inputs = tile.inputs
+                own = tile.place[loaded[tile.outputs]]
+                e = self.model_of(i, self.local.of[i])(
+                    features[None, :, inputs], predictors[inputs]
+                )
                 these = inputs[own]
                 within = e.within(values.low[these], values.high[these], own)[0]
                 likely[these] = np.where(np.isnan(e.spread[own]), np.nan, e.always[0, own] * within)
@@ -366,47 +435,70 @@ class StreamState:
 
     def suspected(self, spatial: Spatial) -> Mask:
         """Return the cells that are no predictors after a test, bool ``[D]``."""
-        return (spatial.scored & (spatial.evidence + self.temporal() >= self.exclusion.threshold)) | spatial.drifting
+        return (
+            spatial.scored & (spatial.evidence + self.temporal() >= self.exclusion.threshold)
+        ) | spatial.drifting
 
     def cells(self, explained: Mask | None) -> CellState:
-        """Return the state of the cells before the spatial test; ``explained`` cells (bool ``[D]``) are left out."""
-        explained = self.intermittency.intermittent | self.intermittency.excess | (explained is not None and explained)
+        """Return the state of the cells before the spatial test; ``explained`` cells (bool ``[D]``)
+        are left out."""
+        explained = (
+            self.intermittency.intermittent
+            | self.intermittency.excess
+            | (explained is not None and explained)
+        )
         eligible = self.received & ~self.silent & ~explained
         runs = self.runs
         if self.reference.model is None:
-            # What no event can tell from a broken cell is not tested; what it reads says something of the others.
+            # What no event can tell from a broken cell is not tested; what it reads says something
+            # of the others.
             untestable = self._response.untestable(self.scale.near) & self.rests()
             runs = replace(runs, length=np.where(untestable, 0, runs.length))
-        return CellState(runs, self.scale, self.reference.tolerance, self.accumulated, self.temporal(), eligible)
+        return CellState(
+            runs, self.scale, self.reference.tolerance, self.accumulated, self.temporal(), eligible
+        )
 
-    def _test(self, cells: CellState, events: TiledEvents, passes: int, misleading: Mask | None = None) -> Test:
+    def _test(
+        self, cells: CellState, events: TiledEvents, passes: int, misleading: Mask | None = None
+    ) -> Test:
         if self.tiled:
             none = np.zeros(self.layout.n_cells, bool)
-            return _TiledTest(self, cells, events, passes, none if misleading is None else misleading)
+            return _TiledTest(
+                self, cells, events, passes, none if misleading is None else misleading
+            )
         (only,) = events.of
         return SpatialTest(only.kept, cells, self.model_of(0, only), self.exclusion, misleading)
 
     def _with_held_loads(self, cells: CellState) -> CellState:
-        """Return the cells with the evidence of loads that are held where nothing has moved for some events."""
+        """Return the cells with the evidence of loads that are held where nothing has moved for
+        some events."""
         if self.reference.model is None:
             return cells  # held loads cannot be predicted from one log alone
         loaded = cells.scored & (self.scale.root_load(self.runs.value) > self.scale.root_near)
         accumulated = cells.accumulated.copy()
         for i in self.local.holding(loaded):
-            tile, own = self.local.tiles[i], self.local.of[i].kept
+            tile = self.local.tiles[i]
+            own = self.local.of[i].kept
             since = np.maximum(self.runs.start[tile.inputs], own[-1].end if own else 0)
-            many = np.where(loaded[tile.inputs], len(self.begun) - np.searchsorted(self.begun, since), 0)
+            many = np.where(
+                loaded[tile.inputs], len(self.begun) - np.searchsorted(self.begun, since), 0
+            )
             if many[tile.place].any():
-                evidence = held_load_evidence(cells.of(tile.inputs), many, self.model_of(i, self.local.of[i]))
+                evidence = held_load_evidence(
+                    cells.of(tile.inputs), many, self.model_of(i, self.local.of[i])
+                )
                 accumulated[tile.outputs] += evidence[tile.place]
         return replace(cells, accumulated=accumulated)
 
     def _close(self) -> None:
         """Process a segment."""
         self._drop()
-        frames, numbers = self._buffer[: self._filled], self._numbers[: self._filled]
+        frames = self._buffer[: self._filled]
+        numbers = self._numbers[: self._filled]
         self._filled = 0
-        self._offsets = self._offsets.extend(frames, self.reference.scale, self.present, self.reference.offset)
+        self._offsets = self._offsets.extend(
+            frames, self.reference.scale, self.present, self.reference.offset
+        )
         self._noise = self._noise.extend(frames, self.present)
         plain = self._offsets.on(self.reference.scale)
         noise = 0.0 if self.reference.noise is None else self.reference.noise.raises(self._noise)
@@ -417,15 +509,19 @@ class StreamState:
             light = max(LIGHT * plain.full_scale, self._noise.range)
             self._rest = self._rest.extend(frames[:, moved], self.lowest[moved], light)
             self.scale = scale = self._rest.scale(plain, self.lowest, moved)
-        start, known = self.runs.start, _known(frames, self.runs.last)
-        before, self.runs = self.runs, self.runs.extend(frames, numbers, self.reference.tolerance, scale.baseline)
+        start = self.runs.start
+        known = _known(frames, self.runs.last)
+        before = self.runs
+        self.runs = self.runs.extend(frames, numbers, self.reference.tolerance, scale.baseline)
         runs = self.runs
         # Evidence belongs to a constant run, and ends with it.
         self.accumulated = np.where(runs.start == start, self.accumulated, 0.0)
         if self.reference.beside is not None:
             baseline = self.reference.scale.baseline
             most = self.reference.beside.most
-            self._of_pad = self._of_pad.extend(frames, runs, int(numbers[0]), baseline, self.layout, most)
+            self._of_pad = self._of_pad.extend(
+                frames, runs, int(numbers[0]), baseline, self.layout, most
+            )
         steady = self._offsets.off(known)
         root = scale.root_load(steady)
         still = runs.start <= numbers[0]
@@ -433,7 +529,9 @@ class StreamState:
         touched = root.any(axis=0)
         if self.reference.model is None:
             self._level = self._level.extend(before, runs.start != start)
-            self._response = self._response.extend(steady, scale.full_scale * root.astype(np.float64) ** 2, self.layout)
+            self._response = self._response.extend(
+                steady, scale.full_scale * root.astype(np.float64) ** 2, self.layout
+            )
             # How often healthy lines with light loads agree is unknown.
             clear = replace(plain, near=max(scale.near, _CLEAR * plain.near))
             # Where a cell rests that never moved is unknown: at its lowest reading at most.
@@ -449,7 +547,8 @@ class StreamState:
             skin = self._skin.extend(root, numbers, scale.root_near, runs.start, jumped)
             self._begun = [*self._begun[:-1], *(event.first for event in skin.kept)][-KEPT_EVENTS:]
             _, self._skin = skin.split(1)
-            # On long lines some cell is always dead: cells that never moved are no difference between two lines.
+            # On long lines some cell is always dead: cells that never moved are no difference
+            # between two lines.
             frames = np.where(runs.moved, frames, np.nan)
         usual = self.reference.usual.with_noise(noise / plain.full_scale)
         self.intermittency = self.intermittency.extend(known, root, numbers, noisy, usual, still)
@@ -465,22 +564,34 @@ class StreamState:
         """Finish the test of old events, and drop them."""
         if self._dropping is not None:
             test, kept = self._dropping
-            self.accumulated, self.local, self._dropping = test.finish().surprisal, kept, None
+            self.accumulated = test.finish().surprisal
+            self.local = kept
+            self._dropping = None
 
 
 class _TiledTest:
     """The spatial test of several tiles, in one or two passes, see the module."""
 
     def __init__(
-        self, stream: StreamState, cells: CellState, events: TiledEvents, passes: int, misleading: Mask
+        self,
+        stream: StreamState,
+        cells: CellState,
+        events: TiledEvents,
+        passes: int,
+        misleading: Mask,
     ) -> None:
-        self._stream, self._cells, self._events, self._passes = stream, cells, events, passes
+        self._stream = stream
+        self._cells = cells
+        self._events = events
+        self._passes = passes
         self._misleading = misleading
         self._outside = stream.runs.moved  # predictors of each tile outside its outputs
         self._begin()
 
     def _begin(self) -> None:
-        self._result = Spatial(*(np.array(values) for values in vars(Spatial.before(self._cells)).values()))
+        self._result = Spatial(
+            *(np.array(values) for values in vars(Spatial.before(self._cells)).values())
+        )
         self._queue = list(self._events.kept())
         self._each = max(1, -(-len(self._queue) // _STEPS))
 
@@ -488,7 +599,8 @@ class _TiledTest:
         """Score some tiles; return whether all passes are done."""
         if self._passes == 0:
             return True
-        now, self._queue = self._queue[: self._each], self._queue[self._each :]
+        now = self._queue[: self._each]
+        self._queue = self._queue[self._each :]
         for i, events in now:
             self._score(i, events)
         if self._queue:
@@ -506,12 +618,16 @@ class _TiledTest:
         return self._result
 
     def _score(self, i: int, events: EventLog) -> None:
-        stream, tile = self._stream, self._events.tiles[i]
-        cells, allowed = self._cells.of(tile.inputs), self._outside[tile.inputs]
+        stream = self._stream
+        tile = self._events.tiles[i]
+        cells = self._cells.of(tile.inputs)
+        allowed = self._outside[tile.inputs]
         allowed[tile.place] = True
         cells = replace(cells, eligible=cells.eligible & allowed)
         misleading = self._misleading[tile.inputs]
-        test = SpatialTest(events.kept, cells, stream.model_of(i, events), stream.exclusion, misleading)
+        test = SpatialTest(
+            events.kept, cells, stream.model_of(i, events), stream.exclusion, misleading
+        )
         for name, values in vars(test.finish()).items():
             getattr(self._result, name)[tile.outputs] = values[tile.place]
 
@@ -530,9 +646,12 @@ def _on_rectangle(model: Model, own: Rectangle) -> Model:
 
 
 def _known(frames: NDArray[np.float64], last: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ``frames`` with each missing reading replaced by the one before it; ``last`` holds those before all.
+    """Return ``frames`` with each missing reading replaced by the one before it; ``last`` holds
+    those before all.
 
     A cell without any reading in these frames stays missing: an old reading is no load now.
     """
     missing = np.isnan(frames)
-    return np.where(missing.all(axis=0), np.nan, held(frames, last)[1:]) if missing.any() else frames
+    return (
+        np.where(missing.all(axis=0), np.nan, held(frames, last)[1:]) if missing.any() else frames
+    )

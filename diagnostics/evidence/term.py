@@ -1,7 +1,8 @@
 """The protocol of the evidence terms of constant cells: what they are given, and what they return.
 
-A term returns log P(constant run | faulty) - log P(constant run | healthy) of each cell, 0 where it does not tell.
-Terms with a reference: :mod:`~diagnostics.evidence.jumps`, :mod:`~diagnostics.evidence.lower_limit`,
+A term returns log P(constant run | faulty) - log P(constant run | healthy) of each cell, 0 where it
+does not tell. Terms with a reference: :mod:`~diagnostics.evidence.jumps`,
+:mod:`~diagnostics.evidence.lower_limit`,
 :mod:`~diagnostics.evidence.noise_loss`, :mod:`~diagnostics.evidence.pad_level`; without one:
 :mod:`~diagnostics.evidence.rest_level`.
 """
@@ -30,7 +31,8 @@ class ConstantCells:
 
     Attributes:
         layout: the array.
-        full_scale, tolerance: in the layout's unit; readings within +- tolerance of a value count as that value.
+        full_scale, tolerance: in the layout's unit; readings within +- tolerance of a value count
+        as that value.
         runs: the constant runs.
         rests: bool ``[D]``, cells whose run lies at their baseline.
         lower: by how much all cells at rest read less than ever in the reference, 0 or below.
@@ -57,9 +59,13 @@ class Term(Protocol):
 
 
 def untouched_evidence(
-    unusual: NDArray[np.bool_], broken: NDArray[np.bool_], as_ever: NDArray[np.bool_], present: NDArray[np.bool_]
+    unusual: NDArray[np.bool_],
+    broken: NDArray[np.bool_],
+    as_ever: NDArray[np.bool_],
+    present: NDArray[np.bool_],
 ) -> Floats:
-    """Return the log likelihood ratio fault : healthy of cells without contact, ``[D]``: 12, -3 or 0.
+    """Return the log likelihood ratio fault : healthy of cells without contact, ``[D]``: 12, -3 or
+    0.
 
     All are 0 where more than half of the cells are unusual.
 

@@ -1,15 +1,19 @@
-"""Weak response: cells that work, but read so little that no contact event can tell them from a broken cell.
+"""Weak response: cells that work, but read so little that no contact event can tell them from a
+broken cell.
 
-Detects, in a cold start, cells whose readings follow the loads of their neighbours and stay below what counts as load.
-With x the readings of a cell and l the mean load of its eight neighbours, each less its mean over a segment of the log,
+Detects, in a cold start, cells whose readings follow the loads of their neighbours and stay below
+what counts as load. With x the readings of a cell and l the mean load of its eight neighbours, each
+less its mean over a segment of the log,
 
-    z    = sum x l / sqrt(sum x^2 / n  sum l^2)     standard normal, if the cell is broken: it has white noise or none
+    z    = sum x l / sqrt(sum x^2 / n  sum l^2)
+         standard normal, if the cell is broken: it has white noise or none
     gain = sum x l / sum l^2                        regression of the readings on the loads
 
-A cell works if z exceeds 4.4 (six in a million), as in a test of Pearson's correlation (``scipy.stats.pearsonr``). Its
-response is weak if gain times the highest l is no load. That a cell with a weak response reads no load is no evidence
-of a fault. It does not detect cells that respond with less than their noise, and takes a broken cell for a working one
-where crosstalk makes it follow its neighbours.
+A cell works if z exceeds 4.4 (six in a million), as in a test of Pearson's correlation
+(``scipy.stats.pearsonr``). Its response is weak if gain times the highest l is no load. That a cell
+with a weak response reads no load is no evidence of a fault. It does not detect cells that respond
+with less than their noise, and takes a broken cell for a working one where crosstalk makes it
+follow its neighbours.
 """
 
 from __future__ import annotations
@@ -76,15 +80,19 @@ class WeakResponse:
 
     def untestable(self, near: float) -> NDArray[np.bool_]:
         """Return the cells that work and respond by at most ``near``, bool ``[D]``."""
-        follows = self.products * np.sqrt(self.frames) > _CERTAIN * np.sqrt(self.readings * self.loads)
+        follows = self.products * np.sqrt(self.frames) > _CERTAIN * np.sqrt(
+            self.readings * self.loads
+        )
         weak = self.products * self.highest <= near * self.loads
         return np.asarray(follows & weak)
 
 
 def _mean_of_neighbours(loads: Floats, layout: SensorLayout) -> Floats:
-    """Return the mean load ``[t, D]`` of the eight neighbours; those beyond an edge count as unloaded."""
+    """Return the mean load ``[t, D]`` of the eight neighbours; those beyond an edge count as
+    unloaded."""
     grid = np.pad(layout.grid(loads), ((0, 0), (0, 0), (1, 1), (1, 1)))
-    rows, cols = layout.rows, layout.cols
+    rows = layout.rows
+    cols = layout.cols
     block = np.zeros((*grid.shape[:2], rows, cols))
     for down in range(3):
         for right in range(3):

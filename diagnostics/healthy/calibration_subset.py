@@ -1,7 +1,9 @@
-"""Calibration subset: blocks of a large array with much contact, on which the calibration is fitted.
+"""Calibration subset: blocks of a large array with much contact, on which the calibration is
+fitted.
 
-Calibration differs little between places of one array, so a subset of about 1000 cells suffices and the cost does not
-grow with the array. The blocks are those with the most loaded readings; differences between places are not seen.
+Calibration differs little between places of one array, so a subset of about 1000 cells suffices and
+the cost does not grow with the array. The blocks are those with the most loaded readings;
+differences between places are not seen.
 """
 
 from __future__ import annotations
@@ -22,8 +24,11 @@ _CELLS = 1000  # in all, about: a size
 Recordings = Sequence[NDArray[np.float64]]
 
 
-def calibration_subset(recordings: Recordings, layout: SensorLayout) -> tuple[Recordings, SensorLayout]:
-    """Return recordings of the blocks with the most contact, and their layout; a small array is returned as it is.
+def calibration_subset(
+    recordings: Recordings, layout: SensorLayout
+) -> tuple[Recordings, SensorLayout]:
+    """Return recordings of the blocks with the most contact, and their layout; a small array is
+    returned as it is.
 
     Recordings without any load on these blocks are left out.
 
@@ -31,7 +36,8 @@ def calibration_subset(recordings: Recordings, layout: SensorLayout) -> tuple[Re
         recordings: ``[T, D]`` each.
         layout: the array.
     """
-    rows, cols = min(layout.rows, _SIDE), min(layout.cols, _SIDE)
+    rows = min(layout.rows, _SIDE)
+    cols = min(layout.cols, _SIDE)
     wanted = max(2, -(-_CELLS // (rows * cols)))
     blocks = [
         (pad, slice(r, r + rows), slice(c, c + cols))
@@ -48,14 +54,22 @@ def calibration_subset(recordings: Recordings, layout: SensorLayout) -> tuple[Re
     index = layout.grid(np.arange(layout.n_cells))
     cells = np.concatenate([index[block].ravel() for block in chosen])
     own = SensorLayout(
-        wanted, rows, cols, full_scale=layout.full_scale, unit=layout.unit, rate=layout.rate,
+        wanted,
+        rows,
+        cols,
+        full_scale=layout.full_scale,
+        unit=layout.unit,
+        rate=layout.rate,
         present=layout.present.ravel()[cells],
-    )  # fmt: skip
+    )
     return _moving(readings, cells, LIGHT * layout.full_scale), own
 
 
-def _moving(readings: RecordingBlocks, cells: NDArray[np.intp], least: float) -> list[NDArray[np.float64]]:
-    """Return the recordings of ``cells`` in which at least one of them moves by more than ``least``."""
+def _moving(
+    readings: RecordingBlocks, cells: NDArray[np.intp], least: float
+) -> list[NDArray[np.float64]]:
+    """Return the recordings of ``cells`` in which at least one of them moves by more than
+    ``least``."""
     found = []
     for i in range(len(readings)):
         frames = readings.piece(i, slice(None), cells)

@@ -1,9 +1,11 @@
-"""Cross-fitting: training samples for the stacking from events that the local regressions were not fitted on.
+"""Cross-fitting: training samples for the stacking from events that the local regressions were not
+fitted on.
 
-Estimates nothing itself. The events are split into 4 folds; regressions fitted on 3 of them predict the fourth, with a
-random 3 to 95 % of the cells excluded from the predictors, as if they were dead or had not moved yet. So the stacking
-learns how reliable the regressions are. Equals scikit-learn's ``StackingClassifier(cv=GroupKFold(4))``, with dropout of
-inputs (Chernozhukov et al. 2018 name the scheme).
+Estimates nothing itself. The events are split into 4 folds; regressions fitted on 3 of them predict
+the fourth, with a random 3 to 95 % of the cells excluded from the predictors, as if they were dead
+or had not moved yet. So the stacking learns how reliable the regressions are. Equals scikit-learn's
+``StackingClassifier(cv=GroupKFold(4))``, with dropout of inputs (Chernozhukov et al. 2018 name the
+scheme).
 """
 
 from __future__ import annotations
@@ -50,16 +52,18 @@ def stacking_samples(
         rng: draws them.
 
     Returns:
-        Features of m samples ``[m, k]``, see ``stacking.neighbourhood``, and whether the cell stayed unloaded, and
-        loaded, throughout ``[m, 2]``.
+        Features of m samples ``[m, k]``, see ``stacking.neighbourhood``, and whether the cell
+        stayed unloaded, and loaded, throughout ``[m, 2]``.
     """
     present = np.flatnonzero(layout.present)
     per_excerpt = sum(min(left, _SCORED) for left in _LEFT_OUT) * len(outputs)
     most = max(1, round(share * _SAMPLES / (FOLDS * per_excerpt)))  # excerpts in each round
     fold = rng.permutation(source.max() + 1)[source] % FOLDS
-    samples, did = [], []
+    samples = []
+    did = []
     for k in range(FOLDS):
-        regression, held_out = fit(features[fold != k]), features[fold == k]
+        regression = fit(features[fold != k])
+        held_out = features[fold == k]
         for left in _LEFT_OUT:
             some = held_out[np.sort(rng.permutation(len(held_out))[:most])]
             out = rng.permutation(present)[: max(1, round(left * len(present)))]
@@ -70,5 +74,9 @@ def stacking_samples(
             regressed = predict_regressions([regression], some, predictors)
             described = neighbourhood(regressed, some, predictors, layout, out)
             samples.append(described.reshape(len(described), -1).T.astype(np.float64))
-            did.append(np.column_stack([(some[:, 2, out] == 0).T.ravel(), (some[:, 3, out] == 1).T.ravel()]))
+            did.append(
+                np.column_stack(
+                    [(some[:, 2, out] == 0).T.ravel(), (some[:, 3, out] == 1).T.ravel()]
+                )
+            )
     return np.concatenate(samples), np.concatenate(did)

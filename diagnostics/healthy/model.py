@@ -1,14 +1,16 @@
-"""The healthy model: the distribution of a cell's load in a contact event, given the loads of the other cells.
+"""The healthy model: the distribution of a cell's load in a contact event, given the loads of the
+other cells.
 
 Estimates, for each cell i and event e with features x_e of the other cells,
 
     P(unloaded throughout e | x_e),   P(loaded throughout e | x_e),   E[mean root load | x_e]
 
-from ridge logistic and linear regressions per cell (:mod:`~diagnostics.healthy.local_regression`), corrected by one
-small network on the neighbourhood of the cell (:mod:`~diagnostics.healthy.stacking`): stacked generalization
-(Wolpert 1992). An open cell reads the same as a healthy cell beside the contact, so the sharpness of the two
-probabilities decides what can be detected. The model assumes that events are independent. It does not describe the
-course of a load within an event.
+from ridge logistic and linear regressions per cell (:mod:`~diagnostics.healthy.local_regression`),
+corrected by one small network on the neighbourhood of the cell
+(:mod:`~diagnostics.healthy.stacking`): stacked generalization (Wolpert 1992). An open cell reads
+the same as a healthy cell beside the contact, so the sharpness of the two probabilities decides
+what can be detected. The model assumes that events are independent. It does not describe the course
+of a load within an event.
 """
 
 from __future__ import annotations
@@ -48,15 +50,21 @@ class HealthyModel:
     stacking: Stacking | None = None
 
     def check(self, layout: SensorLayout) -> None:
-        """Raise ValueError unless each cell of ``layout`` is an output of exactly one local regression."""
+        """Raise ValueError unless each cell of ``layout`` is an output of exactly one local
+        regression."""
         outputs = [regression.outputs for regression in self.local_regressions]
-        if not np.array_equal(np.sort(np.concatenate(outputs)) if outputs else [], np.flatnonzero(layout.present)):
-            raise ValueError(f"the local regressions do not cover each cell of {layout} exactly once")
+        if not np.array_equal(
+            np.sort(np.concatenate(outputs)) if outputs else [], np.flatnonzero(layout.present)
+        ):
+            raise ValueError(
+                f"the local regressions do not cover each cell of {layout} exactly once"
+            )
         if not all(0 < regression.p_floor < 1 for regression in self.local_regressions):
             raise ValueError("expected p_floor between 0 and 1")
 
     def of_tile(self, i: int, cells: NDArray[np.intp], layout: SensorLayout) -> HealthyModel:
-        """Return the model of tile i on its own ``layout``, in which the inputs of the tile are ``cells``."""
+        """Return the model of tile i on its own ``layout``, in which the inputs of the tile are
+        ``cells``."""
         return HealthyModel((self.local_regressions[i].at(cells),), layout, self.stacking)
 
     def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
@@ -69,7 +77,8 @@ class HealthyModel:
         regressed = predict_regressions(self.local_regressions, features, predictors)
         spread, p_floor = np.ones((2, features.shape[2]))  # 1: no model of the cell
         for regression in self.local_regressions:
-            spread[regression.outputs], p_floor[regression.outputs] = regression.spread, regression.p_floor
+            spread[regression.outputs] = regression.spread
+            p_floor[regression.outputs] = regression.p_floor
         known = p_floor < 1
         never, always = expit(regressed[:2])
         if self.stacking is not None:
@@ -77,19 +86,30 @@ class HealthyModel:
             step = max(1, _BATCH // len(modelled))
             for first in range(0, len(features), step):
                 some = slice(first, first + step)
-                samples = neighbourhood(regressed[:, some], features[some], predictors, self.layout, modelled)
+                samples = neighbourhood(
+                    regressed[:, some], features[some], predictors, self.layout, modelled
+                )
                 corrected, always[some, modelled] = (p.T for p in self.stacking.predict(samples))
-                # A cell that no reference event loaded may be out of reach, whatever its neighbours read.
-                never[some, modelled] = np.where(np.isnan(spread[modelled]), never[some, modelled], corrected)
-        # Which cells an event loads depends on the place; that a load is never held alone is learned from all events.
-        always_floor = p_floor if self.stacking is None else np.minimum(p_floor, p_floor_of(self.stacking.events))
+                # A cell that no reference event loaded may be out of reach, whatever its neighbours
+                # read.
+                never[some, modelled] = np.where(
+                    np.isnan(spread[modelled]), never[some, modelled], corrected
+                )
+        # Which cells an event loads depends on the place; that a load is never held alone is
+        # learned from all events.
+        always_floor = (
+            p_floor
+            if self.stacking is None
+            else np.minimum(p_floor, p_floor_of(self.stacking.events))
+        )
         never = np.where(known, np.clip(never, p_floor, 1 - p_floor), 1.0)
         always = np.where(known, np.clip(always, always_floor, 1 - always_floor), 1.0)
         return Prediction(never, always, regressed[2], spread)
 
 
 def p_floor_of(n_events: int) -> float:
-    """Return the probability of what never happened in n events: 1 / (n + 2), Laplace's rule of succession."""
+    """Return the probability of what never happened in n events: 1 / (n + 2), Laplace's rule of
+    succession."""
     return max(MIN_P_FLOOR, 1 / (n_events + 2))
 
 

@@ -1,15 +1,16 @@
-"""The k-NN spatial model: the healthy model of a cold start, built from the log itself without a reference.
+"""The k-NN spatial model: the healthy model of a cold start, built from the log itself without a
+reference.
 
-Estimates the load of a cell from 20 cells with the most similar surroundings, anywhere on the array and in any event.
-Surroundings are the mean load of the four adjacent predictors, of the four diagonal ones, of the 16 of the ring around
-these, and the enclosure (maximum over pairs of opposite neighbours of the smaller load), for highest and mean root
-load:
+Estimates the load of a cell from 20 cells with the most similar surroundings, anywhere on the array
+and in any event. Surroundings are the mean load of the four adjacent predictors, of the four
+diagonal ones, of the 16 of the ring around these, and the enclosure (maximum over pairs of opposite
+neighbours of the smaller load), for highest and mean root load:
 
     P(never loaded) = (count of never loaded neighbours + prior) / (k + 1)
 
-Equals scikit-learn's ``KNeighborsClassifier`` and ``KNeighborsRegressor`` (Cover and Hart 1967) with one pseudo-count.
-It interpolates and never extrapolates: of cells that no two opposite predictors enclose it predicts held loads alone,
-from the means.
+Equals scikit-learn's ``KNeighborsClassifier`` and ``KNeighborsRegressor`` (Cover and Hart 1967)
+with one pseudo-count. It interpolates and never extrapolates: of cells that no two opposite
+predictors enclose it predicts held loads alone, from the means.
 """
 
 from __future__ import annotations
@@ -49,21 +50,27 @@ class NearestNeighbours:
     rest: float = 0.0
 
     @classmethod
-    def of(cls, events: Sequence[ContactEvent], layout: SensorLayout, rest: float = 0.0) -> NearestNeighbours:
+    def of(
+        cls, events: Sequence[ContactEvent], layout: SensorLayout, rest: float = 0.0
+    ) -> NearestNeighbours:
         """Build the model from the events of a log and from each of their parts."""
         parts = [part.features() for event in events for part in (*event.parts, event.whole)]
         return cls(np.stack(parts), layout, rest)
 
     def predict(self, features: Array, predictors: NDArray[np.bool_]) -> Prediction:
-        """See ``HealthyModel.predict``. P(never loaded) is 1 for a cell that no two opposite predictors enclose."""
+        """See ``HealthyModel.predict``. P(never loaded) is 1 for a cell that no two opposite
+        predictors enclose."""
         shape = (len(features), features.shape[2])
-        never, always, mean = np.ones(shape), np.ones(shape), np.zeros(shape)
+        never = np.ones(shape)
+        always = np.ones(shape)
+        mean = np.zeros(shape)
         spread = np.full(shape[1], np.nan)
         present = self.layout.present.ravel()
         usable = predictors & present
         known, scored = (_describe(of, usable, self.layout) for of in (self.log, features))
         enclosed = np.isfinite(scored).all(axis=(0, 2)) & present
-        # A held load beside unloaded cells is unlikely anywhere; an unloaded cell at the border tells nothing.
+        # A held load beside unloaded cells is unlikely anywhere; an unloaded cell at the border
+        # tells nothing.
         border = np.isfinite(scored[..., _MEANS]).all(axis=(0, 2)) & present & ~enclosed
         border &= (features[:, 1] > self.rest).all(axis=0)
         for cells, described in ((enclosed, slice(None)), (border, _MEANS)):
@@ -72,7 +79,9 @@ class NearestNeighbours:
                 continue
             if cells is enclosed:
                 never[:, cells] = found.never
-            always[:, cells], mean[:, cells], spread[cells] = found.always, found.mean, found.spread
+            always[:, cells] = found.always
+            mean[:, cells] = found.mean
+            spread[cells] = found.spread
         return Prediction(never, always, mean, spread, own=False)
 
     def _predict(
@@ -93,9 +102,11 @@ class NearestNeighbours:
         samples = known[:, described].reshape(-1, known.shape[2])
         targets = np.moveaxis(self.log[:, :, described], 1, -1).reshape(-1, self.log.shape[1])
         kept = np.linspace(0, len(samples) - 1, min(len(samples), _MOST_SAMPLES)).astype(int)
-        tree, targets = cKDTree(samples[kept]), targets[kept]
+        tree = cKDTree(samples[kept])
+        targets = targets[kept]
         neighbours = min(_NEIGHBOURS, len(targets))
-        # Most cells lie far from any load and have the same surroundings, which are searched for once, as the first.
+        # Most cells lie far from any load and have the same surroundings, which are searched for
+        # once, as the first.
         neighbourhood = scored.reshape(-1, scored.shape[2])
         loaded = neighbourhood.any(axis=1)
         which = np.where(loaded, np.cumsum(loaded), 0).reshape(len(scored), -1)
@@ -118,24 +129,36 @@ class NearestNeighbours:
         )
 
 
-def _describe(features: Array, usable: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.float64]:
-    """Return the surroundings of each cell in each excerpt, ``[n, D, 8]``; NaN without two opposite usable cells."""
+def _describe(
+    features: Array, usable: NDArray[np.bool_], layout: SensorLayout
+) -> NDArray[np.float64]:
+    """Return the surroundings of each cell in each excerpt, ``[n, D, 8]``; NaN without two opposite
+    usable cells."""
     grid = layout.grid(np.where(usable, features[:, :2], np.nan))  # (n, 2, pads, rows, cols)
     padded = np.pad(grid, ((0, 0), (0, 0), (0, 0), (2, 2), (2, 2)), constant_values=np.nan)
-    rows, cols = layout.rows, layout.cols
+    rows = layout.rows
+    cols = layout.cols
 
     def shifted(*offsets: tuple[int, int]) -> NDArray[np.float64]:
-        return np.stack([padded[..., 2 + r : 2 + r + rows, 2 + c : 2 + c + cols] for r, c in offsets])
+        return np.stack(
+            [padded[..., 2 + r : 2 + r + rows, 2 + c : 2 + c + cols] for r, c in offsets]
+        )
 
-    beside, opposite = shifted((-1, 0), (0, -1)), shifted((1, 0), (0, 1))
-    diagonal, across = shifted((-1, -1), (-1, 1)), shifted((1, 1), (1, -1))
-    near, far = _mean(np.concatenate([beside, opposite])), _mean(np.concatenate([diagonal, across]))
-    ring = _mean(shifted(*((r, c) for r in range(-2, 3) for c in range(-2, 3) if max(abs(r), abs(c)) == 2)))
+    beside = shifted((-1, 0), (0, -1))
+    opposite = shifted((1, 0), (0, 1))
+    diagonal = shifted((-1, -1), (-1, 1))
+    across = shifted((1, 1), (1, -1))
+    near = _mean(np.concatenate([beside, opposite]))
+    far = _mean(np.concatenate([diagonal, across]))
+    ring = _mean(
+        shifted(*((r, c) for r in range(-2, 3) for c in range(-2, 3) if max(abs(r), abs(c)) == 2))
+    )
     # A cell that has only adjacent, or only diagonal, neighbours is described by these.
     near, far = np.where(np.isnan(near), far, near), np.where(np.isnan(far), near, far)
     ring = np.where(np.isnan(ring), far, ring)
     pairs = np.minimum(np.concatenate([beside, diagonal]), np.concatenate([opposite, across]))
-    described = np.stack([near, far, ring, np.fmax.reduce(pairs)], axis=1)  # (n, 4, 2, pads, rows, cols)
+    # (n, 4, 2, pads, rows, cols)
+    described = np.stack([near, far, ring, np.fmax.reduce(pairs)], axis=1)
     return np.moveaxis(described.reshape(len(features), 8, layout.n_cells), 1, 2)
 
 

@@ -1,4 +1,5 @@
-"""Prediction: the distribution of the loads of healthy cells in contact events, as a healthy model gives it."""
+"""Prediction: the distribution of the loads of healthy cells in contact events, as a healthy model
+gives it."""
 
 from __future__ import annotations
 
@@ -32,9 +33,13 @@ class Prediction:
     spread: NDArray[np.float64]
     own: bool = True
 
-    def on(self, excerpts: NDArray[np.bool_] | slice, cells: NDArray[np.intp] | slice = slice(None)) -> Prediction:
+    def on(
+        self, excerpts: NDArray[np.bool_] | slice, cells: NDArray[np.intp] | slice = slice(None)
+    ) -> Prediction:
         """Return the prediction for some of the excerpts and cells."""
-        never, always, mean = (values[excerpts][:, cells] for values in (self.never, self.always, self.mean))
+        never, always, mean = (
+            values[excerpts][:, cells] for values in (self.never, self.always, self.mean)
+        )
         return Prediction(never, always, mean, self.spread[cells], self.own)
 
     def within(
@@ -46,15 +51,16 @@ class Prediction:
     ) -> NDArray[np.float64]:
         """Return P(low <= mean root load <= high), ``[n, k]``.
 
-        A contaminated Student t distribution: 0.9 F_4((x - mean) / (inflation * spread)) + 0.1 of a uniform one; a
-        uniform one alone where the spread is unknown.
+        A contaminated Student t distribution: 0.9 F_4((x - mean) / (inflation * spread)) + 0.1 of a
+        uniform one; a uniform one alone where the spread is unknown.
 
         Args:
             low, high: root loads ``[k]``.
             cells: int ``[k]``.
             inflation: factor on the spread in each excerpt, ``[n]``.
         """
-        mean, spread = self.mean[:, cells], self.spread[cells] * np.reshape(inflation, (-1, 1))
+        mean = self.mean[:, cells]
+        spread = self.spread[cells] * np.reshape(inflation, (-1, 1))
         likely = _student_t((high - mean) / spread) - _student_t((low - mean) / spread)
         p = (1 - OUTLIERS) * likely + OUTLIERS * (np.minimum(high, 1.0) - low)
         # Full scale has no width: a load of unknown size reaches it as often as a broken cell.
@@ -63,14 +69,18 @@ class Prediction:
 
     @cached_property
     def states(self) -> NDArray[np.float64]:
-        """P(never loaded), P(always loaded) and P(sometimes loaded), each at least 0.002, ``[3, n, D]``."""
-        return np.clip(np.stack([self.never, self.always, 1 - self.never - self.always]), MIN_P_FLOOR, 1.0)
+        """P(never loaded), P(always loaded) and P(sometimes loaded), each at least 0.002,
+        ``[3, n, D]``."""
+        return np.clip(
+            np.stack([self.never, self.always, 1 - self.never - self.always]), MIN_P_FLOOR, 1.0
+        )
 
     def log_likelihood(self, features: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the log likelihood of what each cell did, ``[n, D]``, up to a constant.
 
-        log P(its state) + log t_4(mean root load) where it was loaded: summed over cells, the pseudo-likelihood of the
-        excerpts (Besag 1975). A load of a cell whose loads are unknown is an outlier.
+        log P(its state) + log t_4(mean root load) where it was loaded: summed over cells, the
+        pseudo-likelihood of the excerpts (Besag 1975). A load of a cell whose loads are unknown is
+        an outlier.
 
         Args:
             features: ``[n, 4, D]``, of the excerpts (see ``Summary.features``).
@@ -78,14 +88,18 @@ class Prediction:
         did = np.where(features[:, 2] == 0, 0, np.where(features[:, 3] == 1, 1, 2))
         state = np.take_along_axis(np.log(self.states), did[None], axis=0)[0]
         error = np.nan_to_num((features[:, 1] - self.mean) / self.spread, nan=np.inf)
-        log_likely: NDArray[np.float64] = state + np.where(did > 0, log_student_t(error, OUTLIERS), 0.0)
+        log_likely: NDArray[np.float64] = state + np.where(
+            did > 0, log_student_t(error, OUTLIERS), 0.0
+        )
         return log_likely
 
 
 def log_student_t(error: NDArray[Any], outliers: float) -> NDArray[Any]:
-    """Return the log density of standardised errors, contaminated by a share of ``outliers``; up to a constant.
+    """Return the log density of standardised errors, contaminated by a share of ``outliers``; up to
+    a constant.
 
-    ``log((1 - outliers) t_4(error) / t_4(0) + outliers)``, as ``scipy.stats.t(4).pdf``; the dtype of ``error`` is kept.
+    ``log((1 - outliers) t_4(error) / t_4(0) + outliers)``, as ``scipy.stats.t(4).pdf``; the dtype
+    of ``error`` is kept.
     """
     u = 1 + (error / 2) ** 2
     log_density: NDArray[Any] = np.log((1 - outliers) / (u * u * np.sqrt(u)) + outliers)
@@ -93,7 +107,8 @@ def log_student_t(error: NDArray[Any], outliers: float) -> NDArray[Any]:
 
 
 def _student_t(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ``scipy.stats.t(4).cdf(x)`` in closed form, ten times as fast. Edges of objects make the tails heavy."""
+    """Return ``scipy.stats.t(4).cdf(x)`` in closed form, ten times as fast. Edges of objects make
+    the tails heavy."""
     x = np.clip(x, -1e6, 1e6)
     u = x / np.sqrt(1 + x**2 / 4)
     return 0.5 + 0.375 * u * (1 - u**2 / 12)

@@ -1,9 +1,10 @@
 """Reference faults: cells that were dead already while the reference was recorded.
 
-Used arrays often have some. The reference is therefore diagnosed first as in a cold start, by the k-NN spatial model;
-cells with P(faulty) >= 0.999 are excluded from fitting. Candidates are connected groups of cells that never moved in
-any recording and that have, somewhere, cells that moved on two opposite sides. Cells that fail during the reference,
-and groups at the border without such neighbours, are not detected.
+Used arrays often have some. The reference is therefore diagnosed first as in a cold start, by the
+k-NN spatial model; cells with P(faulty) >= 0.999 are excluded from fitting. Candidates are
+connected groups of cells that never moved in any recording and that have, somewhere, cells that
+moved on two opposite sides. Cells that fail during the reference, and groups at the border without
+such neighbours, are not detected.
 """
 
 from __future__ import annotations
@@ -23,22 +24,28 @@ if TYPE_CHECKING:
     from diagnostics.decision.result import Diagnosis
     from diagnostics.layout import SensorLayout
 
-_PIECES, _FRAMES = 60, 200  # pieces that are diagnosed, evenly spread, and frames of each: sizes
+# pieces that are diagnosed, evenly spread, and frames of each: sizes
+_PIECES = 60
+_FRAMES = 200
 
 
 def find_reference_faults(
     recordings: RecordingBlocks,
     layout: SensorLayout,
     tolerance: float,
-    diagnose: Callable[[RecordingBlocks, NDArray[np.bool_], NDArray[np.float64], SensorLayout], Diagnosis],
+    diagnose: Callable[
+        [RecordingBlocks, NDArray[np.bool_], NDArray[np.float64], SensorLayout], Diagnosis
+    ],
 ) -> NDArray[np.float64]:
-    """Return P(dead) of the cells that are dead throughout the reference, ``[D]``; 0 for all others.
+    """Return P(dead) of the cells that are dead throughout the reference, ``[D]``; 0 for all
+    others.
 
     Args:
         recordings: the reference.
         layout: the array.
         tolerance: a constant cell stays within +- this, in the layout's unit.
-        diagnose: a cold-start diagnosis of the candidate cells (bool ``[D]``) with known baselines (float ``[D]``).
+        diagnose: a cold-start diagnosis of the candidate cells (bool ``[D]``) with known baselines
+            (float ``[D]``).
     """
     present = layout.present.ravel()
     still = present & never_moved(recordings, tolerance)
@@ -55,23 +62,33 @@ def find_reference_faults(
 
 
 def never_moved(recordings: RecordingBlocks, tolerance: float) -> NDArray[np.bool_]:
-    """Return the cells whose readings stay within +- ``tolerance`` of a value, bool ``[D]``; False without any."""
+    """Return the cells whose readings stay within +- ``tolerance`` of a value, bool ``[D]``; False
+    without any."""
     low, high = recordings.extremes()
     still: NDArray[np.bool_] = high - low <= 2 * tolerance
     return still
 
 
 def _enclosed_groups(still: NDArray[np.bool_], layout: SensorLayout) -> NDArray[np.bool_]:
-    """Return the groups of cells that are ``still`` in which one is enclosed by cells that moved, bool ``[D]``."""
+    """Return the groups of cells that are ``still`` in which one is enclosed by cells that moved,
+    bool ``[D]``."""
     moved = layout.grid(~still & layout.present.ravel())
     groups = layout.connected(still)
-    candidates: NDArray[np.bool_] = np.isin(groups, groups[enclosed(moved[..., None]).ravel() & still])
+    candidates: NDArray[np.bool_] = np.isin(
+        groups, groups[enclosed(moved[..., None]).ravel() & still]
+    )
     return candidates
 
 
 def _sample(recordings: RecordingBlocks) -> RecordingBlocks:
     """Return evenly spread pieces of the recordings: more add little to a cold start."""
-    pieces = [(i, first) for i in range(len(recordings)) for first in range(0, len(recordings[i]), _FRAMES)]
+    pieces = [
+        (i, first)
+        for i in range(len(recordings))
+        for first in range(0, len(recordings[i]), _FRAMES)
+    ]
     chosen = np.unique(np.linspace(0, len(pieces) - 1, _PIECES).round().astype(int))
     some = (pieces[k] for k in chosen)
-    return RecordingBlocks([recordings.piece(i, slice(first, first + _FRAMES), slice(None)) for i, first in some])
+    return RecordingBlocks(
+        [recordings.piece(i, slice(first, first + _FRAMES), slice(None)) for i, first in some]
+    )

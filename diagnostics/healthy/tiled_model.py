@@ -1,10 +1,12 @@
-"""Fits the healthy model: local regressions for each tile of the array, and the stacking that all tiles share.
+"""Fits the healthy model: local regressions for each tile of the array, and the stacking that all
+tiles share.
 
 The regressions of the tiles of a large array are shrunk towards a shared prior
-(:mod:`~diagnostics.healthy.shared_prior`). The prior and the stacking (:mod:`~diagnostics.healthy.stacking`) are fitted
-on a limited number of tiles with many events, so their cost does not grow with the array. Equals a hierarchical
-(multi-task) ridge regression with fixed variances. Cells of two tiles that are further apart than the halo are
-independent in the model. A small array is one tile, and has no prior.
+(:mod:`~diagnostics.healthy.shared_prior`). The prior and the stacking
+(:mod:`~diagnostics.healthy.stacking`) are fitted on a limited number of tiles with many events, so
+their cost does not grow with the array. Equals a hierarchical (multi-task) ridge regression with
+fixed variances. Cells of two tiles that are further apart than the halo are independent in the
+model. A small array is one tile, and has no prior.
 """
 
 from __future__ import annotations
@@ -33,14 +35,21 @@ from diagnostics.preprocessing.scale import Array, Scale
 if TYPE_CHECKING:
     from diagnostics.layout import SensorLayout
 
-_SAMPLES, _TILE_SAMPLES = 3000, 256  # excerpts for the model of a small array, and of one of several tiles: sizes
+# excerpts for the model of a small array, and of one of several tiles: sizes
+_SAMPLES = 3000
+_TILE_SAMPLES = 256
 _MOST_DRAWS = 8  # excerpts of one event: more of them are nearly the same
 _RIDGE = 30.0  # towards the shared prior, divided by the number of events of the tile
-_PRIOR_TILES, _EXCERPTS, _PRIOR_SAMPLES = 28, 64, 600  # tiles of the shared prior; excerpts and samples of each: sizes
+# tiles of the shared prior; excerpts and samples of each: sizes
+_PRIOR_TILES = 28
+_EXCERPTS = 64
+_PRIOR_SAMPLES = 600
 _STACKING_TILES = 12  # tiles with the most events, from which the stacking is fitted: a size
 
 
-def fit_healthy_model(recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale) -> HealthyModel:
+def fit_healthy_model(
+    recordings: Sequence[NDArray[np.float64]], layout: SensorLayout, scale: Scale
+) -> HealthyModel:
     """Fit to fault-free recordings, ``[T, D]`` each."""
     rng = np.random.default_rng(0)
     events_of = ReferenceEvents.of(RecordingBlocks.of(recordings), layout, scale)
@@ -50,7 +59,9 @@ def fit_healthy_model(recordings: Sequence[NDArray[np.float64]], layout: SensorL
     local_regressions = []
     for k, tile in enumerate(events_of.tiles):
         features, _ = events_of.drawn(k, _TILE_SAMPLES, rng)
-        local_regressions.append(_fit_tile(features, events_of.number(k), tile, shared_prior, layout).at(tile.inputs))
+        local_regressions.append(
+            _fit_tile(features, events_of.number(k), tile, shared_prior, layout).at(tile.inputs)
+        )
     return HealthyModel(tuple(local_regressions), layout, _stacking(events_of, shared_prior, rng))
 
 
@@ -97,21 +108,29 @@ class ReferenceEvents:
             events = TiledEvents.begin(every)
             none = np.zeros(layout.n_cells, bool)
             for frames, numbers, runs in segments(recording, scale):
-                events = events.extend(scale.root_load(frames), numbers, scale.root_near, runs.start, none)
+                events = events.extend(
+                    scale.root_load(frames), numbers, scale.root_near, runs.start, none
+                )
             for k, of_tile in events.kept():
                 again = (count_repeats(of_tile.kept) > 0).tolist()
-                seen[k] += [ReferenceEvent(i, e.first, e.n, a) for e, a in zip(of_tile.kept, again, strict=True)]
+                seen[k] += [
+                    ReferenceEvent(i, e.first, e.n, a)
+                    for e, a in zip(of_tile.kept, again, strict=True)
+                ]
         return cls(readings, layout, scale, every, seen)
 
     def number(self, k: int) -> int:
-        """Return the number of distinct events of tile k; with few recordings repeated ones count too."""
+        """Return the number of distinct events of tile k; with few recordings repeated ones count
+        too."""
         few = _few_recordings(self.seen[k])
         return sum(few or not event.again for event in self.seen[k])
 
     def drawn(self, k: int, most: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.intp]]:
-        """Return about ``most`` random excerpts of the events of tile k: features ``[n, 4, inputs]``, and sources.
+        """Return about ``most`` random excerpts of the events of tile k: features
+        ``[n, 4, inputs]``, and sources.
 
-        The source, int ``[n]``, is that of correlated excerpts: a recording or, with few recordings, an event.
+        The source, int ``[n]``, is that of correlated excerpts: a recording or, with few
+        recordings, an event.
         """
         seen = self.seen[k]
         cells = self.tiles[k].inputs if len(self.tiles) > 1 else slice(None)
@@ -128,7 +147,9 @@ class ReferenceEvents:
             for draw in range(draws):
                 length = int(rng.integers(min(SHORTEST_RUN, n), n + 1)) if draw else n
                 at = int(rng.integers(0, n - length + 1))
-                features.append(Summary.of(root[at : at + length], first + at, scale.root_near).features())
+                features.append(
+                    Summary.of(root[at : at + length], first + at, scale.root_near).features()
+                )
         sources = range(len(seen)) if _few_recordings(seen) else [event.recording for event in seen]
         return np.stack(features), np.unique(sources, return_inverse=True)[1].repeat(draws)
 
@@ -140,23 +161,34 @@ def _few_recordings(seen: Sequence[ReferenceEvent]) -> bool:
 
 def _fit_small(events_of: ReferenceEvents, rng: np.random.Generator) -> HealthyModel:
     """Fit the model of an array that is one tile."""
-    layout, number = events_of.layout, events_of.number(0)
+    layout = events_of.layout
+    number = events_of.number(0)
     features, source = events_of.drawn(0, _SAMPLES, rng)
     every = np.flatnonzero(layout.present)
     fit = partial(LocalRegression.fit, inputs=every, outputs=every, p_floor=p_floor_of(number))
     stacking = None
     if number >= FOLDS:
-        stacking = Stacking.fit(*stacking_samples(features, source, layout, every, fit, 1.0, rng), number)
+        stacking = Stacking.fit(
+            *stacking_samples(features, source, layout, every, fit, 1.0, rng), number
+        )
     return HealthyModel((fit(features),), layout, stacking)
 
 
 def _shared_prior(events_of: ReferenceEvents, rng: np.random.Generator) -> SharedPrior:
     """Return the shared prior."""
     layout = events_of.layout
-    some = rng.permutation(np.flatnonzero([bool(of) for of in events_of.seen]))[:_PRIOR_TILES].tolist()
+    some = rng.permutation(np.flatnonzero([bool(of) for of in events_of.seen]))[
+        :_PRIOR_TILES
+    ].tolist()
     return SharedPrior.fit(
         [
-            Samples.of(events_of.drawn(k, _EXCERPTS, rng)[0], events_of.tiles[k], layout, rng, _PRIOR_SAMPLES)
+            Samples.of(
+                events_of.drawn(k, _EXCERPTS, rng)[0],
+                events_of.tiles[k],
+                layout,
+                rng,
+                _PRIOR_SAMPLES,
+            )
             for k in some
         ]
     )
@@ -166,15 +198,22 @@ def _fit_tile(
     features: Array, events: int, tile: Tile, shared_prior: SharedPrior, layout: SensorLayout
 ) -> LocalRegression:
     """Fit the regressions of a tile; ``features`` (``[n, 4, inputs]``) hold its inputs alone."""
-    rows, cols = tile.inputs // layout.cols % layout.rows, tile.inputs % layout.cols
-    down, across = rows[:, None] - rows, cols[:, None] - cols  # (inputs, inputs)
+    rows = tile.inputs // layout.cols % layout.rows
+    cols = tile.inputs % layout.cols
+    # (inputs, inputs)
+    down = rows[:, None] - rows
+    across = cols[:, None] - cols
     weight = shared_prior.weights(down[:, tile.place], across[:, tile.place])
     taper = np.exp(-(down**2 + across**2) / (2 * REACH**2))
     start = Start(weight, shared_prior.bias, max(RIDGE, _RIDGE / max(events, 1)), taper)
-    return LocalRegression.fit(features, np.arange(len(tile.inputs)), tile.place, p_floor_of(events), start)
+    return LocalRegression.fit(
+        features, np.arange(len(tile.inputs)), tile.place, p_floor_of(events), start
+    )
 
 
-def _stacking(events_of: ReferenceEvents, shared_prior: SharedPrior, rng: np.random.Generator) -> Stacking | None:
+def _stacking(
+    events_of: ReferenceEvents, shared_prior: SharedPrior, rng: np.random.Generator
+) -> Stacking | None:
     """Return the stacking fitted on the tiles with the most events; None if all have too few."""
     number = [events_of.number(k) for k in range(len(events_of.tiles))]
     busiest = [k for k in np.argsort(number)[::-1][:_STACKING_TILES].tolist() if number[k] >= FOLDS]
@@ -186,15 +225,24 @@ def _stacking(events_of: ReferenceEvents, shared_prior: SharedPrior, rng: np.ran
 
 
 def _samples(
-    events_of: ReferenceEvents, k: int, shared_prior: SharedPrior, share: float, rng: np.random.Generator
+    events_of: ReferenceEvents,
+    k: int,
+    shared_prior: SharedPrior,
+    share: float,
+    rng: np.random.Generator,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the stacking samples of tile k."""
-    layout, tile = events_of.layout, events_of.tiles[k]
+    layout = events_of.layout
+    tile = events_of.tiles[k]
     own = tile.rectangle(layout)
     features, source = events_of.drawn(k, _TILE_SAMPLES, rng)
     training_events = events_of.number(k) * (FOLDS - 1) // FOLDS
 
     def fit(training: Array) -> LocalRegression:
-        return _fit_tile(training[:, :, own.cells], training_events, tile, shared_prior, layout).at(own.cells)
+        return _fit_tile(training[:, :, own.cells], training_events, tile, shared_prior, layout).at(
+            own.cells
+        )
 
-    return stacking_samples(own.on(features), source, own.layout, own.cells[tile.place], fit, share, rng)
+    return stacking_samples(
+        own.on(features), source, own.layout, own.cells[tile.place], fit, share, rng
+    )

@@ -1,1 +1,2 @@
-"""Readings before anything is inferred: missing values, baseline and noise, offset tracking, load, transport."""
+"""Readings before anything is inferred: missing values, baseline and noise, offset tracking, load,
+transport."""

@@ -1,11 +1,12 @@
 """Baseline: the reading of each cell without contact, its noise and its drift.
 
-Estimates per cell ``q05(readings) + max(0, drift + 6 sigma - tolerance)``: the 0.05 quantile, plus the upward drift of
-the baseline between recordings, plus noise. The drift is mirrored from the downward drift, which loads do not hide, but
-a baseline of 0 does: there it comes from the frame with the least total load in each recording, and drift that less
-than a quarter of the cells show is not found. The noise sigma is a robust estimate from second differences,
-median(|x_{t+1} - 2 x_t + x_{t-1}|) / (0.6745 sqrt 6), as ``scipy.stats.median_abs_deviation(scale="normal")`` of a
-series without trend.
+Estimates per cell ``q05(readings) + max(0, drift + 6 sigma - tolerance)``: the 0.05 quantile, plus
+the upward drift of the baseline between recordings, plus noise. The drift is mirrored from the
+downward drift, which loads do not hide, but a baseline of 0 does: there it comes from the frame
+with the least total load in each recording, and drift that less than a quarter of the cells show is
+not found. The noise sigma is a robust estimate from second differences, median(|x_{t+1} - 2 x_t +
+x_{t-1}|) / (0.6745 sqrt 6), as ``scipy.stats.median_abs_deviation(scale="normal")`` of a series
+without trend.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, RARE
+from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import CELLS, SEGMENT, RecordingBlocks, spread
 
 _NOISE = 6.0  # standard deviations from the low quantile to the highest of many readings
@@ -42,7 +44,9 @@ class Baseline(NamedTuple):
     peaks: Floats
 
 
-def baseline(recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance: float, full_scale: float) -> Baseline:
+def baseline(
+    recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance: float, full_scale: float
+) -> Baseline:
     """Estimate the baseline of each cell, see the module.
 
     Args:
@@ -51,9 +55,12 @@ def baseline(recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance
         tolerance: a constant run stays within +- this; smaller drift is covered by it.
         full_scale: of the layout.
     """
-    readings, cells = RecordingBlocks.of(recordings), spread(np.flatnonzero(present))
+    readings = RecordingBlocks.of(recordings)
+    cells = spread(np.flatnonzero(present))
     low, last, peaks = _low(readings)
-    offsets, unloaded, curvatures = [], [], []
+    offsets = []
+    unloaded = []
+    curvatures = []
     for i in readings.some:
         frames = readings.piece(i, slice(None), cells)
         received = ~np.isnan(frames).any(axis=0)
@@ -61,7 +68,10 @@ def baseline(recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance
             whole = frames[:, received]
             offsets.append(np.quantile(whole, LOW, axis=0) - low[cells[received]])
             least_loaded = whole[whole.sum(axis=1).argmin()]
-            unloaded.append(np.minimum(least_loaded, np.quantile(whole, LEAST_LOADED, axis=0)) - low[cells[received]])
+            unloaded.append(
+                np.minimum(least_loaded, np.quantile(whole, LEAST_LOADED, axis=0))
+                - low[cells[received]]
+            )
             # A load changes slowly: its second difference is small.
             curvatures.append(np.median(np.abs(np.diff(whole, 2, axis=0)), axis=0))
     if not offsets:
@@ -75,10 +85,12 @@ def baseline(recordings: Sequence[Floats], present: NDArray[np.bool_], tolerance
 
 
 def _highest(offset: Floats, unloaded: Floats) -> float:
-    """Return the upward drift of unloaded cells, mirrored from the downward drift: light loads hide the upper end.
+    """Return the upward drift of unloaded cells, mirrored from the downward drift: light loads hide
+    the upper end.
 
-    Equals twice the median minus the 0.001 quantile, between two and three times the median. Where a baseline of 0
-    hides the downward drift, it is the 0.999 quantile of a normal distribution with the upper quartile of ``unloaded``.
+    Equals twice the median minus the 0.001 quantile, between two and three times the median. Where
+    a baseline of 0 hides the downward drift, it is the 0.999 quantile of a normal distribution with
+    the upper quartile of ``unloaded``.
 
     Args:
         offset: low quantiles of the readings of a cell in a recording, ``[n]``.
@@ -95,7 +107,8 @@ def _highest(offset: Floats, unloaded: Floats) -> float:
 
 
 def _low(readings: RecordingBlocks) -> tuple[Floats, Floats, Floats]:
-    """Return the low quantile of the readings of each cell, and its last reading and lowest peak in each recording.
+    """Return the low quantile of the readings of each cell, and its last reading and lowest peak in
+    each recording.
 
     Shapes: ``[D]`` (0 without any reading), and twice ``[recordings, D]``.
     """
@@ -105,21 +118,22 @@ def _low(readings: RecordingBlocks) -> tuple[Floats, Floats, Floats]:
         cells = np.arange(first, min(first + CELLS, n_cells))
         pieces = [readings.piece(i, slice(None), cells) for i in range(len(readings))]
         for i, frames in enumerate(pieces):
-            last[i, cells], peaks[i, cells] = frames[-1], _lowest_peak(frames)
-        frames = np.concatenate(pieces)
-        received = ~np.isnan(frames).all(axis=0)
-        low[cells[received]] = np.nanquantile(frames[:, received], LOW, axis=0)
+            last[i, cells] = frames[-1]
+            peaks[i, cells] = _lowest_peak(frames)
+        low[cells] = np.nan_to_num(known_quantile(np.concatenate(pieces), LOW, axis=0))
     return low, last, peaks
 
 
 def _lowest_peak(frames: Floats) -> Floats:
-    """Return the minimum over half segments of the highest reading in each, ``[D]``: that of a constant run."""
+    """Return the minimum over half segments of the highest reading in each, ``[D]``: that of a
+    constant run."""
     lowest: Floats = np.fmin.reduce(half_segment_peaks(frames), axis=0)
     return lowest
 
 
 def half_segment_peaks(frames: Floats) -> Floats:
-    """Return the highest reading of each cell in each half segment, ``[n, D]``; a shorter recording is one."""
+    """Return the highest reading of each cell in each half segment, ``[n, D]``; a shorter recording
+    is one."""
     length = min(SEGMENT // 2, len(frames))
     whole = len(frames) // length * length
     peaks: Floats = np.fmax.reduce(frames[:whole].reshape(-1, length, frames.shape[1]), axis=1)

@@ -1,4 +1,5 @@
-"""Levels and priors that several modules share: of full scale, of cells, of log likelihood ratios, of prevalences."""
+"""Levels and priors that several modules share: of full scale, of cells, of log likelihood ratios,
+of prevalences."""
 
 from __future__ import annotations
 
@@ -8,7 +9,8 @@ SLIGHT = 0.02  # readings that differ by less agree
 
 # Of cells, frames or recordings.
 LOW = 0.05  # quantile of all readings of a cell: its baseline
-LEAST_LOADED = 0.25  # quantile over cells or frames: more are unloaded than this, and fewer are open
+# quantile over cells or frames: more are unloaded than this, and fewer are open
+LEAST_LOADED = 0.25
 MAJORITY = 0.5  # what most do is usual
 RARE = 0.001  # what is ignored
 FEWEST = 8  # recordings, or cells, from which differences between them can be estimated
@@ -25,4 +27,5 @@ EXPECTED_LATE = 0.005  # share of cells that fail in the log, and of broken wire
 EXPECTED_CELLS = 35.0  # pseudo-count of either share of cells
 DOUBTED = 0.1  # P(faulty) from which on a cell that moved does not count as alive
 P_MIN = 1e-4  # lower limit of what chance explains, in one event or one test: models err
-ANYWHERE = 0.2  # share of broken cells that stick at any value; the others stick to either rail equally often
+# share of broken cells that stick at any value; the others stick to either rail equally often
+ANYWHERE = 0.2

@@ -1,13 +1,16 @@
-"""Loads: readings of sensors that fall with load, or rest in the middle, as readings that rise with it from 0.
+"""Loads: readings of sensors that fall with load, or rest in the middle, as readings that rise with
+it from 0.
 
     low      load = reading
     high     load = full scale - reading
-    middle   load = |reading - rest|        rest: median of the quiet readings of each cell in the healthy recordings
+    middle   load = |reading - rest|
+             rest: median of the quiet readings of each cell in the healthy recordings
 
-Everything after this sees loads only; faults are reported as readings. ``learn`` decides for one of the three, for the
-whole array: of the cells that move, it compares how far each goes above its median with how far it goes below. Sensors
-that are loaded most of the time have no rest that repeats; they count as low, as do sensors without a reference and
-all doubtful ones: a direction that is known is better declared.
+Everything after this sees loads only; faults are reported as readings. ``learn`` decides for one of
+the three, for the whole array: of the cells that move, it compares how far each goes above its
+median with how far it goes below. Sensors that are loaded most of the time have no rest that
+repeats; they count as low, as do sensors without a reference and all doubtful ones: a direction
+that is known is better declared.
 """
 
 from __future__ import annotations
@@ -27,7 +30,9 @@ if TYPE_CHECKING:
     from diagnostics.layout import Rest, SensorLayout
 
 _MOVES = 0.1  # of full scale: range of a cell that was loaded
-_ASIDE = 0.15  # of the range, at most: rest from its end where load moves cells one way, from its middle where both
+# of the range, at most: rest from its end where load moves cells one way, from its middle where
+# both
+_ASIDE = 0.15
 
 Floats = NDArray[np.float64]
 
@@ -48,7 +53,8 @@ class LoadDirection:
 
     @classmethod
     def declared(cls, layout: SensorLayout) -> LoadDirection | None:
-        """Return the direction without any recording: cells that rest in the middle rest at half of full scale."""
+        """Return the direction without any recording: cells that rest in the middle rest at half of
+        full scale."""
         direction = "middle" if layout.axes > 1 and layout.rest == "learn" else layout.rest
         if direction not in ("high", "middle"):
             return None
@@ -57,7 +63,8 @@ class LoadDirection:
 
     @classmethod
     def fit(cls, recordings: Sequence[NDArray[Any]], layout: SensorLayout) -> LoadDirection | None:
-        """Learn what the layout leaves open from fault-free recordings, ``[T, D]`` each; None: readings are loads."""
+        """Learn what the layout leaves open from fault-free recordings, ``[T, D]`` each; None:
+        readings are loads."""
         readings = RecordingBlocks.of(recordings)
         if layout.rest == "learn" and layout.axes == 1:
             layout = replace(layout, rest=_learned(readings, layout))
@@ -71,8 +78,14 @@ class LoadDirection:
 
     def check(self, layout: SensorLayout) -> None:
         """Raise ValueError unless this is a direction of ``layout``."""
-        if self.direction not in ("high", "middle") or self.rest.shape != (layout.n_cells,) or not self.full_scale > 0:
-            raise ValueError(f"expected a direction of load, high or middle, of {layout}; got {self.direction!r}")
+        if (
+            self.direction not in ("high", "middle")
+            or self.rest.shape != (layout.n_cells,)
+            or not self.full_scale > 0
+        ):
+            raise ValueError(
+                f"expected a direction of load, high or middle, of {layout}; got {self.direction!r}"
+            )
 
     def loads(self, frames: Floats) -> Floats:
         """Return the loads of readings ``[T, D]``; readings that no converter gives stay so."""
@@ -83,7 +96,8 @@ class LoadDirection:
         return loads if wrong is None else np.where(wrong, np.inf, loads)
 
     def readings(self, loads: Floats, below: NDArray[np.bool_]) -> Floats:
-        """Return the readings of loads ``[D]``; ``below`` (bool ``[D]``): cells that read less than at rest."""
+        """Return the readings of loads ``[D]``; ``below`` (bool ``[D]``): cells that read less than
+        at rest."""
         down = below | (self.direction == "high")
         return np.clip(np.where(down, self.rest - loads, self.rest + loads), 0.0, self.full_scale)
 
@@ -91,14 +105,19 @@ class LoadDirection:
 def _learned(readings: RecordingBlocks, layout: SensorLayout) -> Rest:
     """Return the direction of load of the array, see the module."""
     low, high = readings.extremes()
-    moved = spread(np.flatnonzero(layout.present.ravel() & (high - low > _MOVES * layout.full_scale)))
+    moved = spread(
+        np.flatnonzero(layout.present.ravel() & (high - low > _MOVES * layout.full_scale))
+    )
     if not len(moved):
         return "low"
-    low, high, sample = low[moved], high[moved], readings.thinned(moved)
+    low = low[moved]
+    high = high[moved]
+    sample = readings.thinned(moved)
     rest = np.nanmedian(sample, axis=0)
     up = float(np.median((high - rest) / (high - low)))
     quiet = float(np.median((np.abs(sample - rest) <= SLIGHT * layout.full_scale).mean(axis=0)))
-    # Where a load is held most of the time, it differs between cells more than the readings without it do.
+    # Where a load is held most of the time, it differs between cells more than the readings without
+    # it do.
     if up >= 1 - _ASIDE or quiet < MAJORITY or _quartile_range(rest) > _quartile_range(low):
         return "low"
     return "high" if up <= _ASIDE else "middle" if abs(up - 0.5) <= _ASIDE else "low"

@@ -1,22 +1,26 @@
 """Noise that all cells have, as it is now: what exceeds the noise of the reference is no contact.
 
-Estimates the standard deviation of white noise in each segment from the second differences of each cell,
+Estimates the standard deviation of white noise in each segment from the second differences of each
+cell,
 
     d_it  = x_{t+1} - 2 x_t + x_{t-1}
-    sigma = q25 over cells of mean(middle half over t of |d_it - median over cells of d_it|) / (0.693 sqrt 6)
+    sigma = q25 over cells of mean(middle half over t of |d_it - median over cells of d_it|) /
+    (0.693 sqrt 6)
 
-and takes its median over the last 5 segments. What all cells share, as hum, is in the median over cells: it is no
-noise. A load changes slowly, so that its second difference is small, and most loads leave a quarter of the cells alone.
-The mean of the middle half (an L-estimator with a breakdown point of 25 %) has no steps where noise is as small as a
-converter step, as a median has; 0.693 is its value for |N(0, 1)|.
+and takes its median over the last 5 segments. What all cells share, as hum, is in the median over
+cells: it is no noise. A load changes slowly, so that its second difference is small, and most loads
+leave a quarter of the cells alone. The mean of the middle half (an L-estimator with a breakdown
+point of 25 %) has no steps where noise is as small as a converter step, as a median has; 0.693 is
+its value for |N(0, 1)|.
 
-Noise exceeds that of the reference where sigma is 1.5 times the largest of the reference, and half a converter step
-larger. The excess then raises the reading from which on a cell counts as loaded by eight standard deviations (readings
-that a converter cuts off at its lower end seem quieter than they are). So does the step between readings, where it is
-twice that of the reference and more: the smallest difference between two readings of a cell in the last 5 segments.
+Noise exceeds that of the reference where sigma is 1.5 times the largest of the reference, and half
+a converter step larger. The excess then raises the reading from which on a cell counts as loaded by
+eight standard deviations (readings that a converter cuts off at its lower end seem quieter than
+they are). So does the step between readings, where it is twice that of the reference and more: the
+smallest difference between two readings of a cell in the last 5 segments.
 
-It does not detect noise of fewer than three quarters of the cells, hum and other noise that is slow compared with the
-frame rate, nor what readings at the end of the range hide.
+It does not detect noise of fewer than three quarters of the cells, hum and other noise that is slow
+compared with the frame rate, nor what readings at the end of the range hide.
 """
 
 from __future__ import annotations
@@ -47,14 +51,16 @@ class NoiseNow:
 
     Attributes:
         of_segments: standard deviation of each of the last segments, in the layout's unit.
-        steps: smallest difference between readings of a cell in each of the last segments in which they differ.
+        steps: smallest difference between readings of a cell in each of the last segments in which
+            they differ.
     """
 
     of_segments: tuple[float, ...] = ()
     steps: tuple[float, ...] = ()
 
     def extend(self, frames: Floats, present: NDArray[np.bool_]) -> NoiseNow:
-        """Return the noise after one more segment; one that is too short, or misses readings of all cells, is none.
+        """Return the noise after one more segment; one that is too short, or misses readings of all
+        cells, is none.
 
         Args:
             frames: ``[t, D]``, NaN = missing.
@@ -96,7 +102,9 @@ class UsualNoise:
     step: float
 
     @classmethod
-    def fit(cls, recordings: Iterable[Floats], present: NDArray[np.bool_], step: float) -> UsualNoise:
+    def fit(
+        cls, recordings: Iterable[Floats], present: NDArray[np.bool_], step: float
+    ) -> UsualNoise:
         """Fit to fault-free recordings, ``[T, D]`` each; ``step``: of the converter."""
         most = 0.0
         now = NoiseNow()
@@ -107,7 +115,8 @@ class UsualNoise:
         return cls(most, step)
 
     def raises(self, now: NoiseNow) -> float:
-        """Return by how much the noise raises the reading from which on a cell is loaded; 0: it is as usual."""
+        """Return by how much the noise raises the reading from which on a cell is loaded; 0: it is
+        as usual."""
         excess = now.deviation - self.most
         clear = now.deviation >= MARGIN * self.most and excess > self.step / 2
         by_noise = _DEVIATIONS * excess if clear else 0.0

@@ -1,35 +1,41 @@
-"""Offset tracking: drift of the baselines since the reference, as with temperature, estimated and removed.
+"""Offset tracking: drift of the baselines since the reference, as with temperature, estimated and
+removed.
 
 Estimates two offsets above the reference baseline b:
 
-    common(t) = q25 over cells of (x_i(t) - b_i - own_i)        where it exceeds the usual one of the reference
+    common(t) = q25 over cells of (x_i(t) - b_i - own_i)
+                where it exceeds the usual one of the reference
     own_i     = min over t of (x_i(t) - b_i) - common           where it exceeds the noise
 
-A quantile filter over cells and a running minimum over time, as in baseline correction by minimum statistics (Martin
-2001): of the last 512 frames, where most cells no longer come down to their baseline, else of the whole log. Common
-offsets up to 5 % of full scale are removed, and own offsets up to 2 %, or up to what is usual in the log: three robust
-standard deviations above the median of all cells, at most 5 %. Larger ones are not tracked: such a cell is loaded or
-faulty.
+A quantile filter over cells and a running minimum over time, as in baseline correction by minimum
+statistics (Martin 2001): of the last 512 frames, where most cells no longer come down to their
+baseline, else of the whole log. Common offsets up to 5 % of full scale are removed, and own offsets
+up to 2 %, or up to what is usual in the log: three robust standard deviations above the median of
+all cells, at most 5 %. Larger ones are not tracked: such a cell is loaded or faulty.
 
-Where the recordings of the reference rest at levels of their own, further apart than 5 % of full scale, common offsets
-up to the range of these levels and 5 % more are removed. The level of recording r is
+Where the recordings of the reference rest at levels of their own, further apart than 5 % of full
+scale, common offsets up to the range of these levels and 5 % more are removed. The level of
+recording r is
 
-    level_r = q25 over cells of (q05 over t of x_i(t) - b_i),    b_i = q05 over r of q05 over t of x_i(t)
+    level_r = q25 over cells of (q05 over t of x_i(t) - b_i),
+    b_i = q05 over r of q05 over t of x_i(t)
 
-and counts if the q05 over cells, in place of q25, exceeds 5 % in half of the recordings: no contact loads nearly all
-cells throughout most recordings. Levels within a recording of the reference are not recognised.
+and counts if the q05 over cells, in place of q25, exceeds 5 % in half of the recordings: no contact
+loads nearly all cells throughout most recordings. Levels within a recording of the reference are
+not recognised.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.preprocessing.levels import LEAST_LOADED, LIGHT, LOW, MAJORITY, SLIGHT
+from diagnostics.preprocessing.quantiles import known_quantile
 from diagnostics.preprocessing.readings import RecordingBlocks, spread
 from diagnostics.preprocessing.scale import usual_limit
 
@@ -53,18 +59,25 @@ class ReferenceOffset:
 
     mostly: float
     most: float
-    levels: float = field(default=0.0, metadata={"newer": True})
+    levels: float = 0.0
 
     @classmethod
     def fit(
-        cls, recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_], levels: float = 0.0
+        cls,
+        recordings: Sequence[Floats],
+        scale: Scale,
+        present: NDArray[np.bool_],
+        levels: float = 0.0,
     ) -> ReferenceOffset:
-        """Fit to fault-free recordings, ``[T, D]`` each, less their levels, which have the range ``levels``."""
+        """Fit to fault-free recordings, ``[T, D]`` each, less their levels, which have the range
+        ``levels``."""
         cells = spread(np.flatnonzero(present))
         above = RecordingBlocks.of(recordings).thinned(cells) - scale.baseline[cells]
         common = [least_loaded(frame) for frame in above]
         mostly = min(0.0, float(np.median(common)))
-        return cls(mostly, max(mostly + scale.near / 2, float(np.quantile(common, 1 - LOW))), levels)
+        return cls(
+            mostly, max(mostly + scale.near / 2, float(np.quantile(common, 1 - LOW))), levels
+        )
 
     def excess(self, offset: ArrayLike) -> Floats:
         """Return offsets ``[...]`` relative to the median of the reference; 0 for usual ones."""
@@ -81,7 +94,8 @@ class OffsetTracker:
     """Offsets relative to the baseline of the reference, in the layout's unit.
 
     Attributes:
-        lowest: float ``[D]``, lowest reading of each cell in the log above its baseline; inf: no reading.
+        lowest: float ``[D]``, lowest reading of each cell in the log above its baseline; inf: no
+            reading.
         own: float ``[D]``, offset of each cell in addition to the common one.
         common: float ``[t]``, common offset in each of the last frames.
         recent: lowest reading of each cell above its baseline, ``[D]``, in each of the last calls.
@@ -97,7 +111,9 @@ class OffsetTracker:
         """Return the state before any frame."""
         return cls(np.full(n_cells, np.inf), np.zeros(n_cells), np.zeros(1))
 
-    def extend(self, frames: Floats, scale: Scale, present: NDArray[np.bool_], usual: ReferenceOffset) -> OffsetTracker:
+    def extend(
+        self, frames: Floats, scale: Scale, present: NDArray[np.bool_], usual: ReferenceOffset
+    ) -> OffsetTracker:
         """Return the offsets after more frames.
 
         Args:
@@ -109,16 +125,19 @@ class OffsetTracker:
         now = np.fmin.reduce(frames) - scale.baseline
         lowest = np.fmin(self.lowest, now)
         recent = (*self.recent, now)[-_RECENT:]
-        own = _own_offsets(_rests(lowest, np.fmin.reduce(recent), present, scale), scale, present, usual)
+        own = _own_offsets(
+            _rests(lowest, np.fmin.reduce(recent), present, scale), scale, present, usual
+        )
         # Usually there is no common offset: enough cells stay at their baseline throughout.
         calm = present & (np.fmax.reduce(frames) - scale.baseline - own <= usual.most)
         if np.count_nonzero(calm) > LEAST_LOADED * np.count_nonzero(present):
             return OffsetTracker(lowest, own, np.zeros(len(frames)), recent)
-        common = usual.excess([least_loaded(frame) for frame in (frames - scale.baseline - own)[:, present]])
+        common = usual.excess(
+            [least_loaded(frame) for frame in (frames - scale.baseline - own)[:, present]]
+        )
         last = self.common[-1]
-        for t in np.flatnonzero(
-            common >= usual.limit(scale.full_scale)
-        ):  # nearly all cells are loaded: keep the last one
+        # nearly all cells are loaded: keep the last one
+        for t in np.flatnonzero(common >= usual.limit(scale.full_scale)):
             common[t] = common[t - 1] if t else last
         return OffsetTracker(lowest, own, common, recent)
 
@@ -134,7 +153,8 @@ class OffsetTracker:
 
 
 def levels(recordings: Sequence[Floats], present: NDArray[np.bool_], full_scale: float) -> Floats:
-    """Return the level at which each recording rests, ``[recordings]``; 0 where all rest at one, see the module.
+    """Return the level at which each recording rests, ``[recordings]``; 0 where all rest at one,
+    see the module.
 
     Args:
         recordings: ``[T, D]`` each.
@@ -146,8 +166,8 @@ def levels(recordings: Sequence[Floats], present: NDArray[np.bool_], full_scale:
     if not len(cells):
         return np.zeros(len(readings))
     low = _lows(readings, readings.some, cells)
-    rest = np.nan_to_num(_quantile(low, LOW, axis=0))
-    lifted = _quantile(low - rest, LOW, axis=1)
+    rest = np.nan_to_num(known_quantile(low, LOW, axis=0))
+    lifted = known_quantile(low - rest, LOW, axis=1)
     lifted = lifted[~np.isnan(lifted)]
     if not len(lifted) or np.quantile(lifted, MAJORITY) <= LIGHT * full_scale:
         return np.zeros(len(readings))
@@ -160,13 +180,16 @@ def levelled(recordings: Sequence[Floats], level: Floats) -> RecordingBlocks:
     readings = RecordingBlocks.of(recordings)
     if not level.any():
         return readings
-    return RecordingBlocks([given - of_it for given, of_it in zip(readings.given, level, strict=True)])
+    return RecordingBlocks(
+        [given - of_it for given, of_it in zip(readings.given, level, strict=True)]
+    )
 
 
 def levels_above(
     recordings: Sequence[Floats], scale: Scale, present: NDArray[np.bool_], usual: ReferenceOffset
 ) -> Floats:
-    """Return the level of each recording of a log above the baseline of the reference, ``[recordings]``.
+    """Return the level of each recording of a log above the baseline of the reference,
+    ``[recordings]``.
 
     0 where the reference rests at one level, and where nearly all cells are loaded.
 
@@ -186,29 +209,30 @@ def levels_above(
 
 
 def _lows(readings: RecordingBlocks, which: range, cells: NDArray[np.intp]) -> Floats:
-    """Return the low quantile of the readings of each of the ``cells``, ``[which, cells]``; NaN where one misses."""
-    return np.stack([np.quantile(readings.piece(i, slice(None), cells), LOW, axis=0) for i in which])
-
-
-def _quantile(values: Floats, share: float, axis: int) -> Floats:
-    """Return a quantile of what is known; NaN where nothing is."""
-    known = (~np.isnan(values)).any(axis=axis)
-    filled = np.where(np.expand_dims(known, axis), values, 0.0)
-    return np.where(known, np.nanquantile(filled, share, axis=axis), np.nan)
+    """Return the low quantile of the readings of each of the ``cells``, ``[which, cells]``; NaN
+    where one misses."""
+    return np.stack(
+        [np.quantile(readings.piece(i, slice(None), cells), LOW, axis=0) for i in which]
+    )
 
 
 def _rests(lowest: Floats, recent: Floats, present: NDArray[np.bool_], scale: Scale) -> Floats:
-    """Return where each cell rests above its baseline, ``[D]``: the lowest reading ever, or the recent one.
+    """Return where each cell rests above its baseline, ``[D]``: the lowest reading ever, or the
+    recent one.
 
-    Where most cells no longer come down to their baseline, offsets creep; else a cell that does not is loaded.
+    Where most cells no longer come down to their baseline, offsets creep; else a cell that does not
+    is loaded.
     """
     known = present & np.isfinite(recent)
     creeping = known.any() and np.median(recent[known]) > scale.near / 2
     return recent if creeping else lowest
 
 
-def _own_offsets(lowest: Floats, scale: Scale, present: NDArray[np.bool_], usual: ReferenceOffset) -> Floats:
-    """Return the offset of each cell in addition to the common one, ``[D]``, of its ``lowest`` reading."""
+def _own_offsets(
+    lowest: Floats, scale: Scale, present: NDArray[np.bool_], usual: ReferenceOffset
+) -> Floats:
+    """Return the offset of each cell in addition to the common one, ``[D]``, of its ``lowest``
+    reading."""
     if not (lowest > scale.near / 2).any():
         return np.zeros(len(lowest))
     shared = usual.excess(least_loaded(lowest[present]))

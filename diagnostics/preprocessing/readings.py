@@ -1,4 +1,5 @@
-"""Recordings in their own dtype, converted to float64 where they are read: large ones are never copied whole."""
+"""Recordings in their own dtype, converted to float64 where they are read: large ones are never
+copied whole."""
 
 from __future__ import annotations
 
@@ -14,7 +15,10 @@ Recording = NDArray[np.float64]
 
 SEGMENT = 32  # frames processed together: a size
 _MOST_VALUES = 1 << 23  # in a block of frames: a size
-_RECORDINGS, CELLS, _FRAMES = 200, 2000, 20  # in a sample, about, and frames of each recording: sizes
+# in a sample, about, and frames of each recording: sizes
+_RECORDINGS = 200
+CELLS = 2000
+_FRAMES = 20
 
 
 class RecordingBlocks(Sequence[Recording]):
@@ -61,17 +65,19 @@ class RecordingBlocks(Sequence[Recording]):
         return np.concatenate([self.piece(i, slice(None, None, step), cells) for i, step in steps])
 
     def extremes(self) -> tuple[Recording, Recording]:
-        """Return the lowest and the highest reading of each cell, ``[D]``; NaN for a cell without any reading."""
+        """Return the lowest and the highest reading of each cell, ``[D]``; NaN for a cell without
+        any reading."""
         low = high = np.full(self.given[0].shape[1], np.nan)
         for frames in self.blocks():
-            low, high = np.fmin(low, np.fmin.reduce(frames)), np.fmax(high, np.fmax.reduce(frames))
+            low = np.fmin(low, np.fmin.reduce(frames))
+            high = np.fmax(high, np.fmax.reduce(frames))
         return low, high
 
     def valid(self, full_scale: float, present: NDArray[np.bool_]) -> RecordingBlocks:
         """Return the recordings with some readings as missing.
 
-        These are readings that no converter gives, see ``transport.invalid``, and those of positions without a cell,
-        not ``present`` (bool ``[D]``): they may read anything.
+        These are readings that no converter gives, see ``transport.invalid``, and those of
+        positions without a cell, not ``present`` (bool ``[D]``): they may read anything.
         """
         checked = []
         for given in self.given:
@@ -82,15 +88,20 @@ class RecordingBlocks(Sequence[Recording]):
         return RecordingBlocks(checked)
 
     def whole(self, present: NDArray[np.bool_]) -> RecordingBlocks:
-        """Return the recordings without lost frames, each missing reading replaced by the last one of the cell.
+        """Return the recordings without lost frames, each missing reading replaced by the last one
+        of the cell.
 
-        NaN remains before the first reading. Recordings that miss no reading of a ``present`` cell (bool ``[D]``) are
-        not copied.
+        NaN remains before the first reading. Recordings that miss no reading of a ``present`` cell
+        (bool ``[D]``) are not copied.
 
         Raises:
             ValueError: no frame with a reading.
         """
-        whole = [recording for recording in (_whole(given, present) for given in self.given) if len(recording)]
+        whole = [
+            recording
+            for recording in (_whole(given, present) for given in self.given)
+            if len(recording)
+        ]
         if not whole:
             raise ValueError("the recordings hold no frame with a reading: nothing to learn from")
         return RecordingBlocks(whole)
@@ -107,7 +118,8 @@ def spread(cells: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def held(frames: NDArray[Any], last: NDArray[Any]) -> NDArray[Any]:
-    """Return the last reading of each cell, before ``frames`` and at each of them, ``[1 + t, D]``; NaN: none yet.
+    """Return the last reading of each cell, before ``frames`` and at each of them, ``[1 + t, D]``;
+    NaN: none yet.
 
     Args:
         frames: ``[t, D]``; NaN = missing.

@@ -3,12 +3,14 @@
 Estimates, over the cells that moved,
 
     baseline_i = min(lowest reading of cell i, highest of these lowest readings)
-    near       = 4 * mean over segments of q25 over cells of (highest reading in the segment - lowest reading ever)
+    near       = 4 * mean over segments of q25 over cells of
+                     (highest reading in the segment - lowest reading ever)
 
-Minimum statistics as in offset tracking (Martin 2001); the least loaded quarter of the cells shows noise and wandering
-rests alone, and 4 is the margin from such a cell to any cell. Lowest readings that are outliers (three robust standard
-deviations above the median, Hampel 1974) and exceed 5 % of full scale are loads that were held throughout. It does not
-recognise them where most cells hold a load throughout.
+Minimum statistics as in offset tracking (Martin 2001); the least loaded quarter of the cells shows
+noise and wandering rests alone, and 4 is the margin from such a cell to any cell. Lowest readings
+that are outliers (three robust standard deviations above the median, Hampel 1974) and exceed 5 % of
+full scale are loads that were held throughout. It does not recognise them where most cells hold a
+load throughout.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ class RestOfLog:
     """What the log so far shows of the rests.
 
     Attributes:
-        varies: sum over the segments of how far the least loaded cells exceed their lowest readings.
+        varies: sum over the segments of how far the least loaded cells exceed their lowest
+            readings.
         segments: number of these segments.
     """
 
@@ -39,7 +42,8 @@ class RestOfLog:
     segments: int = 0
 
     def extend(self, frames: Floats, lowest: Floats, light: float) -> RestOfLog:
-        """Return the state after one more segment; one in which nearly all cells are loaded does not count.
+        """Return the state after one more segment; one in which nearly all cells are loaded does
+        not count.
 
         Args:
             frames: ``[t, n]``, NaN = missing, of the n cells that moved.
@@ -59,12 +63,15 @@ class RestOfLog:
         Args:
             plain: the scale without knowledge of the log.
             lowest: ``[D]``, lowest reading of each cell so far; inf: none.
-            moved: bool ``[D]``, cells that moved. A cell that never moved may be stuck, and rests no higher than these.
+            moved: bool ``[D]``, cells that moved. A cell that never moved may be stuck, and rests
+                no higher than these.
         """
         known = lowest[moved]
         if not len(known):
             return plain
-        highest = float(known.max(initial=0.0, where=known <= max(LIGHT * plain.full_scale, usual_limit(known))))
+        highest = float(
+            known.max(initial=0.0, where=known <= max(LIGHT * plain.full_scale, usual_limit(known)))
+        )
         near = _MARGIN * self.varies / max(self.segments, 1)
         baseline = np.maximum(plain.baseline, np.minimum(lowest, highest))
         return replace(plain, baseline=baseline, near=max(plain.near, near))

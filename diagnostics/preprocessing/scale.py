@@ -28,13 +28,16 @@ class Scale:
     full_scale: float
 
     def root_load(self, frames: NDArray[np.float64]) -> Array:
-        """Return ``sqrt((reading - baseline) / full_scale)``, ``[..., D]``; 0 up to ``near`` and where missing.
+        """Return ``sqrt((reading - baseline) / full_scale)``, ``[..., D]``; 0 up to ``near`` and
+        where missing.
 
         The square root stabilises the variance of noise that grows with the load (Bartlett 1947).
         """
         load = ((frames - self.baseline) / self.full_scale).astype(np.float32)
         # Comparisons with NaN are False: a missing reading is no load.
-        root: Array = np.sqrt(np.where(load > np.float32(self.near / self.full_scale), load, np.float32(0)))
+        root: Array = np.sqrt(
+            np.where(load > np.float32(self.near / self.full_scale), load, np.float32(0))
+        )
         return root
 
     def of(self, cells: NDArray[np.intp] | slice) -> Scale:
@@ -42,7 +45,8 @@ class Scale:
         return replace(self, baseline=self.baseline[cells])
 
     def above(self, noise: float) -> Scale:
-        """Return the scale where readings up to so much further above the baseline count as unloaded."""
+        """Return the scale where readings up to so much further above the baseline count as
+        unloaded."""
         return replace(self, near=self.near + noise) if noise else self
 
     @property
@@ -52,7 +56,8 @@ class Scale:
 
 
 def usual_limit(values: NDArray[np.float64]) -> float:
-    """Return the median of ``values`` ``[n]`` plus three robust standard deviations: higher ones are outliers.
+    """Return the median of ``values`` ``[n]`` plus three robust standard deviations: higher ones
+    are outliers.
 
     The filter of Hampel (1974); -inf without values.
     """
@@ -65,7 +70,8 @@ def usual_limit(values: NDArray[np.float64]) -> float:
 def robust_moments(values: NDArray[np.float64]) -> tuple[float, float]:
     """Return the median of ``values`` ``[n]`` and their robust standard deviation.
 
-    The latter equals ``scipy.stats.median_abs_deviation(scale="normal")``, which is fifteen times as slow.
+    The latter equals ``scipy.stats.median_abs_deviation(scale="normal")``, which is fifteen times
+    as slow.
     """
     middle = np.median(values)
     return float(middle), float(np.median(np.abs(values - middle)) / ndtri(0.75))

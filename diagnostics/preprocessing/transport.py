@@ -1,9 +1,11 @@
-"""Transport faults: lost frames, frozen streams and invalid readings between sensor and log; no faults of cells.
+"""Transport faults: lost frames, frozen streams and invalid readings between sensor and log; no
+faults of cells.
 
-Detects frames without any reading, one frame repeated too often while at least 3 working cells are loaded, and readings
-that no converter gives. In a frozen stream every cell looks stuck, so repeated frames are not used as evidence. Arrays
-that send exact zeros repeat frames without contact: a repetition without load is no fault. How often healthy frames
-repeat is learnt from the reference, apart for frames with load and for all frames.
+Detects frames without any reading, one frame repeated too often while at least 3 working cells are
+loaded, and readings that no converter gives. In a frozen stream every cell looks stuck, so repeated
+frames are not used as evidence. Arrays that send exact zeros repeat frames without contact: a
+repetition without load is no fault. How often healthy frames repeat is learnt from the reference,
+apart for frames with load and for all frames.
 """
 
 from __future__ import annotations
@@ -24,8 +26,8 @@ class TransportFault:
     """Frames or readings that did not arrive as they were measured.
 
     Attributes:
-        kind: ``"lost"`` (frames without any reading), ``"frozen"`` (one frame repeated) or ``"invalid"`` (readings that
-            no converter gives).
+        kind: ``"lost"`` (frames without any reading), ``"frozen"`` (one frame repeated) or
+            ``"invalid"`` (readings that no converter gives).
         onset: number of the first such frame.
         frames: how many frames; of ``"invalid"``: how many readings.
         reason: one plain sentence.
@@ -53,7 +55,8 @@ class Patience:
     Attributes:
         idle: of a frame in which fewer than 3 cells are loaded.
         loaded: of any other; not more than ``idle``.
-        loaded_from: float ``[D]``, the reading from which on each cell is loaded; infinite where there is no cell.
+        loaded_from: float ``[D]``, the reading from which on each cell is loaded; infinite where
+            there is no cell.
     """
 
     idle: int
@@ -61,14 +64,18 @@ class Patience:
     loaded_from: NDArray[np.float64]
 
     @classmethod
-    def fit(cls, recordings: Sequence[NDArray[np.float64]], loaded_from: NDArray[np.float64], least: int) -> Patience:
-        """Return twice the longest repetition in healthy recordings ``[T, D]``, and no less than ``least``."""
+    def fit(
+        cls, recordings: Sequence[NDArray[np.float64]], loaded_from: NDArray[np.float64], least: int
+    ) -> Patience:
+        """Return twice the longest repetition in healthy recordings ``[T, D]``, and no less than
+        ``least``."""
         found = cls(least, least, loaded_from)
         for frames in recordings:
             times = 2 * repetitions(frames)
             longer = np.flatnonzero(times > least)
             loaded = times[longer[found.is_loaded(frames[longer])]]
-            idle, held = int(times.max(initial=found.idle)), int(loaded.max(initial=found.loaded))
+            idle = int(times.max(initial=found.idle))
+            held = int(loaded.max(initial=found.loaded))
             found = cls(idle, held, loaded_from)
         return found
 
@@ -126,7 +133,8 @@ class TransportState:
     def receive(
         self, frames: NDArray[np.float64], present: NDArray[np.bool_], patience: Patience
     ) -> tuple[TransportState, NDArray[np.intp]]:
-        """Return the state after more frames, and the indices of those that carry information, int ``[k]``.
+        """Return the state after more frames, and the indices of those that carry information, int
+        ``[k]``.
 
         Args:
             frames: ``[t, D]``, t >= 1.
@@ -134,7 +142,9 @@ class TransportState:
             patience: a frame that was repeated more often than this carries none.
         """
         missing = np.isnan(frames)
-        arrived = ~missing.all(axis=1, where=present) if missing.any() else np.ones(len(frames), bool)
+        arrived = (
+            ~missing.all(axis=1, where=present) if missing.any() else np.ones(len(frames), bool)
+        )
         arrived_at = np.flatnonzero(arrived)
         missed = len(frames) - len(arrived_at)
         state = self.without(missed, int((~arrived).argmax())) if missed else self
@@ -143,7 +153,8 @@ class TransportState:
         received = frames[arrived_at] if missed else frames
         before = np.full_like(received[:1], np.nan) if self.last is None else self.last[None]
         again = repetitions(np.concatenate([before, received]))[1:]
-        index, numbers = np.arange(len(received)), self.seen + arrived_at
+        index = np.arange(len(received))
+        numbers = self.seen + arrived_at
         ongoing = again > index  # a repetition that began before these frames
         repeats = again + np.where(ongoing, self.repeats, 0)
         since = np.where(ongoing, self.since, numbers[index - again])
@@ -170,17 +181,27 @@ class TransportState:
         return replace(state, repetitions=tuple(recorded[-_KEPT:])), arrived_at[~beyond]
 
     def dropped(self, invalid: NDArray[np.bool_]) -> TransportState:
-        """Return the state with the ``invalid`` readings of the next frames, bool ``[t, D]``, counted."""
-        first = self.seen + int(invalid.any(axis=1).argmax()) if self.first_invalid < 0 else self.first_invalid
+        """Return the state with the ``invalid`` readings of the next frames, bool ``[t, D]``,
+        counted."""
+        first = (
+            self.seen + int(invalid.any(axis=1).argmax())
+            if self.first_invalid < 0
+            else self.first_invalid
+        )
         return replace(self, invalid=self.invalid + int(invalid.sum()), first_invalid=first)
 
     def without(self, frames: int, first: int = 0) -> TransportState:
-        """Return the state with ``frames`` more frames lost, the ``first`` of them that many frames from now."""
+        """Return the state with ``frames`` more frames lost, the ``first`` of them that many frames
+        from now."""
         first_lost = self.seen + first if self.first_lost < 0 else self.first_lost
         return replace(self, lost=self.lost + frames, first_lost=first_lost)
 
     def faults(
-        self, loaded_from: NDArray[np.float64], working: NDArray[np.bool_], rate: float, moved: bool = True
+        self,
+        loaded_from: NDArray[np.float64],
+        working: NDArray[np.bool_],
+        rate: float,
+        moved: bool = True,
     ) -> tuple[TransportFault, ...]:
         """Return the transport faults.
 
@@ -188,23 +209,46 @@ class TransportState:
             loaded_from: float ``[D]``, the reading from which on each cell is loaded.
             working: bool ``[D]``, cells that are known to work.
             rate: frames per second.
-            moved: whether any cell moved in the log; if none did, ``working`` are the cells not known to be faulty.
+            moved: whether any cell moved in the log; if none did, ``working`` are the cells not
+                known to be faulty.
         """
         found = []
         if self.lost:
-            text = f"{_count(self.lost, 'frame')} lost (no reading, or never received), the first is {self.first_lost}"
-            found.append(TransportFault("lost", self.first_lost, self.lost, f"{text}: check the link to the sensor"))
+            text = (
+                f"{_count(self.lost, 'frame')} lost (no reading, or never received), the first is"
+                f" {self.first_lost}"
+            )
+            found.append(
+                TransportFault(
+                    "lost", self.first_lost, self.lost, f"{text}: check the link to the sensor"
+                )
+            )
         if self.invalid:
-            text = f"{_count(self.invalid, 'reading')} outside what a converter gives, the first in frame"
-            text += f" {self.first_invalid}: counted as missing; check the converter and the link to the sensor"
+            text = (
+                f"{_count(self.invalid, 'reading')} outside what a converter gives, the first in"
+                " frame"
+            )
+            text += (
+                f" {self.first_invalid}: counted as missing; check the converter and the link to"
+                " the sensor"
+            )
             found.append(TransportFault("invalid", self.first_invalid, self.invalid, text))
-        cells, why = ("working cells", "not the cells") if moved else ("cells", "or these cells are stuck")
+        cells, why = (
+            ("working cells", "not the cells") if moved else ("cells", "or these cells are stuck")
+        )
         for r in self.repetitions:
             loaded = int((r.frame > loaded_from)[working].sum())
             if loaded >= _LOADED_CELLS:
-                text = f"frame {r.onset}, in which {loaded} {cells} are loaded, was received {r.frames} times"
+                text = (
+                    f"frame {r.onset}, in which {loaded} {cells} are loaded, was received"
+                    f" {r.frames} times"
+                )
                 text += f" in a row ({r.frames / rate:.1f} s): the stream was frozen, {why}"
-                found.append(TransportFault("frozen", r.onset, r.frames, f"{text}; check the link to the sensor"))
+                found.append(
+                    TransportFault(
+                        "frozen", r.onset, r.frames, f"{text}; check the link to the sensor"
+                    )
+                )
         return tuple(found)
 
 
@@ -213,21 +257,26 @@ def _count(number: int, name: str) -> str:
 
 
 def invalid(frames: NDArray[Any], full_scale: float) -> NDArray[np.bool_] | None:
-    """Return which readings ``[T, D]`` are infinite or over one full scale outside of 0 to full scale; None: none is.
+    """Return which readings ``[T, D]`` are infinite or over one full scale outside of 0 to full
+    scale; None: none is.
 
     Missing readings (NaN) are not.
     """
-    low, high = np.fmin.reduce(frames, axis=None), np.fmax.reduce(frames, axis=None)
+    low = np.fmin.reduce(frames, axis=None)
+    high = np.fmax.reduce(frames, axis=None)
     if np.isnan(low) or (low >= -full_scale and high <= 2 * full_scale):
         return None
     return np.asarray((frames < -full_scale) | (frames > 2 * full_scale))
 
 
 def repetitions(frames: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Return how many times in a row each frame of ``[T, D]`` was received before, int ``[T]``; NaN equals NaN."""
-    equal, missing = frames[1:] == frames[:-1], np.isnan(frames)
+    """Return how many times in a row each frame of ``[T, D]`` was received before, int ``[T]``; NaN
+    equals NaN."""
+    equal = frames[1:] == frames[:-1]
+    missing = np.isnan(frames)
     if missing.any():
         equal |= missing[1:] & missing[:-1]
-    same, counts = np.zeros(len(frames), bool), np.arange(len(frames))
+    same = np.zeros(len(frames), bool)
+    counts = np.arange(len(frames))
     same[1:] = equal.all(axis=1)
     return counts - np.maximum.accumulate(np.where(same, 0, counts))

@@ -1,27 +1,32 @@
-"""Circuit model of the array: readings of the converter with faults in the netlist, not in the readings.
+"""Circuit model of the array: readings of the converter with faults in the netlist, not in the
+readings.
 
-Each cell is a resistor between its row wire and its column wire. To read cell (i, j), row i is driven with the supply,
-column j goes to the load resistor of a voltage divider, and the converter measures across the load. With Y the matrix
-of conductances between wires, a scan solves Y v = s (nodal analysis, Kirchhoff's current law) once for
-each driven row and frame. Which column is read changes one term on the diagonal of Y, so all columns follow from the
-same solution (Sherman-Morrison): v_j = u_j / (1 + d Z_jj) with Z = Y^-1, u = Z s, and d what column j's terminal gains.
+Each cell is a resistor between its row wire and its column wire. To read cell (i, j), row i is
+driven with the supply, column j goes to the load resistor of a voltage divider, and the converter
+measures across the load. With Y the matrix of conductances between wires, a scan solves Y v = s
+(nodal analysis, Kirchhoff's current law) once for each driven row and frame. Which column is read
+changes one term on the diagonal of Y, so all columns follow from the same solution
+(Sherman-Morrison): v_j = u_j / (1 + d Z_jj) with Z = Y^-1, u = Z s, and d what column j's terminal
+gains.
 
 Wires are ideal. A cut makes a second wire of the part beyond it, which no terminal reaches.
 
-Where the laws of :func:`diagnostics.inject` hold: its output on the healthy circuit's readings against the broken
-circuit's, with the resistances below, on simulated grasps (``examples/circuit_vs_injector.py``; 99th percentile of the
-difference, in % of full scale; "others" are the cells that the injector leaves alone).
+Where the laws of :func:`diagnostics.inject` hold: its output on the healthy circuit's readings
+against the broken circuit's, with the resistances below, on simulated grasps
+(``examples/circuit_vs_injector.py``; 99th percentile of the difference, in % of full scale;
+"others" are the cells that the injector leaves alone).
 
-- Grounded lines: open and stuck cells, cuts, lines on ground, columns on the supply, address bits and converters agree
-  within 1.6, others within 0.4. A short of 1 kiloohm moves others by 2.4, of 1 ohm by 13: it halves the rest of its row
-  and leaves 0.3 of the rest of its column.
-- A row on the supply never reads full scale: its cells stay alive (92 off at the median) and their forces are added to
-  those of all other rows of their column. Bridged lines read the same: the sum of the two where the line that is not
-  selected floats (within 1.5), their mean where a switch like the driver's grounds it, still less of two columns where
-  the load is not small.
-- Floating lines: nothing but address bits and converters agrees on all cells. The median loaded cell reads 28 too
-  high without any fault; an open cell reads 34 and cells beyond a cut 16 to 18 at the median, because of sneak
-  currents around the break; a short moves others by 20, a line on ground by 30, a line on the supply by 85.
+- Grounded lines: open and stuck cells, cuts, lines on ground, columns on the supply, address bits
+  and converters agree within 1.6, others within 0.4. A short of 1 kiloohm moves others by 2.4, of 1
+  ohm by 13: it halves the rest of its row and leaves 0.3 of the rest of its column.
+- A row on the supply never reads full scale: its cells stay alive (92 off at the median) and their
+  forces are added to those of all other rows of their column. Bridged lines read the same: the sum
+  of the two where the line that is not selected floats (within 1.5), their mean where a switch like
+  the driver's grounds it, still less of two columns where the load is not small.
+- Floating lines: nothing but address bits and converters agrees on all cells. The median loaded
+  cell reads 28 too high without any fault; an open cell reads 34 and cells beyond a cut 16 to 18 at
+  the median, because of sneak currents around the break; a short moves others by 20, a line on
+  ground by 30, a line on the supply by 85.
 """
 
 from __future__ import annotations
@@ -32,7 +37,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.layout import Line, SensorLayout
+from diagnostics.layout import SensorLayout
+from diagnostics.wiring import Line
 
 Readout = Literal["grounded", "floating", "floating_rows", "floating_columns"]
 """Which lines float while they are not selected; the others are held at ground by their switch."""
@@ -50,7 +56,8 @@ class StuckCell:
 
 @dataclass(frozen=True)
 class CutLine:
-    """A row or column is cut between positions ``before - 1`` and ``before``, as in ``line_fault(break_at=...)``."""
+    """A row or column is cut between positions ``before - 1`` and ``before``, as in
+    ``line_fault(break_at=...)``."""
 
     line: Line
     before: int = 0
@@ -74,7 +81,8 @@ class BridgedLines:
 
 @dataclass(frozen=True)
 class StuckBit:
-    """An address bit stays at ``level`` 0 or 1: another line than addressed is driven or read, or none."""
+    """An address bit stays at ``level`` 0 or 1: another line than addressed is driven or read, or
+    none."""
 
     line: Line
     level: int
@@ -99,21 +107,25 @@ class Circuit:
 
     Args:
         layout: the array; absent positions have no resistor and read 0.
-        readout: ``"grounded"``, ``"floating"`` (all lines that are not selected), ``"floating_rows"`` (columns
-            grounded) or ``"floating_columns"`` (rows grounded). Lines that float let current sneak through other cells.
+        readout: ``"grounded"``, ``"floating"`` (all lines that are not selected),
+            ``"floating_rows"`` (columns grounded) or ``"floating_columns"`` (rows grounded). Lines
+            that float let current sneak through other cells.
         faults: faults of the netlist; at most one cut for each line.
         full_scale_ohms: resistance of a cell at full scale, without ``idle_ohms`` in parallel.
         idle_ohms: resistance of an unloaded cell.
-        load_ohms: the divider's lower resistor. Small against the cells, it keeps the other cells of a column from
-            dividing the reading; near 0 it stands for an amplifier's virtual ground.
-        switch_ohms: a closed switch of the multiplexer (70: a 74HC4067 at 4.5 V), also what holds a line at ground.
+        load_ohms: the divider's lower resistor. Small against the cells, it keeps the other cells
+            of a column from dividing the reading; near 0 it stands for an amplifier's virtual
+            ground.
+        switch_ohms: a closed switch of the multiplexer (70: a 74HC4067 at 4.5 V), also what holds a
+            line at ground.
         short_ohms: contact of two conductors.
         leak_ohms: from every wire to ground.
-        bits: of the converter; None: no rounding. Its range ends at the voltage of a cell at full scale, as with an
-            amplifier before it.
+        bits: of the converter; None: no rounding. Its range ends at the voltage of a cell at full
+            scale, as with an amplifier before it.
 
     Raises:
-        ValueError: a resistance that is not positive, an unknown readout, a fault that fits no wire or cell.
+        ValueError: a resistance that is not positive, an unknown readout, a fault that fits no wire
+            or cell.
     """
 
     layout: SensorLayout
@@ -129,19 +141,28 @@ class Circuit:
 
     def __post_init__(self) -> None:
         if self.readout not in get_args(Readout):
-            raise ValueError(f"unknown readout {self.readout!r}: use one of {', '.join(get_args(Readout))}")
+            raise ValueError(
+                f"unknown readout {self.readout!r}: use one of {', '.join(get_args(Readout))}"
+            )
         for name in ("full_scale", "idle", "load", "switch", "short", "leak"):
             ohms = getattr(self, f"{name}_ohms")
             if not (np.isfinite(ohms) and ohms > 0):
-                raise ValueError(f"a circuit needs {name}_ohms > 0 and finite; got {ohms!r} (nearly 0 will do for 0)")
+                raise ValueError(
+                    f"a circuit needs {name}_ohms > 0 and finite; got {ohms!r} (nearly 0 will do"
+                    " for 0)"
+                )
         if self.bits is not None and self.bits < 1:
-            raise ValueError(f"a converter needs bits >= 1, or None for no rounding; got {self.bits!r}")
+            raise ValueError(
+                f"a converter needs bits >= 1, or None for no rounding; got {self.bits!r}"
+            )
         object.__setattr__(self, "faults", tuple(self.faults))
         for fault in self.faults:
             _check(fault, self.layout)
         cut = [fault.line for fault in self.faults if isinstance(fault, CutLine)]
         if twice := {line for line in cut if cut.count(line) > 1}:
-            raise ValueError(f"{min(twice)} is cut more than once: give the cut nearest to its driven end")
+            raise ValueError(
+                f"{min(twice)} is cut more than once: give the cut nearest to its driven end"
+            )
 
     def with_faults(self, *faults: NetlistFault) -> Circuit:
         """Return the same circuit with these faults instead of its own."""
@@ -154,11 +175,13 @@ class Circuit:
     def read(self, recording: ArrayLike) -> FloatArray:
         """Return the readings of the array under the forces of ``recording``.
 
-        The converter's calibration is that of a healthy cell alone in the divider; readings are clipped to its range.
+        The converter's calibration is that of a healthy cell alone in the divider; readings are
+        clipped to its range.
 
         Args:
-            recording: forces ``[T, D]`` or ``[T, pads, rows, cols]``, in the layout's unit; negative ones count as 0.
-                A missing force (NaN) loads nothing, and its reading is missing.
+            recording: forces ``[T, D]`` or ``[T, pads, rows, cols]``, in the layout's unit;
+                negative ones count as 0. A missing force (NaN) loads nothing, and its reading is
+                missing.
 
         Returns:
             float64 ``[T, D]``, in the layout's unit, 0..full_scale.
@@ -194,12 +217,16 @@ class Circuit:
         read = wires.listen[col]
         if read >= 0:
             matrix[:, wires.rows + read, wires.rows + read] += self._reading_gain
-        solved = np.linalg.solve(matrix, np.broadcast_to(source[:, None], (len(forces), len(source), 1)))
+        solved = np.linalg.solve(
+            matrix, np.broadcast_to(source[:, None], (len(forces), len(source), 1))
+        )
         return np.asarray(solved[..., 0], np.float64)
 
     def _scan(self, wires: _Pad, forces: FloatArray) -> FloatArray:
-        """Return the converter's input ``[T, rows, cols]`` for forces of the same shape, as shares of the supply."""
-        rows, n = wires.rows, len(wires.static)
+        """Return the converter's input ``[T, rows, cols]`` for forces of the same shape, as shares
+        of the supply."""
+        rows = wires.rows
+        n = len(wires.static)
         columns = np.arange(rows, rows + forces.shape[2])
         out = np.zeros(forces.shape)
         step = max(1, _BATCH // n**2)
@@ -209,7 +236,9 @@ class Circuit:
             for driven in np.unique(wires.drive):
                 matrix, source = self._driven(wires, idle, int(driven))
                 sides = np.concatenate([source[:, None], np.eye(n)[:, columns]], axis=1)
-                solved = np.linalg.solve(matrix, np.broadcast_to(sides, (len(matrix), *sides.shape)))
+                solved = np.linalg.solve(
+                    matrix, np.broadcast_to(sides, (len(matrix), *sides.shape))
+                )
                 own = solved[:, columns, np.arange(1, len(columns) + 1)]  # Z_jj [t, cols]
                 at_load = solved[:, columns, 0] / (1 + self._reading_gain * own)
                 received = np.where(wires.listen >= 0, at_load[:, np.maximum(wires.listen, 0)], 0.0)
@@ -220,9 +249,12 @@ class Circuit:
     def _nodal_matrix(self, wires: _Pad, forces: FloatArray) -> FloatArray:
         """Return Y ``[T, wires, wires]`` with nothing selected, for forces ``[T, rows, cols]``."""
         cells = self._conductance(np.nan_to_num(np.maximum(forces, 0.0)))
-        cells = np.where(np.isnan(wires.stuck), cells, wires.stuck).reshape(len(forces), -1)  # [T, rows * cols]
+        # [T, rows * cols]
+        cells = np.where(np.isnan(wires.stuck), cells, wires.stuck).reshape(len(forces), -1)
         n = len(wires.static)
-        a, b = wires.row_wire, wires.column_wire  # no two cells join the same two wires
+        # no two cells join the same two wires
+        a = wires.row_wire
+        b = wires.column_wire
         matrix = np.repeat(wires.static[None], len(forces), axis=0)
         matrix[:, a, b] -= cells
         matrix[:, b, a] -= cells
@@ -231,17 +263,22 @@ class Circuit:
         return matrix
 
     def _driven(self, wires: _Pad, matrix: FloatArray, row: int) -> tuple[FloatArray, FloatArray]:
-        """Return Y ``[T, wires, wires]`` and s ``[wires]`` while ``row`` is driven; -1: an address without a row."""
-        matrix, source = matrix.copy(), wires.source.copy()
+        """Return Y ``[T, wires, wires]`` and s ``[wires]`` while ``row`` is driven; -1: an address
+        without a row."""
+        matrix = matrix.copy()
+        source = wires.source.copy()
         if row >= 0:
-            matrix[:, row, row] += 0.0 if self._grounds("row") else 1 / self.switch_ohms  # the switch moves over
+            # the switch moves over
+            matrix[:, row, row] += 0.0 if self._grounds("row") else 1 / self.switch_ohms
             source[row] += 1 / self.switch_ohms
         return matrix, source
 
     @property
     def _reading_gain(self) -> float:
         """Change of the conductance at the terminal of a column when it is read, in siemens."""
-        return 1 / (self.switch_ohms + self.load_ohms) - (1 / self.switch_ohms if self._grounds("column") else 0.0)
+        return 1 / (self.switch_ohms + self.load_ohms) - (
+            1 / self.switch_ohms if self._grounds("column") else 0.0
+        )
 
     def _grounds(self, kind: str) -> bool:
         return self.readout not in ("floating", f"floating_{kind}s")
@@ -251,7 +288,8 @@ class Circuit:
         return np.asarray(1 / self.idle_ohms + share / self.full_scale_ohms)
 
     def _calibrated(self, volts: FloatArray) -> FloatArray:
-        """Return the forces for which a healthy cell alone gives these voltages, rounded as the converter does."""
+        """Return the forces for which a healthy cell alone gives these voltages, rounded as the
+        converter does."""
         series = self.load_ohms + 2 * self.switch_ohms
         top = self.load_ohms / (series + self.cell_ohms(self.layout.full_scale))
         volts = np.clip(volts, 0.0, top)
@@ -263,7 +301,8 @@ class Circuit:
         return np.clip(force, 0.0, self.layout.full_scale)
 
 
-_BATCH = 4_000_000  # numbers in one batch of nodal matrices: 32 MB, and as much again while it is solved
+# numbers in one batch of nodal matrices: 32 MB, and as much again while it is solved
+_BATCH = 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,14 +321,19 @@ class _Pad:
     @classmethod
     def build(cls, circuit: Circuit, pad: int) -> _Pad:
         """Return the wires of a pad with the faults of the circuit in them."""
-        layout, short = circuit.layout, 1 / circuit.short_ohms
-        rows, cols = layout.rows, layout.cols
+        layout = circuit.layout
+        short = 1 / circuit.short_ohms
+        rows = layout.rows
+        cols = layout.cols
         row_wire, column_wire = (w.copy() for w in np.indices((rows, cols)))
         column_wire += rows
         stuck = np.where(layout.present[pad], np.nan, 0.0)
-        drive, listen = np.arange(rows), np.arange(cols)
+        drive = np.arange(rows)
+        listen = np.arange(cols)
         cuts = sum(isinstance(fault, CutLine) for fault in circuit.faults)
-        held = np.repeat([circuit._grounds("row"), circuit._grounds("column"), False], [rows, cols, cuts])
+        held = np.repeat(
+            [circuit._grounds("row"), circuit._grounds("column"), False], [rows, cols, cuts]
+        )
         static = np.diag(1 / circuit.leak_ohms + held / circuit.switch_ohms)
         source = np.zeros(len(held))
         beyond = rows + cols
@@ -307,7 +351,9 @@ class _Pad:
             match fault:
                 case CutLine(line, before, end):
                     part = slice(before, None) if end == "first" else slice(None, before)
-                    of_line = row_wire[line.index] if line.kind == "row" else column_wire[:, line.index]
+                    of_line = (
+                        row_wire[line.index] if line.kind == "row" else column_wire[:, line.index]
+                    )
                     of_line[part] = number
                 case ShortedLine(to=to):
                     static[wire, wire] += short
@@ -320,8 +366,11 @@ class _Pad:
                     drive = _stick(drive, line.index, level)
                 case StuckBit(line, level):
                     listen = _stick(listen, line.index, level)
-        drive, listen = np.where(drive < rows, drive, -1), np.where(listen < cols, listen, -1)
-        return cls(rows, static, source, row_wire.ravel(), column_wire.ravel(), stuck, drive, listen)
+        drive = np.where(drive < rows, drive, -1)
+        listen = np.where(listen < cols, listen, -1)
+        return cls(
+            rows, static, source, row_wire.ravel(), column_wire.ravel(), stuck, drive, listen
+        )
 
 
 def _stick(addresses: NDArray[np.intp], bit: int, level: int) -> NDArray[np.intp]:
@@ -343,14 +392,20 @@ def _check(fault: NetlistFault, layout: SensorLayout) -> None:
     special = {StuckBit: ("row_address", "column_address"), StuckConverter: ("converter",)}
     kinds = special.get(type(fault), ("row", "column"))
     if line.kind not in kinds:
-        raise ValueError(f"{fault}: this fault sits on a {' or '.join(kinds)}, not on a {line.kind}")
+        raise ValueError(
+            f"{fault}: this fault sits on a {' or '.join(kinds)}, not on a {line.kind}"
+        )
     along = layout.cols if line.kind == "row" else layout.rows
     match fault:
         case CutLine(_, before, end) if not 0 <= before <= along or end not in ("first", "last"):
-            raise ValueError(f"{fault}: cut before position 0 to {along}, driven from 'first' or 'last'")
+            raise ValueError(
+                f"{fault}: cut before position 0 to {along}, driven from 'first' or 'last'"
+            )
         case ShortedLine(to=to) if to not in ("supply", "ground"):
             raise ValueError(f"{fault}: shorted to 'supply' or 'ground'")
-        case BridgedLines() if line.index + 1 >= (layout.rows if line.kind == "row" else layout.cols):
+        case BridgedLines() if line.index + 1 >= (
+            layout.rows if line.kind == "row" else layout.cols
+        ):
             raise ValueError(f"{fault}: {line} is the last of its kind; name the one before it")
         case StuckBit(_, level) if level not in (0, 1):
             raise ValueError(f"{fault}: a bit sticks at level 0 or 1")

@@ -1,6 +1,8 @@
-"""Fault injection: changes recordings to what the converter would report, with one law for each kind of fault.
+"""Fault injection: changes recordings to what the converter would report, with one law for each
+kind of fault.
 
-:mod:`diagnostics.simulation.circuit` shows where these laws hold and where a real array reads something else.
+:mod:`diagnostics.simulation.circuit` shows where these laws hold and where a real array reads
+something else.
 """
 
 from __future__ import annotations
@@ -12,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from diagnostics.faults import Fault, FaultKind
-from diagnostics.layout import Line, SensorLayout
+from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import LIGHT
+from diagnostics.wiring import Line
 
 # Defaults of ``Fault.value`` and thresholds, as shares of full scale.
 _NOISE = 0.05  # NOISY: standard deviation of the added noise
@@ -24,7 +27,8 @@ _PERIODS = (12.0, 100.0)  # FLOATING: frames of one swing, drawn between these
 _DELAY = 10  # LATE: frames
 _WEAK = 0.35  # WEAK: share of the load that is left
 # INTERMITTENT: probability per frame that a closed contact opens, and that an open one closes.
-_OPENS, _CLOSES = 0.2, 0.4
+_OPENS = 0.2
+_CLOSES = 0.4
 
 
 def inject(
@@ -39,25 +43,28 @@ def inject(
 ) -> NDArray[np.float64]:
     """Return a copy of ``recording`` with ``faults`` injected, each from its onset on.
 
-    Faults are applied in order; every one reads the healthy recording, so an alias copies what the other cell would
-    have read without faults. See ``Fault.value`` for its meaning by kind.
+    Faults are applied in order; every one reads the healthy recording, so an alias copies what the
+    other cell would have read without faults. See ``Fault.value`` for its meaning by kind.
 
     Args:
         recording: ``[T, D]`` or ``[T, pads, rows, cols]``, in the layout's unit.
         faults: root causes; empty leaves the values as they are.
         layout: the array.
-        seed: for the kinds that draw (INTERMITTENT, NOISY, FLOATING) and for dither; None draws anew each time.
-        dither: noise of the converter on OPEN, SHORT and STUCK cells: uniform within +- this share of full scale.
+        seed: for the kinds that draw (INTERMITTENT, NOISY, FLOATING) and for dither; None draws
+            anew each time.
+        dither: noise of the converter on OPEN, SHORT and STUCK cells: uniform within +- this share
+            of full scale.
         until: the faults end before this frame; None: they last.
-        gain: change of the gain of a DRIFT cell per second, as a share of its reading, in addition to its offset.
+        gain: change of the gain of a DRIFT cell per second, as a share of its reading, in addition
+            to its offset.
 
     Returns:
-        float64 ``[T, D]``; faulty readings lie within 0..full_scale, all others are unchanged, bit for bit. Missing
-        readings (NaN) stay missing.
+        float64 ``[T, D]``; faulty readings lie within 0..full_scale, all others are unchanged, bit
+        for bit. Missing readings (NaN) stay missing.
 
     Raises:
-        ValueError: a fault names a cell that the layout does not have, or a STUCK fault has no value; ``until`` is
-            negative.
+        ValueError: a fault names a cell that the layout does not have, or a STUCK fault has no
+            value; ``until`` is negative.
     """
     if until is not None and until < 0:
         raise ValueError(f"until is the first frame after the faults, 0 or more; got {until}")
@@ -67,11 +74,15 @@ def inject(
     for fault in faults:
         if fault.cells[-1] >= layout.n_cells:
             raise ValueError(
-                f"the fault names cell {fault.cells[-1]}, but the layout has {layout.n_cells} cells, numbered from 0"
+                f"the fault names cell {fault.cells[-1]}, but the layout has {layout.n_cells}"
+                " cells, numbered from 0"
             )
         while_faulty = slice(fault.onset or 0, until)
-        cells, seen = np.array(fault.cells), healthy[while_faulty]
-        faulty = np.clip(_faulty_readings(fault, cells, seen, layout, rng, dither, gain), 0.0, layout.full_scale)
+        cells = np.array(fault.cells)
+        seen = healthy[while_faulty]
+        faulty = np.clip(
+            _faulty_readings(fault, cells, seen, layout, rng, dither, gain), 0.0, layout.full_scale
+        )
         out[while_faulty, cells] = np.where(np.isnan(seen[:, cells]), np.nan, faulty)
     return out
 
@@ -100,11 +111,14 @@ def _faulty_readings(
             partners = _bridge_partners(fault, cells, layout)
             sources = _alias_sources(fault, cells, layout) if partners is None else partners
             # Where nothing is connected, no current flows.
-            others: NDArray[np.float64] = np.where(sources >= 0, healthy[:, np.maximum(sources, 0)], 0.0)
+            others: NDArray[np.float64] = np.where(
+                sources >= 0, healthy[:, np.maximum(sources, 0)], 0.0
+            )
             # Two cells in parallel: their conductances add, and so do their forces.
             return others if partners is None else own + others
         case FaultKind.INTERMITTENT:
-            # One contact serves all the cells of the fault: they blink together, each only while it is loaded.
+            # One contact serves all the cells of the fault: they blink together, each only while it
+            # is loaded.
             closed = _blinking(len(own), rng)[:, None]
             return np.where(closed | ~(own > LIGHT * full_scale), own, fault.value or 0.0)
         case FaultKind.NOISY:
@@ -113,11 +127,15 @@ def _faulty_readings(
         case FaultKind.DRIFT:
             rate = _DRIFT * full_scale if fault.value is None else fault.value
             frames = np.arange(1, len(own) + 1)[:, None]
-            drifted: NDArray[np.float64] = own * (1.0 + gain / layout.rate * frames) + rate / layout.rate * frames
+            drifted: NDArray[np.float64] = (
+                own * (1.0 + gain / layout.rate * frames) + rate / layout.rate * frames
+            )
             return drifted
         case FaultKind.FLOATING:
             swing = _SWING * full_scale if fault.value is None else fault.value
-            floating: NDArray[np.float64] = np.fmin.reduce(own, initial=np.inf) + swing * _swinging(own.shape, rng)
+            floating: NDArray[np.float64] = np.fmin.reduce(own, initial=np.inf) + swing * _swinging(
+                own.shape, rng
+            )
             return floating
         case FaultKind.LATE:
             delay = _DELAY if fault.value is None else int(fault.value)
@@ -134,7 +152,8 @@ def _faulty_readings(
 
 
 def _swinging(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return a sine from 0 to 1 for each cell, ``[t, cells]``, each with a period and a phase of its own."""
+    """Return a sine from 0 to 1 for each cell, ``[t, cells]``, each with a period and a phase of
+    its own."""
     period = rng.uniform(*_PERIODS, shape[1])
     phase = rng.uniform(0.0, 1.0, shape[1])
     turns = np.arange(shape[0])[:, None] / period + phase
@@ -147,7 +166,8 @@ def _copied(
 ) -> NDArray[np.float64]:
     """Return what the cells of a COPY fault read, ``[t, cells]``."""
     if fault.value is not None:
-        source = layout.cell(*layout.position(int(fault.value)))  # IndexError names a cell that is not there
+        # IndexError names a cell that is not there
+        source = layout.cell(*layout.position(int(fault.value)))
         return np.repeat(healthy[:, [source]], len(cells), axis=1)
     copied = healthy[:, cells].copy()
     for i, cell in enumerate(cells.tolist()):
@@ -159,13 +179,17 @@ def _copied(
 
 
 def _alias_sources(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) -> NDArray[np.intp]:
-    """Return the cell that each of ``cells`` reads instead of itself; -1: an address with nothing connected."""
+    """Return the cell that each of ``cells`` reads instead of itself; -1: an address with nothing
+    connected."""
     line = fault.line
     if fault.value is None:
-        raise ValueError("an ALIAS fault needs a value: the bit's level, or the row, column or cell read instead")
+        raise ValueError(
+            "an ALIAS fault needs a value: the bit's level, or the row, column or cell read instead"
+        )
     value = int(fault.value)
     if line is None:
-        return np.full(len(cells), layout.cell(*layout.position(value)))  # IndexError names a cell that is not there
+        # IndexError names a cell that is not there
+        return np.full(len(cells), layout.cell(*layout.position(value)))
     if line.kind in ("row_address", "column_address"):
         moved, sources = layout.misaddressed(line, value)
         where = dict(zip(moved.tolist(), sources.tolist(), strict=True))
@@ -176,18 +200,23 @@ def _alias_sources(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) 
     return np.array([layout.cell(pad, row, value) for pad, row, _ in positions])
 
 
-def _bridge_partners(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout) -> NDArray[np.intp] | None:
-    """Return the cell that each of ``cells`` is bridged with; -1: an absent one. None: the alias is not a bridge.
+def _bridge_partners(
+    fault: Fault, cells: NDArray[np.intp], layout: SensorLayout
+) -> NDArray[np.intp] | None:
+    """Return the cell that each of ``cells`` is bridged with; -1: an absent one. None: the alias is
+    not a bridge.
 
     A bridge names the cells of both lines; a line that reads another names only its own.
     """
     line = fault.line
     if line is None or line.kind not in ("row", "column") or fault.value is None:
         return None
-    index, size = int(fault.value), layout.rows if line.kind == "row" else layout.cols
+    index = int(fault.value)
+    size = layout.rows if line.kind == "row" else layout.cols
     if index == line.index or not 0 <= index < size:
         return None
-    ours, theirs = set(layout.cells_on(line).tolist()), set(layout.cells_on(Line(line.pad, line.kind, index)).tolist())
+    ours = set(layout.cells_on(line).tolist())
+    theirs = set(layout.cells_on(Line(line.pad, line.kind, index)).tolist())
     if not theirs or not theirs <= set(fault.cells) <= ours | theirs:
         return None
     step = (index - line.index) * (layout.cols if line.kind == "row" else 1)
@@ -196,8 +225,10 @@ def _bridge_partners(fault: Fault, cells: NDArray[np.intp], layout: SensorLayout
 
 
 def _blinking(frames: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Return ``[frames]`` bool, True while a loose contact is closed: a two-state Markov chain, closed at first."""
-    state, closed = True, []
+    """Return ``[frames]`` bool, True while a loose contact is closed: a two-state Markov chain,
+    closed at first."""
+    state = True
+    closed = []
     for draw in rng.random(frames).tolist():
         state = draw >= _OPENS if state else draw < _CLOSES
         closed.append(state)
@@ -214,7 +245,8 @@ def line_fault(
     break_at: int | None = None,
     driven_from: Literal["first", "last"] = "first",
 ) -> Fault:
-    """Return the fault of a wire: every cell it serves, or for a stuck address bit those that it misreads.
+    """Return the fault of a wire: every cell it serves, or for a stuck address bit those that it
+    misreads.
 
     Args:
         layout: the array.
@@ -222,14 +254,14 @@ def line_fault(
         kind: kind of the fault.
         value: as in :class:`~diagnostics.faults.Fault`.
         onset: first faulty frame; None: from the first frame on.
-        break_at: a row or column is broken between positions ``break_at - 1`` and ``break_at`` along it (a row's
-            positions are column numbers, a column's are row numbers): the cells beyond are faulty, the others work.
-            None: the whole wire.
+        break_at: a row or column is broken between positions ``break_at - 1`` and ``break_at``
+            along it (a row's positions are column numbers, a column's are row numbers): the cells
+            beyond are faulty, the others work. None: the whole wire.
         driven_from: the end at which the wire is connected, position 0 or the last one.
 
     Raises:
-        ValueError: ``break_at`` out of range or on a wire that is no row or column, an alias of part of a wire, no cell
-            behind the break.
+        ValueError: ``break_at`` out of range or on a wire that is no row or column, an alias of
+            part of a wire, no cell behind the break.
         IndexError: the layout has no such wire.
     """
     kind = FaultKind(kind)
@@ -238,11 +270,19 @@ def line_fault(
         cells, where = _beyond(layout, line, kind, break_at, driven_from)
         state += f" {where}"
     elif kind is FaultKind.ALIAS and line.kind in ("row_address", "column_address"):
-        value, state = int(value or 0), "stuck"
+        value = int(value or 0)
+        state = "stuck"
         cells, _ = layout.misaddressed(line, value)
     else:
         cells = layout.cells_on(line)
-    return Fault(kind, tuple(cells.tolist()), line=line, value=value, onset=onset, reason=f"{line} is {state}")
+    return Fault(
+        kind,
+        tuple(cells.tolist()),
+        line=line,
+        value=value,
+        onset=onset,
+        reason=f"{line} is {state}",
+    )
 
 
 def _beyond(
@@ -252,29 +292,40 @@ def _beyond(
     if line.kind not in ("row", "column"):
         raise ValueError(f"break_at is a position along a row or column; {line} has no positions")
     if kind is FaultKind.ALIAS:
-        raise ValueError("break_at goes with a fault of the cells behind the break, not with an alias of a whole wire")
+        raise ValueError(
+            "break_at goes with a fault of the cells behind the break, not with an alias of a whole"
+            " wire"
+        )
     along, positions = ("column", layout.cols) if line.kind == "row" else ("row", layout.rows)
     if not 0 <= break_at <= positions:
-        raise ValueError(f"break_at {break_at} is outside {line}: use 0 to {positions}, counted in {along}s")
+        raise ValueError(
+            f"break_at {break_at} is outside {line}: use 0 to {positions}, counted in {along}s"
+        )
     if driven_from not in ("first", "last"):
-        raise ValueError(f"driven_from must be 'first' or 'last', the connected end; got {driven_from!r}")
+        raise ValueError(
+            f"driven_from must be 'first' or 'last', the connected end; got {driven_from!r}"
+        )
     cells = layout.cells_on(line)
     place = cells % layout.cols if line.kind == "row" else cells // layout.cols % layout.rows
     beyond = place >= break_at if driven_from == "first" else place < break_at
     if not beyond.any():
         raise ValueError(
-            f"{line} has no cell behind a break at {break_at} when driven from its {driven_from} position:"
-            " move the break, or drive the wire from the other end"
+            f"{line} has no cell behind a break at {break_at} when driven from its {driven_from}"
+            " position: move the break, or drive the wire from the other end"
         )
-    return cells[beyond], f"from {along} {break_at} on" if driven_from == "first" else f"up to {along} {break_at - 1}"
+    return cells[beyond], (
+        f"from {along} {break_at} on" if driven_from == "first" else f"up to {along} {break_at - 1}"
+    )
 
 
 def bridge(layout: SensorLayout, line: Line, *, onset: int | None = None) -> Fault:
-    """Return the fault of a row or column that touches the next one: an ALIAS with the cells of both.
+    """Return the fault of a row or column that touches the next one: an ALIAS with the cells of
+    both.
 
-    In :func:`inject` both cells of a pair read the sum of their forces, clipped at full scale: their conductances are
-    in parallel. That holds where lines float while they are not selected. Where a switch like the driver's holds the
-    other line at ground, a real array reads their mean (:mod:`diagnostics.simulation.circuit`).
+    In :func:`inject` both cells of a pair read the sum of their forces, clipped at full scale:
+    their conductances are in parallel. That holds where lines float while they are not selected.
+    Where a switch like the driver's holds the other line at ground, a real array reads their mean
+    (:mod:`diagnostics.simulation.circuit`).
 
     Raises:
         ValueError: the wire is no row or column, or there is no next one.
@@ -284,7 +335,9 @@ def bridge(layout: SensorLayout, line: Line, *, onset: int | None = None) -> Fau
         raise ValueError(f"rows and columns have neighbours that they can touch; {line} has none")
     cells = layout.cells_on(line)
     if line.index + 1 >= (layout.rows if line.kind == "row" else layout.cols):
-        raise ValueError(f"{line} is the last {line.kind}: name the one before it, to bridge the two")
+        raise ValueError(
+            f"{line} is the last {line.kind}: name the one before it, to bridge the two"
+        )
     cells = np.concatenate([cells, layout.cells_on(Line(line.pad, line.kind, line.index + 1))])
     return Fault(
         FaultKind.ALIAS,
@@ -296,8 +349,11 @@ def bridge(layout: SensorLayout, line: Line, *, onset: int | None = None) -> Fau
     )
 
 
-def freeze_stream(recording: ArrayLike, onset: int, until: int | None = None) -> NDArray[np.float64]:
-    """Return a copy of ``recording`` ``[T, ...]`` that repeats frame ``onset`` to its end, or before frame ``until``.
+def freeze_stream(
+    recording: ArrayLike, onset: int, until: int | None = None
+) -> NDArray[np.float64]:
+    """Return a copy of ``recording`` ``[T, ...]`` that repeats frame ``onset`` to its end, or
+    before frame ``until``.
 
     A transport fault: one frame is repeated, and no cell is broken.
 
@@ -311,11 +367,14 @@ def freeze_stream(recording: ArrayLike, onset: int, until: int | None = None) ->
     return out
 
 
-def lose_frames(recording: ArrayLike, share: float, *, seed: int | None = None) -> NDArray[np.float64]:
-    """Return a copy of ``recording`` ``[T, ...]`` in which randomly chosen frames are missing: all NaN.
+def lose_frames(
+    recording: ArrayLike, share: float, *, seed: int | None = None
+) -> NDArray[np.float64]:
+    """Return a copy of ``recording`` ``[T, ...]`` in which randomly chosen frames are missing: all
+    NaN.
 
-    A transport fault: lost packets. ``share`` of the frames are lost, 0..1, rounded to whole frames; ``seed`` chooses
-    them, None draws anew each time.
+    A transport fault: lost packets. ``share`` of the frames are lost, 0..1, rounded to whole
+    frames; ``seed`` chooses them, None draws anew each time.
 
     Raises:
         ValueError: ``share`` is outside 0..1.

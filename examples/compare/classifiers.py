@@ -1,4 +1,5 @@
-"""The classifiers of compare_classification.py: each with its shortest correct call, and when it learns."""
+"""The classifiers of compare_classification.py: each with its shortest correct call, and when it
+learns."""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ class Effort:
     rounds: int  # of IterativeImputer
 
 
-FULL, SMALL = Effort(20, 100, 30, 10_000, 1000, 10), Effort(1, 2, 1, 84, 40, 1)
+FULL = Effort(20, 100, 30, 10_000, 1000, 10)
+SMALL = Effort(1, 2, 1, 84, 40, 1)
 
 
 @dataclass(frozen=True)
@@ -83,8 +85,10 @@ class Task:
         return x[..., self.healthy()]
 
     def with_losses(self, windows: af.Windows) -> tuple[np.ndarray, np.ndarray]:
-        """Return windows twice, whole and with a random fault set for each recording, and their classes."""
-        rng, lost = np.random.default_rng(self.seed), windows.x.copy()
+        """Return windows twice, whole and with a random fault set for each recording, and their
+        classes."""
+        rng = np.random.default_rng(self.seed)
+        lost = windows.x.copy()
         for recording in np.unique(windows.recording):
             faults = list(random_fault_set(self.layout, rng))
             lost[np.ix_(windows.recording == recording, np.arange(lost.shape[1]), faults)] = np.nan
@@ -97,27 +101,41 @@ def adaptfault(task: Task) -> dict[str, Repair]:
         model = af.load_model(task.networks / f"base{task.seed}")
     else:
         quick = {"padding": "valid", "init": "glorot"} if task.simulated else {}
-        model = af.TactileTransformer(task.layout, task.n_classes, length=task.x.shape[1], seed=task.seed, **quick)
+        model = af.TactileTransformer(
+            task.layout, task.n_classes, length=task.x.shape[1], seed=task.seed, **quick
+        )
         af.train(
-            model, task.train, task.validation, epochs=task.effort.epochs, patience=None, learning_rate=rate(model),
-            seed=task.seed, progress=False,
-        )  # fmt: skip
+            model,
+            task.train,
+            task.validation,
+            epochs=task.effort.epochs,
+            patience=None,
+            learning_rate=rate(model),
+            seed=task.seed,
+            progress=False,
+        )
     adapter = af.Adapter(model, task.train, task.validation)
     adapter.statistics, adapter.fault_free_accuracy  # noqa: B018 - known before the fault
 
     def auto(faults: FaultSet) -> Predict:
         return adapter.adapt(faults).predict if len(faults) else adapter.healthy.predict
 
-    return {"adaptfault fill": lambda faults: adapter.adapt(faults, method="fill").predict, OURS: auto}
+    return {
+        "adaptfault fill": lambda faults: adapter.adapt(faults, method="fill").predict,
+        OURS: auto,
+    }
 
 
 def imputed_svc(imputer, task: Task) -> Repair:
-    classifier = make_pipeline(imputer, StandardScaler(), SVC(C=10)).fit(summary(task.x[..., task.healthy()]), task.y)
+    classifier = make_pipeline(imputer, StandardScaler(), SVC(C=10)).fit(
+        summary(task.x[..., task.healthy()]), task.y
+    )
     return lambda faults: lambda x: classifier.predict(summary(task.lost(x, faults)))
 
 
 def iterative_svc(task: Task) -> Repair:
-    """The imputer learns once F is known: fitted on tables without a gap it would make one round only."""
+    """The imputer learns once F is known: fitted on tables without a gap it would make one round
+    only."""
     whole = summary(task.x[..., task.healthy()])
     classifier = make_pipeline(StandardScaler(), SVC(C=10)).fit(whole, task.y)
 
@@ -132,9 +150,13 @@ def iterative_svc(task: Task) -> Repair:
 
 def boosting_ready(task: Task) -> Repair:
     x, y = task.with_losses(
-        af.Windows(task.x, task.y, np.concatenate([task.train.recording, task.validation.recording]))
+        af.Windows(
+            task.x, task.y, np.concatenate([task.train.recording, task.validation.recording])
+        )
     )
-    classifier = HistGradientBoostingClassifier(max_iter=task.effort.trees, random_state=task.seed).fit(summary(x), y)
+    classifier = HistGradientBoostingClassifier(
+        max_iter=task.effort.trees, random_state=task.seed
+    ).fit(summary(x), y)
     return lambda faults: lambda x: classifier.predict(summary(task.lost(x, faults)))
 
 
@@ -159,7 +181,8 @@ def minirocket(task: Task, cells: np.ndarray) -> Predict:
 
 def minirocket_ready(task: Task) -> Repair:
     """Let a dead cell read its healthy mean: it takes no NaN."""
-    predict, mean = minirocket(task, task.healthy()), task.x.mean(axis=(0, 1))
+    predict = minirocket(task, task.healthy())
+    mean = task.x.mean(axis=(0, 1))
 
     def repair(faults: FaultSet) -> Predict:
         return lambda x: predict(np.where(faults.mask, mean, x).astype(np.float32))
@@ -168,16 +191,23 @@ def minirocket_ready(task: Task) -> Repair:
 
 
 def grud(task: Task, train: tuple, validation: tuple) -> Predict:
-    """Chosen by the validation windows; PyPOTS fills what was never seen of a cell with 0 and tells the net."""
+    """Chosen by the validation windows; PyPOTS fills what was never seen of a cell with 0 and tells
+    the net."""
     from pypots.classification import GRUD
 
     _, length, cells = train[0].shape
     epochs = task.effort.gru_epochs
     torch.manual_seed(task.seed)
     network = GRUD(
-        length, cells, task.n_classes, rnn_hidden_size=128, epochs=epochs, patience=5 if epochs > 5 else None,
-        device="cpu", verbose=False,
-    )  # fmt: skip
+        length,
+        cells,
+        task.n_classes,
+        rnn_hidden_size=128,
+        epochs=epochs,
+        patience=5 if epochs > 5 else None,
+        device="cpu",
+        verbose=False,
+    )
     network.fit(*({"X": x, "y": y} for x, y in (train, validation)))
     return lambda x: network.predict({"X": x})["classification"]
 
@@ -203,7 +233,9 @@ def minirocket_anew(task: Task) -> Repair:
 def compile_minirocket(task: Task) -> None:
     """Let numba compile, which it does once and not while a clock runs."""
     few = [windows.select(evenly(len(windows), 40)) for windows in (task.train, task.validation)]
-    minirocket(replace(task, train=few[0], validation=few[1], effort=SMALL), task.healthy())(task.test.x[:2])
+    minirocket(replace(task, train=few[0], validation=few[1], effort=SMALL), task.healthy())(
+        task.test.x[:2]
+    )
 
 
 def load_grud(task: Task) -> None:
@@ -242,7 +274,10 @@ PEERS = (
         "ExtraTrees anew",
         "scikit-learn",
         "anew",
-        partial(retrained, lambda task: ExtraTreesClassifier(3 * task.effort.trees, random_state=task.seed)),
+        partial(
+            retrained,
+            lambda task: ExtraTreesClassifier(3 * task.effort.trees, random_state=task.seed),
+        ),
     ),
     Peer("boosting ready", "scikit-learn", "ready", boosting_ready),
     Peer(
@@ -251,7 +286,9 @@ PEERS = (
         "anew",
         partial(
             retrained,
-            lambda task: HistGradientBoostingClassifier(max_iter=task.effort.trees, random_state=task.seed),
+            lambda task: HistGradientBoostingClassifier(
+                max_iter=task.effort.trees, random_state=task.seed
+            ),
         ),
     ),
     Peer("MiniRocket ready", "aeon", "ready", minirocket_ready, compile_minirocket),

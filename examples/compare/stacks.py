@@ -1,4 +1,5 @@
-"""The stacks of compare_keras.py: the paper's network here and in Keras, each served by a process of its own."""
+"""The stacks of compare_keras.py: the paper's network here and in Keras, each served by a process
+of its own."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ Ways = dict[str, Callable[[np.ndarray], np.ndarray]]
 
 @dataclass(frozen=True)
 class Setup:
-    """What every stack gets: the array, the windows, and the initial weights as torch names them."""
+    """What every stack gets: the array, the windows, and the initial weights as torch names
+    them."""
 
     layout: SensorLayout
     train: af.Windows
@@ -54,7 +56,9 @@ class Ours:
         torch.set_num_threads(1)
         self.setup = setup
         length = setup.train.x.shape[1]
-        self.model = af.TactileTransformer(setup.layout, setup.n_classes, length=length, seed=setup.seed).eval()
+        self.model = af.TactileTransformer(
+            setup.layout, setup.n_classes, length=length, seed=setup.seed
+        ).eval()
         self.parameters = sum(p.numel() for p in self.model.parameters())
 
     def logits(self, x: np.ndarray) -> np.ndarray:
@@ -67,17 +71,24 @@ class Ours:
         """Train, and call ``turn`` after each epoch."""
         s = self.setup
         af.train(
-            self.model, s.train, s.validation, epochs=s.epochs, patience=None, averaging=0, seed=s.seed,
-            progress=False, on_epoch=lambda history: turn(),
-        )  # fmt: skip
+            self.model,
+            s.train,
+            s.validation,
+            epochs=s.epochs,
+            patience=None,
+            averaging=0,
+            seed=s.seed,
+            progress=False,
+            on_epoch=lambda history: turn(),
+        )
 
     def ways(self) -> Ways:
         """Return the ways to predict."""
         ways: Ways = {"predict": self.model.predict}
         if not self.setup.small and find_spec("onnxruntime") and find_spec("onnxscript"):
             from adaptfault.adaptation.reduced_model import ReducedModel
-            from adaptfault.models.export import to_onnx
-            from adaptfault.models.inference import open_session, run_session
+            from adaptfault.prediction.export import to_onnx
+            from adaptfault.prediction.inference import open_session, run_session
 
             none = FaultSet((), self.setup.layout.n_cells)
             session = open_session(to_onnx(ReducedModel(self.model, none, None).eval()))
@@ -101,7 +112,8 @@ class Keras:
 
             torch.set_num_threads(1)
         keras.utils.set_random_seed(setup.seed)
-        self.keras, self.setup = keras, setup
+        self.keras = keras
+        self.setup = setup
         self.model = keras_network(keras, setup.layout, setup.n_classes, setup.train.x.shape[1])
         self.parameters = self.model.count_params()
         self.model.set_weights(as_keras(setup.weights, setup.layout, self.model))
@@ -117,15 +129,23 @@ class Keras:
 
     def train(self, turn: Turn) -> None:
         """Train, and call ``turn`` after each epoch."""
-        s, callbacks = self.setup, self.keras.callbacks
+        s = self.setup
+        callbacks = self.keras.callbacks
         self.model.fit(
-            s.train.x, s.train.y, batch_size=32, epochs=s.epochs, verbose=0,
-            validation_data=(s.validation.x, s.validation.y), validation_batch_size=256,
+            s.train.x,
+            s.train.y,
+            batch_size=32,
+            epochs=s.epochs,
+            verbose=0,
+            validation_data=(s.validation.x, s.validation.y),
+            validation_batch_size=256,
             callbacks=[
-                callbacks.EarlyStopping("val_accuracy", patience=s.epochs, mode="max", restore_best_weights=True),
+                callbacks.EarlyStopping(
+                    "val_accuracy", patience=s.epochs, mode="max", restore_best_weights=True
+                ),
                 callbacks.LambdaCallback(on_epoch_end=lambda epoch, logs: turn()),
             ],
-        )  # fmt: skip
+        )
 
     def ways(self) -> Ways:
         """Return the ways to predict."""
@@ -141,8 +161,10 @@ class Keras:
 
 
 def keras_network(keras, layout: SensorLayout, n_classes: int, length: int):
-    """Section III-A in Keras, layer by layer as in ``adaptfault/network.py``; positions without a cell read 0."""
-    layers, ops = keras.layers, keras.ops
+    """Section III-A in Keras, layer by layer as in ``adaptfault/network.py``; positions without a
+    cell read 0."""
+    layers = keras.layers
+    ops = keras.ops
     x = inputs = keras.Input((length, layout.n_cells))
     x = ops.reshape(x, (-1, *layout.shape))  # TimeDistributed goes frame by frame, and takes longer
     x = ops.transpose(x, (0, 2, 3, 1))  # (N * T, rows, cols, pads)
@@ -163,9 +185,15 @@ def keras_network(keras, layout: SensorLayout, n_classes: int, length: int):
 def as_keras(weights: dict[str, np.ndarray], layout: SensorLayout, model) -> list[np.ndarray]:
     """Return torch's weights in Keras's order and shapes.
 
-    torch flattens a frame as (filter, row, col), Keras as (row, col, filter): the d features change places.
+    torch flattens a frame as (filter, row, col), Keras as (row, col, filter): the d features change
+    places.
     """
-    moved = np.arange(32 * layout.rows * layout.cols).reshape(32, layout.rows, layout.cols).transpose(1, 2, 0).ravel()
+    moved = (
+        np.arange(32 * layout.rows * layout.cols)
+        .reshape(32, layout.rows, layout.cols)
+        .transpose(1, 2, 0)
+        .ravel()
+    )
     w = weights
     result = []
     for name in ("conv1", "conv2"):
@@ -175,7 +203,10 @@ def as_keras(weights: dict[str, np.ndarray], layout: SensorLayout, model) -> lis
         bias = w[f"{block}.qkv.bias"].reshape(3, 4, 64)
         for i in range(3):
             result += [qkv[:, i], bias[i]]
-        result += [w[f"{block}.out.weight"][moved].T.reshape(4, 64, -1), w[f"{block}.out.bias"][moved]]
+        result += [
+            w[f"{block}.out.weight"][moved].T.reshape(4, 64, -1),
+            w[f"{block}.out.bias"][moved],
+        ]
         result += [w[f"{block}.norm1.{part}"][moved] for part in ("weight", "bias")]
         result += [w[f"{block}.up.weight"][:, moved].T, w[f"{block}.up.bias"]]
         result += [w[f"{block}.down.weight"][moved].T, w[f"{block}.down.bias"][moved]]
@@ -192,8 +223,13 @@ class Failure:
 
 
 def serve(connection: Connection, name: str, setup: Setup) -> None:
-    """Run one stack in a process of its own, a step each time it is asked: epochs first, then predictions."""
-    os.environ |= {"KERAS_BACKEND": STACKS[name], "TF_CPP_MIN_LOG_LEVEL": "3", "TF_ENABLE_ONEDNN_OPTS": "1"}
+    """Run one stack in a process of its own, a step each time it is asked: epochs first, then
+    predictions."""
+    os.environ |= {
+        "KERAS_BACKEND": STACKS[name],
+        "TF_CPP_MIN_LOG_LEVEL": "3",
+        "TF_ENABLE_ONEDNN_OPTS": "1",
+    }
     warnings.simplefilter("ignore")
     try:
         stack = Ours(setup) if name == OURS else Keras(setup)
@@ -213,16 +249,25 @@ def serve(connection: Connection, name: str, setup: Setup) -> None:
         ways = stack.ways()
         connection.send(float((ways["predict"](setup.test.x) == setup.test.y).mean()))
         while (job := connection.recv()) is not None:
-            connection.send({way: timed(predict, setup.test.x[: job[0]], job[1]) for way, predict in ways.items()})
+            connection.send(
+                {
+                    way: timed(predict, setup.test.x[: job[0]], job[1])
+                    for way, predict in ways.items()
+                }
+            )
         connection.send(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)  # kB on Linux
     except Exception as error:
         connection.send(Failure(f"{type(error).__name__}: {str(error).strip().splitlines()[0]}"))
 
 
-def timed(predict: Callable[[np.ndarray], np.ndarray], x: np.ndarray, runs: int) -> tuple[float, float]:
-    """Return wall (median) and CPU (mean) milliseconds of a prediction, after one that does not count."""
+def timed(
+    predict: Callable[[np.ndarray], np.ndarray], x: np.ndarray, runs: int
+) -> tuple[float, float]:
+    """Return wall (median) and CPU (mean) milliseconds of a prediction, after one that does not
+    count."""
     predict(x)
-    walls, cpu = [], time.process_time()
+    walls = []
+    cpu = time.process_time()
     for _ in range(runs):
         began = time.perf_counter()
         predict(x)

@@ -1,7 +1,8 @@
-"""The states of a disk after a power cut: notes the writes of this process, and builds what POSIX allows to be left.
+"""The states of a disk after a power cut: notes the writes of this process, and builds what POSIX
+allows to be left.
 
-Every write, rename, removal, fsync and directory sync below a folder is a step. For every prefix of the steps, what was
-not synced may be there, be lost, or be there in part, in any order.
+Every write, rename, removal, fsync and directory sync below a folder is a step. For every prefix of
+the steps, what was not synced may be there, be lost, or be there in part, in any order.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-# Lock files carry nothing and are created where missing. SQLite's journal is modelled step by step, see `_sqlite`.
+# Lock files carry nothing and are created where missing. SQLite's journal is modelled step by step,
+# see `_sqlite`.
 _IGNORED = (".lock", "-journal")
 _CALLS = ("replace", "rename", "unlink", "remove", "rmdir", "mkdir", "open", "fsync")
-_MOST_PENDING = 10  # unsynced directory entries of which every subset is tried; above that all, none, and single ones
+# unsynced directory entries of which every subset is tried; above that all, none, and single ones
+_MOST_PENDING = 10
 _DATABASE = "journal.sqlite"
 
 _open = open  # while a trace replaces it
@@ -39,7 +42,8 @@ class Step:
     """One step towards the disk.
 
     Attributes:
-        kind: "names": entries of the folder ``inode`` change, all at once; "data": the file gets a content; "sync".
+        kind: "names": entries of the folder ``inode`` change, all at once; "data": the file gets a
+            content; "sync".
         inode: number of the file or folder.
         names: new inode of each changed entry; None: removed.
         data: the content after the step.
@@ -53,7 +57,8 @@ class Step:
 
 @dataclass
 class Trace:
-    """The steps of one operation on the folder ``root``, from the state that was on the disk before it."""
+    """The steps of one operation on the folder ``root``, from the state that was on the disk before
+    it."""
 
     root: Path
     steps: list[Step] = field(default_factory=list)
@@ -62,7 +67,9 @@ class Trace:
     before: tuple[dict[int, dict[str, int]], dict[int, bytes]] = field(init=False)
 
     def __post_init__(self) -> None:
-        self._numbers: dict[int, int] = {}  # of the file system -> ours, because it uses numbers again
+        self._numbers: dict[
+            int, int
+        ] = {}  # of the file system -> ours, because it uses numbers again
         self._next = 1
         self._ever: set[int] = set()  # folders
         self._guard = threading.RLock()
@@ -77,10 +84,16 @@ class Trace:
         """Note what this process does."""
         with ExitStack() as stack:
             for name in _CALLS:
-                stack.enter_context(mock.patch.object(os, name, self._traced(name, getattr(os, name))))
-            stack.enter_context(mock.patch.object(sqlite3, "connect", self._connect(sqlite3.connect)))
+                stack.enter_context(
+                    mock.patch.object(os, name, self._traced(name, getattr(os, name)))
+                )
+            stack.enter_context(
+                mock.patch.object(sqlite3, "connect", self._connect(sqlite3.connect))
+            )
             for module in (builtins, io):  # opening for writing creates and truncates
-                stack.enter_context(mock.patch.object(module, "open", self._traced("open", module.open)))
+                stack.enter_context(
+                    mock.patch.object(module, "open", self._traced("open", module.open))
+                )
             yield
         self._look(atomic=False)
 
@@ -99,7 +112,9 @@ class Trace:
 
         return traced
 
-    def _connect(self, connect: Callable[..., sqlite3.Connection]) -> Callable[..., sqlite3.Connection]:
+    def _connect(
+        self, connect: Callable[..., sqlite3.Connection]
+    ) -> Callable[..., sqlite3.Connection]:
         trace = self
 
         class Connection(sqlite3.Connection):
@@ -132,24 +147,35 @@ class Trace:
             born: list[Step] = []
             for folder, names in found.items():
                 old = self.folders.get(folder, {})
-                changed = [(n, names.get(n)) for n in sorted({*names, *old}) if names.get(n) != old.get(n)]
-                for group in [tuple(changed)] if atomic and changed else [(one,) for one in changed]:
+                changed = [
+                    (n, names.get(n)) for n in sorted({*names, *old}) if names.get(n) != old.get(n)
+                ]
+                for group in (
+                    [tuple(changed)] if atomic and changed else [(one,) for one in changed]
+                ):
                     born.append(Step("names", folder, group))
             for number, data in contents.items():
                 old_data = self.files.get(number, b"")
                 if data == old_data:
                     continue
-                places = [(f, n) for f, names in found.items() for n, i in names.items() if i == number]
+                places = [
+                    (f, n) for f, names in found.items() for n, i in names.items() if i == number
+                ]
                 if places and places[0][1] == _DATABASE:
                     born += self._sqlite(places[0][0], number, old_data, data, durable)
                 else:
                     born.append(Step("data", number, data=data))
             self.steps += born
-            self.folders, self.files = found, contents
+            self.folders = found
+            self.files = contents
             known = {*found, *contents}
-            self._numbers = {inode: number for inode, number in self._numbers.items() if number in known}
+            self._numbers = {
+                inode: number for inode, number in self._numbers.items() if number in known
+            }
 
-    def _walk(self, path: str, number: int, found: dict[int, dict[str, int]], contents: dict[int, bytes]) -> None:
+    def _walk(
+        self, path: str, number: int, found: dict[int, dict[str, int]], contents: dict[int, bytes]
+    ) -> None:
         names = found[number] = {}
         self._ever.add(number)
         with os.scandir(path) as entries:
@@ -166,12 +192,21 @@ class Trace:
                     with _open(entry.path, "rb") as file:
                         contents[one] = file.read()
 
-    def _sqlite(self, folder: int, number: int, old: bytes, new: bytes, durable: bool) -> list[Step]:
-        """Return the steps of a transaction with a rollback journal, in the order that strace shows."""
-        journal, self._next = self._next, self._next + 1
+    def _sqlite(
+        self, folder: int, number: int, old: bytes, new: bytes, durable: bool
+    ) -> list[Step]:
+        """Return the steps of a transaction with a rollback journal, in the order that strace
+        shows."""
+        journal = self._next
+        self._next = self._next + 1
         size = struct.unpack(">H", new[16:18])[0]
-        pages, nonce = len(old) // size, 0x5EED
-        changed = [p for p in range(pages) if old[p * size : (p + 1) * size] != new[p * size : (p + 1) * size]]
+        pages = len(old) // size
+        nonce = 0x5EED
+        changed = [
+            p
+            for p in range(pages)
+            if old[p * size : (p + 1) * size] != new[p * size : (p + 1) * size]
+        ]
         records = b""
         for page in changed:
             data = old[page * size : (page + 1) * size]
@@ -231,7 +266,10 @@ class Trace:
                 for one in chosen:
                     _apply(folders, one)
                 layout = _paths(folders)
-                unsynced = {n: _contents(durable_data.get(n, b""), data[n]) for n in set(layout.values()) & set(data)}
+                unsynced = {
+                    n: _contents(durable_data.get(n, b""), data[n])
+                    for n in set(layout.values()) & set(data)
+                }
                 for contents in itertools.product(*unsynced.values()):
                     written = dict(zip(unsynced, contents, strict=True))
                     tree: Tree = {
@@ -246,7 +284,9 @@ class Trace:
 
 def _writes(args: tuple[Any, ...], options: dict[str, Any]) -> bool:
     mode = options.get("mode", options.get("flags", args[1] if len(args) > 1 else "r"))
-    return bool(mode & (os.O_WRONLY | os.O_RDWR) if isinstance(mode, int) else set(mode) & set("wxa+"))
+    return bool(
+        mode & (os.O_WRONLY | os.O_RDWR) if isinstance(mode, int) else set(mode) & set("wxa+")
+    )
 
 
 def _apply(folders: dict[int, dict[str, int]], step: Step) -> None:
@@ -259,8 +299,10 @@ def _apply(folders: dict[int, dict[str, int]], step: Step) -> None:
 
 
 def _reachable(durable: dict[int, dict[str, int]], names: list[Step]) -> list[Step]:
-    """Return the unsynced entries whose folder can still be reached, from the root or through unsynced entries."""
-    alive, before = {0}, -1
+    """Return the unsynced entries whose folder can still be reached, from the root or through
+    unsynced entries."""
+    alive = {0}
+    before = -1
     while len(alive) != before:
         before = len(alive)
         for folder in list(alive):
@@ -282,17 +324,20 @@ def _choices(names: list[Step]) -> Iterator[list[Step]]:
 
 
 def _contents(durable: bytes, written: list[bytes]) -> list[bytes]:
-    """Return the contents of a file that may be on the disk: before, after, and torn between two writes."""
+    """Return the contents of a file that may be on the disk: before, after, and torn between two
+    writes."""
     possible = {durable: None}
     old = durable
     for new in written:
         common = min(len(old), len(new))
         possible[new] = None
-        possible[new[: (common + len(new)) // 2] if len(new) > common else new[:common]] = None  # cut off
+        # cut off
+        possible[new[: (common + len(new)) // 2] if len(new) > common else new[:common]] = None
         possible[old[:common] + b"\0" * (len(new) - common)] = None  # the size, but not the data
         for start in range(0, max(len(old), len(new)), 4096):  # one page, and all but one
             end = start + 4096
-            page, other = new[start:end], old[start:end].ljust(min(4096, max(0, len(new) - start)), b"\0")
+            page = new[start:end]
+            other = old[start:end].ljust(min(4096, max(0, len(new) - start)), b"\0")
             possible[(old[:start].ljust(start, b"\0") + page + old[end:])] = None
             possible[(new[:start] + other + new[end:])] = None
         old = new
@@ -311,7 +356,9 @@ def _digest(tree: Tree) -> bytes:
     digest = hashlib.sha256()
     for path in sorted(tree):
         data = tree[path]
-        digest.update(path.encode() + b"\0" + (b"folder" if data is None else hashlib.sha256(data).digest()))
+        digest.update(
+            path.encode() + b"\0" + (b"folder" if data is None else hashlib.sha256(data).digest())
+        )
     return digest.digest()
 
 

@@ -1,8 +1,8 @@
 """Fault-aware training (Section III-C): windows with random faults are added to the training data.
 
-The paper adds 10 000, 100 000 or 200 000 windows. Here each window is generated from its index when training needs it:
-the same set in every epoch, without storage. The paper has faults in scattered cells only; real arrays also lose lines
-and patches, which ``kind`` selects.
+The paper adds 10 000, 100 000 or 200 000 windows. Here each window is generated from its index when
+training needs it: the same set in every epoch, without storage. The paper has faults in scattered
+cells only; real arrays also lose lines and patches, which ``kind`` selects.
 """
 
 from __future__ import annotations
@@ -24,19 +24,23 @@ from diagnostics import SensorLayout
 class FaultySamples:
     """Windows with random faults, generated on demand: sample i is always the same.
 
-    Sample i is a window drawn from ``windows`` with k cells open (0) or short (full scale), each with equal chance;
-    k is drawn from ``n_faults``. A faulty line or block reads one of the two as a whole.
+    Sample i is a window drawn from ``windows`` with k cells open (0) or short (full scale), each
+    with equal chance; k is drawn from ``n_faults``. A faulty line or block reads one of the two as
+    a whole.
 
     Args:
         windows: fault-free.
         layout: the array.
         n: number of samples.
-        n_faults: numbers of faults to draw from: of cells, or of lines or blocks; (0,) gives the same windows healthy.
-        kind: "cells", "lines" or "blocks" (:class:`~adaptfault.adaptation.baselines.random_faults.RandomFaults`).
+        n_faults: numbers of faults to draw from: of cells, or of lines or blocks; (0,) gives the
+            same windows healthy.
+        kind: "cells", "lines" or "blocks"
+            (:class:`~adaptfault.adaptation.baselines.random_faults.RandomFaults`).
         seed: of windows and faults.
 
     Raises:
-        ValueError: no windows, another number of cells than the layout's, an unknown kind, faults that do not fit.
+        ValueError: no windows, another number of cells than the layout's, an unknown kind, faults
+            that do not fit.
     """
 
     def __init__(
@@ -52,10 +56,19 @@ class FaultySamples:
         self.faults = RandomFaults(layout, kind)
         if n < 0 or not len(n_faults) or min(n_faults) < 0 or max(n_faults) > self.faults.most:
             most = self.faults.most
-            raise ValueError(f"expected n >= 0 and numbers of faults from 0 to {most}, got {n} and {list(n_faults)}")
+            raise ValueError(
+                f"expected n >= 0 and numbers of faults from 0 to {most}, got {n} and"
+                f" {list(n_faults)}"
+            )
         if not len(windows) or windows.x.shape[2] != layout.n_cells:
-            raise ValueError(f"expected windows of {layout.n_cells} cells, got {list(windows.x.shape)}")
-        self.windows, self.layout, self.n_faults, self.kind, self.seed = windows, layout, tuple(n_faults), kind, seed
+            raise ValueError(
+                f"expected windows of {layout.n_cells} cells, got {list(windows.x.shape)}"
+            )
+        self.windows = windows
+        self.layout = layout
+        self.n_faults = tuple(n_faults)
+        self.kind = kind
+        self.seed = seed
         self.source = np.random.default_rng(seed).integers(len(windows), size=n)
         self.y: NDArray[np.int64] = windows.y[self.source]
 
@@ -86,16 +99,17 @@ def train_fault_aware(
     seed: int = 0,
     **options: Any,
 ) -> History:
-    """Train ``model`` in place on fault-free windows and on ``n_samples`` more with random faults (Section III-C).
+    """Train ``model`` in place on fault-free windows and on ``n_samples`` more with random faults
+    (Section III-C).
 
-    The selected weights are best on validation windows of which half have faults of the same kind. (The paper selects
-    on fault-free windows, which do not measure the robustness to faults.)
+    The selected weights are best on validation windows of which half have faults of the same kind.
+    (The paper selects on fault-free windows, which do not measure the robustness to faults.)
 
     Args:
         model: a network of a known layout.
         train, validation: fault-free windows.
-        n_faults: numbers of faults in a sample, drawn with equal chance. (0,) is the control: the same windows in the
-            same order, as many steps, no faults.
+        n_faults: numbers of faults in a sample, drawn with equal chance. (0,) is the control: the
+            same windows in the same order, as many steps, no faults.
         n_samples: windows with faults in an epoch, the same in each epoch.
         kind: "cells" as in the paper, "lines" or "blocks" (:class:`FaultySamples`).
         seed: of the faults, and of training.
@@ -107,12 +121,18 @@ def train_fault_aware(
     """
     layout = getattr(model, "layout", None)
     if not isinstance(layout, SensorLayout):
-        raise TypeError(f"fault-aware training needs a network of a known layout, got {type(model).__name__}")
+        raise TypeError(
+            f"fault-aware training needs a network of a known layout, got {type(model).__name__}"
+        )
     added = FaultySamples(train, layout, n=n_samples, n_faults=n_faults, kind=kind, seed=seed)
-    broken = FaultySamples(validation, layout, n=len(validation), n_faults=n_faults, kind=kind, seed=seed + 1)
+    broken = FaultySamples(
+        validation, layout, n=len(validation), n_faults=n_faults, kind=kind, seed=seed + 1
+    )
     both = Windows(
         np.concatenate([validation.x, broken.draw(np.arange(len(broken)))]),
         np.concatenate([validation.y, broken.y]),
         np.concatenate([validation.recording, validation.recording[broken.source]]),
     )
-    return training.train(model, train, both, more=added if n_samples else None, seed=seed, **options)
+    return training.train(
+        model, train, both, more=added if n_samples else None, seed=seed, **options
+    )

@@ -1,4 +1,5 @@
-"""A set of recordings with their layout and labels: what every reader returns and every routine takes."""
+"""A set of recordings with their layout and labels: what every reader returns and every routine
+takes."""
 
 from __future__ import annotations
 
@@ -17,14 +18,18 @@ class Recordings:
     """Recordings of one array.
 
     Attributes:
-        frames: float32 ``[T, D]`` each, in the layout's unit; lengths may differ; NaN = missing reading.
+        frames: float32 ``[T, D]`` each, in the layout's unit; lengths may differ; NaN = missing
+            reading.
         layout: the array they come from.
-        labels: int ``[n]``, the class of each recording (an index into ``class_names``); None where there are none.
+        labels: int ``[n]``, the class of each recording (an index into ``class_names``); None where
+            there are none.
         class_names: one name a class.
-        names: where each recording came from ("normal/0001.csv"), for messages; what cannot be printed is escaped.
+        names: where each recording came from ("normal/0001.csv"), for messages; what cannot be
+            printed is escaped.
 
     Raises:
-        ValueError: a recording that does not fit the layout; labels, class names or names of another number.
+        ValueError: a recording that does not fit the layout; labels, class names or names of
+            another number.
     """
 
     frames: tuple[NDArray[np.float32], ...]
@@ -34,9 +39,12 @@ class Recordings:
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        names = tuple(map(printable, self.names)) or tuple(f"recording {i}" for i in range(len(self.frames)))
+        names = tuple(map(printable, self.names)) or tuple(
+            f"recording {i}" for i in range(len(self.frames))
+        )
         frames = tuple(
-            self.layout.check_recording(f, name).astype(np.float32) for f, name in zip(self.frames, names, strict=True)
+            self.layout.check_recording(f, name).astype(np.float32)
+            for f, name in zip(self.frames, names, strict=True)
         )
         object.__setattr__(self, "names", names)
         object.__setattr__(self, "frames", frames)
@@ -44,12 +52,16 @@ class Recordings:
             return
         labels = np.asarray(self.labels, dtype=np.int64)
         if labels.shape != (len(frames),):
-            raise ValueError(f"{len(frames)} recordings need as many labels, got an array of shape {labels.shape}")
+            raise ValueError(
+                f"{len(frames)} recordings need as many labels, got an array of shape"
+                f" {labels.shape}"
+            )
         numbers = range(int(labels.max(initial=-1)) + 1)
         class_names = tuple(map(printable, self.class_names)) or tuple(map(str, numbers))
         if labels.size and (labels.min() < 0 or labels.max() >= len(class_names)):
             raise ValueError(
-                f"labels run from {labels.min()} to {labels.max()}, but there are {len(class_names)} class names"
+                f"labels run from {labels.min()} to {labels.max()}, but there are"
+                f" {len(class_names)} class names"
             )
         object.__setattr__(self, "labels", labels)
         object.__setattr__(self, "class_names", class_names)
@@ -63,5 +75,6 @@ class Recordings:
     def select(self, which: Sequence[int] | NDArray[np.integer]) -> Recordings:
         """Return the recordings with these indices, in this order."""
         labels = None if self.labels is None else self.labels[np.asarray(which, dtype=np.intp)]
-        frames, names = tuple(self.frames[i] for i in which), tuple(self.names[i] for i in which)
+        frames = tuple(self.frames[i] for i in which)
+        names = tuple(self.names[i] for i in which)
         return Recordings(frames, self.layout, labels, self.class_names, names)

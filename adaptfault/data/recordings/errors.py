@@ -1,4 +1,5 @@
-"""Errors and warnings about a user's file, one line each: file, place, what came, what was expected, the remedy."""
+"""Errors and warnings about a user's file, one line each: file, place, what came, what was
+expected, the remedy."""
 
 from __future__ import annotations
 
@@ -10,11 +11,13 @@ from adaptfault.data.printable import printable
 
 
 class InputError(ValueError):
-    """A file or an option of the user is unusable. One line: ``<file>[, where]: what came; the remedy``."""
+    """A file or an option of the user is unusable. One line:
+    ``<file>[, where]: what came; the remedy``."""
 
     @classmethod
     def at(cls, path: str | PathLike[str], what: str, where: str = "") -> InputError:
-        """Return the error ``what`` in a file, at the place ``where`` ("line 7", "recording 3, frame 12")."""
+        """Return the error ``what`` in a file, at the place ``where`` ("line 7", "recording 3,
+        frame 12")."""
         return cls(located(path, what, where))
 
 
@@ -30,6 +33,7 @@ class Problem:
 
 
 def located(path: str | PathLike[str], what: str, where: str = "") -> str:
-    """Return ``<file>[, where]: what`` as one printable line, whatever characters the file's name holds."""
+    """Return ``<file>[, where]: what`` as one printable line, whatever characters the file's name
+    holds."""
     line = f"{path}, {where}: {what}" if where else f"{path}: {what}"
     return printable(line).replace("\n", "\\n")

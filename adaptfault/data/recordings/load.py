@@ -1,9 +1,13 @@
-"""Reads files and folders of any known format into :class:`Recordings`, and lists every problem."""
+"""Reads files and folders of any known format, and lists every problem.
+
+Every recording is gone through once before the array is decided (:mod:`.survey`), and a second time
+for its frames. Small and large ones take the same way and get the same checks.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -12,17 +16,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.bag import STORAGES, read_bag
-from adaptfault.data.recordings.check import check_range, check_readings, check_width, other_lengths, without_infinite
-from adaptfault.data.recordings.classes import class_indices, label_files
-from adaptfault.data.recordings.content import Content, Shape
-from adaptfault.data.recordings.csv_folder import read_csv
+from adaptfault.data.recordings.check import (
+    OutOfRange,
+    check_readings,
+    check_width,
+    other_lengths,
+    without_infinite,
+)
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError, Problem
+from adaptfault.data.recordings.facts.classes import class_indices, label_files
+from adaptfault.data.recordings.facts.infer import PAPER, SLACK
+from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME, layout_beside
+from adaptfault.data.recordings.facts.resolve import (
+    Resolved,
+    check_agreement,
+    check_statements,
+    given_array,
+    resolve_layout,
+)
 from adaptfault.data.recordings.files import Found, find
-from adaptfault.data.recordings.layout_file import LAYOUT_NAME, layout_beside
-from adaptfault.data.recordings.npz import read_npy, read_npz
-from adaptfault.data.recordings.resolve import Resolved, check_agreement, check_statements, given_array, resolve_layout
+from adaptfault.data.recordings.readers import readers
+from adaptfault.data.recordings.recording import BLOCK, Shape
+from adaptfault.data.recordings.survey import Content, Surveyor
 from diagnostics import SensorLayout
 
 if TYPE_CHECKING:
@@ -30,8 +46,16 @@ if TYPE_CHECKING:
 
 PathName = str | PathLike[str]
 
-READERS: Mapping[str, Callable[[Path], Content]] = {".csv": read_csv, ".npz": read_npz, ".npy": read_npy}
-"""The reader of each format by the end of the file's name; bags, which may be folders, have their own."""
+ROOM = 256_000_000
+"""Bytes of frames that :func:`open_recordings` keeps, so that small files are read once."""
+
+
+PART = 5_000_000
+"""Readings of a log that are in memory at once."""
+
+
+def _nothing(done: int) -> None:
+    """Nobody looks at the progress."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +64,125 @@ class Loaded:
 
     Attributes:
         recordings: at least one recording.
-        problems: errors (a recording was left out) and warnings (a recording was kept), in the order of the files.
-        inferred: one sentence for each fact of the array that no file, layout or option states, with the reason and
-            the option that states it.
+        problems: errors (a recording was left out) and warnings (a recording was kept), in the
+            order of the files.
+        inferred: one sentence for each fact of the array that no file, layout or option states,
+            with the reason and the option that states it.
     """
 
     recordings: Recordings
     problems: tuple[Problem, ...] = ()
     inferred: tuple[str, ...] = ()
+
+
+class Opened:
+    """Recordings whose frames are read when they are asked for; may be iterated more than once.
+
+    Iterating yields float32 ``[T, D]`` in the layout's unit, one recording after the other; NaN =
+    missing.
+
+    Attributes:
+        layout: the array.
+        lengths: frames of each recording.
+        labels, class_names, names: as in :class:`~adaptfault.data.recordings.dataset.Recordings`.
+        inferred: as in :class:`Loaded`.
+        problems: errors and warnings.
+        late_problems: warnings about the range of readings, after a whole iteration.
+    """
+
+    def __init__(
+        self,
+        usable: Sequence[tuple[Found, Content, list[int]]],
+        resolved: Resolved,
+        tables: Calibration | None,
+        problems: list[Problem],
+    ) -> None:
+        self.layout = resolved.layout
+        self.inferred = resolved.inferred
+        self.names = tuple(_name(file, content, i) for file, content, kept in usable for i in kept)
+        self.lengths = tuple(content.surveys[i].length for _, content, kept in usable for i in kept)
+        labels = [
+            content.labels[i] if content.labels else None
+            for _, content, kept in usable
+            for i in kept
+        ]
+        self.labels, self.class_names = class_indices(
+            labels, [content.facts.class_names for _, content, _ in usable], problems
+        )
+        self.problems = tuple(problems)
+        self._usable = usable
+        self._tables = tables
+        self.late_problems: tuple[Problem, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    def __iter__(self) -> Iterator[NDArray[np.float32]]:
+        for pieces in self._recordings():
+            yield np.concatenate(list(pieces))
+
+    def pieces(self, frames: int = BLOCK) -> Iterator[NDArray[np.float32]]:
+        """Yield all recordings in pieces ``[t, D]`` of about so many frames, in constant memory.
+
+        A piece holds frames of one recording.
+        """
+        for blocks in self._recordings():
+            held: list[NDArray[np.float32]] = []
+            for block in blocks:
+                held.append(block)
+                if sum(map(len, held)) >= frames:
+                    yield np.concatenate(held)
+                    held = []
+            if held:
+                yield np.concatenate(held)
+
+    def parts(self, readings: int = PART) -> Iterator[list[NDArray[np.float32]]]:
+        """Yield all recordings in lists of at most about so many readings; long recordings are cut.
+
+        A log that is not larger is one list of whole recordings.
+        """
+        frames = max(1, readings // self.layout.n_cells)
+        if sum(self.lengths) <= frames:
+            yield list(self)
+            return
+        part: list[NDArray[np.float32]] = []
+        for piece in self.pieces(frames):
+            if part and sum(map(len, part)) + len(piece) > frames:
+                yield part
+                part = []
+            part.append(piece)
+        yield part
+
+    def _recordings(self) -> Iterator[Iterator[NDArray[np.float32]]]:
+        """Yield the blocks of each recording, calibrated."""
+        clamped = np.zeros((2, self.layout.n_cells), dtype=np.int64)
+        outside: list[Problem] = []
+        for _, content, kept in self._usable:
+            range_ = OutOfRange(content, self.layout)
+            for i in kept:
+                yield self._blocks(content, i, clamped, range_)
+            problem = range_.problem()
+            if problem is not None:
+                outside.append(problem)
+        late = _summary(outside, len(self._usable), self.layout)
+        if clamped.any():
+            late.append(_clamped(clamped))
+        self.late_problems = tuple(late)
+
+    def _blocks(
+        self, content: Content, i: int, clamped: NDArray[np.int64], range_: OutOfRange
+    ) -> Iterator[NDArray[np.float32]]:
+        for block in content.recordings[i].blocks():
+            if not len(block.values):
+                continue
+            readings = without_infinite(block.values)
+            if self._tables is not None:
+                readings, out = self._tables.apply(readings)
+                clamped += np.stack([out.below, out.above])
+            with np.errstate(all="ignore"):
+                readings = readings.astype(np.float32, copy=False)
+            range_.add(i, readings, block.lines)
+            yield readings
 
 
 def load(
@@ -60,145 +195,157 @@ def load(
     full_scale: float | None = None,
     unit: str | None = None,
     rate: float | None = None,
-    topic: str | None = None,
-    field: str | None = None,
     strict: bool = False,
+    **stated: Any,
 ) -> Loaded:
     """Read recordings; a bad file is listed and left out, the others are read.
 
-    Each file's class comes from the file itself (.npz), or else from a table of labels, or else from the folder that
-    holds it (``folder/<class>/<file>``). Files that all lie in one folder have no labels.
+    Each file's class comes from the file itself (.npz), or else from a table of labels, or else
+    from the folder that holds it (``folder/<class>/<file>``). Files that all lie in one folder have
+    no labels.
 
     Args:
-        paths: a file, a folder, or several of them. Folders are searched to the bottom, in natural order.
-        layout: the array; a layout file; a shape ``(2, 13, 6)``, "2x13x6" or, for one pad, "13x6". None: from the
-            files, see Notes.
-        labels: a table with the columns ``file,label``, paths relative to it. None: a folder's ``labels.csv``.
+        paths: a file, a folder, or several of them. Folders are searched to the bottom, in natural
+            order.
+        layout: the array; a layout file; a shape ``(2, 13, 6)``, "2x13x6" or, for one pad, "13x6".
+            None: from the files, see Notes.
+        labels: a table with the columns ``file,label``, paths relative to it. None: a folder's
+            ``labels.csv``.
         frames: the number of frames that each recording must have; None = any.
         calibration: tables that turn the counts read into newtons (or the file that holds them).
         full_scale, unit, rate: override the layout and the files.
-        strict: refuse files that state another full scale or rate than ``layout``, as a model's layout requires.
-        topic, field: where the readings are in bags, see :func:`adaptfault.data.recordings.bag.read_bag`.
+        strict: refuse files that state another full scale or rate than ``layout``, as a model's
+            layout requires.
+        stated: what readers want to know: ``topic`` and ``field``, where the readings are in bags,
+            see :func:`adaptfault.data.recordings.formats.bag.open_bag`.
 
     Raises:
-        InputError: a path does not exist, no recording survives, or the layout, the table or the calibration is
-            unusable.
+        InputError: a path does not exist, no recording survives, or the layout, the table or the
+            calibration is unusable.
 
     Notes:
-        Without a layout, ``layout.json`` in the folders given is used where there is one. Otherwise the shape is the
-        one of ``[n, T, pads, rows, cols]`` or ``[n, T, rows, cols]`` (one pad), or the paper's for frames of 220
-        readings. Without a full scale, counts get the one of the smallest converter of 8 to 16 bits that holds them;
-        decimal numbers get the paper's 0..5 N for the paper's shape, else the range of the converter whose step they
-        show, else 0 to the largest reading. The rate is the file's, or 10 Hz. Every inferred fact is in ``inferred``.
+        Without a layout, ``layout.json`` in the folders given is used where there is one. Otherwise
+        the shape is the one of ``[n, T, pads, rows, cols]`` or ``[n, T, rows, cols]`` (one pad), or
+        the paper's for frames of 220 readings. Without a full scale, counts get the one of the
+        smallest converter of 8 to 16 bits that holds them; decimal numbers get the paper's 0..5 N
+        for the paper's shape, else the range of the converter whose step they show, else 0 to the
+        largest reading. The rate is the file's, or that of its times, or 10 Hz. Every inferred fact
+        is in ``inferred``.
+    """
+    opened = open_recordings(
+        paths,
+        layout=layout,
+        labels=labels,
+        frames=frames,
+        calibration=calibration,
+        full_scale=full_scale,
+        unit=unit,
+        rate=rate,
+        strict=strict,
+        room=None,
+        **stated,
+    )
+    recordings = Recordings(
+        tuple(opened), opened.layout, opened.labels, opened.class_names, opened.names
+    )
+    return Loaded(recordings, (*opened.problems, *opened.late_problems), opened.inferred)
+
+
+def open_recordings(
+    paths: PathName | Iterable[PathName],
+    *,
+    layout: SensorLayout | Shape | PathName | None = None,
+    labels: PathName | None = None,
+    frames: int | None = None,
+    calibration: Calibration | PathName | None = None,
+    full_scale: float | None = None,
+    unit: str | None = None,
+    rate: float | None = None,
+    strict: bool = False,
+    room: int | None = ROOM,
+    progress: Callable[[int], None] = _nothing,
+    **stated: Any,
+) -> Opened:
+    """Return recordings of any size; their frames are read when they are asked for.
+
+    Args:
+        room: bytes of frames that are kept in memory; None: all.
+        progress: receives the number of frames of each block of the first reading.
+        paths, layout, labels, frames, calibration, full_scale, unit, rate, strict, stated: as for
+            :func:`load`.
+
+    Raises:
+        InputError: as :func:`load`.
     """
     given = [Path(paths)] if isinstance(paths, str | PathLike) else [Path(path) for path in paths]
     if not given:
         raise InputError("no path given; name a recording or a folder of recordings")
     if frames is not None and frames < 1:
-        raise InputError(f"frames {frames}: expected the number of frames a recording must have, at least 1")
+        raise InputError(
+            f"frames {frames}: expected the number of frames a recording must have, at least 1"
+        )
     array = given_array(layout) if layout is not None else layout_beside(given)
     shape = array.shape if isinstance(array, SensorLayout) else array
     tables = _calibration(calibration)
-    aside = {Path(p).resolve() for p in (layout, labels, calibration) if isinstance(p, str | PathLike)}
-    found, problems = find(given, (*READERS, *STORAGES), aside)
-    contents = _read(found, shape, topic, field, problems)
+    aside = {
+        Path(p).resolve() for p in (layout, labels, calibration) if isinstance(p, str | PathLike)
+    }
+    found, problems = find(given, readers(), aside)
+    surveyor = Surveyor(PAPER.full_scale * SLACK, 2**62 if room is None else room)
+    contents: list[tuple[Found, Content]] = []
+    for file in found:
+        try:
+            recordings = list(file.reader.open(file.path, shape=shape, **stated))
+            content = surveyor(recordings, problems, progress)
+        except InputError as error:
+            problems.append(Problem("error", str(error)))
+        else:
+            contents.append((file, content))
     contents = label_files(contents, None if labels is None else Path(labels), problems)
     if not contents:
         raise nothing_left(problems)
-    resolved = resolve_layout([content for _, content in contents], array, full_scale, unit, rate, tables)
+    every = [content for _, content in contents]
+    resolved = resolve_layout(every, array, full_scale, unit, rate, tables)
     problems += resolved.problems
     if tables is not None:
         try:
             tables.check(resolved.layout)
         except ValueError as error:
             raise InputError(f"calibration: {error}") from None
-    stated = f" of the {LAYOUT_NAME} beside the recordings" if layout is None and array is not None else ""
-    return _assemble(contents, resolved, frames, tables, problems, strict=strict, stated=stated)
-
-
-def _read(
-    found: Sequence[Found], shape: Shape | None, topic: str | None, field: str | None, problems: list[Problem]
-) -> list[tuple[Found, Content]]:
-    """Return the content of each file that can be read; what cannot is added to the problems."""
-    contents: list[tuple[Found, Content]] = []
-    for file in found:
-        try:
-            reader = READERS.get(file.path.suffix.lower()) if file.path.is_file() else None
-            content = reader(file.path) if reader else read_bag(file.path, topic=topic, field=field)
-        except InputError as error:
-            problems.append(Problem("error", str(error)))
-        else:
-            problems += content.problems
-            contents.append((file, content.read_as(shape) if shape else content))
-    return contents
-
-
-def _assemble(
-    contents: Sequence[tuple[Found, Content]],
-    resolved: Resolved,
-    length: int | None,
-    tables: Calibration | None,
-    problems: list[Problem],
-    *,
-    strict: bool,
-    stated: str,
-) -> Loaded:
-    """Check each file against the layout, calibrate it, and put the recordings of all together."""
-    layout = resolved.layout
-    out_of_range: list[Problem] = []
-    clamped = np.zeros((2, layout.n_cells), dtype=np.int64)
-    frames: list[NDArray[np.float32]] = []
-    names: list[str] = []
-    labels: list[str | None] = []
-    usable: list[Content] = []
-    every = [content for _, content in contents]
+    beside = layout is None and array is not None
+    usable = []
     for file, content in contents:
         try:
-            check_agreement(content, every, tables is not None)
-            check_width(content, layout, stated, strict=strict)
+            check_agreement(content, every, tables is not None, rate)
+            check_width(
+                content,
+                resolved.layout,
+                f" of the {LAYOUT_NAME} beside the recordings" if beside else "",
+                strict=strict,
+            )
             if strict:
-                check_statements(content, layout, tables is not None)
+                check_statements(content, resolved.layout, tables is not None)
         except InputError as error:
             problems.append(Problem("error", str(error)))
             continue
-        kept, found = check_readings(content, layout, length)
-        problems += found
-        if not kept:
-            continue
-        usable.append(content)
-        readings = [without_infinite(content.frames[i]) for i in kept]
-        if tables is not None:
-            readings = [_calibrated(recording, tables, clamped) for recording in readings]
-        readings = [recording.astype(np.float32, copy=False) for recording in readings]
-        if problem := check_range(content, kept, readings, layout):
-            out_of_range.append(problem)
-        frames += readings
-        names += (_name(file, content, i) for i in kept)
-        labels += (content.labels[i] if content.labels else None for i in kept)
-    if not frames:
+        kept, told = check_readings(content, resolved.layout, frames)
+        problems += told
+        if kept:
+            usable.append((file, content, kept))
+    if not usable:
         raise nothing_left(problems)
-    if length is None:
-        problems += other_lengths(usable)
-    problems += _summary(out_of_range, len(usable), layout)
-    if clamped.any():
-        problems.append(_clamped(clamped))
-    indices, class_names = class_indices(labels, [content.class_names for content in usable], problems)
-    recordings = Recordings(tuple(frames), layout, indices, class_names, tuple(names))
-    return Loaded(recordings, tuple(problems), resolved.inferred)
+    if frames is None:
+        problems += other_lengths([content for _, content, _ in usable])
+    return Opened(usable, resolved, tables, problems)
 
 
 def _calibration(calibration: Calibration | PathName | None) -> Calibration | None:
     if not isinstance(calibration, str | PathLike):
         return calibration
-    from adaptfault.data.calibration import Calibration  # here: that module uses this package's errors
+    # here: that module uses this package's errors
+    from adaptfault.data.calibration import Calibration
 
     return Calibration.read(calibration)
-
-
-def _calibrated(recording: NDArray[Any], tables: Calibration, clamped: NDArray[np.int64]) -> NDArray[np.float32]:
-    newtons, out = tables.apply(recording)
-    clamped += np.stack([out.below, out.above])
-    return newtons
 
 
 def _clamped(clamped: NDArray[np.int64]) -> Problem:
@@ -212,27 +359,32 @@ def _clamped(clamped: NDArray[np.int64]) -> Problem:
 
 
 def _summary(out_of_range: list[Problem], files: int, layout: SensorLayout) -> list[Problem]:
-    """Return the warnings about the range; one for all where most files have it, because then the scale is wrong."""
+    """Return the warnings about the range; one for all where most files have it, because then the
+    scale is wrong."""
     if len(out_of_range) <= max(3, files // 2):
         return out_of_range
     what = (
-        f"{len(out_of_range)} of {files} files hold readings outside 0..{layout.full_scale:g} {layout.unit}:"
-        " check the layout's full scale and unit; the first is"
+        f"{len(out_of_range)} of {files} files hold readings outside 0..{layout.full_scale:g}"
+        f" {layout.unit}: check the layout's full scale and unit; the first is"
     )
     return [Problem("warning", f"{what} {out_of_range[0].message}")]
 
 
 def _name(file: Found, content: Content, i: int) -> str:
-    if content.names is not None:
-        return content.names[i]
-    return file.name if len(content.frames) == 1 else f"{file.name}, recording {i}"
+    name = content.recordings[i].name
+    if name is not None:
+        return name
+    return file.name if len(content.recordings) == 1 else f"{file.name}, recording {i}"
 
 
 def nothing_left(problems: Sequence[Problem]) -> InputError:
-    """Return the error for a run that has no recording left: the first problem, and how many there are."""
+    """Return the error for a run that has no recording left: the first problem, and how many there
+    are."""
     errors = [problem for problem in problems if problem.level == "error"] or list(problems)
     counts = Counter(problem.level for problem in problems)
     count = (
-        f"{counts['error']} error{'s' * (counts['error'] != 1)}" if counts["error"] else f"{counts['warning']} warnings"
+        f"{counts['error']} error{'s' * (counts['error'] != 1)}"
+        if counts["error"]
+        else f"{counts['warning']} warnings"
     )
     return InputError(f"{errors[0].message} (no recording is left; {count} in all)")

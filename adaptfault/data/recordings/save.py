@@ -13,28 +13,32 @@ import numpy as np
 from adaptfault.data.atomic import atomic_write
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError
-from adaptfault.data.recordings.layout_file import LAYOUT_NAME
-from adaptfault.data.recordings.npz import save_npz
+from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME
+from adaptfault.data.recordings.formats.npz import save_npz
 
 FORMATS = ".npz, .npy, .bag (a ROS 2 bag) or a folder of CSV files"
 
-_TOPIC, _KIND = "/tactile", "std_msgs/msg/Float32MultiArray"
+_TOPIC = "/tactile"
+_KIND = "std_msgs/msg/Float32MultiArray"
 _PAUSE = 5.0  # seconds between two recordings in a bag, which separate them
 _BEGIN = 1_700_000_000  # unix time of the first message: a bag needs one, recordings have none
 
 
 def save(path: str | PathLike[str], recordings: Recordings) -> tuple[str, ...]:
-    """Write recordings in the format that the name ends in: ``.npz``, ``.npy``, ``.bag``; without an ending, CSV files.
+    """Write recordings in the format that the name ends in: ``.npz``, ``.npy``, ``.bag``; without
+    an ending, CSV files.
 
-    An archive (``.npz``) holds everything. An array (``.npy``) holds the frames alone, ``[n, T, pads, rows, cols]``,
-    and needs recordings of one length. CSV files lie in one folder a class, with ``layout.json`` beside them. A bag
-    holds one ``Float32MultiArray`` a frame on ``/tactile``, recordings separated by pauses.
+    An archive (``.npz``) holds everything. An array (``.npy``) holds the frames alone,
+    ``[n, T, pads, rows, cols]``, and needs recordings of one length. CSV files lie in one folder a
+    class, with ``layout.json`` beside them. A bag holds one ``Float32MultiArray`` a frame on
+    ``/tactile``, recordings separated by pauses.
 
     Returns:
         What the format cannot hold, one item each: empty for an archive.
 
     Raises:
-        InputError: another ending, no recordings, lengths that differ (``.npy``), or rosbags is missing (``.bag``).
+        InputError: another ending, no recordings, lengths that differ (``.npy``), or rosbags is
+            missing (``.bag``).
         OSError: the file cannot be written.
     """
     path = Path(path)
@@ -57,7 +61,10 @@ def save(path: str | PathLike[str], recordings: Recordings) -> tuple[str, ...]:
 def _save_npy(path: Path, recordings: Recordings) -> tuple[str, ...]:
     lengths = {len(frames) for frames in recordings}
     if len(lengths) > 1:
-        what = f"recordings of {min(lengths)} to {max(lengths)} frames do not fit one array; save them as .npz"
+        what = (
+            f"recordings of {min(lengths)} to {max(lengths)} frames do not fit one array; save them"
+            " as .npz"
+        )
         raise InputError.at(path, what)
     buffer = io.BytesIO()
     np.save(buffer, recordings.layout.grid(np.stack(recordings.frames)), allow_pickle=False)
@@ -82,7 +89,8 @@ def _save_csv(path: Path, recordings: Recordings) -> tuple[str, ...]:
 
 
 def _written(value: float) -> str:
-    """Return a float32 as the shortest text that is read back as the same number; a missing reading is empty."""
+    """Return a float32 as the shortest text that is read back as the same number; a missing reading
+    is empty."""
     return "" if value != value else f"{value:.9g}"
 
 
@@ -96,7 +104,9 @@ def _save_bag(path: Path, recordings: Recordings) -> tuple[str, ...]:
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise InputError.at(path, "bags are written with rosbags; install it: pip install 'adaptfault[ros]'") from None
+        raise InputError.at(
+            path, "bags are written with rosbags; install it: pip install 'adaptfault[ros]'"
+        ) from None
     if path.exists():
         raise InputError.at(path, "exists; choose another name")
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -104,10 +114,16 @@ def _save_bag(path: Path, recordings: Recordings) -> tuple[str, ...]:
     sizes = recordings.layout.shape
     dim = kinds["std_msgs/msg/MultiArrayDimension"]
     strides = [int(np.prod(sizes[i:])) for i in range(3)]
-    dims = [dim(label=n, size=s, stride=t) for n, s, t in zip(("pad", "row", "column"), sizes, strides, strict=True)]
+    dims = [
+        dim(label=n, size=s, stride=t)
+        for n, s, t in zip(("pad", "row", "column"), sizes, strides, strict=True)
+    ]
     about = kinds["std_msgs/msg/MultiArrayLayout"](dim=dims, data_offset=0)
-    period, at = round(1e9 / recordings.layout.rate), _BEGIN * 10**9
-    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:  # ROS 2 Humble rejects version 9
+    period = round(1e9 / recordings.layout.rate)
+    at = _BEGIN * 10**9
+    with Writer(
+        path, version=8, storage_plugin=StoragePlugin.MCAP
+    ) as writer:  # ROS 2 Humble rejects version 9
         connection = writer.add_connection(_TOPIC, _KIND, typestore=store)
         for frames in recordings:
             for frame in frames:

@@ -1,4 +1,5 @@
-"""Fit of the model of healthy cells by cross-fitting: table, units and limits from folds not used for predictions."""
+"""Fit of the model of healthy cells by cross-fitting: table, units and limits from folds not used
+for predictions."""
 
 from __future__ import annotations
 
@@ -71,7 +72,8 @@ def fit_life(
 
 @dataclass(frozen=True)
 class _Fold:
-    """Pieces of some reference recordings: loads and readings ``[n, D]``, piece numbers int ``[n]``."""
+    """Pieces of some reference recordings: loads and readings ``[n, D]``, piece numbers int
+    ``[n]``."""
 
     loads: Array
     readings: Array
@@ -82,10 +84,12 @@ class _Fold:
         return _Fold(self.loads.copy(), self.readings.copy(), self.piece)
 
     def kill(self, cell: int, source: int, rng: np.random.Generator) -> None:
-        """Let a cell read, equally often, what another one (``source``) read at other times, or nothing."""
+        """Let a cell read, equally often, what another one (``source``) read at other times, or
+        nothing."""
         if rng.random() < MAJORITY:
             self.loads[:, cell] = 0.0
-            self.readings[:, cell] = np.fmin.reduce(self.readings[:, cell])  # NaN without any reading
+            # NaN without any reading
+            self.readings[:, cell] = np.fmin.reduce(self.readings[:, cell])
             return
         order = rng.permutation(len(self.loads))
         self.loads[:, cell] = self.loads[order, source]
@@ -95,7 +99,8 @@ class _Fold:
 def _folds(
     recordings: Sequence[Floats], layout: SensorLayout, scale: Scale, offset: ReferenceOffset
 ) -> list[_Fold] | None:
-    """Return the pieces of the reference in folds of whole recordings, with offsets tracked as in a log."""
+    """Return the pieces of the reference in folds of whole recordings, with offsets tracked as in a
+    log."""
     blocks = RecordingBlocks.of(recordings)
     order = np.random.default_rng(0).permutation(len(blocks))
     frames = np.cumsum([len(blocks.given[i]) for i in order])
@@ -127,7 +132,9 @@ def _joined(parts: Sequence[_Fold]) -> _Fold:
     )
 
 
-def _recorded(log: Floats, begin: int, present: Mask, scale: Scale, offset: ReferenceOffset) -> tuple[LifeRecord, int]:
+def _recorded(
+    log: Floats, begin: int, present: Mask, scale: Scale, offset: ReferenceOffset
+) -> tuple[LifeRecord, int]:
     """Return the record of a log, of any length, and the number of the segment after it."""
     tracked = OffsetTracker.begin(log.shape[1])
     root: list[Array] = []
@@ -137,7 +144,9 @@ def _recorded(log: Floats, begin: int, present: Mask, scale: Scale, offset: Refe
         frames = log[first : first + SEGMENT]
         tracked = tracked.extend(frames, scale, present, offset)
         loads = tracked.on(scale).root_load(tracked.off(frames))
-        one = LifeRecord().extend(np.where(present, loads, np.float32(0)), frames, begin + first // SEGMENT)
+        one = LifeRecord().extend(
+            np.where(present, loads, np.float32(0)), frames, begin + first // SEGMENT
+        )
         root += one.root
         readings += one.readings
         number += one.number
@@ -145,7 +154,8 @@ def _recorded(log: Floats, begin: int, present: Mask, scale: Scale, offset: Refe
 
 
 class _Fit:
-    """Fits the model by cross-fitting: tables, units and factors from folds that the predictions were not fitted on."""
+    """Fits the model by cross-fitting: tables, units and factors from folds that the predictions
+    were not fitted on."""
 
     def __init__(self, folds: list[_Fold], layout: SensorLayout, tolerance: float) -> None:
         self._folds = folds
@@ -158,7 +168,8 @@ class _Fit:
         self._full = self._means(every.loads)
         self._used = (every.loads > UNLOADED).sum(axis=0) >= FEWEST
         self._held_out = [
-            self._means(_joined([other for j, other in enumerate(folds) if j != k]).loads) for k in range(len(folds))
+            self._means(_joined([other for j, other in enumerate(folds) if j != k]).loads)
+            for k in range(len(folds))
         ]
 
     def _means(self, loads: Array) -> tuple[ConditionalMean, ...]:
@@ -189,7 +200,9 @@ class _Fit:
         )
         seen = [self._expected(replace(blank, means=means), fold) for means, fold in self._cross()]
         predicted = self._predicted_edges([expected for expected, _ in seen])
-        counts = np.stack([self._counts(fold, *of, predicted) for fold, of in zip(self._folds, seen, strict=True)])
+        counts = np.stack(
+            [self._counts(fold, *of, predicted) for fold, of in zip(self._folds, seen, strict=True)]
+        )
         total = counts.sum(axis=0)
         shrinkage = self._shrinkage(counts, total)
         fitted = replace(blank, predicted=predicted, table=_table(total, shrinkage))
@@ -197,7 +210,10 @@ class _Fit:
             replace(fitted, means=means, table=_table(total - counts[k], shrinkage))
             for k, (means, _) in enumerate(self._cross())
         ]
-        by_unit = [self._independent(model, fold) for model, fold in zip(held_out, self._folds, strict=True)]
+        by_unit = [
+            self._independent(model, fold)
+            for model, fold in zip(held_out, self._folds, strict=True)
+        ]
         independent = self._independent_share(held_out)
         errs, of_others = self._errs(by_unit, independent)
         fitted = self._beside(replace(fitted, independent=independent, errs=errs))
@@ -205,7 +221,8 @@ class _Fit:
             replace(of, independent=independent, errs=own, equal=fitted.equal, amid=fitted.amid)
             for of, own in zip(held_out, of_others, strict=True)
         ]
-        # First with the dead cells known: else healthy cells would be taken for dead ones, and mislead the others.
+        # First with the dead cells known: else healthy cells would be taken for dead ones, and
+        # mislead the others.
         reached, units = self._reached(held_out, informed=True)
         held_out = [replace(of, reached=reached, units=units) for of in held_out]
         reached = np.maximum(reached, self._reached(held_out, informed=False)[0])
@@ -218,7 +235,8 @@ class _Fit:
         return list(zip(self._held_out, self._folds, strict=True))
 
     def _beside(self, model: LifeModel) -> LifeModel:
-        """Return the model with how often healthy cells read as one beside them, or as the mean of these."""
+        """Return the model with how often healthy cells read as one beside them, or as the mean of
+        these."""
         d = len(self._present)
         same = np.zeros(model.equal.shape)
         loaded = np.zeros(model.equal.shape)
@@ -242,7 +260,8 @@ class _Fit:
         return replace(model, equal=equal, amid=amid)
 
     def _expected(self, model: LifeModel, fold: _Fold) -> tuple[Floats, NDArray[np.intp]]:
-        """Return predictions in which some cells are unknown, as in a log with dead ones, and levels of loads beside.
+        """Return predictions in which some cells are unknown, as in a log with dead ones, and
+        levels of loads beside.
 
         Both are ``[n, D]``.
         """
@@ -267,10 +286,15 @@ class _Fit:
         )
         return edges
 
-    def _counts(self, fold: _Fold, expected: Floats, near: NDArray[np.intp], predicted: Floats) -> Floats:
-        """Return how often each cell had each level in each context, ``[D, M, K]``; ``[1, M, K]`` of a large array."""
+    def _counts(
+        self, fold: _Fold, expected: Floats, near: NDArray[np.intp], predicted: Floats
+    ) -> Floats:
+        """Return how often each cell had each level in each context, ``[D, M, K]``; ``[1, M, K]``
+        of a large array."""
         around = len(BESIDE) + 1
-        m, k, d = (len(predicted) + 1) * around, len(self._levels) + 1, len(self._present)
+        m = (len(predicted) + 1) * around
+        k = len(self._levels) + 1
+        d = len(self._present)
         context = levels_of(expected, predicted).astype(np.intp) * around + near
         level = levels_of(fold.loads, self._levels)
         tables = d if self._present.sum() <= MOST_CELLS else 1
@@ -279,7 +303,8 @@ class _Fit:
         return counted.astype(np.float64).reshape(tables, m, k)
 
     def _shrinkage(self, counts: Floats, total: Floats) -> Floats:
-        """Return the pseudo-count of each cell, ``[tables, 1, 1]``: the likeliest for folds that it has not seen."""
+        """Return the pseudo-count of each cell, ``[tables, 1, 1]``: the likeliest for folds that it
+        has not seen."""
         likelihood = []
         for shrinkage in _SHRINKAGES:
             each = [(of * _table(total - of, shrinkage)).sum(axis=(1, 2)) for of in counts]
@@ -289,16 +314,18 @@ class _Fit:
         return found
 
     def _independent(self, model: LifeModel, fold: _Fold) -> Floats:
-        """Return the log ratio independent of the others : healthy of each unit of a fold, ``[units, D]``."""
+        """Return the log ratio independent of the others : healthy of each unit of a fold,
+        ``[units, D]``."""
         log = LifeLog(fold.loads, fold.readings, fold.piece, model, self._layout.beside)
         healthy, _ = finished(log.healthy(self._present))
         return log.by_unit(log.own - healthy)
 
     def _independent_share(self, held_out: list[LifeModel]) -> float:
-        """Return the share of the units that count as independent of each other: those of one contact are alike.
+        """Return the share of the units that count as independent of each other: those of one
+        contact are alike.
 
-        It is the variance of m independent units over that of the sum of m successive ones, with m so large that
-        successive sums are hardly correlated.
+        It is the variance of m independent units over that of the sum of m successive ones, with m
+        so large that successive sums are hardly correlated.
 
         Args:
             held_out: a model for each fold, fitted to the others.
@@ -321,7 +348,8 @@ class _Fit:
             m *= 2
 
     def _errs(self, ratios: list[Floats], independent: float) -> tuple[Floats, list[Floats]]:
-        """Return the share of units in which each healthy cell contradicts, ``[D]``, and the same without each fold.
+        """Return the share of units in which each healthy cell contradicts, ``[D]``, and the same
+        without each fold.
 
         The share of all cells is the likeliest of a grid; that of a cell has it as prior.
 
@@ -330,24 +358,34 @@ class _Fit:
             independent: share of the units that count as independent of each other.
         """
         every = np.concatenate(ratios)[:, self._present].ravel()
-        usual = max(_CONTAMINATIONS, key=lambda e: float(np.logaddexp(np.log1p(-e), np.log(e) + every).sum()))
-        erred = independent * np.stack([expit(ratio + np.log(usual / (1 - usual))).sum(axis=0) for ratio in ratios])
+        usual = max(
+            _CONTAMINATIONS,
+            key=lambda e: float(np.logaddexp(np.log1p(-e), np.log(e) + every).sum()),
+        )
+        erred = independent * np.stack(
+            [expit(ratio + np.log(usual / (1 - usual))).sum(axis=0) for ratio in ratios]
+        )
         units = independent * np.array([len(ratio) for ratio in ratios])[:, None]
 
         def share(erred: Floats, units: Floats) -> Floats:
             found: Floats = (erred.sum(axis=0) + usual * _OWN_ERRS) / (units.sum() + _OWN_ERRS)
             # The rule of three: what was never seen in n units.
             found = np.clip(found, max(usual / 2, 3 / units.sum()), MAJORITY / 2)
-            return np.where(self._used, found, MAJORITY / 2)  # what the reference hardly loaded is hardly known
+            # what the reference hardly loaded is hardly known
+            return np.where(self._used, found, MAJORITY / 2)
 
-        without = [share(np.delete(erred, k, axis=0), np.delete(units, k, axis=0)) for k in range(len(ratios))]
+        without = [
+            share(np.delete(erred, k, axis=0), np.delete(units, k, axis=0))
+            for k in range(len(ratios))
+        ]
         return share(erred, units), without
 
     def _reached(self, held_out: list[LifeModel], *, informed: bool) -> tuple[Floats, int]:
-        """Return the evidence ``[5, D]`` that healthy cells reach in logs with dead ones, and the units of these logs.
+        """Return the evidence ``[5, D]`` that healthy cells reach in logs with dead ones, and the
+        units of these logs.
 
-        Cells where contacts end are predicted worse than others: the limit is the highest evidence of the cell itself,
-        and at least what all but a few of the cells reach.
+        Cells where contacts end are predicted worse than others: the limit is the highest evidence
+        of the cell itself, and at least what all but a few of the cells reach.
 
         Args:
             held_out: a model for each fold, fitted to the others.
@@ -384,14 +422,16 @@ class _Fit:
 def _logs(fold: _Fold) -> list[LifeRecord]:
     """Return the pieces as records of logs, each of as many segments as are kept of a log."""
     numbers, begins = np.unique(fold.piece // (SEGMENT // PIECE), return_index=True)
-    loads, readings = np.split(fold.loads, begins[1:]), np.split(fold.readings, begins[1:])
+    loads = np.split(fold.loads, begins[1:])
+    readings = np.split(fold.readings, begins[1:])
     return [
         LifeRecord(
-            tuple(loads[first : first + KEPT]), tuple(readings[first : first + KEPT]),
+            tuple(loads[first : first + KEPT]),
+            tuple(readings[first : first + KEPT]),
             tuple(numbers[first : first + KEPT].tolist()),
         )
         for first in range(0, len(numbers), KEPT)
-    ]  # fmt: skip
+    ]
 
 
 def _edges(values: Array, n: int) -> Floats:
@@ -399,11 +439,14 @@ def _edges(values: Array, n: int) -> Floats:
     loaded = values[values > UNLOADED]
     if not len(loaded):
         return np.array([UNLOADED, 0.5])
-    return np.unique(np.append(UNLOADED, np.quantile(loaded, np.linspace(0, 1, n)[1:-1]))).astype(np.float64)
+    return np.unique(np.append(UNLOADED, np.quantile(loaded, np.linspace(0, 1, n)[1:-1]))).astype(
+        np.float64
+    )
 
 
 def _table(counts: Floats, shrinkage: Floats | float) -> Array:
-    """Return log P(level | prediction) of each cell, ``[D, M, K]``, shrunk towards that of all cells."""
+    """Return log P(level | prediction) of each cell, ``[D, M, K]``, shrunk towards that of all
+    cells."""
     pooled = counts.sum(axis=0)
     usual = pooled.sum(axis=0) / pooled.sum()
     shared = (pooled + usual) / (pooled.sum(axis=1, keepdims=True) + 1)

@@ -1,4 +1,5 @@
-"""What healthy cells do, given the others: a linear prediction, and a table P(observed level | predicted level)."""
+"""What healthy cells do, given the others: a linear prediction, and a table P(observed level |
+predicted level)."""
 
 from __future__ import annotations
 
@@ -27,9 +28,16 @@ COPY = FAULTS.index("copy")
 UNLOADED = 1e-3  # root load up to which a piece counts as unloaded
 THRESHOLD = 9.0  # evidence of a certain fault: with its prior, P(faulty) = 0.994
 GUESS = 0.005  # of a uniform distribution over the levels, in any table: models err
-_UNSEEN = 3.0  # evidence that a healthy cell may reach in a log as long as those of the reference, though none did
+# evidence that a healthy cell may reach in a log as long as those of the reference, though none did
+_UNSEEN = 3.0
 UNIT = 2  # pieces: a size
-AMID = (0.02, 0.08, 0.25, 0.6)  # distances from the mean of the cells beside one, over their spread, between levels
+# distances from the mean of the cells beside one, over their spread, between levels
+AMID = (
+    0.02,
+    0.08,
+    0.25,
+    0.6,
+)
 _STEPS = 4  # of a prediction: a size
 BESIDE = (0.01, 0.34, 0.67, 0.99)  # shares of the cells beside one that are loaded, between levels
 
@@ -68,10 +76,11 @@ class ConditionalMean:
         return self.inputs[self.place]
 
     def predict(self, loads: Array, known: Mask) -> Floats:
-        """Return the expected loads ``[n, outputs]``, given those of the ``known`` cells (bool ``[D]``) but the cell.
+        """Return the expected loads ``[n, outputs]``, given those of the ``known`` cells (bool
+        ``[D]``) but the cell.
 
-        With K the known cells, Q the inverse of their covariance, and unknown cells as the known ones predict them,
-        E[z_i | K without i] = z_i - (P z)_i / Q_ii.
+        With K the known cells, Q the inverse of their covariance, and unknown cells as the known
+        ones predict them, E[z_i | K without i] = z_i - (P z)_i / Q_ii.
         """
         z = _standardised(loads[:, self.inputs], self.mean, self.scale)
         known = known[self.inputs]
@@ -96,7 +105,8 @@ def _standardised(loads: NDArray[np.floating], mean: Floats, scale: Floats) -> F
 
 
 def levels_of(values: NDArray[np.floating], edges: Floats) -> Levels:
-    """Return the number of the ``edges`` (ascending) that each value reaches: ``np.searchsorted(side="right")``."""
+    """Return the number of the ``edges`` (ascending) that each value reaches:
+    ``np.searchsorted(side="right")``."""
     level = np.zeros(values.shape, np.uint8)
     for edge in edges:
         level += values >= edge
@@ -104,7 +114,8 @@ def levels_of(values: NDArray[np.floating], edges: Floats) -> Levels:
 
 
 def loaded_beside(loads: Array, known: Mask, beside: Cells) -> Levels:
-    """Return the level of the share of the known cells beside each cell that are loaded, ``[n, D]``.
+    """Return the level of the share of the known cells beside each cell that are loaded,
+    ``[n, D]``.
 
     Args:
         loads: root loads ``[n, D]``.
@@ -132,15 +143,22 @@ class LifeModel:
         means: predictions, for each tile; each cell is an output of one.
         levels: float ``[K - 1]``, root loads between the levels that are observed.
         predicted: float ``[M - 1]``, the same of those that are predicted.
-        table: float ``[D, M, K]``, log P(observed level | context) of each healthy cell; ``[1, M, K]``: of all.
-        equal: float ``[D, 8]``, probability that a healthy cell reads the same as one beside it throughout a unit.
-        amid: float ``[D, 5]``, probability of each level of how far a healthy cell reads from the mean beside it.
-        independent: share of the units that count as independent of each other: those of one contact are alike.
+        table: float ``[D, M, K]``, log P(observed level | context) of each healthy cell;
+            ``[1, M, K]``: of all.
+        equal: float ``[D, 8]``, probability that a healthy cell reads the same as one beside it
+            throughout a unit.
+        amid: float ``[D, 5]``, probability of each level of how far a healthy cell reads from the
+            mean beside it.
+        independent: share of the units that count as independent of each other: those of one
+            contact are alike.
         errs: float ``[D]``, share e of the units.
-        tolerance: a cell whose readings lie within this of its highest one reads it, in the layout's unit.
-        reached: float ``[5, D]``, evidence that a healthy cell reaches in a log, for each of the ``FAULTS``.
+        tolerance: a cell whose readings lie within this of its highest one reads it, in the
+            layout's unit.
+        reached: float ``[5, D]``, evidence that a healthy cell reaches in a log, for each of the
+            ``FAULTS``.
         units: number of units of these logs.
-        counts: factor on all evidence, 0 to 1: a reference of few units contains few unusual contacts.
+        counts: factor on all evidence, 0 to 1: a reference of few units contains few unusual
+            contacts.
     """
 
     means: tuple[ConditionalMean, ...]
@@ -168,9 +186,14 @@ class LifeModel:
             raise ValueError(f"expected reached [{len(FAULTS)}, {layout.n_cells}]")
         if self.errs.shape != (layout.n_cells,):
             raise ValueError(f"expected errs [{layout.n_cells}]")
-        if self.equal.shape != layout.beside.shape or self.amid.shape != (layout.n_cells, len(AMID) + 1):
+        if self.equal.shape != layout.beside.shape or self.amid.shape != (
+            layout.n_cells,
+            len(AMID) + 1,
+        ):
             raise ValueError(f"expected equal and amid of {layout}")
-        probabilities = np.concatenate([[self.independent], self.errs, self.equal.ravel(), self.amid.ravel()])
+        probabilities = np.concatenate(
+            [[self.independent], self.errs, self.equal.ravel(), self.amid.ravel()]
+        )
         if not ((probabilities > 0) & (probabilities <= 1)).all():
             raise ValueError("expected probabilities between 0 and 1")
 
@@ -180,14 +203,18 @@ class LifeModel:
         return (len(self.predicted) + 1) * (len(BESIDE) + 1)
 
     def expected(self, loads: Array, known: Mask) -> Floats:
-        """Return the expected root loads ``[n, D]``, given those of the ``known`` cells (bool ``[D]``)."""
+        """Return the expected root loads ``[n, D]``, given those of the ``known`` cells (bool
+        ``[D]``)."""
         found = np.zeros(loads.shape)
         for mean in self.means:
             found[:, mean.outputs] = mean.predict(loads, known)
         return found
 
-    def contexts(self, loads: Array, known: Mask, beside: Cells) -> Generator[None, None, NDArray[np.intp]]:
-        """Yield between steps; return what the others say of each cell, 0 to M - 1, int ``[n, D]``."""
+    def contexts(
+        self, loads: Array, known: Mask, beside: Cells
+    ) -> Generator[None, None, NDArray[np.intp]]:
+        """Yield between steps; return what the others say of each cell, 0 to M - 1, int
+        ``[n, D]``."""
         level = np.zeros(loads.shape, np.uint8)
         each = -(-len(self.means) // _STEPS)
         for k, mean in enumerate(self.means):
@@ -198,10 +225,12 @@ class LifeModel:
         return level.astype(np.intp) * (len(BESIDE) + 1) + around
 
     def factors(self, units: int) -> Floats:
-        """Return the factors ``[5, D]`` on the evidence in a log of so many units: healthy cells stay below the limit.
+        """Return the factors ``[5, D]`` on the evidence in a log of so many units: healthy cells
+        stay below the limit.
 
-        The evidence against a healthy cell that the model predicts badly grows with the length of the log; a log that
-        is longer than those of the reference may hold contacts that are like none of these.
+        The evidence against a healthy cell that the model predicts badly grows with the length of
+        the log; a log that is longer than those of the reference may hold contacts that are like
+        none of these.
         """
         unseen = np.array([_UNSEEN, 0.0, 0.0, 0.0, 0.0])[:, None]
         reached = np.maximum(self.reached, unseen) * max(1.0, units / self.units)
@@ -214,7 +243,8 @@ class LifeModel:
         return np.exp(self.table.astype(np.float64))
 
     def otherwise(self, gain: float, offset: float, cells: Cells) -> Floats:
-        """Return P(observed level | context) of cells with a gain and an offset (of full scale), ``[cells, M, K]``."""
+        """Return P(observed level | context) of cells with a gain and an offset (of full scale),
+        ``[cells, M, K]``."""
         above = np.append(self.levels, 1.0)
         below = np.append(0.0, self.levels)
         middle = (above + below) / 2

@@ -107,13 +107,16 @@ class LifeLog:
 
     @cached_property
     def weight(self) -> Floats:
-        """Weight of each unit ``[units]``: share of independent ones, over 1 + k with k others of the same loads."""
+        """Weight of each unit ``[units]``: share of independent ones, over 1 + k with k others of
+        the same loads."""
         return finished(self._weighed())
 
     def _weighed(self) -> Generator[None, None, Floats]:
         """Yield between steps; return the weight of each unit."""
         length = np.diff(np.append(self.unit_begins, len(self.loads)))[:, None]
-        novelty = yield from _novelty(np.add.reduceat(self.loads, self.unit_begins, axis=0) / length)
+        novelty = yield from _novelty(
+            np.add.reduceat(self.loads, self.unit_begins, axis=0) / length
+        )
         return self.model.independent * novelty
 
     def healthy(self, known: Mask) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
@@ -126,12 +129,15 @@ class LifeLog:
         table = self.model.probabilities[self.model.of_cell(self._cell)]
         return self.tilted(table, context, self.level), context
 
-    def tilted(self, table: Floats, context: NDArray[np.intp], level: NDArray[np.integer]) -> Floats:
-        """Return log P(level | context) of cells whose levels are as frequent as they are in the log.
+    def tilted(
+        self, table: Floats, context: NDArray[np.intp], level: NDArray[np.integer]
+    ) -> Floats:
+        """Return log P(level | context) of cells whose levels are as frequent as they are in the
+        log.
 
-        Where contacts hardly change, a level is likely because the cell had it before, whatever the others say. The
-        table of healthy cells is tilted, P(l | c) f(l) / sum over l' of P(l' | c) f(l'), with f the frequency in the
-        log over the expected one, within limits.
+        Where contacts hardly change, a level is likely because the cell had it before, whatever the
+        others say. The table of healthy cells is tilted, P(l | c) f(l) / sum over l' of P(l' | c)
+        f(l'), with f the frequency in the log over the expected one, within limits.
 
         Args:
             table: P(level | context) of each cell, ``[D, M, K]``.
@@ -152,7 +158,8 @@ class LifeLog:
         return found
 
     def counted(self, ratio: Floats, cells: Cells | None = None) -> Floats:
-        """Return the evidence of each unit, ``[units, D]``, of the log ratio of each piece, ``[n, D]``.
+        """Return the evidence of each unit, ``[units, D]``, of the log ratio of each piece,
+        ``[n, D]``.
 
         Args:
             cells: int ``[D]``, which cells these are; None: all.
@@ -162,7 +169,8 @@ class LifeLog:
         return found
 
     def by_unit(self, ratio: Floats, cells: Cells | None = None) -> Floats:
-        """Return the sums over the pieces of each unit that were read, ``[units, D]``; arguments as in counted."""
+        """Return the sums over the pieces of each unit that were read, ``[units, D]``; arguments as
+        in counted."""
         if not self._all_read:
             read = self._read if cells is None else self._read[:, cells]
             ratio = np.where(read, ratio, 0.0)
@@ -170,7 +178,8 @@ class LifeLog:
         return summed
 
     def same(self, k: int) -> tuple[Mask, Mask]:
-        """Return in which units a cell and its neighbour k are both loaded, and read the same, ``[units, D]`` each."""
+        """Return in which units a cell and its neighbour k are both loaded, and read the same,
+        ``[units, D]`` each."""
         other = self.beside[:, k]
         loaded = self.level > 0
         either = loaded & loaded[:, other] & (other >= 0)
@@ -181,11 +190,12 @@ class LifeLog:
     def amid(self) -> Generator[None, None, tuple[Mask, Levels]]:
         """Yield between steps; return how far a cell is from the mean of those beside it.
 
-        The distance is relative to the mean distance of the cells beside it from their mean, without the farthest one:
-        it may be dead.
+        The distance is relative to the mean distance of the cells beside it from their mean,
+        without the farthest one: it may be dead.
 
         Returns:
-            The units in which it and some beside it are loaded, bool ``[units, D]``; levels ``[units, D]``.
+            The units in which it and some beside it are loaded, bool ``[units, D]``; levels
+            ``[units, D]``.
         """
         has = self.beside >= 0
         count = np.maximum(has.sum(axis=1), 2)
@@ -211,7 +221,8 @@ class LifeLog:
         return pieces > 0, levels_of(total / np.maximum(pieces, 1), np.asarray(AMID))
 
     def any_by_unit(self, holds: Mask) -> Mask:
-        """Return whether something holds in a piece of each unit, bool ``[units, D]``, of each piece ``[n, D]``."""
+        """Return whether something holds in a piece of each unit, bool ``[units, D]``, of each
+        piece ``[n, D]``."""
         found: Mask = np.logical_or.reduceat(holds, self.unit_begins, axis=0)
         return found
 
@@ -224,9 +235,11 @@ def _counted(numbers: NDArray[np.integer], n: int) -> NDArray[np.intp]:
 
 
 def _novelty(means: Floats) -> Generator[None, None, Floats]:
-    """Yield between steps; return the weight of each unit, ``[units]``, of the mean root loads in it, ``[units, D]``.
+    """Yield between steps; return the weight of each unit, ``[units]``, of the mean root loads in
+    it, ``[units, D]``.
 
-    Two units have the same loads if these differ by less than a tenth, over the cells whose loads change at all.
+    Two units have the same loads if these differ by less than a tenth, over the cells whose loads
+    change at all.
     """
     cells = spread(np.flatnonzero(np.ptp(means, axis=0) > UNLOADED))
     changing = means[:, cells]
@@ -241,7 +254,8 @@ def _novelty(means: Floats) -> Generator[None, None, Floats]:
 
 
 def bounded(ratio: Floats, errs: Floats | float) -> Floats:
-    """Return the log ratio of two models that both err in a share of the units, of their log ``ratio``."""
+    """Return the log ratio of two models that both err in a share of the units, of their log
+    ``ratio``."""
     likelihood = np.exp(np.clip(ratio, -_SATURATED, _SATURATED))
     right = 1 - errs
     found: Floats = np.log((right * likelihood + errs) / (right + errs * likelihood))

@@ -47,9 +47,10 @@ class Life:
         against: bool ``[units, D]``, units against the cell.
         begins: int ``[units]``, number of the first frame of each.
         highest: float, highest reading of a piece, in the layout's unit.
-        floats: bool, certain cells that do not follow the others at all, not with a lower gain either.
-        contradicting: share of the tested cells that are refuted, where it is so large that all are disturbed and none
-            is faulty; else 0.
+        floats: bool, certain cells that do not follow the others at all, not with a lower gain
+            either.
+        contradicting: share of the tested cells that are refuted, where it is so large that all are
+            disturbed and none is faulty; else 0.
     """
 
     evidence: Floats
@@ -92,7 +93,8 @@ class Life:
 
     @classmethod
     def assumed(cls, n_cells: int) -> Life:
-        """Return the evidence where the reference tells nothing: a cell that moves counts as alive."""
+        """Return the evidence where the reference tells nothing: a cell that moves counts as
+        alive."""
         return replace(cls.unknown(n_cells), shown=np.ones(n_cells, bool))
 
     @property
@@ -102,7 +104,8 @@ class Life:
         return found
 
     def mostly_before(self, frame: NDArray[np.intp]) -> Mask:
-        """Return the cells that most units against them contradict before a ``frame`` (int ``[D]``), bool ``[D]``."""
+        """Return the cells that most units against them contradict before a ``frame`` (int
+        ``[D]``), bool ``[D]``."""
         before = (self.against & (self.begins[:, None] < frame)).sum(axis=0)
         found: Mask = before > MAJORITY * self.units
         return found
@@ -111,7 +114,8 @@ class Life:
 class LifeTest:
     """The iterated test.
 
-    What it finds of the log, given the cells that predict others, is kept with the log: a second test of it is short.
+    What it finds of the log, given the cells that predict others, is kept with the log: a second
+    test of it is short.
 
     Args:
         evidence: what the log says; None: it holds too little, and tells nothing.
@@ -183,9 +187,11 @@ class LifeTest:
 
 
 def _without_followers(log: LifeLog, ways: WaysToFail, life: Life) -> Generator[None, None, Life]:
-    """Yield between steps; return the result where cells that follow the others otherwise are not floating.
+    """Yield between steps; return the result where cells that follow the others otherwise are not
+    floating.
 
-    A load that lies still, another specimen, a weak cell: it reads otherwise, but it follows the others.
+    A load that lies still, another specimen, a weak cell: it reads otherwise, but it follows the
+    others.
     """
     cells = np.flatnonzero((life.refuted | life.certain) & (life.kind == 0))
     if not len(cells):

@@ -1,7 +1,7 @@
 """The record of a log for the proof of life: mean root loads of short pieces, in constant memory.
 
-A piece is a quarter of a segment. Segments in which no cell is loaded tell nothing about how cells depend on each other
-and are not kept; of the others the last ones are.
+A piece is a quarter of a segment. Segments in which no cell is loaded tell nothing about how cells
+depend on each other and are not kept; of the others the last ones are.
 """
 
 from __future__ import annotations
@@ -33,17 +33,21 @@ class LifeRecord:
     number: tuple[int, ...] = ()
 
     def extend(self, root: Array, frames: NDArray[np.float64], number: int) -> LifeRecord:
-        """Return the record after one more segment: root loads and readings ``[t, D]``, and its number."""
+        """Return the record after one more segment: root loads and readings ``[t, D]``, and its
+        number."""
         if not root.any():
             return self
         begins = np.arange(0, len(root), PIECE)
-        if len(begins) > 1 and len(root) - begins[-1] < PIECE // 2:  # too short for a piece of its own
+        # too short for a piece of its own
+        if len(begins) > 1 and len(root) - begins[-1] < PIECE // 2:
             begins = begins[:-1]
         length = np.diff(np.append(begins, len(root)))[:, None].astype(np.float32)
         mean_root: Array = (np.add.reduceat(root, begins, axis=0) / length).astype(np.float32)
         mean_reading: Array = (np.add.reduceat(frames, begins, axis=0) / length).astype(np.float32)
         return LifeRecord(
-            (*self.root, mean_root)[-KEPT:], (*self.readings, mean_reading)[-KEPT:], (*self.number, number)[-KEPT:]
+            (*self.root, mean_root)[-KEPT:],
+            (*self.readings, mean_reading)[-KEPT:],
+            (*self.number, number)[-KEPT:],
         )
 
     @property
@@ -60,4 +64,6 @@ class LifeRecord:
     def piece(self) -> NDArray[np.intp]:
         """Number of each piece, counted from the begin of the log, int ``[n]``."""
         first = np.array(self.number, np.intp) * (SEGMENT // PIECE)
-        return np.concatenate([begin + np.arange(len(root)) for begin, root in zip(first, self.root, strict=True)])
+        return np.concatenate(
+            [begin + np.arange(len(root)) for begin, root in zip(first, self.root, strict=True)]
+        )

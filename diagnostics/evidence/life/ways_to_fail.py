@@ -1,4 +1,5 @@
-"""The evidence of each way in which a cell that moves can be dead, see :data:`healthy_table.FAULTS`.
+"""The evidence of each way in which a cell that moves can be dead, see
+:data:`healthy_table.FAULTS`.
 
 Each is a log likelihood ratio fault : healthy, summed over the units of the log.
 """
@@ -21,7 +22,8 @@ from diagnostics.preprocessing.levels import MAJORITY, TESTED
 REFUTED = 4.0  # evidence from which on a cell is replaced
 
 _LAGS = (1, 2, 3, 4)  # pieces
-# Gain and offset, as a share of full scale, of a cell that reads otherwise than it did, but follows the others: a grid.
+# Gain and offset, as a share of full scale, of a cell that reads otherwise than it did, but follows
+# the others: a grid.
 _OTHERWISE = (
     *((gain, 0.0) for gain in (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0)),
     *((1.0, offset) for offset in (0.02, 0.05, 0.1, 0.2, 0.4)),
@@ -78,7 +80,8 @@ class WaysToFail:
         share: float ``[D]``, of the tested units in which a cell that comes and goes was dead.
         against: bool ``[units, D]``, units against the cell.
         highest: float ``[D]``, highest reading of a piece, in the layout's unit.
-        now: float ``[D]``, log ratio independent : healthy since the cell, if it ever was dead, works again.
+        now: float ``[D]``, log ratio independent : healthy since the cell, if it ever was dead,
+            works again.
         healthy: float ``[n, D]``, log P(level | healthy).
         context: int ``[n, D]``, what the others say.
     """
@@ -95,7 +98,8 @@ class WaysToFail:
 
 
 class EvidenceOfLog:
-    """What a log says of each way to fail, given the cells that predict others; the last answers are kept.
+    """What a log says of each way to fail, given the cells that predict others; the last answers
+    are kept.
 
     Args:
         log: the levels of the log.
@@ -146,7 +150,8 @@ def _at_once(readings: int) -> int:
 
 
 def suspicion(log: LifeLog, known: Mask) -> Generator[None, None, Suspicion]:
-    """Yield between steps; return the evidence of the two faults, where only the ``known`` cells predict others."""
+    """Yield between steps; return the evidence of the two faults, where only the ``known`` cells
+    predict others."""
     healthy, context = yield from log.healthy(known)
     yield
     by_unit = log.counted(log.own - healthy)
@@ -200,8 +205,11 @@ def ways_to_fail(
     )
 
 
-def follows_otherwise(log: LifeLog, ways: WaysToFail, cells: Cells) -> Generator[None, None, Floats]:
-    """Yield between steps; return the log ratio follows with another gain or offset : not at all, ``[cells]``."""
+def follows_otherwise(
+    log: LifeLog, ways: WaysToFail, cells: Cells
+) -> Generator[None, None, Floats]:
+    """Yield between steps; return the log ratio follows with another gain or offset : not at all,
+    ``[cells]``."""
     healthy = ways.healthy[:, cells]
     context = ways.context[:, cells]
     level = log.level[:, cells]
@@ -219,7 +227,8 @@ def follows_otherwise(log: LifeLog, ways: WaysToFail, cells: Cells) -> Generator
 
 
 def _dies_and_recovers(dead: Floats) -> tuple[Floats, Floats]:
-    """Return the log evidence ``[D]`` of a cell that dies and recovers, and P(dead) in each unit ``[units, D]``.
+    """Return the log evidence ``[D]`` of a cell that dies and recovers, and P(dead) in each unit
+    ``[units, D]``.
 
     Args:
         dead: float ``[units, D]``, log ratio dead : healthy, bounded.
@@ -241,7 +250,8 @@ def _dies_and_recovers(dead: Floats) -> tuple[Floats, Floats]:
 
 
 def _from_some_unit(dead: Floats) -> Floats:
-    """Return the log evidence ``[D]`` of a cell that is dead from a unit on, half of them from the first."""
+    """Return the log evidence ``[D]`` of a cell that is dead from a unit on, half of them from the
+    first."""
     before = np.cumsum(dead, axis=0)
     later = logsumexp(before[-1] - before, axis=0) - np.log(len(dead))
     found: Floats = np.logaddexp(before[-1], later) - np.log(2)
@@ -257,7 +267,8 @@ def _up_to_some_unit(dead: Floats) -> Floats:
 
 
 def _since_it_works(dead: Floats) -> Floats:
-    """Return the log ratio dead : healthy ``[D]`` after the unit up to which a cell was most likely dead, if any."""
+    """Return the log ratio dead : healthy ``[D]`` after the unit up to which a cell was most likely
+    dead, if any."""
     before = np.cumsum(dead, axis=0)
     found: Floats = before[-1] - np.maximum(before.max(axis=0), 0.0)
     return found
@@ -275,7 +286,8 @@ def _late(log: LifeLog, seen: Suspicion, lag: int) -> Floats:
 
 
 def _clamped(log: LifeLog, context: NDArray[np.intp]) -> Floats:
-    """Return the evidence ``[D]`` that a cell is clamped: any higher load explains its highest reading."""
+    """Return the evidence ``[D]`` that a cell is clamped: any higher load explains its highest
+    reading."""
     model = log.model
     limit = log.readings.max(axis=0)
     piece, cell = np.nonzero((log.readings >= limit - model.tolerance) & (log.level > 0))
@@ -290,7 +302,8 @@ def _clamped(log: LifeLog, context: NDArray[np.intp]) -> Floats:
 
 
 def _alike(log: LifeLog) -> Generator[None, None, tuple[Floats, ...]]:
-    """Yield between steps; return the evidence ``[D]`` that a cell repeats each of those beside it, and their mean."""
+    """Yield between steps; return the evidence ``[D]`` that a cell repeats each of those beside it,
+    and their mean."""
     errs = log.model.errs
     of_different = bounded(np.log(errs), errs)
     evidence = []
@@ -299,7 +312,9 @@ def _alike(log: LifeLog) -> Generator[None, None, tuple[Floats, ...]]:
         of_same = bounded(-np.log(log.model.equal[:, k]), errs)
         either, same = log.same(k)
         n_same = same.sum(axis=0)
-        found = log.model.independent * (n_same * of_same + (either.sum(axis=0) - n_same) * of_different)
+        found = log.model.independent * (
+            n_same * of_same + (either.sum(axis=0) - n_same) * of_different
+        )
         evidence.append(np.where(other >= 0, found, -np.inf))
         if k % each == 0:
             yield
@@ -310,10 +325,11 @@ def _alike(log: LifeLog) -> Generator[None, None, tuple[Floats, ...]]:
 def _copies(
     log: LifeLog, known: Mask, seen: Suspicion, alike: Sequence[Floats]
 ) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
-    """Yield between steps; return the evidence ``[D]`` that a cell repeats one beside it, and which, int ``[D]``.
+    """Yield between steps; return the evidence ``[D]`` that a cell repeats one beside it, and
+    which, int ``[D]``.
 
-    Or the mean of those beside it: -1. Either cell of two that read the same may be the copy: the one that fits worse
-    to the others, without both.
+    Or the mean of those beside it: -1. Either cell of two that read the same may be the copy: the
+    one that fits worse to the others, without both.
     """
     evidence = [*alike[:-1], _unless_misled(alike[-1], log, seen)]
     cell = np.arange(len(known))
@@ -336,7 +352,8 @@ def _copies(
 
 
 def _mean_of_others(log: LifeLog) -> Generator[None, None, Floats]:
-    """Yield between steps; return the evidence ``[D]`` that a cell reads the mean of those beside it."""
+    """Yield between steps; return the evidence ``[D]`` that a cell reads the mean of those beside
+    it."""
     some, level = yield from log.amid()
     healthy = log.model.amid[np.arange(level.shape[1]), level]
     ratio = np.where(some, np.log(np.asarray(_AMID)[level] / healthy), 0.0)
@@ -345,7 +362,8 @@ def _mean_of_others(log: LifeLog) -> Generator[None, None, Floats]:
 
 
 def _unless_misled(evidence: Floats, log: LifeLog, seen: Suspicion) -> Floats:
-    """Return the evidence of a mean, where none of the cells beside one is refuted: else their mean is unknown."""
+    """Return the evidence of a mean, where none of the cells beside one is refuted: else their mean
+    is unknown."""
     plain = np.maximum(seen.independent, seen.intermittent)
     worse = seen.refuted(log)[log.beside] & (plain[log.beside] > plain[:, None])
     misled = ((log.beside >= 0) & worse).any(axis=1)

@@ -1,4 +1,5 @@
-"""Starts the node: ``ros2 launch adaptfault_ros tactile.launch.py bundle:=/home/robot/robot.bundle``."""
+"""Starts the node: ``ros2 launch adaptfault_ros tactile.launch.py
+bundle:=/home/robot/robot.bundle``."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
@@ -25,8 +26,13 @@ PARAMETERS = {
 
 def generate_launch_description() -> LaunchDescription:
     """Return the node with one launch argument a parameter."""
-    arguments = [DeclareLaunchArgument(name, default_value=value) for name, (value, _) in PARAMETERS.items()]
+    arguments = [
+        DeclareLaunchArgument(name, default_value=value) for name, (value, _) in PARAMETERS.items()
+    ]
     values = {
-        name: ParameterValue(LaunchConfiguration(name), value_type=kind) for name, (_, kind) in PARAMETERS.items()
+        name: ParameterValue(LaunchConfiguration(name), value_type=kind)
+        for name, (_, kind) in PARAMETERS.items()
     }
-    return LaunchDescription([*arguments, Node(package="adaptfault_ros", executable="node", parameters=[values])])
+    return LaunchDescription(
+        [*arguments, Node(package="adaptfault_ros", executable="node", parameters=[values])]
+    )

@@ -1,0 +1,1 @@
+"""The one folder that a robot carries: versions, the pointer to the active one, and its journal."""

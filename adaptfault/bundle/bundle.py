@@ -1,0 +1,454 @@
+"""The bundle: the folder with everything that one robot needs. Opening it and predicting need no
+torch."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, suppress
+from dataclasses import replace
+from datetime import datetime, timezone
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+from uuid import uuid4
+
+from adaptfault.bundle.checksummed_json import (
+    Damaged,
+    damage,
+    decoding,
+    hash_files,
+    read_with_copy,
+    reading,
+    sync,
+    sync_tree,
+    write_with_copy,
+)
+from adaptfault.bundle.journal import Entry, Journal
+from adaptfault.bundle.known_faults import KnownFaults
+from adaptfault.bundle.lock import PATIENCE, locked
+from adaptfault.bundle.parts import Parts, split_validation
+from adaptfault.bundle.pointer import NAME as POINTER
+from adaptfault.bundle.pointer import SCHEMA as POINTER_SCHEMA
+from adaptfault.bundle.pointer import STARTS, Pointer
+from adaptfault.bundle.signature import verify
+from adaptfault.bundle.versions import Version, Versions
+from adaptfault.data.atomic import make_folder
+from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
+
+if TYPE_CHECKING:
+    from adaptfault.adaptation.adapter import Adapter
+    from adaptfault.adaptation.result import Adaptation
+    from adaptfault.data.calibration import Calibration
+    from adaptfault.data.windows import Windows
+    from adaptfault.imputation.restorer import Restorer
+    from adaptfault.models.any_model import AnyModel
+    from adaptfault.models.network import TactileTransformer
+
+SCHEMA = "adaptfault.bundle/1"
+
+_ABOUT = "bundle.json"
+_PARTS = "parts"
+_MAINTENANCE_LOCK = "maintenance.lock"
+_STATE_LOCK = "state.lock"
+
+PROCESS = uuid4().hex  # identifies this process in the count of starts
+_log = logging.getLogger(__name__)
+# names that atomic_write makes
+_TEMPORARY = re.compile(r"\.(bundle|current|journal)\..*\.[a-z0-9_]{8}")
+_ABANDONED = 3600  # seconds
+# seconds that a confirmation, which runs in the robot's loop, waits for another process
+_IN_LOOP = 0.1
+_KEPT = 5  # latest versions that stay on the disk, besides the fault-free one
+
+
+class Bundle:
+    """Network, layout, calibration, healthy reference, stored windows, versions and history of one
+    robot's sensor.
+
+    The folder::
+
+        bundle.json           the layout, the classes, and the hash of each part (and a copy)
+        parts/adapter         fault-free model and windows, from which every adaptation starts
+        parts/reference       fitted healthy model of the self-diagnosis
+        parts/check           held-out windows on which a new version is compared
+        parts/calibration.csv
+        versions/0001, ...    one model for one fault set each; 0001 is the fault-free one
+        current.json          which version runs (and a copy)
+        journal.sqlite        recordings used, maintenance runs, known faults
+
+    Parts and versions are written once, into a temporary folder that is renamed after all data is
+    synced. Every load checks the hashes. Where the active version is damaged, the last valid one
+    before it runs.
+
+    Args:
+        path: an existing bundle.
+        keys: PEM files of public ed25519 keys. The bundle must be signed by one of them
+            (:func:`adaptfault.sign_bundle`), and only signed versions run, and those that this
+            object wrote. None: signatures are not checked.
+        least_serial: smallest serial number of the signature that is accepted.
+
+    Raises:
+        FileNotFoundError: the folder holds no bundle.
+        Damaged: both ``bundle.json`` and its copy fail their checksum.
+        Untrusted: no given key signed the bundle, or it is older than ``least_serial``.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        keys: Sequence[str | os.PathLike[str]] | None = None,
+        least_serial: int = 0,
+    ) -> None:
+        self.path = Path(path)
+        with reading(self.path):
+            there = any((self.path / name).is_file() for name in (_ABOUT, "bundle.copy.json"))
+        if not there:
+            raise FileNotFoundError(
+                f"{self.path}: expected a bundle, a folder with {_ABOUT}; adaptfault train --out"
+                " X.bundle makes one"
+            )
+        self.about: dict[str, Any] = read_with_copy(self.path / _ABOUT, SCHEMA)
+        with decoding(self.path / _ABOUT):
+            self.layout = SensorLayout.from_dict(self.about["layout"])
+            self.class_names: tuple[str, ...] = tuple(map(str, self.about["class_names"]))
+            self.parts = Parts(self.path / _PARTS, dict(self.about["parts"]))
+        self.versions = Versions(self.path / "versions")
+        self.journal = Journal(self.path)
+        if keys is not None:
+            self.versions.signed = verify(self.path, self.about, keys, least_serial)
+
+    @classmethod
+    def open(
+        cls,
+        path: str | Path,
+        *,
+        keys: Sequence[str | os.PathLike[str]] | None = None,
+        least_serial: int = 0,
+    ) -> Bundle:
+        """Open a bundle; see the class."""
+        return cls(path, keys=keys, least_serial=least_serial)
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        model: TactileTransformer | AnyModel,
+        adapter: Adapter,
+        diagnoser: SelfDiagnosis,
+        *,
+        check: Windows | None = None,
+        class_names: Sequence[str] = (),
+        calibration: Calibration | None = None,
+        head: Literal["auto", "linear"] = "auto",
+    ) -> Bundle:
+        """Write a new bundle from a fault-free model, its adapter and a fitted diagnoser.
+
+        Args:
+            path: folder to create; must not exist.
+            model: the fault-free model; version 1 is this model, see ``head``.
+            adapter: of the same model; its windows are stored, at most 20 MB of them.
+            diagnoser: fitted on fault-free recordings.
+            check: held-out fault-free labelled windows, as the test windows of ``split``, on which
+                new versions are compared with the running one. None takes half of the adapter's
+                validation windows.
+            class_names: one name a class, or none.
+            calibration: from raw counts to the layout's unit, if recordings are raw counts.
+            head: of version 1. "auto": fitted in closed form where it improves validation, as for a
+                repair (:attr:`~adaptfault.adaptation.adapter.Adapter.healthy`). "linear": the
+                model's own.
+
+        Raises:
+            FileExistsError: ``path`` exists.
+            ValueError: the parts have different array shapes, the diagnoser is not fitted, or
+                ``head`` is unknown.
+        """
+        path = Path(path)
+        _check_parts(path, model, adapter, diagnoser, class_names, head)
+        make_folder(path.parent)
+        new = path.with_name(f".{path.name}.unfinished")
+        shutil.rmtree(new, ignore_errors=True)  # left by a crash
+        if check is None:
+            adapter, check = split_validation(adapter)
+        Parts.write(new / _PARTS, adapter, diagnoser, check, calibration, _graph(adapter))
+        about: dict[str, Any] = {
+            "schema": SCHEMA,
+            "layout": model.layout.to_dict(),
+            "class_names": list(class_names),
+            "created": now(),
+            "parts": hash_files(new / _PARTS),
+        }
+        write_with_copy(new / _ABOUT, about)
+        bundle = cls(new)
+        Pointer(active=1).write(new)
+        first = (
+            adapter.healthy
+            if head == "auto"
+            else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
+        )
+        bundle.write_version(first, {"reason": "the fault-free model"})
+        sync_tree(new)
+        os.replace(new, path)
+        sync(path.parent)
+        return cls(path)
+
+    # The active version.
+
+    @property
+    def pointer(self) -> Path:
+        """The file that names the active version; replaced at every switch."""
+        return self.path / POINTER
+
+    def active(self) -> Version:
+        """Return the active version; where it is damaged, the last valid one before it.
+
+        Raises:
+            Damaged: no version can be read.
+        """
+        problems = []
+        for number in self._candidates():
+            try:
+                return self.versions[number]
+            except (FileNotFoundError, Damaged) as error:
+                problems.append(str(error))
+        raise Damaged(f"{self.path} holds no version that can be read: {problems[0]}")
+
+    def _candidates(self) -> Iterator[int]:
+        """Yield the number of the active version, then those that replace it, the best first."""
+        pointer = Pointer.read(self.path)
+        first = dict.fromkeys((pointer.active, *pointer.fallbacks))
+        yield from first
+        for number in reversed(self.versions.numbers):
+            if number < pointer.active and number not in first:
+                yield number
+
+    def begin(self, starter: str = PROCESS) -> Version:
+        """Return the version to run and count the start while that version is on probation.
+
+        A version that was started twice without :meth:`confirm` is replaced by the one before it.
+
+        Args:
+            starter: identifies the caller. Consecutive starts by the same starter count once,
+                because one process may serve several devices.
+        """
+        try:
+            with locked(self.path / _STATE_LOCK):
+                pointer = Pointer.read(self.path)
+                after = pointer.started(starter)
+                if after.starts > STARTS and pointer.fallbacks:
+                    self._fall_back(
+                        pointer,
+                        f"version {pointer.active} was started {STARTS} times and never confirmed",
+                    )
+                elif after != pointer:
+                    after.write(self.path)
+        except (
+            OSError
+        ) as error:  # a full or read-only disk, or a stopped process, must not stop the prediction
+            _log.warning("%s cannot be written, so this start is not counted: %s", self.path, error)
+        return self.active()
+
+    def confirm(self) -> None:
+        """End the probation of the active version.
+
+        Raises:
+            OSError: the bundle cannot be written, or another process holds it; the version stays on
+                probation.
+        """
+        if not Pointer.read(self.path).probation:
+            return
+        with locked(self.path / _STATE_LOCK, patience=_IN_LOOP):
+            pointer = Pointer.read(self.path)
+            if pointer.probation:
+                entry = Entry(now(), "confirmed", {"version": pointer.active})
+                self._switch(pointer, pointer.confirmed(), entry, patience=_IN_LOOP)
+
+    def deploy(self, number: int, entry: Entry | None = None) -> None:
+        """Make a version the active one, on probation, and journal it: both, or neither.
+
+        Args:
+            number: of the version.
+            entry: of the journal; None: it is not journalled.
+
+        Raises:
+            OSError: the bundle cannot be written, or another process holds it.
+        """
+        with locked(self.path / _STATE_LOCK):
+            pointer = Pointer.read(self.path)
+            if entry is None:
+                pointer.deployed(number).write(self.path)
+            else:
+                self._switch(pointer, pointer.deployed(number), entry)
+
+    def rollback(self) -> Version:
+        """Return to the previous version. The fault set of the rejected one is not deployed again.
+
+        Raises:
+            ValueError: there is no previous version.
+            OSError: the bundle cannot be written, or another process holds it.
+        """
+        with locked(self.path / _STATE_LOCK):
+            pointer = Pointer.read(self.path)
+            self._fall_back(pointer, f"version {pointer.active} was rolled back")
+        return self.active()
+
+    def problems(self, *, repair: bool = True) -> list[str]:
+        """Check every file and return the damage; ``repair`` restores what has a copy.
+
+        Raises:
+            OSError: a file cannot be read or written now.
+        """
+        problems = damage(self.pointer, POINTER_SCHEMA, repair=repair) + damage(
+            self.path / _ABOUT, SCHEMA, repair=repair
+        )
+        problems += self.journal.damage(repair=repair)
+        if repair:
+            self._settle()
+        try:
+            self.parts.check(repair=repair)
+        except Damaged as error:
+            problems.append(str(error))
+        for number in self.versions.numbers:
+            try:
+                self.versions[number]
+            except (Damaged, FileNotFoundError) as error:
+                problems.append(str(error))
+        return problems
+
+    def sweep(self) -> None:
+        """Remove temporary files that crashes left, once they are older than any write."""
+        for path in self.path.glob(".*"):
+            with suppress(OSError):  # another process may remove it, too
+                if (
+                    _TEMPORARY.fullmatch(path.name)
+                    and time.time() - path.stat().st_mtime > _ABANDONED
+                ):
+                    path.unlink()
+
+    def _fall_back(self, pointer: Pointer, reason: str) -> None:
+        try:
+            rejected = self.versions[pointer.active].fault_set.cells
+        except (FileNotFoundError, Damaged):
+            rejected = ()
+        after = pointer.fallen_back(rejected)
+        document = {"from": pointer.active, "to": after.active, "reason": reason}
+        self._switch(pointer, after, Entry(now(), "rollback", document))
+
+    def _switch(
+        self, before: Pointer, after: Pointer, entry: Entry, patience: float = PATIENCE
+    ) -> None:
+        """Replace the pointer and journal the entry: both, or neither. Needs the lock of the
+        state."""
+        self.journal.prepare(entry, before.entry)
+        replace(after, entry=entry.key).write(self.path)
+        self.journal.settle(entry.key, patience=patience)
+
+    def _settle(self) -> None:
+        """Move entries that wait into the journal, as after a crash."""
+        if self.journal.waits:
+            with locked(self.path / _STATE_LOCK):
+                self.journal.settle(Pointer.read(self.path).entry)
+
+    def diagnoser(self) -> SelfDiagnosis:
+        """Return the fitted self-diagnosis; raises Damaged. Needs no torch."""
+        return self.parts.diagnoser()
+
+    def restorer(self) -> Restorer:
+        """Return a restorer that is fitted on the healthy windows; raises Damaged. Loads torch."""
+        from adaptfault.data.windows import recordings_of
+        from adaptfault.imputation.restorer import Restorer
+
+        return Restorer(self.layout).fit(recordings_of(self.parts.adapter().train, self.layout))
+
+    # History.
+
+    def known_faults(self) -> KnownFaults:
+        """Return the known faults after the last maintenance run."""
+        known = self.journal.last("knowledge")
+        # new or lost journal: the active version stores the faults it was adapted to
+        if known is None:
+            known = self.active().about.get("knowledge")
+        if known is None:
+            return KnownFaults(self.layout.n_cells)
+        with decoding(self.journal.path):
+            return KnownFaults.from_dict(known)
+
+    def maintenance(self, *, dry_run: bool = False) -> AbstractContextManager[None]:
+        """Hold the maintenance lock, one run at a time; raises Busy. A dry run goes on without
+        it."""
+        return locked(self.path / _MAINTENANCE_LOCK, patience=0, needed=not dry_run)
+
+    def write_version(self, adaptation: Adaptation, about: dict[str, Any]) -> Version:
+        """Write an adaptation as a new version without activating it."""
+        version = self.versions.write(
+            partial(_save, adaptation, self.parts.graph),
+            layout=self.layout,
+            class_names=self.class_names,
+            length=adaptation.model.network.length,
+            fault_set=adaptation.fault_set,
+            about=about,
+        )
+        pointer = Pointer.read(self.path)
+        needed = {1, pointer.active, *pointer.fallbacks[:_KEPT]}
+        self.versions.sweep(keep={*self.versions.numbers[-_KEPT:], *needed})
+        return version
+
+
+def now() -> str:
+    """Return the current UTC time as ISO 8601."""
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def _check_parts(
+    path: Path,
+    model: TactileTransformer | AnyModel,
+    adapter: Adapter,
+    diagnoser: SelfDiagnosis,
+    class_names: Sequence[str],
+    head: str,
+) -> None:
+    """Refuse parts that make no bundle, before anything is written; the errors are those of
+    :meth:`Bundle.create`."""
+    if head not in ("auto", "linear"):
+        raise ValueError(f"unknown head {head!r}: use 'auto' or 'linear'")
+    if path.exists():
+        raise FileExistsError(f"{path} exists: choose another name, or remove it")
+    if not diagnoser.layout.shape == adapter.model.layout.shape == model.layout.shape:
+        raise ValueError(
+            f"model, adapter and diagnoser need one array shape; got {model.layout} and"
+            f" {diagnoser.layout}"
+        )
+    if class_names and len(class_names) != model.n_classes:
+        raise ValueError(
+            f"{model.n_classes} classes need as many class names, got {len(class_names)}"
+        )
+
+
+def _graph(adapter: Adapter) -> bytes | None:
+    """Return the ONNX graph that repairs of this adapter share, so that each is exported in a
+    second."""
+    from adaptfault.imputation.tiled_statistics import LARGE
+    from adaptfault.prediction.export import ExportError, graph_of
+
+    # a large array has another front end for each F
+    if not adapter.has_features or adapter.layout.n_cells > LARGE:
+        return None
+    with suppress(ImportError, ExportError):  # logged with version 1
+        return graph_of(adapter.model)
+    return None
+
+
+def _save(adaptation: Adaptation, graph: bytes | None, folder: Path) -> None:
+    """Write an adaptation and its ONNX file; without the ONNX file the version runs on torch."""
+    from adaptfault.prediction.export import ExportError, add_onnx
+
+    adaptation.save(folder)
+    try:
+        add_onnx(folder, graph)
+    except (ImportError, ExportError) as error:
+        _log.warning("no ONNX export, this version runs on torch: %s", error)

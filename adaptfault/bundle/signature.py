@@ -1,0 +1,129 @@
+"""Signed bundles: an ed25519 signature over the manifest and the versions. Needs the extra ``sign``
+(cryptography)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from adaptfault.bundle.versions import Untrusted
+from adaptfault.data.recordings.facts.sizes import check_file
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import (
+        Ed25519PrivateKey,
+        Ed25519PublicKey,
+    )
+
+SCHEMA = "adaptfault.signature/1"
+NAME = "signature.json"
+
+_MISSING = "signatures need cryptography; pip install 'adaptfault[sign]'"
+
+
+def verify(
+    folder: Path, manifest: dict[str, Any], keys: Sequence[str | PathLike[str]], least_serial: int
+) -> dict[int, str]:
+    """Return number and hash of each version that a trusted key signed.
+
+    Args:
+        folder: of the bundle.
+        manifest: that was read from it.
+        keys: PEM files of the trusted keys:
+            ``openssl pkey -in private.pem -pubout -out public.pem``. A private key stands for its
+            public one.
+        least_serial: smallest serial number that is accepted.
+
+    Raises:
+        Untrusted: the bundle is not signed, not by one of these keys, was changed since, or is
+            older than that.
+        ValueError: a file holds no ed25519 key, or cryptography is not installed.
+    """
+    path = folder / NAME
+    trusted = [_read_public_key(key) for key in keys]
+    try:
+        check_file(path)
+        document = json.loads(path.read_bytes())
+        signed = document["signed"]
+        signature = bytes.fromhex(document["signature"])
+        data = canonical(signed)
+    except FileNotFoundError:
+        raise Untrusted(
+            f"{folder} is not signed; adaptfault train --sign or adaptfault.sign_bundle signs it"
+        ) from None
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise Untrusted(f"{path} holds no signature; sign the bundle again") from None
+    if not any(_verifies(key, signature, data) for key in trusted):
+        raise Untrusted(f"{folder} is not signed by one of the {len(keys)} trusted keys")
+    if signed["schema"] != SCHEMA:
+        raise Untrusted(f"{path} has schema {signed['schema']!r}, expected {SCHEMA!r}")
+    if signed["manifest"] != manifest:
+        raise Untrusted(
+            f"{folder}: the manifest is not the signed one, from another bundle or changed"
+        )
+    if signed["serial"] < least_serial:
+        raise Untrusted(
+            f"{folder} has serial number {signed['serial']}, expected {least_serial} or more"
+        )
+    return {int(number): str(digest) for number, digest in signed["versions"].items()}
+
+
+def read_private_key(path: str | PathLike[str]) -> Ed25519PrivateKey:
+    """Return the ed25519 key in a PEM file; raises ValueError, also where cryptography is not
+    installed."""
+    check_file(Path(path))
+    try:
+        from cryptography.exceptions import UnsupportedAlgorithm
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+        from cryptography.hazmat.primitives.serialization import load_pem_private_key
+    except ImportError:
+        raise ValueError(_MISSING) from None
+    try:
+        key = load_pem_private_key(Path(path).read_bytes(), password=None)
+    except (ValueError, TypeError, UnsupportedAlgorithm):  # TypeError: it has a password
+        key = None
+    if not isinstance(key, Ed25519PrivateKey):
+        raise ValueError(
+            f"{path}: expected an ed25519 key without password; openssl genpkey -algorithm ed25519"
+        )
+    return key
+
+
+def _read_public_key(path: str | PathLike[str]) -> Ed25519PublicKey:
+    check_file(Path(path))
+    try:
+        from cryptography.exceptions import UnsupportedAlgorithm
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+        from cryptography.hazmat.primitives.serialization import load_pem_public_key
+    except ImportError:
+        raise ValueError(_MISSING) from None
+    data = Path(path).read_bytes()
+    if b"PRIVATE KEY" in data:
+        return read_private_key(path).public_key()
+    try:
+        key = load_pem_public_key(data)
+    except (ValueError, UnsupportedAlgorithm):
+        key = None
+    if not isinstance(key, Ed25519PublicKey):
+        raise ValueError(
+            f"{path}: expected the public part of an ed25519 key; openssl pkey -in KEY -pubout"
+        )
+    return key
+
+
+def _verifies(key: Ed25519PublicKey, signature: bytes, data: bytes) -> bool:
+    from cryptography.exceptions import InvalidSignature
+
+    try:
+        key.verify(signature, data)
+    except InvalidSignature:
+        return False
+    return True
+
+
+def canonical(signed: dict[str, Any]) -> bytes:
+    """Return the bytes that are signed."""
+    return json.dumps(signed, sort_keys=True, allow_nan=False).encode()

@@ -1,0 +1,175 @@
+"""Reads the description of an array from a JSON or TOML file, or from its shape as text
+("2x13x6")."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+from adaptfault.data.atomic import atomic_write
+from adaptfault.data.printable import printable
+from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.formats.text import read_json_object, read_text, shown
+from adaptfault.data.recordings.recording import Shape
+from diagnostics import SensorLayout
+
+LAYOUT_NAME = "layout.json"
+"""The name of the layout that is read from a folder of recordings without an option;
+``layout.toml`` is read too."""
+
+MOST_CELLS = 1_000_000
+"""A layout with more positions is a typing error, and would fill the memory."""
+
+_SIZES = re.compile(r"\s*(?:(\d{1,9})\s*[xX×*,]\s*)?(\d{1,9})\s*[xX×*,]\s*(\d{1,9})\s*", re.ASCII)
+
+
+def looks_like_shape(text: str) -> bool:
+    """Return whether text is a shape such as "2x13x6" or "10x10" (and not the name of a file)."""
+    return _SIZES.fullmatch(text) is not None
+
+
+def parse_shape(text: str) -> Shape:
+    """Return ``(pads, rows, cols)`` from "2x13x6"; "10x10" is one pad, ``(1, 10, 10)``.
+
+    Raises:
+        InputError: the text is no shape, or a size is 0 or too large.
+    """
+    match = _SIZES.fullmatch(text)
+    if match is None:
+        raise InputError(
+            f"shape {shown(text)}: expected pads x rows x columns, such as 2x13x6, or 10x10 for"
+            " one pad"
+        )
+    pads, rows, cols = (int(size or 1) for size in match.groups())
+    if min(pads, rows, cols) < 1:
+        raise InputError(f"shape {shown(text)}: every size must be at least 1, such as 2x13x6")
+    if pads * rows * cols > MOST_CELLS:
+        raise InputError(f"shape {shown(text)}: more than {MOST_CELLS} cells; check the sizes")
+    return pads, rows, cols
+
+
+def layout_beside(paths: Sequence[Path]) -> SensorLayout | None:
+    """Return the layout in the :data:`LAYOUT_NAME` of the folders given, or of the folders that
+    hold the files given.
+
+    None unless every path has one, and all are the same.
+
+    Raises:
+        InputError: such a file is no layout.
+    """
+    files = [(path if path.is_dir() else path.parent) / LAYOUT_NAME for path in paths]
+    files = [file if file.is_file() else file.with_suffix(".toml") for file in files]
+    if not files or not all(file.is_file() for file in files):
+        return None
+    layouts = {read_layout(file) for file in dict.fromkeys(files)}
+    return layouts.pop() if len(layouts) == 1 else None
+
+
+def read_layout(path: str | PathLike[str]) -> SensorLayout:
+    """Read a layout from a file of the schema "adaptfault.layout/1", as ``SensorLayout.to_dict``
+    gives it.
+
+    A name that ends in ``.toml`` is TOML, any other JSON.
+
+    Raises:
+        InputError: the file cannot be read, is no JSON or TOML, or a field is missing, unknown or
+            of a wrong kind; named.
+    """
+    path = Path(path)
+    document = _read_toml(path) if path.suffix.lower() == ".toml" else read_json_object(path)
+    for name, kind in (
+        ("pads", int),
+        ("rows", int),
+        ("cols", int),
+        ("axes", int),
+        ("full_scale", float),
+        ("rate", float),
+        ("unit", str),
+    ):
+        if name in document and not _is(document[name], kind):
+            kind_name = {int: "a whole number", float: "a number", str: "text"}[kind]
+            what = (
+                f"field {name!r}: expected {kind_name}, got {shown(str(document[name]))};"
+                " correct it"
+            )
+            raise InputError.at(path, what)
+    sizes = [document.get(name, 1) for name in ("pads", "rows", "cols", "axes")]
+    if sizes[0] * sizes[1] * sizes[2] * sizes[3] > MOST_CELLS:
+        raise InputError.at(
+            path, f"fields 'pads', 'rows', 'cols': more than {MOST_CELLS} cells; check the sizes"
+        )
+    if "present" in document and not (
+        _are_bools(document["present"]) and _is_regular(document["present"])
+    ):
+        raise InputError.at(
+            path, "field 'present': expected lists [pads][rows][cols] of true and false; correct it"
+        )
+    try:
+        return SensorLayout.from_dict(document)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise InputError.at(path, f"is no layout: {error}; correct the file") from None
+
+
+def write_layout(
+    path: str | PathLike[str], layout: SensorLayout, reasons: Sequence[str] = ()
+) -> None:
+    """Write a layout as TOML, which :func:`read_layout` reads.
+
+    Args:
+        path: of the file.
+        layout: the array.
+        reasons: one sentence each, why a fact is as it is; comments of the file.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    lines = ["# The array: pads x rows x columns, range, unit and rate."]
+    lines += [f"# inferred: {' '.join(printable(reason).split())}" for reason in reasons]
+    # a JSON value other than null is one of TOML
+    lines += [
+        f"{name} = {json.dumps(value, ensure_ascii=False)}"
+        for name, value in layout.to_dict().items()
+        if value is not None
+    ]
+    atomic_write(Path(path), ("\n".join(lines) + "\n").encode())
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError.at(path, f"is not TOML ({error}); correct it") from None
+    except RecursionError:
+        raise InputError.at(path, "is not TOML that can be read; write it again") from None
+
+
+def _is(value: Any, kind: type) -> bool:
+    if isinstance(value, bool):
+        return False
+    return isinstance(value, int | float) if kind is float else isinstance(value, kind)
+
+
+def _is_regular(lists: Any) -> bool:
+    try:
+        np.array(lists, dtype=bool)
+    except ValueError:
+        return False
+    return True
+
+
+def _are_bools(value: Any, depth: int = 0) -> bool:
+    if isinstance(value, list) and depth < 3:
+        return all(_are_bools(item, depth + 1) for item in value)
+    return isinstance(value, bool) or value in (0, 1)

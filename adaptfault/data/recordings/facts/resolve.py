@@ -1,0 +1,235 @@
+"""Decides which array the files were recorded from: by options, by a layout, by the files, or by
+inference."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.facts.infer import default_unit, infer_scale, infer_shape
+from adaptfault.data.recordings.facts.layout_file import looks_like_shape, parse_shape, read_layout
+from adaptfault.data.recordings.facts.rates import Elapsed
+from adaptfault.data.recordings.recording import Shape
+from adaptfault.data.recordings.survey import Content
+from diagnostics import SensorLayout
+
+if TYPE_CHECKING:
+    from adaptfault.data.calibration import Calibration
+
+_KEPT = "present", "wiring", "groups", "axes", "rest"
+"""What a layout states besides the shape and what the options override."""
+
+_SAME_RATE = 0.05
+"""Rates that differ by less are the same: those of bags are measured."""
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """The layout of the recordings.
+
+    Attributes:
+        layout: the array.
+        inferred: one sentence for each fact that no file, layout or option states.
+        problems: warnings.
+    """
+
+    layout: SensorLayout
+    inferred: tuple[str, ...] = ()
+    problems: tuple[Problem, ...] = ()
+
+
+def given_array(
+    layout: SensorLayout | Shape | Sequence[int] | str | PathLike[str] | None,
+) -> SensorLayout | Shape | None:
+    """Return a layout, or at least its shape, from any of the forms in which the user may give
+    it."""
+    if layout is None or isinstance(layout, SensorLayout):
+        return layout
+    if isinstance(layout, tuple | list):
+        return parse_shape("x".join(map(str, layout)))
+    if isinstance(layout, str) and looks_like_shape(layout):
+        return parse_shape(layout)
+    return read_layout(layout)  # type: ignore[arg-type]
+
+
+def resolve_layout(
+    contents: Sequence[Content],
+    array: SensorLayout | Shape | None,
+    full_scale: float | None,
+    unit: str | None,
+    rate: float | None,
+    tables: Calibration | None,
+) -> Resolved:
+    """Decide on the layout: options first, then a layout that was given, then the files, then
+    inference.
+
+    Raises:
+        InputError: an option makes no layout, or the shape or the scale cannot be inferred.
+    """
+    inferred: list[str] = []
+    problems: list[Problem] = []
+    overrides = {"full_scale": full_scale, "unit": unit, "rate": rate}
+    if isinstance(array, SensorLayout):
+        stated: dict[str, Any] = {name: getattr(array, name) for name in (*overrides, *_KEPT)}
+        shape = array.shape
+        if tables is not None and array.unit != "N":  # that was the layout of the counts
+            stated |= {"full_scale": None, "unit": None}
+    else:
+        shape, reason = (array, "") if array else infer_shape(contents)
+        if reason:
+            inferred.append(f"shape {'x'.join(map(str, shape))} ({reason}); otherwise give --shape")
+        fitting = [c for c in contents if c.shape in (None, shape)]
+        stated = {
+            name: _first(getattr(content.facts, name) for content in fitting)
+            for name in (*overrides, "present")
+        }
+        if tables is not None:  # files describe counts
+            stated |= {"full_scale": None, "unit": None}
+        unknown = [name for name in ("full_scale", "rate") if not (overrides[name] or stated[name])]
+        inferred += _lost(contents, unknown)
+    stated |= {name: value for name, value in overrides.items() if value is not None}
+    if stated["full_scale"] is None:
+        if tables is not None:
+            stated["unit"] = stated["unit"] or "N"
+            stated["full_scale"] = tables.full_scale
+        else:
+            scaled = [
+                content for content in contents if content.width == math.prod(shape)
+            ] or contents
+            scale = infer_scale(scaled, shape)
+            stated["unit"] = stated["unit"] or scale.unit
+            stated["full_scale"] = scale.full_scale
+            what = f"full scale {scale.full_scale:g} {stated['unit']} ({scale.reason})"
+            inferred.append(f"{what}; otherwise give --full-scale and --unit")
+            problems += scale.problems
+    measured, reason_of_rate = _measured_rate(contents)
+    known = {name: value for name, value in stated.items() if value is not None}
+    if measured is not None:
+        known.setdefault("rate", measured)
+    try:
+        usual = (
+            "N"
+            if tables is not None
+            else default_unit(float(stated["full_scale"]), shape, contents)
+        )
+        known.setdefault("unit", usual)
+        sizes = (array.pads, array.rows, array.cols) if isinstance(array, SensorLayout) else shape
+        layout = SensorLayout(*sizes, **known)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"layout: {error}; correct the option") from None
+    if stated["rate"] is None:
+        inferred.append(f"rate {layout.rate:g} Hz ({reason_of_rate}); otherwise give --rate")
+    problems += [] if tables is not None else _contradicted(contents, layout)
+    return Resolved(layout, tuple(inferred), tuple(problems))
+
+
+def _measured_rate(contents: Sequence[Content]) -> tuple[float | None, str]:
+    """Return the rate that the clocks of all files show together, and where it is from."""
+    clocks = [content for content in contents if content.elapsed is not None]
+    if not clocks:
+        return None, "assumed: no file states one"
+    tick = clocks[0].surveys[0].tick
+    same = [content for content in clocks if content.surveys[0].tick == tick]
+    elapsed = Elapsed.of_all(content.elapsed for content in same)
+    rate = None if elapsed is None else elapsed.rate(tick)
+    if rate is None:
+        return None, "assumed: no time in the files rises at 2 to 2000 Hz"
+    what = "time column" if clocks[0].text else "times of the messages"
+    more = f" and {len(same) - 1} more" if len(same) > 1 else ""
+    return rate, f"{what} of {clocks[0].path.name}{more}"
+
+
+def _lost(contents: Sequence[Content], missing: Sequence[str]) -> list[str]:
+    """Return a sentence on archives without the JSON file that may state what they do not."""
+    bare = [
+        c
+        for c in contents
+        if c.path.suffix.lower() == ".npz" and not c.path.with_suffix(".json").is_file()
+    ]
+    numbered = [c for c in bare if c.facts.numbered]
+    if not bare or not (numbered or missing):
+        return []
+    what = ["class names (the numbers of the labels are used)"] * bool(numbered)
+    what += [name.replace("_", " ") for name in missing]
+    first = (numbered or bare)[0].path
+    return [
+        f"{first}: no {first.stem}.json beside it, and the archive does not state:"
+        f" {', '.join(what)}"
+    ]
+
+
+def _contradicted(contents: Sequence[Content], layout: SensorLayout) -> list[Problem]:
+    """Warn if the first file that states a scale states another than the layout that is used."""
+    content = next((c for c in contents if c.facts.full_scale is not None), None)
+    if content is None or content.facts.full_scale == layout.full_scale:
+        return []
+    what = f"the file states 0..{content.facts.full_scale:g} {content.facts.unit or ''}".rstrip()
+    used = f"0..{layout.full_scale:g} {layout.unit} is used, as the option or layout states"
+    return [Problem("warning", located(content.path, f"{what}, but {used}"))]
+
+
+def _first(values: Iterable[Any]) -> Any:
+    return next((value for value in values if value is not None), None)
+
+
+def check_agreement(
+    content: Content, contents: Sequence[Content], calibrated: bool, rate: float | None
+) -> None:
+    """Raise InputError if a file contradicts the first file that states the same fact: they are of
+    different arrays.
+
+    Args:
+        content: of the file.
+        contents: of all files.
+        calibrated: the scale of counts does not matter: the tables define it.
+        rate: as the user states it; then that of the files does not matter.
+    """
+    for name in () if calibrated else ("full_scale", "unit"):
+        value = getattr(content.facts, name)
+        reference = _first(getattr(other.facts, name) for other in contents)
+        if value is not None and value != reference:
+            raise _disagrees(content, name.replace("_", " "), value, reference)
+    reference = _first(other.rate for other in contents)
+    if rate is None and content.rate is not None and not same_rate(content.rate, reference):
+        raise _disagrees(content, "rate", content.rate, reference)
+    if content.facts.present is None:
+        return
+    reference = _first(other.facts.present for other in contents if other.shape == content.shape)
+    if not np.array_equal(content.facts.present, reference):
+        raise InputError.at(
+            content.path, "another mask of present cells than the files before it; load them apart"
+        )
+
+
+def _disagrees(content: Content, name: str, came: object, expected: object) -> InputError:
+    what = f"{name} {came} where the files before it have {expected}; load them apart"
+    return InputError.at(content.path, f"{what}, or give --rate" if name == "rate" else what)
+
+
+def check_statements(content: Content, layout: SensorLayout, calibrated: bool) -> None:
+    """Raise InputError if a file states another full scale or rate than the layout."""
+    full_scale = None if calibrated else content.facts.full_scale
+    if full_scale is not None and not math.isclose(full_scale, layout.full_scale, rel_tol=1e-3):
+        came = f"full scale {full_scale:g} {content.facts.unit or ''}".rstrip()
+        what = (
+            f"{came} where {layout.full_scale:g} {layout.unit} is expected; use recordings of the"
+            " same sensor"
+        )
+        raise InputError.at(content.path, what)
+    if content.rate is not None and not same_rate(content.rate, layout.rate):
+        what = (
+            f"rate {content.rate:g} Hz where {layout.rate:g} Hz is expected; use recordings of the"
+            " same sensor"
+        )
+        raise InputError.at(content.path, what)
+
+
+def same_rate(one: float, other: float) -> bool:
+    """Return whether two rates differ by less than the jitter of measured ones."""
+    return abs(one - other) < _SAME_RATE * max(one, other)

@@ -1,0 +1,109 @@
+"""Size limits: what a file declares is refused before it is read into memory."""
+
+from __future__ import annotations
+
+import math
+import stat
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from adaptfault.data.recordings.errors import InputError
+
+MOST_BYTES = 2 << 30
+"""Bytes that a file may take which has to be read whole."""
+
+LONGEST_LINE = 64 << 20
+"""Bytes of a line of text: a million cells of 64 digits."""
+
+_MOST_TEXT = 4096  # bytes of one text in an array of texts
+
+
+def check_file(path: Path) -> None:
+    """Check that a path is a regular file of a size that can be read whole.
+
+    Raises:
+        InputError: a device, a pipe or a folder, or over :data:`MOST_BYTES`.
+        OSError: there is no such file.
+    """
+    size = check_kind(path)
+    if size > MOST_BYTES:
+        raise InputError.at(
+            path,
+            f"has {size:,} bytes, more than {MOST_BYTES:,}; split it into several files",
+        )
+
+
+def check_kind(path: Path) -> int:
+    """Return the bytes of a regular file.
+
+    Raises:
+        InputError: a device, a pipe or a folder.
+        OSError: there is no such file.
+    """
+    about = path.stat()
+    if not stat.S_ISREG(about.st_mode):
+        raise InputError.at(path, "is not a regular file; copy its content into one")
+    return about.st_size
+
+
+def check_archive(path: Path, archive: zipfile.ZipFile, arrays: tuple[str, ...]) -> None:
+    """Check the sizes that the arrays of an NPZ file declare, in the directory of the archive and
+    in their headers.
+
+    Raises:
+        InputError: they take more than :data:`MOST_BYTES` in all, or one holds texts of over 4096
+            bytes.
+    """
+    total = 0
+    for name in arrays:
+        try:
+            about = archive.getinfo(f"{name}.npy")
+        except KeyError:
+            continue
+        with archive.open(about) as file:
+            version = np.lib.format.read_magic(file)
+            if version == (1, 0):
+                shape, _, kind = np.lib.format.read_array_header_1_0(file)
+            elif version == (2, 0):
+                shape, _, kind = np.lib.format.read_array_header_2_0(file)
+            else:
+                shape = ()
+                kind = np.dtype(np.uint8)
+        if kind.kind in "US" and kind.itemsize > 4 * _MOST_TEXT:
+            raise InputError.at(
+                path, f"array {name!r} declares texts of {kind.itemsize:,} bytes; shorten them"
+            )
+        total += max(about.file_size, math.prod(shape) * kind.itemsize)
+    if total > MOST_BYTES:
+        raise InputError.at(
+            path,
+            f"declares {total:,} bytes of arrays, more than {MOST_BYTES:,}; split it into several"
+            " files",
+        )
+
+
+def check_array(path: Path, data: bytes) -> None:
+    """Check that an NPY file holds the bytes that its header declares, so that no larger array is
+    allocated.
+
+    Raises:
+        InputError: it declares more.
+        ValueError: the header cannot be read.
+    """
+    import io
+
+    file = io.BytesIO(data)
+    version = np.lib.format.read_magic(file)
+    read = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
+    shape, _, kind = read(file)
+    if (declared := math.prod(shape) * kind.itemsize) > len(data):
+        raise InputError.at(
+            path,
+            f"declares {declared:,} bytes and holds {len(data):,}: it is cut off; write it again",
+        )

@@ -1,0 +1,1 @@
+"""File formats of recordings: CSV folders, ROS bags, numpy arrays and archives."""

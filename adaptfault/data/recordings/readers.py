@@ -1,0 +1,75 @@
+"""The readers of recordings, one a format, found through the entry point group
+``adaptfault.readers``.
+
+A reader is a module (or any object) with::
+
+    SUFFIXES = (".csv",)                            # of the files it reads, in lower case
+    def open(path, **stated): -> Iterable[Recording]
+    def accepts(path): -> bool                      # optional: whether a folder is one of its own
+
+``stated`` is what the user says about the files: ``shape``, ``topic``, ``field`` and what else the
+reader asks for; it ignores the rest. A package that declares such an entry point is used by every
+command::
+
+    [project.entry-points."adaptfault.readers"]
+    mine = "my_package.my_format"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol
+
+from adaptfault.data.plugins import plugins
+from adaptfault.data.recordings.recording import Recording
+
+GROUP = "adaptfault.readers"
+
+BUILT_IN = {
+    "csv": "adaptfault.data.recordings.formats.csv_folder",
+    "npz": "adaptfault.data.recordings.formats.npz",
+    "npy": "adaptfault.data.recordings.formats.npy",
+    "bag": "adaptfault.data.recordings.formats.bag",
+}
+"""Those of this package, as its entry points name them; they are there without an installation,
+too."""
+
+
+class Reader(Protocol):
+    """The reader of one format."""
+
+    SUFFIXES: tuple[str, ...]
+
+    def open(self, path: Path, **stated: Any) -> Iterable[Recording]:
+        """Return the recordings of a file.
+
+        Raises:
+            InputError: the file cannot be read.
+        """
+        ...
+
+
+@cache
+def readers() -> Mapping[str, Reader]:
+    """Return the reader of each format by its name."""
+    return plugins(GROUP, BUILT_IN)
+
+
+def suffixes(known: Mapping[str, Reader]) -> tuple[str, ...]:
+    """Return the suffixes that readers accept, sorted."""
+    return tuple(sorted({suffix for reader in known.values() for suffix in reader.SUFFIXES}))
+
+
+def reader_of(path: Path, known: Mapping[str, Reader], *, is_folder: bool) -> Reader | None:
+    """Return the reader of a file or of a folder that is one recording; None where there is
+    none."""
+    for reader in known.values():
+        if is_folder:
+            accepts = getattr(reader, "accepts", None)
+            if accepts is not None and accepts(path):
+                return reader
+        elif path.suffix.lower() in reader.SUFFIXES:
+            return reader
+    return None

@@ -1,0 +1,130 @@
+"""A recording of a file: what the file states of its array, and its frames, read when asked for.
+
+A reader of any format returns these; small and large files take the same way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.data.recordings.errors import InputError, Problem
+
+Shape = tuple[int, int, int]
+
+BLOCK = 4096
+"""Frames that are read at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Some frames of a recording.
+
+    Attributes:
+        values: ``[t, D]`` as stored: counts keep their integer type; NaN = missing.
+        lines: int ``[t]``, the line of each frame in a text file; None for other files.
+        times: float64 ``[t]``, of the clock that the file holds; None where it holds none.
+        tick: unit of these times: "s", "ms", "us" or "ns"; None where the file does not state it.
+        problems: warnings about these frames.
+    """
+
+    values: NDArray[Any]
+    lines: NDArray[np.intp] | None = None
+    times: NDArray[np.float64] | None = None
+    tick: str | None = None
+    problems: tuple[Problem, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Facts:
+    """What a file states about the array; None = it does not.
+
+    Attributes:
+        path: the file.
+        counts: whether the readings are stored as whole numbers; None: their values tell.
+        text: whether it is a text file, whose lines are named in messages.
+        class_names: the order of the classes, if the file gives one.
+        numbered: the class names are the numbers of the labels, because the file gives no names.
+        shape: ``(pads, rows, cols)``.
+        present: bool ``[pads, rows, cols]``, False = no sensing element.
+        full_scale, unit, rate: as in SensorLayout.
+        stored: shape of the array in the file, where it holds one.
+        problems: warnings of the reader.
+    """
+
+    path: Path
+    counts: bool | None = None
+    text: bool = False
+    class_names: tuple[str, ...] = ()
+    numbered: bool = False
+    shape: Shape | None = None
+    present: NDArray[np.bool_] | None = None
+    full_scale: float | None = None
+    unit: str | None = None
+    rate: float | None = None
+    stored: tuple[int, ...] = ()
+    problems: tuple[Problem, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One recording of a file.
+
+    Attributes:
+        facts: what its file states; the same object for all recordings of a file.
+        blocks: reads its frames from the first to the last, each time it is called.
+        name: how the file calls it.
+        label: its class.
+    """
+
+    facts: Facts
+    blocks: Callable[[], Iterator[Block]]
+    name: str | None = None
+    label: str | None = None
+
+    @property
+    def frames(self) -> NDArray[Any]:
+        """All frames, ``[T, D]``, as stored.
+
+        Raises:
+            InputError: the file is damaged, or holds no frame.
+        """
+        values = [block.values for block in self.blocks()]
+        if not values:
+            raise InputError.at(self.facts.path, "holds no frames; record it again or remove it")
+        return np.concatenate(values)
+
+
+def cut(frames: NDArray[Any]) -> Iterator[Block]:
+    """Yield frames ``[T, D]`` that are in memory in blocks."""
+    for first in range(0, len(frames), BLOCK):
+        yield Block(frames[first : first + BLOCK])
+
+
+def grid_shape(sizes: Sequence[int], given: Shape | None = None) -> Shape | None:
+    """Return ``(pads, rows, cols)`` of stored frames; None where they are flat.
+
+    Frames of four axes are ``[n, T, rows, cols]``, recordings of one pad. They are one recording
+    ``[T, pads, rows, cols]`` if T would be 1, or if the ``given`` shape has those pads, rows and
+    columns. Frames of three axes are ``[n, T, D]``, or ``[T, rows, cols]`` if the given shape has
+    those rows and columns.
+    """
+    sizes = tuple(int(size) for size in sizes)
+    if given is not None and len(sizes) == 4 and given[0] > 1 and sizes[1:] == given:
+        return given
+    if (
+        given is not None
+        and len(sizes) == 3
+        and (1, *sizes[1:]) == given
+        and sizes[2] != math.prod(given)
+    ):
+        return given
+    if len(sizes) < 4:
+        return None
+    return (sizes[-3] if len(sizes) == 5 else 1), sizes[-2], sizes[-1]

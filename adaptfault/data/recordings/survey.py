@@ -1,0 +1,231 @@
+"""Goes through the frames of each recording once, before the array is decided: lengths, the largest
+readings, what is missing, the times. What fits into memory is kept, so that it is read once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.data.recordings.errors import InputError, Problem
+from adaptfault.data.recordings.facts.rates import Elapsed
+from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
+
+_HEAD = 100  # first frames of a recording, for messages
+_SAMPLE = 2000  # readings of a recording, in which the step of a converter is looked for
+
+
+@dataclass(eq=False)
+class Survey:
+    """What one recording holds.
+
+    Attributes:
+        length: T, the number of frames.
+        head: its first frames, ``[t, D]``.
+        first_line: of the file, where it is text; 0 otherwise.
+        whole: whether all readings are whole numbers.
+        largest: finite reading.
+        sample: finite readings above 0, evenly spaced in each block.
+        missing, infinite: number of such readings of each cell, ``[D]``.
+        first_missing, first_infinite: frame of the first one, or line in a text; ``[D]``.
+        loaded, beyond: number of readings above 0, and above ``limit``.
+        elapsed: of its clock; None without one.
+        tick: unit of its clock.
+    """
+
+    limit: float
+    length: int = 0
+    head: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    first_line: int = 0
+    whole: bool = True
+    largest: float = 0.0
+    sample: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    missing: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    infinite: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    first_missing: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    first_infinite: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    loaded: int = 0
+    beyond: int = 0
+    elapsed: Elapsed | None = None
+    tick: str | None = None
+
+    def add(self, block: Block) -> None:
+        """Take in the next frames."""
+        values = block.values
+        if not len(values):
+            return
+        if not self.length:
+            self.head = np.asarray(values[:_HEAD], dtype=np.float64)
+            self.first_line = 0 if block.lines is None else int(block.lines[0])
+            for name in ("missing", "infinite", "first_missing", "first_infinite"):
+                setattr(self, name, np.zeros(values.shape[1], np.int64))
+        whole_type = values.dtype.kind in "iu"
+        finite = values if whole_type else values[np.isfinite(values)]
+        positive = finite[finite > 0]
+        self.largest = max(self.largest, float(positive.max(initial=0)))
+        self.loaded += positive.size
+        self.beyond += int(np.count_nonzero(positive > self.limit))
+        if not whole_type:
+            self.whole = self.whole and bool(np.array_equal(finite, np.rint(finite)))
+            self._count("missing", np.isnan(values), block)
+            self._count("infinite", np.isinf(values), block)
+        room = _SAMPLE - len(self.sample)
+        if room > 0:
+            step = max(1, len(positive) // room)
+            picked = np.asarray(positive[::step], dtype=np.float64)
+            self.sample = np.concatenate([self.sample, picked[:room]])
+        if block.times is not None:
+            self.elapsed = Elapsed() if self.elapsed is None else self.elapsed
+            self.elapsed.add(block.times, block.lines)
+            self.tick = block.tick
+        self.length += len(values)
+
+    def _count(self, name: str, gaps: NDArray[np.bool_], block: Block) -> None:
+        cells = np.flatnonzero(gaps.any(axis=0))
+        if not len(cells):
+            return
+        frames = gaps[:, cells].argmax(axis=0)
+        places = frames + self.length if block.lines is None else block.lines[frames]
+        counts = getattr(self, name)
+        new = counts[cells] == 0
+        getattr(self, f"first_{name}")[cells[new]] = places[new]
+        counts[cells] += gaps[:, cells].sum(axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """The recordings of one file, and what it states about the array.
+
+    Attributes:
+        facts: of the file.
+        recordings: at least one.
+        surveys: of each.
+        labels: the class of each recording; None without.
+    """
+
+    facts: Facts
+    recordings: tuple[Recording, ...]
+    surveys: tuple[Survey, ...]
+    labels: tuple[str, ...] | None = None
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.facts.path
+
+    @property
+    def text(self) -> bool:
+        """Whether it is a text file."""
+        return self.facts.text
+
+    @property
+    def shape(self) -> Shape | None:
+        """``(pads, rows, cols)``, where the file states it."""
+        return self.facts.shape
+
+    @property
+    def width(self) -> int:
+        """D, the number of readings in a frame."""
+        return int(self.surveys[0].head.shape[1])
+
+    @property
+    def counts(self) -> bool:
+        """Whether the readings are whole numbers: by their type, or in a text by their values."""
+        if self.facts.counts is not None:
+            return self.facts.counts
+        return all(survey.whole for survey in self.surveys)
+
+    @property
+    def largest(self) -> float:
+        """The largest finite reading, 0 where there is none."""
+        return max(survey.largest for survey in self.surveys)
+
+    @property
+    def elapsed(self) -> Elapsed | None:
+        """Of the clocks of its recordings; None without one."""
+        return Elapsed.of_all(survey.elapsed for survey in self.surveys)
+
+    @property
+    def rate(self) -> float | None:
+        """Frames a second that the file states, else those of its clock."""
+        if self.facts.rate is not None:
+            return self.facts.rate
+        elapsed = self.elapsed
+        return None if elapsed is None else elapsed.rate(self.surveys[0].tick)
+
+    def where(self, recording: int, frame: int | None = None) -> str:
+        """Return the place of a recording or a frame in this file as text.
+
+        Args:
+            recording: its index.
+            frame: its index, or in a text its line; None: the whole recording.
+        """
+        if self.text:
+            return "" if frame is None else f"line {frame}"
+        parts = [f"recording {recording}"] if len(self.recordings) > 1 else []
+        return ", ".join(parts if frame is None else [*parts, f"frame {frame}"])
+
+    def error(self, what: str, recording: int = 0, frame: int | None = None) -> InputError:
+        """Return the error for something wrong at a place in this file."""
+        return InputError.at(self.path, what, self.where(recording, frame))
+
+
+class Surveyor:
+    """Surveys one file after the other, and keeps their frames while there is room.
+
+    Args:
+        limit: readings above it are counted.
+        room: bytes of frames that are kept in memory.
+    """
+
+    def __init__(self, limit: float, room: int) -> None:
+        self.limit = limit
+        self.room = room
+
+    def __call__(
+        self, recordings: Sequence[Recording], problems: list[Problem], step: Callable[[int], None]
+    ) -> Content:
+        """Return the content of a file; warnings are added to ``problems``.
+
+        Args:
+            recordings: of one file.
+            problems: of all files.
+            step: receives the number of frames of each block.
+
+        Raises:
+            InputError: the file is damaged, or holds no frame.
+        """
+        surveyed = []
+        kept = []
+        for recording in recordings:
+            survey = Survey(self.limit)
+            blocks: list[Block] | None = []
+            size = 0
+            for block in recording.blocks():
+                survey.add(block)
+                problems += block.problems
+                size += block.values.nbytes
+                step(len(block.values))
+                if size > self.room:
+                    blocks = None
+                if blocks is not None:
+                    blocks.append(replace(block, problems=()))
+            if blocks is not None:
+                self.room -= size
+                recording = replace(recording, blocks=_again(blocks))
+            surveyed.append(survey)
+            kept.append(recording)
+        facts = recordings[0].facts
+        problems += facts.problems
+        held = [recording.label for recording in recordings]
+        labels = tuple(label for label in held if label is not None)
+        return Content(
+            facts, tuple(kept), tuple(surveyed), labels if len(labels) == len(held) else None
+        )
+
+
+def _again(blocks: list[Block]) -> Callable[[], Iterator[Block]]:
+    return lambda: iter(blocks)

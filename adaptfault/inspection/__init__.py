@@ -1,0 +1,1 @@
+"""What a log tells: all findings, how severe each is, and checks of its readings."""

@@ -1,0 +1,148 @@
+"""Changed readings: exchanged wires and replaced pads of a log, and the log with both undone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnostics import Diagnosis, FaultKind, SelfDiagnosis
+from diagnostics.sensor.recalibration import Recalibration, find_recalibration, recalibrated
+from diagnostics.sensor.rewiring import Rewiring
+from diagnostics.sensor.sensor_change import SensorChange, find_change
+
+if TYPE_CHECKING:
+    from adaptfault.bundle.versions import Version
+
+Frames = list[NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class ChangedReadings:
+    """What changed between cells and readings; at most one of the two.
+
+    Attributes:
+        rewiring: exchanged wires; None: none.
+        recalibration: replaced pads; None: none.
+        frames: recordings ``[T, D]`` with the change undone.
+        diagnosis: of these.
+        as_found: the recordings as they came and their diagnosis, where a pad was replaced; None
+            otherwise.
+    """
+
+    rewiring: Rewiring | None
+    recalibration: Recalibration | None
+    frames: Frames
+    diagnosis: Diagnosis
+    as_found: ChangedReadings | None = None
+
+    @property
+    def reason(self) -> str:
+        """One sentence; empty: nothing changed."""
+        found = self.rewiring or self.recalibration
+        return "" if found is None else found.reason
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """What a report says of it."""
+        return {
+            "rewiring": () if self.rewiring is None else self.rewiring.steps,
+            "replaced_pads": () if self.recalibration is None else self.recalibration.pads,
+        }
+
+    def readings(self, version: Version) -> dict[str, list[Any]]:
+        """Return how a version undoes the change, on top of what ``version`` undoes; see
+        ``Version.readings``."""
+        if self.rewiring is not None:
+            order = self.rewiring.source.tolist()
+            return {name: [values[i] for i in order] for name, values in version.readings.items()}
+        if self.recalibration is None:
+            return version.readings
+        gain = version.gain * self.recalibration.gain
+        offset = version.offset + version.gain * self.recalibration.offset
+        return {**version.readings, "gain": gain.tolist(), "offset": offset.tolist()}
+
+    def changed(self, x: NDArray[np.float32], full_scale: float) -> NDArray[np.float32]:
+        """Return scaled windows ``[N, T, D]`` of the unchanged sensor as the changed one reads
+        them."""
+        if self.rewiring is not None:
+            return x[..., np.argsort(self.rewiring.source)]
+        if self.recalibration is None:
+            return x
+        gain = self.recalibration.gain
+        offset = self.recalibration.offset / full_scale
+        return np.clip(gain * x + offset, 0.0, 1.0).astype(np.float32)
+
+    def undone(self, x: NDArray[np.float32], full_scale: float) -> NDArray[np.float32]:
+        """Return scaled windows ``[N, T, D]`` of the changed sensor with the change undone."""
+        if self.rewiring is not None:
+            return self.rewiring.undo(x)
+        if self.recalibration is None:
+            return x
+        return recalibrated(x, self.recalibration.gain, self.recalibration.offset / full_scale, 1.0)
+
+
+def find_changed_readings(
+    diagnoser: SelfDiagnosis, frames: Frames, healthy: Sequence[NDArray[Any]]
+) -> ChangedReadings:
+    """Return what changed between cells and readings, and the diagnosis with it undone.
+
+    Args:
+        diagnoser: fitted, or not: then nothing is found.
+        frames: recordings ``[T, D]``, as the running version undoes them.
+        healthy: those of the reference, with which pads are compared.
+    """
+    rewiring = diagnoser.rewiring(frames)
+    if rewiring is not None:
+        put_back = [rewiring.undo(recording) for recording in frames]
+        return ChangedReadings(rewiring, None, put_back, diagnoser.diagnose(put_back))
+    as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
+    recalibration = _recalibration(diagnoser, frames, healthy, as_found.diagnosis)
+    if recalibration is None:
+        return as_found
+    undone = [recalibration.undo(recording, diagnoser.layout.full_scale) for recording in frames]
+    return ChangedReadings(None, recalibration, undone, diagnoser.diagnose(undone), as_found)
+
+
+def find_sensor_change(
+    diagnoser: SelfDiagnosis, readings: ChangedReadings, healthy: Sequence[NDArray[Any]]
+) -> SensorChange | None:
+    """Return how a pad, or all cells together, differ from the healthy recordings; None where they
+    do not.
+
+    Faulty cells, and those that a static load may reach, do not count.
+
+    Args:
+        diagnoser: fitted.
+        readings: of the log.
+        healthy: recordings ``[T, D]`` of the reference.
+    """
+    excluded = readings.diagnosis.fault_set | readings.diagnosis.disturbed
+    loads = as_loads(diagnoser, readings.frames)
+    return find_change(loads, as_loads(diagnoser, healthy), diagnoser.layout, excluded)
+
+
+def as_loads(diagnoser: SelfDiagnosis, recordings: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
+    """Return recordings ``[T, D]`` as loads, where readings fall with the load or rest in the
+    middle."""
+    load = diagnoser.load_
+    return list(recordings) if load is None else [load.loads(recording) for recording in recordings]
+
+
+def _recalibration(
+    diagnoser: SelfDiagnosis, frames: Frames, healthy: Sequence[NDArray[Any]], diagnosis: Diagnosis
+) -> Recalibration | None:
+    """Return how replaced pads read; None where none is replaced."""
+    if diagnoser.load_ is not None or diagnoser.reference_ is None or not healthy:
+        return None
+    # Cells of a new pad have other gains and offsets, as those that drift; other faulty cells tell
+    # nothing of a pad.
+    faulty = np.zeros(diagnoser.layout.n_cells, bool)
+    for fault in diagnosis.faults:
+        if fault.kind is not FaultKind.DRIFT:
+            faulty[list(fault.cells)] = True
+    held = diagnosis.statically_loaded.mask
+    return find_recalibration(frames, healthy, diagnoser.reference_, diagnoser.layout, faulty, held)

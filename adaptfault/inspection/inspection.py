@@ -1,0 +1,295 @@
+"""Inspection of a log: everything that is told of it, each finding with a severity; the worst
+decides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from adaptfault.inspection.changed_readings import (
+    ChangedReadings,
+    find_changed_readings,
+    find_sensor_change,
+)
+from adaptfault.inspection.converter_range import within_range
+from adaptfault.inspection.severity import Name, of_faults, of_finding, untested, worst
+from diagnostics import Diagnosis, SelfDiagnosis, SensorLayout
+from diagnostics.diagnosis import checked_recordings
+from diagnostics.sensor.disturbance import (
+    CommonMode,
+    Disturbance,
+    find_common_mode,
+    find_disturbances,
+    find_sentinel,
+)
+from diagnostics.sensor.recalibration import Recalibration
+from diagnostics.sensor.rewiring import Rewiring
+from diagnostics.sensor.sensor_change import SensorChange
+
+SCHEMA = "adaptfault.inspection/1"
+
+OF_CELLS = ("fault", "wire", "static_load", "frozen", "lost_frames", "untested")
+"""Names of the findings that the diagnosis of the cells gives."""
+
+_EXPLAIN_A_CHANGE = ("normalised", "ramp", "hum", "crosstalk")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One finding.
+
+    Attributes:
+        name: one of :data:`adaptfault.inspection.severity.NAMES`.
+        severity: 0 nothing to do, 1 watch, 2 a person is needed, 3 unknown.
+        reason: one sentence.
+    """
+
+    name: Name
+    severity: int
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """What a log tells about a sensor.
+
+    Attributes:
+        readings: of the log with wires and pads put back, and without what the cells share; their
+            diagnosis.
+        findings: in the order in which they are told.
+        change: of a pad, or of the whole sensor, against the reference; None where there is none.
+        common_mode: what the cells share, which the diagnosis does without; None where there is
+            nothing to take out.
+    """
+
+    readings: ChangedReadings
+    findings: tuple[Finding, ...]
+    change: SensorChange | None = None
+    common_mode: CommonMode | None = None
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """Of the readings."""
+        return self.readings.diagnosis
+
+    @property
+    def rewiring(self) -> Rewiring | None:
+        """Rows, columns or pads that answer in each other's place; None where there are none."""
+        return self.readings.rewiring
+
+    @property
+    def recalibration(self) -> Recalibration | None:
+        """Gain and offset of replaced pads; None where none was replaced."""
+        return self.readings.recalibration
+
+    @property
+    def severity(self) -> int:
+        """The worst severity of all findings; 0 without any."""
+        return worst(self.findings)
+
+    def __str__(self) -> str:
+        lines = [f"{finding.name}: {finding.reason}" for finding in self.findings]
+        return "\n".join([str(self.diagnosis), *lines])
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """What changed between cells and readings, JSON-safe."""
+        return {
+            "rewiring": list(self.readings.told["rewiring"]),
+            "replaced_pads": list(self.readings.told["replaced_pads"]),
+            "change": None if self.change is None else asdict(self.change),
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict."""
+        return {
+            "schema": SCHEMA,
+            "severity": self.severity,
+            "findings": [asdict(finding) for finding in self.findings],
+            **self.told,
+            "diagnosis": self.diagnosis.to_dict(),
+        }
+
+
+def inspect(
+    recordings: ArrayLike | Sequence[ArrayLike],
+    diagnoser: SelfDiagnosis,
+    *,
+    reference: ArrayLike | Sequence[ArrayLike] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Inspection:
+    """Return everything that a log tells about a sensor.
+
+    What all cells share is explained first: it is taken out where it can be, and where that leaves
+    fewer faults. Then the wiring and replaced pads are undone, and then cells are judged.
+
+    Args:
+        recordings: the log, ``[T, D]`` or a list of them, in the layout's unit, in time order.
+        diagnoser: fitted on healthy recordings of the same array; one that is not fitted is a cold
+            start, for which see :meth:`diagnostics.SelfDiagnosis.for_log`.
+        reference: these recordings. None: nothing is compared with them.
+        progress: receives the share of the fit that is done, where a cold start fits to the log.
+
+    Raises:
+        ValueError: recordings that do not fit the layout, or hold no frame.
+    """
+    layout = diagnoser.layout
+    given = list(checked_recordings(recordings, layout))
+    healthy = (
+        []
+        if reference is None
+        else [within_range(r, layout)[0] for r in checked_recordings(reference, layout)]
+    )
+    log = [within_range(frames, layout)[0] for frames in given]
+    disturbances = _disturbances(given, log, healthy, layout)
+    if any(one.name == "silent_array" for one in disturbances):
+        findings = [_finding(one) for one in disturbances]
+        return Inspection(ChangedReadings(None, None, log, _untold(log, layout)), tuple(findings))
+    common = None
+    if diagnoser.reference_ is None:
+        fitted = diagnoser.for_log(log, progress=progress)
+        readings = ChangedReadings(None, None, log, fitted.diagnose(log))
+    else:
+        readings, common = _judged(log, healthy, diagnoser)
+    if common is not None:
+        disturbances.append(common.disturbance)
+    change = _change(_with_offset(readings, common, log), healthy, diagnoser, disturbances)
+    if change is not None:  # measures it
+        disturbances = [one for one in disturbances if one.name != "offset"]
+    findings = [
+        *_of_readings(readings),
+        *(_finding(one) for one in disturbances),
+        *_of_change(change),
+        *of_diagnosis(readings.diagnosis),
+    ]
+    return Inspection(readings, tuple(findings), change, common)
+
+
+def _disturbances(
+    given: list[NDArray[np.float64]],
+    log: list[NDArray[np.float64]],
+    healthy: list[NDArray[np.float64]],
+    layout: SensorLayout,
+) -> list[Disturbance]:
+    """Return the disturbances of a log but for a common mode; ``log`` is ``given`` within the
+    converter's range."""
+    sentinel = find_sentinel(given, layout)
+    found = [] if sentinel is None else [sentinel]
+    if any(np.isfinite(frames[:, layout.present.ravel()]).any() for frames in log):
+        return found + find_disturbances(log, healthy, layout)
+    return [
+        *found,
+        Disturbance("silent_array", 0.0, "no cell has a reading in the range of the converter"),
+    ]
+
+
+def _judged(
+    log: list[NDArray[np.float64]], healthy: list[NDArray[np.float64]], diagnoser: SelfDiagnosis
+) -> tuple[ChangedReadings, CommonMode | None]:
+    """Return the diagnosis of a log, and the common mode that it does without; None: the log as it
+    is.
+
+    A common mode is one explanation beside the faults that it explains away.
+    """
+    as_it_is = find_changed_readings(diagnoser, log, healthy)
+    common = find_common_mode(log, healthy, diagnoser.layout) if healthy else None
+    if common is None:
+        return as_it_is, None
+    without = find_changed_readings(diagnoser, common.undo(log, diagnoser.layout), healthy)
+    explanations = len(without.diagnosis.faults) + 1
+    if explanations > len(as_it_is.diagnosis.faults) and _is_converter(as_it_is.diagnosis):
+        return as_it_is, None
+    if _lost(without.diagnosis) > _lost(as_it_is.diagnosis):
+        return as_it_is, None
+    return without, common
+
+
+def _lost(diagnosis: Diagnosis) -> int:
+    """Return the number of cells that are faulty, or disturbed by a static load."""
+    return len(diagnosis.fault_set | diagnosis.disturbed)
+
+
+def _is_converter(diagnosis: Diagnosis) -> bool:
+    """Return whether a converter is among the faults: its cells share what they read, as those of a
+    common mode."""
+    return any(
+        fault.line is not None and fault.line.kind == "converter" for fault in diagnosis.faults
+    )
+
+
+def _with_offset(
+    readings: ChangedReadings, common: CommonMode | None, log: list[NDArray[np.float64]]
+) -> ChangedReadings:
+    """Return the readings with a constant shift left in: it is a change of the sensor."""
+    if common is None or common.disturbance.name != "offset" or readings.reason:
+        return readings
+    return replace(readings, frames=log)
+
+
+def _change(
+    readings: ChangedReadings,
+    healthy: list[NDArray[np.float64]],
+    diagnoser: SelfDiagnosis,
+    disturbances: list[Disturbance],
+) -> SensorChange | None:
+    """Return what changed of a pad or of the sensor, unless a disturbance explains it."""
+    if not healthy or any(one.name in _EXPLAIN_A_CHANGE for one in disturbances):
+        return None
+    return find_sensor_change(diagnoser, readings, healthy)
+
+
+def _of_readings(readings: ChangedReadings) -> list[Finding]:
+    """Return exchanged wires, or replaced pads."""
+    if readings.rewiring is not None:
+        return [_told("rewired", readings.reason)]
+    if readings.recalibration is not None:
+        return [_told("replaced_pad", readings.reason)]
+    return []
+
+
+def _of_change(change: SensorChange | None) -> list[Finding]:
+    """Return a change of gain, or else of offset."""
+    if change is None:
+        return []
+    return [_told("gain" if change.gain != 1.0 else "offset", change.reason)]
+
+
+def of_diagnosis(diagnosis: Diagnosis) -> list[Finding]:
+    """Return the faults, wires, static loads, lost frames and what was not tested."""
+    severity = of_faults(diagnosis)
+    findings = [
+        Finding("fault" if f.line is None else "wire", severity, f.reason) for f in diagnosis.faults
+    ]
+    findings += [_told("static_load", load.reason) for load in diagnosis.static_loads]
+    findings += [_told("frozen", frozen.reason) for frozen in diagnosis.frozen]
+    findings += [
+        _told("lost_frames", link.reason) for link in diagnosis.transport if link.kind == "lost"
+    ]
+    reason = untested(diagnosis)
+    if reason is not None:
+        findings.append(_told("untested", reason))
+    return findings
+
+
+def _finding(disturbance: Disturbance) -> Finding:
+    return _told(disturbance.name, disturbance.reason)
+
+
+def _told(name: Name, reason: str) -> Finding:
+    return Finding(name, of_finding(name), reason)
+
+
+def _untold(log: list[NDArray[np.float64]], layout: SensorLayout) -> Diagnosis:
+    """Return a diagnosis that judges no cell."""
+    return Diagnosis(
+        layout=layout,
+        faults=(),
+        probability=np.zeros(layout.n_cells),
+        tested=np.zeros(layout.n_cells, bool),
+        n_frames=sum(map(len, log)),
+        n_recordings=len(log),
+    )

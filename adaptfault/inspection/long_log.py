@@ -1,0 +1,78 @@
+"""Inspection of a log that does not fit into memory: part by part, with one diagnosis of all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
+from typing import Any
+
+from numpy.typing import ArrayLike, NDArray
+
+from adaptfault.inspection.changed_readings import ChangedReadings
+from adaptfault.inspection.inspection import OF_CELLS, Finding, Inspection, inspect, of_diagnosis
+from diagnostics import Diagnosis, SelfDiagnosis
+from diagnostics.threads import one_thread
+
+
+def inspect_parts(
+    parts: Iterator[list[NDArray[Any]]],
+    diagnoser: SelfDiagnosis,
+    *,
+    reference: ArrayLike | Sequence[ArrayLike] | None = None,
+    n_recordings: int = 1,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Inspection:
+    """Return everything that a log tells about a sensor, as
+    :func:`adaptfault.inspection.inspection.inspect`.
+
+    One part is inspected as a whole. Of several, each is inspected for itself: wires and pads are
+    put back, and what its cells share is taken out. The cells are judged from all of them together.
+    The result holds no readings.
+
+    Args:
+        parts: at least one list of recordings ``[T, D]``, in time order.
+        diagnoser, reference, progress: as for ``inspect``.
+        n_recordings: number of recordings in all parts, of which long ones are cut.
+
+    Raises:
+        ValueError: recordings that do not fit the layout, or hold no frame.
+    """
+    first = next(parts)
+    second = next(parts, None)
+    if second is None:
+        return inspect(first, diagnoser, reference=reference, progress=progress)
+    fitted = diagnoser
+    if diagnoser.reference_ is None:
+        fitted = diagnoser.for_log(first, progress=progress)
+    stream = fitted.stream()
+    inspected = []
+    for part in chain([first, second], parts):
+        one = inspect(part, fitted, reference=reference)
+        with one_thread():
+            for frames in one.readings.frames:
+                stream.extend(frames)
+        inspected.append(_without_frames(one))
+    return _together(inspected, fitted.evaluate(stream, n_recordings=n_recordings))
+
+
+def _without_frames(inspection: Inspection) -> Inspection:
+    return replace(
+        inspection,
+        readings=replace(inspection.readings, frames=[], as_found=None),
+        common_mode=None,
+    )
+
+
+def _together(inspected: list[Inspection], diagnosis: Diagnosis) -> Inspection:
+    """Return one inspection: what is told of the whole sensor in any part, and the diagnosis of
+    all."""
+    changed = next((one for one in inspected if one.readings.reason), inspected[0])
+    readings = ChangedReadings(changed.rewiring, changed.recalibration, [], diagnosis)
+    change = next((one.change for one in inspected if one.change is not None), None)
+    told: dict[str, Finding] = {}
+    for one in inspected:
+        for finding in one.findings:
+            if finding.name not in OF_CELLS:
+                told.setdefault(finding.name, finding)
+    return Inspection(readings, (*told.values(), *of_diagnosis(diagnosis)), change)

@@ -1,0 +1,1 @@
+"""Prediction: graphs for onnxruntime, sessions, and the predictor that follows a bundle."""

@@ -1,0 +1,164 @@
+"""Runs an adapted model from its folder: on ONNX Runtime without torch where it is installed, else
+on torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.models.accumulation import ContactStatistics
+from adaptfault.models.store import ADAPTATION, read_attached, read_manifest
+from diagnostics import FaultSet, SensorLayout
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+ONNX_FILE = "model.onnx"
+Runtime = Literal["onnx", "torch"]
+
+# windows run at once; ONNX has no kernel of absolute distances that holds less than all differences
+_BATCH = 16
+
+
+class Inference:
+    """A classifier of whole windows, adapted to F.
+
+    Attributes:
+        layout: the array whose windows it takes.
+        length: T, frames in a window.
+        n_classes: number of classes.
+        fault_set: F; the readings of its cells cannot reach the output, not even NaN or infinity.
+        runtime: "onnx" or "torch".
+        contact: for decisions about whole contacts.
+    """
+
+    def __init__(
+        self,
+        run: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+        runtime: Runtime,
+        layout: SensorLayout,
+        fault_set: FaultSet,
+        length: int,
+        n_classes: int,
+        contact: ContactStatistics | None = None,
+    ) -> None:
+        self.contact = ContactStatistics.unknown(layout.n_cells) if contact is None else contact
+        self._run = run
+        self.runtime = runtime
+        self.layout = layout
+        self.fault_set = fault_set
+        self.length = length
+        self.n_classes = n_classes
+
+    @classmethod
+    def load(cls, folder: str | Path, *, runtime: Runtime | None = None) -> Inference:
+        """Read a folder that :meth:`Adaptation.save` wrote, with an ONNX file where ``add_onnx``
+        added one.
+
+        Args:
+            folder: the folder to read.
+            runtime: "onnx" or "torch". None: ONNX Runtime if it is installed and the folder has an
+                ONNX file, else torch.
+
+        Raises:
+            FileNotFoundError: the folder or a file is missing.
+            ValueError: a file is damaged or of another kind; the runtime is unknown or cannot run
+                this model.
+            ImportError: the runtime is not installed.
+        """
+        if runtime is not None and runtime not in get_args(Runtime):
+            raise ValueError(
+                f"unknown runtime {runtime!r}: use one of {', '.join(get_args(Runtime))}"
+            )
+        manifest = read_manifest(folder, ADAPTATION)
+        try:
+            network = manifest["network"]
+            layout = SensorLayout.from_dict(network["layout"])
+            fault_set = FaultSet(tuple(manifest["fault_set"]), layout.n_cells)
+            length = int(network["length"])
+            n_classes = int(network["n_classes"])
+            stored = manifest.get("contact")
+            contact = None if stored is None else ContactStatistics.from_dict(stored)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ValueError(f"the adaptation in {folder} is damaged: {error}") from None
+        exported = "onnx" in manifest
+        if runtime is None:
+            runtime = "onnx" if exported and find_spec("onnxruntime") else "torch"
+        if runtime == "onnx" and not exported:
+            raise ValueError(
+                f"{folder} has no ONNX file: add one with add_onnx, or run it on torch"
+            )
+        run = _on_onnx(folder, manifest) if runtime == "onnx" else _on_torch(folder)
+        return cls(run, runtime, layout, fault_set, length, n_classes, contact)
+
+    def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the probability of each class for windows ``[N, T, D]`` on the 0..1 scale,
+        ``[N, n_classes]``.
+
+        Raises:
+            ValueError: windows of another shape.
+        """
+        x = np.asarray(x, dtype=np.float32)
+        if x.ndim != 3 or x.shape[1:] != (self.length, self.layout.n_cells):
+            raise ValueError(
+                f"expected windows [N, {self.length}, {self.layout.n_cells}], got {list(x.shape)}"
+            )
+        batches = [self._run(x[i : i + _BATCH]) for i in range(0, len(x), _BATCH)]
+        return np.concatenate(batches) if batches else np.zeros((0, self.n_classes), np.float32)
+
+    def predict(self, x: NDArray[Any]) -> NDArray[np.int64]:
+        """Return the class of each window ``[N, T, D]``, int64 ``[N]``."""
+        classes: NDArray[np.int64] = self.predict_proba(x).argmax(axis=1).astype(np.int64)
+        return classes
+
+    def __str__(self) -> str:
+        runtime = "ONNX Runtime" if self.runtime == "onnx" else "torch"
+        what = f"{self.n_classes} classes from {self.length} frames of {self.layout}"
+        return f"{what}, {len(self.fault_set)} cells dropped, on {runtime}"
+
+
+def open_session(data: bytes) -> InferenceSession:
+    """Return an ONNX Runtime session for the content of an ONNX file.
+
+    It uses one thread without spinning: spinning threads take 29 % of a core at 10 frames a second.
+
+    Raises:
+        ImportError: ONNX Runtime is not installed.
+        ValueError: it is not an ONNX file, or its version is too new for this ONNX Runtime.
+    """
+    from onnxruntime import InferenceSession, SessionOptions
+
+    options = SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 3  # errors; they are raised as well
+    try:
+        return InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime derives its errors from Exception directly
+        raise ValueError(
+            f"ONNX Runtime cannot run this file: {str(error).splitlines()[0]}"
+        ) from None
+
+
+def run_session(session: InferenceSession, x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the outputs ``[N, n_classes]`` of a session for windows ``[N, T, D]``."""
+    probabilities: NDArray[np.float32] = session.run(None, {"x": np.ascontiguousarray(x)})[0]
+    return probabilities
+
+
+def _on_onnx(
+    folder: str | Path, manifest: dict[str, Any]
+) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+    session = open_session(read_attached(folder, manifest, "onnx"))
+    return lambda x: run_session(session, x)
+
+
+def _on_torch(folder: str | Path) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+    from adaptfault.adaptation.result import Adaptation
+
+    return Adaptation.load(folder).predict_proba

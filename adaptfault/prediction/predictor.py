@@ -1,0 +1,378 @@
+"""Prediction and monitoring in the robot's loop; newly deployed versions take over between two
+frames."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from adaptfault.bundle.bundle import PROCESS
+from adaptfault.bundle.checksummed_json import Damaged, decoding
+from adaptfault.bundle.pointer import file_stamp
+from adaptfault.data.windows import hold_missing, scale
+from adaptfault.inspection.converter_range import within_range
+from adaptfault.models.accumulation import ContactDecision
+from adaptfault.prediction.inference import Inference
+from diagnostics import Fault, FaultSet, Monitor, SelfDiagnosis, SensorLayout
+
+if TYPE_CHECKING:
+    from adaptfault.bundle.bundle import Bundle
+    from adaptfault.bundle.versions import Version
+
+_POLL = 1.0  # seconds between two checks of the bundle's pointer
+_RETRY = 60.0  # seconds until the next check after the bundle could not be read
+_STARTS = 3  # attempts to load a version; the bundle falls back to an earlier one after two
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """Result of one frame.
+
+    Attributes:
+        label: the class of the window that ends with this frame; None until a window is full.
+        probabilities: float32 ``[n_classes]``; None until a window is full.
+        fault_set: F, the cells that were not used.
+        events: faults that are new, changed, or gone (probability 0).
+        version: number of the version that computed the label.
+        contact: float32 ``[n_classes]``, probabilities accumulated over the windows of the present
+            contact; None without contact, or where the predictor does not accumulate.
+    """
+
+    label: int | None
+    probabilities: NDArray[np.float32] | None
+    fault_set: FaultSet
+    events: tuple[Fault, ...]
+    version: int
+    contact: NDArray[np.float32] | None = None
+
+    def __str__(self) -> str:
+        confidence = "" if self.probabilities is None else f" ({self.probabilities.max():.2f})"
+        result = "window not full yet" if self.label is None else f"class {self.label}{confidence}"
+        news = "".join(f"; {event.reason}" for event in self.events)
+        return f"{result}, {len(self.fault_set)} cells dropped, version {self.version}{news}"
+
+
+@dataclass(frozen=True, eq=False)
+class _Running:
+    """A loaded version, and the bundle that was opened for it."""
+
+    version: Version
+    model: Inference
+    bundle: Bundle
+
+
+class Predictor:
+    """Predicts, monitors, and switches to newly deployed versions; needs no torch where ONNX
+    Runtime is installed.
+
+    A new version is loaded in a thread and takes over between two frames. A version that cannot be
+    loaded is logged, and the running one continues. Not thread-safe: one thread may use a predictor
+    at a time.
+
+    Args:
+        open_bundle: opens the bundle as it is now on disk; see :meth:`load`.
+        accumulate: :meth:`stream` also accumulates the probabilities of the windows of one contact,
+            calibrated on validation recordings, and begins anew at its release
+            (:mod:`adaptfault.models.accumulation`).
+
+    Raises:
+        FileNotFoundError, ValueError: no version of the bundle can be loaded.
+    """
+
+    def __init__(self, open_bundle: Callable[[], Bundle], *, accumulate: bool = False) -> None:
+        self._open = open_bundle
+        self._accumulate = accumulate
+        bundle = open_bundle()
+        self._pointer = bundle.pointer
+        self._stamp = file_stamp(self._pointer)
+        self._running = _start_any(bundle)
+        self._next_look = monotonic() + _POLL
+        self._loading: threading.Thread | None = None
+        self._ready: _Running | None = None
+        self._failed: int | None = None  # number of the version that could not be loaded
+        self._told: set[str] = set()  # problems that were logged
+        self._monitor = Monitor(_reference(bundle))
+        self.layout = bundle.layout
+        self.class_names = tuple(bundle.class_names)
+        self.outside = 0  # readings outside the range so far
+        self._last: NDArray[np.float32]  # last reading of each cell that is not missing
+        self._frames: NDArray[np.float32]  # last frames, scaled
+        self._decision = self._new_decision()
+        self.reset()
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        keys: Sequence[str | os.PathLike[str]] | None = None,
+        least_serial: int = 0,
+        accumulate: bool = False,
+    ) -> Predictor:
+        """Open the bundle in a folder and start its active version; ``accumulate`` as in the class.
+
+        Args:
+            path: of the bundle.
+            keys, least_serial: whose signature is needed, see :class:`Bundle`.
+
+        Raises:
+            FileNotFoundError: the folder holds no bundle, or a file is missing.
+            ValueError: the active version and all earlier ones are damaged, or not signed by one of
+                the keys.
+        """
+        from adaptfault.bundle.bundle import Bundle
+
+        return cls(
+            lambda: Bundle.open(path, keys=keys, least_serial=least_serial), accumulate=accumulate
+        )
+
+    @property
+    def fault_set(self) -> FaultSet:
+        """F, the cells that the running version does not use."""
+        return self._running.model.fault_set
+
+    @property
+    def running(self) -> Version:
+        """The running version: its model, and how readings reach it (``Version.undo``)."""
+        return self._running.version
+
+    @property
+    def version(self) -> int:
+        """Number of the running version."""
+        return self._running.version.number
+
+    @property
+    def runtime(self) -> str:
+        """The runtime, "onnx" or "torch"."""
+        return self._running.model.runtime
+
+    def predict(self, x: NDArray[Any]) -> NDArray[np.int64]:
+        """Return the class of each window ``[N, T, D]`` on the 0..1 scale, int64 ``[N]``."""
+        self._keep_up()
+        return self._running.model.predict(self._rewired(_finite(x)))
+
+    def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
+        """Return class probabilities ``[N, n_classes]`` of windows ``[N, T, D]``; F's cells may
+        hold anything."""
+        self._keep_up()
+        return self._running.model.predict_proba(self._rewired(_finite(x)))
+
+    def stream(self, frame: ArrayLike, time: float | None = None) -> Reading:
+        """Process one frame and classify the window that ends with it.
+
+        A missing reading (NaN, infinite, or more than one full scale outside the range) is replaced
+        by the last reading of its cell, 0 before the first, as in ``make_windows``.
+
+        Args:
+            frame: ``[D]`` or ``[pads, rows, cols]`` in the layout's unit.
+            time: of the frame, seconds; frames missing between two times are reported as lost.
+                None: unknown.
+
+        Raises:
+            ValueError: the frame has another shape, or the time is not finite.
+        """
+        given = self.layout.check_frame(frame)
+        if time is not None and not np.isfinite(time):
+            raise ValueError(f"time {time}: expected seconds, or None where it is unknown")
+        given = self._running.version.undo(given)
+        reading, outside = within_range(given, self.layout)
+        if outside and not self.outside:
+            _log.warning(
+                "%d readings outside the range of %s count as missing", outside, self.layout
+            )
+        self.outside += outside
+        events = self._monitor.update(given, time)
+        self._keep_up()
+        model = self._running.model
+        scaled = scale(reading, self.layout)
+        self._last = np.where(np.isnan(scaled), self._last, scaled)
+        # All cells are kept, the dropped ones too: the next version may use them.
+        self._frames = np.concatenate([self._frames, self._last[None]])[-model.length :]
+        label = probabilities = None
+        if len(self._frames) == model.length:
+            probabilities = model.predict_proba(self._frames[None])[0]
+            label = int(probabilities.argmax())
+        contact = (
+            None if self._decision is None else self._decision.update(self._last, probabilities)
+        )
+        return Reading(label, probabilities, model.fault_set, events, self.version, contact)
+
+    def _new_decision(self) -> ContactDecision | None:
+        """Return a decision for the running version, without contact; None where the predictor does
+        not accumulate."""
+        if not self._accumulate:
+            return None
+        model = self._running.model
+        healthy = self.layout.present.ravel() & ~model.fault_set.mask
+        return ContactDecision(model.contact, healthy, model.length)
+
+    def reset(self) -> None:
+        """Begin a new recording: no window spans it. The monitor keeps its state."""
+        self._frames = np.zeros((0, self.layout.n_cells), np.float32)
+        self._last = np.zeros(self.layout.n_cells, np.float32)
+        if self._decision is not None:
+            self._decision.reset()
+
+    def confirm(self) -> bool:
+        """End the probation of the running version.
+
+        Returns:
+            False, without a confirmation, where another version is active that does not run here
+            yet, or the bundle cannot be written (logged).
+        """
+        bundle = self._running.bundle
+        try:
+            if bundle.active().number != self.version:
+                return False
+            bundle.confirm()
+        except (OSError, Damaged) as error:
+            self._tell(f"version {self.version} stays on probation: {error}")
+            return False
+        return True
+
+    def __str__(self) -> str:
+        return f"version {self.version}: {self._running.model}"
+
+    def _rewired(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return windows as the model reads them; see ``Version.undo``."""
+        version = self._running.version
+        # the model refuses another shape
+        return version.undo(x, 1.0) if x.shape[-1:] == version.source.shape else x
+
+    def _keep_up(self) -> None:
+        """Switch to a new version once it is loaded; check for one every second."""
+        if self._loading is not None:
+            if self._loading.is_alive():
+                return
+            self._loading = None
+            if self._ready is not None:
+                before = self._running
+                self._running = self._ready
+                self._ready = None
+                # the frames so far read otherwise
+                if before.version.readings != self._running.version.readings:
+                    self._monitor = Monitor(_reference(self._running.bundle))
+                    self.reset()
+                self._decision = self._new_decision()
+                _log.info("version %d runs now", self.version)
+        now = monotonic()
+        if now < self._next_look:
+            return
+        self._next_look = now + _POLL
+        stamp = file_stamp(self._pointer)
+        if stamp is not None and stamp != self._stamp:
+            self._stamp = stamp
+            self._loading = threading.Thread(
+                target=self._load_new, name="adaptfault-load", daemon=True
+            )
+            self._loading.start()
+
+    def _load_new(self) -> None:
+        """Load the active version if it differs from the running one; runs in a thread and never
+        raises.
+
+        After an error of the system, as too many open files, it is tried again. A version that is
+        damaged is not.
+        """
+        number = None
+        try:
+            bundle = self._open()
+            if bundle.active().number in (self.version, self._failed):
+                return
+            version = bundle.begin()
+            number = version.number
+            if number != self.version:
+                self._ready = _start(bundle, version, self.layout)
+        except Exception as error:  # a failed load must not stop the robot's loop
+            if number is None or _passes(error):
+                self._stamp = None
+                self._next_look = monotonic() + _RETRY
+            else:
+                self._failed = number
+            what = (
+                "the bundle could not be read"
+                if number is None
+                else f"version {number} could not be loaded"
+            )
+            self._tell(f"{what}, version {self.version} goes on: {error}")
+
+    def _tell(self, text: str) -> None:
+        """Log a problem once, however often it comes again."""
+        if text not in self._told:
+            _log.warning("%s", text)
+        self._told.add(text)
+
+
+def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
+    """Load a version and run it once, so that errors and the first run's set-up time come before
+    the first frame.
+
+    Raises:
+        FileNotFoundError, ImportError, ValueError: the version cannot be loaded.
+    """
+    with decoding(version.folder):
+        model = Inference.load(version.folder)
+    if model.layout != layout:
+        raise ValueError(f"the version is for {model.layout}, the bundle for {layout}")
+    model.predict_proba(np.zeros((1, model.length, layout.n_cells), np.float32))
+    _ = version.readings  # raises Damaged
+    return _Running(version, model, bundle)
+
+
+def _finite(x: NDArray[Any]) -> NDArray[np.float32]:
+    """Return windows ``[N, T, D]`` on the 0..1 scale without missing or invalid readings."""
+    x = np.asarray(x, dtype=np.float32)
+    if x.ndim != 3 or not x.size or bool(((x >= -1) & (x <= 2)).all()):  # NaN compares as False
+        return x
+    missing = ~((x >= -1) & (x <= 2))  # as for a layout of full scale 1
+    held: NDArray[np.float32] = np.stack(
+        [hold_missing(window) for window in np.where(missing, np.float32(np.nan), x)]
+    )
+    return held
+
+
+def _start_any(bundle: Bundle) -> _Running:
+    """Start the active version; repeat on failure, until the bundle falls back to an earlier
+    version.
+
+    An attempt that fails by an error of the system, as too many open files, does not count against
+    the version.
+    """
+    failures = 0
+    for left in reversed(range(_STARTS)):
+        version = bundle.begin(f"{PROCESS}, {failures} failures")
+        try:
+            return _start(bundle, version, bundle.layout)
+        except (OSError, MemoryError, ImportError, ValueError) as error:
+            if not left:
+                raise
+            failures += not _passes(error)
+            _log.warning("version %d could not be loaded: %s", version.number, error)
+    raise AssertionError("unreachable")
+
+
+def _passes(error: Exception) -> bool:
+    """Return whether the same call may succeed later: the system had too little of something, the
+    files are whole."""
+    return isinstance(error, OSError | MemoryError) and not isinstance(error, FileNotFoundError)
+
+
+def _reference(bundle: Bundle) -> SelfDiagnosis:
+    """Return the bundle's diagnoser; where it cannot be read, one without a reference, so that
+    prediction goes on."""
+    try:
+        return bundle.diagnoser()
+    except (OSError, Damaged) as error:
+        _log.warning("monitoring without the healthy reference: %s", error)
+        return SelfDiagnosis(bundle.layout)

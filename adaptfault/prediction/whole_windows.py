@@ -1,0 +1,88 @@
+"""Adapted models as functions of whole windows, for the export: what a dropped cell reads cannot
+reach the output."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from adaptfault.adaptation.cell_summary import CellSummary
+from adaptfault.adaptation.reduced_model import ReducedModel
+from adaptfault.imputation.linear import AffineFill
+from adaptfault.imputation.tiled_statistics import LARGE
+from adaptfault.models.heads import Head
+from diagnostics import FaultSet
+
+
+class Selected(nn.Module):
+    """Selects the healthy cells first; the shapes of its tensors depend on F."""
+
+    healthy: Tensor
+
+    def __init__(self, model: ReducedModel) -> None:
+        super().__init__()
+        self.model = model
+        self.register_buffer("healthy", torch.from_numpy(model.fault_set.healthy.copy()))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map windows ``[N, T, D]`` to probabilities ``[N, n_classes]``."""
+        return torch.softmax(self.model(x[..., self.healthy]), dim=1)
+
+
+class Masked(nn.Module):
+    """A model with a head in closed form, on all D cells: no shape and no constant depends on F,
+    only its state does.
+
+    A dropped cell reads 0 in the windows and in those that the head knows, so it adds nothing to a
+    distance.
+
+    Args:
+        model: with a linear front end or none, and a :class:`~adaptfault.models.heads.Head`;
+            see :meth:`suits`.
+    """
+
+    used: Tensor
+    weight: Tensor
+    bias: Tensor
+
+    def __init__(self, model: ReducedModel) -> None:
+        super().__init__()
+        layout = model.network.layout
+        faults = model.fault_set
+        d = layout.n_cells
+        missing = np.flatnonzero(faults.mask)
+        present = layout.present.ravel()
+        weight = torch.zeros(d, d)
+        bias = torch.zeros(d)
+        if isinstance(model.front, AffineFill):
+            with torch.no_grad():
+                weight[np.ix_(missing, faults.healthy)] = model.front.weight
+                bias[missing] = model.front.bias
+        self.register_buffer("used", torch.from_numpy(present & ~faults.mask))
+        self.register_buffer("weight", weight)
+        self.register_buffer("bias", bias)
+        self.network = model.network
+        self.summary = CellSummary(layout, FaultSet((), d))
+        self.moments = model.moments
+        assert isinstance(model.head, Head)
+        features, cells, *others = model.head.known
+        wide = cells.new_zeros(len(cells), 2, int(present.sum()))
+        # means and maxima
+        wide[..., torch.from_numpy(~faults.mask[present])] = cells.view(len(cells), 2, -1)
+        self.head = model.head.knowing((features, wide.flatten(1), *others))
+
+    @staticmethod
+    def suits(model: ReducedModel) -> bool:
+        """Return whether the model has parts of these kinds, and not too many cells for a matrix of
+        them."""
+        small = model.fault_set.n_cells <= LARGE
+        return small and isinstance(model.head, Head) and isinstance(model.front, AffineFill | None)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map windows ``[N, T, D]`` to probabilities ``[N, n_classes]``."""
+        known = torch.where(self.used, x, 0.0)
+        filled = nn.functional.linear(known, self.weight, self.bias).clamp(0.0, 1.0)
+        whole = torch.where(self.used, x, filled)
+        views = (self.network.features(whole), *self.summary(known), self.moments(whole))
+        return torch.softmax(self.head(views), dim=1)

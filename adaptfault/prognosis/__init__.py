@@ -1,0 +1,1 @@
+"""How cells age: their condition over the runs of a robot, trends, and lifetimes over a fleet."""

@@ -1,0 +1,115 @@
+"""What the steps of one maintenance run work with: read where it is first needed, and changed by
+none of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.bundle.bundle import Bundle
+from adaptfault.bundle.checksummed_json import Damaged
+from adaptfault.bundle.known_faults import KnownFaults
+from adaptfault.bundle.versions import Version
+from adaptfault.data.windows import recordings_of
+from adaptfault.evaluation.scores import chance
+from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
+
+if TYPE_CHECKING:
+    from adaptfault.adaptation.adapter import Adapter
+    from adaptfault.adaptation.result import Adaptation
+    from adaptfault.data.windows import Windows
+
+
+@dataclass(frozen=True)
+class MaintenanceRun:
+    """One maintenance run.
+
+    Attributes:
+        robot: what the bundle holds.
+        version: that runs.
+        known: the known faults before this run.
+        dry_run: nothing is changed.
+        budget: seconds that an adaptation may take; None: no limit.
+        say: receives one line of progress before each long step.
+        warnings: damage found in the bundle.
+        left_out: recordings, or readings of them, that are not used, with the reason.
+    """
+
+    robot: Robot
+    version: Version
+    known: KnownFaults
+    dry_run: bool
+    budget: float | None
+    say: Callable[[str], None]
+    warnings: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+class Robot:
+    """The bundle of a robot and its parts, each read once."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle = bundle
+
+    @property
+    def layout(self) -> SensorLayout:
+        """The array."""
+        return self.bundle.layout
+
+    @cached_property
+    def diagnoser(self) -> SelfDiagnosis:
+        """The fitted diagnosis."""
+        return self.bundle.diagnoser()
+
+    @cached_property
+    def adapter(self) -> Adapter:
+        """The adapter, with the fault-free model and windows."""
+        return self.bundle.parts.adapter()
+
+    @cached_property
+    def healthy(self) -> list[NDArray[np.float64]]:
+        """The healthy recordings, ``[T, D]`` each."""
+        return recordings_of(self.adapter.train, self.layout)
+
+    @cached_property
+    def windows(self) -> Windows:
+        """Held-out fault-free windows, on which models are compared."""
+        return self.bundle.parts.check_windows()
+
+    @cached_property
+    def chance(self) -> tuple[float, float]:
+        """Accuracy of always naming the most frequent class, and what guessing may reach by
+        chance."""
+        return chance(self.windows.y)
+
+    @cached_property
+    def present(self) -> FaultSet:
+        """Every cell that exists."""
+        cells = np.flatnonzero(self.layout.present).tolist()
+        return FaultSet(tuple(cells), self.layout.n_cells)
+
+    @cached_property
+    def fault_free_accuracy(self) -> float:
+        """Accuracy of version 1, the model of the healthy sensor, on the windows without faults."""
+        try:
+            model = self.model(self.bundle.versions[1])
+        except (Damaged, FileNotFoundError):
+            model = None
+        predict = self.adapter.model.predict if model is None else model.predict
+        return float((predict(self.windows.x) == self.windows.y).mean())
+
+    def model(self, version: Version) -> Adaptation:
+        """Return the model of a version; raises Damaged."""
+        from adaptfault.adaptation.result import Adaptation
+
+        return Adaptation.load(version.folder)
+
+    def class_name(self, number: int) -> str:
+        """Return the name of a class, or its number."""
+        names = self.bundle.class_names
+        return names[number] if names else f"class {number}"

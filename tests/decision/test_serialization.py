@@ -1,0 +1,187 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from safetensors.numpy import load, save
+
+from adaptfault.data.recordings import Recordings
+from diagnostics import Fault, Line, Monitor, SelfDiagnosis, SensorLayout, inject, line_fault
+
+
+def stored(diagnoser: SelfDiagnosis) -> SelfDiagnosis:
+    """Through JSON text and safetensors bytes, as on a disk."""
+    about, arrays = diagnoser.state()
+    text = json.dumps(about, allow_nan=False)
+    data = save(arrays)
+    return SelfDiagnosis.from_state(json.loads(text), load(data))
+
+
+@pytest.fixture(scope="module")
+def fitted(grasps: Recordings) -> SelfDiagnosis:
+    """Fitted here: that of all tests may have come from a file, and what that lost would go
+    unseen."""
+    return SelfDiagnosis(grasps.layout).fit(grasps.frames[::20])
+
+
+@pytest.fixture(scope="module")
+def log(grasps: Recordings) -> np.ndarray:
+    """Eight grasps that the reference does not hold, with a broken row, a stuck and a loose
+    cell."""
+    frames = np.concatenate([grasps.frames[i] for i in range(21, 140, 15)]).astype(float)
+    row = line_fault(grasps.layout, Line(0, "row", 5), "short", onset=250)
+    faults = [row, Fault("stuck", (160,), value=1.7), Fault("intermittent", (38,), onset=100)]
+    return inject(frames, faults, grasps.layout, seed=0, dither=0.004)
+
+
+def small_fit(layout: SensorLayout, recordings: int = 3) -> SelfDiagnosis:
+    rng = np.random.default_rng(1)
+    force = np.maximum(0, np.sin(np.arange(120) / 9))[:, None]
+    return SelfDiagnosis(layout).fit(
+        [force * rng.uniform(0, 3, layout.n_cells) for _ in range(recordings)]
+    )
+
+
+def test_a_restored_diagnosis_gives_the_same_result_to_the_last_bit(fitted, log):
+    assert fitted.diagnose(log).faults
+    assert stored(fitted).diagnose(log).to_dict() == fitted.diagnose(log).to_dict()
+
+
+def test_one_without_a_reference_does_too(grasps, log):
+    cold = SelfDiagnosis(grasps.layout, false_discovery_rate=0.02)
+    restored = stored(cold)
+    assert restored.reference_ is None
+    assert restored.false_discovery_rate == 0.02
+    assert restored.diagnose(log).to_dict() == cold.diagnose(log).to_dict()
+
+
+def test_frame_by_frame_it_gives_the_same_result(fitted, log):
+    was = Monitor(fitted)
+    restored = Monitor(stored(fitted))
+    news = [(was.update(frame), restored.update(frame)) for frame in log[:420]]
+    assert any(one for one, _ in news)
+    assert all(one == other for one, other in news)
+    assert restored.diagnosis().to_dict() == was.diagnosis().to_dict()
+
+
+def test_masked_positions_and_arrays_in_tiles_come_back():
+    present = np.ones((2, 16, 16), bool)
+    present[:, :2, :2] = False
+    diagnoser = small_fit(
+        SensorLayout(2, 16, 16, full_scale=4095, unit="counts", rate=31.25, present=present)
+    )
+    assert len(diagnoser.reference_.model.local_regressions) == 8
+    frames = np.full((80, 512), np.nan)
+    frames[:, :500] = np.random.default_rng(2).uniform(0, 4000, (80, 500))
+    frames[20:, 100] = 4095
+    restored = stored(diagnoser)
+    assert restored.layout == diagnoser.layout
+    assert restored.diagnose(frames).to_dict() == diagnoser.diagnose(frames).to_dict()
+
+
+def test_arrays_are_fitted_in_the_memory_order_in_which_they_come_back():
+    for diagnoser in (small_fit(SensorLayout(1, 3, 3)), stored(small_fit(SensorLayout(1, 3, 3)))):
+        (regression,) = diagnoser.reference_.model.local_regressions
+        assert all(
+            array.flags.c_contiguous
+            for array in vars(regression).values()
+            if isinstance(array, np.ndarray)
+        )
+
+
+def test_the_state_is_a_copy(fitted):
+    about, arrays = fitted.state()
+    restored = SelfDiagnosis.from_state(about, arrays)
+    before = restored.reference_.model.local_regressions[0].weight.copy()
+    arrays["reference.model.local_regressions.0.weight"][:] = 7
+    assert (restored.reference_.model.local_regressions[0].weight == before).all()
+    assert (fitted.reference_.model.local_regressions[0].weight == before).all()
+
+
+@pytest.mark.parametrize("array", sorted(small_fit(SensorLayout(1, 3, 3)).state()[1]))
+def test_an_array_that_is_missing_misshapen_or_not_finite_is_refused_by_name(array):
+    about, arrays = small_fit(SensorLayout(1, 3, 3)).state()
+    without = {name: value for name, value in arrays.items() if name != array}
+    with pytest.raises(ValueError, match=array):
+        SelfDiagnosis.from_state(about, without)
+    with pytest.raises(ValueError, match=array):
+        SelfDiagnosis.from_state(about, {**arrays, array: arrays[array][:-1, ...][:, None]})
+    if arrays[array].dtype.kind == "f" and np.isfinite(arrays[array]).all():
+        with pytest.raises(ValueError, match=array):
+            SelfDiagnosis.from_state(about, {**arrays, array: np.full_like(arrays[array], np.nan)})
+    elif array.endswith("outputs"):
+        with pytest.raises(ValueError, match="cover"):
+            SelfDiagnosis.from_state(about, {**arrays, array: arrays[array] + 1})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"schema": "adaptfault.diagnoser/2"}, "schema"),
+        ({"layout": {"rows": 3}}, "pads"),
+        ({"layout": None}, "damaged"),
+        ({"false_discovery_rate": None}, "damaged"),
+        ({"calibrator": {}}, "offset"),
+        ({"calibrator": 3}, "calibrator"),
+        ({"reference": {}}, "missing"),
+        ({"reference": 3}, "damaged"),
+    ],
+)
+def test_a_field_that_is_missing_or_wrong_is_refused(wrong, message):
+    about, arrays = small_fit(SensorLayout(1, 3, 3)).state()
+    with pytest.raises(ValueError, match=message):
+        SelfDiagnosis.from_state({**about, **wrong}, arrays)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("tolerance", -1.0),
+        ("tolerance", "wide"),
+        ("patience", 0),
+        ("patience", None),
+        ("usual", {}),
+        ("model", 3),
+    ],
+)
+def test_a_reference_whose_numbers_cannot_be_is_refused(field, value):
+    about, arrays = small_fit(SensorLayout(1, 3, 3)).state()
+    about["reference"][field] = value
+    with pytest.raises(ValueError, match="damaged"):
+        SelfDiagnosis.from_state(about, arrays)
+
+
+def test_a_model_that_leaves_cells_out_is_refused():
+    about, arrays = small_fit(SensorLayout(1, 3, 3)).state()
+    about["reference"]["model"]["local_regressions"] = []
+    with pytest.raises(ValueError, match="cover"):
+        SelfDiagnosis.from_state(about, arrays)
+
+
+@pytest.mark.parametrize("p_floor", [0.0, 2.0])
+def test_a_probability_that_cannot_be_is_refused(p_floor):
+    about, arrays = small_fit(SensorLayout(1, 3, 3)).state()
+    about["reference"]["model"]["local_regressions"][0]["p_floor"] = p_floor
+    with pytest.raises(ValueError, match="p_floor"):
+        SelfDiagnosis.from_state(about, arrays)
+
+
+def test_restoring_needs_no_torch(tmp_path):
+    about, arrays = small_fit(SensorLayout(1, 3, 3)).state()
+    (tmp_path / "about.json").write_text(json.dumps(about))
+    (tmp_path / "arrays.safetensors").write_bytes(save(arrays))
+    code = """
+import json, sys
+from pathlib import Path
+from safetensors.numpy import load
+from diagnostics import SelfDiagnosis
+home = Path(sys.argv[1])
+about = json.loads((home / "about.json").read_text())
+arrays = load((home / "arrays.safetensors").read_bytes())
+print(SelfDiagnosis.from_state(about, arrays).layout.n_cells, "torch" in sys.modules)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path], check=True, capture_output=True, text=True
+    )
+    assert done.stdout.split() == ["9", "False"]

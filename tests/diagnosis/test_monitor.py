@@ -1,0 +1,268 @@
+import copy
+import pickle
+
+import numpy as np
+import pytest
+
+from adaptfault.data.recordings import Recordings
+from diagnostics import (
+    Fault,
+    FaultKind,
+    Line,
+    Monitor,
+    SelfDiagnosis,
+    SensorLayout,
+    bridge,
+    freeze_stream,
+    inject,
+    line_fault,
+    lose_frames,
+)
+
+LAYOUT = SensorLayout.paper()
+COLD = SelfDiagnosis(LAYOUT)
+
+
+@pytest.fixture(scope="module")
+def log(grasps: Recordings) -> np.ndarray:
+    """Ten grasps that the reference does not hold, one after another."""
+    return np.concatenate([grasps.frames[i] for i in range(21, 140, 12)]).astype(float)
+
+
+@pytest.fixture(scope="module")
+def middle(log: np.ndarray) -> list[int]:
+    """The 20 cells that carry the most load."""
+    most = np.minimum(log.reshape(10, 100, -1).max(axis=1), 1).mean(axis=0)
+    return np.sort(np.argsort(-most, kind="stable")[:20]).tolist()
+
+
+def mixes(middle: list[int]) -> dict[str, list[Fault]]:
+    a = middle[3]
+    b = middle[-4]
+    c = middle[len(middle) // 2]
+    return {
+        "none": [],
+        "cells": [
+            Fault("short", (a,), onset=300),
+            Fault("open", (b,)),
+            Fault("stuck", (c,), value=1.7, onset=500),
+        ],
+        "a row and a noisy cell": [
+            line_fault(LAYOUT, Line(0, "row", 5), FaultKind.OPEN, onset=250),
+            Fault("noisy", (b,), onset=100),
+        ],
+        "loose and drifting": [
+            Fault("intermittent", (a,), onset=200),
+            Fault("drift", (b,), onset=100),
+        ],
+        "an address": [
+            line_fault(LAYOUT, Line(1, "row_address", 2), FaultKind.ALIAS, value=0, onset=333)
+        ],
+        "a bridge": [bridge(LAYOUT, Line(0, "column", 3), onset=450)],
+    }
+
+
+def watched(
+    diagnoser: SelfDiagnosis, frames: np.ndarray
+) -> tuple[Monitor, list[tuple[int, Fault]]]:
+    """Feed a log frame by frame; return the monitor and (frame, what it reported)."""
+    monitor = Monitor(diagnoser)
+    changes = []
+    for i, frame in enumerate(frames):
+        changes += [(i, fault) for fault in monitor.update(frame)]
+    return monitor, changes
+
+
+def without_recordings(diagnosis) -> dict:
+    return {key: value for key, value in diagnosis.to_dict().items() if key != "n_recordings"}
+
+
+EVERY = mixes([0, 1, 2, 3, 4])
+QUICK = ("none", "a row and a noisy cell")  # of the cold starts, which take longer
+
+
+@pytest.mark.parametrize(
+    ("cold", "mix"),
+    [
+        pytest.param(cold, mix, marks=pytest.mark.slow if cold and mix not in QUICK else ())
+        for cold in (False, True)
+        for mix in EVERY
+    ],
+)
+def test_frame_by_frame_it_gives_the_diagnosis_of_all_frames(
+    fitted, log, middle, mix: str, cold: bool
+):
+    diagnoser = COLD if cold else fitted
+    frames = inject(log, mixes(middle)[mix], LAYOUT, seed=0, dither=0.004)[:970]
+    frames = lose_frames(freeze_stream(frames, 700, 800), 0.02, seed=0)
+    monitor, _ = watched(diagnoser, frames)
+    assert without_recordings(monitor.diagnosis()) == without_recordings(diagnoser.diagnose(frames))
+
+
+def test_a_diagnosis_in_between_changes_nothing(fitted, log, middle):
+    frames = inject(log, mixes(middle)["cells"], LAYOUT)
+    monitor = Monitor(fitted)
+    for i, frame in enumerate(frames):
+        monitor.update(frame)
+        if i % 111 == 50:
+            assert without_recordings(monitor.diagnosis()) == without_recordings(
+                fitted.diagnose(frames[: i + 1])
+            )
+    assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames))
+
+
+def test_a_fault_is_reported_once_soon_after_it_is_detectable(fitted, log, middle):
+    cell = middle[3]
+    _, changes = watched(fitted, inject(log, [Fault("short", (cell,), onset=300)], LAYOUT))
+    ((frame, fault),) = changes
+    assert (fault.kind, fault.cells) == (FaultKind.SHORT, (cell,))
+    assert 300 <= frame < 300 + 2 * 32  # it looks every 32 frames
+    assert fault.probability > 0.9
+
+
+def test_a_healthy_run_is_silent(fitted, log):
+    for diagnoser in (fitted, COLD):
+        assert watched(diagnoser, log)[1] == []
+
+
+def test_a_fault_that_goes_away_is_reported_as_gone_with_probability_0(fitted, log, middle):
+    cell = middle[3]
+    _, changes = watched(
+        fitted, inject(log, [Fault("short", (cell,), onset=200)], LAYOUT, until=600)
+    )
+    (_, came), (frame, gone) = changes
+    assert came.cells == gone.cells == (cell,)
+    assert came.probability > 0.9
+    assert gone.probability == 0
+    assert gone.reason.startswith("gone since about frame")
+    assert came.reason in gone.reason
+    assert 600 <= frame <= 700
+
+
+def test_a_fault_that_spreads_is_reported_as_changed_and_no_cell_of_it_as_gone(fitted, log):
+    row = Line(0, "row", 5)
+    first = Fault("short", LAYOUT.cells_on(row)[4:6], onset=100)
+    rest = line_fault(LAYOUT, row, FaultKind.SHORT, onset=500)
+    _, reported = watched(fitted, inject(log, [first, rest], LAYOUT))
+    changes = [fault for _, fault in reported if set(fault.cells) & set(rest.cells)]
+    assert (changes[-1].line, changes[-1].cells) == (row, rest.cells)
+    assert all(fault.probability > 0 for fault in changes)
+
+
+def test_while_a_row_breaks_hardly_a_cell_beside_it_is_reported_and_none_for_long(fitted, log):
+    row = line_fault(LAYOUT, Line(0, "row", 5), FaultKind.SHORT, onset=500)
+    monitor, changes = watched(fitted, inject(log, [row], LAYOUT))
+    assert len({c for _, fault in changes for c in fault.cells} - set(row.cells)) <= 2
+    assert set(monitor.diagnosis().fault_set) == set(row.cells)
+
+
+def test_frames_missing_according_to_the_clock_are_counted(fitted, log):
+    monitor = Monitor(fitted)
+    for i, frame in enumerate(log[:200]):
+        if i not in (40, 41, 42, 150):
+            monitor.update(frame, time=i / LAYOUT.rate)
+    (fault,) = monitor.diagnosis().transport
+    assert (fault.kind, fault.frames, fault.onset) == ("lost", 4, 40)
+
+
+def test_a_clock_that_jitters_or_stops_or_runs_back_loses_no_frames(fitted, log):
+    jitter = np.random.default_rng(0).uniform(-0.02, 0.02, 100)
+    for times in (np.arange(100) / 10 + jitter, np.zeros(100), -np.arange(100) / 10):
+        monitor = Monitor(fitted)
+        for frame, time in zip(log[:100], times, strict=True):
+            monitor.update(frame, time=float(time))
+        assert monitor.diagnosis().transport == ()
+
+
+def test_a_frame_may_be_a_grid_and_hold_missing_readings(fitted, log):
+    frames = log[:100].copy()
+    frames[::5, 7] = np.nan
+    flat = Monitor(fitted)
+    grid = Monitor(fitted)
+    for frame in frames:
+        flat.update(frame)
+        grid.update(LAYOUT.grid(frame))
+    assert without_recordings(flat.diagnosis()) == without_recordings(grid.diagnosis())
+
+
+def test_a_cell_that_falls_silent_is_reported_soon_and_so_is_its_return(fitted, log, middle):
+    frames = log[:800].copy()
+    cell = middle[10]
+    frames[300:600, cell] = np.nan
+    monitor, changes = watched(fitted, frames)
+    (silent, first), (back, last) = [(i, fault) for i, fault in changes if fault.cells == (cell,)]
+    assert first.kind is FaultKind.OPEN
+    assert "delivers no reading from frame 300 on" in first.reason
+    assert 300 + 64 <= silent < 300 + 64 + 2 * 32
+    assert "gone since about frame" in last.reason
+    assert 600 <= back < 600 + 2 * 32
+    assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4])
+def test_online_equals_batch_where_readings_are_missing(fitted, log, middle, share: float):
+    frames = inject(log, mixes(middle)["cells"], LAYOUT)
+    frames[np.random.default_rng(0).random(frames.shape) < share] = np.nan
+    monitor, _ = watched(fitted, frames)
+    assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames))
+
+
+@pytest.mark.parametrize("size", [0, 219, 221])
+def test_a_frame_of_the_wrong_size_is_refused_with_both_sizes(size: int):
+    with pytest.raises(ValueError, match=rf"expected a frame of 220 readings .*, got {size}"):
+        Monitor(COLD).update(np.zeros(size))
+
+
+def test_before_any_reading_there_is_nothing_to_diagnose():
+    monitor = Monitor(COLD)
+    with pytest.raises(ValueError, match="no frame with a reading"):
+        monitor.diagnosis()
+    monitor.update(np.full(220, np.nan))
+    with pytest.raises(ValueError, match="no frame with a reading"):
+        monitor.diagnosis()
+    for _ in range(100):
+        assert monitor.update(np.full(220, np.nan)) == ()
+
+
+def test_two_monitors_of_one_diagnoser_do_not_disturb_each_other(fitted, log, middle):
+    broken = inject(log, [Fault("short", (middle[3],))], LAYOUT)
+    a = Monitor(fitted)
+    b = Monitor(fitted)
+    for healthy_frame, broken_frame in zip(log[:400], broken[:400], strict=True):
+        a.update(healthy_frame)
+        b.update(broken_frame)
+    assert not a.diagnosis().faults
+    assert b.diagnosis().fault_set == {middle[3]}
+
+
+def test_a_time_that_is_not_finite_is_refused_and_a_clock_that_is_set_loses_no_frames():
+    layout = SensorLayout(1, 2, 3)
+    monitor = Monitor(SelfDiagnosis(layout))
+    for time in (np.nan, np.inf, -np.inf):
+        with pytest.raises(ValueError, match="expected seconds"):
+            monitor.update(np.ones(6), time)
+    for time in (0.0, 0.1, -1e300, 1e300, 5.0, 4.0, 4.1, 4.3):
+        monitor.update(np.ones(6), time)
+    diagnosis = monitor.diagnosis()
+    assert diagnosis.n_frames == 8  # those that were refused are not among them
+    assert np.isfinite(diagnosis.probability).all()
+    assert monitor._stream.transport.lost == 1
+
+
+@pytest.mark.parametrize(
+    "duplicate", [copy.deepcopy, lambda monitor: pickle.loads(pickle.dumps(monitor))]
+)
+def test_a_copy_of_a_monitor_goes_on_as_the_monitor_does_and_apart_from_it(
+    fitted, log, middle, duplicate
+):
+    broken = inject(log, [Fault("short", (middle[3],), onset=200)], LAYOUT)
+    monitor = Monitor(fitted)
+    for frame in broken[:140]:
+        monitor.update(frame)
+    twin = duplicate(monitor)
+    found = [fault for frame in broken[140:600] for fault in twin.update(frame)]
+    assert middle[3] in {cell for fault in found for cell in fault.cells}
+    assert monitor.diagnosis().n_frames == 140
+    for frame in broken[140:600]:
+        monitor.update(frame)
+    assert twin.diagnosis().to_dict() == monitor.diagnosis().to_dict()

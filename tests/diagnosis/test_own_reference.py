@@ -1,0 +1,105 @@
+"""Without a reference, a log of enough recordings is its own: its first half."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from adaptfault.data.simulated_grasps import simulate
+from diagnostics import Fault, FaultKind, SelfDiagnosis, SensorLayout, Verdict, inject
+from diagnostics.diagnosis import OWN_REFERENCE
+
+LAYOUT = SensorLayout(1, 8, 8)
+FAILS = 25  # recording from which on cells are dead
+
+
+@pytest.fixture(scope="module")
+def grasps() -> list[np.ndarray]:
+    frames = simulate(6, LAYOUT, n_frames=50, seed=3).frames[:40]
+    return [np.asarray(recording, dtype=np.float64) for recording in frames]
+
+
+def failing(grasps: list[np.ndarray], cells: list[int], since: int) -> list[np.ndarray]:
+    faults = [Fault(FaultKind.OPEN, (cell,)) for cell in cells]
+    after = [
+        inject(recording, faults, LAYOUT, seed=i) for i, recording in enumerate(grasps[since:])
+    ]
+    return [*grasps[:since], *after]
+
+
+def test_cells_that_fail_in_the_second_half_are_found_without_a_reference(grasps):
+    dead = [18, 27, 44]
+    diagnosis = SelfDiagnosis(LAYOUT).diagnose(failing(grasps, dead, FAILS))
+    assert sorted(diagnosis.fault_set) == dead
+    start = sum(map(len, grasps[:FAILS]))
+    assert all(abs(fault.onset - start) < 300 for fault in diagnosis.faults)
+
+
+def test_cells_that_are_dead_from_the_start_are_found_too(grasps):
+    dead = [9, 36]
+    diagnosis = SelfDiagnosis(LAYOUT).diagnose(failing(grasps, dead, 0))
+    assert sorted(diagnosis.fault_set) == dead
+
+
+def test_of_a_healthy_log_no_cell_is_blamed_and_most_are_alive(grasps):
+    diagnosis = SelfDiagnosis(LAYOUT).diagnose(grasps)
+    assert not diagnosis.faults
+    assert (diagnosis.verdicts == Verdict.ALIVE).mean() > 0.9
+
+
+def test_a_shorter_log_is_no_reference(grasps):
+    cold = SelfDiagnosis(LAYOUT)
+    assert cold.for_log(grasps[: OWN_REFERENCE - 1]) is cold
+
+
+def test_a_fitted_diagnosis_stays_what_it_is(grasps):
+    fitted = SelfDiagnosis(LAYOUT, proof_of_life=False).fit(grasps[:10])
+    assert fitted.for_log(grasps) is fitted
+
+
+def test_the_diagnosis_itself_is_not_fitted_by_a_log(grasps):
+    cold = SelfDiagnosis(LAYOUT)
+    cold.diagnose(grasps)
+    assert cold.reference_ is None
+
+
+@pytest.mark.parametrize("value", [0.0, 2.5, 5.0])
+def test_an_array_that_never_moves_is_no_reference(value: float):
+    cold = SelfDiagnosis(LAYOUT)
+    assert cold.for_log([np.full((20, 64), value)] * 40) is cold
+
+
+def test_noise_before_the_first_contact_is_no_reference(grasps):
+    rng = np.random.default_rng(0)
+    idle = [np.abs(rng.normal(0, 0.005, recording.shape)) for recording in grasps[:20]]
+    cold = SelfDiagnosis(LAYOUT)
+    assert cold.for_log([*idle, *grasps[20:]]) is cold
+
+
+def test_a_log_with_missing_readings_is_its_own_reference(grasps):
+    rng = np.random.default_rng(0)
+    gappy = [np.where(rng.random(recording.shape) < 0.2, np.nan, recording) for recording in grasps]
+    diagnosis = SelfDiagnosis(LAYOUT).diagnose(failing(gappy, [27], FAILS))
+    assert sorted(diagnosis.fault_set) == [27]
+
+
+def test_recordings_of_one_frame_do_not_crash_it(grasps):
+    frames = [recording[25:26] for recording in grasps]
+    SelfDiagnosis(LAYOUT).diagnose(frames)
+
+
+def test_progress_is_told(grasps):
+    told: list[float] = []
+    SelfDiagnosis(LAYOUT).for_log(grasps, progress=told.append)
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
+def test_a_log_without_any_reading_is_refused():
+    with pytest.raises(ValueError, match="no frame with a reading"):
+        SelfDiagnosis(LAYOUT).diagnose([np.full((20, 64), np.nan)] * 40)
+
+
+def test_a_cell_that_never_delivers_a_reading_is_faulty_and_does_not_disturb_the_fit(grasps):
+    silent = [np.where(np.arange(64) == 30, np.nan, recording) for recording in grasps]
+    assert SelfDiagnosis(LAYOUT).diagnose(silent).fault_set == {30}

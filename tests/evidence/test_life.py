@@ -1,0 +1,239 @@
+"""Proof of life: cells that move by themselves are no healthy cells."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from adaptfault.data.recordings import Recordings
+from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, Verdict, inject
+from diagnostics.evidence.life import EvidenceOfLog, LifeRecord, LifeTest
+from diagnostics.evidence.life.healthy_table import ConditionalMean
+from diagnostics.evidence.life.record import KEPT
+from diagnostics.evidence.stepping import finished
+
+
+@pytest.fixture(scope="module")
+def fitted(fitted: SelfDiagnosis, grasps: Recordings) -> SelfDiagnosis:
+    """The fitted diagnosis, with the proof of life learned from the same grasps."""
+    healthy = [np.asarray(frames, dtype=np.float64) for frames in grasps.frames[::2]]
+    about, arrays = fitted.state()
+    proving = SelfDiagnosis.from_state(about, arrays)
+    proving.reference_ = proving.reference_.with_life(healthy, fitted.layout)
+    proving.proof_of_life = True
+    return proving
+
+
+@pytest.fixture(scope="module")
+def log(grasps: Recordings) -> list[np.ndarray]:
+    """Forty grasps that the reference does not hold."""
+    return [np.asarray(frames, dtype=np.float64) for frames in grasps.frames[1::2][:40]]
+
+
+@pytest.fixture(scope="module")
+def used(log: list[np.ndarray]) -> np.ndarray:
+    """The cells by their load, the one that carries most first."""
+    return np.argsort(-np.mean([frames.max(axis=0) for frames in log], axis=0), kind="stable")
+
+
+def broken(log: list[np.ndarray], fault: Fault, diagnoser: SelfDiagnosis) -> list[np.ndarray]:
+    whole = inject(np.concatenate(log), [fault], diagnoser.layout, seed=1)
+    return np.split(whole, np.cumsum([len(frames) for frames in log])[:-1])
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        (FaultKind.FLOATING, 1.0),
+        (FaultKind.FLOATING, 0.25),
+        (FaultKind.LATE, 10),
+        (FaultKind.CLAMPED, 0.5),
+    ],
+)
+def test_a_dead_cell_that_moves_is_found_named_by_how_it_fails_and_no_other_cell_is(
+    fitted, log, used, kind, value
+):
+    cell = int(used[0])
+    found = fitted.diagnose(broken(log, Fault(kind, (cell,), value=value), fitted))
+    assert [(fault.kind, fault.cells) for fault in found.faults] == [(kind, (cell,))]
+
+
+def test_of_two_cells_that_read_the_same_the_one_that_contradicts_the_others_is_the_copy(
+    fitted, log, used
+):
+    cell = int(used[0])
+    copied = broken(log, Fault(FaultKind.COPY, (cell,), value=cell + 1), fitted)
+    (fault,) = fitted.diagnose(copied).faults
+    assert (fault.kind, fault.cells, fault.value) == (FaultKind.COPY, (cell,), cell + 1)
+    assert fitted.layout.place(cell + 1) in fault.reason
+
+
+def test_a_cell_that_reads_the_mean_of_those_beside_it_is_told_as_such(fitted, log, used):
+    cell = int(used[0])
+    (fault,) = fitted.diagnose(broken(log, Fault(FaultKind.COPY, (cell,)), fitted)).faults
+    assert (fault.kind, fault.cells, fault.value) == (FaultKind.COPY, (cell,), None)
+    assert "the mean of the cells beside it" in fault.reason
+
+
+def test_a_cell_that_is_dead_in_every_second_recording_is_not_called_alive(fitted, log, used):
+    cell = int(used[0])
+    dead = Fault(FaultKind.OPEN, (cell,))
+    seen = [
+        inject(frames, [dead], fitted.layout) if i % 2 else frames for i, frames in enumerate(log)
+    ]
+    found = fitted.diagnose(seen)
+    assert found.verdicts[cell] != Verdict.ALIVE or found.probability[cell] >= 0.1
+
+
+def test_healthy_cells_in_use_are_shown_to_be_alive_and_none_is_blamed(fitted, log, used):
+    found = fitted.diagnose(log)
+    assert not found.faults
+    assert found.contradicting == 0
+    assert (found.verdicts[used[:100]] == Verdict.ALIVE).mean() >= 0.95
+
+
+def test_where_many_cells_contradict_at_once_the_sensor_is_disturbed_and_no_cell_is_floating(
+    fitted, log
+):
+    some = np.random.default_rng(0).choice(fitted.layout.n_cells, 110, replace=False)
+    seen = broken(log, Fault(FaultKind.FLOATING, tuple(some.tolist()), value=1.5), fitted)
+    found = fitted.diagnose(seen)
+    assert not [fault for fault in found.faults if fault.kind is FaultKind.FLOATING]
+    stream = fitted.stream()
+    for frames in seen:
+        stream.extend(frames)
+    none = np.zeros(fitted.layout.n_cells, bool)
+    whole = stream.complete()
+    life = whole.proof_of_life(whole.evidence_of_life(), none, none).finish()
+    assert life.contradicting > 1 / 3
+    assert not life.refuted.any()
+    told = replace(found, contradicting=life.contradicting)
+    assert type(found).from_dict(told.to_dict()).contradicting == life.contradicting
+
+
+def test_a_reference_without_a_model_of_life_takes_a_cell_that_moves_for_alive(fitted, log, used):
+    without = SelfDiagnosis(fitted.layout)
+    without.calibrator_ = fitted.calibrator_
+    without.reference_ = replace(fitted.reference_, life=None)
+    cell = int(used[0])
+    floating = broken(log, Fault(FaultKind.FLOATING, (cell,), value=1.0), fitted)
+    assert without.diagnose(floating).verdicts[cell] == Verdict.ALIVE
+    assert fitted.diagnose(floating).verdicts[cell] == Verdict.FAULTY
+
+
+def test_frame_by_frame_a_floating_cell_is_told_as_in_batch(fitted, log, used):
+    cell = int(used[0])
+    frames = np.concatenate(broken(log[:16], Fault(FaultKind.FLOATING, (cell,), value=1.0), fitted))
+    monitor = Monitor(fitted)
+    told = set[FaultKind]()
+    for frame in frames:
+        told |= {
+            fault.kind
+            for fault in monitor.update(frame)
+            if fault.cells == (cell,) and fault.probability
+        }
+    assert FaultKind.FLOATING in told
+    assert monitor.diagnosis().to_dict() | {"n_recordings": 1} == fitted.diagnose(frames).to_dict()
+
+
+def test_the_record_keeps_the_last_segments_with_load_and_no_others():
+    record = LifeRecord()
+    for number in range(2 * KEPT):
+        root = np.full((32, 3), 0.1 * (number % 2), np.float32)
+        record = record.extend(root, root.astype(np.float64), number)
+    assert record.number == tuple(range(1, 2 * KEPT, 2))[-KEPT:]
+    assert record.loads.shape == (4 * KEPT, 3)
+
+
+def test_a_log_without_contact_proves_nothing(fitted):
+    idle = [np.zeros((50, fitted.layout.n_cells))]
+    stream = fitted.stream()
+    stream.extend(idle[0])
+    evidence = EvidenceOfLog.of(stream.life, fitted.reference_.life, fitted.layout.beside)
+    life = LifeTest(evidence, np.ones(220, bool)).finish()
+    assert not life.shown.any()
+    assert not life.evidence.any()
+
+
+def test_the_proof_of_life_is_on_unless_it_is_declined_and_is_stored_with_the_fit(fitted, log):
+    assert SelfDiagnosis(fitted.layout).proof_of_life is True
+    assert SelfDiagnosis(fitted.layout, proof_of_life=False).get_params()["proof_of_life"] is False
+    about, arrays = fitted.state()
+    again = SelfDiagnosis.from_state(about, arrays)
+    assert again.proof_of_life
+    assert again.diagnose(log).to_dict() == fitted.diagnose(log).to_dict()
+
+
+def test_the_longer_the_log_the_more_evidence_is_needed_against_cells_that_the_model_predicts_badly(
+    fitted,
+):
+    model = fitted.reference_.life
+    short, usual, long = (model.factors(units) for units in (1, model.units, 4 * model.units))
+    np.testing.assert_array_equal(short, usual)
+    badly = usual < model.counts
+    np.testing.assert_allclose(long[badly], usual[badly] / 4)
+    assert badly.any()
+
+
+def test_a_level_that_a_cell_has_all_the_time_is_no_contradiction_whatever_was_expected(
+    fitted, log
+):
+    stream = fitted.stream()
+    for frames in log:
+        stream.extend(frames)
+    pieces = stream.complete().evidence_of_life().log
+    model = fitted.reference_.life
+    each = np.arange(pieces.level.shape[1])
+    likeliest = model.table[model.of_cell(each), :, 3].argmax(axis=1)
+    context = np.broadcast_to(likeliest, pieces.level.shape)
+    always = pieces.tilted(model.probabilities, context, np.full(pieces.level.shape, 3))
+    assert (always > np.log(0.9)).all()
+    healthy, context = finished(pieces.healthy(np.ones(len(each), bool)))
+    plain = model.table[model.of_cell(each), context, pieces.level]
+    assert healthy.mean() > plain.mean()
+
+
+def test_two_cells_side_by_side_that_move_by_themselves_are_found_and_none_of_those_between(
+    fitted, log, used
+):
+    first = int(used[0])
+    dead = (first, first + 1)
+    seen = broken(log, Fault(FaultKind.FLOATING, (first,), value=1.0), fitted)
+    seen = broken(seen, Fault(FaultKind.LATE, (first + 1,), value=10), fitted)
+    found = fitted.diagnose(seen)
+    assert tuple(sorted(found.fault_set)) == dead
+
+
+def test_a_second_test_of_the_same_log_finds_what_the_first_did_and_asks_the_model_nothing(
+    fitted, log
+):
+    stream = fitted.stream()
+    for frames in log:
+        stream.extend(frames)
+    evidence = stream.complete().evidence_of_life()
+    every = np.ones(fitted.layout.n_cells, bool)
+    first = LifeTest(evidence, every)
+    life = first.finish()
+    evidence.log.healthy = None
+    again = LifeTest(evidence, every, known=first.known).finish()
+    np.testing.assert_array_equal(again.evidence, life.evidence)
+
+
+def test_what_the_others_say_of_a_cell_is_the_regression_on_the_known_ones_without_itself():
+    rng = np.random.default_rng(0)
+    loads = rng.normal(size=(300, 6)) @ rng.normal(size=(6, 6)) + 3
+    cells = np.arange(6)
+    mean = ConditionalMean.fit(loads, cells, cells)
+    known = np.array([True, True, False, True, False, True])
+    expected = mean.predict(loads, known)
+    z = (loads - mean.mean) / mean.scale
+    for cell in cells:
+        others = np.flatnonzero(known & (cells != cell))
+        weights = np.linalg.solve(
+            mean.covariance[np.ix_(others, others)], mean.covariance[others, cell]
+        )
+        np.testing.assert_allclose(
+            expected[:, cell], z[:, others] @ weights * mean.scale[cell] + mean.mean[cell]
+        )

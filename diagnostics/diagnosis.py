@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -15,7 +16,13 @@ from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
 from diagnostics.decision.line_cover import candidate_groups
 from diagnostics.decision.result import Diagnosis
 from diagnostics.decision.root_causes import CellFindings, root_causes
-from diagnostics.decision.serialization import Arrays, from_state, to_state
+from diagnostics.decision.serialization import (
+    Arrays,
+    from_state,
+    read_state,
+    to_state,
+    write_state,
+)
 from diagnostics.decision.static_loads import StaticLoad, find_static_loads
 from diagnostics.events.constant_runs import SHORTEST_RUN
 from diagnostics.evidence.life import PIECE, Life
@@ -298,6 +305,26 @@ class SelfDiagnosis:
         except (TypeError, ValueError, AttributeError) as error:
             raise ValueError(f"the stored diagnosis is damaged: {error}") from None
         return diagnoser
+
+    def save(self, path: str | Path) -> None:
+        """Write the fitted diagnosis into one file, so that nothing is fitted twice; no pickle.
+
+        A power cut leaves the earlier file or the new one.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        write_state(path, *self.state())
+
+    @classmethod
+    def load(cls, path: str | Path) -> SelfDiagnosis:
+        """Read what :meth:`save` wrote; its results are bit-identical.
+
+        Raises:
+            OSError: the file is missing, or cannot be read.
+            ValueError: it is damaged, or of another kind.
+        """
+        return cls.from_state(*read_state(path))
 
     def stream(self, needed: NDArray[np.bool_] | None = None) -> StreamState:
         """Return the state before any frame. Only tiles with a ``needed`` cell (bool ``[D]``; None:

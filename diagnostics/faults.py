@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,6 +190,21 @@ class FaultSet(Set[int]):
         object.__setattr__(self, "cells", tuple(cells.tolist()))
         object.__setattr__(self, "n_cells", int(self.n_cells))
 
+    @classmethod
+    def of(cls, cells: Cells, n_cells: int) -> FaultSet:
+        """Return F over ``n_cells`` cells from a fault set, or from any list of cells.
+
+        Raises:
+            ValueError: a fault set over another number of cells, or what is no cell of the array.
+        """
+        if isinstance(cells, FaultSet):
+            if cells.n_cells != n_cells:
+                raise ValueError(f"F is over {cells.n_cells} cells, expected one over {n_cells}")
+            return cells
+        if not isinstance(cells, Iterable) or isinstance(cells, str | bytes | Mapping):
+            raise ValueError(f"F is a fault set or a list of cells, got {str(cells)[:60]!r}")
+        return cls(tuple(cells), n_cells)
+
     @cached_property
     def mask(self) -> NDArray[np.bool_]:
         """bool ``[D]``, True on the faulty cells."""
@@ -244,3 +259,7 @@ class FaultSet(Set[int]):
                 " combined"
             )
         return other
+
+
+Cells: TypeAlias = FaultSet | Iterable[int]
+"""F, wherever one is taken: a fault set, or any list of cells."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diagnostics.evidence.life import Life
+from diagnostics.evidence.stepping import finished
 from diagnostics.threads import one_thread
 from diagnostics.wiring import Line
 
@@ -121,6 +122,23 @@ class Monitor:
                 self._life = end.value
         return ()
 
+    def flush(self) -> tuple[Fault, ...]:
+        """Evaluate all frames so far at once; return the faults that are new, changed, or gone.
+
+        After it, what was told is what :meth:`diagnosis` tells. It takes as long as that one, some
+        hundred milliseconds: it belongs to the end of a log, or to a pause of the control loop.
+        """
+        if not self._stream.received.any():
+            return ()
+        self._work = None
+        self._proof = None
+        self._segments = 0
+        with one_thread():
+            if self._life is not None:
+                self._life = finished(self._diagnoser.proof(copy(self._stream)))
+            steps = self._diagnoser.steps(copy(self._stream), life=self._life)
+            return self._changes(finished(steps))
+
     def diagnosis(self) -> Diagnosis:
         """Return the diagnosis of all frames so far, as :meth:`SelfDiagnosis.diagnose` does.
 
@@ -128,6 +146,11 @@ class Monitor:
             ValueError: no frame with a reading was received yet.
         """
         return self._diagnoser.evaluate(self._stream)
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """The faults that were told and are not gone, without a new evaluation."""
+        return tuple(self._known.values())
 
     def _changes(self, diagnosis: Diagnosis) -> tuple[Fault, ...]:
         now = {

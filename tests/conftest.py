@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import threading
@@ -85,15 +84,9 @@ def fitted(grasps: Recordings, made_once) -> SelfDiagnosis:
     nothing of it."""
 
     def make(folder: Path) -> None:
-        about, arrays = SelfDiagnosis(grasps.layout).fit(grasps.frames[::2]).state()
-        (folder / "about.json").write_text(json.dumps(about))
-        np.savez(folder / "arrays.npz", **arrays)
+        SelfDiagnosis(grasps.layout).fit(grasps.frames[::2]).save(folder / "fitted.npz")
 
-    folder = made_once("fitted", make)
-    with np.load(folder / "arrays.npz") as arrays:
-        return SelfDiagnosis.from_state(
-            json.loads((folder / "about.json").read_text()), dict(arrays)
-        )
+    return SelfDiagnosis.load(made_once("fitted", make) / "fitted.npz")
 
 
 @pytest.fixture

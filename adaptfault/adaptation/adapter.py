@@ -17,6 +17,7 @@ from adaptfault.adaptation.stages import Method, Run
 from adaptfault.models.any_model import AnyModel, not_resettable
 from adaptfault.models.heads import log_likelihood
 from diagnostics import FaultSet
+from diagnostics.faults import Cells
 
 
 class Adapter(FaultFreeModel):
@@ -46,7 +47,7 @@ class Adapter(FaultFreeModel):
 
     def adapt(
         self,
-        fault_set: FaultSet,
+        fault_set: Cells,
         *,
         method: Method = "auto",
         budget: float | None = None,
@@ -57,7 +58,7 @@ class Adapter(FaultFreeModel):
         have no effect.
 
         Args:
-            fault_set: F, over the D cells of the layout.
+            fault_set: F, over the D cells of the layout; a fault set, or a list of cells.
             method: "fill": the missing cells are imputed from the healthy ones, no training.
                 "head": in addition, a new head is fitted in closed form to the features of the
                 network and the healthy cells. "finetune": in addition, all parameters are trained,
@@ -76,7 +77,7 @@ class Adapter(FaultFreeModel):
             ValueError: an unknown method, one that this model does not allow, F over another number
                 of cells, or no healthy cell left.
         """
-        self.check(fault_set, method)
+        fault_set = self.check(fault_set, method)
         method = "fill" if method == "auto" and not len(fault_set) else method
         return Run(
             self, fault_set, budget, seed, progress, lambda: self.fault_free_accuracy
@@ -103,7 +104,7 @@ class Adapter(FaultFreeModel):
         scored windows."""
         return self._healthy.accuracy()
 
-    def forecast(self, fault_set: FaultSet, *, recordings: float | None = None) -> Forecast:
+    def forecast(self, fault_set: Cells, *, recordings: float | None = None) -> Forecast:
         """Return the accuracy (R2 of a regression) to expect of each stage, from validation windows
         without F.
 
@@ -119,7 +120,7 @@ class Adapter(FaultFreeModel):
             ValueError: F over another number of cells, no healthy cell left, or a number of
                 recordings that is not positive.
         """
-        self.check(fault_set)
+        fault_set = self.check(fault_set)
         if recordings is not None and not recordings > 0:
             raise ValueError(
                 f"a forecast needs a positive number of new recordings, got {recordings}"
@@ -147,8 +148,8 @@ class Adapter(FaultFreeModel):
         other.__dict__.pop("compact", None)  # is on its own device
         return other
 
-    def check(self, fault_set: FaultSet, method: Method = "auto") -> None:
-        """Refuse an adaptation that is impossible.
+    def check(self, fault_set: Cells, method: Method = "auto") -> FaultSet:
+        """Return F as a fault set; refuse an adaptation that is impossible.
 
         Raises:
             ValueError: an unknown method, one that this model does not allow, F over another number
@@ -156,9 +157,7 @@ class Adapter(FaultFreeModel):
         """
         if method not in get_args(Method):
             raise ValueError(f"unknown method {method!r}: use one of {', '.join(get_args(Method))}")
-        d = self.train.x.shape[2]
-        if fault_set.n_cells != d:
-            raise ValueError(f"F is over {fault_set.n_cells} cells, the model over {d}")
+        fault_set = FaultSet.of(fault_set, self.train.x.shape[2])
         if not self.layout.present.ravel()[fault_set.healthy].any():
             raise ValueError(
                 f"F holds all {int(self.layout.present.sum())} cells: no healthy one is left to"
@@ -178,3 +177,4 @@ class Adapter(FaultFreeModel):
                     f"{name} cannot be trained anew: {', '.join(kinds)} has parameters but no"
                     " reset_parameters()"
                 )
+        return fault_set

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from adaptfault.adaptation.prediction_sets import PredictionSets
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
 from adaptfault.data.windows import Windows
 from adaptfault.evaluation.scores import Scores, ValueScores
@@ -63,6 +64,7 @@ class Adaptation:
     _held_out: Tensor | None = field(default=None, repr=False)
     _scores: Scores | ValueScores | None = field(default=None, repr=False)
     _contact: ContactStatistics | None = field(default=None, repr=False)
+    _conformal: PredictionSets | None = field(default=None, repr=False)
 
     def predict(self, x: NDArray[Any] | Tensor) -> NDArray[Any]:
         """Return the class of each window ``[N, T, D]``, int64 ``[N]``, or its values, float32
@@ -116,6 +118,60 @@ class Adaptation:
         return self._held_out
 
     @property
+    def accuracy(self) -> float:
+        """Accuracy on validation, R2 of a regression: that of :attr:`scores`."""
+        scores = self.scores
+        return scores.r2 if isinstance(scores, ValueScores) else scores.accuracy
+
+    @property
+    def by_class(self) -> NDArray[np.float64]:
+        """Recall of each class on validation, float ``[n_classes]``: the share of its windows that
+        is recognised; NaN for a class without a window.
+
+        Raises:
+            ValueError: the model is a regression.
+        """
+        scores = self.scores
+        if isinstance(scores, ValueScores):
+            raise ValueError("a regression has no classes: use scores")
+        return scores.by_class
+
+    def prediction_sets(self, x: NDArray[Any] | Tensor, alpha: float = 0.1) -> NDArray[np.bool_]:
+        """Return for each window the set of classes that holds its true one with probability
+        1 - ``alpha``, bool ``[N, n_classes]``.
+
+        :mod:`adaptfault.adaptation.prediction_sets` describes the method and what it assumes. A
+        robot that acts on sets of a single class only is right about as often as stated; a set of
+        several classes, or of none, says that the window does not decide.
+
+        Args:
+            x: windows ``[N, T, D]``, 0..1; the cells in F may hold anything.
+            alpha: the share of windows whose true class may be missing, between 0 and 1.
+
+        Raises:
+            ValueError: ``alpha`` is outside; a regression; or the adaptation was stored without
+                validation.
+        """
+        return self.conformal.sets(self.predict_proba(x), alpha)
+
+    @cached_property
+    def conformal(self) -> PredictionSets:
+        """What :meth:`prediction_sets` needs to know of the validation windows.
+
+        Raises:
+            ValueError: a regression, or an adaptation without validation windows.
+        """
+        if self._conformal is not None:
+            return self._conformal
+        if self.task == "regression":
+            raise ValueError("a regression has no sets of classes")
+        windows = self._validation
+        if windows is None:
+            raise ValueError("sets of classes need validation windows, which were not stored here")
+        likely = self._outputs(windows).softmax(1).numpy()
+        return PredictionSets.fit(likely, windows.y, windows.recording)
+
+    @property
     def contact(self) -> ContactStatistics | None:
         """What accumulating probabilities over a contact needs; None for a regression, or where it
         is not stored."""
@@ -140,8 +196,14 @@ class Adaptation:
             "stages": [vars(stage) for stage in self.stages],
             "scores": self.scores.to_dict(),
             "contact": None if (contact := self.contact) is None else contact.to_dict(),
+            "sets": self._sets_to_dict(),
         }
         save_tensors(path, ADAPTATION, about, model.state_dict())
+
+    def _sets_to_dict(self) -> dict[str, Any] | None:
+        if self.task == "regression" or (self._validation is None and self._conformal is None):
+            return None
+        return self.conformal.to_dict()
 
     @classmethod
     def load(
@@ -173,13 +235,23 @@ class Adaptation:
             scores = (ValueScores if task == "regression" else Scores).from_dict(about["scores"])
             stored = about.get("contact")
             contact = None if stored is None else ContactStatistics.from_dict(stored)
+            kept = about.get("sets")
+            sets = None if kept is None else PredictionSets.from_dict(kept)
         except ModelNotAllowed:
             raise
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise ValueError(
                 f"the adaptation in {path} is damaged: {str(error).splitlines()[0]}"
             ) from None
-        return cls(model.eval(), fault_set, stages, task, _scores=scores, _contact=contact)
+        return cls(
+            model.eval(),
+            fault_set,
+            stages,
+            task,
+            _scores=scores,
+            _contact=contact,
+            _conformal=sets,
+        )
 
 
 def load_healthy(folder: str | Path) -> Adaptation:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,9 +52,11 @@ class Windows:
 
     def __str__(self) -> str:
         n, t, d = self.x.shape
-        classes = len(np.unique(self.y[self.y >= 0]))
+        told = f"{len(np.unique(self.y[self.y >= 0]))} classes"
+        if self.y.ndim == 2:
+            told = "1 value" if self.y.shape[1] == 1 else f"{self.y.shape[1]} values"
         recordings = len(np.unique(self.recording))
-        return f"{n} windows of {t} frames x {d} cells, {recordings} recordings, {classes} classes"
+        return f"{n} windows of {t} frames x {d} cells, {recordings} recordings, {told}"
 
     def select(self, which: NDArray[Any] | Sequence[int] | slice) -> Windows:
         """Return the windows of a bool mask ``[N]``, of indices in their order, or of a slice."""
@@ -93,7 +95,7 @@ def hold_missing(frames: NDArray[Any]) -> NDArray[Any]:
 
 def make_windows(
     recordings: Sequence[ArrayLike],
-    labels: ArrayLike | None,
+    targets: ArrayLike | Sequence[ArrayLike] | None,
     layout: SensorLayout,
     *,
     length: int = 10,
@@ -107,43 +109,83 @@ def make_windows(
     Args:
         recordings: in the layout's unit, as :meth:`SensorLayout.recordings` takes them; lengths may
             differ.
-        labels: int ``[n]``, one class a recording; None gives y = -1.
+        targets: of a classification, int ``[n]``, one class a recording; None gives y = -1. Of a
+            regression, float ``[n, k]``, values of each recording, or a list of float ``[T, k]``,
+            values of each frame (``[T]``, as long as its recording: one value). A window has those
+            of its last frame, which is the present when a robot has read the window.
         layout: the array they come from.
         length: frames in a window, 10 in Section VI-C.
         stride: frames between the starts of two windows; None means ``length``, windows that do not
             overlap.
 
     Raises:
-        ValueError: a recording that does not fit the layout, another number of labels, no window at
-            all.
+        ValueError: a recording that does not fit the layout, another number of targets, a value
+            that is not finite, no window at all.
     """
     recordings = layout.recordings(recordings)
     stride = length if stride is None else stride
     if length < 1 or stride < 1:
         raise ValueError(f"windows need length >= 1 and stride >= 1, got {length} and {stride}")
-    classes = np.full(len(recordings), -1) if labels is None else np.asarray(labels)
-    if classes.shape != (len(recordings),):
-        raise ValueError(
-            f"{len(recordings)} recordings need as many labels, got {list(classes.shape)}"
-        )
+    checked = [
+        layout.check_recording(recording, f"recording {i}")
+        for i, recording in enumerate(recordings)
+    ]
+    of_frames = _targets_of_frames(targets, [len(recording) for recording in checked])
+    y: list[NDArray[Any]] = []
     pieces: list[NDArray[np.float32]] = []
     counts = np.zeros(len(recordings), dtype=np.int64)
     longest = 0
-    for i, recording in enumerate(recordings):
-        frames = hold_missing(scale(layout.check_recording(recording, f"recording {i}"), layout))
+    for i, recording in enumerate(checked):
+        frames = hold_missing(scale(recording, layout))
         longest = max(longest, len(frames))
         if len(frames) >= length:
             # [n, D, T]
             views = np.lib.stride_tricks.sliding_window_view(frames, length, axis=0)[::stride]
             pieces.append(views.transpose(0, 2, 1))
             counts[i] = len(views)
+            y.append(of_frames[i][length - 1 :: stride])
     if not pieces:
         raise ValueError(
             f"no windows: a window needs {length} frames, the longest of {len(recordings)}"
             f" recordings has {longest}"
         )
     x = np.ascontiguousarray(np.concatenate(pieces), dtype=np.float32)
-    return Windows(x, np.repeat(classes, counts), np.repeat(np.arange(len(recordings)), counts))
+    return Windows(x, np.concatenate(y), np.repeat(np.arange(len(recordings)), counts))
+
+
+def _targets_of_frames(
+    targets: ArrayLike | Sequence[ArrayLike] | None, lengths: Sequence[int]
+) -> list[NDArray[Any]]:
+    """Return for each recording the class of its frames, int ``[T]``, or their values, float32
+    ``[T, k]``."""
+    given = [-1] * len(lengths) if targets is None else list(cast(Iterable[ArrayLike], targets))
+    if len(given) != len(lengths):
+        raise ValueError(f"{len(lengths)} recordings need as many targets, got {len(given)}")
+    each = [np.asarray(of) for of in given]
+    kinds = {of.dtype.kind for of in each}
+    if kinds <= set("iub") and all(of.ndim == 0 for of in each):
+        return [np.full(frames, int(of)) for frames, of in zip(lengths, each, strict=True)]
+    if not kinds <= set("iubf"):
+        raise ValueError("targets are whole numbers (classes) or floats (values), nothing else")
+    each = [np.atleast_1d(of).astype(np.float32) for of in each]
+    if all(of.shape == (frames,) for of, frames in zip(each, lengths, strict=True)):
+        each = [of[:, None] for of in each]
+    widths = {of.shape[-1] for of in each}
+    if len(widths) > 1:
+        raise ValueError(
+            f"every recording needs as many values, got {sorted(widths)}; values of each frame are"
+            " [T, k]"
+        )
+    (k,) = widths
+    for i, (of, frames) in enumerate(zip(each, lengths, strict=True)):
+        if of.shape not in ((k,), (frames, k)):
+            raise ValueError(
+                f"recording {i} has {frames} frames: expected targets [{k}] or [{frames}, {k}], got"
+                f" {list(of.shape)}"
+            )
+        if not np.isfinite(of).all():
+            raise ValueError(f"the targets of recording {i} are not all finite")
+    return [np.broadcast_to(of, (frames, k)) for of, frames in zip(each, lengths, strict=True)]
 
 
 def recordings_of(windows: Windows, layout: SensorLayout) -> list[NDArray[np.float64]]:
@@ -159,7 +201,8 @@ def recordings_of(windows: Windows, layout: SensorLayout) -> list[NDArray[np.flo
 def split(
     windows: Windows, *, test: float = 0.2, validation: float = 0.2, seed: int = 0
 ) -> tuple[Windows, Windows, Windows]:
-    """Return ``(train, validation, test)``, split by recording and stratified by class.
+    """Return ``(train, validation, test)``, split by recording and stratified by class; those of a
+    regression by recording alone.
 
     ``validation`` is a share of the recordings outside the test set, so the defaults give 64 %, 16
     % and 20 % (Section VI-C). Every class has a recording on each side, which plain stratification
@@ -175,8 +218,9 @@ def split(
     recordings, first, inverse = np.unique(
         windows.recording, return_index=True, return_inverse=True
     )
-    classes = windows.y[first]  # of each recording
-    if (mixed := classes[inverse] != windows.y).any():
+    of_class = windows.y if windows.y.ndim == 1 else np.zeros(len(windows), np.int64)
+    classes = of_class[first]  # of each recording
+    if (mixed := classes[inverse] != of_class).any():
         raise ValueError(
             f"recording {windows.recording[mixed][0]} has windows of two classes: give each its own"
             " number"
@@ -184,10 +228,10 @@ def split(
     sides = 1 + (test > 0) + (validation > 0)
     for label, count in zip(*np.unique(classes, return_counts=True), strict=True):
         if count < sides:
-            raise ValueError(
-                f"class {label} has {count} recordings: a split into {sides} parts needs at least"
-                f" {sides}"
-            )
+            found = f"class {label} has {count} recordings"
+            if windows.y.ndim == 2:
+                found = f"there are {count} recordings"
+            raise ValueError(f"{found}: a split into {sides} parts needs at least {sides}")
     rng = np.random.default_rng(seed)
     rest = np.arange(len(recordings))
     chosen = _draw(rest, classes, test, 1 + (validation > 0), rng)

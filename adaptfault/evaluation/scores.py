@@ -74,6 +74,13 @@ class Scores:
             float((t == p).mean()), float(precision), float(recall), float(f1), confusion, len(t)
         )
 
+    @property
+    def by_class(self) -> NDArray[np.float64]:
+        """Recall of each class, float ``[C]``; NaN for a class without a window."""
+        right = self.confusion.diagonal()
+        total = self.confusion.sum(axis=1)
+        return np.where(total > 0, right / np.maximum(total, 1), np.nan)
+
     def __eq__(self, other: object) -> bool:
         return self.to_dict() == other.to_dict() if isinstance(other, Scores) else NotImplemented
 

@@ -16,6 +16,7 @@ from adaptfault.imputation.cross_fitted import CrossFitted
 from adaptfault.imputation.recalibration import two_folds
 from adaptfault.imputation.tiled_statistics import LARGE, TiledStatistics
 from diagnostics import FaultSet, SensorLayout
+from diagnostics.faults import Cells
 
 _MOST_FRAMES = 20_000  # of the fit; more are thinned evenly
 _PLANS = 64  # fault sets whose affine maps are cached
@@ -91,22 +92,22 @@ class Restorer:
     def transform(
         self,
         recording: ArrayLike,
-        fault_set: FaultSet | None = ...,
+        fault_set: Cells | None = ...,
         *,
         return_std: Literal[False] = ...,
     ) -> Floats: ...
     @overload
     def transform(
-        self, recording: ArrayLike, fault_set: FaultSet | None = ..., *, return_std: Literal[True]
+        self, recording: ArrayLike, fault_set: Cells | None = ..., *, return_std: Literal[True]
     ) -> tuple[Floats, Floats]: ...
     def transform(
-        self, recording: ArrayLike, fault_set: FaultSet | None = None, *, return_std: bool = False
+        self, recording: ArrayLike, fault_set: Cells | None = None, *, return_std: bool = False
     ) -> Floats | tuple[Floats, Floats]:
         """Return ``recording [T, D]`` with the cells in F and all NaN restored.
 
         Args:
             recording: readings in the unit of the layout; the cells in F may hold anything.
-            fault_set: F; None restores NaN only.
+            fault_set: F, a fault set or a list of cells; None restores NaN only.
             return_std: also return the standard deviation of each reading, ``[T, D]``: 0 where it
                 is not restored.
         """
@@ -128,7 +129,7 @@ class Restorer:
                     deviation[np.ix_(of, part.missing)] = part.deviation
         return (frames, deviation) if return_std else frames
 
-    def update(self, frame: ArrayLike, fault_set: FaultSet | None = None) -> Floats:
+    def update(self, frame: ArrayLike, fault_set: Cells | None = None) -> Floats:
         """Return one ``frame [D]`` with the cells in F and all NaN restored.
 
         The first frame with a new set of missing cells takes the time of a linear solve; the next
@@ -142,7 +143,7 @@ class Restorer:
                 x[part.missing] = self._clip(part.weight @ known[part.known] + part.bias)
         return x
 
-    def deviation(self, fault_set: FaultSet) -> Floats:
+    def deviation(self, fault_set: Cells) -> Floats:
         """Return the standard deviation of the error of each cell with F missing, ``[D]``; 0 for
         healthy cells."""
         out = np.zeros(self.layout.n_cells)
@@ -154,16 +155,12 @@ class Restorer:
         clipped: NDArray[np.float32] = np.minimum(np.maximum(values, 0), self.layout.full_scale)
         return clipped
 
-    def _missing(self, frames: Floats, fault_set: FaultSet | None) -> NDArray[np.bool_]:
+    def _missing(self, frames: Floats, fault_set: Cells | None) -> NDArray[np.bool_]:
         if not hasattr(self, "mean_"):
             raise ValueError("this restorer is not fitted: call fit with healthy recordings first")
         missing = np.isnan(frames)
         if fault_set is not None:
-            if fault_set.n_cells != self.layout.n_cells:
-                raise ValueError(
-                    f"F is over {fault_set.n_cells} cells, the layout has {self.layout.n_cells}"
-                )
-            missing |= fault_set.mask
+            missing |= FaultSet.of(fault_set, self.layout.n_cells).mask
         return missing
 
     def _plan(self, mask: NDArray[np.bool_]) -> tuple[_Map, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -22,8 +22,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from adaptfault.imputation.cross_fitted import CrossFitted
 from diagnostics import FaultSet
-
-Faults = FaultSet | Sequence[int] | None
+from diagnostics.faults import Cells
 
 
 class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]
@@ -43,7 +42,7 @@ class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # typ
         n_features_in_, feature_names_in_: as in scikit-learn.
     """
 
-    def __init__(self, fault_set: Faults = None) -> None:
+    def __init__(self, fault_set: Cells | None = None) -> None:
         self.fault_set = fault_set
 
     def fit(self, X: ArrayLike, y: object = None) -> CellImputer:
@@ -108,7 +107,7 @@ class CellImputer(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):  # typ
         return tags
 
 
-def columns_of(fault_set: Faults, n_features: int) -> NDArray[np.bool_]:
+def columns_of(fault_set: Cells | None, n_features: int) -> NDArray[np.bool_]:
     """Return bool ``[n_features]``, the columns that belong to the cells of F.
 
     Raises:
@@ -118,7 +117,7 @@ def columns_of(fault_set: Faults, n_features: int) -> NDArray[np.bool_]:
     if fault_set is None:
         return np.zeros(n_features, dtype=bool)
     if not isinstance(fault_set, FaultSet):
-        fault_set = FaultSet(tuple(int(cell) for cell in fault_set), n_features)
+        fault_set = FaultSet.of(fault_set, n_features)
     if n_features % fault_set.n_cells:
         raise ValueError(
             f"F is over {fault_set.n_cells} cells, X has {n_features} columns: no multiple of it"
@@ -168,7 +167,7 @@ class _FaultTolerant(MetaEstimatorMixin, BaseEstimator):  # type: ignore[misc]
             self.classes_ = self._fitted.classes_
         return self.set_faults(None)
 
-    def set_faults(self, fault_set: Faults) -> Any:
+    def set_faults(self, fault_set: Cells | None) -> Any:
         """Adapt to F from the healthy data; earlier F have no effect. Returns self.
 
         Cross-validation compares imputing F in front of the fitted estimator with a refit on the

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 SCHEMA = "adaptfault.model/1"
 ADAPTATION = "adaptfault.adaptation/1"  # schema of an adapted model
 MANIFEST = "manifest.json"
+_BUNDLE = "bundle.json"  # a folder with one holds models, and is none
 _HEAD = "closed form head."  # begins the names of its tensors; no module's name holds a space
 
 
@@ -113,6 +114,11 @@ def read_manifest(folder: str | Path, schema: str) -> dict[str, Any]:
 def _manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     if not path.is_file():
+        if (folder / _BUNDLE).is_file():
+            raise FileNotFoundError(
+                f"{folder} is a bundle, not a model: Bundle.open({str(folder)!r}).adapter() has its"
+                " model, and its healthy adaptation"
+            )
         raise FileNotFoundError(f"{folder}: expected a folder with a {MANIFEST}, found none")
     try:
         manifest = json.loads(path.read_bytes())

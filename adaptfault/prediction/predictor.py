@@ -47,6 +47,8 @@ class Reading:
         version: number of the version that computed the label.
         contact: float32 ``[n_classes]``, probabilities accumulated over the windows of the present
             contact; None without contact, or where the predictor does not accumulate.
+        name: name of the class; None where there is no label, or classes have no names.
+        faults: all faults that the monitor knows now, as :attr:`diagnostics.Monitor.faults`.
     """
 
     label: int | None
@@ -55,10 +57,16 @@ class Reading:
     events: tuple[Fault, ...]
     version: int
     contact: NDArray[np.float32] | None = None
+    name: str | None = None
+    faults: tuple[Fault, ...] = ()
 
     def __str__(self) -> str:
         confidence = "" if self.probabilities is None else f" ({self.probabilities.max():.2f})"
-        result = "window not full yet" if self.label is None else f"class {self.label}{confidence}"
+        result = (
+            "window not full yet"
+            if self.label is None
+            else f"{self.name or f'class {self.label}'}{confidence}"
+        )
         news = "".join(f"; {event.reason}" for event in self.events)
         return f"{result}, {len(self.fault_set)} cells dropped, version {self.version}{news}"
 
@@ -199,14 +207,24 @@ class Predictor:
         self._last = np.where(np.isnan(scaled), self._last, scaled)
         # All cells are kept, the dropped ones too: the next version may use them.
         self._frames = np.concatenate([self._frames, self._last[None]])[-model.length :]
-        label = probabilities = None
+        label = probabilities = name = None
         if len(self._frames) == model.length:
             probabilities = model.predict_proba(self._frames[None])[0]
             label = int(probabilities.argmax())
+            name = self.class_names[label] if self.class_names else None
         contact = (
             None if self._decision is None else self._decision.update(self._last, probabilities)
         )
-        return Reading(label, probabilities, model.fault_set, events, self.version, contact)
+        return Reading(
+            label,
+            probabilities,
+            model.fault_set,
+            events,
+            self.version,
+            contact,
+            name,
+            self._monitor.faults,
+        )
 
     def _new_decision(self) -> ContactDecision | None:
         """Return a decision for the running version, without contact; None where the predictor does

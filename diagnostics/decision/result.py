@@ -19,6 +19,7 @@ from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.transport import TransportFault
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
 
 SCHEMA = "adaptfault.diagnosis/1"
@@ -37,6 +38,9 @@ LETTERS = {
     FaultKind.CLAMPED: "M",
     FaultKind.WEAK: "W",
 }
+
+
+_SURE = 0.95
 
 
 class Verdict(IntEnum):
@@ -90,6 +94,27 @@ class Diagnosis:
         return FaultSet(
             tuple({c for fault in self.faults for c in fault.cells}), self.layout.n_cells
         )
+
+    @cached_property
+    def false_share(self) -> float:
+        """Upper bound (95 %) of the share of healthy cells in F, 0 to 1; 0 where F is empty.
+
+        Each root cause is right with its own probability, independent of the others; a wrong one
+        puts all its cells into F wrongly. The bound is the 95 % quantile of the number of wrong
+        cells (a Poisson binomial distribution, weighted by the cells of each cause) as a share of
+        F. It holds as far as the probabilities are calibrated: faults unlike the injected ones of
+        the calibration, and disturbances of the whole array, are outside of it.
+        """
+        if not self.faults:
+            return 0.0
+        wrong = np.ones(1)  # probability of 0, 1, ... wrong cells
+        for fault in self.faults:
+            right = 1.0 if fault.probability is None else fault.probability
+            shifted = np.concatenate([np.zeros(len(fault.cells)), wrong])
+            wrong = np.concatenate([wrong * right, np.zeros(len(fault.cells))])
+            wrong += shifted * (1 - right)
+        most = int(np.searchsorted(np.cumsum(wrong), _SURE))
+        return min(most / len(self.fault_set), 1.0)
 
     @property
     def frozen(self) -> tuple[TransportFault, ...]:
@@ -189,6 +214,40 @@ class Diagnosis:
         frames = "1 frame" if self.n_frames == 1 else f"{self.n_frames} frames"
         head = f"{found} in {recordings} ({frames}); {self.coverage}"
         return "\n".join([head, self.map(), *reasons])
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return a pandas DataFrame with a row a cell, in their order.
+
+        Columns: ``cell``, ``pad``, ``row``, ``column``, ``verdict`` ("ALIVE", "FAULTY",
+        "UNTESTED"), ``probability`` of a fault, ``kind`` of the fault and ``line``, the wire
+        behind it; both are empty where there is none. A layout of several axes adds ``axis``.
+        Positions without a cell are left out.
+        """
+        import pandas as pd
+
+        kind = np.full(self.layout.n_cells, "", dtype=object)
+        line = kind.copy()
+        for fault in self.faults:
+            kind[list(fault.cells)] = str(fault.kind)
+            if fault.line is not None:
+                line[list(fault.cells)] = str(fault.line)
+        cells = np.flatnonzero(self.layout.present.ravel())
+        places = [self.layout.position(cell) for cell in cells.tolist()]
+        pad, row, column = zip(*places, strict=True)
+        axis = {"axis": cells % self.layout.axes} if self.layout.axes > 1 else {}
+        return pd.DataFrame(
+            {
+                "cell": cells,
+                "pad": pad,
+                "row": row,
+                "column": column,
+                **axis,
+                "verdict": [verdict.name for verdict in self.verdicts[cells]],
+                "probability": self.probability[cells],
+                "kind": kind[cells],
+                "line": line[cells],
+            }
+        )
 
     def plot(self, page: float = 10.0) -> Figure:
         """Return the verdict map as a matplotlib Figure; pads that do not fit ``page`` inches side

@@ -8,8 +8,15 @@ tuples of these, and ``| None``. A :class:`~diagnostics.layout.SensorLayout` is 
 
 from __future__ import annotations
 
+import json
+import os
+import struct
+import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from io import BytesIO
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -20,6 +27,22 @@ from diagnostics.layout import SensorLayout
 
 Arrays = dict[str, NDArray[Any]]
 T = TypeVar("T")
+
+_ABOUT = "about.json"
+# what numpy and zipfile raise for a file that was cut off, changed, or is another one
+_DAMAGED = (
+    AttributeError,
+    EOFError,
+    KeyError,
+    NotImplementedError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 def to_state(value: object) -> tuple[Any, Arrays]:
@@ -102,3 +125,44 @@ def _array(about: Any, arrays: Mapping[str, ArrayLike]) -> NDArray[Any]:
     if about["finite"] and not np.isfinite(array).all():
         raise ValueError(f"{name} holds numbers that are not finite")
     return np.array(array, order="C")
+
+
+def write_state(
+    path: str | Path, about: Mapping[str, Any], arrays: Mapping[str, ArrayLike]
+) -> None:
+    """Write a description and arrays into one file: an NPZ archive, the description as the bytes of
+    its JSON.
+
+    The file is written beside ``path`` and renamed, so that a power cut leaves the old one or the
+    new one.
+    """
+    path = Path(path)
+    text = json.dumps(about, allow_nan=False).encode()
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with beside.open("wb") as file:
+            np.savez(file, **{_ABOUT: np.frombuffer(text, np.uint8)}, **arrays)  # type: ignore[arg-type]
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def read_state(path: str | Path) -> tuple[dict[str, Any], Arrays]:
+    """Read what :func:`write_state` wrote.
+
+    Raises:
+        OSError: the file is missing, or cannot be read.
+        ValueError: it is damaged, or of another kind.
+    """
+    data = Path(path).read_bytes()
+    try:
+        with np.load(BytesIO(data), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        about = json.loads(arrays.pop(_ABOUT).tobytes())
+        if not isinstance(about, dict):
+            raise TypeError("its description is no object")
+    except _DAMAGED as error:
+        raise ValueError(f"{path} is damaged, or holds no fitted diagnosis: {error}") from None
+    return about, arrays

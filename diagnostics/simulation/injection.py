@@ -33,7 +33,7 @@ _CLOSES = 0.4
 
 def inject(
     recording: ArrayLike,
-    faults: Iterable[Fault],
+    faults: Iterable[Fault | int],
     layout: SensorLayout,
     *,
     seed: int | None = None,
@@ -48,7 +48,8 @@ def inject(
 
     Args:
         recording: ``[T, D]`` or ``[T, pads, rows, cols]``, in the layout's unit.
-        faults: root causes; empty leaves the values as they are.
+        faults: root causes, or cells, as a FaultSet holds them: these are open. Empty leaves the
+            values as they are.
         layout: the array.
         seed: for the kinds that draw (INTERMITTENT, NOISY, FLOATING) and for dither; None draws
             anew each time.
@@ -71,7 +72,8 @@ def inject(
     healthy = layout.check_recording(recording)
     out = healthy.copy()
     rng = np.random.default_rng(seed)
-    for fault in faults:
+    for given in faults:
+        fault = given if isinstance(given, Fault) else Fault(FaultKind.OPEN, (given,))
         if fault.cells[-1] >= layout.n_cells:
             raise ValueError(
                 f"the fault names cell {fault.cells[-1]}, but the layout has {layout.n_cells}"

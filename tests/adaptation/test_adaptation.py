@@ -400,7 +400,7 @@ def test_a_damaged_adaptation_is_refused_in_one_line(adapter, tmp_path):
 
 
 def test_what_cannot_be_adapted_is_said(adapter):
-    with pytest.raises(ValueError, match="F is over 220 cells, the model over 32"):
+    with pytest.raises(ValueError, match="F is over 220 cells, expected one over 32"):
         adapter.adapt(FaultSet((1,), 220))
     with pytest.raises(ValueError, match="holds all 32 cells"):
         adapter.adapt(FaultSet(range(D), D))
@@ -410,3 +410,30 @@ def test_what_cannot_be_adapted_is_said(adapter):
         Adapter(adapter.model, adapter.train.select([]), adapter.validation)
     with pytest.raises(TypeError, match=r"repairs a torch\.nn\.Module, got dict"):
         Adapter({}, adapter.train, adapter.validation)
+
+
+def test_a_list_of_cells_is_a_fault_set(adapter):
+    listed = adapter.adapt([3, 1, 17], method="fill", progress=False)
+    assert listed.fault_set == FaultSet((1, 3, 17), D)
+    assert adapter.forecast(np.array([3, 1])).fault_set == FaultSet((1, 3), D)
+    for wrong in ([-1], [D], [1.5], "13", 3, None, {3: 1}):
+        with pytest.raises(ValueError, match="F "):
+            adapter.adapt(wrong)
+
+
+def test_an_adaptation_tells_its_accuracy_by_class_and_sets_of_classes(adapter, tmp_path):
+    adapted = adapter.adapt([1, 3, 17], method="head", progress=False)
+    scores = adapted.scores
+    assert adapted.accuracy == scores.accuracy
+    weights = scores.confusion.sum(axis=1) / scores.n
+    assert adapted.by_class @ weights == pytest.approx(scores.accuracy)
+    x = blobs(400, 5)
+    sets = adapted.prediction_sets(x.x)
+    assert sets.shape == (400, 3)
+    assert sets[np.arange(400), x.y].mean() > 0.85
+    wider = adapted.prediction_sets(x.x, alpha=0.02)
+    assert (wider >= sets).all()
+    adapted.save(tmp_path / "adapted")
+    loaded = Adaptation.load(tmp_path / "adapted")
+    assert (loaded.prediction_sets(x.x) >= sets).all()
+    assert loaded.accuracy == adapted.accuracy

@@ -64,6 +64,50 @@ def test_recordings_without_labels_give_class_minus_one():
     assert make_windows([ramp(20)], None, LAYOUT).y.tolist() == [-1, -1]
 
 
+def test_values_of_a_recording_are_those_of_each_of_its_windows():
+    recordings = [np.zeros((25, 4)), np.zeros((10, 4))]
+    windows = make_windows(recordings, [[1.5, 2.0], [3.0, 4.0]], SensorLayout(1, 2, 2))
+    assert windows.y.dtype == np.float32
+    assert windows.y.tolist() == [[1.5, 2.0], [1.5, 2.0], [3.0, 4.0]]
+    one = make_windows(recordings, np.array([1.5, 2.5]), SensorLayout(1, 2, 2))
+    assert one.y.tolist() == [[1.5], [1.5], [2.5]]
+
+
+def test_values_of_frames_are_those_of_the_last_frame_of_a_window():
+    recordings = [np.zeros((25, 4)), np.zeros((10, 4))]
+    of_frames = [np.arange(25.0), np.arange(10.0)]
+    windows = make_windows(recordings, of_frames, SensorLayout(1, 2, 2), stride=5)
+    assert windows.y[:, 0].tolist() == [9, 14, 19, 24, 9]
+    pairs = [np.stack([of, -of], axis=1) for of in of_frames]
+    two = make_windows(recordings, pairs, SensorLayout(1, 2, 2), stride=5)
+    assert two.y[:, 1].tolist() == [-9, -14, -19, -24, -9]
+
+
+@pytest.mark.parametrize(
+    ("targets", "message"),
+    [
+        ([[1.0], [2.0], [3.0]], "2 recordings need as many targets, got 3"),
+        ([[1.0, 2.0], [1.0]], r"as many values, got \[1, 2\]"),
+        ([np.zeros((24, 1)), np.zeros((10, 1))], r"recording 0 has 25 frames: expected targets"),
+        ([[np.nan], [1.0]], "targets of recording 0 are not all finite"),
+        (["a", "b"], "whole numbers"),
+    ],
+)
+def test_targets_that_fit_no_recording_are_refused(targets, message):
+    with pytest.raises(ValueError, match=message):
+        make_windows([np.zeros((25, 4)), np.zeros((10, 4))], targets, SensorLayout(1, 2, 2))
+
+
+def test_a_regression_is_split_by_recording():
+    recordings = [np.zeros((30, 4))] * 20
+    windows = make_windows(recordings, np.arange(20.0), SensorLayout(1, 2, 2))
+    parts = split(windows)
+    assert [len(set(part.recording)) for part in parts] == [13, 3, 4]
+    assert sum(len(part) for part in parts) == len(windows)
+    with pytest.raises(ValueError, match="there are 2 recordings: a split"):
+        split(make_windows(recordings[:2], np.arange(2.0), SensorLayout(1, 2, 2)))
+
+
 def test_no_window_at_all_is_an_error_that_says_so():
     with pytest.raises(
         ValueError, match="no windows: a window needs 10 frames, the longest of 2 recordings has 9"
@@ -76,7 +120,7 @@ def test_no_window_at_all_is_an_error_that_says_so():
 def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="recording 1"):
         make_windows([ramp(10), np.zeros((10, 5))], [0, 1], LAYOUT)
-    with pytest.raises(ValueError, match="2 recordings need as many labels"):
+    with pytest.raises(ValueError, match="2 recordings need as many targets"):
         make_windows([ramp(10), ramp(10)], [0], LAYOUT)
     with pytest.raises(ValueError, match="stride >= 1"):
         make_windows([ramp(10)], [0], LAYOUT, stride=0)

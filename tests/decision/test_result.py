@@ -2,6 +2,7 @@ import base64
 import json
 import re
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -133,6 +134,38 @@ def test_suspects_are_f_and_the_tested_cells_that_are_likely_enough():
     assert diagnosis.suspects() == {1, 2, 30}
     assert diagnosis.suspects(0.05) == {1, 30}
     assert diagnosis.suspects(1.0) == diagnosis.fault_set
+
+
+def test_the_table_has_a_row_for_each_cell_that_exists():
+    table = diagnosed(ROW, CELL).to_dataframe()
+    assert table["cell"].tolist() == list(range(40))
+    assert table.loc[30].to_dict() == {
+        "cell": 30,
+        "pad": 1,
+        "row": 2,
+        "column": 0,
+        "verdict": "FAULTY",
+        "probability": 0.01,
+        "kind": "short",
+        "line": "",
+    }
+    assert table.groupby("line")["cell"].count()["pad 0, row 1"] == 5
+    present = np.ones(LAYOUT.shape, bool)
+    present[0, 0, 1] = False
+    masked = diagnosed(layout=SensorLayout(2, 4, 5, present=present)).to_dataframe()
+    assert 1 not in set(masked["cell"])
+    axes = SensorLayout(2, 2, 5, axes=2)
+    assert diagnosed(layout=axes).to_dataframe()["axis"].tolist()[:3] == [0, 1, 0]
+
+
+def test_the_share_of_false_cells_is_a_bound_by_the_probabilities_of_the_causes():
+    assert diagnosed().false_share == 0
+    assert diagnosed(Fault("open", (3,))).false_share == 0  # known, not inferred
+    cells = [Fault("open", (c,), probability=0.9) for c in range(20)]
+    drawn = np.random.default_rng(0).binomial(20, 0.1, 100_000) / 20
+    assert diagnosed(*cells).false_share == np.quantile(drawn, 0.95)
+    wire = replace(ROW, probability=0.9)  # all of its cells are wrong together
+    assert diagnosed(wire, CELL).false_share == 5 / 6
 
 
 def test_each_cell_is_alive_faulty_or_untested():

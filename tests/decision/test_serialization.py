@@ -1,21 +1,21 @@
-import json
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
-from safetensors.numpy import load, save
 
 from adaptfault.data.recordings import Recordings
 from diagnostics import Fault, Line, Monitor, SelfDiagnosis, SensorLayout, inject, line_fault
 
 
 def stored(diagnoser: SelfDiagnosis) -> SelfDiagnosis:
-    """Through JSON text and safetensors bytes, as on a disk."""
-    about, arrays = diagnoser.state()
-    text = json.dumps(about, allow_nan=False)
-    data = save(arrays)
-    return SelfDiagnosis.from_state(json.loads(text), load(data))
+    """Through a file, as on a disk."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "diagnosis.npz"
+        diagnoser.save(path)
+        return SelfDiagnosis.load(path)
 
 
 @pytest.fixture(scope="module")
@@ -168,20 +168,56 @@ def test_a_probability_that_cannot_be_is_refused(p_floor):
 
 
 def test_restoring_needs_no_torch(tmp_path):
-    about, arrays = small_fit(SensorLayout(1, 3, 3)).state()
-    (tmp_path / "about.json").write_text(json.dumps(about))
-    (tmp_path / "arrays.safetensors").write_bytes(save(arrays))
+    path = tmp_path / "diagnosis.npz"
+    small_fit(SensorLayout(1, 3, 3)).save(path)
     code = """
-import json, sys
-from pathlib import Path
-from safetensors.numpy import load
+import sys
 from diagnostics import SelfDiagnosis
-home = Path(sys.argv[1])
-about = json.loads((home / "about.json").read_text())
-arrays = load((home / "arrays.safetensors").read_bytes())
-print(SelfDiagnosis.from_state(about, arrays).layout.n_cells, "torch" in sys.modules)
+print(SelfDiagnosis.load(sys.argv[1]).layout.n_cells, "torch" in sys.modules)
 """
     done = subprocess.run(
-        [sys.executable, "-c", code, tmp_path], check=True, capture_output=True, text=True
+        [sys.executable, "-c", code, path], check=True, capture_output=True, text=True
     )
     assert done.stdout.split() == ["9", "False"]
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut", b"{}", b"\x93NUMPY"])
+def test_a_file_that_is_no_fitted_diagnosis_is_refused_by_its_name(tmp_path, content):
+    path = tmp_path / "diagnosis.npz"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"diagnosis\.npz is damaged, or holds no fitted"):
+        SelfDiagnosis.load(path)
+
+
+def test_each_byte_that_turns_in_a_file_is_noticed_or_changes_nothing(tmp_path):
+    path = tmp_path / "diagnosis.npz"
+    whole = small_fit(SensorLayout(1, 2, 3))
+    whole.save(path)
+    data = path.read_bytes()
+    about, arrays = whole.state()
+    rng = np.random.default_rng(0)
+    for place in rng.choice(len(data), 60, replace=False):
+        turned = bytearray(data)
+        turned[place] ^= 0x10
+        path.write_bytes(turned)
+        try:
+            other, found = SelfDiagnosis.load(path).state()
+        except ValueError:
+            continue
+        assert other == about
+        assert all(np.array_equal(found[name], arrays[name], equal_nan=True) for name in arrays)
+
+
+def test_a_save_that_fails_leaves_the_earlier_file(tmp_path, monkeypatch):
+    path = tmp_path / "diagnosis.npz"
+    earlier = small_fit(SensorLayout(1, 2, 3))
+    earlier.save(path)
+
+    def full(*args: object, **named: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("numpy.savez", full)
+    with pytest.raises(OSError, match="No space left"):
+        small_fit(SensorLayout(1, 3, 3)).save(path)
+    assert [file.name for file in tmp_path.iterdir()] == ["diagnosis.npz"]
+    assert SelfDiagnosis.load(path).layout == earlier.layout

@@ -111,6 +111,20 @@ def test_a_diagnosis_in_between_changes_nothing(fitted, log, middle):
     assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames))
 
 
+def test_a_flush_tells_at_once_what_diagnose_tells(fitted, log, middle):
+    for diagnoser in (fitted, COLD):
+        frames = inject(log, mixes(middle)["cells"], LAYOUT, seed=0, dither=0.004)[:970]
+        monitor, told = watched(diagnoser, frames)
+        changes = monitor.flush()
+        known = {fault.cells: fault for _, fault in told} | {f.cells: f for f in changes}
+        faults = monitor.diagnosis().faults
+        assert {cells for cells, fault in known.items() if fault.probability} == {
+            fault.cells for fault in faults
+        }
+        assert monitor.flush() == ()
+    assert Monitor(fitted).flush() == ()
+
+
 def test_a_fault_is_reported_once_soon_after_it_is_detectable(fitted, log, middle):
     cell = middle[3]
     _, changes = watched(fitted, inject(log, [Fault("short", (cell,), onset=300)], LAYOUT))

@@ -146,7 +146,7 @@ def test_bad_input_is_refused_in_one_line(small):
         Restorer(LAYOUT).update(np.zeros(60))
     with pytest.raises(ValueError, match=r"expected a frame \[60\] or \[2, 6, 5\], got \[59\]"):
         small.update(np.zeros(59))
-    with pytest.raises(ValueError, match="F is over 59 cells, the layout has 60"):
+    with pytest.raises(ValueError, match="F is over 59 cells, expected one over 60"):
         small.update(np.zeros(60), FaultSet((1,), 59))
     with pytest.raises(ValueError, match="at least 4 healthy frames, got 2"):
         Restorer(LAYOUT).fit(np.zeros((2, 60)))

@@ -420,3 +420,13 @@ def test_the_command_line_trains_a_model_of_the_user_and_adapts_it(
     assert capsys.readouterr().err.count("\n") == 1
     assert main([*command[:-1], "own_network:lost"]) == 3
     assert "install its package or set PYTHONPATH" in capsys.readouterr().err
+
+
+def test_a_regression_has_an_accuracy_but_no_classes():
+    model = Recurrent(2)
+    adapted = Adapter(model, values(80, 0), values(40, 1), layout=LAYOUT).adapt(F, progress=False)
+    assert adapted.accuracy == adapted.scores.r2
+    with pytest.raises(ValueError, match="a regression has no classes"):
+        _ = adapted.by_class
+    with pytest.raises(ValueError, match="a regression has no sets of classes"):
+        adapted.prediction_sets(values(5, 2).x)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from adaptfault.adaptation.result import Adaptation, load_healthy
 from adaptfault.data.atomic import atomic_write
 from adaptfault.models.network import TactileTransformer
 from adaptfault.models.store import SCHEMA, load_model, read_manifest, save_model
@@ -153,8 +154,6 @@ def test_an_atomic_write_replaces_all_or_nothing(tmp_path: Path, monkeypatch: py
 
 
 def test_a_model_comes_back_with_its_head_in_closed_form_and_without(tmp_path, versions):
-    from adaptfault.adaptation.result import Adaptation, load_healthy
-
     head = Adaptation.load(versions["head"]).model.head
     network = Adaptation.load(versions["whole"]).model.network
     save_model(tmp_path, network, head=head)
@@ -171,3 +170,10 @@ def test_a_model_comes_back_with_its_head_in_closed_form_and_without(tmp_path, v
     )
     save_model(tmp_path, network)
     assert load_healthy(tmp_path).model.head is None
+
+
+def test_a_bundle_that_is_opened_as_a_model_is_named(tmp_path):
+    (tmp_path / "bundle.json").write_text("{}")
+    for read in (load_model, load_healthy):
+        with pytest.raises(FileNotFoundError, match="is a bundle, not a model: Bundle.open"):
+            read(tmp_path)

@@ -144,6 +144,10 @@ def test_frame_by_frame_it_says_what_the_model_says_of_every_window(carried, rng
     )
     assert len(set(predictor.predict(x))) > 1
     assert all(tuple(reading.fault_set) == DROPPED["head"] for reading in readings)
+    assert readings[3].name is None
+    assert [reading.name for reading in readings[4:]] == [
+        "abc"[label] for label in predictor.predict(x)
+    ]
 
 
 def test_what_a_dropped_cell_reads_changes_nothing_and_an_infinite_reading_of_another_is_held(
@@ -171,9 +175,13 @@ def test_its_events_are_the_monitors(carried, fitted_small):
     predictor = running(carried)
     monitor = Monitor(fitted_small)
     times = np.arange(len(frames)) / SMALL.rate
-    said = [predictor.stream(frame, t).events for frame, t in zip(frames, times, strict=True)]
+    readings = [predictor.stream(frame, t) for frame, t in zip(frames, times, strict=True)]
+    said = [reading.events for reading in readings]
     assert said == [monitor.update(frame, t) for frame, t in zip(frames, times, strict=True)]
     assert any(8 in event.cells for events in said for event in events)
+    assert readings[0].faults == ()
+    assert readings[-1].faults == monitor.faults
+    assert any(8 in fault.cells for fault in monitor.faults)
 
 
 def test_a_frame_may_come_as_a_grid_and_one_of_another_shape_is_refused_and_not_counted(carried):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from diagnostics import Fault, FaultKind, Line, SensorLayout, inject, line_fault
+from diagnostics import Fault, FaultKind, FaultSet, Line, SensorLayout, inject, line_fault
 from diagnostics.simulation.injection import bridge, freeze_stream, lose_frames
 
 LAYOUT = SensorLayout(2, 11, 10)
@@ -58,6 +58,14 @@ def test_an_address_with_nothing_connected_reads_zero(recording):
     assert (
         LAYOUT.grid(inject(recording, [fault], LAYOUT))[:, 0, 8:] == 0
     ).all()  # rows 8..10 would be 12..14
+
+
+def test_cells_alone_are_open(recording):
+    broken = inject(recording, FaultSet((3, 7), LAYOUT.n_cells), LAYOUT)
+    assert (broken[:, [3, 7]] == 0).all()
+    assert np.array_equal(broken, inject(recording, [7, np.int64(3)], LAYOUT))
+    with pytest.raises(ValueError, match="a fault needs at least one cell index"):
+        inject(recording, ["3"], LAYOUT)
 
 
 def test_an_alias_may_name_a_row_or_a_cell(recording):

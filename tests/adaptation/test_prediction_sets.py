@@ -1,0 +1,76 @@
+"""Sets of classes that hold the true one."""
+
+import numpy as np
+import pytest
+
+from adaptfault.adaptation.prediction_sets import PredictionSets
+
+
+def drawn(rng: np.random.Generator, recordings: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Probabilities of 4 classes, the true ones, and the recordings of windows that agree within a
+    recording."""
+    counts = rng.integers(1, 9, recordings)
+    recording = np.repeat(np.arange(recordings), counts)
+    y = rng.integers(0, 4, recordings)[recording]
+    quality = rng.normal(1.5, 1.5, recordings)[recording]
+    logits = rng.normal(0, 1, (len(y), 4)) + quality[:, None] * np.eye(4)[y]
+    likely = np.exp(logits)
+    return likely / likely.sum(axis=1, keepdims=True), y, recording
+
+
+@pytest.mark.parametrize("recordings", [9, 30, 200])
+def test_sets_of_new_recordings_hold_the_true_class_as_often_as_stated(recordings):
+    rng = np.random.default_rng(recordings)
+    held = []
+    for _ in range(400):
+        sets = PredictionSets.fit(*drawn(rng, recordings))
+        likely, y, _ = drawn(rng, 1)
+        held.append(sets.sets(likely, 0.1)[np.arange(len(y)), y].mean())
+    error = np.std(held) / np.sqrt(len(held))
+    assert np.mean(held) > 0.9 - 3 * error
+    # no looser than one recording makes it
+    assert np.mean(held) < 0.9 + 1 / (recordings + 1) + 3 * error
+
+
+def test_with_one_window_a_recording_the_threshold_is_that_of_split_conformal_prediction():
+    rng = np.random.default_rng(0)
+    scores = rng.random(99)
+    likely = np.stack([1 - scores, scores], axis=1)
+    sets = PredictionSets.fit(likely, np.zeros(99, np.int64), np.arange(99))
+    for alpha in (0.05, 0.1, 0.5):
+        rank = int(np.ceil((99 + 1) * (1 - alpha) - 1e-9))
+        assert sets.threshold(alpha) == pytest.approx(np.sort(scores)[rank - 1])
+
+
+def test_too_few_recordings_give_sets_of_all_classes():
+    sets = PredictionSets.fit(*drawn(np.random.default_rng(1), 8))
+    assert sets.threshold(0.1) == np.inf
+    assert sets.sets(np.array([[1.0, 0.0, 0.0, 0.0]]), 0.1).all()
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0, -1, np.nan])
+def test_an_alpha_that_is_no_share_is_refused(alpha):
+    with pytest.raises(ValueError, match="alpha is the share of wrong sets"):
+        PredictionSets.fit(*drawn(np.random.default_rng(1), 8)).threshold(alpha)
+
+
+def test_what_is_stored_makes_no_set_smaller_and_hardly_any_larger():
+    sets = PredictionSets.fit(*drawn(np.random.default_rng(2), 900))
+    stored = PredictionSets.from_dict(sets.to_dict())
+    assert len(stored.scores) <= 1001
+    for alpha in np.linspace(0.01, 0.9, 50):
+        exact = sets.threshold(alpha)
+        assert exact <= stored.threshold(alpha) <= sets.threshold(alpha - 0.002)
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        {"scores": [0.1], "weights": [0.1, 0.2]},
+        {"scores": [0.2, 0.1], "weights": [0.1, 0.2]},
+        {"scores": [0.1, 0.2], "weights": [0.1, -0.2]},
+    ],
+)
+def test_damaged_scores_are_refused(damaged):
+    with pytest.raises(ValueError, match="scores of the sets of classes"):
+        PredictionSets.from_dict(damaged)

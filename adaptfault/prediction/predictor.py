@@ -62,11 +62,8 @@ class Reading:
 
     def __str__(self) -> str:
         confidence = "" if self.probabilities is None else f" ({self.probabilities.max():.2f})"
-        result = (
-            "window not full yet"
-            if self.label is None
-            else f"{self.name or f'class {self.label}'}{confidence}"
-        )
+        named = self.name or f"class {self.label}"
+        result = "window not full yet" if self.label is None else f"{named}{confidence}"
         news = "".join(f"; {event.reason}" for event in self.events)
         return f"{result}, {len(self.fault_set)} cells dropped, version {self.version}{news}"
 

@@ -42,7 +42,10 @@ def add_recordings(
 ) -> None:
     """Add the paths of recordings, as ``least`` arguments or as an ``option``, and how they are
     read."""
-    help_ = "file or folder of recordings (.csv, .npz, .npy; ROS 2 bags: folder, .mcap, .db3)"
+    help_ = (
+        "file or folder of recordings: CSV, NPZ, NPY, ROS 2 bags, LeRobot, Zarr, HDF5, MAT,"
+        " Parquet, JSON lines"
+    )
     if option:
         parser.add_argument("--recordings", nargs="+", metavar="FILE", help=help_)
     else:
@@ -54,6 +57,12 @@ def add_recordings(
         group.add_argument(
             "--labels", metavar="TABLE", help="CSV table with the columns file,label"
         )
+    group.add_argument(
+        "--key",
+        metavar="NAME",
+        help="arrays of a data set that hold the readings, one a pad, as tactile_left,tactile_right"
+        " or 'observation.tactile.*'",
+    )
     group.add_argument("--topic", metavar="NAME", help="topic of a bag that holds the readings")
     group.add_argument(
         "--field",
@@ -312,7 +321,7 @@ def _array(args: argparse.Namespace) -> str | tuple[int, int, int] | None:
 
 def _array_options(args: argparse.Namespace) -> dict[str, Any]:
     """Return the options that describe the array, as :func:`adaptfault.load` takes them."""
-    names = ("calibration", "full_scale", "unit", "rate", "topic", "field")
+    names = ("calibration", "full_scale", "unit", "rate", "key", "topic", "field")
     return {"layout": _array(args), **{name: getattr(args, name) for name in names}}
 
 
@@ -335,7 +344,7 @@ def _agreeing(args: argparse.Namespace, layout: SensorLayout) -> dict[str, Any]:
         )
     if args.rate is not None and not same_rate(args.rate, layout.rate):
         raise ValueError(f"--rate {args.rate:g} given, expected {layout.rate:g} Hz")
-    return {name: options[name] for name in ("calibration", "topic", "field")}
+    return {name: options[name] for name in ("calibration", "key", "topic", "field")}
 
 
 def check_scale(path: str, recordings: Iterable[NDArray[Any]], layout: SensorLayout) -> None:

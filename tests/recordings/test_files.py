@@ -7,6 +7,7 @@ import pytest
 from recording_files import messages, newtons, refusal, write
 
 from adaptfault.data.recordings import load
+from adaptfault.data.recordings.readers import readers, suffixes
 
 
 def test_a_path_that_is_not_there_is_refused(tmp_path):
@@ -20,10 +21,8 @@ def test_a_path_that_is_not_there_is_refused(tmp_path):
 def test_a_folder_without_recordings_and_an_unknown_kind_of_file_are_refused(tmp_path):
     (tmp_path / "x.csv").mkdir()
     message = refusal(tmp_path / "x.csv")
-    assert (
-        "x.csv: the folder holds no recordings; expected files that end in .csv, .db3, .mcap, .npy,"
-        " .npz" in message
-    )
+    endings = ", ".join(suffixes(readers()))
+    assert f"x.csv: the folder holds no recordings; expected files that end in {endings}" in message
     assert "notes.txt: is no recording" in refusal(write(tmp_path / "notes.txt", "hello"))
 
 

@@ -3,13 +3,13 @@
 
 A reader is a module (or any object) with::
 
-    SUFFIXES = (".csv",)                            # of the files it reads, in lower case
+    SUFFIXES = (".csv",)                            # how their names end, in lower case
     def open(path, **stated): -> Iterable[Recording]
     def accepts(path): -> bool                      # optional: whether a folder is one of its own
 
-``stated`` is what the user says about the files: ``shape``, ``topic``, ``field`` and what else the
-reader asks for; it ignores the rest. A package that declares such an entry point is used by every
-command::
+``stated`` is what the user says about the files: ``shape``, ``key``, ``topic``, ``field`` and what
+else the reader asks for; it ignores the rest. A package that declares such an entry point is used
+by every command::
 
     [project.entry-points."adaptfault.readers"]
     mine = "my_package.my_format"
@@ -32,6 +32,12 @@ BUILT_IN = {
     "npz": "adaptfault.data.recordings.formats.npz",
     "npy": "adaptfault.data.recordings.formats.npy",
     "bag": "adaptfault.data.recordings.formats.bag",
+    "lerobot": "adaptfault.data.recordings.formats.datasets.lerobot",
+    "zarr": "adaptfault.data.recordings.formats.datasets.zarr_store",
+    "hdf5": "adaptfault.data.recordings.formats.datasets.hdf5",
+    "mat": "adaptfault.data.recordings.formats.datasets.mat",
+    "parquet": "adaptfault.data.recordings.formats.datasets.parquet",
+    "jsonl": "adaptfault.data.recordings.formats.datasets.jsonl",
 }
 """Those of this package, as its entry points name them; they are there without an installation,
 too."""
@@ -70,6 +76,6 @@ def reader_of(path: Path, known: Mapping[str, Reader], *, is_folder: bool) -> Re
             accepts = getattr(reader, "accepts", None)
             if accepts is not None and accepts(path):
                 return reader
-        elif path.suffix.lower() in reader.SUFFIXES:
+        elif path.name.lower().endswith(tuple(reader.SUFFIXES)):
             return reader
     return None

@@ -196,35 +196,51 @@ class Surveyor:
             step: receives the number of frames of each block.
 
         Raises:
-            InputError: the file is damaged, or holds no frame.
+            InputError: all recordings are damaged. Single damaged ones are left out, with an
+                error.
         """
         surveyed = []
         kept = []
+        failed: list[InputError] = []
         for recording in recordings:
-            survey = Survey(self.limit)
-            blocks: list[Block] | None = []
-            size = 0
-            for block in recording.blocks():
-                survey.add(block)
-                problems += block.problems
-                size += block.values.nbytes
-                step(len(block.values))
-                if size > self.room:
-                    blocks = None
-                if blocks is not None:
-                    blocks.append(replace(block, problems=()))
-            if blocks is not None:
-                self.room -= size
-                recording = replace(recording, blocks=_again(blocks))
+            try:
+                survey, recording = self._survey(recording, problems, step)
+            except InputError as error:
+                failed.append(error)
+                continue
             surveyed.append(survey)
             kept.append(recording)
-        facts = recordings[0].facts
+        if not kept:
+            raise failed[0] if failed else InputError("holds no recordings")
+        problems += [Problem("error", str(error)) for error in failed]
+        facts = kept[0].facts
         problems += facts.problems
-        held = [recording.label for recording in recordings]
+        held = [recording.label for recording in kept]
         labels = tuple(label for label in held if label is not None)
         return Content(
             facts, tuple(kept), tuple(surveyed), labels if len(labels) == len(held) else None
         )
+
+    def _survey(
+        self, recording: Recording, problems: list[Problem], step: Callable[[int], None]
+    ) -> tuple[Survey, Recording]:
+        """Return what a recording holds, and the recording, with its frames where there is room."""
+        survey = Survey(self.limit)
+        blocks: list[Block] | None = []
+        size = 0
+        for block in recording.blocks():
+            survey.add(block)
+            problems += block.problems
+            size += block.values.nbytes
+            step(len(block.values))
+            if size > self.room:
+                blocks = None
+            if blocks is not None:
+                blocks.append(replace(block, problems=()))
+        if blocks is not None:
+            self.room -= size
+            recording = replace(recording, blocks=_again(blocks))
+        return survey, recording
 
 
 def _again(blocks: list[Block]) -> Callable[[], Iterator[Block]]:

@@ -1,0 +1,179 @@
+"""Which features of a data set hold the readings of touch, and how several of them are one array.
+
+A feature is an array with a name and one frame after the other. Without a name from the user, those
+with a word for touch in their names are meant. Several with the same word are the pads of one
+array, in natural order of their names. Pads of different shapes become one layout: rows and columns
+of the largest, the positions that a pad does not have are absent.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.facts.labels import natural_key
+from adaptfault.data.recordings.recording import Shape
+
+_TOUCH = re.compile(r"tactile|taxel|pressure|touch|skin|fsr", re.IGNORECASE)
+_NO_TOUCH = re.compile(
+    r"temp|time|stamp|valid|mask|index|image|rgb|depth|video|calib", re.IGNORECASE
+)
+_SEPARATOR = re.compile(r"[/.]")
+_SHOWN = 12  # features in a message
+
+Sizes = tuple[int, ...]
+
+
+def choose(path: Path, features: Mapping[str, Sizes], key: str | None = None) -> list[str]:
+    """Return the names of the features that hold the readings, one a pad.
+
+    Args:
+        path: of the data set, for messages.
+        features: sizes of one frame of each feature; ``()`` for a single number.
+        key: names, last parts of names, or patterns as ``*.left``, divided by commas; None: found
+            by their names.
+
+    Raises:
+        InputError: no feature, or two that could be meant.
+    """
+    if key is not None:
+        return _named(path, features, key)
+    arrays = {name: sizes for name, sizes in features.items() if math.prod(sizes) > 1}
+    words: dict[str, list[str]] = {}
+    for name in sorted(arrays, key=natural_key):
+        word = _TOUCH.search(name)
+        if word and not _NO_TOUCH.search(name):
+            words.setdefault(word[0].lower(), []).append(name)
+    if len(words) > 1:
+        found = ", ".join(_shown(name, arrays[name]) for names in words.values() for name in names)
+        what = f"several features could hold the readings of touch: {found}; name one with --key"
+        raise InputError.at(path, what)
+    if words:
+        (names,) = words.values()
+        return names
+    if len(arrays) == 1:
+        return list(arrays)
+    what = "no feature has touch, tactile, taxel, pressure, skin or fsr in its name"
+    raise InputError.at(path, f"{what}; {_held(features)}; name one with --key")
+
+
+def _named(path: Path, features: Mapping[str, Sizes], key: str) -> list[str]:
+    chosen: list[str] = []
+    for pattern in filter(None, (part.strip() for part in key.split(","))):
+        whole = [name for name in features if fnmatchcase(name, pattern)]
+        ends = [
+            name
+            for name in features
+            if any(fnmatchcase(name[end.end() :], pattern) for end in _SEPARATOR.finditer(name))
+        ]
+        names = whole or ends
+        if set(pattern) & set("*?["):
+            names = [name for name in names if not _NO_TOUCH.search(name)]
+        if not names:
+            raise InputError.at(path, f"holds no feature {pattern!r}; {_held(features)}")
+        chosen += [name for name in sorted(names, key=natural_key) if name not in chosen]
+    return chosen
+
+
+def _held(features: Mapping[str, Sizes]) -> str:
+    if not features:
+        return "it holds no feature of numbers"
+    names = sorted(features, key=natural_key)
+    found = ", ".join(_shown(name, features[name]) for name in names[:_SHOWN])
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return f"it holds {found}{more}"
+
+
+def _shown(name: str, sizes: Sizes) -> str:
+    return f"{name} {list(sizes)}" if sizes else name
+
+
+@dataclass(frozen=True)
+class Pads:
+    """Features as the pads of one array.
+
+    Attributes:
+        sizes: of a frame of each feature.
+        steps: frames that one row of the data set holds: touch that is faster than the other
+            features comes in windows.
+        shape: ``(pads, rows, cols)``; None: one flat feature.
+    """
+
+    sizes: tuple[Sizes, ...]
+    steps: int
+    shape: Shape | None
+
+    @classmethod
+    def of(cls, sizes: Sequence[Sizes], given: Shape | None = None) -> Pads:
+        """Return the layout of features; ``given`` is ``(pads, rows, cols)``, where the user states
+        it."""
+        sizes = [size or (1,) for size in sizes]
+        total = sum(map(math.prod, sizes))
+        cells = math.prod(given) if given else total
+        if len(sizes) == 1:
+            windowed = cells < total and total % cells == 0 and sizes[0][0] == total // cells
+            if windowed:
+                return cls((sizes[0][1:],), sizes[0][0], given)
+            if given is not None or len(sizes[0]) == 1:
+                return cls(tuple(sizes), 1, given)
+        grids = [_grid(size) for size in sizes]
+        pads = sum(grid[0] for grid in grids)
+        shape = (pads, max(grid[1] for grid in grids), max(grid[2] for grid in grids))
+        return cls(tuple(sizes), 1, given if cells == total and given else shape)
+
+    @property
+    def present(self) -> NDArray[np.bool_] | None:
+        """Bool ``[pads, rows, cols]``; None where all pads have all positions."""
+        if self.shape is None or self._is_plain:
+            return None
+        present = np.zeros(self.shape, dtype=bool)
+        present.ravel()[self._places] = True
+        return present
+
+    @property
+    def _is_plain(self) -> bool:
+        """Whether the readings of all features one after the other are the frame."""
+        total = sum(map(math.prod, self.sizes))
+        return self.shape is None or math.prod(self.shape) == total
+
+    @property
+    def _places(self) -> NDArray[np.intp]:
+        """Where in a frame ``[D]`` each reading belongs."""
+        assert self.shape is not None  # for the type checker
+        index = np.arange(math.prod(self.shape)).reshape(self.shape)
+        places = []
+        first = 0
+        for size in self.sizes:
+            pads, rows, cols = _grid(size)
+            places.append(index[first : first + pads, :rows, :cols].ravel())
+            first += pads
+        return np.concatenate(places)
+
+    def frames(self, features: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        """Return frames ``[t, D]`` of rows ``[n, ...]`` of each feature; positions without a cell
+        hold 0."""
+        rows = len(features[0])
+        joined = np.concatenate([feature.reshape(rows, -1) for feature in features], axis=1)
+        if self._is_plain:
+            return joined.reshape(rows * self.steps, -1)
+        assert self.shape is not None  # for the type checker
+        frames = np.zeros((rows, math.prod(self.shape)), joined.dtype)
+        frames[:, self._places] = joined
+        return frames
+
+
+def _grid(size: Sizes) -> Shape:
+    """Return the pads, rows and columns of a feature; a flat one is a row."""
+    if len(size) > 3:
+        size = (math.prod(size[:-2]), *size[-2:])
+    pads, rows, cols = (1,) * (3 - len(size)) + size
+    return pads, rows, cols

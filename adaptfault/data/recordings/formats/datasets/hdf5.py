@@ -1,0 +1,98 @@
+"""Reads HDF5 files (ACT, robomimic, laboratories) and MAT files of version 7.3; needs the extra
+"datasets"."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.formats.datasets.extra import imported
+from adaptfault.data.recordings.formats.datasets.hierarchy import Array, Contents, recordings_of
+from adaptfault.data.recordings.recording import Recording, Shape
+
+SUFFIXES = (".h5", ".hdf5", ".hdf", ".he5")
+
+_MATLAB = "MATLAB_class"  # attribute of every array that MATLAB wrote
+
+
+def open(
+    path: Path, *, shape: Shape | None = None, key: str | None = None, **stated: Any
+) -> list[Recording]:
+    """Return the recordings of a file: one, one a group (``demo_0``, ``episode_3``), or those that
+    ``episode_ends`` divides.
+
+    Args:
+        path: the file.
+        shape: ``(pads, rows, cols)`` where the user states it.
+        key: names of the arrays that hold the readings, one a pad; None: found by their names
+            (:mod:`adaptfault.data.recordings.formats.datasets.features`).
+        stated: what other readers ask for.
+
+    Raises:
+        InputError: h5py is not installed, the file is damaged or being written, or the arrays are
+            not clear.
+    """
+    return recordings_of(path, lambda: opened(path), shape=shape, key=key)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Contents]:
+    """Open a file for reading.
+
+    Raises:
+        InputError: as :func:`open`.
+    """
+    h5py = imported("h5py", path)
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        reason = str(error).split("(")[-1].rstrip(")")
+        what = f"is no HDF5 file, is cut off, or is being written ({reason})"
+        raise InputError.at(path, f"{what}; close the writer, or copy it again") from None
+    with file:
+        arrays: dict[str, Array] = {}
+        texts: dict[str, list[str]] = {}
+        attributes = {"": dict(file.attrs)}
+
+        def add(name: str, found: Any) -> None:
+            if len(found.attrs):
+                attributes[name] = dict(found.attrs)
+            if not isinstance(found, h5py.Dataset) or not found.shape:
+                return
+            if found.dtype.kind in "iuf":
+                arrays[name] = Reversed(found) if _MATLAB in found.attrs else found
+            elif found.dtype.kind in "OS" and found.ndim == 1:
+                texts[name] = [_text(value) for value in found[:]]
+
+        file.visititems(add)
+        yield Contents(arrays, attributes, texts)
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+class Reversed:
+    """An array that MATLAB wrote: its axes are stored in reverse order."""
+
+    def __init__(self, stored: Any) -> None:
+        self._stored = stored
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Sizes of the axes as MATLAB shows them."""
+        return tuple(reversed(self._stored.shape))
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the numbers."""
+        kind: np.dtype[Any] = self._stored.dtype
+        return kind
+
+    def __getitem__(self, part: slice) -> Any:
+        return np.asarray(self._stored[..., part]).T

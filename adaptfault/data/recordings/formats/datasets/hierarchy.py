@@ -1,0 +1,297 @@
+"""Recordings of a file of named arrays with groups: HDF5, Zarr, MAT.
+
+Three forms are read:
+
+- arrays of all episodes one behind the other, with ``episode_ends`` (or ``lengths``) beside them;
+- one group an episode: ``demo_0/obs/tactile``, ``demo_1/obs/tactile``;
+- one array: a recording ``[T, ...]``, or recordings ``[n, T, ...]`` named ``frames``.
+
+Arrays of one episode whose names differ are the pads of one array.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.facts.labels import natural_key
+from adaptfault.data.recordings.formats.datasets.features import Pads, choose
+from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
+
+_EPISODE = re.compile(
+    r"(?:demo|ep|episode|traj|trajectory|trial|rec|recording|sample|run|grasp|seq|sequence|rollout"
+    r"|log|)[_-]?\d+",
+    re.IGNORECASE,
+)
+_ENDS = ("episode_ends", "lengths", "episode_lengths")
+_CLOCKS = ("timestamp", "timestamps", "time", "times", "stamp", "t")
+LABELS = ("label", "labels", "class", "object", "task")
+RATES = ("rate", "fps", "hz", "sampling_rate", "sampling_hz", "frequency")
+FULL_SCALES = ("full_scale", "max_value")
+UNITS = ("unit", "units")
+
+
+class Array(Protocol):
+    """An array in a file; a slice of it is read."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Sizes of the axes."""
+        ...
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the numbers."""
+        ...
+
+    def __getitem__(self, part: slice, /) -> Any: ...
+
+
+@dataclass(frozen=True)
+class Contents:
+    """An open file.
+
+    Attributes:
+        arrays: those of numbers, by their names with groups, as "data/tactile".
+        attributes: of each group and array that has some; "" is the file itself.
+        texts: arrays of text.
+    """
+
+    arrays: Mapping[str, Array]
+    attributes: Mapping[str, Mapping[str, Any]]
+    texts: Mapping[str, Sequence[str]]
+
+
+Opened = Callable[[], AbstractContextManager[Contents]]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Where the frames of one recording are."""
+
+    names: tuple[str, ...]
+    first: int
+    last: int
+    clock: str | None = None
+    outer: int | None = None
+    label: str | None = None
+    name: str | None = None
+
+
+def recordings_of(
+    path: Path, opened: Opened, *, shape: Shape | None, key: str | None
+) -> list[Recording]:
+    """Return the recordings of a file.
+
+    Args:
+        path: of the file, for messages.
+        opened: opens it; raises InputError where it cannot be read.
+        shape: ``(pads, rows, cols)`` where the user states it.
+        key: which arrays hold the readings; None: found by their names.
+
+    Raises:
+        InputError: no array of touch, or several that could be meant.
+    """
+    with opened() as contents:
+        arrays = contents.arrays
+        ends = next((name for name in arrays if _last(name) in _ENDS), None)
+        listed = {name: tuple(array.shape[1:]) for name, array in arrays.items() if name != ends}
+        episodes = _episodes(path, listed, key)
+        names = episodes[0][1]
+        outer = _holds_recordings(arrays[names[0]], names, shape) and ends is None
+        skipped = 2 if outer else 1
+        sizes = [tuple(map(int, arrays[name].shape[skipped:])) for name in names]
+        pads = Pads.of(sizes, shape)
+        facts = _facts(path, contents, names, pads)
+        parts = list(_parts(path, contents, episodes, ends, outer=outer))
+
+    def blocks(part: _Part) -> Callable[[], Iterator[Block]]:
+        return lambda: _blocks(path, opened, part, pads)
+
+    return [Recording(facts, blocks(part), part.name, part.label) for part in parts]
+
+
+def _last(name: str) -> str:
+    return name.rpartition("/")[2].lower()
+
+
+def _episodes(
+    path: Path, listed: Mapping[str, tuple[int, ...]], key: str | None
+) -> list[tuple[str, list[str]]]:
+    """Return the names of the arrays of each episode, and how the episode is called."""
+    grouped: dict[tuple[str, ...], dict[str, str]] = {}
+    for name in sorted(listed, key=natural_key):
+        *groups, last = name.split("/")
+        episode = tuple(group for group in groups if _EPISODE.fullmatch(group))
+        common = "/".join([*(group for group in groups if group not in episode), last])
+        grouped.setdefault(episode, {})[common] = name
+    features: dict[str, tuple[int, ...]] = {}
+    for names in grouped.values():
+        features |= {common: listed[name] for common, name in names.items()}
+    chosen = choose(path, features, key)
+    found = []
+    for episode, names in grouped.items():
+        if all(common in names for common in chosen):
+            found.append(("/".join(episode), [names[common] for common in chosen]))
+    if not found:
+        raise InputError.at(path, f"no episode holds all of {', '.join(chosen)}")
+    return found
+
+
+def _holds_recordings(array: Array, names: Sequence[str], given: Shape | None) -> bool:
+    """Return whether the first axis counts recordings, not frames."""
+    sizes = tuple(map(int, array.shape))
+    if len(names) > 1 or len(sizes) < 3:
+        return False
+    if given is not None:
+        cells = math.prod(given)
+        return math.prod(sizes[1:]) != cells and math.prod(sizes[2:]) == cells
+    return len(sizes) == 5 or _last(names[0]) in ("frames", "recordings")
+
+
+def _parts(
+    path: Path,
+    contents: Contents,
+    episodes: Sequence[tuple[str, list[str]]],
+    ends: str | None,
+    *,
+    outer: bool,
+) -> Iterator[_Part]:
+    for episode, names in episodes:
+        length = min(int(contents.arrays[name].shape[0]) for name in names)
+        beside = _beside(contents.arrays, names[0], _CLOCKS, length)
+        labels = _labels(contents, names[0])
+        if outer:
+            frames = int(contents.arrays[names[0]].shape[1])
+            for i in range(length):
+                label = labels[i] if len(labels) == length else None
+                yield _Part(tuple(names), 0, frames, None, i, label)
+            continue
+        if ends is None:
+            own = _attribute(contents, names[0], LABELS)
+            label = str(own) if own is not None else (labels[0] if len(labels) == 1 else None)
+            yield _Part(tuple(names), 0, length, beside, None, label, _called(path, episode))
+            continue
+        bounds = _bounds(path, contents, ends, length)
+        for i, (first, last) in enumerate(bounds):
+            label = labels[i] if len(labels) == len(bounds) else None
+            yield _Part(tuple(names), first, last, beside, None, label, f"{path.name}, episode {i}")
+
+
+def _called(path: Path, episode: str) -> str | None:
+    return f"{path.name}, {episode}" if episode else None
+
+
+def _bounds(path: Path, contents: Contents, name: str, length: int) -> list[tuple[int, int]]:
+    """Return the first frame of each episode and the one behind its last."""
+    stored = np.asarray(contents.arrays[name][:]).ravel().astype(np.int64)
+    ends = stored if _last(name) == _ENDS[0] else np.cumsum(stored)
+    if not len(ends) or (np.diff(ends, prepend=0) < 0).any():
+        raise InputError.at(path, f"{name} does not rise; it holds where each episode ends")
+    if ends[-1] > length:
+        what = f"{name} ends at frame {ends[-1]}, but the readings hold {length}: cut off?"
+        raise InputError.at(path, what)
+    return [bounds for bounds in pairwise([0, *ends.tolist()]) if bounds[1] > bounds[0]]
+
+
+def _beside(
+    arrays: Mapping[str, Array], name: str, wanted: Sequence[str], length: int
+) -> str | None:
+    """Return an array of one number a frame in a group of ``name``, or above it."""
+    groups = name.split("/")[:-1]
+    for depth in range(len(groups), -1, -1):
+        above = "/".join(groups[:depth])
+        for other, array in arrays.items():
+            within = other.rpartition("/")[0] == above or (
+                depth == 0 and other.startswith(("data/", "meta/"))
+            )
+            if within and _last(other) in wanted and tuple(array.shape) in ((length,), (length, 1)):
+                return other
+    return None
+
+
+def _labels(contents: Contents, name: str) -> list[str]:
+    """Return the labels of recordings that an array beside the readings holds."""
+    for other, texts in contents.texts.items():
+        if _last(other) in LABELS:
+            return list(texts)
+    for other, array in contents.arrays.items():
+        if _last(other) in LABELS and array.dtype.kind in "iu" and len(array.shape) == 1:
+            return [str(label) for label in np.asarray(array[:]).tolist()]
+    return []
+
+
+def _attribute(contents: Contents, name: str, wanted: Sequence[str]) -> Any:
+    """Return an attribute of an array, of a group that holds it, or of the file."""
+    parts = name.split("/")
+    for depth in range(len(parts), -1, -1):
+        attributes = contents.attributes.get("/".join(parts[:depth]), {})
+        for known, value in attributes.items():
+            if known.lower() in wanted and np.size(value) == 1:
+                plain = np.asarray(value).item()
+                return plain.decode() if isinstance(plain, bytes) else plain
+    return None
+
+
+def _facts(path: Path, contents: Contents, names: Sequence[str], pads: Pads) -> Facts:
+    array = contents.arrays[names[0]]
+    rate = _positive(_attribute(contents, names[0], RATES))
+    unit = _attribute(contents, names[0], UNITS)
+    return Facts(
+        path,
+        counts=all(contents.arrays[name].dtype.kind in "iu" for name in names),
+        shape=pads.shape,
+        present=pads.present,
+        full_scale=_positive(_attribute(contents, names[0], FULL_SCALES)),
+        unit=unit if isinstance(unit, str) and 0 < len(unit) <= 16 else None,
+        rate=None if rate is None else rate * pads.steps,
+        stored=tuple(map(int, array.shape)),
+    )
+
+
+def _positive(value: Any) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value) if math.isfinite(value) and value > 0 else None
+
+
+def _blocks(path: Path, opened: Opened, part: _Part, pads: Pads) -> Iterator[Block]:
+    with opened() as contents:
+        arrays: list[Any] = [contents.arrays[name] for name in part.names]
+        if part.outer is not None:
+            arrays = [arrays[0][part.outer : part.outer + 1][0]]
+        clock = None if part.clock is None else contents.arrays[part.clock]
+        for first in range(part.first, part.last, BLOCK):
+            last = min(first + BLOCK, part.last)
+            where = f"{part.name or part.names[0]}, frames {first} to {last - 1}"
+            try:
+                values = [np.asarray(array[first:last]) for array in arrays]
+                times = None if clock is None else np.asarray(clock[first:last], dtype=np.float64)
+            # a damaged chunk raises any of a dozen kinds: the codec's, the store's, Python's
+            except Exception as error:
+                what = f"cannot be read ({type(error).__name__}): damaged, or cut off"
+                raise InputError.at(path, what, where) from None
+            if any(len(value) != last - first for value in values):
+                raise InputError.at(path, "is cut off", where)
+            if times is not None and pads.steps > 1:
+                times = None  # of rows, not of frames
+            yield Block(
+                _numbers(pads.frames(values)), None, None if times is None else times.ravel()
+            )
+
+
+def _numbers(values: NDArray[Any]) -> NDArray[Any]:
+    if values.dtype.kind in "iu":
+        return values
+    with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is missing
+        return values.astype(np.float32)

@@ -1,0 +1,74 @@
+"""Reads Zarr stores, a folder or a ``.zarr.zip``, of versions 2 and 3; needs the extra
+"datasets"."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.formats.datasets.extra import imported
+from adaptfault.data.recordings.formats.datasets.hierarchy import Contents, recordings_of
+from adaptfault.data.recordings.recording import Recording, Shape
+
+SUFFIXES = (".zarr.zip",)
+
+_MARKS = (".zgroup", ".zarray", ".zattrs", "zarr.json")
+
+
+def accepts(path: Path) -> bool:
+    """Return whether a folder is a store."""
+    return any((path / mark).is_file() for mark in _MARKS)
+
+
+def open(
+    path: Path, *, shape: Shape | None = None, key: str | None = None, **stated: Any
+) -> list[Recording]:
+    """Return the recordings of a store: those that ``episode_ends`` divides, one a group, or one.
+
+    Args:
+        path: the folder or the archive.
+        shape: ``(pads, rows, cols)`` where the user states it.
+        key: names of the arrays that hold the readings, one a pad; None: found by their names
+            (:mod:`adaptfault.data.recordings.formats.datasets.features`).
+        stated: what other readers ask for.
+
+    Raises:
+        InputError: zarr is not installed, the store is damaged, or the arrays are not clear.
+    """
+    return recordings_of(path, lambda: _opened(path), shape=shape, key=key)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Contents]:
+    zarr = imported("zarr", path)
+    archive = None
+    try:
+        archive = None if path.is_dir() else zarr.storage.ZipStore(path, mode="r")
+        store = path if archive is None else archive
+        root = zarr.open(store, mode="r")
+        is_group = isinstance(root, zarr.Group)
+        members = dict(root.members(max_depth=None)) if is_group else {path.stem: root}
+        arrays = {
+            name: member
+            for name, member in members.items()
+            if isinstance(member, zarr.Array) and member.shape and member.dtype.kind in "iuf"
+        }
+        attributes = {"": dict(root.attrs)} if is_group else {}
+        attributes |= {name: dict(member.attrs) for name, member in members.items()}
+        texts = {
+            name: [str(value) for value in member[:]]
+            for name, member in members.items()
+            if isinstance(member, zarr.Array) and member.ndim == 1 and member.dtype.kind in "OUST"
+        }
+    # a damaged store raises any of a dozen kinds: zarr's, zipfile's, JSON's
+    except Exception as error:
+        what = f"is no Zarr store, or is damaged ({type(error).__name__}); copy it again"
+        raise InputError.at(path, what) from None
+    try:
+        yield Contents(arrays, attributes, texts)
+    finally:
+        if archive is not None:
+            archive.close()

@@ -20,6 +20,7 @@ GROUP = "adaptfault.commands"
 
 BUILT_IN = {
     "info": "adaptfault.cli.info",
+    "check": "adaptfault.cli.check",
     "convert": "adaptfault.cli.convert",
     "simulate": "adaptfault.cli.simulate",
     "diagnose": "adaptfault.cli.diagnose",

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from adaptfault.data.atomic import atomic_write
 from diagnostics.decision.coverage import percent
 from diagnostics.decision.plot import PAGE
+from diagnostics.decision.result import LETTERS, Diagnosis
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,10 +34,17 @@ def render(path: str | Path, template: str, **values: Any) -> Path:
         loader=PackageLoader("adaptfault.evaluation"), autoescape=True, undefined=StrictUndefined
     )
     environment.filters["percent"] = percent
+    environment.filters["legend"] = legend
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(path, environment.get_template(template).render(values).encode())
     return path
+
+
+def legend(diagnosis: Diagnosis) -> str:
+    """Return the letters of the kinds of fault that are on the map, as "O open, S short"."""
+    kinds = {fault.kind for fault in diagnosis.faults}
+    return ", ".join(f"{letter} {kind}" for kind, letter in LETTERS.items() if kind in kinds)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from adaptfault.data.recordings.errors import InputError, Problem
 from adaptfault.data.recordings.facts.classes import class_indices, label_files
 from adaptfault.data.recordings.facts.infer import PAPER, SLACK
 from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME, layout_beside
+from adaptfault.data.recordings.facts.rates import Clock, Elapsed
 from adaptfault.data.recordings.facts.resolve import (
     Resolved,
     check_agreement,
@@ -113,6 +114,14 @@ class Opened:
         self._usable = usable
         self._tables = tables
         self.late_problems: tuple[Problem, ...] = ()
+
+    @property
+    def clock(self) -> Clock:
+        """How regular the times of the frames are."""
+        elapsed = Elapsed.of_all(
+            content.surveys[i].elapsed for _, content, kept in self._usable for i in kept
+        )
+        return Clock() if elapsed is None else elapsed.clock()
 
     def __len__(self) -> int:
         return len(self.lengths)

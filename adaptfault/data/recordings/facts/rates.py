@@ -16,6 +16,7 @@ where the times jitter by more than a fifth of the period.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,21 @@ _MOST_TICKS = 1e30  # frames a tick: no clock
 _TURNS = 3  # of p and n_i
 _NEAR = 0.2  # a multiple of the period is whole
 _MOST = 0.9  # share of the steps that are whole multiples, where frames may be lost
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What the times of the frames tell.
+
+    Attributes:
+        jitter: robust standard deviation of the period, as a share of it; None without times.
+        lost: frames that are missing between two times; 0 where the jitter hides them.
+        falls: how often a time is before the one before it.
+    """
+
+    jitter: float | None = None
+    lost: int = 0
+    falls: int = 0
 
 
 class Elapsed:
@@ -108,6 +124,22 @@ class Elapsed:
             return _rounded(per_tick * TICKS[tick])
         rates = [per_tick * ticks for ticks in TICKS.values()]
         return next((_rounded(rate) for rate in rates if _SLOWEST <= rate <= _FASTEST), None)
+
+    def clock(self) -> Clock:
+        """Return how regular the times are."""
+        steps = np.concatenate([np.empty(0), *self._steps])
+        shared = np.concatenate([np.empty(0), *self._shared])
+        if not len(steps):
+            return Clock(None, 0, self.falls)
+        with np.errstate(all="ignore"):  # a time may be anything that a file can hold
+            periods = steps / shared
+            period = float(np.median(periods))
+            jitter = float(1.4826 * np.median(np.abs(periods - period)) / period)
+            multiples = periods[periods <= _PAUSE * period] / period
+            whole = np.maximum(1, np.rint(multiples))
+            regular = np.mean(np.abs(multiples - whole) < _NEAR) >= _MOST
+        lost = int((whole - 1).sum()) if regular else 0
+        return Clock(jitter if np.isfinite(jitter) else None, lost, self.falls)
 
     def _per_tick(self) -> float | None:
         """Return frames a tick."""

@@ -1,0 +1,153 @@
+"""adaptfault check: the health of a data set, before anybody trains on it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from itertools import islice
+from typing import TYPE_CHECKING
+
+from adaptfault.cli.inspecting import (
+    healthy_recordings,
+    inspected,
+    reasons_of,
+    reference_bundle,
+    text_of,
+)
+from adaptfault.cli.options import (
+    Commands,
+    add_recordings,
+    add_trust,
+    add_untested_code,
+    command,
+    emit,
+    fit_diagnoser,
+    load_recordings,
+    open_reported,
+    report_inferred,
+    report_range,
+)
+
+if TYPE_CHECKING:
+    from adaptfault.data.recordings import Opened, Recordings
+    from adaptfault.inspection.data_set import DataSetCheck
+    from adaptfault.inspection.inspection import Inspection
+
+_EXAMPLE = """\
+  adaptfault check my_lerobot_data/ --html health.html --badge health.svg
+  adaptfault check grasps.zarr --healthy 0:20 --write-valid valid.zarr
+      the first 20 recordings are known to be healthy: the others are compared with them
+      exit code: 0 fine; 1 single cells, or something to know before training; 2 a wire, or
+      a tenth of the cells; 3 unusable input"""
+
+
+def add(commands: Commands) -> None:
+    """Add the command."""
+    parser = command(
+        commands, "check", "check the health of a data set before anybody trains on it", _EXAMPLE
+    )
+    add_recordings(parser)
+    given = parser.add_mutually_exclusive_group()
+    given.add_argument(
+        "--reference",
+        nargs="+",
+        metavar="FILE",
+        help="fault-free recordings of the same array, or a bundle",
+    )
+    given.add_argument(
+        "--healthy",
+        metavar="FIRST:LAST",
+        help="recordings of the data set that are known to be healthy, as 0:20 for the first 20",
+    )
+    parser.add_argument("--out", metavar="FILE", help="write the result as JSON")
+    parser.add_argument("--html", metavar="FILE", help="write a page")
+    parser.add_argument("--badge", metavar="FILE", help="write a badge as SVG")
+    parser.add_argument(
+        "--write-valid",
+        metavar="FILE",
+        help="write which readings are valid: .npz, .parquet, .zarr or .h5",
+    )
+    add_untested_code(parser)
+    add_trust(parser)
+    parser.set_defaults(run=run, writes=("out", "html", "badge", "write_valid"))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check a data set; the exit code says how bad it is."""
+    from adaptfault.inspection.severity import worst
+
+    bundle = reference_bundle(args)
+    healthy = load_recordings(args, args.reference) if args.reference and bundle is None else None
+    known = bundle.diagnoser() if bundle is not None else healthy
+    log = open_reported(args, args.recordings, None if known is None else known.layout)
+    report_inferred(args, log.inferred)
+    if args.healthy is not None:
+        healthy = _part(args.healthy, log)
+    diagnoser = None if bundle is None else bundle.diagnoser()
+    if healthy is not None:
+        diagnoser = fit_diagnoser(args, healthy)
+    inspection = inspected(args, log, diagnoser, bundle, healthy_recordings(bundle, healthy))
+    report_range(log)
+    checked = _checked(args, log, inspection)
+    reasons = reasons_of(inspection.diagnosis, inspection.findings, bundle, args.untested_code)
+    code = max(worst(reasons), 1 if checked.remarks else 0)
+    notes = [reason.text for reason in reasons if reason.text] + list(checked.remarks)
+    _write(args, log, checked, code, notes)
+    text = [str(checked.summary), "", text_of(inspection.diagnosis), *notes]
+    emit(args, checked.to_dict(), "\n".join(text))
+    return code
+
+
+def _part(text: str, log: Opened) -> Recordings:
+    """Return the recordings that are known to be healthy."""
+    from adaptfault.data.recordings import Recordings
+
+    first, divided, last = text.partition(":")
+    if not divided or not (first or "0").isdigit() or not (last or "0").isdigit():
+        raise ValueError(f"--healthy {text}: expected FIRST:LAST, as 0:20 for the first 20")
+    begin = int(first or 0)
+    end = int(last) if last else len(log)
+    if not begin < end <= len(log):
+        raise ValueError(
+            f"--healthy {text}: the data set has {len(log)} recordings, numbered from 0"
+        )
+    frames = tuple(islice(iter(log), begin, end))
+    return Recordings(frames, log.layout, names=log.names[begin:end])
+
+
+def _checked(args: argparse.Namespace, log: Opened, inspection: Inspection) -> DataSetCheck:
+    from collections import Counter
+
+    from adaptfault.data.summary import summarise
+    from adaptfault.inspection.data_set import DataSetCheck, starts_and_tares
+
+    classes = {}
+    if log.labels is not None:
+        counts = Counter(log.labels.tolist())
+        classes = {name: counts[i] for i, name in enumerate(log.class_names)}
+    summary = summarise(log.pieces(), log.layout, lengths=log.lengths, classes=classes)
+    begun, tared = starts_and_tares(lambda: iter(log), log.names, log.layout)
+    return DataSetCheck(inspection, summary, log.clock, getattr(args, "left_out", 0), begun, tared)
+
+
+def _write(
+    args: argparse.Namespace, log: Opened, checked: DataSetCheck, code: int, notes: list[str]
+) -> None:
+    from adaptfault.data.atomic import atomic_write
+
+    diagnosis = checked.inspection.diagnosis
+    if args.out:
+        atomic_write(args.out, json.dumps(checked.to_dict(), allow_nan=False).encode())
+    if args.badge:
+        atomic_write(args.badge, checked.badge().encode())
+    if args.html:
+        from adaptfault.evaluation.html_diagnosis import write_diagnosis
+
+        name = ", ".join(args.recordings)
+        compared = bool(args.reference or args.healthy)
+        write_diagnosis(args.html, diagnosis, name=name, reference=compared, code=code, notes=notes)
+    if args.write_valid:
+        from adaptfault.data.recordings.valid import valid_masks, write_valid
+
+        masks = valid_masks(iter(log), diagnosis.faults, log.layout)
+        write_valid(args.write_valid, masks, log.names, log.layout)

@@ -1,0 +1,202 @@
+"""Health of a data set: what its recordings show beside the state of the cells.
+
+Beside an inspection of the cells, told are: missing readings and cells that never change; lost
+frames and jitter of the clock; recordings that begin in contact, where a driver that tares at the
+start takes the contact out; and recordings whose readings fall below their rest, where one did.
+
+With s_i the mean of the first readings of each cell in recording i, s their median over the
+recordings, and l_i(t) the mean over the cells of the readings minus s, a recording begins in
+contact where mean |s_i - s| exceeds 30 % of the median peak of mean |l_i|, and was tared in contact
+where l_i(t) goes 10 % of it to the other side of rest. Not detected: a tare in contact whose
+readings are cut off at 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.data.recordings.facts.rates import Clock
+from adaptfault.data.summary import Summary
+from adaptfault.inspection.inspection import Inspection
+from diagnostics import SensorLayout
+
+SCHEMA = "adaptfault.check/1"
+
+_FIRST = 3  # frames of a recording from which its begin is taken
+_IN_CONTACT = 0.3  # of the median peak, as the begin of a contact event
+_BELOW = 0.1  # of the median peak, on the other side of rest
+_JITTER = 0.2  # of the period: times say less about lost frames from here on
+_LISTED = 5
+
+
+@dataclass(frozen=True, eq=False)
+class DataSetCheck:
+    """The health of a data set.
+
+    Attributes:
+        inspection: of its cells.
+        summary: of its readings.
+        clock: of its frames.
+        left_out: recordings that could not be read.
+        begin_in_contact, tared_in_contact: names of such recordings.
+    """
+
+    inspection: Inspection
+    summary: Summary
+    clock: Clock
+    left_out: int
+    begin_in_contact: tuple[str, ...]
+    tared_in_contact: tuple[str, ...]
+
+    @property
+    def healthy_share(self) -> float:
+        """Share of the cells that are not in F."""
+        diagnosis = self.inspection.diagnosis
+        return 1 - len(diagnosis.fault_set) / int(diagnosis.layout.present.sum())
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """One sentence for each thing that whoever trains on the data should know."""
+        found = []
+        if self.left_out:
+            found.append(f"{self.left_out} recordings or files could not be read: left out")
+        if share := self._missing_share():
+            found.append(f"{share:.2%} of the readings are missing")
+        if self.clock.lost:
+            found.append(f"about {self.clock.lost} frames are missing between the times")
+        if self.clock.falls:
+            found.append(f"the clock falls back {self.clock.falls} times")
+        if self.clock.jitter is not None and self.clock.jitter > _JITTER:
+            found.append(f"the period between frames varies by {self.clock.jitter:.0%}")
+        if self.begin_in_contact:
+            found.append(
+                f"{_counted(self.begin_in_contact)} in contact: a tare at the start takes it out"
+            )
+        if self.tared_in_contact:
+            names = _listed(self.tared_in_contact)
+            found.append(f"readings fall below rest, as after a tare in contact: {names}")
+        return tuple(found)
+
+    @property
+    def severity(self) -> int:
+        """0 nothing to do, 1 there are remarks or single faults, 2 a wire or a tenth of the
+        cells."""
+        return max(self.inspection.severity, 1 if self.remarks else 0)
+
+    def _missing_share(self) -> float:
+        present = self.summary.layout.present.ravel()
+        readings = int(self.summary.lengths.sum()) * int(present.sum())
+        return float(self.summary.missing[present].sum()) / max(readings, 1)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict."""
+        return {
+            "schema": SCHEMA,
+            "severity": self.severity,
+            "healthy_share": self.healthy_share,
+            "remarks": list(self.remarks),
+            "clock": {
+                "jitter": self.clock.jitter,
+                "lost": self.clock.lost,
+                "falls": self.clock.falls,
+            },
+            "left_out": self.left_out,
+            "begin_in_contact": list(self.begin_in_contact),
+            "tared_in_contact": list(self.tared_in_contact),
+            "summary": self.summary.to_dict(),
+            "inspection": self.inspection.to_dict(),
+        }
+
+    def badge(self) -> str:
+        """Return a badge as SVG: how many cells work, in green, yellow or red."""
+        diagnosis = self.inspection.diagnosis
+        cells = int(diagnosis.layout.present.sum())
+        text = f"{cells - len(diagnosis.fault_set)} of {cells} cells"
+        if not diagnosis.coverage.test_coverage:
+            text = "not tested"
+        colour = ("#2e7d32", "#b08800", "#c62828")[min(self.severity, 2)]
+        return _BADGE.format(text=text, colour=colour)
+
+
+_BADGE = """<svg xmlns="http://www.w3.org/2000/svg" width="210" height="20" role="img" \
+aria-label="tactile cells: {text}">
+<title>tactile cells: {text}</title>
+<rect width="84" height="20" rx="3" fill="#555"/>
+<rect x="81" width="129" height="20" rx="3" fill="{colour}"/>
+<g fill="#fff" font-family="Verdana,sans-serif" font-size="11" text-anchor="middle">
+<text x="41" y="14">tactile cells</text>
+<text x="146" y="14">{text}</text>
+</g>
+</svg>
+"""
+
+
+def starts_and_tares(
+    recordings: Callable[[], Iterable[NDArray[Any]]], names: Sequence[str], layout: SensorLayout
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of the recordings that begin in contact, and of those that were tared in
+    contact.
+
+    Args:
+        recordings: yields them, ``[T, D]`` each, every time it is called.
+        names: of each.
+        layout: the array.
+    """
+    present = layout.present.ravel()
+    starts = np.array([_mean(r[:_FIRST, present]) for r in recordings()])
+    rest = np.nan_to_num(_median(starts))
+    peaks = np.zeros(len(starts))
+    signed = np.zeros((len(starts), 2))
+    for i, frames in enumerate(_loads(recordings(), present, rest)):
+        peaks[i] = np.abs(frames).max()
+        signed[i] = frames.min(), frames.max()
+    peak = float(np.median(peaks))
+    if not peak > 0:
+        return (), ()
+    rises = np.median(signed[:, 1]) >= -np.median(signed[:, 0])
+    other_side = -signed[:, 0] if rises else signed[:, 1]
+    begun = np.nanmean(np.abs(np.nan_to_num(starts - rest)), axis=1) > _IN_CONTACT * peak
+    tared = other_side > _BELOW * peak
+    return (
+        tuple(np.array(names, dtype=object)[begun]),
+        tuple(np.array(names, dtype=object)[tared & ~begun]),
+    )
+
+
+def _loads(
+    recordings: Iterable[NDArray[Any]], present: NDArray[np.bool_], rest: NDArray[np.float64]
+) -> Iterator[NDArray[np.float64]]:
+    """Yield the mean of readings minus rest of each frame, ``[T]``; missing readings rest."""
+    for frames in recordings:
+        yield np.nan_to_num(frames[:, present] - rest).mean(axis=1)
+
+
+def _mean(frames: NDArray[Any]) -> NDArray[np.float64]:
+    known = np.isfinite(frames)
+    total = np.where(known, frames, 0.0).sum(axis=0)
+    counts = known.sum(axis=0)
+    return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
+
+
+def _median(starts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the median of each column; NaN where it has none."""
+    known = ~np.isnan(starts).all(axis=0)
+    median = np.full(starts.shape[1], np.nan)
+    median[known] = np.nanmedian(starts[:, known], axis=0)
+    return median
+
+
+def _counted(names: Sequence[str]) -> str:
+    if len(names) == 1:
+        return f"{names[0]} begins"
+    return f"{len(names)} recordings begin ({_listed(names)})"
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return f"{', '.join(names[:_LISTED])}{more}"

@@ -16,6 +16,7 @@ from adaptfault.cli.inspecting import (
 )
 from adaptfault.cli.options import (
     Commands,
+    add_cache,
     add_recordings,
     add_trust,
     add_untested_code,
@@ -67,6 +68,7 @@ def add(commands: Commands) -> None:
         metavar="FILE",
         help="write which readings are valid: .npz, .parquet, .zarr or .h5",
     )
+    add_cache(parser)
     add_untested_code(parser)
     add_trust(parser)
     parser.set_defaults(run=run, writes=("out", "html", "badge", "write_valid"))

@@ -15,6 +15,7 @@ from adaptfault.cli.inspecting import (
 )
 from adaptfault.cli.options import (
     Commands,
+    add_cache,
     add_recordings,
     add_trust,
     add_untested_code,
@@ -57,6 +58,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--out", metavar="FILE", help="write the diagnosis as JSON")
     parser.add_argument("--picture", metavar="FILE", help="write the verdict map as PNG")
     parser.add_argument("--html", metavar="FILE", help="write the technician's page")
+    add_cache(parser)
     add_untested_code(parser)
     add_trust(parser)
     parser.set_defaults(run=run, writes=("out", "picture", "html"))

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.data.printable import printable
@@ -477,12 +478,39 @@ def progress(args: argparse.Namespace) -> bool | None:
 
 
 def fit_diagnoser(args: argparse.Namespace, recordings: Recordings) -> SelfDiagnosis:
-    """Return the healthy model of recordings, with a bar while it is fitted."""
+    """Return the healthy model of recordings, with a bar while it is fitted.
+
+    With ``--reference`` it is kept beside the reference, unless ``--no-cache`` is given.
+    """
+    from adaptfault.inspection.fit_cache import FitCache
     from diagnostics import SelfDiagnosis
 
+    kept = None
+    if getattr(args, "reference", None) and not args.no_cache:
+        kept = FitCache(Path(args.reference[0]), recordings.frames, recordings.layout)
+        fitted = kept.load()
+        if fitted is not None:
+            say(args, f"taking the healthy model from {kept.path}")
+            return fitted
     say(args, f"fitting the healthy model of the diagnosis on {len(recordings)} recordings")
     with fitting_bar(args) as advance:
-        return SelfDiagnosis(recordings.layout).fit(recordings.frames, progress=advance)
+        fitted = SelfDiagnosis(recordings.layout).fit(recordings.frames, progress=advance)
+    if kept is not None:
+        kept.save(fitted)
+    return fitted
+
+
+def add_cache(parser: argparse.ArgumentParser) -> None:
+    """Add the option that keeps no fit."""
+    parser.add_argument(
+        "--no-cache",
+        action="store_true",
+        help="fit anew, and keep nothing beside the reference (.adaptfault/)",
+    )
+
+
+_KNOWN_FROM = 0.1  # share of a fit from which on its time is told where no bar is shown
+_WORTH_TELLING = 5.0  # seconds
 
 
 @contextmanager
@@ -493,10 +521,18 @@ def fitting_bar(args: argparse.Namespace) -> Iterator[Callable[[float], None]]:
 
     form = "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]"
     hide = None if (shown := progress(args)) is None else not shown
+    began = monotonic()
+    told = False
     with tqdm(total=1.0, desc="fitting", bar_format=form, disable=hide, leave=False) as bar:
 
         def advance(share: float) -> None:
+            nonlocal told
             bar.update(share - bar.n)
+            if bar.disable and not told and share >= _KNOWN_FROM:
+                told = True
+                left = (monotonic() - began) * (1 - share) / share
+                if left >= _WORTH_TELLING:
+                    say(args, f"fitting: about {left:.0f} s left")
 
         yield advance
 

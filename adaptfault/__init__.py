@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from adaptfault.prediction.predictor import Predictor, Reading
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.maintenance_report import MaintenanceReport
+    from adaptfault.robot.selftest import Routine, plan_selftest
 
 __version__ = "0.1.0"
 
@@ -78,6 +79,7 @@ __all__ = [
     "Recordings",
     "ReducedModel",
     "Restorer",
+    "Routine",
     "Scores",
     "Sensitivity",
     "Station",
@@ -102,6 +104,7 @@ __all__ = [
     "maintain",
     "maintain_fleet",
     "make_windows",
+    "plan_selftest",
     "read_key",
     "save",
     "save_adapter",
@@ -144,6 +147,7 @@ _HOMES = {
     "ReducedModel": "adaptation.reduced_model",
     "Restorer": "imputation.restorer",
     "Station": "acquisition",
+    "Routine": "robot.selftest",
     "Scores": "evaluation.scores",
     "Summary": "data.summary",
     "Sensitivity": "evaluation.sensitivity",
@@ -167,6 +171,7 @@ _HOMES = {
     "maintain": "robot.maintenance",
     "maintain_fleet": "fleet.run",
     "make_windows": "data.windows",
+    "plan_selftest": "robot.selftest",
     "read_key": "acquisition",
     "save": "data.recordings",
     "save_adapter": "adaptation.adapter_files",

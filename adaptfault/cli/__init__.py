@@ -24,6 +24,7 @@ BUILT_IN = {
     "convert": "adaptfault.cli.convert",
     "simulate": "adaptfault.cli.simulate",
     "diagnose": "adaptfault.cli.diagnose",
+    "selftest": "adaptfault.cli.selftest",
     "train": "adaptfault.cli.train",
     "evaluate": "adaptfault.cli.evaluate",
     "predict": "adaptfault.cli.predict",

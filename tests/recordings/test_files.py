@@ -21,8 +21,8 @@ def test_a_folder_without_recordings_and_an_unknown_kind_of_file_are_refused(tmp
     (tmp_path / "x.csv").mkdir()
     message = refusal(tmp_path / "x.csv")
     assert (
-        "x.csv: the folder holds no recordings; expected files that end in .csv, .db3, .mcap, .npy,"
-        " .npz" in message
+        "x.csv: the folder holds no recordings; expected files that end in .asc, .csv, .db3, .mcap,"
+        " .npy, .npz, .tsv, .txt" in message
     )
     assert "notes.txt: is no recording" in refusal(write(tmp_path / "notes.txt", "hello"))
 

@@ -56,8 +56,9 @@ def read_text(path: Path) -> str:
     return decoded(path, read_bytes(path))
 
 
-def decoded(path: Path, data: bytes) -> str:
-    """Return the content ``data`` of a file as :func:`read_text` does."""
+def decoded(path: Path, data: bytes, *, latin: bool = False) -> str:
+    """Return the content ``data`` of a file as :func:`read_text` does; with ``latin``, what is not
+    UTF-8 is latin-1."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError.at(path, "is UTF-16 text; save it as UTF-8")
     if b"\0" in data:
@@ -65,9 +66,15 @@ def decoded(path: Path, data: bytes) -> str:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
+        if latin:
+            return _with_newlines(data.decode("latin-1"))
         line = data.count(b"\n", 0, error.start) + 1
         what = f"is not UTF-8 text (byte 0x{data[error.start]:02x}); save it as UTF-8"
         raise InputError.at(path, what, f"line {line}") from None
+    return _with_newlines(text)
+
+
+def _with_newlines(text: str) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

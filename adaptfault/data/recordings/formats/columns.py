@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -148,7 +148,7 @@ def choose_columns(
         clock,
         unit,
         label,
-        any(table.is_unreadable(i) for i in others),
+        table.has_unreadable(others),
         problems,
     )
 
@@ -176,8 +176,6 @@ class _Named:
         self.path = path
         self.width = dialect.width
         self.names = dialect.header or _names_of_times(dialect)
-        self._is_text = dialect.is_text
-        self._rows = [dialect.split(line) for line in dialect.probe[:1]]
         self._dialect = dialect
 
     @property
@@ -220,27 +218,32 @@ class _Named:
         more = f", ... ({self.width} in all)" if self.width > _LISTED else ""
         return ", ".join(name or f"{i}" for i, name in enumerate(self.names[:_LISTED])) + more
 
-    def is_unreadable(self, column: int) -> bool:
-        """Return whether the first line holds no number in a column."""
-        cells = [cell for row in self._rows for cell in row[column : column + 1]]
-        return any(self._dialect.number(cell) is None for cell in cells)
+    def text(self) -> list[int]:
+        """Return the columns in which the first lines hold text, and no number."""
+        probe = self._dialect.probe
+        columns = self._dialect.texts(probe[0]) if probe else []
+        if not columns:
+            return []
+        rows = [self._dialect.split(line) for line in probe]
+        numbers = {
+            i: [self._dialect.number(row[i]) for row in rows if i < len(row)] for i in columns
+        }
+        return [i for i in columns if all(n is None or n != n for n in numbers[i])]
 
-    def holds_text(self, column: int) -> bool:
-        """Return whether the first lines hold text in a column, and no number."""
-        if not any(self._is_text(cell) for row in self._rows for cell in row[column : column + 1]):
-            return False
-        rows = [self._dialect.split(line) for line in self._dialect.probe]
-        cells = [cell for row in rows for cell in row[column : column + 1]]
-        return all(self._dialect.number(cell) is None or not cell for cell in cells)
+    def has_unreadable(self, columns: Collection[int]) -> bool:
+        """Return whether the first line holds text or a date in one of some columns."""
+        probe = self._dialect.probe[:1]
+        return any(i in columns for line in probe for i in self._dialect.unreadable(line))
 
     def refuse_text(self, readings: Sequence[int]) -> None:
         """Raise InputError where there is text in a column of readings."""
-        text = [i for i in readings if self.holds_text(i)]
+        text = [i for i in self.text() if i in readings]
         if not text:
             return
+        cell = self._dialect.split(self._dialect.probe[0])[text[0]]
         named = ",".join(self.names[i] if self.names and self.names[i] else str(i) for i in text)
         what = (
-            f"{shown(self._rows[0][text[0]])} is not a number; write the reading, or leave a column"
+            f"{shown(cell)} is not a number; write the reading, or leave a column"
             f" of text out: --ignore {named}"
         )
         raise InputError.at(self.path, what, f"{self.first_line}, column {text[0] + 1}")

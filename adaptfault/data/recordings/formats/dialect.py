@@ -94,9 +94,17 @@ class Dialect:
             return float("nan")
         return number(cell.replace(",", ".") if self.decimal_comma else cell)
 
-    def is_text(self, cell: str) -> bool:
-        """Return whether a cell is neither missing nor a number, a date or a time of day."""
-        return _kind(cell, self.separator) == "text"
+    def texts(self, line: str) -> list[int]:
+        """Return the columns in which a line holds neither a number, a date nor a time of day, and
+        is not without a value."""
+        return _texts(self.split(line), self.separator)
+
+    def unreadable(self, line: str) -> list[int]:
+        """Return the columns in which a line holds text or a date."""
+        cells = self.split(line)
+        if _are_floats(cells):
+            return []
+        return [i for i, cell in enumerate(cells) if self.number(cell) is None]
 
 
 def number(cell: str) -> float | None:
@@ -214,7 +222,7 @@ def _confirms(line: str, after: str) -> bool:
     """
     separator = _separator(line) or ""
     cells = _split(line, separator)
-    if len(cells) > 1 and all(_kind(cell, separator) != "text" for cell in cells):
+    if len(cells) > 1 and not _texts(cells, separator):
         return True
     return _separator(after) == separator and len(_split(after, separator)) == len(cells)
 
@@ -283,8 +291,10 @@ def _frames(runs: Sequence[int], markers: Sequence[str], above: str) -> tuple[in
     between = markers[0] if markers else ""
     if is_frame(between):
         return runs[0], marker_of(between)
-    if between and marker_of(above) == marker_of(between) != between.strip():
-        return runs[0], marker_of(between)
+    marker = marker_of(between)
+    is_numbered = any(map(str.isdigit, between)) and any(map(str.isalpha, marker))
+    if is_numbered and marker_of(above) == marker:
+        return runs[0], marker
     is_regular = len(runs) == _BLOCKS and runs[0] == runs[1] > 1 and not any(markers)
     return (runs[0] if is_regular else 0), ""
 
@@ -335,16 +345,30 @@ def _split(line: str, separator: str) -> list[str]:
     if not separator:
         return line.split()
     cells = line.split(separator)
-    return [cell.strip() for cell in cells] if len(line.split(None, 1)) > 1 else cells
+    return [cell.strip() for cell in cells] if " " in line or "\t" in line else cells
 
 
 def _is_mostly_numbers(cells: Sequence[str], separator: str) -> bool:
-    try:  # nearly every line
+    if _are_floats(cells):
+        return True
+    kinds = [_kind(cell, separator) for cell in cells]
+    return kinds.count("number") > kinds.count("text")
+
+
+def _are_floats(cells: Sequence[str]) -> bool:
+    """Return whether all cells are numbers, without a call for each."""
+    try:
         list(map(float, cells))
     except ValueError:
-        kinds = [_kind(cell, separator) for cell in cells]
-        return kinds.count("number") > kinds.count("text")
+        return False
     return True
+
+
+def _texts(cells: Sequence[str], separator: str) -> list[int]:
+    """Return the indices of the cells that are text."""
+    if _are_floats(cells):
+        return []
+    return [i for i, cell in enumerate(cells) if _kind(cell, separator) == "text"]
 
 
 def _kind(cell: str, separator: str) -> str:

@@ -251,10 +251,11 @@ class _Named:
 
 def _names_of_times(dialect: Dialect) -> tuple[str, ...]:
     """Return the names above a table of another width whose first name is that of a time."""
-    if not dialect.preamble:
+    if not dialect.preamble or not dialect.separator:
         return ()
-    cells = dialect.split(dialect.preamble[-1])
-    if _leading(cells)[1] is None:
+    above = dialect.preamble[-1]
+    cells = dialect.split(above)
+    if _leading(cells)[1] is None or len(dialect.texts(above)) < len(cells):
         return ()
     return tuple((*cells, *[""] * dialect.width)[: dialect.width])
 

@@ -263,9 +263,12 @@ def _runs(path: Path, first: int, separator: str) -> tuple[list[int], list[str],
     probe: list[str] = []
     between: str | None = None
     for at, line in numbered(path):
-        if at < first or (is_comment(line) and not is_frame(line)):
+        if at < first:
             continue
-        if not line or not _begins_with_numbers(line, separator):
+        is_row = line[:1].isdigit()  # a shortcut for nearly every line
+        if not is_row and is_comment(line) and not is_frame(line):
+            continue
+        if not line or not (is_row or _begins_with_numbers(line, separator)):
             between = line or between or ""
             continue
         if between is not None:
@@ -315,7 +318,7 @@ def _header(line: str, separator: str, width: int) -> tuple[str, ...]:
         cells = _split(written, one)
         while len(cells) > width and not cells[-1]:
             cells = cells[:-1]
-        if len(cells) == width:
+        if len(cells) == width < 2 * sum(map(bool, cells)):
             return tuple(cells)
     return ()
 

@@ -85,7 +85,7 @@ def _read_by_cell(
     width = Counter(len(cells) for cells in table).most_common(1)[0][0]
     for row, number, cells in zip(rows, numbers, table, strict=True):
         if len(cells) != width:
-            remedy = "leave a missing reading as an empty cell, between its commas"
+            remedy = "leave a missing reading as an empty cell, between its separators"
             if number == numbers[-1] and len(cells) < width:
                 remedy = "the recording was cut off here: remove the line"
             if other := _other_separator(row, dialect, width):

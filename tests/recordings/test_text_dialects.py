@@ -1,6 +1,8 @@
 """Text files as people and instruments write them: separators, preambles, encodings, matrices."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -199,6 +201,28 @@ def test_a_semicolon_file_is_read_in_pieces_as_in_one(tmp_path):
         assert np.concatenate([piece.lines for piece in pieces]).tolist() == list(range(3, 33))
 
 
+def test_a_first_line_of_missing_readings_is_a_frame_and_one_of_empty_cells_is_none(tmp_path):
+    content = f"glove,,,,,\n{NAMES}\n,,,,,\n" + text(VALUES)
+    is_read(write(tmp_path / "a.csv", content))
+    values = frames(write(tmp_path / "b.csv", f"{NAMES}\n" + "NA," * 5 + "NA\n" + text(VALUES)))
+    assert np.isnan(values[0]).all()
+    np.testing.assert_array_equal(values[1:], VALUES.astype(np.float32))
+
+
+def test_the_examples_on_the_page_of_formats_are_read(tmp_path):
+    page = (Path(__file__).parents[2] / "docs/file-formats.md").read_text()
+    section = page.partition("## Recordings: text")[2].partition("### Classes")[0]
+    first, second, third = re.findall(r"```text\n(.*?)```", section, re.DOTALL)
+    assert load(write(tmp_path / "1.csv", first), layout="2x2").recordings.layout.rate == 50
+    loaded = load(write(tmp_path / "2.csv", second), layout="1x2", label_column="object")
+    assert loaded.recordings.layout.rate == 100
+    assert loaded.recordings.class_names == ("mug",)
+    assert "--ignore object" in refusal(tmp_path / "2.csv", layout="1x2")
+    loaded = load(write(tmp_path / "3.txt", third))
+    assert loaded.recordings.frames[0].shape == (2, 6)
+    assert loaded.recordings.layout.shape == (1, 2, 3)
+
+
 # Matrices
 
 
@@ -360,6 +384,11 @@ def test_a_column_that_is_not_there_is_refused_with_those_that_are(table, option
     ((name, _),) = options.items()
     assert f"a.csv: --{name.replace('_', '-')} " in message
     assert "there is no such column; it has frame, when, note, c0, c1, c2" in message
+
+
+def test_more_columns_than_cells_are_told_with_the_options_that_choose(table):
+    message = refusal(table, layout="1x2", ignore="when,note,object")
+    assert "7 values a frame, expected 2: --columns or --ignore says which" in message
 
 
 def test_columns_of_text_are_named_with_the_option_that_leaves_them_out(table):

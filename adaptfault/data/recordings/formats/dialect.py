@@ -39,6 +39,7 @@ TEKSCAN = "ASCII_DATA"
 _FRAME = re.compile(r"\W*frame[\s:#=_-]*\d+\b(?!.*frame).*", re.IGNORECASE)
 
 _SEPARATORS = (";", "\t", ",", "")
+_EMPTY = " ,;\t"  # all that a line of empty cells holds
 _PROBE = 100  # lines of the table that are kept
 _HIGHEST = 1024  # rows of a frame
 _BLOCKS = 3  # as many show that blank lines divide frames
@@ -174,7 +175,7 @@ def find_dialect(path: Path) -> Dialect | None:
     above: list[tuple[int, str]] = []
     held: tuple[int, str] | None = None  # a line of numbers that the next one may confirm
     for at, line in numbered(path):
-        if not line or (held is not None and is_comment(line)):
+        if not line.strip(_EMPTY) or (held is not None and is_comment(line)):
             continue
         if line.startswith(TEKSCAN):
             return _tekscan(path, at, [text for _, text in above])
@@ -354,8 +355,8 @@ def _split(line: str, separator: str) -> list[str]:
 def _is_mostly_numbers(cells: Sequence[str], separator: str) -> bool:
     if _are_floats(cells):
         return True
-    kinds = [_kind(cell, separator) for cell in cells]
-    return kinds.count("number") > kinds.count("text")
+    kinds = [_kind(cell, separator) for cell in cells if cell]
+    return len(kinds) > 2 * kinds.count("text")
 
 
 def _are_floats(cells: Sequence[str]) -> bool:

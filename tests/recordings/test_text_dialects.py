@@ -143,6 +143,15 @@ def test_a_file_is_read_in_the_encoding_of_its_program(tmp_path, encoding, heade
     )
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "latin-1"])
+def test_names_and_classes_keep_their_letters(tmp_path, encoding):
+    rows = [f"{line};Tüte" for line in separated(";").splitlines()]
+    content = "\n".join(["Zeitraum;" * 6 + "Größe", *rows])
+    (tmp_path / "a.csv").write_bytes(content.encode(encoding))
+    loaded = load(tmp_path, layout="2x3", label_column="Größe")
+    assert loaded.recordings.class_names == ("Tüte",)
+
+
 @pytest.mark.parametrize("gap", ["", "N/A", "NA", "nan", "null", "NULL", "-", '""'])
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 def test_words_for_missing_are_missing_readings(tmp_path, gap, separator):

@@ -35,7 +35,13 @@ from adaptfault.data.recordings.formats.dialect import (
 )
 from adaptfault.data.recordings.formats.matrices import matrices
 from adaptfault.data.recordings.formats.rows import parse_rows
-from adaptfault.data.recordings.formats.text import check_text, decoded, numbered_lines, shown
+from adaptfault.data.recordings.formats.text import (
+    LATIN,
+    check_text,
+    decoded,
+    numbered_lines,
+    shown,
+)
 from adaptfault.data.recordings.recording import Block, Facts, Recording
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".asc")
@@ -145,7 +151,7 @@ class _Before:
 
     def behind(self, piece: bytes) -> _Before:
         last = piece.rstrip(b"\r\n").rpartition(b"\n")[2]
-        return _Before(self.lines + piece.count(b"\n"), last.decode("utf-8", "replace"))
+        return _Before(self.lines + piece.count(b"\n"), last.decode("utf-8", LATIN))
 
 
 def _blocks(path: Path, dialect: Dialect, columns: Columns, size: int) -> Iterator[Block]:

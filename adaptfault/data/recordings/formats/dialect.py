@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from adaptfault.data.recordings.facts.sizes import LONGEST_LINE
+from adaptfault.data.recordings.formats.text import LATIN
 
 COMMENTS = ("#", "%", "//")
 
@@ -152,18 +153,13 @@ def encoding_of(path: Path) -> str:
 
 
 def numbered(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the lines of a file that are not blank, with their numbers, up to a zero byte: behind
-    it nothing is data.
-
-    A blank line is yielded as "".
-    """
-    encoding = encoding_of(path)
-    with builtins.open(path, encoding=encoding, errors="replace") as file:
-        for number_, line in enumerate(iter(partial(file.readline, LONGEST_LINE), ""), 1):
-            held, zero, _ = line.partition("\0")
-            if zero:
+    """Yield the number and the text of each line of a file, "" for a blank line, up to a zero byte:
+    behind it nothing is data."""
+    with builtins.open(path, encoding=encoding_of(path), errors=LATIN) as file:
+        for at, line in enumerate(iter(partial(file.readline, LONGEST_LINE), ""), 1):
+            if "\0" in line:
                 return
-            yield number_, held.strip("\n") if held.strip() else ""
+            yield at, line.strip("\n") if line.strip() else ""
 
 
 def find_dialect(path: Path) -> Dialect | None:
@@ -172,23 +168,23 @@ def find_dialect(path: Path) -> Dialect | None:
     Raises:
         OSError: the file cannot be read.
     """
-    above: list[tuple[int, str]] = []
+    above: list[str] = []
     held: tuple[int, str] | None = None  # a line of numbers that the next one may confirm
     for at, line in numbered(path):
         if not line.strip(_EMPTY) or (held is not None and is_comment(line)):
             continue
         if line.startswith(TEKSCAN):
-            return _tekscan(path, at, [text for _, text in above])
+            return _tekscan(path, at, above)
         if held is not None:
             if _confirms(held[1], line):
                 break
-            above.append(held)
+            above.append(held[1])
             held = None
         if _separator(line) is None:
-            above.append((at, line))
+            above.append(line)
         else:
             held = at, line
-    return None if held is None else _found(path, [text for _, text in above], *held)
+    return None if held is None else _found(path, above, *held)
 
 
 def _tekscan(path: Path, skip: int, preamble: list[str]) -> Dialect | None:

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 Commands = Any  # argparse's private type of subparsers
 
+_PLACES = ("key", "topic", "field", "columns", "ignore", "time_column", "label_column")
+"""Options that say where the readings are in a file."""
+
 
 def command(commands: Commands, name: str, summary: str, example: str) -> argparse.ArgumentParser:
     """Add a command whose ``--help`` ends with an example, and the option ``--json``."""
@@ -44,8 +47,8 @@ def add_recordings(
     """Add the paths of recordings, as ``least`` arguments or as an ``option``, and how they are
     read."""
     help_ = (
-        "file or folder of recordings: CSV, NPZ, NPY, ROS 2 bags, LeRobot, Zarr, HDF5, MAT,"
-        " Parquet, JSON lines"
+        "file or folder of recordings: CSV and other text, NPZ, NPY, ROS 2 bags, LeRobot, Zarr,"
+        " HDF5, MAT, Parquet, JSON lines"
     )
     if option:
         parser.add_argument("--recordings", nargs="+", metavar="FILE", help=help_)
@@ -69,6 +72,18 @@ def add_recordings(
         "--field",
         metavar="PATH",
         help="array in its messages that holds them, as data or sensors.values",
+    )
+    group.add_argument(
+        "--columns",
+        metavar="NAMES",
+        help="columns of a text file that hold the readings: names, patterns, or numbers as 2-33",
+    )
+    group.add_argument("--ignore", metavar="NAMES", help="columns that hold none, in this form")
+    group.add_argument("--time-column", metavar="NAME", help="column of the times")
+    group.add_argument(
+        "--label-column",
+        metavar="NAME",
+        help="column of the class: the most frequent value is that of the recording",
     )
     group.add_argument(
         "--frames", type=int, metavar="T", help="refuse recordings of another length"
@@ -322,7 +337,7 @@ def _array(args: argparse.Namespace) -> str | tuple[int, int, int] | None:
 
 def _array_options(args: argparse.Namespace) -> dict[str, Any]:
     """Return the options that describe the array, as :func:`adaptfault.load` takes them."""
-    names = ("calibration", "full_scale", "unit", "rate", "key", "topic", "field")
+    names = ("calibration", "full_scale", "unit", "rate", *_PLACES)
     return {"layout": _array(args), **{name: getattr(args, name) for name in names}}
 
 
@@ -345,7 +360,7 @@ def _agreeing(args: argparse.Namespace, layout: SensorLayout) -> dict[str, Any]:
         )
     if args.rate is not None and not same_rate(args.rate, layout.rate):
         raise ValueError(f"--rate {args.rate:g} given, expected {layout.rate:g} Hz")
-    return {name: options[name] for name in ("calibration", "key", "topic", "field")}
+    return {name: options[name] for name in ("calibration", *_PLACES)}
 
 
 def check_scale(path: str, recordings: Iterable[NDArray[Any]], layout: SensorLayout) -> None:

@@ -24,7 +24,7 @@ from adaptfault.data.recordings.check import (
     without_infinite,
 )
 from adaptfault.data.recordings.dataset import Recordings
-from adaptfault.data.recordings.errors import InputError, Problem
+from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.classes import class_indices, label_files
 from adaptfault.data.recordings.facts.infer import PAPER, SLACK
 from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME, layout_beside
@@ -226,7 +226,9 @@ def load(
         strict: refuse files that state another full scale or rate than ``layout``, as a model's
             layout requires.
         stated: what readers want to know: ``topic`` and ``field``, where the readings are in bags,
-            see :func:`adaptfault.data.recordings.formats.bag.open_bag`.
+            see :func:`adaptfault.data.recordings.formats.bag.open`; ``columns``, ``ignore``,
+            ``time_column`` and ``label_column``, where they are in text files, see
+            :func:`adaptfault.data.recordings.formats.csv_folder.open`.
 
     Raises:
         InputError: a path does not exist, no recording survives, or the layout, the table or the
@@ -302,14 +304,19 @@ def open_recordings(
     found, problems = find(given, readers(), aside)
     surveyor = Surveyor(PAPER.full_scale * SLACK, 2**62 if room is None else room)
     contents: list[tuple[Found, Content]] = []
+    notes: list[Path] = []
     for file in found:
         try:
             recordings = list(file.reader.open(file.path, shape=shape, **stated))
+            if not recordings:
+                notes.append(file.path)
+                continue
             content = surveyor(recordings, problems, progress)
         except InputError as error:
             problems.append(Problem("error", str(error)))
         else:
             contents.append((file, content))
+    problems += _passed_over(notes)
     contents = label_files(contents, None if labels is None else Path(labels), problems)
     if not contents:
         raise nothing_left(problems)
@@ -346,6 +353,15 @@ def open_recordings(
     if frames is None:
         problems += other_lengths([content for _, content, _ in usable])
     return Opened(usable, resolved, tables, problems)
+
+
+def _passed_over(notes: Sequence[Path]) -> list[Problem]:
+    """Return one warning for all files that hold no line of numbers."""
+    if not notes:
+        return []
+    more = f", and {len(notes) - 1} more" if len(notes) > 1 else ""
+    what = f"is no recording, it holds no line of numbers: passed over{more}"
+    return [Problem("warning", located(notes[0], what))]
 
 
 def _calibration(calibration: Calibration | PathName | None) -> Calibration | None:

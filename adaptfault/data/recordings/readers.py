@@ -7,9 +7,10 @@ A reader is a module (or any object) with::
     def open(path, **stated): -> Iterable[Recording]
     def accepts(path): -> bool                      # optional: whether a folder is one of its own
 
-``stated`` is what the user says about the files: ``shape``, ``key``, ``topic``, ``field`` and what
-else the reader asks for; it ignores the rest. A package that declares such an entry point is used
-by every command::
+``stated`` is what the user says about the files: ``shape``, ``key``, ``topic``, ``columns`` and
+what else the reader asks for; it ignores the rest. A file that turns out to be none of its format,
+as notes that end in ``.txt``, gives no recording. A package that declares such an entry point is
+used by every command::
 
     [project.entry-points."adaptfault.readers"]
     mine = "my_package.my_format"

@@ -136,6 +136,8 @@ def describe_width(content: Content, expected: int) -> str:
         )
     if width == expected - 1 and content.text:
         return f"{text}: a column is missing, write an empty cell for a missing reading"
+    if width > expected and content.text and content.shape is None:
+        return f"{text}: --columns or --ignore says which columns are readings"
     return text
 
 

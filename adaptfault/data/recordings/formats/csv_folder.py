@@ -1,189 +1,207 @@
-"""Reads CSV files: one recording a file, one frame a line, one cell a column."""
+"""Reads text files: tables of one frame a line and one cell a column, with any separator, and files
+of one matrix a frame.
+
+How a file writes its table is found once, from its first lines (:mod:`.dialect`), and so is what
+its columns hold (:mod:`.columns`).
+"""
 
 from __future__ import annotations
 
 import builtins
-import re
-from collections import Counter
-from collections.abc import Iterator, Sequence
+import codecs
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from itertools import dropwhile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.sizes import LONGEST_LINE
-from adaptfault.data.recordings.formats.text import check_text, decoded, numbered_lines, shown
+from adaptfault.data.recordings.formats.columns import Columns, Names, choose_columns, label_of
+from adaptfault.data.recordings.formats.dialect import (
+    CLOCK,
+    COMMENTS,
+    DATE,
+    Dialect,
+    bare,
+    encoding_of,
+    find_dialect,
+    is_comment,
+    is_written_out,
+    number,
+    numbered,
+)
+from adaptfault.data.recordings.formats.matrices import matrices
+from adaptfault.data.recordings.formats.rows import parse_rows
+from adaptfault.data.recordings.formats.text import (
+    LATIN,
+    check_text,
+    decoded,
+    numbered_lines,
+    shown,
+)
 from adaptfault.data.recordings.recording import Block, Facts, Recording
 
-SUFFIXES = (".csv",)
+SUFFIXES = (".csv", ".txt", ".tsv", ".asc")
 
 PIECE = 2_000_000
 """Bytes of text that are parsed at once."""
 
-_TIME = re.compile(
-    r"[%#]?(?:rosbag[_ ]?)?(?:time(?:[_ ]?stamp)?|stamp|t|epoch|elapsed|zeit|uhrzeit|clock)"
-    r"(?:[_ ]?[\[(]?(s|sec|secs|seconds|ms|us|ns)[\])]?)?",
-    re.IGNORECASE | re.ASCII,
-)
-"""Names of a column of times, also as rostopic, plotjuggler and Arduino sketches write them."""
+_TABLES = (".csv", ".tsv")
+"""Suffixes of files that are tables; others may be notes."""
 
-_UNITS = {
-    **dict.fromkeys(("s", "sec", "secs", "seconds"), "s"),
-    **dict.fromkeys(("ms", "millis", "milliseconds"), "ms"),
-    **dict.fromkeys(("us", "micros", "microseconds"), "us"),
-    "ns": "ns",
-}
-_ALONE = ("seconds", "secs", "millis", "milliseconds", "micros", "microseconds")
-"""Units that name a column of times by themselves."""
-
-_NUMBER = re.compile(r"|unnamed: 0|index|(?:frame|sample)(?:[_ ]?(?:id|no|number))?", re.IGNORECASE)
-
-_CLOCK = re.compile(r"(\d{1,2}):([0-5]\d):([0-5]\d(?:\.\d+)?)", re.ASCII)  # of a day
-
-_DATE = re.compile(
-    r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?) ?(?:Z|[+-]\d\d:?\d\d)?", re.ASCII
-)
-
-_LARGEST = float(np.finfo(np.float32).max)
+_HEAD = 4096  # bytes in which zeros show that a file is binary
 
 
-def open(path: Path, **stated: Any) -> list[Recording]:
-    """Return the recording of a CSV file of T lines x D readings, comma separated, with or without
-    a header line.
+def open(
+    path: Path,
+    *,
+    columns: Names | None = None,
+    ignore: Names | None = None,
+    time_column: str | int | None = None,
+    label_column: str | int | None = None,
+    **stated: Any,
+) -> list[Recording]:
+    """Return the recording of a text file of T lines x D readings, separated by commas, semicolons,
+    tabs or blanks, with or without a header line and lines of text above it. A file of blocks of
+    lines has one matrix a frame, see :mod:`.matrices`.
 
     A first column that the header names as a time (``time``, ``timestamp``, ``t``, with a unit as
     in ``time_ms``) is no reading; it gives the rate. One without a name, or called ``index``,
-    ``frame`` or ``sample``, is none either. An empty cell and ``nan`` are missing readings and
-    become NaN. Blank lines are skipped. A last line that a power failure cut off is left out with a
-    warning, and so is everything from zero bytes on, which stand for data that did not reach the
-    disk. A cut inside the last number of a full line cannot be detected.
+    ``frame`` or ``sample``, is none either. A first column without such a name is taken as a time,
+    with a warning, where it rises far beyond all readings. An empty cell and ``nan`` are missing
+    readings and become NaN. Blank lines and comments are skipped. A last line that a power failure
+    cut off is left out with a warning, and so is everything from zero bytes on, which stand for
+    data that did not reach the disk. A cut inside the last number of a full line cannot be
+    detected.
+
+    Args:
+        path: the file. One that may be notes, as ``.txt``, gives no recording if it holds no line
+            of numbers.
+        columns, ignore: what is a reading and what is not: names, patterns, or numbers from 0, as
+            "2-33"; several are separated by commas.
+        time_column, label_column: the column of times, and of the class, whose most frequent value
+            counts.
+        stated: what other readers ask for.
 
     Raises:
-        InputError: once its frames are read: not text, no readings, lines of different lengths, a
-            cell that is no number.
+        InputError: not text, no readings, a column that is not there; once the frames are read,
+            lines of different lengths, or a cell that is no number.
     """
-    return [Recording(Facts(path, text=True), lambda: csv_blocks(path))]
-
-
-@dataclass(frozen=True)
-class _Leading:
-    """The first columns, which hold no readings.
-
-    Attributes:
-        columns: how many.
-        clock: which of them holds times; None where none does.
-        unit: of the times, where the header states it.
-    """
-
-    columns: int = 0
-    clock: int | None = None
-    unit: str | None = None
-
-    @classmethod
-    def of(cls, header: str) -> _Leading:
-        """Read the header line of a file."""
-        leading = cls()
-        for column, name in enumerate(map(_bare, header.split(","))):
-            time = _TIME.fullmatch(name)
-            is_unit = name.lower() in _ALONE
-            if leading.clock is None and (time or is_unit):
-                unit = name if time is None else time[1] or ""
-                leading = cls(column + 1, column, _UNITS.get(unit.lower()))
-            elif _NUMBER.fullmatch(name) and column < 2:
-                leading = replace(leading, columns=column + 1)
-            else:
-                break
-        return leading
-
-
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """Some lines of a file: the frames in them, and the columns that hold no readings."""
-
-    block: Block
-    leading: _Leading = _Leading()
-
-    @property
-    def first_line(self) -> int:
-        """The line of the first frame."""
-        return 0 if self.block.lines is None else int(self.block.lines[0])
+    check_text(path)
+    try:
+        dialect = find_dialect(path)
+    except OSError as error:
+        raise _unreadable(path, error) from None
+    if dialect is None:
+        if path.suffix.lower() in _TABLES:
+            raise _no_numbers(path)
+        return []
+    if dialect.rows:
+        return matrices(path, dialect)
+    held = choose_columns(path, dialect, columns, ignore, time_column, label_column)
+    label = None if held.label is None else label_of(path, dialect, held.label)
+    facts = Facts(path, text=True, problems=held.problems)
+    return [Recording(facts, lambda: _blocks(path, dialect, held, PIECE), label=label)]
 
 
 def csv_blocks(path: Path, size: int = PIECE) -> Iterator[Block]:
-    """Yield the frames of a file, about ``size`` bytes of text at a time.
+    """Yield the frames of a table, about ``size`` bytes of text at a time.
 
     Raises:
         InputError: as :func:`open`, once the place is reached.
     """
     check_text(path)
-    before = _Before()
-    rest = b""
-    width = 0
-    try:
+    dialect = find_dialect(path)
+    if dialect is None:
+        raise _no_numbers(path)
+    yield from _blocks(path, dialect, choose_columns(path, dialect), size)
+
+
+def _no_numbers(path: Path) -> InputError:
+    """Return the error for a table without a line of numbers."""
+    if encoding_of(path) != "utf-16":
         with builtins.open(path, "rb") as file:
-            while True:
-                data = file.read(size)
-                rest += data
-                # behind zero bytes nothing is data
-                is_last = len(data) < size or b"\0" in data
-                cut = len(rest) if is_last else rest.rfind(b"\n") + 1
-                piece = rest[:cut]
-                rest = rest[cut:]
-                if len(rest) > LONGEST_LINE:
-                    what = f"has a line of over {LONGEST_LINE:,} bytes, so it is no CSV file"
-                    raise InputError.at(path, f"{what}; remove it")
-                if piece:
-                    parsed = _parse(path, piece, before)
-                    here = _width(parsed.block)
-                    width = width or here
-                    if here not in (0, width):
-                        what = f"{_values(here)} where the lines before it have {width}; correct it"
-                        raise InputError.at(path, what, f"line {parsed.first_line}")
-                    yield parsed.block
-                    before = before.behind(piece, parsed)
-                if is_last:
-                    break
-    except OSError as error:
-        what = f"cannot be read ({error.strerror}); check the path and its permissions"
-        raise InputError.at(path, what) from None
-    if not width:
-        raise InputError.at(path, "holds no readings; record it again or remove it")
+            decoded(path, file.read(_HEAD), latin=True)
+    lines = [(at, line) for at, line in numbered(path) if line and not is_comment(line)]
+    if len(lines) < 2:
+        return InputError.at(path, "holds no readings; record it again or remove it")
+    at, line = lines[1]
+    cells = [bare(cell) for cell in line.split(",")]
+    column, cell = next(
+        ((i, cell) for i, cell in enumerate(cells) if cell and number(cell) is None), (0, "")
+    )
+    what = f"{shown(cell)} is not a number; write one line of numbers a frame, or remove the file"
+    return InputError.at(path, what, f"line {at}, column {column + 1}")
 
 
-def _width(block: Block) -> int:
-    """Return the number of readings in its frames; 0 where it holds no frame."""
-    return int(block.values.shape[1]) if len(block.values) else 0
+def _unreadable(path: Path, error: OSError) -> InputError:
+    what = f"cannot be read ({error.strerror}); check the path and its permissions"
+    return InputError.at(path, what)
 
 
 @dataclass(frozen=True)
 class _Before:
-    """The lines before a piece of a file: how many, the last one, and the columns that hold no
-    readings."""
+    """The lines before a piece of a file: how many, and the last one."""
 
     lines: int = 0
     last: str = ""
-    leading: _Leading = _Leading()
 
-    def behind(self, piece: bytes, parsed: _Piece) -> _Before:
+    def behind(self, piece: bytes) -> _Before:
         last = piece.rstrip(b"\r\n").rpartition(b"\n")[2]
-        return _Before(
-            self.lines + piece.count(b"\n"), last.decode("utf-8", "replace"), parsed.leading
-        )
+        return _Before(self.lines + piece.count(b"\n"), last.decode("utf-8", LATIN))
 
 
-def _parse(path: Path, data: bytes, before: _Before) -> _Piece:
+def _blocks(path: Path, dialect: Dialect, columns: Columns, size: int) -> Iterator[Block]:
+    before = _Before()
+    rest = b""
+    length = 0
+    try:
+        for data, is_last in _read(path, dialect, size):
+            rest += data
+            cut = len(rest) if is_last else rest.rfind(b"\n") + 1
+            piece = rest[:cut]
+            rest = rest[cut:]
+            if len(rest) > LONGEST_LINE:
+                what = f"has a line of over {LONGEST_LINE:,} bytes, so it is no table"
+                raise InputError.at(path, f"{what}; remove it")
+            if piece:
+                block = _parse(path, piece, before, dialect, columns)
+                length += len(block.values)
+                yield block
+                before = before.behind(piece)
+    except OSError as error:
+        raise _unreadable(path, error) from None
+    if not length:
+        raise InputError.at(path, "holds no readings; record it again or remove it")
+
+
+def _read(path: Path, dialect: Dialect, size: int) -> Iterator[tuple[bytes, bool]]:
+    """Yield the bytes of a file, as UTF-8, and whether they are the last: behind zero bytes nothing
+    is data."""
+    decoder = codecs.getincrementaldecoder("utf-16")("replace")
+    with builtins.open(path, "rb") as file:
+        while True:
+            data = file.read(size)
+            is_last = len(data) < size
+            if dialect.encoding == "utf-16":
+                data = decoder.decode(data).encode("utf-8", "replace")
+            is_last = is_last or b"\0" in data
+            yield data, is_last
+            if is_last:
+                break
+
+
+def _parse(path: Path, data: bytes, before: _Before, dialect: Dialect, columns: Columns) -> Block:
     whole, zeros, _ = data.partition(b"\0")
     is_text = data.isascii() and (
         b"\n" in whole or before.lines or not data.rstrip(b"\0").count(b"\0")
     )
     # else the file is binary
     written = whole if (whole or before.lines) and zeros and is_text else data
-    text = decoded(path, written)
+    text = decoded(path, written, latin=True)
     rows, numbers = numbered_lines(text)
     problems: tuple[Problem, ...] = ()
     above = rows[-2] if len(rows) > 1 else before.last
@@ -191,152 +209,64 @@ def _parse(path: Path, data: bytes, before: _Before) -> _Piece:
         rows
         and above
         and not text.endswith("\n")
-        and (len(written) < len(data) or _is_cut(rows[-1], above))
+        and (len(written) < len(data) or _is_cut(rows[-1], above, dialect))
     ):
         what = "cut off in this line: the lines before it are kept"
         problems = (Problem("warning", located(path, what, f"line {before.lines + numbers[-1]}")),)
         rows = rows[:-1]
         numbers = numbers[:-1]
-    leading = before.leading
-    if rows and not before.lines and _is_header(rows[0]):
-        leading = _Leading.of(rows[0])
-        rows = rows[1:]
-        numbers = numbers[1:]
+    has_comments = any(mark in text for mark in COMMENTS)
+    if before.lines < dialect.skip or has_comments:
+        kept = [
+            (row, number)
+            for row, number in zip(rows, numbers, strict=True)
+            if number + before.lines > dialect.skip and not (has_comments and is_comment(row))
+        ]
+        rows = [row for row, _ in kept]
+        numbers = [number for _, number in kept]
     lines = np.array(numbers, dtype=np.intp) + before.lines
     if not rows:
-        nothing = np.empty((0, 0), dtype=np.float32)
-        return _Piece(Block(nothing, lines, problems=problems), leading)
-    if leading.clock is not None and _is_written_out(_cell(rows[0], leading.clock)):
-        rows = [_in_seconds(row, leading.clock) for row in rows]
-        leading = replace(leading, unit="s")
-    kind = np.float64 if leading.columns else np.float32  # float32 holds a unix time to two minutes
-    try:
-        values = np.loadtxt(rows, dtype=kind, delimiter=",", comments=None, ndmin=2)
-    except ValueError:  # numpy's parser is fast, but does not name the cell
-        values = _read_by_cell(path, rows, lines.tolist(), kind, leading)
-    if not leading.columns:
-        return _Piece(Block(values.astype(np.float32, copy=False), lines, problems=problems))
-    if values.shape[1] <= leading.columns:
-        held = "a column of times" if leading.clock is not None else "numbers of frames"
-        raise InputError.at(
-            path, f"holds {held} and no readings; add one column a cell", f"line {lines[0]}"
-        )
-    times = None if leading.clock is None else values[:, leading.clock].astype(np.float64)
+        nothing = np.empty((0, len(columns.readings)), dtype=np.float32)
+        return Block(nothing, lines, problems=problems)
+    unit = columns.unit
+    clock = columns.clock
+    if clock is not None and is_written_out(_cell(rows[0], clock, dialect)):
+        rows = [_in_seconds(row, clock, dialect) for row in rows]
+        unit = "s"
+    kind = np.float32 if clock is None else np.float64  # float32 holds a unix time to two minutes
+    values = parse_rows(path, rows, lines.tolist(), dialect, columns, kind)
+    used = columns.used
+    times = None if clock is None else values[:, used.index(clock)].astype(np.float64)
+    if used != list(columns.readings):
+        values = values[:, [used.index(column) for column in columns.readings]]
     # a reading that float32 cannot hold becomes infinite, and is missing
     with np.errstate(all="ignore"):
-        readings = values[:, leading.columns :].astype(np.float32)
-    return _Piece(Block(readings, lines, times, leading.unit, problems), leading)
+        readings = values.astype(np.float32, copy=False)
+    return Block(readings, lines, times, unit, problems)
 
 
-def _cell(row: str, column: int) -> str:
-    return _bare((*row.split(",", column + 1), "")[column])
+def _cell(row: str, column: int, dialect: Dialect) -> str:
+    return bare((*row.split(dialect.separator or None, column + 1), *[""] * (column + 1))[column])
 
 
-def _is_written_out(cell: str) -> bool:
-    """Return whether a cell holds a date, or a time of day."""
-    return _DATE.fullmatch(cell) is not None or _CLOCK.fullmatch(cell) is not None
-
-
-def _in_seconds(row: str, column: int) -> str:
+def _in_seconds(row: str, column: int, dialect: Dialect) -> str:
     """Return a line with the date in a column as seconds; what is no date stays, for the parser to
     name."""
-    cells = row.split(",", column + 1)
-    written = _cell(row, column)
-    if clock := _CLOCK.fullmatch(written):
-        cells[column] = repr(3600 * int(clock[1]) + 60 * int(clock[2]) + float(clock[3]))
-    elif date := _DATE.fullmatch(written):
+    cells = row.split(dialect.separator or None, column + 1)
+    written = _cell(row, column, dialect)
+    if clock := CLOCK.fullmatch(written):
+        seconds = float(clock[3].replace(",", "."))
+        cells[column] = repr(3600 * int(clock[1]) + 60 * int(clock[2]) + seconds)
+    elif date := DATE.fullmatch(written):
         with suppress(ValueError):  # the 45th of a month
-            cells[column] = repr(int(np.datetime64(date[1], "ns").astype(np.int64)) / 1e9)
-    return ",".join(cells)
+            day = np.datetime64(date[1].replace(",", "."), "ns")
+            cells[column] = repr(int(day.astype(np.int64)) / 1e9)
+    return (dialect.separator or " ").join(cells)
 
 
-def _is_cut(line: str, before: str) -> bool:
+def _is_cut(line: str, before: str, dialect: Dialect) -> bool:
     """Return whether a line stops short, compared with the line before it."""
-    last, last_before = (_bare(row.rpartition(",")[2]) for row in (line, before))
-    stops = line.count(",") < before.count(",") or (last != "" and _number(last) is None)
-    return stops and (last_before == "" or _number(last_before) is not None)
-
-
-def _is_header(line: str) -> bool:
-    """Return whether a line is a header: most cells are no numbers, or they count the columns (0,
-    1, 2, ...)."""
-    cells = [_bare(cell) for cell in re.split("[,;\t]", line)]
-    if len(cells) == 1:
-        # numbers with a wrong separator are a frame too, which the parser refuses
-        cells = line.split()
-    first = _number(cells[0])
-    if first not in (None, 0.0, 1.0) and _number(cells[-1]) is not None:
-        return False  # a shortcut for nearly every frame
-    numbers = [_number(cell) for cell in cells if cell]
-    if 2 * numbers.count(None) > len(numbers):
-        return True
-    # behind the names of the first columns
-    counted = list(dropwhile(lambda number: number is None, numbers))
-    # pandas writes such a header by default; no array reads exactly that
-    return len(counted) > 3 and any(
-        counted == list(range(start, start + len(counted))) for start in (0, 1)
-    )
-
-
-def _read_by_cell(
-    path: Path, rows: Sequence[str], numbers: Sequence[int], kind: type, leading: _Leading
-) -> NDArray[Any]:
-    """Parse cell by cell: accepts missing readings, and names the line and column of a cell that is
-    no number."""
-    for separator, name in ((";", "';'"), ("\t", "tabs")):
-        if separator in rows[0]:
-            raise InputError.at(
-                path,
-                f"separated by {name}? use commas, and a point in decimals",
-                f"line {numbers[0]}",
-            )
-    table = [row.split(",") for row in rows]
-    if len(table[0]) == 1 and " " in rows[0].strip():
-        raise InputError.at(path, "separated by spaces? use commas", f"line {numbers[0]}")
-    width = Counter(len(cells) for cells in table).most_common(1)[0][0]
-    for number, cells in zip(numbers, table, strict=True):
-        if len(cells) != width:
-            remedy = "leave a missing reading as an empty cell, between its commas"
-            if number == numbers[-1] and len(cells) < width:
-                remedy = "the recording was cut off here: remove the line"
-            what = f"{_values(len(cells))} where the other lines have {width}; {remedy}"
-            raise InputError.at(path, what, f"line {number}")
-    values: NDArray[Any] = np.empty((len(table), width), dtype=kind)
-    for frame, (number, cells) in enumerate(zip(numbers, table, strict=True)):
-        for column, cell in enumerate(cells):
-            reading = _number(_bare(cell)) if cell.strip() else np.nan
-            if reading is None:
-                what = (
-                    f"{shown(cell)} is not a number; write the reading, or leave the cell empty if"
-                    " it is missing"
-                )
-                if column == leading.clock:
-                    what = (
-                        f"{shown(cell)} is no time; write a number, or a date as"
-                        " 2025-03-01T12:00:00.05"
-                    )
-                elif column == 0 and len(cells) > 1:
-                    what += " (name a column of times in a header line, or remove it)"
-                raise InputError.at(path, what, f"line {number}, column {column + 1}")
-            values[frame, column] = reading
-    return values
-
-
-def _values(count: int) -> str:
-    return "1 value" if count == 1 else f"{count} values"
-
-
-def _bare(cell: str) -> str:
-    return cell.strip().strip('"').strip()
-
-
-def _number(cell: str) -> float | None:
-    """Return the number in a cell, or None; readings that float32 cannot hold become infinite, as
-    in numpy's parser."""
-    try:
-        number = float(cell)
-    except ValueError:
-        return None
-    if "_" in cell:  # Python's float accepts 1_000, which no CSV file means
-        return None
-    return number if abs(number) <= _LARGEST or number != number else float("inf")
+    cells, cells_before = (dialect.split(row) for row in (line, before))
+    last = cells[-1]
+    stops = len(cells) < len(cells_before) or dialect.number(last) is None
+    return stops and dialect.number(cells_before[-1]) is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,18 @@ from typing import Any
 
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.sizes import check_file, check_kind
+
+LATIN = "adaptfault.latin"
+"""Name of the error handler that takes bytes that are not UTF-8 as latin-1."""
+
+
+def _as_latin(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeDecodeError):
+        raise error
+    return error.object[error.start : error.end].decode("latin-1"), error.end
+
+
+codecs.register_error(LATIN, _as_latin)
 
 
 def check_text(path: Path) -> None:
@@ -56,14 +69,15 @@ def read_text(path: Path) -> str:
     return decoded(path, read_bytes(path))
 
 
-def decoded(path: Path, data: bytes) -> str:
-    """Return the content ``data`` of a file as :func:`read_text` does."""
+def decoded(path: Path, data: bytes, *, latin: bool = False) -> str:
+    """Return the content ``data`` of a file as :func:`read_text` does; with ``latin``, what is not
+    UTF-8 is latin-1."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError.at(path, "is UTF-16 text; save it as UTF-8")
     if b"\0" in data:
         raise InputError.at(path, "is not a text file (it holds zero bytes); save it as UTF-8 text")
     try:
-        text = data.decode("utf-8-sig")
+        text = data.decode("utf-8-sig", LATIN if latin else "strict")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         what = f"is not UTF-8 text (byte 0x{data[error.start]:02x}); save it as UTF-8"

@@ -1,0 +1,392 @@
+"""Finds how a text file writes its table: encoding, separator, decimal sign, header, and whether a
+line or a block of lines is one frame.
+
+The table begins at the first line most of whose values are numbers, if the next line has as many of
+them. What is above it is a preamble; its last line is the header, if it has as many names.
+"""
+
+from __future__ import annotations
+
+import builtins
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import dropwhile
+from pathlib import Path
+
+import numpy as np
+
+from adaptfault.data.recordings.facts.sizes import LONGEST_LINE
+from adaptfault.data.recordings.formats.text import LATIN
+
+COMMENTS = ("#", "%", "//")
+
+MISSING = frozenset(("", "n/a", "na", "nan", "null", "-"))
+"""Cells without a reading, in lower case."""
+
+CLOCK = re.compile(r"(\d{1,2}):([0-5]\d):([0-5]\d(?:[.,]\d+)?)", re.ASCII)  # of a day
+
+DATE = re.compile(
+    r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?) ?(?:Z|[+-]\d\d:?\d\d)?", re.ASCII
+)
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+TEKSCAN = "ASCII_DATA"
+"""Begins the line of a Tekscan file behind which the frames are."""
+
+_FRAME = re.compile(r"\W*frame[\s:#=_-]*\d+\b(?!.*frame).*", re.IGNORECASE)
+
+_SEPARATORS = (";", "\t", ",", "")
+_EMPTY = " ,;\t"  # all that a line of empty cells holds
+_PROBE = 100  # lines of the table that are kept
+_HIGHEST = 1024  # rows of a frame
+_BLOCKS = 3  # as many show that blank lines divide frames
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How a text file writes its table.
+
+    Attributes:
+        encoding: "utf-8-sig", in which invalid bytes are latin-1, or "utf-16".
+        separator: of values; "" = blanks.
+        skip: lines above the table, the header included.
+        width: values in a line of the table.
+        header: names of the columns; empty without a header.
+        ends: each line ends with a separator, behind which there is no value.
+        rows: lines of a frame; 0 = each line is a frame.
+        marker: of the line that begins a frame, without its digits; "" = a blank line.
+        probe: first lines of the table.
+        preamble: lines above the table.
+        no_cell: value of a position without a cell; empty without such a value.
+    """
+
+    encoding: str = "utf-8-sig"
+    separator: str = ","
+    skip: int = 0
+    width: int = 0
+    header: tuple[str, ...] = ()
+    ends: bool = False
+    rows: int = 0
+    marker: str = ""
+    probe: tuple[str, ...] = ()
+    preamble: tuple[str, ...] = ()
+    no_cell: str = ""
+
+    @property
+    def decimal_comma(self) -> bool:
+        """Whether a comma inside a value is the decimal sign."""
+        return self.separator != ","
+
+    def split(self, line: str) -> list[str]:
+        """Return the values of a line, without blanks and quotes around them."""
+        cells = _split(line, self.separator)
+        return cells[:-1] if self.ends and len(cells) > 1 and not cells[-1] else cells
+
+    def first(self, line: str) -> str:
+        """Return the first value of a line."""
+        return _first(line, self.separator)
+
+    def number(self, cell: str) -> float | None:
+        """Return the number in a cell, NaN where it is missing; None where it is text."""
+        if cell.lower() in MISSING:
+            return float("nan")
+        return number(cell.replace(",", ".") if self.decimal_comma else cell)
+
+    def texts(self, line: str) -> list[int]:
+        """Return the columns in which a line holds neither a number, a date nor a time of day, and
+        is not without a value."""
+        return _texts(self.split(line), self.separator)
+
+    def unreadable(self, line: str) -> list[int]:
+        """Return the columns in which a line holds text or a date."""
+        cells = self.split(line)
+        if _are_floats(cells):
+            return []
+        return [i for i, cell in enumerate(cells) if self.number(cell) is None]
+
+
+def number(cell: str) -> float | None:
+    """Return the number in a cell, or None; what float32 cannot hold becomes infinite, as in
+    numpy's parser."""
+    try:
+        value = float(cell)
+    except ValueError:
+        return None
+    if "_" in cell:  # Python's float accepts 1_000, which no file means
+        return None
+    return value if abs(value) <= _LARGEST or value != value else float("inf")
+
+
+def bare(cell: str) -> str:
+    """Return a cell without blanks and quotes around it."""
+    return cell.strip().strip('"').strip()
+
+
+def is_comment(line: str) -> bool:
+    """Return whether a line is a comment."""
+    return line.lstrip().startswith(COMMENTS)
+
+
+def is_written_out(cell: str) -> bool:
+    """Return whether a cell holds a date, or a time of day."""
+    return DATE.fullmatch(cell) is not None or CLOCK.fullmatch(cell) is not None
+
+
+def is_frame(line: str) -> bool:
+    """Return whether a line begins a frame, as ``Frame 12``."""
+    return _FRAME.fullmatch(line) is not None
+
+
+def marker_of(line: str) -> str:
+    """Return a line without digits: what all lines that begin a frame have in common."""
+    return re.sub(r"\d+", "", line).strip(" \t.,;")
+
+
+def encoding_of(path: Path) -> str:
+    """Return the encoding that the first bytes of a file state."""
+    with builtins.open(path, "rb") as file:
+        return "utf-16" if file.read(2) in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+
+
+def numbered(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the number and the text of each line of a file, "" for a blank line, up to a zero byte:
+    behind it nothing is data."""
+    with builtins.open(path, encoding=encoding_of(path), errors=LATIN) as file:
+        for at, line in enumerate(iter(partial(file.readline, LONGEST_LINE), ""), 1):
+            if "\0" in line:
+                return
+            yield at, line.strip("\n") if line.strip() else ""
+
+
+def find_dialect(path: Path) -> Dialect | None:
+    """Return how a file writes its table; None where it holds no line of numbers.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    above: list[str] = []
+    held: tuple[int, str] | None = None  # a line of numbers that the next one may confirm
+    for at, line in numbered(path):
+        if not line.strip(_EMPTY) or (held is not None and is_comment(line)):
+            continue
+        if line.startswith(TEKSCAN):
+            return _tekscan(path, at, above)
+        if held is not None:
+            if _confirms(held[1], line):
+                break
+            above.append(held[1])
+            held = None
+        if _separator(line) is None:
+            above.append(line)
+        else:
+            held = at, line
+    return None if held is None else _found(path, above, *held)
+
+
+def _tekscan(path: Path, skip: int, preamble: list[str]) -> Dialect | None:
+    """Return the dialect of an ASCII file of Tekscan, whose rows follow lines ``Frame 1``."""
+    rows: list[str] = []
+    for at, line in numbered(path):
+        if at > skip and line and not is_frame(line):
+            rows.append(line)
+        elif rows:
+            break
+    if not rows:
+        return None
+    separator = next(one for one in _SEPARATORS if one in rows[0])
+    return Dialect(
+        encoding_of(path),
+        separator,
+        skip=skip,
+        width=len(_split(rows[0], separator)),
+        rows=len(rows),
+        marker=marker_of("Frame 1"),
+        probe=tuple(rows),
+        preamble=tuple(preamble),
+        no_cell="B",
+    )
+
+
+def _confirms(line: str, after: str) -> bool:
+    """Return whether the line ``after`` shows that ``line`` begins the table.
+
+    A line of several numbers alone does: where the others have another width, it is to be named,
+    not passed over.
+    """
+    separator = _separator(line) or ""
+    cells = _split(line, separator)
+    if len(cells) > 1 and not _texts(cells, separator):
+        return True
+    return _separator(after) == separator and len(_split(after, separator)) == len(cells)
+
+
+def _found(path: Path, above: list[str], first: int, line: str) -> Dialect:
+    """Return the dialect of a file whose table begins at its line ``first``."""
+    separator = _separator(line) or ""
+    runs, markers, probe = _runs(path, first, separator)
+    rows, marker = _frames(runs, markers, above[-1] if above else "")
+    skip = first - 1
+    if not rows and _counts_columns(_split(line, separator)):
+        above = [*above, line]
+        probe = probe[1:]
+        skip = first
+    ends = separator not in ("", ",") and all(text.endswith(separator) for text in probe)
+    dialect = Dialect(encoding_of(path), separator, ends=ends)
+    width = len(dialect.split(probe[0] if probe else line))
+    header = _header(above[-1], separator, width) if above else ()
+    if rows and not marker and header:  # blank lines inside a table
+        rows = 0
+    return replace(
+        dialect,
+        skip=skip,
+        width=width,
+        header=() if rows else header,
+        rows=rows,
+        marker=marker,
+        probe=tuple(probe),
+        preamble=tuple(above),
+    )
+
+
+def _runs(path: Path, first: int, separator: str) -> tuple[list[int], list[str], list[str]]:
+    """Return the lengths of the first blocks of lines of numbers, the lines between them, and the
+    first lines of numbers."""
+    runs = [0]
+    markers: list[str] = []
+    probe: list[str] = []
+    between: str | None = None
+    for at, line in numbered(path):
+        if at < first:
+            continue
+        is_row = line[:1].isdigit()  # a shortcut for nearly every line
+        if not is_row and is_comment(line) and not is_frame(line):
+            continue
+        if not line or not (is_row or _begins_with_numbers(line, separator)):
+            between = line or between or ""
+            continue
+        if between is not None:
+            if len(runs) == _BLOCKS:
+                break
+            runs.append(0)
+            markers.append(between)
+            between = None
+        runs[-1] += 1
+        if len(probe) < _PROBE:
+            probe.append(line)
+        if runs[-1] > _HIGHEST:
+            break
+    return runs, markers, probe
+
+
+def _frames(runs: Sequence[int], markers: Sequence[str], above: str) -> tuple[int, str]:
+    """Return the lines of a frame and what begins one; 0 where each line is a frame."""
+    if runs[0] > _HIGHEST:
+        return 0, ""
+    if is_frame(above):
+        return runs[0], marker_of(above)
+    between = markers[0] if markers else ""
+    if is_frame(between):
+        return runs[0], marker_of(between)
+    marker = marker_of(between)
+    is_numbered = any(map(str.isdigit, between)) and any(map(str.isalpha, marker))
+    if is_numbered and marker_of(above) == marker:
+        return runs[0], marker
+    is_regular = len(runs) == _BLOCKS and runs[0] == runs[1] > 1 and not any(markers)
+    return (runs[0] if is_regular else 0), ""
+
+
+def _begins_with_numbers(line: str, separator: str) -> bool:
+    """Return whether a line is one of numbers: its first value is one, or most of them are."""
+    if is_frame(line):
+        return False
+    return _kind(_first(line, separator), separator) == "number" or _is_mostly_numbers(
+        _split(line, separator), separator
+    )
+
+
+def _header(line: str, separator: str, width: int) -> tuple[str, ...]:
+    """Return the names of so many columns, where a line holds them; empty where it does not."""
+    written = line.lstrip().lstrip("#%/") if is_comment(line) else line
+    for one in (separator, *_SEPARATORS):
+        cells = _split(written, one)
+        while len(cells) > width and not cells[-1]:
+            cells = cells[:-1]
+        if len(cells) == width < 2 * sum(map(bool, cells)):
+            return tuple(cells)
+    return ()
+
+
+def _separator(line: str) -> str | None:
+    """Return what separates the values of a line, most of which are numbers; None where they are
+    not."""
+    if is_comment(line) or is_frame(line):
+        return None
+    for separator in _SEPARATORS:
+        if separator in line and _is_mostly_numbers(_split(line, separator), separator):
+            return separator
+    return None
+
+
+def _first(line: str, separator: str) -> str:
+    return bare(line.split(separator or None, 1)[0])
+
+
+def _split(line: str, separator: str) -> list[str]:
+    if '"' in line:
+        try:
+            cells = next(csv.reader([line], delimiter=separator or " ", skipinitialspace=True))
+        except csv.Error:  # a cell of more than 128 KB
+            cells = line.split(separator or None)
+        return [bare(cell) for cell in cells]
+    if not separator:
+        return line.split()
+    cells = line.split(separator)
+    return [cell.strip() for cell in cells] if " " in line or "\t" in line else cells
+
+
+def _is_mostly_numbers(cells: Sequence[str], separator: str) -> bool:
+    if _are_floats(cells):
+        return True
+    kinds = [_kind(cell, separator) for cell in cells if cell]
+    return len(kinds) > 2 * kinds.count("text")
+
+
+def _are_floats(cells: Sequence[str]) -> bool:
+    """Return whether all cells are numbers, without a call for each."""
+    try:
+        list(map(float, cells))
+    except ValueError:
+        return False
+    return True
+
+
+def _texts(cells: Sequence[str], separator: str) -> list[int]:
+    """Return the indices of the cells that are text."""
+    if _are_floats(cells):
+        return []
+    return [i for i, cell in enumerate(cells) if _kind(cell, separator) == "text"]
+
+
+def _kind(cell: str, separator: str) -> str:
+    """Return whether a cell is a "number", "missing" or "text"; dates are numbers."""
+    if cell.lower() in MISSING:
+        return "missing"
+    written = cell if separator == "," else cell.replace(",", ".")
+    return "number" if number(written) is not None or is_written_out(cell) else "text"
+
+
+def _counts_columns(cells: Sequence[str]) -> bool:
+    """Return whether cells are a header that counts the columns (0, 1, 2, ...), as pandas writes it
+    by default, behind the names of the first columns; no array reads exactly that."""
+    first = number(cells[0])
+    if first not in (None, 0.0, 1.0) and number(cells[-1]) is not None:
+        return False  # a shortcut for nearly every file
+    numbers = [number(cell) for cell in cells if cell]
+    counted = list(dropwhile(lambda value: value is None, numbers))
+    return len(counted) > 3 and any(
+        counted == list(range(start, start + len(counted))) for start in (0, 1)
+    )

@@ -13,6 +13,7 @@ from scipy.special import expit, logit
 
 from diagnostics.decision.address_aliasing import find_aliasing
 from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
+from diagnostics.decision.certificate import Certificate, certify
 from diagnostics.decision.line_cover import candidate_groups
 from diagnostics.decision.result import Diagnosis
 from diagnostics.decision.root_causes import CellFindings, root_causes
@@ -67,6 +68,11 @@ class Fitted:
     calibrator: Calibrator
     reference: Reference | None
     load: LoadDirection | None = None
+    certificate: Certificate | None = None
+
+
+def _no_progress(share: float) -> None:
+    """Nobody looks at the progress."""
 
 
 class SelfDiagnosis:
@@ -87,6 +93,8 @@ class SelfDiagnosis:
 
     reference_: Reference | None = None
     calibrator_: Calibrator = Calibrator.cold()
+    _certificate: Certificate | None = None
+    _held_out: tuple[Sequence[NDArray[Any]], NDArray[np.float64]] | None = None
 
     def __init__(
         self,
@@ -124,6 +132,8 @@ class SelfDiagnosis:
         SelfDiagnosis.__init__(self, **(known | params))
         self.reference_ = None
         self.calibrator_ = Calibrator.cold()
+        self._certificate = None
+        self._held_out = None
         return self
 
     def __sklearn_is_fitted__(self) -> bool:
@@ -162,9 +172,10 @@ class SelfDiagnosis:
         recordings: RecordingBlocks,
         progress: Callable[[float], None],
         suspected: NDArray[np.float64] | None = None,
+        calibrator: Calibrator | None = None,
     ) -> SelfDiagnosis:
         """Fit; ``suspected``: P(dead) ``[D]`` of cells that are dead if they never move; None:
-        found here."""
+        found here. ``calibrator``: None: fitted here."""
         progress(0.0)
         present = self.layout.present.ravel()
         healthy = recordings.valid(self.layout.full_scale, present).whole(present)
@@ -187,9 +198,46 @@ class SelfDiagnosis:
         self.reference_ = Reference.fit(healthy, layout, dead)
         if self.proof_of_life:
             self.reference_ = self.reference_.with_life(healthy, layout)
-        self.calibrator_ = Calibrator.fit(healthy, living(layout, dead), progress=progress)
+        if calibrator is None:
+            calibrator = Calibrator.fit(healthy, living(layout, dead), progress=progress)
+        self.calibrator_ = calibrator
+        self._certificate = None
+        self._held_out = (recordings.given, dead[self._place])
         progress(1.0)
         return self
+
+    @property
+    def certificate_(self) -> Certificate | None:
+        """How often a healthy log is blamed at most, measured on healthy recordings that are held
+        out (:mod:`diagnostics.decision.certificate`).
+
+        It is computed when it is first asked for, which takes about a third of the time of the fit;
+        :meth:`save` keeps it from then on. None: not fitted, to fewer than 20 recordings, or read
+        from a file that has none.
+        """
+        if self._held_out is not None:
+            recordings, dead = self._held_out
+            self._held_out = None
+            with one_thread():
+                self._certificate = certify(recordings, dead > 0, self._blamed(dead))
+        return self._certificate
+
+    def _blamed(
+        self, dead: NDArray[np.float64]
+    ) -> Callable[
+        [Sequence[NDArray[Any]], Sequence[Sequence[NDArray[Any]]]], list[NDArray[np.bool_]]
+    ]:
+        """Return what fits to recordings with this calibration and returns F of each log, bool
+        ``[D]``; ``dead``: P(dead) ``[D]`` of cells that never move."""
+
+        def blamed(
+            rest: Sequence[NDArray[Any]], logs: Sequence[Sequence[NDArray[Any]]]
+        ) -> list[NDArray[np.bool_]]:
+            part = SelfDiagnosis(**self.get_params())
+            part._fit(RecordingBlocks(list(rest)), _no_progress, dead, self.calibrator_)
+            return [part._diagnosed(RecordingBlocks(list(log))).fault_set.mask for log in logs]
+
+        return blamed
 
     def diagnose(self, recordings: ArrayLike | Sequence[ArrayLike]) -> Diagnosis:
         """Diagnose a log: recordings ``[T, D]`` or a list of them, in time order.
@@ -275,6 +323,7 @@ class SelfDiagnosis:
                 self.calibrator_,
                 self.reference_,
                 self.load_,
+                self._certificate,
             )
         )
         return {"schema": SCHEMA, **fitted}, arrays
@@ -295,6 +344,7 @@ class SelfDiagnosis:
             diagnoser.calibrator_ = fitted.calibrator
             diagnoser.reference_ = fitted.reference
             diagnoser.load_ = fitted.load
+            diagnoser._certificate = fitted.certificate
             if fitted.load is not None:
                 fitted.load.check(fitted.layout)
             if fitted.reference is not None:

@@ -89,6 +89,23 @@ def add_untested_code(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_metrics(parser: argparse.ArgumentParser) -> None:
+    """Add the file of metrics."""
+    parser.add_argument(
+        "--metrics",
+        type=_metrics_file,
+        metavar="FILE.prom",
+        help="write metrics for Prometheus, as node_exporter's textfile collector reads them",
+    )
+
+
+def _metrics_file(text: str) -> str:
+    if not text.endswith(".prom"):
+        what = "expected a name that ends in .prom: node_exporter reads no other"
+        raise argparse.ArgumentTypeError(f"{what}; got {text!r}")
+    return text
+
+
 def add_trust(parser: argparse.ArgumentParser) -> None:
     """Add whose signature a bundle needs."""
     group = parser.add_argument_group("signed bundles")

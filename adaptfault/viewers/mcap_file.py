@@ -1,8 +1,8 @@
 """Writes an MCAP file for Foxglove: JSON messages with its public schemas.
 
 - ``/tactile/<pad>/readings``: one ``foxglove.Grid`` a frame, field ``reading``
-- ``/tactile/<pad>/states``: one ``foxglove.Grid`` a second, field ``state`` (:class:`State`) and
-  its colour
+- ``/tactile/<pad>/states``: one ``foxglove.Grid`` a second, field ``state`` (numbered as in
+  :class:`~adaptfault.viewers.timed_log.State`) and its colour
 - ``/diagnostics``: one ``diagnostic_msgs/DiagnosticArray`` a second
 
 Foxglove draws the rows of a grid upwards, so the last row of a pad comes first. The states lie

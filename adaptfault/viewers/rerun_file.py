@@ -1,7 +1,8 @@
 """Writes an RRD file for Rerun.
 
 - ``/tactile/<pad>/readings``: a depth image a frame, from 0 to full scale
-- ``/tactile/<pad>/states``: a segmentation image of the :class:`State` of each position
+- ``/tactile/<pad>/states``: a segmentation image, numbered as in
+  :class:`~adaptfault.viewers.timed_log.State`
 - ``/tactile/faults``: a text log, a line a fault at its onset
 - ``/tactile/recordings``: a text log, a line a recording
 

@@ -37,6 +37,8 @@ class StreamResult(Protocol):
     def fault_set(self) -> FaultSet: ...  # noqa: D102
     @property
     def events(self) -> tuple[Fault, ...]: ...  # noqa: D102
+    @property
+    def faults(self) -> tuple[Fault, ...]: ...  # noqa: D102
 
 
 class StreamingPredictor(Protocol):
@@ -107,6 +109,7 @@ class Session:
         self.clock = clock
         self.switch = None if rule is None else Switch(rule)
         self.label: Any = None
+        self.faults: tuple[Fault, ...] = ()
         self._classified = 0
         self._confirmed = self._confirm_failed = False
         self._faulty: NDArray[np.bool_] | None = None
@@ -131,9 +134,11 @@ class Session:
         events = [self._event("restart", "the device restarted")] if frame.restarted else []
         if isinstance(self.watcher, Monitor):
             news = self.watcher.update(frame.values, frame.time)
+            self.faults = self.watcher.faults
         else:
             reading = self.watcher.stream(frame.values, frame.time)
             news = tuple(reading.events)
+            self.faults = reading.faults
             events += self._classify(reading)
         events += [self._fault_event(fault) for fault in news]
         faulty = np.zeros(frame.values.size, bool) if self._faulty is None else self._faulty

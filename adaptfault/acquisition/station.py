@@ -23,6 +23,7 @@ from adaptfault.acquisition.session import Event, Session, StreamingPredictor
 from adaptfault.acquisition.switch import Rule, parse_when
 from adaptfault.data.printable import printable
 from adaptfault.inspection.converter_range import within_range
+from adaptfault.robot.metrics import RobotMetrics, cells_by_pad, fault_counts, write_metrics
 from diagnostics import Monitor, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
@@ -57,6 +58,8 @@ class Station:
         record: folder for recordings; None: no recording.
         relay: ``HOST:PORT`` to which repaired packets are sent, see :class:`Relay`; needs a bundle.
         when: when to record, see :func:`parse_when`.
+        metrics: file of metrics for Prometheus, written when faults change and at the end; the
+            robots in it are devices.
         seconds, frames: when to end; None: never.
         calibration: converts received values into the layout's unit.
         on_event: called with each event in the event loop, instead of printing it.
@@ -83,6 +86,7 @@ class Station:
         record: str | os.PathLike[str] | None = None,
         relay: str | None = None,
         when: str = "contact",
+        metrics: str | os.PathLike[str] | None = None,
         seconds: float | None = None,
         frames: int | None = None,
         calibration: Calibration | None = None,
@@ -93,6 +97,7 @@ class Station:
         self.bundle = bundle
         self.record = record
         self.calibration = calibration
+        self.metrics = metrics
         self._keys = keys
         self._least_serial = least_serial
         self.seconds = seconds
@@ -167,6 +172,7 @@ class Station:
                 self._emit(session.close())
             if self._relay is not None:
                 self._relay.close()
+            self._write_metrics()
         self._end()
 
     async def _take_all(self) -> None:
@@ -200,8 +206,30 @@ class Station:
         self._outside += outside
         events = session.take(frame, time.monotonic())
         self._emit(events)
-        if self._relay is not None and any(event.kind in ("fault", "gone") for event in events):
-            self._relay.found(frame.device, session.fault_set)
+        if any(event.kind in ("fault", "gone") for event in events):
+            if self._relay is not None:
+                self._relay.found(frame.device, session.fault_set)
+            self._write_metrics(frame.device, frame.time)
+
+    def _write_metrics(self, device: str = "station", at: float = 0.0) -> None:
+        """Write the metrics of all devices; a file that cannot be written does not end the
+        station."""
+        if self.metrics is None:
+            return
+        now = time.time()
+        robots = [
+            RobotMetrics(
+                name,
+                now,
+                pads=cells_by_pad(self.layout, session.faults),
+                faults=fault_counts(session.faults),
+            )
+            for name, session in self._sessions.items()
+        ]
+        try:
+            write_metrics(self.metrics, robots)
+        except OSError as error:
+            self.on_event(Event("trouble", device, at, f"metrics are not written: {error}"))
 
     def _send(self, frame: Frame) -> None:
         """Send a frame on, before it waits for monitoring and classification, which take longer."""

@@ -22,6 +22,7 @@ BUILT_IN = {
     "info": "adaptfault.cli.info",
     "check": "adaptfault.cli.check",
     "convert": "adaptfault.cli.convert",
+    "view": "adaptfault.cli.view",
     "simulate": "adaptfault.cli.simulate",
     "diagnose": "adaptfault.cli.diagnose",
     "selftest": "adaptfault.cli.selftest",

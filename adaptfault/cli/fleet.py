@@ -7,6 +7,7 @@ import argparse
 
 from adaptfault.cli.options import (
     Commands,
+    add_metrics,
     add_sign,
     add_trust,
     command,
@@ -63,9 +64,10 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--out", metavar="FOLDER", help="of ledger and reports (default: FLEET.fleet)"
     )
+    add_metrics(parser)
     add_trust(parser)
     add_sign(parser, "each bundle after its run")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, writes=("metrics",))
     parser = command(
         inner, "survival", "how long wires and cells last, and whom to service next", _SURVIVAL
     )
@@ -103,6 +105,10 @@ def run(args: argparse.Namespace) -> int:
     atomic_write(
         folder / "report.json", json.dumps(report.to_dict(), indent=1, allow_nan=False).encode()
     )
+    if args.metrics:
+        from adaptfault.robot.metrics import write_metrics
+
+        write_metrics(args.metrics, report.metrics())
     page = report.write_page(folder / "report.html")
     say(args, f"report: {page}")
     emit(args, report.to_dict(), str(report))

@@ -5,7 +5,15 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from adaptfault.cli.options import Commands, add_array, add_trust, command, layout_of, trust
+from adaptfault.cli.options import (
+    Commands,
+    add_array,
+    add_metrics,
+    add_trust,
+    command,
+    layout_of,
+    trust,
+)
 
 if TYPE_CHECKING:
     from adaptfault.acquisition import Station
@@ -61,9 +69,10 @@ def add(commands: Commands) -> None:
     parser.add_argument("--when", metavar="WHEN", help=_WHEN)
     parser.add_argument("--seconds", type=float, metavar="S", help="end after so long")
     parser.add_argument("--frames", type=int, metavar="N", help="end after so many frames")
+    add_metrics(parser)
     add_array(parser)
     add_trust(parser)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, writes=("metrics",))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -114,6 +123,7 @@ def _station(args: argparse.Namespace) -> Station:
         record=args.record,
         relay=args.relay,
         when=args.when or "contact",
+        metrics=args.metrics,
         seconds=args.seconds,
         frames=args.frames,
         calibration=tables,

@@ -4,9 +4,12 @@ it."""
 from __future__ import annotations
 
 import argparse
+import time
+from typing import TYPE_CHECKING
 
 from adaptfault.cli.options import (
     Commands,
+    add_metrics,
     add_sign,
     add_trust,
     add_untested_code,
@@ -15,6 +18,10 @@ from adaptfault.cli.options import (
     say,
     trust,
 )
+
+if TYPE_CHECKING:
+    from adaptfault.bundle.bundle import Bundle
+    from adaptfault.robot.maintenance_report import MaintenanceReport
 
 _EXAMPLE = """  adaptfault maintain robot.bundle today/
       recordings seen before are skipped
@@ -43,13 +50,23 @@ def add(commands: Commands) -> None:
     )
     add_untested_code(parser)
     parser.add_argument("--report", metavar="FILE", help="write the technician's report (HTML)")
+    add_metrics(parser)
     add_trust(parser)
     add_sign(parser, "the bundle after the run")
-    parser.set_defaults(run=run, writes=("report",))
+    parser.set_defaults(run=run, writes=("report", "metrics"))
 
 
 def run(args: argparse.Namespace) -> int:
     """Maintain; the exit code gives the state of the sensor."""
+    try:
+        return _maintain(args)
+    except Exception:
+        if args.metrics:
+            _write_failure(args)
+        raise
+
+
+def _maintain(args: argparse.Namespace) -> int:
     import sys
 
     from adaptfault.bundle.bundle import Bundle
@@ -79,5 +96,27 @@ def run(args: argparse.Namespace) -> int:
         from adaptfault.robot.technician_report import write_report
 
         write_report(args.report, bundle, run=report)
+    if args.metrics:
+        _write_metrics(args, bundle, report)
     emit(args, report.to_dict(), str(report))
     return report.exit_code
+
+
+def _write_metrics(args: argparse.Namespace, bundle: Bundle, report: MaintenanceReport) -> None:
+    from adaptfault.robot.metrics import RobotMetrics, write_metrics
+    from adaptfault.robot.technician_report import robot_name
+
+    name = robot_name(bundle.path)
+    write_metrics(args.metrics, [RobotMetrics.of(name, time.time(), bundle, report)])
+
+
+def _write_failure(args: argparse.Namespace) -> None:
+    """Write that the state of the robot is unknown."""
+    from pathlib import Path
+
+    from adaptfault.inspection.severity import UNKNOWN
+    from adaptfault.robot.metrics import RobotMetrics, write_metrics
+    from adaptfault.robot.technician_report import robot_name
+
+    name = robot_name(Path(args.bundle))
+    write_metrics(args.metrics, [RobotMetrics(name, time.time(), UNKNOWN)])

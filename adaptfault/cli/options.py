@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from adaptfault.data.recordings import Loaded, Opened, Problem, Recordings
-    from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
+    from diagnostics import Diagnosis, FaultSet, SelfDiagnosis, SensorLayout
 
 Commands = Any  # argparse's private type of subparsers
 
@@ -103,6 +103,23 @@ def add_untested_code(parser: argparse.ArgumentParser) -> None:
             " (default 1)"
         ),
     )
+
+
+def add_metrics(parser: argparse.ArgumentParser) -> None:
+    """Add the file of metrics."""
+    parser.add_argument(
+        "--metrics",
+        type=_metrics_file,
+        metavar="FILE.prom",
+        help="write metrics for Prometheus, as node_exporter's textfile collector reads them",
+    )
+
+
+def _metrics_file(text: str) -> str:
+    if not text.endswith(".prom"):
+        what = "expected a name that ends in .prom: node_exporter reads no other"
+        raise argparse.ArgumentTypeError(f"{what}; got {text!r}")
+    return text
 
 
 def add_trust(parser: argparse.ArgumentParser) -> None:
@@ -411,7 +428,16 @@ def refuse_missing(args: argparse.Namespace) -> None:
         for name in ("recordings", "reference", "trust")
         for path in getattr(args, name, None) or []
     ]
-    names = ("labels", "layout", "calibration", "adapted", "model", "fleet", "sign")
+    names = (
+        "labels",
+        "layout",
+        "calibration",
+        "adapted",
+        "model",
+        "fleet",
+        "sign",
+        "diagnosis",
+    )
     one = [getattr(args, name, None) for name in names]
     for path in (path for path in (*many, *one) if path is not None):
         # an empty path, as of a shell variable that is not set, is none either
@@ -469,22 +495,31 @@ def fault_set(text: str, layout: SensorLayout) -> FaultSet:
 
 
 def _diagnosed(path: Path, layout: SensorLayout) -> FaultSet:
-    from adaptfault.data.recordings.formats.text import read_json_object
-    from diagnostics import Diagnosis
-
     if not path.is_file():
         raise ValueError(f"--faults {path}: no such file, and not cell indices as 3,17,200")
-    try:
-        diagnosis = Diagnosis.from_dict(read_json_object(path))
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"{path}: not a diagnosis ({error}); write one with adaptfault diagnose --out"
-        ) from None
+    diagnosis = read_diagnosis(path)
     if diagnosis.layout.shape != layout.shape:
         raise ValueError(
             f"{path}: a diagnosis of {diagnosis.layout}, but the model is for {layout}"
         )
     return diagnosis.fault_set
+
+
+def read_diagnosis(path: Path) -> Diagnosis:
+    """Read a diagnosis that ``adaptfault diagnose --out`` wrote.
+
+    Raises:
+        ValueError: the file holds none.
+    """
+    from adaptfault.data.recordings.formats.text import read_json_object
+    from diagnostics import Diagnosis
+
+    try:
+        return Diagnosis.from_dict(read_json_object(path))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{path}: not a diagnosis ({error}); write one with adaptfault diagnose --out"
+        ) from None
 
 
 def progress(args: argparse.Namespace) -> bool | None:

@@ -7,6 +7,7 @@ import contextlib
 import errno
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 
@@ -37,6 +38,31 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
             os.unlink(name)
         raise
     sync_folder(path.parent)  # the rename is durable once the folder is synchronised
+
+
+@contextlib.contextmanager
+def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield the name of a new file in the same folder, which takes the place of ``path`` at the
+    end: for files that are written piece by piece.
+
+    Raises:
+        OSError: the folder does not exist or cannot be written; nothing is left behind, as after
+            any other error.
+    """
+    path = Path(path)
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    os.close(descriptor)
+    try:
+        yield Path(name)
+        with open(name, "rb+") as file:
+            os.fsync(file.fileno())
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(name)
+        raise
+    sync_folder(path.parent)
 
 
 def make_folder(path: str | os.PathLike[str]) -> None:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from adaptfault.fleet.listing import Robot
+from adaptfault.robot.metrics import PadCells, RobotMetrics, cells_by_pad, summed
 
 if TYPE_CHECKING:  # passing outcomes on needs no torch
     from adaptfault.bundle.bundle import Bundle
@@ -58,6 +59,8 @@ class Outcome:
         notes: first recordings left out, and damage.
         recordings: number of new recordings used.
         seconds: wall clock on the worker.
+        pads: cells of each pad by state.
+        coverage: share of the cells that the new recordings tested; None without new recordings.
     """
 
     robot: Robot
@@ -74,6 +77,8 @@ class Outcome:
     notes: tuple[str, ...] = ()
     recordings: int = 0
     seconds: float = 0.0
+    pads: tuple[PadCells, ...] = ()
+    coverage: float | None = None
 
     @classmethod
     def of(
@@ -111,6 +116,8 @@ class Outcome:
             notes=(*every[:_NOTES], *more),
             recordings=len(report.used),
             seconds=seconds,
+            pads=cells_by_pad(bundle.layout, report.faults, report.diagnosis),
+            coverage=None if report.diagnosis is None else report.diagnosis.coverage.test_coverage,
         )
 
     @classmethod
@@ -125,6 +132,19 @@ class Outcome:
             return 0.0
         return self.accuracy / self.fault_free_accuracy
 
+    def metrics(self, time: float) -> RobotMetrics:
+        """Return the metrics of a run that ended at ``time``, in seconds since 1970."""
+        faults = summed((cause.kind, cause.wire or "", cause.cells) for cause in self.causes)
+        return RobotMetrics(
+            self.robot.name,
+            time,
+            self.exit_code,
+            self.pads,
+            self.coverage,
+            self.accuracy,
+            faults,
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict that :meth:`from_dict` reads."""
         return asdict(self)
@@ -138,4 +158,6 @@ class Outcome:
             "tags": tuple(d["robot"]["tags"]),
         }
         causes = tuple(Cause(**cause) for cause in d["causes"])
-        return cls(**{**d, "robot": Robot(**robot), "causes": causes, "notes": tuple(d["notes"])})
+        pads = tuple(PadCells(**pad) for pad in d.get("pads", ()))
+        lists = {"causes": causes, "notes": tuple(d["notes"]), "pads": pads}
+        return cls(**{**d, "robot": Robot(**robot), **lists})

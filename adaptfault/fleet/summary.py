@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from adaptfault.fleet.outcome import Outcome
+from adaptfault.robot.metrics import RobotMetrics
 from adaptfault.robot.sensor_state import weak_base
 
 SCHEMA = "adaptfault.fleet/1"
@@ -213,6 +214,11 @@ class FleetReport:
             "seconds": self.seconds,
             "outcomes": [o.to_dict() for o in self.outcomes],
         }
+
+    def metrics(self) -> list[RobotMetrics]:
+        """Return the metrics of each robot."""
+        ended = datetime.fromisoformat(self.ended).timestamp()
+        return [outcome.metrics(ended) for outcome in self.outcomes]
 
     def write_page(self, path: str | Path) -> Path:
         """Write the report as one self-contained HTML file and return its path.

@@ -34,6 +34,7 @@ class Reading:
     probabilities: object = (0.1, 0.9)
     fault_set: FaultSet = field(default_factory=lambda: FaultSet((), 6))
     events: tuple[Fault, ...] = ()
+    faults: tuple[Fault, ...] = ()
 
 
 class Scripted:

@@ -263,7 +263,7 @@ def without_export() -> Iterator[None]:
     """As where the export's packages are missing: it takes seconds, and has tests of its own."""
     pytest.importorskip("torch")
 
-    def missing(*_: object) -> None:
+    def missing(*_: object, **__: object) -> None:
         raise ImportError("left out in this test")
 
     with pytest.MonkeyPatch.context() as patch:

@@ -34,14 +34,18 @@ class Stage:
         name: "fill", "head", "finetune" or "scratch".
         seconds: wall clock, without the scoring.
         accuracy: on validation (R2 of a regression); None where it was not computed.
+        measure: what that is, "accuracy" or "R2".
     """
 
     name: str
     seconds: float
     accuracy: float | None = None
+    measure: str = "accuracy"
 
     def __str__(self) -> str:
-        reached = "" if self.accuracy is None else f", validation accuracy {self.accuracy:.3f}"
+        reached = (
+            "" if self.accuracy is None else f", validation {self.measure} {self.accuracy:.3f}"
+        )
         return f"{self.name}: {self.seconds:.2f} s{reached}"
 
 

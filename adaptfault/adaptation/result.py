@@ -22,7 +22,14 @@ from adaptfault.models.any_model import network_from_config
 from adaptfault.models.builders import ModelNotAllowed
 from adaptfault.models.heads import Head
 from adaptfault.models.network import logits_of
-from adaptfault.models.store import ADAPTATION, load_tensors, load_with_head, save_tensors
+from adaptfault.models.store import (
+    ADAPTATION,
+    SCHEMA,
+    load_tensors,
+    load_with_head,
+    read_manifest,
+    save_tensors,
+)
 from diagnostics import FaultSet
 
 
@@ -265,8 +272,9 @@ def load_healthy(folder: str | Path) -> Adaptation:
     :func:`~adaptfault.load_model`.
     """
     model, head = load_with_head(folder)
+    task = read_manifest(folder, SCHEMA).get("task", "classification")
     none = FaultSet((), model.layout.n_cells)
-    return Adaptation(ReducedModel(model, none, None, head).eval(), none, ())
+    return Adaptation(ReducedModel(model, none, None, head).eval(), none, (), task)
 
 
 def _empty_front(about: dict[str, Any], fault_set: FaultSet) -> nn.Module:

@@ -429,10 +429,9 @@ def _check_parts(
             f" {diagnoser.layout}"
         )
     if class_names and len(class_names) != model.n_classes:
+        kinds = ("values", "value") if adapter.task == "regression" else ("classes", "class")
         raise ValueError(
-            f"{model.n_classes} {'values' if adapter.task == 'regression' else 'classes'} need as"
-            f" many {'value' if adapter.task == 'regression' else 'class'} names, got"
-            f" {len(class_names)}"
+            f"{model.n_classes} {kinds[0]} need as many {kinds[1]} names, got {len(class_names)}"
         )
 
 

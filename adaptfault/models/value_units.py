@@ -8,6 +8,7 @@ deviation, so that the stored network returns values in their own unit.
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,6 +51,11 @@ class ValueUnits:
         """Return windows with standardised values."""
         y = (windows.y.astype(np.float64) - self.mean) / self.deviation
         return replace(windows, y=y.astype(np.float32))
+
+    def to_dict(self, names: Sequence[str]) -> dict[str, dict[str, float]]:
+        """Return mean and standard deviation of each value by name, a JSON-safe dict."""
+        units = zip(names, self.mean.tolist(), self.deviation.tolist(), strict=True)
+        return {name: {"mean": mean, "deviation": deviation} for name, mean, deviation in units}
 
     @torch.no_grad()
     def fold(self, model: TactileTransformer | AnyModel) -> None:

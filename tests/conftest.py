@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import threading
@@ -337,7 +338,7 @@ def write_forces(folder: Path, recordings: Sequence[np.ndarray]) -> None:
     """Write recordings of the small array as CSV files, and the table of the forces of their
     frames."""
     (folder / "grasps").mkdir(parents=True)
-    SIMULATED.to_json(folder / "grasps" / "layout.json")
+    (folder / "grasps" / "layout.json").write_text(json.dumps(SIMULATED.to_dict()))
     lines = [",".join(["file", "frame", *VALUES])]
     for i, frames in enumerate(recordings):
         np.savetxt(folder / "grasps" / f"{i:02d}.csv", frames, fmt="%.4f", delimiter=",")
@@ -353,11 +354,13 @@ def forces_home(small_grasps: Recordings, made_once) -> Path:
     """Recordings with a table of their forces, a model of them and a bundle; not to be changed."""
 
     def make(home: Path) -> None:
-        held = [f for f, label in zip(small_grasps.frames, small_grasps.labels, strict=True) if label]
+        held = [
+            f for f, label in zip(small_grasps.frames, small_grasps.labels, strict=True) if label
+        ]
         write_forces(home, held)
         training = ["train", str(home / "grasps"), "--targets", str(home / "targets.csv")]
         training += ["--epochs", "8", "--learning-rate", "1e-3", "--quiet"]
-        with without_export():
+        with without_export(), without_calibration():
             assert main([*training, "--out", str(home / "model")]) == 0
             assert main([*training, "--out", str(home / "robot.bundle")]) == 0
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from recording_files import messages, newtons, refusal, write
 
-from adaptfault.data.recordings import Recordings, load
+from adaptfault.data.recordings import Recordings, load, save
 from adaptfault.data.windows import make_windows
 from diagnostics import SensorLayout
 
@@ -143,3 +143,11 @@ def test_recordings_refuse_targets_that_do_not_fit_them():
         Recordings(frames, layout, targets=(np.zeros(2), np.zeros((5, 2))))
     named = Recordings(frames, layout, targets=(np.zeros(2), np.zeros((6, 2))))
     assert named.value_names == ("value 0", "value 1")
+
+
+def test_a_file_that_is_written_says_that_it_holds_no_targets(tmp_path):
+    layout = SensorLayout(1, 2, 2)
+    recordings = Recordings((np.ones((5, 4)),), layout, targets=(np.zeros(2),))
+    for name in ("a.npz", "a.npy", "folder"):
+        assert "the targets of a regression" in save(tmp_path / name, recordings)
+    assert save(tmp_path / "b.npz", Recordings((np.ones((5, 4)),), layout)) == ()

@@ -28,13 +28,13 @@ def save(path: str | PathLike[str], recordings: Recordings) -> tuple[str, ...]:
     """Write recordings in the format that the name ends in: ``.npz``, ``.npy``, ``.bag``; without
     an ending, CSV files.
 
-    An archive (``.npz``) holds everything but the targets of a regression. An array (``.npy``) holds the frames alone,
-    ``[n, T, pads, rows, cols]``, and needs recordings of one length. CSV files lie in one folder a
-    class, with ``layout.json`` beside them. A bag holds one ``Float32MultiArray`` a frame on
-    ``/tactile``, recordings separated by pauses.
+    An archive (``.npz``) holds everything but the targets of a regression. An array (``.npy``)
+    holds the frames alone, ``[n, T, pads, rows, cols]``, and needs recordings of one length. CSV
+    files lie in one folder a class, with ``layout.json`` beside them. A bag holds one
+    ``Float32MultiArray`` a frame on ``/tactile``, recordings separated by pauses.
 
     Returns:
-        What the format cannot hold, one item each: empty for an archive.
+        What the format cannot hold, one item each.
 
     Raises:
         InputError: another ending, no recordings, lengths that differ (``.npy``), or rosbags is

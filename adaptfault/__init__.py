@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from adaptfault.models.network import TactileTransformer
     from adaptfault.models.store import load_model, save_model
     from adaptfault.models.training import train
+    from adaptfault.models.value_units import ValueUnits
     from adaptfault.prediction.export import add_onnx
     from adaptfault.prediction.inference import Inference
     from adaptfault.prediction.predictor import Predictor, Reading
@@ -87,6 +88,7 @@ __all__ = [
     "TactileTransformer",
     "Untrusted",
     "ValueScores",
+    "ValueUnits",
     "Windows",
     "WorstFaults",
     "add_onnx",
@@ -154,6 +156,7 @@ _HOMES = {
     "TactileTransformer": "models.network",
     "Untrusted": "bundle.versions",
     "ValueScores": "evaluation.scores",
+    "ValueUnits": "models.value_units",
     "Windows": "data.windows",
     "WorstFaults": "adaptation.worst",
     "add_onnx": "prediction.export",

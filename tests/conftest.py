@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import threading
@@ -263,7 +264,7 @@ def without_export() -> Iterator[None]:
     """As where the export's packages are missing: it takes seconds, and has tests of its own."""
     pytest.importorskip("torch")
 
-    def missing(*_: object) -> None:
+    def missing(*_: object, **__: object) -> None:
         raise ImportError("left out in this test")
 
     with pytest.MonkeyPatch.context() as patch:
@@ -314,6 +315,64 @@ def bundle(made_bundle: Path, tmp_path: Path) -> Iterator[Bundle]:
     shutil.copytree(made_bundle, tmp_path / "robot.bundle")
     with without_export():
         yield Bundle.open(tmp_path / "robot.bundle")
+
+
+VALUES = ("force", "row", "column")
+
+
+def forces(frames: np.ndarray) -> np.ndarray:
+    """Return the total force of each frame in mN, and its centre in rows and in thousandths of a
+    column, ``[T, 3]``."""
+    pads = frames.reshape(-1, *SIMULATED.shape)
+    total = pads.sum((1, 2, 3))
+    loaded = np.maximum(total, 1e-6)
+    row = (pads.sum((1, 3)) * np.arange(6)).sum(1) / loaded
+    column = (pads.sum((1, 2)) * np.arange(5)).sum(1) / loaded
+    touched = total > 0.5
+    return np.stack(
+        [1000 * total, np.where(touched, row, 2.5), 1e-3 * np.where(touched, column, 2.0)], axis=1
+    )
+
+
+def write_forces(folder: Path, recordings: Sequence[np.ndarray]) -> None:
+    """Write recordings of the small array as CSV files, and the table of the forces of their
+    frames."""
+    (folder / "grasps").mkdir(parents=True)
+    (folder / "grasps" / "layout.json").write_text(json.dumps(SIMULATED.to_dict()))
+    lines = [",".join(["file", "frame", *VALUES])]
+    for i, frames in enumerate(recordings):
+        np.savetxt(folder / "grasps" / f"{i:02d}.csv", frames, fmt="%.4f", delimiter=",")
+        lines += [
+            f"grasps/{i:02d}.csv,{t},{force:.2f},{row:.4f},{column:.7f}"
+            for t, (force, row, column) in enumerate(forces(frames))
+        ]
+    (folder / "targets.csv").write_text("\n".join(lines))
+
+
+@pytest.fixture(scope="session")
+def forces_home(small_grasps: Recordings, made_once) -> Path:
+    """Recordings with a table of their forces, a model of them and a bundle; not to be changed."""
+
+    def make(home: Path) -> None:
+        held = [
+            f for f, label in zip(small_grasps.frames, small_grasps.labels, strict=True) if label
+        ]
+        write_forces(home, held)
+        training = ["train", str(home / "grasps"), "--targets", str(home / "targets.csv")]
+        training += ["--epochs", "8", "--learning-rate", "1e-3", "--quiet"]
+        with without_export(), without_calibration():
+            assert main([*training, "--out", str(home / "model")]) == 0
+            assert main([*training, "--out", str(home / "robot.bundle")]) == 0
+
+    return made_once("forces", make)
+
+
+@pytest.fixture
+def forces_bundle(forces_home: Path, tmp_path: Path) -> Iterator[Bundle]:
+    """A copy of the bundle of a regression, to be changed."""
+    shutil.copytree(forces_home / "robot.bundle", tmp_path / "forces.bundle")
+    with without_export():
+        yield Bundle.open(tmp_path / "forces.bundle")
 
 
 @pytest.fixture

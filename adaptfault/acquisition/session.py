@@ -17,7 +17,7 @@ from adaptfault.acquisition.switch import Contact, Rule, Switch
 from diagnostics import Fault, FaultSet, Monitor, SensorLayout
 
 CONFIRMED_AFTER = 100
-"""Number of classified windows after which a version on probation is confirmed."""
+"""Number of predicted windows after which a version on probation is confirmed."""
 
 SILENCE = 2.0
 """Seconds without a frame after which a device is reported silent and its recording is closed."""
@@ -27,7 +27,7 @@ _BEFORE = 0.5  # seconds recorded before a contact
 
 class StreamResult(Protocol):
     """Result of one frame, as :class:`adaptfault.Reading`; ``label`` is None until a window is
-    full."""
+    full, and of a regression, which has ``values``."""
 
     @property
     def label(self) -> Any: ...  # noqa: D102
@@ -171,7 +171,8 @@ class Session:
         return [] if recorded is None else [self._recorded(recorded)]
 
     def _classify(self, reading: StreamResult) -> list[Event]:
-        if reading.label is None:
+        values = getattr(reading, "values", None)  # of a regression: no label, and no event
+        if reading.label is None and values is None:
             return []
         events = []
         self._classified += 1

@@ -26,6 +26,7 @@ LIMIT = 20_000_000  # bytes of an adapter, unless its network alone is larger
 _SHARE = 0.5  # of the limit: the most that windows take
 _FINEST = 1 / 4095  # step for readings without visible converter steps: a 12-bit converter
 _MOST_STEPS = 65_535
+_COARSEST = 1e-3  # largest error of a 16-bit float, in units of the largest of its tensor
 _OVERHEAD = 100_000  # bytes for names, labels and JSON
 
 
@@ -35,8 +36,9 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int | None = None
     Without a limit these are 20,000,000 bytes, or what a network of a large array needs with 8-bit
     weights and as many bytes of windows.
 
-    Readings that are whole converter steps are stored exactly, others with 12 bits. Windows that
-    need more than half of the limit are thinned evenly. The weights use the first format that fits
+    Readings that are whole converter steps are stored exactly, others with 12 bits. The values of a
+    regression are stored exactly. Windows that need more than half of the limit are thinned
+    evenly. The weights use the first format that fits
     the rest: 32-bit floats, 16-bit floats, or 8-bit integers with a scale for each row.
     ``manifest.json`` records the choices.
 
@@ -49,8 +51,6 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int | None = None
             f"{adapter.model.config['module']} cannot be rebuilt from a file: make it with"
             " build_model('package.module:function', layout, n_classes)"
         )
-    if adapter.task == "regression":
-        raise ValueError("the adapter of a regression cannot be saved: its targets are no classes")
     statistics = adapter.statistics
     upper = np.triu_indices(len(statistics.mean))
     tensors: dict[str, Tensor] = {
@@ -61,14 +61,17 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int | None = None
         weights_only = _bytes(_eighth(adapter.model.state_dict()))
         limit = max(LIMIT, _OVERHEAD + _bytes(tensors) + int(weights_only / (1 - _SHARE)) + 1)
     room = limit - _OVERHEAD - _bytes(tensors)
-    about: dict[str, Any] = {"network": adapter.model.config}
+    about: dict[str, Any] = {"network": adapter.model.config, "task": adapter.task}
     parts = {
         "train": (adapter.train, adapter.targets),
         "validation": (adapter.validation, adapter.validation_targets),
     }
+    values = adapter.task == "regression"  # y has them
     n = sum(len(windows) for windows, _ in parts.values())
     for name, (windows, targets) in parts.items():
-        packed, packing = _pack_thinned(windows, targets, int(_SHARE * room * len(windows) / n))
+        packed, packing = _pack_thinned(
+            windows, None if values else targets, int(_SHARE * room * len(windows) / n)
+        )
         tensors |= {f"{name}.{key}": value for key, value in packed.items()}
         about[name] = packing
     room = limit - _OVERHEAD - _bytes(tensors)
@@ -88,7 +91,7 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int | None = None
 def save_windows(path: str | Path, windows: Windows, *, limit: int = LIMIT // 4) -> None:
     """Write windows into a folder as :func:`save_adapter` does, thinned evenly to ``limit``
     bytes."""
-    packed, packing = _pack_thinned(windows, np.zeros((len(windows), 0), np.float32), limit)
+    packed, packing = _pack_thinned(windows, None, limit)
     save_tensors(
         path,
         WINDOWS_SCHEMA,
@@ -121,12 +124,13 @@ def load_adapter(path: str | Path) -> Adapter:
         model.load_state_dict(
             _restore({k.removeprefix("model."): v for k, v in tensors.items() if k[:6] == "model."})
         )
-        adapter = Adapter(
-            model.eval(), *(_unpack(about[name], tensors, name) for name in ("train", "validation"))
-        )
-        adapter.targets, adapter.validation_targets = (
-            tensors[f"{name}.targets"].float().numpy() for name in ("train", "validation")
-        )
+        task = about.get("task", "classification")
+        parts = (_unpack(about[name], tensors, name) for name in ("train", "validation"))
+        adapter = Adapter(model.eval(), *parts, task=task)
+        if task == "classification":
+            adapter.targets, adapter.validation_targets = (
+                tensors[f"{name}.targets"].float().numpy() for name in ("train", "validation")
+            )
         d = model.layout.n_cells
         covariance = np.zeros((d, d))
         covariance[np.triu_indices(d)] = tensors["statistics.covariance"].numpy()
@@ -147,19 +151,21 @@ def _bytes(tensors: dict[str, Tensor]) -> int:
 
 
 def _pack_thinned(
-    windows: Windows, targets: NDArray[Any], room: int
+    windows: Windows, targets: NDArray[Any] | None, room: int
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Pack as many windows as fit; return them and the packing parameters."""
     keep = len(windows)
     while True:
         which = evenly(len(windows), keep)
-        packed, packing = _pack(windows.select(which), targets[which])
+        packed, packing = _pack(windows.select(which), None if targets is None else targets[which])
         if (size := _bytes(packed)) <= room or keep == 1:
             return packed, {**packing, "of": len(windows)}
         keep = max(1, min(keep - 1, int(keep * room / size)))
 
 
-def _pack(windows: Windows, targets: NDArray[Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def _pack(
+    windows: Windows, targets: NDArray[Any] | None
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
     low, step = _steps(windows.x)
     counts = np.rint((windows.x.astype(np.float64) - low) / step).astype(np.uint16)
     # Differences between frames and then all low bytes before all high ones: mostly zeros, which
@@ -170,8 +176,9 @@ def _pack(windows: Windows, targets: NDArray[Any]) -> tuple[dict[str, Tensor], d
         "x": torch.frombuffer(bytearray(data), dtype=torch.uint8),
         "y": torch.from_numpy(windows.y),
         "recording": torch.from_numpy(windows.recording),
-        "targets": torch.from_numpy(targets).half(),
     }
+    if targets is not None:
+        packed["targets"] = torch.from_numpy(targets).half()
     return packed, {"shape": list(windows.x.shape), "low": low, "step": step}
 
 
@@ -210,15 +217,24 @@ def _whole(state: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _half(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: tensor.half() for name, tensor in state.items()}
+    return {name: _short(tensor) for name, tensor in state.items()}
+
+
+def _short(tensor: Tensor) -> Tensor:
+    """Return a tensor as 16-bit floats; as it is where they are too coarse or too small for it."""
+    half = tensor.half()
+    error = (half.to(tensor.dtype) - tensor).abs()
+    # not true where a value became infinite
+    fits = bool((error <= _COARSEST * tensor.abs().amax()).all()) if tensor.numel() else True
+    return half if fits else tensor
 
 
 def _eighth(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return matrices as int8 with a scale for each row, the rest as 16-bit floats."""
+    """Return matrices as int8 with a scale for each row, the rest as :func:`_half`."""
     small: dict[str, Tensor] = {}
     for name, tensor in state.items():
         if tensor.dim() < 2:
-            small[name] = tensor.half()
+            small[name] = _short(tensor)
             continue
         rows = tensor.flatten(1)
         scale = (rows.abs().amax(1, keepdim=True) / 127).clamp_min(torch.finfo(torch.float32).tiny)

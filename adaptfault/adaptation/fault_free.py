@@ -100,6 +100,11 @@ class FaultFreeModel:
             else self.statistics
         )
 
+    @property
+    def measure(self) -> str:
+        """What :meth:`score` returns: "accuracy" or "R2"."""
+        return "R2" if self.task == "regression" else "accuracy"
+
     def score(self, outputs: Tensor) -> float:
         """Return accuracy or R2 of outputs ``[N, n]`` for the validation windows."""
         if self.task == "regression":

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.determination import explained
 from adaptfault.evaluation.scores import mean_interval, prediction_interval
 from diagnostics import FaultSet
 
@@ -55,14 +56,14 @@ class Expected:
 
     @classmethod
     def of_errors(
-        cls, explained: NDArray[np.floating], recording: NDArray[np.int64], new: float | None
+        cls, shares: NDArray[np.floating], recording: NDArray[np.int64], new: float | None
     ) -> Expected:
         """Return the R2 to expect from the share of the variance that is explained in each window
         ``[N]``."""
-        low, high = mean_interval(explained, recording)
+        low, high = mean_interval(shares, recording)
         known = len(np.unique(recording))
         wider = np.sqrt(1 + known / (known if new is None else new))
-        r2 = float(explained.mean())
+        r2 = float(shares.mean())
         return cls(r2, r2 - wider * (r2 - low), min(1.0, r2 + wider * (high - r2)), r2)
 
 
@@ -81,6 +82,7 @@ class Forecast:
         worst_loss: loss of its recall, 0..1.
         n_recordings: number of validation recordings.
         n_new: number of new recordings whose accuracy the intervals hold.
+        measure: what is expected, "accuracy" or "R2".
     """
 
     fault_set: FaultSet
@@ -89,6 +91,7 @@ class Forecast:
     worst_loss: float
     n_recordings: int
     n_new: float
+    measure: str = "accuracy"
 
     @classmethod
     def of(
@@ -135,22 +138,20 @@ class Forecast:
     ) -> Forecast:
         """Build a forecast from the values ``[N, k]`` that each measured stage predicted for
         validation windows."""
-        total = ((y - y.mean(axis=0)) ** 2).mean(axis=0)
-        total = np.where(total > 0, total, 1.0)
         stages = {}
         for name, values in predicted.items():
-            explained = 1 - ((values - y) ** 2 / total).mean(axis=1)  # its mean is R2
-            stages[name] = Expected.of_errors(explained, recording, new)
+            shares = explained(y, values).mean(axis=1)  # its mean is R2
+            stages[name] = Expected.of_errors(shares, recording, new)
         if len(predicted) > 1:
             _add_trained(stages)
         count = len(np.unique(recording))
-        return cls(fault_set, stages, None, 0.0, count, count if new is None else new)
+        return cls(fault_set, stages, None, 0.0, count, count if new is None else new, "R2")
 
     def __str__(self) -> str:
         k = len(self.fault_set)
         many = "many new recordings" if np.isinf(self.n_new) else f"{self.n_new:g} new ones"
         lines = [
-            f"expected accuracy without {k} cells, from {self.n_recordings} recordings (95 %"
+            f"expected {self.measure} without {k} cells, from {self.n_recordings} recordings (95 %"
             f" interval, {many}):"
         ]
         lines += [f"  {name:10s} {expected}" for name, expected in self.stages.items()]

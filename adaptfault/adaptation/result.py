@@ -22,7 +22,14 @@ from adaptfault.models.any_model import network_from_config
 from adaptfault.models.builders import ModelNotAllowed
 from adaptfault.models.heads import Head
 from adaptfault.models.network import logits_of
-from adaptfault.models.store import ADAPTATION, load_tensors, load_with_head, save_tensors
+from adaptfault.models.store import (
+    ADAPTATION,
+    SCHEMA,
+    load_tensors,
+    load_with_head,
+    read_manifest,
+    save_tensors,
+)
 from diagnostics import FaultSet
 
 
@@ -34,14 +41,18 @@ class Stage:
         name: "fill", "head", "finetune" or "scratch".
         seconds: wall clock, without the scoring.
         accuracy: on validation (R2 of a regression); None where it was not computed.
+        measure: what that is, "accuracy" or "R2".
     """
 
     name: str
     seconds: float
     accuracy: float | None = None
+    measure: str = "accuracy"
 
     def __str__(self) -> str:
-        reached = "" if self.accuracy is None else f", validation accuracy {self.accuracy:.3f}"
+        reached = (
+            "" if self.accuracy is None else f", validation {self.measure} {self.accuracy:.3f}"
+        )
         return f"{self.name}: {self.seconds:.2f} s{reached}"
 
 
@@ -261,8 +272,9 @@ def load_healthy(folder: str | Path) -> Adaptation:
     :func:`~adaptfault.load_model`.
     """
     model, head = load_with_head(folder)
+    task = read_manifest(folder, SCHEMA).get("task", "classification")
     none = FaultSet((), model.layout.n_cells)
-    return Adaptation(ReducedModel(model, none, None, head).eval(), none, ())
+    return Adaptation(ReducedModel(model, none, None, head).eval(), none, (), task)
 
 
 def _empty_front(about: dict[str, Any], fault_set: FaultSet) -> nn.Module:

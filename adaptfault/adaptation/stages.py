@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from adaptfault.adaptation.fault_free import FaultFreeModel, Network
 from adaptfault.adaptation.reduced_model import ReducedModel, reduce_windows
 from adaptfault.adaptation.result import Adaptation, Stage
+from adaptfault.data.determination import explained
 from adaptfault.data.windows import Windows, evenly
 from adaptfault.models.any_model import device_of
 from adaptfault.models.compact import CompactNetwork
@@ -32,6 +33,7 @@ from adaptfault.models.heads import (
 from adaptfault.models.history import History
 from adaptfault.models.network import as_tensor, logits_of
 from adaptfault.models.training import train
+from adaptfault.models.value_units import ValueUnits, foldable
 from diagnostics import FaultSet
 
 Method = Literal["auto", "fill", "head", "finetune", "scratch"]
@@ -161,7 +163,9 @@ class Run:
         self.reduced = self._behind(self.fault_free.imputation.linear(self.fault_set), fresh)
         self.stages.clear()
         began = time.perf_counter()
-        history = self._train(self.reduced, _SCRATCH_EPOCHS, self.seed, patience=_SCRATCH_PATIENCE)
+        history = self._train(
+            self.reduced, _SCRATCH_EPOCHS, self.seed, patience=_SCRATCH_PATIENCE, fresh=True
+        )
         self.stages.append(Stage("scratch", time.perf_counter() - began, history.best_accuracy))
         self.logits = None
 
@@ -180,11 +184,10 @@ class Run:
         return accuracy
 
     def _quality(self, outputs: Tensor) -> tuple[float, float]:
-        """Return accuracy and negative cross entropy at its best scale, or R2 and negative mean
-        squared error."""
+        """Return accuracy and negative cross entropy at its best scale, or R2 twice."""
         score = self.fault_free.score(outputs)
         if self.fault_free.task == "regression":
-            return score, -float(((outputs.numpy() - self.validation.y) ** 2).mean())
+            return score, score
         return score, -calibrate(outputs, self.validation.y)[1]
 
     def left(self) -> float:
@@ -196,7 +199,7 @@ class Run:
         return Adaptation(
             self.reduced.eval(),
             self.fault_set,
-            tuple(self.stages),
+            tuple(replace(stage, measure=self.fault_free.measure) for stage in self.stages),
             task=self.fault_free.task,
             _validation=self.fault_free.validation,
             _held_out=self.logits,
@@ -228,8 +231,8 @@ class Run:
         """Return whether the gain of new validation outputs exceeds its standard error ``noise``
         times.
 
-        The gain is that of the logarithm of the probability of the true class, or of the negative
-        squared error. Its standard error is that of a mean of clusters, one for each recording.
+        The gain is that of the logarithm of the probability of the true class, or of R2. Its
+        standard error is that of a mean of clusters, one for each recording.
         """
         if not self.noise:
             return True
@@ -239,12 +242,11 @@ class Run:
         return bool(gain.mean() > self.noise * np.sqrt((deviation**2).sum()) / len(gain))
 
     def _merit(self, outputs: Tensor) -> NDArray[np.float64]:
-        """Return for each validation window the log probability of its class, or its negative
-        squared error."""
+        """Return for each validation window the log probability of its class, or its share of
+        R2."""
         if self.fault_free.task == "regression":
-            return np.asarray(
-                -((outputs.numpy() - self.validation.y) ** 2).mean(axis=1, dtype=np.float64)
-            )
+            shares: NDArray[np.float64] = explained(self.validation.y, outputs.numpy()).mean(axis=1)
+            return shares
         return log_likelihood(outputs, self.validation.y)
 
     def _head(self, reduced: ReducedModel) -> tuple[Head | None, Tensor] | None:
@@ -344,12 +346,25 @@ class Run:
         *,
         patience: int | None = None,
         reserve: float = 0.0,
+        fresh: bool = False,
     ) -> History:
-        """Train a reduced model; ``reserve`` seconds of the budget stay for a head."""
-        return train(
+        """Train a reduced model; ``reserve`` seconds of the budget stay for a head.
+
+        The values of a regression are standardised meanwhile, if the last layer of the network can
+        take up their units and no loss is given. A ``fresh`` network has not taken them up.
+        """
+        training, validation = self.training, self.validation
+        units = None
+        values = self.fault_free.task == "regression" and self.fault_free.loss is None
+        if values and foldable(reduced.network):
+            units = ValueUnits.of(training)
+            if not fresh:
+                units.unfold(reduced.network)
+            training, validation = units.standardised(training), units.standardised(validation)
+        history = train(
             reduced,
-            self.training,
-            self.validation,
+            training,
+            validation,
             epochs=epochs,
             patience=patience,
             budget=None if self.budget is None else max(0.0, self.left() - reserve),
@@ -357,3 +372,6 @@ class Run:
             loss=self.fault_free.loss,
             progress=self.progress,
         )
+        if units is not None:
+            units.fold(reduced.network)
+        return history

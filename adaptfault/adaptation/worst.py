@@ -50,6 +50,7 @@ class WorstFaults:
         layout: the array.
         fault_free: accuracy without faults.
         wires, pairs, pads: the faults of each kind; a pad is left out where it is the only one.
+        measure: what is expected, "accuracy" or "R2"; R2 then stands for the probability, too.
     """
 
     layout: SensorLayout
@@ -57,23 +58,21 @@ class WorstFaults:
     wires: tuple[Loss, ...]
     pairs: tuple[Loss, ...]
     pads: tuple[Loss, ...]
+    measure: str = "accuracy"
 
     def __str__(self) -> str:
         return self.text()
 
     def text(self, most: int = 5) -> str:
         """Return the list as text, at most so many faults of each kind."""
-        lines = [f"expected accuracy without faults: {self.fault_free}"]
+        ranked = "R2" if self.measure == "R2" else "mean probability of the true class; accuracy"
+        lines = [f"expected {self.measure} without faults: {self.fault_free}"]
         for name, losses in (("wire", self.wires), ("two wires", self.pairs), ("pad", self.pads)):
             if losses:
-                lines.append(
-                    f"worst {name} to lose, after repair: mean probability of the true class;"
-                    " accuracy"
-                )
-                lines += [
-                    f"  {loss.expected.likelihood:.3f}; {loss.expected}  {loss.what}"
-                    for loss in losses[:most]
-                ]
+                lines.append(f"worst {name} to lose, after repair: {ranked}")
+                for loss in losses[:most]:
+                    first = "" if self.measure == "R2" else f"{loss.expected.likelihood:.3f}; "
+                    lines.append(f"  {first}{loss.expected}  {loss.what}")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
@@ -115,7 +114,10 @@ class WorstFaults:
             )
             ax.set_title(f"pad {pad}", fontsize=9)
         figure.colorbar(
-            image, ax=axes[0].tolist(), label="P(true class) lost after repair, worse wire"
+            image,
+            ax=axes[0].tolist(),
+            label=f"{'R2' if self.measure == 'R2' else 'P(true class)'} lost after repair, worse"
+            " wire",
         )
         return figure
 
@@ -164,4 +166,4 @@ def worst_faults(
     say(f"forecasting {len(pairs)} pairs of wires and {len(pads)} pads")
     together = ranked((f"{a.what} and {b.what}", a.fault_set | b.fault_set) for a, b in pairs)
     fault_free = adapter.forecast(FaultSet((), layout.n_cells)).stages["fault-free"]
-    return WorstFaults(layout, fault_free, alone, together, ranked(pads.items()))
+    return WorstFaults(layout, fault_free, alone, together, ranked(pads.items()), adapter.measure)

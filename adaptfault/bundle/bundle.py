@@ -157,7 +157,7 @@ class Bundle:
             check: held-out fault-free labelled windows, as the test windows of ``split``, on which
                 new versions are compared with the running one. None takes half of the adapter's
                 validation windows.
-            class_names: one name a class, or none.
+            class_names: one name a class, or a value of a regression; or none.
             calibration: from raw counts to the layout's unit, if recordings are raw counts.
             head: of version 1. "auto": fitted in closed form where it improves validation, as for a
                 repair (:attr:`~adaptfault.adaptation.adapter.Adapter.healthy`). "linear": the
@@ -165,11 +165,16 @@ class Bundle:
 
         Raises:
             FileExistsError: ``path`` exists.
-            ValueError: the parts have different array shapes, the diagnoser is not fitted, or
-                ``head`` is unknown.
+            ValueError: the parts have different array shapes, ``check`` has targets of another
+                kind, the diagnoser is not fitted, or ``head`` is unknown.
         """
         path = Path(path)
         _check_parts(path, model, adapter, diagnoser, class_names, head)
+        if check is not None and check.y.shape[1:] != adapter.validation.y.shape[1:]:
+            raise ValueError(
+                f"check has targets [N{_more(check)}], the adapter [N{_more(adapter.validation)}]:"
+                " give windows with the same classes or values"
+            )
         make_folder(path.parent)
         new = path.with_name(f".{path.name}.unfinished")
         shutil.rmtree(new, ignore_errors=True)  # left by a crash
@@ -424,9 +429,14 @@ def _check_parts(
             f" {diagnoser.layout}"
         )
     if class_names and len(class_names) != model.n_classes:
+        kinds = ("values", "value") if adapter.task == "regression" else ("classes", "class")
         raise ValueError(
-            f"{model.n_classes} classes need as many class names, got {len(class_names)}"
+            f"{model.n_classes} {kinds[0]} need as many {kinds[1]} names, got {len(class_names)}"
         )
+
+
+def _more(windows: Windows) -> str:
+    return "".join(f", {size}" for size in windows.y.shape[1:])
 
 
 def _graph(adapter: Adapter) -> bytes | None:
@@ -439,7 +449,7 @@ def _graph(adapter: Adapter) -> bytes | None:
     if not adapter.has_features or adapter.layout.n_cells > LARGE:
         return None
     with suppress(ImportError, ExportError):  # logged with version 1
-        return graph_of(adapter.model)
+        return graph_of(adapter.model, values=adapter.task == "regression")
     return None
 
 

@@ -154,7 +154,7 @@ def _diagnoser(path: Path) -> SelfDiagnosis:
 
 def split_validation(adapter: Adapter) -> tuple[Adapter, Windows]:
     """Return an adapter with every second validation recording of each class, and the windows of
-    the others."""
+    the others; of a regression, with every second recording."""
     import numpy as np
 
     from adaptfault.adaptation.adapter import Adapter
@@ -166,6 +166,7 @@ def split_validation(adapter: Adapter) -> tuple[Adapter, Windows]:
             "one validation recording cannot be split into validation and check; give held-out"
             " windows as check="
         )
-    by_class = recordings[np.argsort(windows.y[first], kind="stable")]
-    given = np.isin(windows.recording, by_class[1::2])
+    if adapter.task == "classification":
+        recordings = recordings[np.argsort(windows.y[first], kind="stable")]
+    given = np.isin(windows.recording, recordings[1::2])
     return Adapter(adapter.model, adapter.train, windows.select(~given)), windows.select(given)

@@ -35,7 +35,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "model", metavar="MODEL", help="folder written by adaptfault train or --keep, or a bundle"
     )
-    add_recordings(parser, least=0)
+    add_recordings(parser, least=0, targets=True)
     parser.add_argument(
         "--faults", metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200"
     )
@@ -146,7 +146,7 @@ def _adapt(
         "stages": [vars(stage) for stage in adaptation.stages],
     }
     lines += [
-        f"validation, fault-free: accuracy {adapter.fault_free_accuracy:.3f}",
+        f"validation, fault-free: {adapter.measure} {adapter.fault_free_accuracy:.3f}",
         f"validation, {len(faults)} cells removed: {adaptation.scores}",
         *(f"  {stage}" for stage in adaptation.stages),
         f"adapted model: {args.out}",

@@ -4,6 +4,8 @@ faults."""
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.inject_option import INJECT_HELP, parse_faults
 from adaptfault.cli.options import (
@@ -17,6 +19,10 @@ from adaptfault.cli.options import (
     say,
 )
 
+if TYPE_CHECKING:
+    from adaptfault.adaptation.result import Adaptation
+    from adaptfault.data.windows import Windows
+
 _EXAMPLE = """  adaptfault evaluate model grasps/ --inject random:5=short
   adaptfault evaluate model grasps/ --inject row:0:3=open --adapted adapted"""
 
@@ -27,7 +33,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "model", metavar="MODEL", help="folder written by adaptfault train, or a bundle"
     )
-    add_recordings(parser)
+    add_recordings(parser, targets=True)
     parser.add_argument(
         "--adapted", metavar="FOLDER", help="score this adaptation of the model instead"
     )
@@ -58,7 +64,6 @@ def run(args: argparse.Namespace) -> int:
 
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.cli.trained_model import TrainedModel, say_short
-    from adaptfault.evaluation.scores import Scores, accuracy_interval, recording_scores
     from diagnostics import inject
 
     trained = TrainedModel.open(args, args.model)
@@ -90,25 +95,40 @@ def run(args: argparse.Namespace) -> int:
             inject(r, faults, recordings.layout, seed=args.seed + i) if i in which else r
             for i, r in enumerate(recordings.frames)
         ]
-        from adaptfault.data.windows import make_windows
-
-        every = make_windows(broken, recordings.labels, recordings.layout, length=model.length)
+        every = trained.windows(recordings, broken)
         windows = every.select(np.isin(every.recording, which))
+    if trained.is_regression:
+        result, first, *more = _of_values(classifier, windows, trained.class_names)
+    else:
+        result, first, *more = _of_classes(classifier, windows)
+    cells = {c for fault in faults for c in fault.cells}
+    first = f"{len(cells)} cells faulty: {first}" if cells else first
+    document = {
+        "schema": "adaptfault.evaluate/1",
+        **result,
+        "injected": [fault.to_dict() for fault in faults],
+    }
+    emit(args, document, "\n".join([first, *more]))
+    return 0
+
+
+def _of_classes(classifier: Adaptation, windows: Windows) -> tuple[Any, ...]:
+    """Return the scores of a classifier as JSON-safe values, and as lines."""
+    from adaptfault.evaluation.scores import Scores, accuracy_interval, recording_scores
+
     probabilities = classifier.predict_proba(windows.x)
     predicted = probabilities.argmax(axis=1)
-    scores = Scores.of(windows.y, predicted, n_classes=model.n_classes)
+    scores = Scores.of(windows.y, predicted, n_classes=probabilities.shape[1])
     whole_recordings = recording_scores(probabilities, windows)
     interval = accuracy_interval(predicted == windows.y, windows.recording)
-    cells = sorted({c for fault in faults for c in fault.cells})
     result = {
-        "schema": "adaptfault.evaluate/1",
         "scores": scores.to_dict(),
         "accuracy_interval": list(interval),
         "recordings": {"accuracy": whole_recordings.accuracy, "n": whole_recordings.n},
-        "injected": [fault.to_dict() for fault in faults],
     }
-    lines = (
-        f"{len(cells)} cells faulty: {scores}" if cells else str(scores),
+    return (
+        result,
+        str(scores),
         (
             f"95 % interval of the accuracy, clustered by recording: {interval[0]:.3f} to"
             f" {interval[1]:.3f}"
@@ -118,5 +138,21 @@ def run(args: argparse.Namespace) -> int:
             f" {whole_recordings.accuracy:.3f} on {whole_recordings.n} recordings"
         ),
     )
-    emit(args, result, "\n".join(lines))
-    return 0
+
+
+def _of_values(regression: Adaptation, windows: Windows, names: Sequence[str]) -> tuple[Any, ...]:
+    """Return the scores of a regression as JSON-safe values, and as lines."""
+    import numpy as np
+
+    from adaptfault.data.determination import explained
+    from adaptfault.evaluation.scores import ValueScores, mean_interval
+
+    predicted = regression.predict(windows.x)
+    scores = ValueScores.of(windows.y, predicted)
+    result: dict[str, Any] = {"scores": scores.to_dict(), "value_names": list(names)}
+    low, high = mean_interval(explained(windows.y, predicted).mean(axis=1), windows.recording)
+    if not np.isfinite(low):  # a single recording
+        return {**result, "r2_interval": None}, scores.named(names)
+    high = min(1.0, high)
+    line = f"95 % interval of R2, clustered by recording: {low:.3f} to {high:.3f}"
+    return {**result, "r2_interval": [low, high]}, scores.named(names), line

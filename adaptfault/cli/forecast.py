@@ -36,7 +36,7 @@ def add(commands: Commands) -> None:
         metavar="MODEL",
         help="folder written by adaptfault train or adapt --keep, or a bundle",
     )
-    add_recordings(parser, least=0)
+    add_recordings(parser, least=0, targets=True)
     parser.add_argument(
         "--faults", metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200"
     )

@@ -42,10 +42,15 @@ def command(commands: Commands, name: str, summary: str, example: str) -> argpar
 
 
 def add_recordings(
-    parser: argparse.ArgumentParser, *, option: bool = False, labels: bool = True, least: int = 1
+    parser: argparse.ArgumentParser,
+    *,
+    option: bool = False,
+    labels: bool = True,
+    least: int = 1,
+    targets: bool = False,
 ) -> None:
     """Add the paths of recordings, as ``least`` arguments or as an ``option``, and how they are
-    read."""
+    read; ``targets``: models of values, too, learn from them."""
     help_ = (
         "file or folder of recordings: CSV and other text, NPZ, NPY, ROS 2 bags, LeRobot, Zarr,"
         " HDF5, MAT, Parquet, JSON lines"
@@ -67,6 +72,15 @@ def add_recordings(
         help="arrays of a data set that hold the readings, one a pad, as tactile_left,tactile_right"
         " or 'observation.tactile.*'",
     )
+    if targets:
+        group.add_argument(
+            "--targets",
+            metavar="TABLE",
+            help=(
+                "for a regression: CSV table with the columns file and one for each value, or"
+                " file,frame and one for each value"
+            ),
+        )
     group.add_argument("--topic", metavar="NAME", help="topic of a bag that holds the readings")
     group.add_argument(
         "--field",
@@ -263,10 +277,11 @@ def load_recordings(
     """
     loaded = load_reported(args, paths, layout)
     report_inferred(args, loaded.inferred)
-    if labelled and loaded.recordings.labels is None:
+    recordings = loaded.recordings
+    if labelled and recordings.labels is None and recordings.targets is None:
         raise ValueError(
             f"{paths[0]}: the recordings have no labels; give --labels TABLE, one folder for each"
-            " class, or labels in the .npz"
+            " class, or labels in the .npz; --targets TABLE for a regression"
         )
     return loaded.recordings
 
@@ -277,8 +292,8 @@ def load_reported(
     """Read recordings as :func:`load_recordings`; only the problems are printed."""
     from adaptfault.data.recordings import load
 
-    labels = getattr(args, "labels", None)
-    loaded = load(paths, labels=labels, frames=args.frames, **_options_of(args, layout))
+    tables: dict[str, Any] = {name: getattr(args, name, None) for name in ("labels", "targets")}
+    loaded = load(paths, frames=args.frames, **tables, **_options_of(args, layout))
     _report(args, loaded.problems)
     if layout is not None:
         check_scale(paths[0], loaded.recordings, layout)
@@ -430,6 +445,7 @@ def refuse_missing(args: argparse.Namespace) -> None:
     ]
     names = (
         "labels",
+        "targets",
         "layout",
         "calibration",
         "adapted",

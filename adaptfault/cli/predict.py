@@ -1,8 +1,11 @@
-"""adaptfault predict: the class of each recording, by a model or the version that a bundle runs."""
+"""adaptfault predict: the class or the values of each recording, by a model or the version that a
+bundle runs."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.options import (
     Commands,
@@ -15,6 +18,11 @@ from adaptfault.cli.options import (
     load_recordings,
 )
 
+if TYPE_CHECKING:
+    from adaptfault.cli.trained_model import TrainedModel
+    from adaptfault.data.recordings import Recordings
+    from adaptfault.data.windows import Windows
+
 _EXAMPLE = """  adaptfault predict today/ --bundle robot.bundle
       the version that the robot runs: faulty cells are not used
   adaptfault predict today/ --model model --json"""
@@ -22,7 +30,9 @@ _EXAMPLE = """  adaptfault predict today/ --bundle robot.bundle
 
 def add(commands: Commands) -> None:
     """Add the command."""
-    parser = command(commands, "predict", "name the class of each recording", _EXAMPLE)
+    parser = command(
+        commands, "predict", "name the class or the values of each recording", _EXAMPLE
+    )
     add_recordings(parser)
     which = parser.add_mutually_exclusive_group(required=True)
     which.add_argument("--model", metavar="MODEL", help="folder written by adaptfault train")
@@ -33,7 +43,7 @@ def add(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Predict; the probabilities of a recording are the mean over its windows."""
+    """Predict; the probabilities or values of a recording are the mean over its windows."""
     import numpy as np
 
     from adaptfault.cli.trained_model import TrainedModel
@@ -49,6 +59,8 @@ def run(args: argparse.Namespace) -> int:
         recordings.frames, None, recordings.layout, length=trained.network.length
     )
     trained.adaptation.model.to(device(args))
+    if trained.is_regression:
+        return _values(args, trained, recordings, windows)
     probabilities = trained.adaptation.predict_proba(windows.x)
     names = trained.class_names or tuple(f"class {i}" for i in range(probabilities.shape[1]))
     results = []
@@ -80,6 +92,47 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _values(
+    args: argparse.Namespace, trained: TrainedModel, recordings: Recordings, windows: Windows
+) -> int:
+    """Print the values of each recording."""
+    predicted = trained.adaptation.predict(windows.x)
+    names = trained.class_names or tuple(f"value {i}" for i in range(predicted.shape[1]))
+    results: list[dict[str, Any]] = []
+    for i, name in enumerate(recordings.names):
+        own = predicted[windows.recording == i]
+        mean = own.mean(axis=0).tolist() if len(own) else None
+        results.append(
+            {"recording": name, "values": mean, "windows": len(own), "each": own.tolist()}
+        )
+    result = {
+        "schema": "adaptfault.predict/1",
+        "layout": recordings.layout.to_dict(),
+        "value_names": list(names),
+        "fault_set": list(trained.adaptation.fault_set),
+        "predictions": results,
+    }
+    rows = [("recording", *names, "windows")]
+    for one in results:
+        shown = (
+            ["shorter than a window"]
+            if one["values"] is None
+            else [*(f"{value:.4g}" for value in one["values"]), str(one["windows"])]
+        )
+        rows.append((one["recording"], *shown, *[""] * (len(names) + 1 - len(shown))))
+    emit(args, result, _aligned(rows))
+    return 0
+
+
+def _aligned(rows: Sequence[tuple[str, ...]]) -> str:
+    """Return rows of text in columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(text.ljust(n) for text, n in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    )
+
+
 def _table(results: list[dict[str, object]]) -> str:
     """Return one line a recording: name, class, probability, windows, and the label where there is
     one."""
@@ -94,11 +147,7 @@ def _table(results: list[dict[str, object]]) -> str:
             else ("shorter than a window", "", "")
         )
         rows.append((str(one["recording"]), *row, *([str(one["label"])] if labelled else [])))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [
-        "  ".join(text.ljust(n) for text, n in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+    lines = [_aligned(rows)]
     if labelled:
         right = sum(one["class"] == one["label"] for one in results)
         lines.append(f"{right} of {len(results)} recordings are predicted as labelled")

@@ -24,13 +24,16 @@ from adaptfault.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.data.recordings import Recordings
     from adaptfault.data.windows import Windows
-    from adaptfault.evaluation.scores import Scores
+    from adaptfault.evaluation.scores import Scores, ValueScores
     from adaptfault.models.any_model import AnyModel
     from adaptfault.models.history import History
     from adaptfault.models.network import TactileTransformer
+    from adaptfault.models.value_units import ValueUnits
     from diagnostics import SensorLayout
 
 _CHECKPOINT = "training.safetensors"
@@ -38,7 +41,9 @@ _CHECKPOINT = "training.safetensors"
 _EXAMPLE = """  adaptfault train grasps/ --out model --epochs 20
       grasps/<class>/<recording>.csv; after a crash the same command continues the training
   adaptfault train grasps/ --out robot.bundle
-      the folder that a robot carries: for adaptfault maintain and listen"""
+      the folder that a robot carries: for adaptfault maintain and listen
+  adaptfault train grasps/ --targets targets.csv --out model
+      a regression; targets.csv: file,force,row,column"""
 
 
 def add(commands: Commands) -> None:
@@ -46,7 +51,7 @@ def add(commands: Commands) -> None:
     parser = command(
         commands, "train", "train the paper's network on fault-free recordings", _EXAMPLE
     )
-    add_recordings(parser)
+    add_recordings(parser, targets=True)
     parser.add_argument(
         "--out", required=True, metavar="FOLDER", help="where the model goes; X.bundle: a bundle"
     )
@@ -109,42 +114,60 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.adaptation.adapter import Adapter
     from adaptfault.cli.trained_model import say_short
     from adaptfault.data.windows import make_windows, split
-    from adaptfault.evaluation.scores import Scores
+    from adaptfault.evaluation.scores import Scores, ValueScores
     from adaptfault.models.network import TactileTransformer
     from adaptfault.models.store import save_model
     from diagnostics import FaultSet
 
+    values = recordings.targets is not None
+    names = recordings.value_names if values else recordings.class_names
     windows = make_windows(
-        recordings.frames, recordings.labels, recordings.layout, length=args.length
+        recordings.frames,
+        recordings.targets if values else recordings.labels,
+        recordings.layout,
+        length=args.length,
     )
     parts = split(windows, seed=args.seed)
     say(args, f"{recordings.layout}; {windows}")
     say_short(args, recordings, args.length)
-    n_classes = len(recordings.class_names)
+    n_classes = len(names)
+    units = _units(args, names, parts[0]) if values else None
     model: TactileTransformer | AnyModel
     if args.builder:
-        model = _built(args.builder, windows, recordings.layout, n_classes)
+        model = _built(args.builder, windows, recordings.layout, n_classes, values)
     else:
         model = TactileTransformer(recordings.layout, n_classes, length=args.length, seed=args.seed)
     folder = out.with_name(f".{out.name}.training") if bundled else out
-    history = _trained(args, model.to(where), parts, folder)
+    history = _trained(args, model.to(where), parts, folder, units)
     adapter = Adapter(model.cpu(), parts[0], parts[1])
     healthy = (
         adapter.healthy
         if args.head == "auto"
         else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
     )
-    scores = Scores.of(parts[2].y, healthy.predict(parts[2].x), n_classes=n_classes)
+    predicted = healthy.predict(parts[2].x)
+    scores: Scores | ValueScores
+    if units is None:
+        scores = Scores.of(parts[2].y, predicted, n_classes=n_classes)
+    else:
+        scores = ValueScores.of(parts[2].y, predicted)
     extra = {"split_seed": args.seed, "test_scores": scores.to_dict(), "history": history.to_dict()}
+    if units is not None:
+        extra["units"] = units.to_dict(names)
     if bundled:
-        _bundle(args, out, recordings, adapter, parts)
+        _bundle(args, out, recordings, adapter, parts, names)
         shutil.rmtree(folder)
     else:
         save_model(
-            out, model, class_names=recordings.class_names, extra=extra, head=healthy.model.head
+            out,
+            model,
+            class_names=names,
+            extra=extra,
+            head=healthy.model.head,
+            task=adapter.task,
         )
         (folder / _CHECKPOINT).unlink()  # the run is complete: nothing is left to resume
-    problems = _told(args, out, bundled, scores, history, recordings.class_names, extra)
+    problems = _told(args, out, bundled, scores, history, names, extra, (parts[2].y, predicted))
     return int(args.strict and bool(problems))
 
 
@@ -165,18 +188,25 @@ def _trained(
     model: TactileTransformer | AnyModel,
     parts: tuple[Windows, Windows, Windows],
     folder: Path,
+    units: ValueUnits | None,
 ) -> History:
-    """Train in place; the checkpoint in the folder continues a training that was cut off."""
+    """Train in place; the checkpoint in the folder continues a training that was cut off.
+
+    A regression trains on values in ``units``, which its last layer then takes up.
+    """
     from adaptfault.models.training import train
 
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint = folder / _CHECKPOINT
     if checkpoint.exists():
         say(args, f"continuing from {checkpoint}")
-    return train(
+    training, validation = parts[:2]
+    if units is not None:
+        training, validation = units.standardised(training), units.standardised(validation)
+    history = train(
         model,
-        parts[0],
-        parts[1],
+        training,
+        validation,
         epochs=args.epochs,
         learning_rate=args.learning_rate,
         seed=args.seed,
@@ -184,24 +214,58 @@ def _trained(
         checkpoint=checkpoint,
         progress=progress(args),
     )
+    if units is not None:
+        units.fold(model)
+    return history
+
+
+def _units(args: argparse.Namespace, names: Sequence[str], training: Windows) -> ValueUnits:
+    """Return the units of the values.
+
+    Raises:
+        ValueError: a value is the same in all training windows.
+    """
+    from adaptfault.models.value_units import ValueUnits
+
+    for name, values in zip(names, training.y.T, strict=True):
+        if values.min() == values.max():
+            raise ValueError(
+                f"{args.targets}: {name} is {values[0]:g} in all training recordings, so nothing"
+                " can be learned of it: leave the column out, or add recordings with other values"
+            )
+    return ValueUnits.of(training)
 
 
 def _told(
     args: argparse.Namespace,
     out: Path,
     bundled: bool,
-    scores: Scores,
+    scores: Scores | ValueScores,
     history: History,
-    class_names: Sequence[str],
+    names: Sequence[str],
     extra: dict[str, Any],
+    values: tuple[NDArray[Any], NDArray[Any]],
 ) -> tuple[str, ...]:
     """Draw the training, print the result, and return the signs of a failed training."""
-    from adaptfault.evaluation.training_check import plot_training, training_problems
+    from adaptfault.evaluation.scores import ValueScores
+    from adaptfault.evaluation.training_check import (
+        plot_training,
+        plot_value_training,
+        training_problems,
+        value_training_problems,
+    )
 
     kind = "bundle" if bundled else "model"
     picture = out.with_name(f"{out.stem}.training.png") if bundled else out / "training.png"
-    plot_training(scores, history, class_names).savefig(picture, dpi=120)
-    problems = training_problems(scores, history, class_names)
+    if isinstance(scores, ValueScores):
+        figure = plot_value_training(*values, scores, history, names)
+        problems = value_training_problems(scores, history)
+        told, trained = scores.named(names), history.told("R2")
+    else:
+        figure = plot_training(scores, history, names)
+        problems = training_problems(scores, history, names)
+        told, trained = str(scores), str(history)
+    figure.savefig(picture, dpi=120)
     for problem in problems:
         print(f"warning: {problem}", file=sys.stderr)
     emit(
@@ -213,18 +277,19 @@ def _told(
             "picture": str(picture),
             "problems": list(problems),
         },
-        f"test: {scores}\ntraining: {history}\n{kind}: {out}\npicture: {picture}",
+        f"test: {told}\ntraining: {trained}\n{kind}: {out}\npicture: {picture}",
     )
     return problems
 
 
 def _built(
-    builder: str, windows: Windows, layout: SensorLayout, n_classes: int
+    builder: str, windows: Windows, layout: SensorLayout, n_classes: int, values: bool
 ) -> TactileTransformer | AnyModel:
     """Build the user's model; naming the builder on the command line allows it."""
     from adaptfault.models.any_model import AnyModel
     from adaptfault.models.builders import allow_model, build_model
     from adaptfault.models.network import as_tensor
+    from adaptfault.models.value_units import foldable
 
     allow_model(builder)
     model = build_model(builder, layout, n_classes, length=windows.x.shape[1])
@@ -232,7 +297,12 @@ def _built(
     if wrapped.n_classes != n_classes:
         raise ValueError(
             f"--model {builder} has {wrapped.n_classes} outputs, the recordings have {n_classes}"
-            " classes"
+            f" {'values' if values else 'classes'}"
+        )
+    if values and not foldable(wrapped):
+        raise ValueError(
+            f"--model {builder} does not end with a nn.Linear with a bias, which takes up the units"
+            " of the values: end the module with one"
         )
     return wrapped
 
@@ -243,6 +313,7 @@ def _bundle(
     recordings: Recordings,
     adapter: Adapter,
     parts: tuple[Windows, Windows, Windows],
+    names: Sequence[str],
 ) -> None:
     """Make the bundle; new versions are tested on the windows of the test recordings."""
     import numpy as np
@@ -258,7 +329,7 @@ def _bundle(
         adapter,
         fit_diagnoser(args, recordings.select(np.unique(training.recording))),
         check=test,
-        class_names=recordings.class_names,
+        class_names=names,
         calibration=Calibration.read(args.calibration) if args.calibration else None,
         head=args.head,
     )

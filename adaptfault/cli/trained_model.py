@@ -7,9 +7,10 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptfault.adaptation.fault_free import Network
 from adaptfault.adaptation.result import Adaptation, load_healthy
@@ -29,7 +30,7 @@ class TrainedModel:
 
     Attributes:
         network: the fault-free model, with its layout and window length.
-        class_names: one name a class, or none.
+        class_names: one name a class, or a value of a regression; or none.
         split_seed: of the split into training, validation and test recordings; None where it is not
             stored.
         adaptation: the version that a bundle runs; of a model, its form for the healthy sensor,
@@ -73,16 +74,30 @@ class TrainedModel:
             version,
         )
 
+    @property
+    def is_regression(self) -> bool:
+        """Whether the model predicts values."""
+        return self.adaptation.task == "regression"
+
     def recordings(self, args: argparse.Namespace, paths: Sequence[str]) -> Recordings:
-        """Read labelled recordings in the layout of the model.
+        """Read labelled recordings in the layout of the model; of a regression, with targets.
 
         Raises:
-            ValueError: they contradict the layout or the classes of the model; both values are
+            ValueError: they contradict the layout, the classes or the values of the model; both are
                 named.
         """
+        if self.is_regression and args.targets is None:
+            names = ", ".join(self.class_names)
+            raise ValueError(f"the model is a regression of {names}: give --targets TABLE")
+        if args.targets is not None and not self.is_regression:
+            raise ValueError(
+                "--targets is for a regression, and this model names classes: give --labels TABLE"
+            )
         if args.calibration is None and self.calibration is not None:
             args.calibration = str(self.calibration)
         recordings = load_recordings(args, paths, labelled=True, layout=self.network.layout)
+        if self.is_regression:
+            return self._with_values(args.targets, recordings)
         if self.class_names and recordings.class_names != self.class_names:
             recordings = self._in_order(recordings)
         return recordings
@@ -114,10 +129,29 @@ class TrainedModel:
             recordings.frames, recordings.layout, labels, self.class_names, recordings.names
         )
 
-    def windows(self, recordings: Recordings) -> Windows:
-        """Cut recordings into the windows that the model takes."""
+    def _with_values(self, table: str, recordings: Recordings) -> Recordings:
+        """Return the recordings with the values of the model, in the order of the model."""
+        names = recordings.value_names
+        lacking = [name for name in self.class_names if name not in names]
+        if lacking:
+            raise ValueError(
+                f"{table}: the columns are {', '.join(names)}, the model has"
+                f" {', '.join(self.class_names)}; add {lacking[0]}"
+            )
+        assert recordings.targets is not None
+        index = [names.index(name) for name in self.class_names]
+        targets = tuple(of[..., index] for of in recordings.targets)
+        return replace(recordings, targets=targets, value_names=self.class_names)
+
+    def windows(
+        self, recordings: Recordings, frames: Sequence[NDArray[Any]] | None = None
+    ) -> Windows:
+        """Cut recordings, or other ``frames`` of them, into the windows that the model takes."""
         return make_windows(
-            recordings.frames, recordings.labels, recordings.layout, length=self.network.length
+            recordings.frames if frames is None else frames,
+            recordings.targets if self.is_regression else recordings.labels,
+            recordings.layout,
+            length=self.network.length,
         )
 
     def parts(self, recordings: Recordings) -> tuple[Windows, Windows, Windows]:

@@ -1,20 +1,29 @@
-"""The coefficient of determination of predicted values."""
+"""The coefficient of determination of predicted values, and the share of each window in it."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 
 def r2(true: ArrayLike, predicted: ArrayLike) -> float:
     """Return the coefficient of determination of values ``[N, k]``, mean over those that vary; 0 if
     none varies."""
+    return float(explained(true, predicted).mean())
+
+
+def explained(true: ArrayLike, predicted: ArrayLike) -> NDArray[np.float64]:
+    """Return 1 - squared error / variance of each window and each value that varies, ``[N, v]``.
+
+    One column of 0 if none varies. The mean over the windows is the coefficient of determination
+    of a value.
+    """
     t = np.asarray(true, dtype=np.float64)
     p = np.asarray(predicted, dtype=np.float64)
-    total = ((t - t.mean(axis=0)) ** 2).sum(axis=0)
-    varies = total > 0
-    return (
-        float((1 - ((t - p) ** 2).sum(axis=0)[varies] / total[varies]).mean())
-        if varies.any()
-        else 0.0
-    )
+    variance = ((t - t.mean(axis=0)) ** 2).mean(axis=0)
+    # a constant has the variance of rounding
+    varies = t.min(axis=0) < t.max(axis=0)
+    if not varies.any():
+        return np.zeros((len(t), 1))
+    shares: NDArray[np.float64] = 1 - (t - p)[:, varies] ** 2 / variance[varies]
+    return shares

@@ -160,7 +160,14 @@ class ValueScores:
         return cls(r2(t, p), tuple(np.abs(t - p).mean(axis=0).tolist()), len(t))
 
     def __str__(self) -> str:
-        errors = ", ".join(f"{error:.4g}" for error in self.mae)
+        return self.named()
+
+    def named(self, names: Sequence[str] = ()) -> str:
+        """Return the scores as text, with the name of each value where there are names."""
+        labels = [f"{name} " for name in names] or [""] * len(self.mae)
+        errors = ", ".join(
+            f"{label}{error:.4g}" for label, error in zip(labels, self.mae, strict=True)
+        )
         return f"R2 {self.r2:.3f}, mean absolute error {errors} on {self.n} windows"
 
     def to_dict(self) -> dict[str, Any]:

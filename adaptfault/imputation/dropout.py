@@ -85,7 +85,7 @@ class RandomRepairs:
             repaired[group == i] = self._repair(torch.from_numpy(repaired[group == i]), rng).numpy()
         return Windows(
             np.concatenate([windows.x, repaired]),
-            np.tile(windows.y, 2),
+            np.concatenate([windows.y, windows.y]),
             np.tile(windows.recording, 2),
         )
 

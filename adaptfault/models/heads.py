@@ -120,11 +120,11 @@ class Head(nn.Module):
         )
 
     @classmethod
-    def blank(cls, known: Views, n: int) -> Head:
-        """Build a head for n classes that knows four views of some windows and has learnt nothing
-        from them."""
+    def blank(cls, known: Views, n: int, *, values: bool = False) -> Head:
+        """Build a head for n classes or values that knows four views of some windows and has learnt
+        nothing from them."""
         known = [*known, known[_MOMENTS]]
-        return cls.empty({"known": [list(view.shape) for view in known], "values": False}, n)
+        return cls.empty({"known": [list(view.shape) for view in known], "values": values}, n)
 
     @property
     def known(self) -> list[Tensor]:

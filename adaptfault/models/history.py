@@ -44,10 +44,14 @@ class History:
         return self.start[1] if self.start else math.nan
 
     def __str__(self) -> str:
+        return self.told()
+
+    def told(self, measure: str = "accuracy") -> str:
+        """Return the run as text; ``measure`` is what the validation accuracy is, as "R2"."""
         epochs = "1 epoch" if self.epochs == 1 else f"{self.epochs} epochs"
         return (
             f"{epochs} in {sum(self.seconds):.1f} s, stopped by {self.stopped}; "
-            f"best is epoch {self.best_epoch}, validation accuracy {self.best_accuracy:.3f}"
+            f"best is epoch {self.best_epoch}, validation {measure} {self.best_accuracy:.3f}"
         )
 
     def longer(self, train_loss: float, scores: tuple[float, float], seconds: float) -> History:

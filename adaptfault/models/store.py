@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -204,31 +204,39 @@ def save_model(
     class_names: Sequence[str] = (),
     extra: Mapping[str, Any] | None = None,
     head: Head | None = None,
+    task: Literal["classification", "regression"] = "classification",
 ) -> None:
     """Write a model into a folder; an earlier model there is replaced in one step.
 
     Args:
         folder: the folder to write.
         model: saved as weights and :attr:`~adaptfault.models.network.TactileTransformer.config`.
-        class_names: one name a class, or none.
+        class_names: one name a class, or a value of a regression; or none.
         extra: JSON-safe values to store beside the model.
         head: fitted in closed form to the healthy model, for :func:`~adaptfault.load_healthy`;
             None: the model has its own alone.
+        task: "classification" or "regression".
 
     Raises:
-        ValueError: another number of class names than classes, a module without builder, or
+        ValueError: another number of names than classes or values, a module without builder, or
             ``extra`` does not fit into JSON.
     """
     if class_names and len(class_names) != model.n_classes:
+        kinds = ("values", "value") if task == "regression" else ("classes", "class")
         raise ValueError(
-            f"{model.n_classes} classes need as many class names, got {len(class_names)}"
+            f"{model.n_classes} {kinds[0]} need as many {kinds[1]} names, got {len(class_names)}"
         )
     if "module" in model.config and model.config["builder"] is None:
         raise ValueError(
             f"{model.config['module']} cannot be rebuilt from a file: make it with"
             " build_model('package.module:function', layout, n_classes)"
         )
-    about = {"config": model.config, "class_names": list(class_names), "extra": dict(extra or {})}
+    about = {
+        "config": model.config,
+        "task": task,
+        "class_names": list(class_names),
+        "extra": dict(extra or {}),
+    }
     tensors = dict(model.state_dict())
     if head is not None:
         about["head"] = head.about

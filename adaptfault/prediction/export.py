@@ -30,7 +30,7 @@ from adaptfault.prediction.inference import ONNX_FILE, open_session, run_session
 from adaptfault.prediction.whole_windows import Masked, Selected
 from diagnostics import FaultSet
 
-TOLERANCE = 1e-5  # of a probability
+TOLERANCE = 1e-5  # of a probability; of a value, in units of the largest one
 
 _EXAMPLE = 2  # windows in the batch of the export
 _LOGS = ("torch.onnx._internal.exporter._registration", "torch.fx.experimental.symbolic_shapes")
@@ -62,14 +62,20 @@ def add_onnx(folder: str | Path, graph: bytes | None = None) -> Path:
         FileNotFoundError, ValueError: there is no whole adaptation in the folder.
     """
     adaptation = Adaptation.load(folder)
-    return attach(folder, "onnx", ONNX_FILE, to_onnx(adaptation.model, graph))
+    return attach(
+        folder,
+        "onnx",
+        ONNX_FILE,
+        to_onnx(adaptation.model, graph, values=adaptation.task == "regression"),
+    )
 
 
-def to_onnx(model: ReducedModel, graph: bytes | None = None) -> bytes:
+def to_onnx(model: ReducedModel, graph: bytes | None = None, *, values: bool = False) -> bytes:
     """Return a model as the content of an ONNX file.
 
     The input ``x`` is a batch of whole windows, float32 ``[N, T, D]`` on the 0..1 scale, any N. The
-    output ``probabilities`` is float32 ``[N, n_classes]``. The paper's network is stored in its
+    output ``probabilities`` is float32 ``[N, n_classes]``; of a regression it is ``values``
+    ``[N, k]``. The paper's network is stored in its
     low-rank form (:mod:`adaptfault.models.compact`). The file is run on batches of 1 and 7 windows;
     its outputs agree with the model within 1e-5.
 
@@ -77,26 +83,27 @@ def to_onnx(model: ReducedModel, graph: bytes | None = None) -> bytes:
         model: adapted to any F.
         graph: of :func:`graph_of`, for the same network: a new file takes a second with it. One
             that does not fit the model has no effect.
+        values: the model is a regression.
 
     Raises:
         ExportError: the export failed, or the outputs differ.
         ImportError: the packages for it are not installed.
     """
     model = copy.deepcopy(model).cpu().eval()
-    whole = _whole(model)
+    whole = _whole(model, values)
     if graph is not None:
         with suppress(ExportError):
             data = _with_state(graph, whole)
-            _verify(data, model)
+            _verify(data, model, values)
             return data
-    data = _translate(whole, torch.from_numpy(_probes(model, _EXAMPLE)))
-    _verify(data, model)
+    data = _translate(whole, torch.from_numpy(_probes(model, _EXAMPLE)), values)
+    _verify(data, model, values)
     return data
 
 
-def graph_of(network: TactileTransformer | AnyModel) -> bytes:
+def graph_of(network: TactileTransformer | AnyModel, *, values: bool = False) -> bytes:
     """Return the ONNX graph of a network with a head in closed form, without the state, for
-    :func:`to_onnx`.
+    :func:`to_onnx`; ``values`` as there.
 
     Raises the errors of :func:`to_onnx`.
     """
@@ -104,14 +111,15 @@ def graph_of(network: TactileTransformer | AnyModel) -> bytes:
     model = ReducedModel(copy.deepcopy(network).cpu(), none, None).eval()
     with torch.no_grad():
         views = model.views(torch.from_numpy(_probes(model, _EXAMPLE)))
-    model.head = Head.blank(views, network.n_classes)
-    whole = _whole(model)
-    return _stripped(_translate(whole, torch.from_numpy(_probes(model, _EXAMPLE))), whole)
+    model.head = Head.blank(views, network.n_classes, values=values)
+    whole = _whole(model, values)
+    return _stripped(_translate(whole, torch.from_numpy(_probes(model, _EXAMPLE)), values), whole)
 
 
-def _whole(model: ReducedModel) -> nn.Module:
+def _whole(model: ReducedModel, values: bool = False) -> nn.Module:
     compact = _compacted(model)
-    return (Masked(compact) if Masked.suits(compact) else Selected(compact)).eval()
+    kind = Masked if Masked.suits(compact) else Selected
+    return kind(compact, values=values).eval()
 
 
 def _compacted(model: ReducedModel) -> ReducedModel:
@@ -123,7 +131,7 @@ def _compacted(model: ReducedModel) -> ReducedModel:
     return compact
 
 
-def _translate(whole: nn.Module, example: Tensor) -> bytes:
+def _translate(whole: nn.Module, example: Tensor, values: bool) -> bytes:
     """Return the ONNX file of a module, its parameters and buffers under their own names."""
     _require("onnxscript")  # torch's exporter needs it
     with _quiet():
@@ -134,7 +142,7 @@ def _translate(whole: nn.Module, example: Tensor) -> bytes:
                 dynamo=True,
                 dynamic_shapes=({0: torch.export.Dim.DYNAMIC},),
                 input_names=["x"],
-                output_names=["probabilities"],
+                output_names=["values" if values else "probabilities"],
                 verbose=False,
                 # it folds parameters into new constants; ONNX Runtime optimises what it opens
                 optimize=False,
@@ -190,25 +198,28 @@ def _with_state(data: bytes, whole: nn.Module) -> bytes:
     return whole_file
 
 
-def _verify(data: bytes, model: ReducedModel) -> None:
+def _verify(data: bytes, model: ReducedModel, values: bool) -> None:
     """Run the file on batch sizes other than that of the export, and compare its outputs with the
     model."""
-    whole = Selected(model).eval()
+    whole = Selected(model, values=values).eval()
     try:
         session = open_session(data)
     except ValueError as error:
         raise ExportError(str(error)) from None
-    for n in _BATCHES:
-        x = _probes(model, n)
-        with torch.no_grad():
-            expected = whole(torch.from_numpy(x)).numpy()
+    probes = [_probes(model, n) for n in _BATCHES]
+    with torch.no_grad():
+        outputs = [whole(torch.from_numpy(x)).numpy() for x in probes]
+    largest = np.abs(np.concatenate(outputs)).max(axis=0) if values else np.float32(1.0)
+    for x, expected in zip(probes, outputs, strict=True):
+        n = len(x)
         try:
             given = run_session(session, x)
         except Exception as error:  # ONNX Runtime has its own kinds, all straight from Exception
             raise ExportError(
                 f"the exported file does not run on {n} windows: {str(error).splitlines()[0]}"
             ) from None
-        if given.shape != expected.shape or not np.abs(given - expected).max() <= TOLERANCE:
+        same = given.shape == expected.shape
+        if not same or not (np.abs(given - expected) <= TOLERANCE * largest).all():
             raise ExportError(
                 f"the outputs of the exported file differ from the model on {n} windows: the file"
                 " is not used"

@@ -26,12 +26,13 @@ _BATCH = 16
 
 
 class Inference:
-    """A classifier of whole windows, adapted to F.
+    """A classifier, or a regression, of whole windows, adapted to F.
 
     Attributes:
         layout: the array whose windows it takes.
         length: T, frames in a window.
-        n_classes: number of classes.
+        n_classes: number of classes, or of values.
+        task: "classification" or "regression".
         fault_set: F; the readings of its cells cannot reach the output, not even NaN or infinity.
         runtime: "onnx" or "torch".
         contact: for decisions about whole contacts.
@@ -46,6 +47,7 @@ class Inference:
         length: int,
         n_classes: int,
         contact: ContactStatistics | None = None,
+        task: Literal["classification", "regression"] = "classification",
     ) -> None:
         self.contact = ContactStatistics.unknown(layout.n_cells) if contact is None else contact
         self._run = run
@@ -54,6 +56,7 @@ class Inference:
         self.fault_set = fault_set
         self.length = length
         self.n_classes = n_classes
+        self.task = task
 
     @classmethod
     def load(cls, folder: str | Path, *, runtime: Runtime | None = None) -> Inference:
@@ -84,6 +87,9 @@ class Inference:
             n_classes = int(network["n_classes"])
             stored = manifest.get("contact")
             contact = None if stored is None else ContactStatistics.from_dict(stored)
+            task = manifest.get("task", "classification")
+            if task not in ("classification", "regression"):
+                raise ValueError(f"unknown task {task!r}")
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueError(f"the adaptation in {folder} is damaged: {error}") from None
         exported = "onnx" in manifest
@@ -94,15 +100,20 @@ class Inference:
                 f"{folder} has no ONNX file: add one with add_onnx, or run it on torch"
             )
         run = _on_onnx(folder, manifest) if runtime == "onnx" else _on_torch(folder)
-        return cls(run, runtime, layout, fault_set, length, n_classes, contact)
+        return cls(run, runtime, layout, fault_set, length, n_classes, contact, task)
 
     def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
         """Return the probability of each class for windows ``[N, T, D]`` on the 0..1 scale,
         ``[N, n_classes]``.
 
         Raises:
-            ValueError: windows of another shape.
+            ValueError: windows of another shape; the model is a regression.
         """
+        if self.task == "regression":
+            raise ValueError("a regression has no class probabilities: use predict")
+        return self._outputs(x)
+
+    def _outputs(self, x: NDArray[Any]) -> NDArray[np.float32]:
         x = np.asarray(x, dtype=np.float32)
         if x.ndim != 3 or x.shape[1:] != (self.length, self.layout.n_cells):
             raise ValueError(
@@ -111,14 +122,20 @@ class Inference:
         batches = [self._run(x[i : i + _BATCH]) for i in range(0, len(x), _BATCH)]
         return np.concatenate(batches) if batches else np.zeros((0, self.n_classes), np.float32)
 
-    def predict(self, x: NDArray[Any]) -> NDArray[np.int64]:
-        """Return the class of each window ``[N, T, D]``, int64 ``[N]``."""
-        classes: NDArray[np.int64] = self.predict_proba(x).argmax(axis=1).astype(np.int64)
-        return classes
+    def predict(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Return the class of each window ``[N, T, D]``, int64 ``[N]``, or its values, float32
+        ``[N, k]``.
+
+        Raises:
+            ValueError: windows of another shape.
+        """
+        outputs = self._outputs(x)
+        return outputs if self.task == "regression" else outputs.argmax(axis=1).astype(np.int64)
 
     def __str__(self) -> str:
         runtime = "ONNX Runtime" if self.runtime == "onnx" else "torch"
-        what = f"{self.n_classes} classes from {self.length} frames of {self.layout}"
+        kind = "values" if self.task == "regression" else "classes"
+        what = f"{self.n_classes} {kind} from {self.length} frames of {self.layout}"
         return f"{what}, {len(self.fault_set)} cells dropped, on {runtime}"
 
 
@@ -146,9 +163,9 @@ def open_session(data: bytes) -> InferenceSession:
 
 
 def run_session(session: InferenceSession, x: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the outputs ``[N, n_classes]`` of a session for windows ``[N, T, D]``."""
-    probabilities: NDArray[np.float32] = session.run(None, {"x": np.ascontiguousarray(x)})[0]
-    return probabilities
+    """Return the outputs ``[N, n]`` of a session for windows ``[N, T, D]``."""
+    outputs: NDArray[np.float32] = session.run(None, {"x": np.ascontiguousarray(x)})[0]
+    return outputs
 
 
 def _on_onnx(
@@ -161,4 +178,5 @@ def _on_onnx(
 def _on_torch(folder: str | Path) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
     from adaptfault.adaptation.result import Adaptation
 
-    return Adaptation.load(folder).predict_proba
+    adaptation = Adaptation.load(folder)
+    return adaptation.predict if adaptation.task == "regression" else adaptation.predict_proba

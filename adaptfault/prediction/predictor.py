@@ -40,15 +40,18 @@ class Reading:
     """Result of one frame.
 
     Attributes:
-        label: the class of the window that ends with this frame; None until a window is full.
-        probabilities: float32 ``[n_classes]``; None until a window is full.
+        label: the class of the window that ends with this frame; None until a window is full, and
+            of a regression.
+        probabilities: float32 ``[n_classes]``; None where there is no label.
         fault_set: F, the cells that were not used.
         events: faults that are new, changed, or gone (probability 0).
-        version: number of the version that computed the label.
+        version: number of the version that computed the label, or the values.
         contact: float32 ``[n_classes]``, probabilities accumulated over the windows of the present
             contact; None without contact, or where the predictor does not accumulate.
         name: name of the class; None where there is no label, or classes have no names.
         faults: all faults that the monitor knows now, as :attr:`diagnostics.Monitor.faults`.
+        values: float32 ``[k]``, those of a regression for the window that ends with this frame;
+            None until a window is full, and of a classifier.
     """
 
     label: int | None
@@ -59,11 +62,14 @@ class Reading:
     contact: NDArray[np.float32] | None = None
     name: str | None = None
     faults: tuple[Fault, ...] = ()
+    values: NDArray[np.float32] | None = None
 
     def __str__(self) -> str:
         confidence = "" if self.probabilities is None else f" ({self.probabilities.max():.2f})"
         named = self.name or f"class {self.label}"
         result = "window not full yet" if self.label is None else f"{named}{confidence}"
+        if self.values is not None:
+            result = f"values {', '.join(f'{value:.4g}' for value in self.values)}"
         news = "".join(f"; {event.reason}" for event in self.events)
         return f"{result}, {len(self.fault_set)} cells dropped, version {self.version}{news}"
 
@@ -92,7 +98,8 @@ class Predictor:
             (:mod:`adaptfault.models.accumulation`).
 
     Raises:
-        FileNotFoundError, ValueError: no version of the bundle can be loaded.
+        FileNotFoundError, ValueError: no version of the bundle can be loaded; ``accumulate`` with a
+            regression.
     """
 
     def __init__(self, open_bundle: Callable[[], Bundle], *, accumulate: bool = False) -> None:
@@ -113,6 +120,10 @@ class Predictor:
         self.outside = 0  # readings outside the range so far
         self._last: NDArray[np.float32]  # last reading of each cell that is not missing
         self._frames: NDArray[np.float32]  # last frames, scaled
+        if accumulate and self.task == "regression":
+            raise ValueError(
+                "a regression has no class probabilities to accumulate: leave accumulate out"
+            )
         self._decision = self._new_decision()
         self.reset()
 
@@ -158,23 +169,33 @@ class Predictor:
         return self._running.version.number
 
     @property
+    def task(self) -> str:
+        """ "classification" or "regression"."""
+        return self._running.model.task
+
+    @property
     def runtime(self) -> str:
         """The runtime, "onnx" or "torch"."""
         return self._running.model.runtime
 
-    def predict(self, x: NDArray[Any]) -> NDArray[np.int64]:
-        """Return the class of each window ``[N, T, D]`` on the 0..1 scale, int64 ``[N]``."""
+    def predict(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Return the class of each window ``[N, T, D]`` on the 0..1 scale, int64 ``[N]``, or its
+        values, float32 ``[N, k]``."""
         self._keep_up()
         return self._running.model.predict(self._rewired(_finite(x)))
 
     def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
         """Return class probabilities ``[N, n_classes]`` of windows ``[N, T, D]``; F's cells may
-        hold anything."""
+        hold anything.
+
+        Raises:
+            ValueError: the model is a regression.
+        """
         self._keep_up()
         return self._running.model.predict_proba(self._rewired(_finite(x)))
 
     def stream(self, frame: ArrayLike, time: float | None = None) -> Reading:
-        """Process one frame and classify the window that ends with it.
+        """Process one frame and predict from the window that ends with it.
 
         A missing reading (NaN, infinite, or more than one full scale outside the range) is replaced
         by the last reading of its cell, 0 before the first, as in ``make_windows``.
@@ -204,8 +225,11 @@ class Predictor:
         self._last = np.where(np.isnan(scaled), self._last, scaled)
         # All cells are kept, the dropped ones too: the next version may use them.
         self._frames = np.concatenate([self._frames, self._last[None]])[-model.length :]
-        label = probabilities = name = None
-        if len(self._frames) == model.length:
+        label = probabilities = name = values = None
+        full = len(self._frames) == model.length
+        if full and model.task == "regression":
+            values = model.predict(self._frames[None])[0]
+        elif full:
             probabilities = model.predict_proba(self._frames[None])[0]
             label = int(probabilities.argmax())
             name = self.class_names[label] if self.class_names else None
@@ -221,6 +245,7 @@ class Predictor:
             contact,
             name,
             self._monitor.faults,
+            values,
         )
 
     def _new_decision(self) -> ContactDecision | None:
@@ -340,7 +365,7 @@ def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
         model = Inference.load(version.folder)
     if model.layout != layout:
         raise ValueError(f"the version is for {model.layout}, the bundle for {layout}")
-    model.predict_proba(np.zeros((1, model.length, layout.n_cells), np.float32))
+    model.predict(np.zeros((1, model.length, layout.n_cells), np.float32))
     _ = version.readings  # raises Damaged
     return _Running(version, model, bundle)
 

@@ -16,18 +16,25 @@ from diagnostics import FaultSet
 
 
 class Selected(nn.Module):
-    """Selects the healthy cells first; the shapes of its tensors depend on F."""
+    """Selects the healthy cells first; the shapes of its tensors depend on F.
+
+    Args:
+        model: adapted to F.
+        values: its outputs are values, not logits.
+    """
 
     healthy: Tensor
 
-    def __init__(self, model: ReducedModel) -> None:
+    def __init__(self, model: ReducedModel, *, values: bool = False) -> None:
         super().__init__()
         self.model = model
+        self.values = values
         self.register_buffer("healthy", torch.from_numpy(model.fault_set.healthy.copy()))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map windows ``[N, T, D]`` to probabilities ``[N, n_classes]``."""
-        return torch.softmax(self.model(x[..., self.healthy]), dim=1)
+        """Map windows ``[N, T, D]`` to probabilities ``[N, n_classes]`` or values ``[N, k]``."""
+        outputs: Tensor = self.model(x[..., self.healthy])
+        return outputs if self.values else torch.softmax(outputs, dim=1)
 
 
 class Masked(nn.Module):
@@ -40,14 +47,16 @@ class Masked(nn.Module):
     Args:
         model: with a linear front end or none, and a :class:`~adaptfault.models.heads.Head`;
             see :meth:`suits`.
+        values: its outputs are values, not logits.
     """
 
     used: Tensor
     weight: Tensor
     bias: Tensor
 
-    def __init__(self, model: ReducedModel) -> None:
+    def __init__(self, model: ReducedModel, *, values: bool = False) -> None:
         super().__init__()
+        self.values = values
         layout = model.network.layout
         faults = model.fault_set
         d = layout.n_cells
@@ -80,9 +89,10 @@ class Masked(nn.Module):
         return small and isinstance(model.head, Head) and isinstance(model.front, AffineFill | None)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map windows ``[N, T, D]`` to probabilities ``[N, n_classes]``."""
+        """Map windows ``[N, T, D]`` to probabilities ``[N, n_classes]`` or values ``[N, k]``."""
         known = torch.where(self.used, x, 0.0)
         filled = nn.functional.linear(known, self.weight, self.bias).clamp(0.0, 1.0)
         whole = torch.where(self.used, x, filled)
         views = (self.network.features(whole), *self.summary(known), self.moments(whole))
-        return torch.softmax(self.head(views), dim=1)
+        outputs: Tensor = self.head(views)
+        return outputs if self.values else torch.softmax(outputs, dim=1)

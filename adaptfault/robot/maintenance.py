@@ -30,7 +30,7 @@ from adaptfault.inspection.severity import (
 from adaptfault.prognosis.cell_condition import encode
 from adaptfault.robot.maintenance_report import Decision, MaintenanceReport
 from adaptfault.robot.maintenance_run import MaintenanceRun, Robot
-from adaptfault.robot.model_comparison import Judgement, compare_candidate, with_faults
+from adaptfault.robot.model_comparison import Judgement, compare_candidate, score, with_faults
 from adaptfault.robot.repair import Candidate, repair
 from adaptfault.robot.sensor_state import judged_before, unhandled_cells
 from diagnostics import FaultSet
@@ -325,7 +325,7 @@ def _decide_candidate(
         )
     measured["accuracy"] = judgement.candidate
     severity = _measured_severity(run.robot, known, judgement.candidate)
-    accuracies = f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}"
+    accuracies = f"{judgement.measure} {judgement.running:.3f} -> {judgement.candidate:.3f}"
     text = f"{accuracies} under the faults known now ({free:.3f} without any)"
     if candidate.stored is not None:
         recovered = len(run.version.fault_set) - len(known.fault_set)
@@ -348,11 +348,12 @@ def _obstacle(run: MaintenanceRun, candidate: Candidate, judgement: Judgement) -
         recovered = len(run.version.fault_set) - len(candidate.stored.fault_set)
         return (
             f"{recovered} cells recovered, but version {candidate.stored.number}, which uses them,"
-            f" is worse: accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}"
+            f" is worse: {judgement.measure} {judgement.running:.3f} -> {judgement.candidate:.3f}"
         )
     if judgement.collapsed:
         names = ", ".join(run.robot.class_name(c) for c in judgement.collapsed)
-        return f"the adapted model loses more than half of the recall of {names}"
+        what = "R2" if judgement.measure == "R2" else "recall"
+        return f"the adapted model loses more than half of the {what} of {names}"
     if judgement.better:
         return None
     return (
@@ -369,7 +370,7 @@ def _deploy(
     if candidate.stored is not None:
         return candidate.stored.number
     about = {
-        "reason": f"accuracy {judgement.running:.3f} -> {judgement.candidate:.3f}",
+        "reason": f"{judgement.measure} {judgement.running:.3f} -> {judgement.candidate:.3f}",
         "knowledge": known.to_dict(),
         **run.version.readings,
         "accuracy": judgement.candidate,
@@ -421,6 +422,7 @@ def _report(
     robot = run.robot
     readings = outcome.readings
     number = run.version.number if outcome.deploys is None else outcome.deploys
+    judgement = outcome.measured.get("judgement")
     change = None
     reasons: list[Reason] = []
     if inspection is not None and readings is not None:
@@ -441,6 +443,7 @@ def _report(
         change=change,
         dry_run=run.dry_run,
         n_cells=len(robot.present),
+        measure="accuracy" if judgement is None else judgement.measure,
         **({} if outcome.told is None else outcome.told.told),
         left_out=run.left_out,
         warnings=run.warnings,
@@ -456,8 +459,10 @@ def _of_chance(robot: Robot, accuracy: float | None) -> list[Reason]:
     severity = of_accuracy(accuracy, None, limit)
     if severity == 0:
         return []
-    guessing = f"always naming the most frequent class gives {share:.3f}"
-    return [Reason(severity, f"the model is at chance: accuracy {accuracy:.3f}, where {guessing}")]
+    constant = "mean" if robot.measure == "R2" else "most frequent class"
+    guessing = f"always naming the {constant} gives {share:.3f}"
+    text = f"the model is at chance: {robot.measure} {accuracy:.3f}, where {guessing}"
+    return [Reason(severity, text)]
 
 
 def _of_findings(inspection: Inspection, untested_code: int) -> list[Reason]:
@@ -476,9 +481,9 @@ def _of_change(robot: Robot, change: SensorChange, known: KnownFaults, number: i
     layout = robot.layout
     windows = with_faults(robot.windows, known.faults, layout)
     model = robot.model(robot.bundle.versions[number])
-    before = float((model.predict(windows.x) == windows.y).mean())
-    after = float((model.predict(_changed(robot, change, windows.x)) == windows.y).mean())
-    effect = f"accuracy of version {number} {before:.3f} -> {after:.3f} with this change"
+    before = score(model.predict, windows)
+    after = score(model.predict, replace(windows, x=_changed(robot, change, windows.x)))
+    effect = f"{robot.measure} of version {number} {before:.3f} -> {after:.3f} with this change"
     return Reason(of_change(before, after), f"{change.reason}; {effect}")
 
 

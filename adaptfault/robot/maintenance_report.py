@@ -31,8 +31,8 @@ class MaintenanceReport:
         diagnosis: of the new recordings; None without new recordings.
         judgement: comparison of the last candidate with the running version; None without a
             candidate.
-        accuracy: of the version that runs now, under the known faults, on the held-out windows;
-            None if not measured.
+        accuracy: of the version that runs now, under the known faults, on the held-out windows (R2
+            of a regression); None if not measured.
         fault_free_accuracy: of version 1 on the same windows without faults; None if not measured.
         change: of a pad, or of the whole sensor, against the reference (gain, offset); None where
             none was found.
@@ -47,6 +47,7 @@ class MaintenanceReport:
         dry_run: nothing was changed.
         seconds: wall clock.
         n_cells: cells of the array, without masked positions; 0 where that is not known.
+        measure: what ``accuracy`` is, "accuracy" or "R2"; where none was measured, "accuracy".
     """
 
     decision: Decision
@@ -68,6 +69,7 @@ class MaintenanceReport:
     dry_run: bool = False
     seconds: float = 0.0
     n_cells: int = 0
+    measure: str = "accuracy"
 
     @property
     def exit_code(self) -> int:
@@ -85,7 +87,7 @@ class MaintenanceReport:
         faulty = len(self.fault_set)
         measured = [f"faulty={faulty};;;0;{n}"]
         if self.accuracy is not None:
-            measured.append(f"accuracy={self.accuracy:.4f};;;0;1")
+            measured.append(f"{self.measure}={self.accuracy:.4f};;;0;1")
         would = " (dry run: nothing was changed)" if self.dry_run else ""
         lines = [
             f"ADAPTFAULT {status} - {self.decision}: {self.reason}{would} | {' '.join(measured)}"
@@ -97,7 +99,7 @@ class MaintenanceReport:
         if weak_base(self.accuracy, self.fault_free_accuracy):
             both = f"{self.accuracy:.3f} repaired, {self.fault_free_accuracy:.3f} healthy"
             lines.append(
-                f"  weak base model: accuracy {both}; train it longer or on more recordings"
+                f"  weak base model: {self.measure} {both}; train it longer or on more recordings"
             )
         if self.diagnosis is not None:
             lines += [f"  {fault.reason}" for fault in self.diagnosis.faults]
@@ -128,6 +130,7 @@ class MaintenanceReport:
             "judgement": None if self.judgement is None else vars(self.judgement),
             "accuracy": self.accuracy,
             "fault_free_accuracy": self.fault_free_accuracy,
+            "measure": self.measure,
             "change": None if self.change is None else vars(self.change),
             "rewiring": list(self.rewiring),
             "replaced_pads": list(self.replaced_pads),

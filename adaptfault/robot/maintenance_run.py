@@ -17,6 +17,7 @@ from adaptfault.bundle.known_faults import KnownFaults
 from adaptfault.bundle.versions import Version
 from adaptfault.data.windows import recordings_of
 from adaptfault.evaluation.scores import chance
+from adaptfault.robot.model_comparison import measure_of, score
 from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
@@ -83,9 +84,14 @@ class Robot:
 
     @cached_property
     def chance(self) -> tuple[float, float]:
-        """Accuracy of always naming the most frequent class, and what guessing may reach by
-        chance."""
-        return chance(self.windows.y)
+        """Accuracy of always naming the most frequent class, and what guessing may reach by chance;
+        of values, R2 of always naming their mean."""
+        return (0.0, 0.0) if self.windows.y.ndim == 2 else chance(self.windows.y)
+
+    @property
+    def measure(self) -> str:
+        """What models are compared by: "accuracy" or "R2"."""
+        return measure_of(self.windows)
 
     @cached_property
     def present(self) -> FaultSet:
@@ -95,13 +101,16 @@ class Robot:
 
     @cached_property
     def fault_free_accuracy(self) -> float:
-        """Accuracy of version 1, the model of the healthy sensor, on the windows without faults."""
+        """Accuracy or R2 of version 1, the model of the healthy sensor, on the windows without
+        faults."""
         try:
             model = self.model(self.bundle.versions[1])
         except (Damaged, FileNotFoundError):
             model = None
-        predict = self.adapter.model.predict if model is None else model.predict
-        return float((predict(self.windows.x) == self.windows.y).mean())
+        if model is None:  # the fault-free model with its own head
+            none = FaultSet((), self.layout.n_cells)
+            model = self.adapter.adapt(none, method="fill")
+        return score(model.predict, self.windows)
 
     def model(self, version: Version) -> Adaptation:
         """Return the model of a version; raises Damaged."""
@@ -110,6 +119,7 @@ class Robot:
         return Adaptation.load(version.folder)
 
     def class_name(self, number: int) -> str:
-        """Return the name of a class, or its number."""
+        """Return the name of a class or a value, or its number."""
         names = self.bundle.class_names
-        return names[number] if names else f"class {number}"
+        kind = "value" if self.windows.y.ndim == 2 else "class"
+        return names[number] if names else f"{kind} {number}"

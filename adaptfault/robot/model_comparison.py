@@ -10,26 +10,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.determination import explained
 from adaptfault.data.windows import Windows
 from diagnostics import Fault, SensorLayout, inject
 
-Predict = Callable[[NDArray[np.float32]], NDArray[np.int64]]
+Predict = Callable[[NDArray[np.float32]], NDArray[Any]]
 
 _DRAWS = 2000
 _CONFIDENCE = 0.95  # share of the bootstrap draws that must agree
-_COLLAPSE = 0.5  # a class collapses when it keeps less than this share of its recall
+_COLLAPSE = 0.5  # a class or value collapses when it keeps less than this share of its score
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Accuracy of a candidate and of the running model under the same faults.
+    """Accuracy of a candidate and of the running model under the same faults; R2 of a regression.
 
     Attributes:
-        running, candidate: accuracies.
+        running, candidate: accuracies, or R2.
         gain: candidate - running.
         low, high: 5 % and 95 % quantiles of the gain, paired bootstrap over recordings.
         collapsed: classes of which the candidate keeps less than half of the running model's
-            recall.
+            recall; values of which it keeps less than half of the R2.
+        measure: "accuracy" or "R2".
     """
 
     running: float
@@ -38,6 +40,7 @@ class Judgement:
     low: float
     high: float
     collapsed: tuple[int, ...]
+    measure: str = "accuracy"
 
     @property
     def better(self) -> bool:
@@ -46,7 +49,7 @@ class Judgement:
 
     def __str__(self) -> str:
         return (
-            f"accuracy under these faults: running {self.running:.3f}, candidate"
+            f"{self.measure} under these faults: running {self.running:.3f}, candidate"
             f" {self.candidate:.3f} (gain {self.gain:+.3f}, 90 % interval {self.low:+.3f} to"
             f" {self.high:+.3f})"
         )
@@ -66,17 +69,34 @@ def with_faults(
     return Windows(x, windows.y, windows.recording)
 
 
+def measure_of(windows: Windows) -> str:
+    """Return what models are compared by on these windows: "accuracy", or "R2" of values."""
+    return "R2" if windows.y.ndim == 2 else "accuracy"
+
+
+def score(predict: Predict, windows: Windows) -> float:
+    """Return the accuracy of predictions for labelled windows, or R2 of values."""
+    return float(_of_windows(windows.y, predict(windows.x)).mean())
+
+
+def _of_windows(y: NDArray[Any], predicted: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the share of each window in the accuracy or R2, ``[N]``; the mean is the score."""
+    if y.ndim == 2:
+        shares: NDArray[np.float64] = explained(y, predicted).mean(axis=1)
+        return shares
+    return np.asarray(predicted == y, dtype=np.float64)
+
+
 def compare_candidate(
     running: Predict, candidate: Predict, windows: Windows, *, seed: int = 0
 ) -> Judgement:
-    """Compare two classifiers on labelled windows with injected faults.
+    """Compare two classifiers or regressions on labelled windows with injected faults.
 
     Paired bootstrap over recordings, because windows of one recording are dependent (Efron and
     Tibshirani 1993)."""
+    predicted = running(windows.x), candidate(windows.x)
     # [2, N]
-    right = np.stack([running(windows.x) == windows.y, candidate(windows.x) == windows.y]).astype(
-        float
-    )
+    right = np.stack([_of_windows(windows.y, given) for given in predicted])
     recordings, inverse = np.unique(windows.recording, return_inverse=True)
     size = np.bincount(inverse).astype(float)
     won = np.bincount(inverse, weights=right[1] - right[0])
@@ -90,23 +110,35 @@ def compare_candidate(
         gain=float(right[1].mean() - right[0].mean()),
         low=float(low),
         high=float(high),
-        collapsed=_collapsed(right, windows.y, inverse, drawn),
+        collapsed=_collapsed(predicted, windows.y, inverse, drawn),
+        measure=measure_of(windows),
     )
 
 
 def _collapsed(
-    right: NDArray[np.float64], y: NDArray[Any], inverse: NDArray[np.intp], drawn: NDArray[np.intp]
+    predicted: Sequence[NDArray[Any]],
+    y: NDArray[Any],
+    inverse: NDArray[np.intp],
+    drawn: NDArray[np.intp],
 ) -> tuple[int, ...]:
-    """Return the classes whose recall is more than halved in at least 95 % of the bootstrap
-    draws."""
+    """Return the classes whose recall, or the values whose R2, is more than halved in at least 95 %
+    of the bootstrap draws.
+
+    An R2 below 0 has not to be kept: there the candidate collapses if it is worse.
+    """
     collapsed = []
-    for label in np.unique(y):
-        of_it = y == label
-        kept = np.bincount(
-            inverse[of_it],
-            weights=right[1, of_it] - _COLLAPSE * right[0, of_it],
-            minlength=drawn.shape[1],
+    every = np.ones(len(y), dtype=bool)
+    for part in range(y.shape[1]) if y.ndim == 2 else np.unique(y):
+        of_it = every if y.ndim == 2 else y == part
+        column = [part] if y.ndim == 2 else slice(None)
+        before, after = (
+            np.bincount(
+                inverse[of_it],
+                weights=_of_windows(y[of_it][..., column], given[of_it][..., column]),
+                minlength=drawn.shape[1],
+            )[drawn].sum(axis=1)
+            for given in predicted
         )
-        if (kept[drawn].sum(axis=1) < 0).mean() >= _CONFIDENCE:
-            collapsed.append(int(label))
+        if (after < np.minimum(before, _COLLAPSE * before)).mean() >= _CONFIDENCE:
+            collapsed.append(int(part))
     return tuple(collapsed)

@@ -51,6 +51,7 @@ class SensorState:
         accuracy, fault_free_accuracy: of the running version, under the known faults and without;
         None if not measured.
         reason: of the last maintenance run, while the same version runs; otherwise empty.
+        measure: what the accuracies are, "accuracy" or "R2".
     """
 
     exit_code: int
@@ -60,6 +61,7 @@ class SensorState:
     accuracy: float | None = None
     fault_free_accuracy: float | None = None
     reason: str = ""
+    measure: str = "accuracy"
 
     @classmethod
     def of(cls, bundle: Bundle) -> SensorState:
@@ -77,7 +79,13 @@ class SensorState:
         if last is not None and last.get("version") == version.number and "exit_code" in last:
             code = max(code, last["exit_code"])
             reason = last["reason"]
-        return cls(code, known, version, unhandled, accuracy, free, reason)
+        measures = [run["measure"] for run in runs if "measure" in run]
+        measure = "R2" if "R2" in measures else "accuracy"
+        return cls(code, known, version, unhandled, accuracy, free, reason, measure)
+
+    def shown(self, accuracy: float) -> str:
+        """Return an accuracy in percent, or R2."""
+        return f"{accuracy:.3f}" if self.measure == "R2" else f"{100 * accuracy:.1f}%"
 
     @property
     def weak_base(self) -> bool:

@@ -113,6 +113,7 @@ def _state_after(run: MaintenanceReport, bundle: Bundle, state: SensorState) -> 
         accuracy=run.accuracy if measured else state.accuracy,
         fault_free_accuracy=run.fault_free_accuracy if measured else state.fault_free_accuracy,
         reason=run.reason,
+        measure=run.measure if measured else state.measure,
     )
 
 

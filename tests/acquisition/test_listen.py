@@ -114,6 +114,18 @@ def test_a_predictor_is_confirmed_once_after_it_has_worked_for_a_while():
     assert [kind for kind, _ in events].count("confirmed") == 1
 
 
+def test_a_regression_is_confirmed_as_a_classifier_is_and_tells_no_class():
+    predictor = Scripted()
+    values = types.SimpleNamespace(
+        label=None, probabilities=None, values=np.ones(2), fault_set=FaultSet((), 6), events=()
+    )
+    predictor.readings = [values] * CONFIRMED_AFTER
+    assert [kind for kind, _ in told(Session("a", predictor), frames(CONFIRMED_AFTER))] == [
+        "confirmed"
+    ]
+    assert predictor.confirmed == 1
+
+
 def test_a_version_that_cannot_be_confirmed_is_reported_once_and_tried_again():
     predictor = Scripted()
     answers = [OSError("no space left"), False, True]

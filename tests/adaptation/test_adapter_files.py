@@ -5,7 +5,13 @@ import pytest
 import torch
 
 from adaptfault.adaptation.adapter import Adapter
-from adaptfault.adaptation.adapter_files import LIMIT, load_adapter, save_adapter
+from adaptfault.adaptation.adapter_files import (
+    LIMIT,
+    load_adapter,
+    load_windows,
+    save_adapter,
+    save_windows,
+)
 from adaptfault.data.windows import Windows
 from adaptfault.models.network import TactileTransformer
 from diagnostics import FaultSet, SensorLayout
@@ -135,5 +141,57 @@ def test_a_damaged_adapter_is_refused_in_one_line(tmp_path):
             load_adapter(tmp_path)
         assert "\n" not in str(error.value)
     manifest.write_text(whole.replace("120,", "100000000,"))
+    with pytest.raises(ValueError, match="is damaged"):
+        load_adapter(tmp_path)
+
+
+def regression(scale: float = 4000.0) -> Adapter:
+    """Two values of each window, of very different size."""
+    units = np.array([scale, 0.001], np.float32)
+    parts = [counts(120, 0), counts(40, 1)]
+    for i, part in enumerate(parts):
+        y = np.stack([part.x.mean((1, 2)), part.x[:, -1].max(1)], axis=1) * units
+        parts[i] = Windows(part.x, y, part.recording)
+    return Adapter(TactileTransformer(LAYOUT, 2, seed=1).eval(), *parts)
+
+
+def test_the_adapter_of_a_regression_comes_back_with_its_task_and_its_values(tmp_path):
+    first = regression()
+    save_adapter(tmp_path, first)
+    again = load_adapter(tmp_path)
+    assert again.task == "regression"
+    for name in ("train", "validation"):
+        one, other = getattr(first, name), getattr(again, name)
+        assert other.y.dtype == np.float32
+        np.testing.assert_array_equal(one.y, other.y)
+    np.testing.assert_array_equal(first.targets, again.targets)
+    x = first.validation.x
+    one, other = (of.adapt(F, method="head").predict(x) for of in (first, again))
+    np.testing.assert_allclose(one / [4000, 0.001], other / [4000, 0.001], atol=1e-3)
+
+
+def test_the_windows_of_a_regression_come_back_without_loss(tmp_path):
+    windows = regression().train
+    save_windows(tmp_path, windows)
+    again = load_windows(tmp_path)
+    for key in ("x", "y", "recording"):
+        np.testing.assert_array_equal(getattr(again, key), getattr(windows, key))
+
+
+def test_weights_too_large_or_too_small_for_16_bits_stay_as_they_are(tmp_path):
+    first = regression()
+    with torch.no_grad():
+        first.model.head.bias.copy_(torch.tensor([2e6, 2e-7]))
+    weights = sum(p.numel() for p in first.model.parameters())
+    save_adapter(tmp_path, first, limit=2 * weights)
+    assert json.loads((tmp_path / "manifest.json").read_text())["weights_as"] == "int8"
+    bias = load_adapter(tmp_path).model.head.bias.detach().numpy()
+    np.testing.assert_allclose(bias, [2e6, 2e-7], rtol=1e-6)
+
+
+def test_an_adapter_whose_task_does_not_fit_its_targets_is_damaged(tmp_path):
+    save_adapter(tmp_path, regression())
+    manifest = tmp_path / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"regression"', '"classification"'))
     with pytest.raises(ValueError, match="is damaged"):
         load_adapter(tmp_path)

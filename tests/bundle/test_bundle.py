@@ -49,7 +49,7 @@ def test_all_versions_are_exported_from_one_graph_and_without_it_where_it_is_dam
     bundle, tmp_path, monkeypatch
 ):
     given = []
-    monkeypatch.setattr("adaptfault.prediction.export.graph_of", lambda network: b"graph")
+    monkeypatch.setattr("adaptfault.prediction.export.graph_of", lambda network, values: b"graph")
     monkeypatch.setattr(
         "adaptfault.prediction.export.add_onnx", lambda folder, graph: given.append(graph)
     )

@@ -135,7 +135,7 @@ def test_the_manifest_states_the_file_and_keeps_all_else(versions, tmp_path, mon
     adaptation = Adaptation.load(versions["whole"])
     adaptation.save(tmp_path)
     before = json.loads((tmp_path / "manifest.json").read_text())
-    monkeypatch.setattr(export, "to_onnx", lambda model, graph: b"a file")
+    monkeypatch.setattr(export, "to_onnx", lambda model, graph, values: b"a file")
     path = add_onnx(tmp_path)
     assert (path, path.read_bytes()) == (tmp_path / "model.onnx", b"a file")
     after = json.loads((tmp_path / "manifest.json").read_text())

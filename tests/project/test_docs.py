@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from _pytest.mark import ParameterSet
-from conftest import without_calibration, without_export, write_keys
+from conftest import without_calibration, without_export, write_forces, write_keys
 
 import adaptfault as af
 from adaptfault.bundle.bundle import Bundle
@@ -76,6 +76,8 @@ def prepared(made_bundle, small_grasps, later_grasps, broken_row, tmp_path_facto
         (home / name).mkdir()
         save_npz(home / name / f"{name}.npz", recordings)
     save_npz(home / "grasps.npz", small_grasps)
+    held = [f for f, label in zip(small_grasps.frames, small_grasps.labels, strict=True) if label]
+    write_forces(home / "force", held[::3])
     shutil.copytree(made_bundle, home / "robot.bundle")
     adapter = Bundle.open(home / "robot.bundle").parts.adapter()
     af.save_model(home / "model", adapter.model)

@@ -26,10 +26,13 @@ class Recordings:
         class_names: one name a class.
         names: where each recording came from ("normal/0001.csv"), for messages; what cannot be
             printed is escaped.
+        targets: float32 ``[k]`` each, the values of a recording, or ``[T, k]``, those of its
+            frames; None where there are none.
+        value_names: one name a value.
 
     Raises:
-        ValueError: a recording that does not fit the layout; labels, class names or names of
-            another number.
+        ValueError: a recording that does not fit the layout; labels, class names, names, targets or
+            value names of another number.
     """
 
     frames: tuple[NDArray[np.float32], ...]
@@ -37,6 +40,8 @@ class Recordings:
     labels: NDArray[np.int64] | None = None
     class_names: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
+    targets: tuple[NDArray[np.float32], ...] | None = None
+    value_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         names = tuple(map(printable, self.names)) or tuple(
@@ -48,6 +53,8 @@ class Recordings:
         )
         object.__setattr__(self, "names", names)
         object.__setattr__(self, "frames", frames)
+        if self.targets is not None:
+            self._check_targets(self.targets)
         if self.labels is None:
             return
         labels = np.asarray(self.labels, dtype=np.int64)
@@ -66,6 +73,22 @@ class Recordings:
         object.__setattr__(self, "labels", labels)
         object.__setattr__(self, "class_names", class_names)
 
+    def _check_targets(self, given: tuple[NDArray[np.float32], ...]) -> None:
+        if len(given) != len(self.frames):
+            raise ValueError(
+                f"{len(self.frames)} recordings need as many targets, got {len(given)}"
+            )
+        targets = tuple(np.asarray(of, dtype=np.float32) for of in given)
+        k = len(self.value_names) or (targets[0].shape[-1] if targets else 0)
+        for name, of, frames in zip(self.names, targets, self.frames, strict=True):
+            if of.shape not in ((k,), (len(frames), k)):
+                raise ValueError(
+                    f"{name}: expected targets [{k}] or [{len(frames)}, {k}], got {list(of.shape)}"
+                )
+        names = tuple(map(printable, self.value_names)) or tuple(f"value {i}" for i in range(k))
+        object.__setattr__(self, "targets", targets)
+        object.__setattr__(self, "value_names", names)
+
     def __len__(self) -> int:
         return len(self.frames)
 
@@ -77,4 +100,7 @@ class Recordings:
         labels = None if self.labels is None else self.labels[np.asarray(which, dtype=np.intp)]
         frames = tuple(self.frames[i] for i in which)
         names = tuple(self.names[i] for i in which)
-        return Recordings(frames, self.layout, labels, self.class_names, names)
+        targets = None if self.targets is None else tuple(self.targets[i] for i in which)
+        return Recordings(
+            frames, self.layout, labels, self.class_names, names, targets, self.value_names
+        )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from adaptfault.data.recordings.errors import InputError, Problem, located
-from adaptfault.data.recordings.facts.labels import TABLE, natural_key
+from adaptfault.data.recordings.facts.labels import TABLE, TARGETS, natural_key
 from adaptfault.data.recordings.readers import Reader, reader_of, suffixes
 
 
@@ -111,5 +111,5 @@ def _below(root: Path, known: Mapping[str, Reader], problems: list[Problem]) -> 
     files.sort(key=lambda file: [natural_key(part) for part in file[0].relative_to(root).parts])
     labels = table if table.is_file() else None
     for path, reader in files:
-        if path != table:
+        if path not in (table, root / TARGETS):
             yield Found(path, path.relative_to(root).as_posix(), root, reader, labels)

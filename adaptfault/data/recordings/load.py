@@ -36,6 +36,7 @@ from adaptfault.data.recordings.facts.resolve import (
     given_array,
     resolve_layout,
 )
+from adaptfault.data.recordings.facts.targets import TargetTable, target_files
 from adaptfault.data.recordings.files import Found, find
 from adaptfault.data.recordings.readers import readers
 from adaptfault.data.recordings.recording import BLOCK, Shape
@@ -85,7 +86,8 @@ class Opened:
     Attributes:
         layout: the array.
         lengths: frames of each recording.
-        labels, class_names, names: as in :class:`~adaptfault.data.recordings.dataset.Recordings`.
+        labels, class_names, names, targets, value_names: as in
+            :class:`~adaptfault.data.recordings.dataset.Recordings`.
         inferred: as in :class:`Loaded`.
         problems: errors and warnings.
         late_problems: warnings about the range of readings, after a whole iteration.
@@ -97,18 +99,26 @@ class Opened:
         resolved: Resolved,
         tables: Calibration | None,
         problems: list[Problem],
+        targets: dict[Path, NDArray[np.float32]] | None = None,
+        value_names: tuple[str, ...] = (),
     ) -> None:
         self.layout = resolved.layout
         self.inferred = resolved.inferred
         self.names = tuple(_name(file, content, i) for file, content, kept in usable for i in kept)
         self.lengths = tuple(content.surveys[i].length for _, content, kept in usable for i in kept)
         labels = [
-            content.labels[i] if content.labels else None
+            content.labels[i] if content.labels and targets is None else None
             for _, content, kept in usable
             for i in kept
         ]
         self.labels, self.class_names = class_indices(
             labels, [content.facts.class_names for _, content, _ in usable], problems
+        )
+        self.value_names = value_names
+        self.targets = (
+            None
+            if targets is None
+            else tuple(targets[file.path.resolve()] for file, _, kept in usable for _ in kept)
         )
         self.problems = tuple(problems)
         self._usable = usable
@@ -205,6 +215,7 @@ def load(
     unit: str | None = None,
     rate: float | None = None,
     strict: bool = False,
+    targets: PathName | None = None,
     **stated: Any,
 ) -> Loaded:
     """Read recordings; a bad file is listed and left out, the others are read.
@@ -225,6 +236,9 @@ def load(
         full_scale, unit, rate: override the layout and the files.
         strict: refuse files that state another full scale or rate than ``layout``, as a model's
             layout requires.
+        targets: a table of the values that a regression learns, with the columns ``file``, maybe
+            ``frame``, and one for each value, paths relative to it; a file has one recording, and
+            one that is not in the table is left out. Labels are not read then.
         stated: what readers want to know: ``topic`` and ``field``, where the readings are in bags,
             see :func:`adaptfault.data.recordings.formats.bag.open`; ``columns``, ``ignore``,
             ``time_column`` and ``label_column``, where they are in text files, see
@@ -253,11 +267,18 @@ def load(
         unit=unit,
         rate=rate,
         strict=strict,
+        targets=targets,
         room=None,
         **stated,
     )
     recordings = Recordings(
-        tuple(opened), opened.layout, opened.labels, opened.class_names, opened.names
+        tuple(opened),
+        opened.layout,
+        opened.labels,
+        opened.class_names,
+        opened.names,
+        opened.targets,
+        opened.value_names,
     )
     return Loaded(recordings, (*opened.problems, *opened.late_problems), opened.inferred)
 
@@ -273,6 +294,7 @@ def open_recordings(
     unit: str | None = None,
     rate: float | None = None,
     strict: bool = False,
+    targets: PathName | None = None,
     room: int | None = ROOM,
     progress: Callable[[int], None] = _nothing,
     **stated: Any,
@@ -282,8 +304,8 @@ def open_recordings(
     Args:
         room: bytes of frames that are kept in memory; None: all.
         progress: receives the number of frames of each block of the first reading.
-        paths, layout, labels, frames, calibration, full_scale, unit, rate, strict, stated: as for
-            :func:`load`.
+        paths, layout, labels, frames, calibration, full_scale, unit, rate, strict, targets, stated:
+            as for :func:`load`.
 
     Raises:
         InputError: as :func:`load`.
@@ -298,9 +320,13 @@ def open_recordings(
     array = given_array(layout) if layout is not None else layout_beside(given)
     shape = array.shape if isinstance(array, SensorLayout) else array
     tables = _calibration(calibration)
-    aside = {
-        Path(p).resolve() for p in (layout, labels, calibration) if isinstance(p, str | PathLike)
-    }
+    if labels is not None and targets is not None:
+        raise InputError(
+            "labels and targets both given: a model learns classes or values, not both"
+        )
+    values = None if targets is None else TargetTable.read(Path(targets))
+    tables_given = (layout, labels, calibration, targets)
+    aside = {Path(p).resolve() for p in tables_given if isinstance(p, str | PathLike)}
     found, problems = find(given, readers(), aside)
     surveyor = Surveyor(PAPER.full_scale * SLACK, 2**62 if room is None else room)
     contents: list[tuple[Found, Content]] = []
@@ -317,7 +343,11 @@ def open_recordings(
         else:
             contents.append((file, content))
     problems += _passed_over(notes)
-    contents = label_files(contents, None if labels is None else Path(labels), problems)
+    targets_of = None
+    if values is not None:
+        contents, targets_of = target_files(contents, values, problems)
+    else:
+        contents = label_files(contents, None if labels is None else Path(labels), problems)
     if not contents:
         raise nothing_left(problems)
     every = [content for _, content in contents]
@@ -352,7 +382,8 @@ def open_recordings(
         raise nothing_left(problems)
     if frames is None:
         problems += other_lengths([content for _, content, _ in usable])
-    return Opened(usable, resolved, tables, problems)
+    names = () if values is None else values.names
+    return Opened(usable, resolved, tables, problems, targets_of, names)
 
 
 def _passed_over(notes: Sequence[Path]) -> list[Problem]:

@@ -28,13 +28,13 @@ def save(path: str | PathLike[str], recordings: Recordings) -> tuple[str, ...]:
     """Write recordings in the format that the name ends in: ``.npz``, ``.npy``, ``.bag``; without
     an ending, CSV files.
 
-    An archive (``.npz``) holds everything. An array (``.npy``) holds the frames alone,
-    ``[n, T, pads, rows, cols]``, and needs recordings of one length. CSV files lie in one folder a
-    class, with ``layout.json`` beside them. A bag holds one ``Float32MultiArray`` a frame on
-    ``/tactile``, recordings separated by pauses.
+    An archive (``.npz``) holds everything but the targets of a regression. An array (``.npy``)
+    holds the frames alone, ``[n, T, pads, rows, cols]``, and needs recordings of one length. CSV
+    files lie in one folder a class, with ``layout.json`` beside them. A bag holds one
+    ``Float32MultiArray`` a frame on ``/tactile``, recordings separated by pauses.
 
     Returns:
-        What the format cannot hold, one item each: empty for an archive.
+        What the format cannot hold, one item each.
 
     Raises:
         InputError: another ending, no recordings, lengths that differ (``.npy``), or rosbags is
@@ -44,16 +44,17 @@ def save(path: str | PathLike[str], recordings: Recordings) -> tuple[str, ...]:
     path = Path(path)
     if not len(recordings):
         raise InputError.at(path, "there are no recordings to save; give at least one")
+    lost = () if recordings.targets is None else ("the targets of a regression",)
     match path.suffix.lower():
         case ".npz":
             save_npz(path, recordings)
-            return ()
+            return lost
         case ".npy":
-            return _save_npy(path, recordings)
+            return (*_save_npy(path, recordings), *lost)
         case ".bag":
-            return _save_bag(path, recordings)
+            return (*_save_bag(path, recordings), *lost)
         case "":
-            return _save_csv(path, recordings)
+            return (*_save_csv(path, recordings), *lost)
         case _:
             raise InputError.at(path, f"recordings are saved as {FORMATS}; choose another name")
 

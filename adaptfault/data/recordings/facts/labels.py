@@ -13,6 +13,9 @@ from adaptfault.data.recordings.formats.text import read_text
 TABLE = "labels.csv"
 """The name of the table of labels that is read from a folder without an option."""
 
+TARGETS = "targets.csv"
+"""The name of a table of targets, which is no recording where it lies in a folder of recordings."""
+
 
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     """Return the key of natural order: numbers by value ("9" before "10"), before letters."""
@@ -37,18 +40,8 @@ def read_label_table(path: Path) -> tuple[dict[Path, str], list[Problem]]:
     Raises:
         InputError: the table cannot be read, or its header lacks a column.
     """
-    reader = csv.reader(read_text(path).split("\n"), strict=False)
-    try:
-        lines = [
-            (reader.line_num, [cell.strip() for cell in row])
-            for row in reader
-            if any(map(str.strip, row))
-        ]
-    except csv.Error as error:
-        raise InputError.at(
-            path, f"is no table ({error}); correct it", f"line {reader.line_num}"
-        ) from None
-    header = [name.casefold() for name in lines[0][1]] if lines else []
+    first, lines = table_lines(path)
+    header = [name.casefold() for name in first]
     if not {"file", "label"} <= set(header):
         raise InputError.at(
             path, "expected a first line 'file,label', separated by commas; add it", "line 1"
@@ -64,7 +57,7 @@ def read_label_table(path: Path) -> tuple[dict[Path, str], list[Problem]]:
             Problem("warning" if warning else "error", located(path, what, f"line {number}"))
         )
 
-    for number, row in lines[1:]:
+    for number, row in lines:
         if len(row) != len(header):
             note(
                 number,
@@ -76,7 +69,7 @@ def read_label_table(path: Path) -> tuple[dict[Path, str], list[Problem]]:
         if not name or not label:
             note(number, f"the {'label' if name else 'file'} is empty; give both")
             continue
-        file = _existing(path.parent, name)
+        file = existing_file(path.parent, name)
         if file is None:
             note(number, f"names {name!r}, which is not there; correct the path or remove the line")
         elif file not in labels:
@@ -93,7 +86,27 @@ def read_label_table(path: Path) -> tuple[dict[Path, str], list[Problem]]:
     return {file: label for file, label in labels.items() if file not in conflicts}, problems
 
 
-def _existing(folder: Path, name: str) -> Path | None:
+def table_lines(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the header of a table, and its other lines that are not empty with their numbers.
+
+    Raises:
+        InputError: the table cannot be read.
+    """
+    reader = csv.reader(read_text(path).split("\n"), strict=False)
+    try:
+        lines = [
+            (reader.line_num, [cell.strip() for cell in row])
+            for row in reader
+            if any(map(str.strip, row))
+        ]
+    except csv.Error as error:
+        raise InputError.at(
+            path, f"is no table ({error}); correct it", f"line {reader.line_num}"
+        ) from None
+    return (lines[0][1], lines[1:]) if lines else ([], [])
+
+
+def existing_file(folder: Path, name: str) -> Path | None:
     """Return the file that a table names, resolved; tables written on Windows separate folders by a
     backslash."""
     for spelling in (name, name.replace("\\", "/")):

@@ -121,6 +121,7 @@ def run(args: argparse.Namespace) -> int:
 
     values = recordings.targets is not None
     names = recordings.value_names if values else recordings.class_names
+    _check_classes(args.recordings[0], recordings)
     windows = make_windows(
         recordings.frames,
         recordings.targets if values else recordings.labels,
@@ -169,6 +170,23 @@ def run(args: argparse.Namespace) -> int:
         (folder / _CHECKPOINT).unlink()  # the run is complete: nothing is left to resume
     problems = _told(args, out, bundled, scores, history, names, extra, (parts[2].y, predicted))
     return int(args.strict and bool(problems))
+
+
+def _check_classes(path: str, recordings: Recordings) -> None:
+    """Refuse recordings of one class.
+
+    Raises:
+        ValueError: there are no two classes.
+    """
+    if recordings.labels is None or recordings.targets is not None:
+        return
+    present = set(recordings.labels.tolist())
+    if len(present) == 1:
+        name = recordings.class_names[present.pop()]
+        raise ValueError(
+            f"{path}: all recordings are of one class, {name!r}; a classifier needs two, one folder"
+            " each"
+        )
 
 
 def _check_options(args: argparse.Namespace, out: Path, bundled: bool) -> None:

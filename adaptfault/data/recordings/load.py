@@ -24,6 +24,7 @@ from adaptfault.data.recordings.check import (
     without_infinite,
 )
 from adaptfault.data.recordings.dataset import Recordings
+from adaptfault.data.recordings.doubts import doubts
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.classes import class_indices, label_files
 from adaptfault.data.recordings.facts.infer import PAPER, SLACK
@@ -380,6 +381,9 @@ def open_recordings(
             usable.append((file, content, kept))
     if not usable:
         raise nothing_left(problems)
+    used = [(file, content) for file, content, _ in usable]
+    is_labelled = values is not None or any(content.labels for _, content in used)
+    problems += doubts(used, resolved.layout, labelled=is_labelled)
     if frames is None:
         problems += other_lengths([content for _, content, _ in usable])
     names = () if values is None else values.names

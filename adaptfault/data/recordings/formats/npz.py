@@ -18,6 +18,7 @@ from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from adaptfault.data.atomic import atomic_write
+from adaptfault.data.printable import printable
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.sizes import check_archive, check_array
@@ -38,8 +39,11 @@ _KEYS = (
     "rate",
     "unit",
 )
+_COUNTS = 16  # whole numbers that reach it are counts, in an array of decimals, too
 _RATES = ("sampling_hz", "rate", "rate_hz", "rate_Hz")  # in the JSON file beside an archive
 _BITS = re.compile(r"\s*(\d{1,2})[ -]?bits?\b", re.ASCII)
+
+_SHOWN = 8  # arrays in a message
 
 _EXPECTED = (
     "expected [n, T, pads, rows, cols], [n, T, rows, cols] (one pad) or [n, T, D], or one recording"
@@ -99,9 +103,8 @@ def _read(path: Path, given: Shape | None) -> _Archive:
     """Return the recordings of an archive; the last one stays in memory."""
     arrays = _open_archive(path)
     if "frames" not in arrays:
-        raise InputError.at(
-            path, "holds no array 'frames'; save the recordings as frames=[n, T, pads, rows, cols]"
-        )
+        what = f"holds no array 'frames'; {_others(path)}"
+        raise InputError.at(path, f"{what}; save the recordings as frames=[n, T, pads, rows, cols]")
     beside, problems = _read_sibling(path)
     mask = arrays.get("present", arrays.get("factory_mask"))
     if (
@@ -146,7 +149,7 @@ def _read(path: Path, given: Shape | None) -> _Archive:
             problems = (*problems, Problem("warning", located(path.with_suffix(".json"), what)))
     facts = Facts(
         path,
-        counts=arrays["frames"].dtype.kind in "iu",
+        counts=_counts(arrays["frames"]),
         class_names=class_names,
         numbered=numbered,
         shape=shape,
@@ -158,6 +161,15 @@ def _read(path: Path, given: Shape | None) -> _Archive:
         problems=problems,
     )
     return _Archive(facts, frames, names, labels)
+
+
+def _counts(frames: NDArray[Any]) -> bool:
+    """Return whether readings are counts, by their type or because all are whole numbers."""
+    if frames.dtype.kind in "iu":
+        return True
+    known = frames[np.isfinite(frames)]
+    whole = known.size > 0 and known.max() >= _COUNTS and np.array_equal(known, np.rint(known))
+    return bool(whole)
 
 
 def save_npz(path: str | PathLike[str], recordings: Recordings) -> None:
@@ -234,6 +246,14 @@ def _open_archive(path: Path) -> dict[str, NDArray[Any]]:
             except Exception as error:  # as above
                 raise _damaged(path, error, key) from None
     return arrays
+
+
+def _others(path: Path) -> str:
+    """Return which arrays an archive holds."""
+    with open_numpy(path) as archive:
+        names = [printable(name) for name in archive.files[:_SHOWN]]
+    more = ", ..." if len(archive.files) > _SHOWN else ""
+    return f"it holds {', '.join(names)}{more}" if names else "it is empty"
 
 
 def _damaged(path: Path, error: Exception, key: str = "") -> InputError:

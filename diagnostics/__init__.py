@@ -4,6 +4,7 @@ Needs numpy, scipy, statsmodels and scikit-learn; never torch, so that a robot c
 without it.
 """
 
+from diagnostics.decision.certificate import Certificate
 from diagnostics.decision.coverage import Coverage
 from diagnostics.decision.result import Diagnosis, Verdict
 from diagnostics.decision.static_loads import StaticLoad
@@ -16,6 +17,7 @@ from diagnostics.simulation.injection import bridge, freeze_stream, inject, line
 from diagnostics.wiring import Line
 
 __all__ = [
+    "Certificate",
     "Coverage",
     "Diagnosis",
     "Fault",

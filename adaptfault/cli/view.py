@@ -15,6 +15,7 @@ from adaptfault.cli.inspecting import (
 )
 from adaptfault.cli.options import (
     Commands,
+    add_cache,
     add_recordings,
     add_trust,
     command,
@@ -65,6 +66,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("--mcap", metavar="FILE", help="write an MCAP file, for Foxglove")
     parser.add_argument("--rrd", metavar="FILE", help="write an RRD file, for Rerun")
+    add_cache(parser)
     add_trust(parser)
     parser.set_defaults(run=run, writes=("mcap", "rrd"))
 

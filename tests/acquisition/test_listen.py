@@ -117,7 +117,12 @@ def test_a_predictor_is_confirmed_once_after_it_has_worked_for_a_while():
 def test_a_regression_is_confirmed_as_a_classifier_is_and_tells_no_class():
     predictor = Scripted()
     values = types.SimpleNamespace(
-        label=None, probabilities=None, values=np.ones(2), fault_set=FaultSet((), 6), events=()
+        label=None,
+        probabilities=None,
+        values=np.ones(2),
+        fault_set=FaultSet((), 6),
+        events=(),
+        faults=(),
     )
     predictor.readings = [values] * CONFIRMED_AFTER
     assert [kind for kind, _ in told(Session("a", predictor), frames(CONFIRMED_AFTER))] == [

@@ -44,6 +44,7 @@ _EMPTY = " ,;\t"  # all that a line of empty cells holds
 _PROBE = 100  # lines of the table that are kept
 _HIGHEST = 1024  # rows of a frame
 _BLOCKS = 3  # as many show that blank lines divide frames
+_CHUNK = 1 << 16  # letters that are read at once
 
 
 @dataclass(frozen=True)
@@ -154,12 +155,25 @@ def encoding_of(path: Path) -> str:
 
 def numbered(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the number and the text of each line of a file, "" for a blank line, up to a zero byte:
-    behind it nothing is data."""
+    behind it nothing is data, nor is the line that holds it."""
+    at = 0
+    parts: list[str] = []  # of the line that the last chunk cut
     with builtins.open(path, encoding=encoding_of(path), errors=LATIN) as file:
-        for at, line in enumerate(iter(partial(file.readline, LONGEST_LINE), ""), 1):
-            if "\0" in line:
+        for chunk in iter(partial(file.read, _CHUNK), ""):
+            *lines, rest = chunk.partition("\0")[0].split("\n")
+            for line in lines:
+                at += 1
+                whole = "".join([*parts, line])
+                parts = []
+                yield at, whole if whole.strip() else ""
+            if "\0" in chunk:
                 return
-            yield at, line.strip("\n") if line.strip() else ""
+            parts.append(rest)
+            if sum(map(len, parts)) > LONGEST_LINE:
+                break
+    whole = "".join(parts)
+    if whole:
+        yield at + 1, whole if whole.strip() else ""
 
 
 def find_dialect(path: Path) -> Dialect | None:

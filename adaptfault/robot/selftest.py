@@ -11,7 +11,7 @@ recordings without classes). A cell counts as tested by two loads, so a routine 
     sum_c w_c min(1, sum_{i in R} p_ic / 2)
 
 This is submodular: the greedy choice reaches 1 - 1/e of the best one at least (Nemhauser, Wolsey
-and Fisher 1978). The weights w are the accuracy that is lost if the cell is dead and nobody knows,
+and Fisher 1978). The weights w are the accuracy that is lost if the cell is dead and not in F,
 plus one window, so that no cell is worth nothing.
 
 Not considered: how hard a fault is to see where neighbours say little about a cell.
@@ -208,7 +208,7 @@ def load_probability(
 
 def cell_weights(adapter: Adapter, faulty: FaultSet | None = None) -> Floats:
     """Return what each cell matters, ``[D]``, of sum 1: the accuracy that is lost if it reads 0 and
-    nobody knows."""
+    is not in F."""
     windows = adapter.validation
     present = adapter.layout.present.ravel().copy()
     if faulty is not None:

@@ -260,7 +260,7 @@ def test_labels_may_be_text_or_numbers_without_names(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "expected"),
     [
-        ({"data": counts()}, "holds no array 'frames'; save the recordings as"),
+        ({"data": counts()}, "holds no array 'frames'; it holds data; save the recordings as"),
         ({"frames": counts().astype(object)}, "array 'frames' holds Python objects"),
         ({"frames": counts().astype(str)}, "frames are of type <U"),
         ({"frames": counts() > 0}, "frames are of type bool"),

@@ -91,27 +91,23 @@ class Table:
 
         parquet = imported("pyarrow.parquet", path)
         types = imported("pyarrow.types", path)
+        sizes: dict[str, Sizes] = {}
+        whole: dict[str, bool] = {}
         try:
             with builtins.open(path, "rb") as file:
-                opened = parquet.ParquetFile(file)
+                opened = parquet.ParquetFile(file, pre_buffer=False)
                 schema = opened.schema_arrow
                 about = opened.metadata
                 groups = tuple(about.row_group(i).num_rows for i in range(about.num_row_groups))
-                first = next(opened.iter_batches(batch_size=1), None)
+                for field in schema:
+                    inner, stated = _unpacked(field.type)
+                    if not (types.is_integer(inner) or types.is_floating(inner)):
+                        continue
+                    whole[field.name] = types.is_integer(inner)
+                    sizes[field.name] = _first(opened, field.name) if stated is None else stated
         # a damaged file raises any of pyarrow's kinds
         except Exception as error:
             raise _damaged(path, error) from None
-        sizes: dict[str, Sizes] = {}
-        whole: dict[str, bool] = {}
-        for i, field in enumerate(schema):
-            inner = field.type
-            while types.is_nested(inner) and hasattr(inner, "value_type"):
-                inner = inner.value_type
-            if not (types.is_integer(inner) or types.is_floating(inner)):
-                continue
-            value = None if first is None or not len(first) else first.column(i)[0].as_py()
-            sizes[field.name] = np.shape(value) if value is not None else ()
-            whole[field.name] = types.is_integer(inner)
         return cls(path, sizes, whole, tuple(schema.names), groups)
 
     def cells(self, key: str | None) -> list[str]:
@@ -152,11 +148,35 @@ class Table:
         """
         parquet = imported("pyarrow.parquet", self.path)
         try:
-            read = parquet.read_table(self.path, columns=[name], partitioning=None)
+            read = parquet.read_table(
+                self.path, columns=[name], partitioning=None, use_threads=False
+            )
         except Exception as error:
             raise _damaged(self.path, error) from None
         values: NDArray[Any] = read.column(0).to_numpy()
         return values
+
+
+def _unpacked(kind: Any) -> tuple[Any, Sizes | None]:
+    """Return the type of the numbers in a column, and the sizes of a frame; None where only its
+    values tell them."""
+    sizes: list[int] = []
+    stated = True
+    while hasattr(kind, "value_type"):
+        if hasattr(kind, "list_size"):
+            sizes.append(kind.list_size)
+        else:
+            stated = False
+        kind = kind.value_type
+    return kind, tuple(sizes) if stated else None
+
+
+def _first(opened: Any, name: str) -> Sizes:
+    """Return the sizes of the first frame in a column of lists."""
+    batches = opened.iter_batches(batch_size=1, row_groups=[0], columns=[name], use_threads=False)
+    first = next(batches, None)
+    value = None if first is None or not len(first) else first.column(0)[0].as_py()
+    return () if value is None else np.shape(value)
 
 
 def _most(classes: NDArray[Any]) -> str | None:
@@ -208,7 +228,9 @@ def _group(path: Path, group: int, names: tuple[str, ...]) -> dict[str, NDArray[
     parquet = imported("pyarrow.parquet", path)
     try:
         with builtins.open(path, "rb") as file:
-            table = parquet.ParquetFile(file).read_row_group(group, columns=list(names))
+            table = parquet.ParquetFile(file, pre_buffer=False).read_row_group(
+                group, columns=list(names), use_threads=False
+            )
     except Exception as error:
         raise _damaged(path, error) from None
     return {name: _array(path, table.column(name).combine_chunks(), name) for name in names}

@@ -32,14 +32,14 @@ class FaultFreeModel:
 
     Args:
         model, train, validation, layout, features, task, loss: as in
-        :class:`~adaptfault.adaptation.adapter.Adapter`.
+            :class:`~adaptfault.adaptation.adapter.Adapter`.
 
     Attributes:
         model: the network; other modules are wrapped in
             :class:`~adaptfault.models.any_model.AnyModel`.
         task: "classification" or "regression".
         targets, validation_targets: ``[N, n]``, class indicators or probabilities; values of a
-        regression.
+            regression.
     """
 
     def __init__(

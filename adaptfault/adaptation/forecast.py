@@ -23,7 +23,7 @@ class Expected:
     Attributes:
         accuracy: on the validation windows.
         low, high: 95 % interval of the accuracy on new recordings, whose number is
-        :attr:`Forecast.n_new`.
+            :attr:`Forecast.n_new`.
         likelihood: mean calibrated probability of the true class (R2 of a regression). It ranks
             fault sets more reliably than the accuracy, because windows near a decision count in
             proportion.

@@ -2,7 +2,7 @@
 alone.
 
 A unit (a wire, a cell) enters at the age at which its robot is first watched, and leaves at its
-first fault or at the last run (left truncation, right censoring). Three estimates:
+first fault or at the last run (left truncation, right censoring). Three estimates::
 
     curve     Kaplan and Meier (1958), ``statsmodels.SurvfuncRight``, with log(-log) intervals
     Weibull   H(t) = (t / scale)^shape, maximum likelihood; with fewer than 5 faults

@@ -1,7 +1,7 @@
 """Intermittency and noise: cells that move, but blink to a rail or have excess noise.
 
 Detects both with a CUSUM of log likelihood ratios over segments of 32 frames (Page 1954), so that a
-fault is found whenever it begins, and cleared when it has gone:
+fault is found whenever it begins, and cleared when it has gone::
 
     S <- clip(S + c g, 0, 40),    faulty if S >= 14
     blinks:  g = n log(0.05 / r) - m (0.05 - r)

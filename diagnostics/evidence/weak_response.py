@@ -3,7 +3,7 @@ broken cell.
 
 Detects, in a cold start, cells whose readings follow the loads of their neighbours and stay below
 what counts as load. With x the readings of a cell and l the mean load of its eight neighbours, each
-less its mean over a segment of the log,
+less its mean over a segment of the log::
 
     z    = sum x l / sqrt(sum x^2 / n  sum l^2)
          standard normal, if the cell is broken: it has white noise or none

@@ -1,5 +1,5 @@
 """Loads: readings of sensors that fall with load, or rest in the middle, as readings that rise with
-it from 0.
+it from 0::
 
     low      load = reading
     high     load = full scale - reading

@@ -1,7 +1,7 @@
 """Offset tracking: drift of the baselines since the reference, as with temperature, estimated and
 removed.
 
-Estimates two offsets above the reference baseline b:
+Estimates two offsets above the reference baseline b::
 
     common(t) = q25 over cells of (x_i(t) - b_i - own_i)
                 where it exceeds the usual one of the reference
@@ -15,7 +15,7 @@ all cells, at most 5 %. Larger ones are not tracked: such a cell is loaded or fa
 
 Where the recordings of the reference rest at levels of their own, further apart than 5 % of full
 scale, common offsets up to the range of these levels and 5 % more are removed. The level of
-recording r is
+recording r is::
 
     level_r = q25 over cells of (q05 over t of x_i(t) - b_i),
     b_i = q05 over r of q05 over t of x_i(t)

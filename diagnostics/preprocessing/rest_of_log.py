@@ -1,6 +1,6 @@
 """Rest of a log: where the cells of a cold start rest, and how far rests vary, without a reference.
 
-Estimates, over the cells that moved,
+Estimates, over the cells that moved::
 
     baseline_i = min(lowest reading of cell i, highest of these lowest readings)
     near       = 4 * mean over segments of q25 over cells of

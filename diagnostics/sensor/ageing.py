@@ -2,7 +2,7 @@
 are estimated.
 
 Statistics, per cell, with the load l(t) = r(t) - b and the contact limit c = 5 % of the largest
-load in the reference:
+load in the reference::
 
     baseline   b = 5 % quantile of all r(t), if the 25 % quantile is within
                2 % of full scale: the cell rests

@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
     report_range(log)
     checked = _checked(args, log, inspection)
     reasons = reasons_of(inspection.diagnosis, inspection.findings, bundle, args.untested_code)
-    code = max(worst(reasons), 1 if checked.remarks else 0)
+    code = max(worst(reasons), 1 if checked.harms else 0)
     notes = [reason.text for reason in reasons if reason.text] + list(checked.remarks)
     _write(args, log, checked, code, notes)
     text = [str(checked.summary), "", text_of(inspection.diagnosis), *notes]

@@ -2,18 +2,20 @@
 
 Beside an inspection of the cells, told are: missing readings and cells that never change; lost
 frames and jitter of the clock; recordings that begin in contact, where a driver that tares at the
-start takes the contact out; and recordings whose readings fall below their rest, where one did.
+start takes the contact out; and recordings whose readings go to the other side of rest, where one
+did.
 
 With s_i the mean of the first readings of each cell in recording i, s their median over the
-recordings, and l_i(t) the mean over the cells of the readings minus s, a recording begins in
-contact where mean |s_i - s| exceeds 30 % of the median peak of mean |l_i|, and was tared in contact
-where l_i(t) goes 10 % of it to the other side of rest. Not detected: a tare in contact whose
-readings are cut off at 0.
+recordings, l_i(t) the mean over the cells of the readings minus s, and p the median over the
+recordings of the peak of |l_i|, a recording begins in contact where the mean of |s_i - s| exceeds
+30 % of p, and was tared in contact where l_i goes 10 % of p to the other side of rest. Not
+detected: a tare in contact whose readings are cut off at 0, and one where most recordings begin in
+contact.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +26,7 @@ from adaptfault.data.recordings.facts.rates import Clock
 from adaptfault.data.summary import Summary
 from adaptfault.inspection.inspection import Inspection
 from diagnostics import SensorLayout
+from diagnostics.preprocessing.levels import MAJORITY
 
 SCHEMA = "adaptfault.check/1"
 
@@ -75,7 +78,7 @@ class DataSetCheck:
             found.append(f"the period between frames varies by {self.clock.jitter:.0%}")
         if self.begin_in_contact:
             found.append(
-                f"{_counted(self.begin_in_contact)} in contact: a tare at the start takes it out"
+                f"{_counted(self.begin_in_contact)}: harmless, unless the driver tares at the start"
             )
         if self.tared_in_contact:
             names = _listed(self.tared_in_contact)
@@ -86,7 +89,13 @@ class DataSetCheck:
     def severity(self) -> int:
         """0 nothing to do, 1 there are remarks or single faults, 2 a wire or a tenth of the
         cells."""
-        return max(self.inspection.severity, 1 if self.remarks else 0)
+        return max(self.inspection.severity, 1 if self.harms else 0)
+
+    @property
+    def harms(self) -> bool:
+        """Whether whoever trains loses something by what is remarked."""
+        harmless = 1 if self.begin_in_contact else 0
+        return len(self.remarks) > harmless
 
     def _missing_share(self) -> float:
         present = self.summary.layout.present.ravel()
@@ -148,35 +157,25 @@ def starts_and_tares(
         layout: the array.
     """
     present = layout.present.ravel()
-    starts = np.array([_mean(r[:_FIRST, present]) for r in recordings()])
+    starts = np.array([_mean(frames[:_FIRST, present]) for frames in recordings()])
     rest = np.nan_to_num(_median(starts))
-    peaks = np.zeros(len(starts))
-    signed = np.zeros((len(starts), 2))
-    for i, frames in enumerate(_loads(recordings(), present, rest)):
-        peaks[i] = np.abs(frames).max()
-        signed[i] = frames.min(), frames.max()
-    peak = float(np.median(peaks))
+    sides = np.zeros((len(starts), 2))
+    for i, frames in enumerate(recordings()):
+        loads = np.nan_to_num(frames[:, present] - rest).mean(axis=1)
+        sides[i] = loads.min(), loads.max()
+    peak = float(np.median(np.abs(sides).max(axis=1)))
     if not peak > 0:
         return (), ()
-    rises = np.median(signed[:, 1]) >= -np.median(signed[:, 0])
-    other_side = -signed[:, 0] if rises else signed[:, 1]
-    begun = np.nanmean(np.abs(np.nan_to_num(starts - rest)), axis=1) > _IN_CONTACT * peak
-    tared = other_side > _BELOW * peak
-    return (
-        tuple(np.array(names, dtype=object)[begun]),
-        tuple(np.array(names, dtype=object)[tared & ~begun]),
-    )
-
-
-def _loads(
-    recordings: Iterable[NDArray[Any]], present: NDArray[np.bool_], rest: NDArray[np.float64]
-) -> Iterator[NDArray[np.float64]]:
-    """Yield the mean of readings minus rest of each frame, ``[T]``; missing readings rest."""
-    for frames in recordings:
-        yield np.nan_to_num(frames[:, present] - rest).mean(axis=1)
+    begun = np.nan_to_num(np.abs(starts - rest)).mean(axis=1) > _IN_CONTACT * peak
+    rises = np.median(sides[:, 1]) >= -np.median(sides[:, 0])
+    other_side = -sides[:, 0] if rises else sides[:, 1]
+    tared = (other_side > _BELOW * peak) & ~begun & (begun.mean() < MAJORITY)
+    every = np.array(names, dtype=object)
+    return tuple(every[begun]), tuple(every[tared])
 
 
 def _mean(frames: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the mean of each cell; NaN where it has no reading."""
     known = np.isfinite(frames)
     total = np.where(known, frames, 0.0).sum(axis=0)
     counts = known.sum(axis=0)
@@ -193,8 +192,8 @@ def _median(starts: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _counted(names: Sequence[str]) -> str:
     if len(names) == 1:
-        return f"{names[0]} begins"
-    return f"{len(names)} recordings begin ({_listed(names)})"
+        return f"{names[0]} begins in contact"
+    return f"{len(names)} recordings begin in contact ({_listed(names)})"
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -99,6 +99,10 @@ def test_a_tare_in_contact_is_named_whichever_way_readings_go(sign):
     assert starts(recordings) == ((), ("5",))
 
 
+def test_where_most_recordings_begin_in_contact_none_is_told_as_tared():
+    assert starts([recording[25:] for recording in contacts(9)])[1] == ()
+
+
 def test_healthy_recordings_and_those_without_contact_get_no_remark():
     assert starts(contacts(20)) == ((), ())
     assert starts([np.full((30, 12), 0.1)] * 4) == ((), ())

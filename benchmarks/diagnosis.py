@@ -8,6 +8,9 @@ table, repeat by repeat, and names the rows that got worse by more than twice th
 code is then 1. ``--out FILE`` keeps the counts (JSON lines); a run that was cut off goes on where
 it stopped. Real arrays are read from ``../shared/data`` and left out where that is absent.
 
+``--method my_package:MyDetector`` runs somebody's own detector on the same logs, and prints its
+figures beside ours: those that need no more than F. See ``docs/your-method.md``.
+
 The method is chosen on splits 0 and 1. Splits 2 and 3 are for the end: ``--splits 2 3``.
 """
 
@@ -23,6 +26,7 @@ from pathlib import Path
 import numpy as np
 from arrays import ARRAYS, SPEED, Array
 from joblib import Parallel, delayed, parallel_config
+from own_method import ROWS_OF_F, find_method, needs_only_f
 from rows import ROWS
 from tqdm import tqdm
 
@@ -30,14 +34,24 @@ Key = tuple[str, str]  # array, row
 Samples = dict[tuple[int, int], dict]  # by split and repeat
 
 
-def measured(array: Array, split: int, repeat: int, logs: int, rows: tuple[str, ...]) -> list[dict]:
-    """Return the counts of one array, one half of its recordings and one draw of faults."""
+def measured(
+    array: Array, split: int, repeat: int, logs: int, rows: tuple[str, ...], method: str = ""
+) -> list[dict]:
+    """Return the counts of one array, one half of its recordings and one draw of faults.
+
+    ``method`` is ``module:Name`` of a detector, measured in place of the diagnosis.
+    """
     bench = array.bench(split, repeat, logs)
+    bench.method = method
     found = []
     about = {"array": array.name, "split": split, "repeat": repeat, "logs": logs}
+    if method:
+        about["method"] = method
     for name in rows:
         began = time.perf_counter()
         counts = list(ROWS[name](bench))
+        if method:
+            counts = [count for count in counts if needs_only_f(count.row)]
         taken = round(time.perf_counter() - began, 1)
         found += [{**about, **vars(count), "seconds": taken} for count in counts]
     return found
@@ -117,6 +131,38 @@ def table(counts: list[dict], against: list[dict] | None) -> list[str]:
     return worse
 
 
+def of_method(counts: list[dict], method: str) -> dict[Key, Samples]:
+    """Sort the counts of a detector, or of ours ("")."""
+    return by_row([count for count in counts if count.get("method", "") == method])
+
+
+def table_of_methods(counts: list[dict], methods: list[str]) -> None:
+    """Print our figures and those of detectors on the same logs, a column each."""
+    columns = {name: of_method(counts, name) for name in ("", *methods)}
+    keys = dict.fromkeys(key for name in methods for key in columns[name])
+    heads = ["SelfDiagnosis", *methods]
+    width = max(24, *(len(head) + 2 for head in heads))
+    print(f"{'':91}" + "".join(f"{head:>{width}}{'+-':>13}" for head in heads))
+    for key in keys:
+        rows = [columns[name].get(key, {}) for name in columns]
+        # the draws that all of them saw
+        common = [
+            draw
+            for draw in rows[0]
+            if len({row[draw]["logs"] if draw in row else None for row in rows}) == 1
+        ]
+        line = f"{key[0]:36}{key[1]:55}"
+        for row in rows:
+            samples = {draw: row[draw] for draw in common}
+            text = spread = "-"
+            if any(sample["of"] for sample in samples.values()):
+                value, noise = value_and_noise(samples)
+                text = shown(value, samples[common[0]]["unit"])
+                spread = f"{noise:.4f}"
+            line += f"{text:>{width}}{spread:>13}"
+        print(line)
+
+
 def chosen(name: str, wanted: list[str]) -> bool:
     """Return whether an array is named, or is one of a kind: ``fabric`` for ``fabric, 16 x 16``."""
     return name in wanted or (
@@ -147,29 +193,56 @@ def main() -> int:
         "--out", type=Path, help="JSON lines of the counts; a run that was cut off goes on there"
     )
     parser.add_argument("--against", type=Path, help="counts of an earlier version")
+    method_help = "detectors with fit and detect, such as my_package:MyDetector, beside ours"
+    parser.add_argument("--method", nargs="+", default=[], metavar="MODULE:NAME", help=method_help)
     options = parser.parse_args()
+    if options.method and (options.against or options.speed):
+        parser.error(
+            "--method prints detectors beside ours; --against and --speed are for ours alone: leave"
+            " them out"
+        )
+    for name in options.method:
+        try:
+            find_method(name)()
+        except (ImportError, ValueError) as error:
+            parser.error(str(error))
     kept = (
         [json.loads(line) for line in options.out.read_text().splitlines()]
         if options.out and options.out.exists()
         else []
     )
     done = {
-        (c["array"], c["split"], c["repeat"], c["logs"], c["row"].startswith("fit")) for c in kept
+        (
+            c["array"],
+            c["split"],
+            c["repeat"],
+            c["logs"],
+            c["row"].startswith("fit"),
+            c.get("method", ""),
+        )
+        for c in kept
     }
     jobs = []
     absent = []
+    more_than_f: dict[str, None] = {}
     for array in SPEED if options.speed else ARRAYS:
         logs, rows = (array.quick, array.quick_rows) if options.quick else (array.logs, array.rows)
         rows = tuple(row for row in rows if not options.rows or row in options.rows)
         if not logs or not rows or (options.arrays and not chosen(array.name, options.arrays)):
+            continue
+        if options.method:
+            more_than_f.update(dict.fromkeys(row for row in rows if row not in ROWS_OF_F))
+            rows = tuple(row for row in rows if row in ROWS_OF_F)
+        if not rows:
             continue
         if not array.available:
             absent.append(array.name)
             continue
         for repeat in range(1 if options.quick else array.repeats):
             for split in options.splits[:1] if options.speed else options.splits:
-                if (array.name, split, repeat, logs, options.speed) not in done:
-                    jobs.append((array, split, repeat, logs, rows))
+                for method in ("", *options.method):
+                    if (array.name, split, repeat, logs, options.speed, method) not in done:
+                        jobs.append((array, split, repeat, logs, rows, method))
     with parallel_config(backend="loky", inner_max_num_threads=1):
         work = Parallel(n_jobs=1 if options.speed else options.jobs, return_as="generator")
         for counts in tqdm(
@@ -187,7 +260,13 @@ def main() -> int:
         if options.against
         else None
     )
-    worse = table(kept, against)
+    worse = []
+    if options.method:
+        table_of_methods(kept, options.method)
+    else:
+        worse = table([count for count in kept if not count.get("method")], against)
+    if more_than_f:
+        print(f"left out, they need more than F: {', '.join(more_than_f)}")
     for text in absent:
         print(f"left out, no recordings at hand: {text}")
     for text in worse:

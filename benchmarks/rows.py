@@ -17,6 +17,7 @@ from functools import cache, cached_property
 from itertools import combinations
 
 import numpy as np
+from own_method import Found, OwnMethod
 from sklearn.ensemble import ExtraTreesClassifier
 
 from adaptfault.data.recordings import Recordings
@@ -90,7 +91,7 @@ class Tally:
     dead: list[np.ndarray] = field(default_factory=list)
 
     def add(
-        self, log: Log, seen: Log, faults: Sequence[Fault], diagnosis: Diagnosis, start: int
+        self, log: Log, seen: Log, faults: Sequence[Fault], diagnosis: Diagnosis | Found, start: int
     ) -> None:
         """Count one log: true readings, readings with the faults, and the diagnosis; ``start``: the
         onset."""
@@ -108,7 +109,7 @@ class Tally:
         self.testable, self.hit = self.testable + len(can), self.hit + len(found & can)
         self.objects += len(diagnosis.static_loads)
         self.right_kind += sum(kinds.get(cell) == fault.kind for cell, fault in told.items())
-        for cell in found & can:
+        for cell in found & can & told.keys():
             between = slice(*sorted((start, told[cell].onset or 0)))
             self.late.append(int(differs(before[between, cell], after[-1, cell], layout).sum()))
         present = layout.present.ravel()
@@ -131,6 +132,7 @@ class Bench:
         count: logs of a row.
         trained: recordings that the diagnosis learns from in place of ``recordings``: before a
             drift.
+        method: ``module:Name`` of a detector under test in place of the diagnosis; "": none.
     """
 
     recordings: Recordings
@@ -138,6 +140,7 @@ class Bench:
     count: int
     repeat: int = 0
     trained: Recordings | None = None
+    method: str = ""
 
     def __post_init__(self) -> None:
         self.layout = self.recordings.layout
@@ -150,14 +153,17 @@ class Bench:
         self.case = cache(self._case)
 
     @cached_property
-    def fitted(self) -> SelfDiagnosis:
-        """The diagnosis under test."""
+    def fitted(self) -> SelfDiagnosis | OwnMethod:
+        """The diagnosis, or the detector, under test."""
         frames = (self.trained or self.recordings).frames
-        return SelfDiagnosis(self.layout).fit([frames[i] for i in self.reference])
+        made = OwnMethod(self.method, self.layout) if self.method else SelfDiagnosis(self.layout)
+        return made.fit([frames[i] for i in self.reference])
 
     @cached_property
-    def proving(self) -> SelfDiagnosis:
-        """The same with the proof of life."""
+    def proving(self) -> SelfDiagnosis | OwnMethod:
+        """The diagnosis with the proof of life; a detector has none."""
+        if self.method:
+            return self.fitted
         fitted = SelfDiagnosis(self.layout, proof_of_life=True)
         return fitted.fit([self.recordings.frames[i] for i in self.reference])
 

@@ -4,7 +4,9 @@ with the model."""
 from __future__ import annotations
 
 import copy
+import hashlib
 import io
+import json
 import logging
 import warnings
 from collections.abc import Iterator
@@ -18,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from adaptfault import __version__
 from adaptfault.adaptation.reduced_model import ReducedModel
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.models.any_model import AnyModel
@@ -79,6 +82,10 @@ def to_onnx(model: ReducedModel, graph: bytes | None = None, *, values: bool = F
     low-rank form (:mod:`adaptfault.models.compact`). The file is run on batches of 1 and 7 windows;
     its outputs agree with the model within 1e-5.
 
+    The file's ``metadata_props`` state what it is: ``adaptfault.layout`` (SHA-256 of the layout as
+    JSON with sorted keys), ``adaptfault.fault_set`` (JSON list of cells), ``adaptfault.task`` and
+    ``adaptfault.version``. The same model gives the same file.
+
     Args:
         model: adapted to any F.
         graph: of :func:`graph_of`, for the same network: a new file takes a second with it. One
@@ -93,10 +100,11 @@ def to_onnx(model: ReducedModel, graph: bytes | None = None, *, values: bool = F
     whole = _whole(model, values)
     if graph is not None:
         with suppress(ExportError):
-            data = _with_state(graph, whole)
+            data = _described(_with_state(graph, whole), model, values)
             _verify(data, model, values)
             return data
     data = _translate(whole, torch.from_numpy(_probes(model, _EXAMPLE)), values)
+    data = _described(data, model, values)
     _verify(data, model, values)
     return data
 
@@ -196,6 +204,25 @@ def _with_state(data: bytes, whole: nn.Module) -> bytes:
             tensor.CopyFrom(onnx.numpy_helper.from_array(state[tensor.name].numpy(), tensor.name))
     whole_file: bytes = graph.SerializeToString()
     return whole_file
+
+
+def _described(data: bytes, model: ReducedModel, values: bool) -> bytes:
+    """Return an ONNX file whose ``metadata_props`` state layout, F, task and version."""
+    onnx = _require("onnx")
+    graph = onnx.load_from_string(data)
+    layout = json.dumps(model.network.layout.to_dict(), sort_keys=True, allow_nan=False)
+    facts = {
+        "adaptfault.layout": hashlib.sha256(layout.encode()).hexdigest(),
+        "adaptfault.fault_set": json.dumps(sorted(int(cell) for cell in model.fault_set)),
+        "adaptfault.task": "regression" if values else "classification",
+        "adaptfault.version": __version__,
+    }
+    others = [entry for entry in graph.metadata_props if entry.key not in facts]
+    stated = [onnx.StringStringEntryProto(key=key, value=facts[key]) for key in facts]
+    del graph.metadata_props[:]
+    graph.metadata_props.extend([*others, *stated])
+    described: bytes = graph.SerializeToString()
+    return described
 
 
 def _verify(data: bytes, model: ReducedModel, values: bool) -> None:

@@ -1,3 +1,4 @@
+import hashlib
 import json
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ import torch
 from conftest import DROPPED, small_windows
 from torch import nn
 
+import adaptfault as af
 from adaptfault.adaptation.adapter import Adapter
 from adaptfault.adaptation.reduced_model import ReducedModel
 from adaptfault.adaptation.result import Adaptation
@@ -62,6 +64,38 @@ def test_one_graph_serves_every_fault_set_and_number_of_known_windows(versions, 
         x[..., list(cells)] = np.nan
         said = run_session(open_session(to_onnx(head.model, graph)), x)
         np.testing.assert_allclose(said, head.predict_proba(x), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", DROPPED)
+def test_the_file_states_layout_fault_set_task_and_version(versions, name):
+    onnx = pytest.importorskip("onnx")
+    model = Adaptation.load(versions[name]).model
+    graph = onnx.load(versions[name] / "model.onnx")
+    stated = {entry.key: entry.value for entry in graph.metadata_props}
+    layout = json.dumps(model.network.layout.to_dict(), sort_keys=True)
+    assert stated["adaptfault.layout"] == hashlib.sha256(layout.encode()).hexdigest()
+    assert json.loads(stated["adaptfault.fault_set"]) == sorted(DROPPED[name])
+    assert stated["adaptfault.task"] == "classification"
+    assert stated["adaptfault.version"] == af.__version__
+
+
+def test_what_the_file_states_changes_no_prediction_and_the_file_comes_out_twice_the_same(
+    versions,
+):
+    onnx = pytest.importorskip("onnx")
+    data = (versions["head"] / "model.onnx").read_bytes()
+    model = Adaptation.load(versions["head"]).model
+    plain = onnx.load_from_string(data)
+    del plain.metadata_props[:]
+    x = small_windows(7)
+    np.testing.assert_array_equal(
+        run_session(open_session(data), x),
+        run_session(open_session(plain.SerializeToString()), x),
+    )
+    graph = graph_of(model.network)
+    assert not onnx.load_from_string(graph).metadata_props  # it serves any F
+    assert to_onnx(model, graph) == to_onnx(model, graph)
+    assert to_onnx(model) == to_onnx(model) == data
 
 
 def test_a_large_array_is_exported_without_a_matrix_of_its_cells(monkeypatch):

@@ -119,7 +119,7 @@ def pads_figure(
 
     cell = _cell(layout, page)
     beside = 1.2 if scale else 0.0
-    named = 0.0 if scale else 0.2  # room for the names of the axes
+    named = 0.0 if scale else 0.35  # room for the names of the axes
     height = layout.rows * cell + 0.7 + named
     width = max(layout.shape[2] * cell, 1.8) + 0.5 + named
     columns = max(1, min(layout.pads, int(page // width)))
@@ -128,7 +128,7 @@ def pads_figure(
     below = 0.6 if scale else 0.5 if across > _WIDE else 0.9
     figure = Figure(figsize=(across, n_rows * rows * height + below))
     # inches: the first layout lets titles stick out a little
-    figure.set_layout_engine("constrained", h_pad=0.1)
+    figure.set_layout_engine("constrained", h_pad=0.14)
     axes = figure.subplots(n_rows * rows, columns, squeeze=False).reshape(n_rows, rows * columns)
     for ax in axes[:, layout.pads :].ravel():
         ax.set_visible(False)

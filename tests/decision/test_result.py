@@ -49,7 +49,17 @@ def test_the_map_wraps_wide_pads_and_its_legend_explains_the_letters():
 
 
 @pytest.mark.parametrize(
-    "shape", [(1, 10, 10), (2, 13, 6), (5, 1, 12), (1, 2, 3), (2, 33, 15), (1, 64, 64), (1, 40, 4)]
+    "shape",
+    [
+        (1, 10, 10),
+        (2, 13, 6),
+        (5, 1, 12),
+        (1, 2, 3),
+        (2, 33, 15),
+        (1, 64, 64),
+        (1, 40, 4),
+        (2, 4, 5),
+    ],
 )
 def test_nothing_on_the_map_is_cut_off_or_covered(shape):
     layout = SensorLayout(*shape)

@@ -50,6 +50,7 @@ from diagnostics.threads import one_thread
 SCHEMA = "adaptfault.diagnoser/1"
 
 # P(faulty) of silent, intermittent, noisy and drifting cells, which have their own thresholds
+_WHOLE = 1e-6  # by which a whole number may be missed after a conversion to loads and back
 _CERTAIN = 1 - RARE
 
 # recordings from which on a log is its own reference: with a model of ten, healthy cells are blamed
@@ -650,7 +651,27 @@ class SelfDiagnosis:
             known=known,
             refuted=kind,
             share=life.share,
+            typical=self._typical(stream),
         )
+
+    @staticmethod
+    def _typical(stream: StreamState) -> NDArray[np.float64]:
+        """Return the reading of each cell's constant run, ``[D]``: in whole counts where it has
+        such readings.
+
+        A value that fills more than half of the run is its median. Otherwise the median is between
+        the ends of the run: then it is the whole number beside their middle that is closer to the
+        last reading.
+        """
+        runs = stream.runs
+        held = stream.reading(runs.value)
+        ends = np.stack([stream.reading(one) for one in (runs.low, runs.high, runs.last)])
+        ends = np.where(np.isfinite(ends), ends, 0.5)  # no reading: not whole
+        whole = (np.abs(ends - np.rint(ends)) < _WHOLE).all(axis=0)
+        last = np.rint(ends[2])
+        beside = np.where(last > held, np.ceil(held - _WHOLE), np.floor(held + _WHOLE))
+        counts = np.where(2 * runs.same > runs.length, last, beside)
+        return np.where(whole, counts, held)
 
     def _log_ratio(self, stream: StreamState, life: Life) -> LogRatio:
         """Return the function from evidence and summed surprisal to the calibrated log likelihood

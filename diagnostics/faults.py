@@ -46,6 +46,18 @@ class FaultKind(str, Enum):
 
     __str__ = str.__str__
 
+    def verb(self, *, plural: bool = False) -> str:
+        """Return what a cell or a wire of this kind does or is: "is stuck", "drifts"."""
+        single, several = _VERBS.get(self, (f"is {self}", f"are {self}"))
+        return several if plural else single
+
+
+_VERBS = {
+    FaultKind.DRIFT: ("drifts", "drift"),
+    FaultKind.COPY: ("is a copy", "are copies"),
+    FaultKind.ALIAS: ("reads another cell", "read other cells"),
+}
+
 
 @dataclass(frozen=True)
 class Fault:

@@ -84,7 +84,7 @@ def recordings(count: int, home: Path, rng: np.random.Generator) -> Outcome:
 
 def packets(count: int, home: Path, rng: np.random.Generator) -> Outcome:
     """Send what is no packet; each valid packet between arrives."""
-    receiver = Receiver(SensorLayout(1, 2, 3))
+    receiver = Receiver(SensorLayout(1, 2, 3), queue=count)
     for i in range(count):
         packet = format_packet("robot", i / 10, np.ones(6))
         receiver.take(rubbish(packet, 6, rng), i / 10, "10.0.0.66")
@@ -106,7 +106,7 @@ def names(count: int, home: Path, rng: np.random.Generator) -> Outcome:
 def replays(count: int, home: Path, rng: np.random.Generator) -> Outcome:
     """Replay old packets from the device's own address while it sends; none is taken for a
     restart."""
-    receiver = Receiver(SensorLayout(1, 2, 3))
+    receiver = Receiver(SensorLayout(1, 2, 3), queue=count + 100)
     for i in range(count + 100):
         now = i / 10
         receiver.take(format_packet("robot", 1000 + i / 10, np.ones(6)), now, "10.0.0.1")

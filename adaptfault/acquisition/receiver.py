@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 from ipaddress import ip_address
 from types import TracebackType
 
+from adaptfault.acquisition.clock import ClockCheck
 from adaptfault.acquisition.ordering import WINDOW, Arrivals, Frame, Ordering
 from adaptfault.acquisition.packet import (
     TICKS,
@@ -30,19 +31,22 @@ _TURNS = 8  # of the event loop for each frame fetched; each turn reads one data
 _BOUND = 10.0  # seconds of silence after which a device may send from another address
 _IDLE = 2.0  # seconds of silence after which a device may give its place to another one
 _TICK = 0.05  # seconds between checks for held packets
+_TELL = 10.0  # seconds between two lines about packets that are no packets of this array
+
+_OUTSIDE = ("devices", "lost", "restarts")  # counts of something else than datagrams
 
 
 @dataclass(frozen=True)
 class Counters:
     """Counts of all datagrams.
 
-    ``received`` is the sum of ``kept``, ``malformed``, ``oversized``, ``forged``, ``refused``,
-    ``duplicates``, ``late``, ``strays`` and ``held``.
+    ``received`` is the sum of ``kept``, ``dropped``, ``malformed``, ``oversized``, ``forged``,
+    ``refused``, ``duplicates``, ``late``, ``strays`` and ``held``.
 
     Attributes:
         received: datagrams.
-        kept: frames, in order.
-        dropped: kept frames that were not fetched in time.
+        kept: frames, in order, that were fetched or still wait for it.
+        dropped: frames that were not fetched in time.
         malformed, oversized: not packets of this array.
         forged: without the right authentication code, where a key is given.
         refused: from devices that are not listed, beyond the limit of devices, or from another
@@ -68,14 +72,17 @@ class Counters:
     restarts: int = 0
 
     def __str__(self) -> str:
-        named = {f.name: getattr(self, f.name) for f in fields(self)}
-        head = f"{named.pop('received')} received, {named.pop('kept')} kept"
-        counted = (
-            f"{count} {name.removesuffix('s') if count == 1 else name}"
-            for name, count in named.items()
-            if count
-        )
-        return ", ".join([head, *counted])
+        counts = {f.name: getattr(self, f.name) for f in fields(self)}
+        received = counts.pop("received")
+        outside = {name: counts.pop(name) for name in _OUTSIDE}
+        kept = f"{counts.pop('kept')} kept"
+        parts = [
+            kept,
+            *(f"{count} {_noun(name, count)}" for name, count in counts.items() if count),
+        ]
+        others = [f"{count} {_noun(name, count)}" for name, count in outside.items() if count]
+        text = f"{received} received = {' + '.join(parts)}"
+        return f"{text}; {', '.join(others)}" if others else text
 
     def to_dict(self) -> dict[str, int]:
         """Return a JSON-safe dict."""
@@ -107,6 +114,9 @@ class Receiver(asyncio.DatagramProtocol):
             replays.
         on_frame: called with each frame before it waits to be fetched, also where the queue
             discards it.
+        on_trouble: called with a device ("": none) and one line about packets that are malformed,
+            oversized or not authentic (the first one, then a count every 10 s), and about a clock
+            that runs in another unit than ``ticks`` states (once a device).
 
     Raises:
         ValueError: an address in ``devices`` is none.
@@ -125,12 +135,14 @@ class Receiver(asyncio.DatagramProtocol):
         window: int = WINDOW,
         key: bytes | None = None,
         on_frame: Callable[[Frame], None] | None = None,
+        on_trouble: Callable[[str, str], None] | None = None,
     ) -> None:
         self.layout = layout
         self.port = port
         self.host = host
         self.ticks = ticks
         self.on_frame = on_frame
+        self.on_trouble = on_trouble
         self.devices = None if devices is None else dict(map(_device, devices))
         self.most_devices = most_devices
         self.window = window
@@ -138,6 +150,7 @@ class Receiver(asyncio.DatagramProtocol):
         self._queue: deque[Frame] = deque(maxlen=queue)
         self._longest = longest_packet(layout.n_cells)
         self._streams: dict[str, Ordering] = {}
+        self._clocks: dict[str, ClockCheck] = {}
         self._senders: dict[
             str, tuple[str, float]
         ] = {}  # address of each device, and when it sent last
@@ -146,6 +159,9 @@ class Receiver(asyncio.DatagramProtocol):
         self._received = self._dropped = self._malformed = self._oversized = self._forged = (
             self._refused
         ) = 0
+        self._told: float | None = None  # when a packet was told that is none of this array
+        self._untold = 0  # such packets since then
+        self._last_problem = ""
         self._transport: asyncio.BaseTransport | None = None
         self._news = asyncio.Event()
         self._closed = False
@@ -160,6 +176,7 @@ class Receiver(asyncio.DatagramProtocol):
             for f in fields(Arrivals)
             if f.name != "received"
         }
+        total["kept"] -= self._dropped
         return Counters(
             received=self._received,
             dropped=self._dropped,
@@ -186,14 +203,17 @@ class Receiver(asyncio.DatagramProtocol):
         self._received += 1
         if len(data) > self._longest:
             self._oversized += 1
+            self._tell(f"{len(data)} bytes, expected {self._longest} at most", now, sender)
             return
         try:
             packet = parse_packet(data, self.layout.n_cells, ticks=self.ticks, key=self.key)
-        except NotAuthentic:
+        except NotAuthentic as error:
             self._forged += 1
+            self._tell(str(error), now, sender)
             return
-        except PacketError:
+        except PacketError as error:
             self._malformed += 1
+            self._tell(str(error), now, sender)
             return
         if self.devices is not None and self.devices.get(packet.device, "none") not in (
             None,
@@ -209,12 +229,39 @@ class Receiver(asyncio.DatagramProtocol):
             stream = self._streams[packet.device] = Ordering(
                 packet.device, self.layout.rate, window=self.window, restarts=self.key is None
             )
+            self._clocks[packet.device] = ClockCheck(self.ticks)
         bound, last = self._senders.get(packet.device, (sender, now))
         if sender != bound and now - last < _BOUND:
             self._refused += 1
             return
         self._senders[packet.device] = (sender, now)
+        problem = self._clocks[packet.device].push(packet.time, now)
+        if problem and self.on_trouble is not None:
+            self.on_trouble(packet.device, problem)
         self._put(stream.push(packet, now))
+
+    def _tell(self, problem: str, now: float, sender: str) -> None:
+        """Tell the first datagram that is no packet of this array; later ones are told together."""
+        if self.on_trouble is None:
+            return
+        self._last_problem = f"{problem}{f' (from {sender})' if sender else ''}"
+        if self._told is None:
+            self._told = now
+            self.on_trouble("", f"a packet is dropped: {self._last_problem}")
+            return
+        self._untold += 1
+        self._tell_more(now)
+
+    def _tell_more(self, now: float) -> None:
+        if not self._untold or self._told is None or now - self._told < _TELL:
+            return
+        assert self.on_trouble is not None
+        packets = "packet is" if self._untold == 1 else "packets are"
+        self.on_trouble(
+            "", f"{self._untold} more {packets} dropped, the last: {self._last_problem}"
+        )
+        self._told = now
+        self._untold = 0
 
     def _evict(self, now: float) -> bool:
         """Forget the device that has been silent longest; return whether there was one."""
@@ -222,7 +269,7 @@ class Receiver(asyncio.DatagramProtocol):
         if now - self._senders[name][1] < _IDLE:
             return False
         stream = self._streams.pop(name)
-        del self._senders[name]
+        del self._senders[name], self._clocks[name]
         self._put(stream.flush())
         for count in self._evicted:
             self._evicted[count] += getattr(stream.arrivals, count)
@@ -242,6 +289,7 @@ class Receiver(asyncio.DatagramProtocol):
         """Release packets whose waiting time for an earlier one is over."""
         for stream in self._streams.values():
             self._put(stream.overdue(now))
+        self._tell_more(now)
 
     def close(self) -> None:
         """Stop listening. Received frames can still be fetched; then the iteration ends."""
@@ -315,6 +363,10 @@ class Receiver(asyncio.DatagramProtocol):
             self._dropped += len(self._queue) == self._queue.maxlen
             self._queue.append(frame)
             self._news.set()
+
+
+def _noun(name: str, count: int) -> str:
+    return name.removesuffix("s") if count == 1 else name
 
 
 def _device(text: str) -> tuple[str, str | None]:

@@ -61,6 +61,8 @@ class Event:
         time: seconds, as in :class:`Frame`.
         text: one sentence.
         data: the content as JSON-safe values.
+        clock: local time of the receiver; None: unknown. It is printed in place of ``time``, which
+            counts from the start of the device.
     """
 
     kind: str
@@ -68,18 +70,26 @@ class Event:
     time: float
     text: str
     data: dict[str, Any] = field(default_factory=dict)
+    clock: datetime | None = None
 
     def __str__(self) -> str:
-        return f"{self.time:.1f} {self.device} {self.kind}: {self.text}"
+        if self.clock is None:
+            at = f"{self.time:.1f}"
+        else:
+            at = self.clock.strftime("%H:%M:%S")
+            at += f".{self.clock.microsecond // 100_000}"
+        return f"{at} {self.device} {self.kind}: {self.text}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
-        head = {
+        head: dict[str, Any] = {
             "schema": "adaptfault.event/1",
             "kind": self.kind,
             "device": self.device,
             "time": self.time,
         }
+        if self.clock is not None:
+            head["clock"] = self.clock.astimezone().isoformat(timespec="milliseconds")
         return {**head, "text": self.text, **self.data}
 
 
@@ -92,6 +102,8 @@ class Session:
         recorder: writes its frames; None: no recording.
         rule: when to record, see :func:`parse_when`.
         clock: returns the local time.
+        accumulate: tell the class of the whole contact so far, which the watcher accumulates, and
+            not that of the last window. Every contact is decided anew.
     """
 
     def __init__(
@@ -102,18 +114,20 @@ class Session:
         recorder: Recorder | None = None,
         rule: Rule | None = None,
         clock: Callable[[], datetime] = datetime.now,
+        accumulate: bool = False,
     ) -> None:
         self.device = device
         self.watcher = watcher
         self.recorder = recorder
         self.clock = clock
+        self.accumulate = accumulate
         self.switch = None if rule is None else Switch(rule)
         self.label: Any = None
         self.faults: tuple[Fault, ...] = ()
         self._classified = 0
         self._confirmed = self._confirm_failed = False
         self._faulty: NDArray[np.bool_] | None = None
-        self._time = 0.0
+        self.time = 0.0  # of the last frame
         self._arrived: float | None = None
         before = (
             round(_BEFORE * recorder.layout.rate) if recorder and isinstance(rule, Contact) else 0
@@ -129,7 +143,7 @@ class Session:
     def take(self, frame: Frame, now: float) -> list[Event]:
         """Process a frame that arrived at ``now`` (seconds of the receiver's clock); return its
         events."""
-        self._time = frame.time
+        self.time = frame.time
         self._arrived = now
         events = [self._event("restart", "the device restarted")] if frame.restarted else []
         if isinstance(self.watcher, Monitor):
@@ -178,10 +192,16 @@ class Session:
         self._classified += 1
         if self._classified % CONFIRMED_AFTER == 0 and not self._confirmed:
             events += self._confirm()
-        if reading.label == self.label:
+        decided, probabilities = reading.label, reading.probabilities
+        if self.accumulate:
+            probabilities = getattr(reading, "contact", None)
+            decided = None if probabilities is None else int(np.argmax(probabilities))
+        if decided == self.label:
             return events
-        self.label = reading.label
-        share = float(np.max(reading.probabilities))
+        self.label = decided
+        if decided is None:  # the contact has ended
+            return events
+        share = float(np.max(probabilities))
         label = self.label.item() if isinstance(self.label, np.generic) else self.label
         names = getattr(self.watcher, "class_names", ())
         text = f"{names[label] if names else label} ({share:.0%})"
@@ -242,4 +262,4 @@ class Session:
         return self._event("trouble", f"recording stopped: {error}")
 
     def _event(self, kind: str, text: str, **data: Any) -> Event:
-        return Event(kind, self.device, self._time, text, data)
+        return Event(kind, self.device, self.time, text, data, self.clock())

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 from adaptfault.acquisition.ordering import Frame
@@ -63,12 +64,14 @@ class Station:
         seconds, frames: when to end; None: never.
         calibration: converts received values into the layout's unit.
         on_event: called with each event in the event loop, instead of printing it.
+        accumulate: tell one class for a whole contact, see :class:`Session`; needs a bundle.
         as_json: one JSON object per line.
         quiet: no output on stderr.
 
     Raises:
-        ValueError: neither layout nor bundle, an unknown rule, a calibration of another layout, or
-            a relay that has no bundle or sends to the port it listens on.
+        ValueError: neither layout nor bundle, an unknown rule, a calibration of another layout, a
+            relay that has no bundle or sends to the port it listens on, or ``accumulate`` without a
+            bundle or with a regression.
     """
 
     def __init__(
@@ -91,6 +94,7 @@ class Station:
         frames: int | None = None,
         calibration: Calibration | None = None,
         on_event: Callable[[Event], None] | None = None,
+        accumulate: bool = False,
         as_json: bool = False,
         quiet: bool = False,
     ) -> None:
@@ -105,6 +109,9 @@ class Station:
         self.as_json = as_json
         self.quiet = quiet
         self.on_event = self._print if on_event is None else on_event
+        self.accumulate = accumulate
+        if accumulate and bundle is None:
+            raise ValueError("--accumulate needs BUNDLE: classes are accumulated over a contact")
         self._ready: list[StreamingPredictor | Monitor] = []
         if bundle is not None:
             predictor = self._predictor()
@@ -134,6 +141,7 @@ class Station:
             queue=queue,
             key=key,
             on_frame=send,
+            on_trouble=self._trouble,
         )
         self._sessions: dict[str, Session] = {}
         self._outside = 0  # readings outside the layout's range
@@ -167,6 +175,7 @@ class Station:
                     await self._take_all()
                 finally:
                     looking.cancel()
+            self.receiver.discard()  # what the number of frames left over
         finally:
             for session in self._sessions.values():
                 self._emit(session.close())
@@ -211,6 +220,11 @@ class Station:
                 self._relay.found(frame.device, session.fault_set)
             self._write_metrics(frame.device, frame.time)
 
+    def _trouble(self, device: str, text: str) -> None:
+        session = self._sessions.get(device)
+        at = 0.0 if session is None else session.time
+        self.on_event(Event("trouble", device or "station", at, text, clock=datetime.now()))
+
     def _write_metrics(self, device: str = "station", at: float = 0.0) -> None:
         """Write the metrics of all devices; a file that cannot be written does not end the
         station."""
@@ -229,7 +243,8 @@ class Station:
         try:
             write_metrics(self.metrics, robots)
         except OSError as error:
-            self.on_event(Event("trouble", device, at, f"metrics are not written: {error}"))
+            text = f"metrics are not written: {error}"
+            self.on_event(Event("trouble", device, at, text, clock=datetime.now()))
 
     def _send(self, frame: Frame) -> None:
         """Send a frame on, before it waits for monitoring and classification, which take longer."""
@@ -259,7 +274,9 @@ class Station:
             else self._predictor()
         )
         recorder = None if self.record is None else Recorder(self.record, self.layout, device)
-        session = Session(device, watcher, recorder=recorder, rule=self._rule)
+        session = Session(
+            device, watcher, recorder=recorder, rule=self._rule, accumulate=self.accumulate
+        )
         session.command(self._command)
         return session
 
@@ -274,7 +291,12 @@ class Station:
 
         assert self.bundle is not None
         try:
-            return Predictor.load(self.bundle, keys=self._keys, least_serial=self._least_serial)
+            return Predictor.load(
+                self.bundle,
+                keys=self._keys,
+                least_serial=self._least_serial,
+                accumulate=self.accumulate,
+            )
         except ImportError as error:
             raise ValueError(
                 f"{self.bundle}: classifying needs {error.name}; install it, or give no bundle"

@@ -48,7 +48,9 @@ def add(commands: Commands) -> None:
         "--port", type=int, required=True, help="UDP port; 0 takes a free one and prints it"
     )
     parser.add_argument(
-        "--host", default="127.0.0.1", help="address to listen on (default: this machine only)"
+        "--host",
+        default="127.0.0.1",
+        help="address to listen on; 0.0.0.0: the whole network (default: this machine only)",
     )
     parser.add_argument("--device", action="append", metavar="ID", help=_DEVICE)
     parser.add_argument(
@@ -56,9 +58,15 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--ticks",
-        type=float,
+        type=_ticks,
         default=1000.0,
-        help="time stamps count so many a second (default 1000: milliseconds)",
+        metavar="UNIT",
+        help="unit of the time stamps: s, ms, us, ns, or ticks a second (default ms)",
+    )
+    parser.add_argument(
+        "--accumulate",
+        action="store_true",
+        help="tell the class of a whole contact, not of each window; needs BUNDLE",
     )
     parser.add_argument("--record", metavar="FOLDER", help="record into this folder, CSV")
     parser.add_argument(
@@ -83,6 +91,17 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _ticks(text: str) -> float:
+    from adaptfault.acquisition.clock import UNITS
+
+    try:
+        return UNITS[text] if text in UNITS else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: expected {', '.join(UNITS)} or a number of ticks a second"
+        ) from None
+
+
 def _station(args: argparse.Namespace) -> Station:
     from adaptfault.acquisition import Station, read_key
     from adaptfault.data.calibration import Calibration
@@ -91,6 +110,8 @@ def _station(args: argparse.Namespace) -> Station:
         raise ValueError("--when needs --record FOLDER: it chooses when to record")
     if args.trust and not args.bundle:
         raise ValueError("--trust needs BUNDLE: its signature is checked")
+    if args.accumulate and not args.bundle:
+        raise ValueError("--accumulate needs BUNDLE: its model classifies the windows")
     if not 0 <= args.port < 65536:
         raise ValueError(f"--port {args.port}: expected 0 to 65535")
     if not 0 < args.ticks < float("inf"):
@@ -127,6 +148,7 @@ def _station(args: argparse.Namespace) -> Station:
         seconds=args.seconds,
         frames=args.frames,
         calibration=tables,
+        accumulate=args.accumulate,
         as_json=args.json,
         quiet=args.quiet,
     )

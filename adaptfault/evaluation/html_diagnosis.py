@@ -9,6 +9,7 @@ from typing import Literal
 
 from adaptfault.evaluation.html_page import Picture, render, version_of
 from diagnostics import Diagnosis
+from diagnostics.decision.grouped_faults import by_group
 
 Verdict = Literal["call", "watch", "nothing"]
 
@@ -83,7 +84,10 @@ def write_diagnosis(
         headline=headline,
         diagnosis=diagnosis,
         layout=diagnosis.layout,
-        ordered=sorted(diagnosis.faults, key=lambda fault: (fault.line is None, -len(fault.cells))),
+        ordered=sorted(
+            by_group(diagnosis.faults, diagnosis.layout),
+            key=lambda fault: (fault.line is None, -len(fault.cells)),
+        ),
         reference=reference,
         verdicts=Picture.of(diagnosis.plot),
         date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),

@@ -14,6 +14,7 @@ from adaptfault.bundle.pointer import Pointer
 from adaptfault.evaluation.html_page import Picture, render, version_of
 from adaptfault.robot.sensor_state import SensorState, unhandled_cells
 from diagnostics import Diagnosis
+from diagnostics.decision.grouped_faults import by_group
 
 if TYPE_CHECKING:
     from adaptfault.robot.maintenance_report import MaintenanceReport
@@ -62,6 +63,10 @@ def write_report(
         headline = "Watch: no fault is known, but see the reason"
     if state.exit_code == 0 and problems:
         headline = "Watch: files of the bundle are damaged"
+    unhandled = by_group(
+        [fault for fault in state.known.faults if fault in state.unhandled], bundle.layout
+    )
+    handled = [fault for fault in state.known.faults if fault not in state.unhandled]
     return render(
         path,
         "technician.html",
@@ -73,9 +78,10 @@ def write_report(
         active=state.version,
         pointer=Pointer.read(bundle.path),
         state=state,
+        unhandled=unhandled,
         ordered=sorted(
-            state.known.faults,
-            key=lambda fault: (fault not in state.unhandled, fault.line is None, -len(fault.cells)),
+            [*unhandled, *by_group(handled, bundle.layout)],
+            key=lambda fault: (fault not in unhandled, fault.line is None, -len(fault.cells)),
         ),
         diagnosis=diagnosis,
         verdicts=None if diagnosis is None else Picture.of(diagnosis.plot),

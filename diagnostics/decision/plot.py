@@ -55,6 +55,9 @@ def draw(
         ax.imshow(layout.grid(colours)[pad], cmap=palette, vmin=-0.5, vmax=3.5)
         ax.set_title(f"pad {pad}", fontsize=10)
         _ticks(ax, layout)
+        if layout.is_matrix:
+            ax.set_xlabel("column", fontsize=8)
+            ax.set_ylabel("row", fontsize=8)
         ax.set_xticks(np.arange(0.5, layout.shape[2] - 1), minor=True)
         ax.set_yticks(np.arange(0.5, layout.rows - 1), minor=True)
         ax.grid(which="minor", color="white", linewidth=min(1.5, 0.1 * cell_points))
@@ -116,15 +119,16 @@ def pads_figure(
 
     cell = _cell(layout, page)
     beside = 1.2 if scale else 0.0
-    height = layout.rows * cell + 0.7
-    width = max(layout.shape[2] * cell, 1.8) + 0.5
+    named = 0.0 if scale else 0.35  # room for the names of the axes
+    height = layout.rows * cell + 0.7 + named
+    width = max(layout.shape[2] * cell, 1.8) + 0.5 + named
     columns = max(1, min(layout.pads, int(page // width)))
     rows = -(-layout.pads // columns)
     across = max(columns * width, 3.0) + beside
     below = 0.6 if scale else 0.5 if across > _WIDE else 0.9
     figure = Figure(figsize=(across, n_rows * rows * height + below))
     # inches: the first layout lets titles stick out a little
-    figure.set_layout_engine("constrained", h_pad=0.08)
+    figure.set_layout_engine("constrained", h_pad=0.14)
     axes = figure.subplots(n_rows * rows, columns, squeeze=False).reshape(n_rows, rows * columns)
     for ax in axes[:, layout.pads :].ravel():
         ax.set_visible(False)

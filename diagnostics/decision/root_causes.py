@@ -46,6 +46,7 @@ class CellFindings:
         rests: constant cells at their baseline.
         full: constant cells at full scale, and not at their baseline.
         zero: constant cells at 0, and not at their baseline; None for sensors that rest low.
+        typical: float, reading that is told of constant cells; None: ``value``.
         intermittent, noisy, drifting: cells that move, but wrongly.
         gain: float, gain relative to the reference of cells with a changed gain; NaN: others.
         value: float, reading (not load) of constant cells, and reading to which intermittent cells
@@ -78,6 +79,7 @@ class CellFindings:
     refuted: NDArray[np.intp]
     share: Floats
     zero: Mask | None = None
+    typical: Floats | None = None
 
     def of(self, cells: NDArray[np.intp]) -> CellFindings:
         """Return the findings in the order of ``cells``."""
@@ -231,6 +233,8 @@ def _fault(
                 if value <= low
                 else FaultKind.STUCK
             )
+        if kind in (FaultKind.OPEN, FaultKind.SHORT, FaultKind.STUCK):
+            value = _middle((found.value if found.typical is None else found.typical)[seen])
     start = int(np.median(found.since[seen]))
     fault = Fault(
         kind,
@@ -247,6 +251,13 @@ def _fault(
     if cause.proven and cause.line is not None and cause.line.kind in ("row", "column"):
         fault = replace(fault, alternatives=_alternatives(fault, cause, found, layout))
     return fault
+
+
+def _middle(readings: Floats) -> float:
+    """Return the median; of whole numbers the lower one of the two in the middle, a reading."""
+    if (readings == np.rint(readings)).all():
+        return float(np.sort(readings)[(len(readings) - 1) // 2])
+    return float(np.median(readings))
 
 
 _DOING = {
@@ -306,7 +317,7 @@ def _reason(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayou
     if not cause.proven:
         few = f"{len(cause.seen)} cells on it" if len(cause.seen) > 1 else "1 cell on it"
         return (
-            f"{fault.line} may be {fault.kind}{_where(fault, cause, layout)} (P ="
+            f"{fault.line} may {_infinitive(fault.kind)}{_where(fault, cause, layout)} (P ="
             f" {fault.probability:.2f}), or only {few}, each of which {does}: one more contact"
             " along it will tell"
         )
@@ -322,14 +333,16 @@ def _reason(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayou
         )
         check = _CHECKS.get(fault.kind, "the cell and its traces for a short circuit")
         return (
-            f"{layout.place(fault.cells[0])} is {fault.kind}: it {does}{since}{whatever}{already};"
-            f" check {check}"
+            f"{layout.place(fault.cells[0])} {fault.kind.verb()}: it {does}{since}{whatever}"
+            f"{already}; check {check}"
         )
     inferred = len(cause.cells) - len(cause.seen)
     are = "is" if inferred == 1 else "are"
     if fault.line.kind in ("position", "bus", "group"):
         silent = (
-            "are silent" if found.silent[fault.cells[0]] else f"are {fault.kind}: each cell {does}"
+            "are silent"
+            if found.silent[fault.cells[0]]
+            else f"{fault.kind.verb(plural=True)}: each cell {does}"
         )
         also = f"; {inferred} of the cells, not tested, {are} inferred" if inferred else ""
         return f"{action(fault.line)}: {_behind(fault, layout)} {silent}{since}{already}{also}"
@@ -341,7 +354,13 @@ def _reason(fault: Fault, cause: Cause, found: CellFindings, layout: SensorLayou
         if of_converter
         else f"the {fault.line.kind} wire and its address"
     )
-    return f"{fault.line} is {fault.kind}{_where(fault, cause, layout)}: {seen}; check {check}"
+    return f"{fault.line} {fault.kind.verb()}{_where(fault, cause, layout)}: {seen}; check {check}"
+
+
+def _infinitive(kind: FaultKind) -> str:
+    """Return the verb as it follows "may": "be stuck"."""
+    verb = kind.verb()
+    return f"be {verb[3:]}" if verb.startswith("is ") else kind.verb(plural=True)
 
 
 def _behind(fault: Fault, layout: SensorLayout) -> str:

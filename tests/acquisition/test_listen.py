@@ -12,6 +12,7 @@ import threading
 import time
 import types
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ class Reading:
     fault_set: FaultSet = field(default_factory=lambda: FaultSet((), 6))
     events: tuple[Fault, ...] = ()
     faults: tuple[Fault, ...] = ()
+    contact: object = None
 
 
 class Scripted:
@@ -86,11 +88,30 @@ def test_only_changes_of_the_class_are_told_and_none_before_the_window_is_full()
     assert told(session, frames(7)) == [("class", 0.2), ("class", 0.4), ("class", 0.6)]
 
 
-def test_labels_of_numpy_become_json():
-    session = Session("a", Scripted([Reading(np.int64(3), np.array([0.25, 0.75]))]))
+def test_labels_of_numpy_become_json_and_lines_begin_with_the_time_of_day():
+    session = Session(
+        "a",
+        Scripted([Reading(np.int64(3), np.array([0.25, 0.75]))]),
+        clock=lambda: datetime(2026, 5, 4, 14, 3, 7, 250_000),
+    )
     (event,) = session.take(frames(1)[0], 0.0)
     assert json.loads(json.dumps(event.to_dict()))["label"] == 3
-    assert str(event) == "0.0 a class: 3 (75%)"
+    assert str(event) == "14:03:07.2 a class: 3 (75%)"
+    assert event.to_dict()["clock"].startswith("2026-05-04T14:03:07.250")
+
+
+def test_accumulated_classes_are_told_once_a_contact_and_do_not_flip():
+    cup = np.array([0.9, 0.1])
+    ball = np.array([0.2, 0.8])
+    readings = [Reading(1), Reading(1, contact=cup), Reading(0, contact=cup)]
+    readings += [Reading(1), Reading(0, contact=cup), Reading(0, contact=ball)]
+    session = Session("a", Scripted(readings), accumulate=True)
+    events = [event for one in frames(6) for event in session.take(one, one.time)]
+    assert [(round(event.time, 1), event.text) for event in events] == [
+        (0.1, "0 (90%)"),
+        (0.4, "0 (90%)"),
+        (0.5, "1 (80%)"),
+    ]
 
 
 def test_faults_are_told_when_they_come_and_when_they_go():
@@ -236,7 +257,9 @@ def test_what_is_sent_is_recorded_and_the_counters_come_last(tmp_path, listened)
         2,
         "--json",
     )
-    first, *_, last = map(json.loads, lines)
+    dropped, first, *_, last = map(json.loads, lines)
+    assert (dropped["kind"], dropped["device"]) == ("trouble", "station")
+    assert dropped["text"].startswith("a packet is dropped: 0 values after device and time stamp")
     assert (first["schema"], first["kind"]) == ("adaptfault.event/1", "recording")
     assert last["schema"] == "adaptfault.listen/1"
     assert (last["counters"]["kept"], last["counters"]["malformed"]) == (10, 2)
@@ -259,9 +282,10 @@ def test_with_a_bundle_classes_are_told(tmp_path, listened, monkeypatch):
     (tmp_path / "robot.bundle").mkdir()
     (tmp_path / "robot.bundle/bundle.json").touch()
     lines = listened(packets(np.zeros((3, 6))), "robot.bundle", "--frames", 3, "--seconds", 20)
-    assert lines[0] == "0.1 a class: cup (90%)"
-    assert lines[1] == "0.2 a class: ball (90%)"
-    assert lines[-1].startswith("end: 3 received, 3 kept")
+    time_of_day = r"\d\d:\d\d:\d\d\.\d"
+    assert re.fullmatch(rf"{time_of_day} a class: cup \(90%\)", lines[0])
+    assert re.fullmatch(rf"{time_of_day} a class: ball \(90%\)", lines[1])
+    assert lines[-1].startswith("end: 3 received = 3 kept")
     ((path, predictor),) = loaded
     assert (path, len(predictor.frames)) == ("robot.bundle", 3)
 
@@ -382,7 +406,7 @@ def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp
     assert (child.returncode, err) == (0, "")
     recorded, last = out.splitlines()
     assert "5 frames" in recorded
-    assert last == "end: 17 received, 17 kept, 1 device, 1 restart"
+    assert last == "end: 17 received = 17 kept; 1 device, 1 restart"
     recordings = load(tmp_path, layout=tmp_path / "layout.json").recordings
     first, second = (one[:, 0].tolist() for one in recordings.frames)
     assert (first[-5:], second) == ([1.0] * 5, [2.0] * 5)
@@ -439,9 +463,27 @@ def test_it_quits_while_10000_packets_a_second_arrive():
         assert child.poll() == 0, (
             f"it still runs {sent - quit_after} packets after it was told to quit"
         )
-        counted = re.fullmatch(r"end: (\d+) received, .*", child.stdout.read().splitlines()[-1])
+        counted = re.fullmatch(r"end: (\d+) received = .*", child.stdout.read().splitlines()[-1])
     assert int(counted[1]) > 0
     print(f"{sent - quit_after} packets after quit")
+
+
+def test_the_unit_of_time_stamps_is_a_word_or_a_number(listened):
+    datagrams = [b"a,12,1,1,1,1,1,1", b"a,12.5,1,1,1,1,1,1"]
+    for ticks in ("s", "1"):
+        lines = listened(
+            datagrams, "--shape", "1x2x3", "--frames", 2, "--seconds", 20, "--ticks", ticks
+        )
+        assert lines == ["end: 2 received = 2 kept; 1 device, 4 lost"]
+
+
+def test_frames_beyond_the_wanted_number_count_as_dropped(listened):
+    lines = listened(
+        packets(np.zeros((4, 6))), "--shape", "1x2x3", "--frames", 1, "--seconds", 20, "--json"
+    )
+    counters = json.loads(lines[-1])["counters"]
+    assert counters["kept"] == 1
+    assert counters["received"] == 1 + counters["dropped"]
 
 
 @pytest.mark.parametrize(
@@ -457,6 +499,7 @@ def test_it_quits_while_10000_packets_a_second_arrive():
         (["--port", "0", "--record", "{tmp}/file/new"], "Not a directory"),
         (["--port", "0", "--host", "256.1.1.1", "--seconds", "1"], ""),
         (["--port", "0", "--ticks", "0"], "--ticks 0"),
+        (["--port", "0", "--accumulate"], "--accumulate needs BUNDLE"),
         (["--port", "0", "--frames", "0"], "--frames 0"),
         (["--port", "0", "--record", ""], "--record '': name a folder"),
         (["", "--port", "0"], ": expected a bundle"),

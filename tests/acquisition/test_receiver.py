@@ -173,7 +173,7 @@ def test_invented_names_do_not_lock_a_device_out():
 def test_a_device_that_sends_is_not_evicted():
     arrivals = [("robot", i / 10, "10.0.0.1", i / 10) for i in range(600)]
     arrivals += [(f"invented{i}", 0.0, "10.0.0.66", i / 10 + 0.05) for i in range(600)]
-    receiver, _ = offered(sorted(arrivals, key=lambda one: one[3]))
+    receiver, _ = offered(sorted(arrivals, key=lambda one: one[3]), queue=1200)
     assert receiver.arrivals["robot"].kept == 600
     assert receiver.counters.received == 1200 == receiver.counters.kept + receiver.counters.refused
 
@@ -239,7 +239,7 @@ def test_a_station_that_is_told_to_quit_drops_what_it_has_no_time_for(monkeypatc
 
 def test_when_nobody_fetches_the_oldest_frames_go_and_are_counted():
     receiver, frames = taken(packets(300), queue=100)
-    assert (receiver.counters.dropped, receiver.counters.kept) == (200, 300)
+    assert (receiver.counters.dropped, receiver.counters.kept) == (200, 100)
     assert [round(frame.time * 1000) for frame in frames] == list(range(200, 300))
 
 
@@ -307,6 +307,30 @@ def test_a_port_in_use_is_an_os_error_and_nothing_is_left_open():
 def test_counters_print_only_what_happened():
     assert (
         str(Counters(received=5, kept=4, malformed=1, devices=1))
-        == "5 received, 4 kept, 1 malformed, 1 device"
+        == "5 received = 4 kept + 1 malformed; 1 device"
     )
     assert Counters().to_dict()["received"] == 0
+
+
+def test_packets_that_are_dropped_are_told_when_they_come_and_then_counted_every_10_s():
+    heard = []
+    receiver = Receiver(SMALL, on_trouble=lambda device, text: heard.append((device, text)))
+    for i in range(250):
+        receiver.take(b"a,1,2", i / 10, "10.0.0.7")
+    receiver.poll(40.0)
+    expected = "1 values after device and time stamp, expected 6 (from 10.0.0.7)"
+    assert heard == [
+        ("", f"a packet is dropped: {expected}"),
+        ("", f"100 more packets are dropped, the last: {expected}"),
+        ("", f"100 more packets are dropped, the last: {expected}"),
+        ("", f"49 more packets are dropped, the last: {expected}"),
+    ]
+    assert receiver.counters.malformed == 250
+
+
+def test_the_counts_of_the_last_line_add_up_where_frames_were_dropped():
+    receiver, _ = taken([*packets(300), b"garbage", b"a" * 60000, *packets(1)], queue=100)
+    text = str(receiver.counters)
+    total, _, parts = text.partition(";")[0].partition(" received = ")
+    assert int(total) == sum(int(part.split()[0]) for part in parts.split(" + ")) == 303
+    assert "100 kept + 200 dropped + 1 malformed + 1 oversized" in text

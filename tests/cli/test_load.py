@@ -246,3 +246,25 @@ def test_a_bundle_keeps_the_direction_and_maintains_by_it(tmp_path, capsys, smal
     assert diagnosis.layout == layout
     assert {14, 17, 42} <= set(diagnosis.fault_set)
     assert "row" not in str(diagnosis).split("tested")[-1]
+
+
+@pytest.mark.parametrize("rest", ["low", "high"])
+def test_a_cell_that_holds_a_count_is_told_with_the_count_that_it_reads_mostly(
+    healthy, later_grasps, small_grasps, rest
+):
+    """Three counts of the run are lower by 3, as where a cell settles: the middle is no reading."""
+    most = 1023
+    layout = replace(small_grasps.layout, rest=rest, full_scale=float(most), unit="count")
+
+    def counts(frames):
+        loads = np.rint(np.asarray(frames, np.float64) / FULL * most)
+        return most - loads if rest == "high" else loads
+
+    with without_calibration():
+        fitted = SelfDiagnosis(layout).fit([counts(frames) for frames in healthy])
+    log = counts(np.concatenate(later_grasps))
+    log[:, 27] = 40
+    log[:3, 27] = 37
+    fault = next(fault for fault in fitted.diagnose([log]).faults if 27 in fault.cells)
+    assert fault.value == 40.0
+    assert "reads 40 count" in fault.reason

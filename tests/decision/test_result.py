@@ -49,7 +49,17 @@ def test_the_map_wraps_wide_pads_and_its_legend_explains_the_letters():
 
 
 @pytest.mark.parametrize(
-    "shape", [(1, 10, 10), (2, 13, 6), (5, 1, 12), (1, 2, 3), (2, 33, 15), (1, 64, 64), (1, 40, 4)]
+    "shape",
+    [
+        (1, 10, 10),
+        (2, 13, 6),
+        (5, 1, 12),
+        (1, 2, 3),
+        (2, 33, 15),
+        (1, 64, 64),
+        (1, 40, 4),
+        (2, 4, 5),
+    ],
 )
 def test_nothing_on_the_map_is_cut_off_or_covered(shape):
     layout = SensorLayout(*shape)
@@ -227,3 +237,13 @@ def test_the_map_has_a_letter_for_every_kind_of_fault():
     letters = {diagnosed(Fault(kind, (1,))).map().splitlines()[1].split()[2] for kind in FaultKind}
     assert len(letters) == len(FaultKind)
     assert not letters & {".", "?"}
+
+
+def test_the_axes_of_the_map_are_named_and_the_page_says_from_where_they_count(tmp_path):
+    of = diagnosed(ROW)
+    names = {(ax.get_xlabel(), ax.get_ylabel()) for ax in of.plot().axes if ax.get_visible()}
+    assert names == {("column", "row")}
+    page = write_diagnosis(tmp_path / "page.html", of, name="log", reference=True).read_text()
+    assert page.count("Pads, rows and columns count from 0.") == 1
+    bus = SensorLayout(2, 4, 5, wiring="bus")
+    assert {ax.get_xlabel() for ax in diagnosed(layout=bus).plot().axes} == {""}

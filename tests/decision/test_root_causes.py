@@ -296,3 +296,35 @@ def test_a_wire_broken_in_the_reference_is_named_and_a_later_one_includes_cells_
     assert (fault.line, fault.cells) == (Line(0, "row", 3), tuple(on.tolist()))
     assert "already" not in fault.reason
     assert "; 1 more, not tested, is inferred" in fault.reason
+
+
+@pytest.mark.parametrize(
+    ("cells", "said"),
+    [([7], "pad 0, row 1, column 1 drifts: it moves"), (row(1, 5), "pad 1, row 5 drifts: each of")],
+)
+def test_the_verb_of_a_sentence_fits_the_kind(cells, said):
+    (fault,) = causes(moving(HEALTHY, "drifting", cells))
+    assert fault.reason.startswith(said)
+    copied = replace(moving(HEALTHY, "noisy", [8]), noisy=NONE, refuted=np.where(at([8]), 3, -1))
+    (copy,) = causes(replace(copied, value=np.where(at([8]), 9.0, np.nan)))
+    assert copy.reason.startswith("pad 0, row 1, column 2 is a copy: it repeats pad 0")
+    for kind in FaultKind:
+        assert kind.verb().split()[0] in ("is", "drifts", "reads")
+        assert kind.verb(plural=True).split()[0] in ("are", "drift", "read")
+
+
+def test_a_wire_that_possibly_drifts_may_drift():
+    cells = at(row(0, 3)[2:])
+    found = replace(HEALTHY, alive=~cells, drifting=cells, weight=np.where(cells, 3.02, 0.0))
+    _, (possible,) = root_causes(found, (), LAYOUT)
+    assert "pad 0, row 3 may drift from column 2 on" in possible.reason
+
+
+def test_a_stuck_wire_in_whole_counts_is_told_with_a_reading_and_not_with_a_mean():
+    cells = row(0, 2)
+    found = dead(HEALTHY, cells, 2.0)
+    counts = np.full(CELLS, np.nan)
+    counts[cells] = [2, 3, 2, 3, 2, 3]
+    (fault,) = causes(replace(found, typical=counts))
+    assert (fault.kind, fault.value) == (FaultKind.STUCK, 2.0)
+    assert "reads 2 N" in fault.reason

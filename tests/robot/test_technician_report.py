@@ -46,6 +46,7 @@ def test_the_commands_of_a_bundles_life(bundle, log, capsys, tmp_path):
         first,
     )
     assert "pad 1, row 2 is short" in page.read_text()
+    assert page.read_text().count("Pads, rows and columns count from 0.") == 1
 
     code, out = told(capsys, "history", bundle.path)
     assert (

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,22 @@ _VERBS = {
 }
 
 
+KindName = Literal[
+    "open",
+    "short",
+    "stuck",
+    "alias",
+    "intermittent",
+    "noisy",
+    "drift",
+    "floating",
+    "late",
+    "copy",
+    "clamped",
+    "weak",
+]
+
+
 @dataclass(frozen=True)
 class Fault:
     """One root cause: a cell, or every cell behind one broken wire.
@@ -94,6 +110,22 @@ class Fault:
     reason: str = field(default="", kw_only=True)
     evidence: int | None = field(default=None, kw_only=True)
     alternatives: tuple[str, ...] = field(default=(), kw_only=True)
+
+    if TYPE_CHECKING:  # what it takes, beside what it holds
+
+        def __init__(
+            self,
+            kind: FaultKind | KindName,
+            cells: Iterable[int],
+            *,
+            line: Line | None = None,
+            value: float | None = None,
+            onset: int | None = None,
+            probability: float | None = None,
+            reason: str = "",
+            evidence: int | None = None,
+            alternatives: tuple[str, ...] = (),
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kind", FaultKind(self.kind))

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from itertools import combinations
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -122,6 +123,9 @@ class WorstFaults:
         return figure
 
 
+_MANY = 4  # forecasts, of which the time left is told
+
+
 def worst_faults(
     adapter: Adapter, *, among: int = 5, say: Callable[[str], None] = lambda text: None
 ) -> WorstFaults:
@@ -149,7 +153,12 @@ def worst_faults(
 
     def ranked(sets: Iterable[tuple[str, Iterable[int]]]) -> tuple[Loss, ...]:
         losses = []
-        for what, cells in sets:
+        every = list(sets)
+        began = monotonic()
+        for done, (what, cells) in enumerate(every):
+            if done in (1, len(every) // 2) and len(every) >= _MANY:
+                left = (monotonic() - began) / done * (len(every) - done)
+                say(f"{done} of {len(every)}, about {left:.0f} s left")
             faults = FaultSet(tuple(sorted(set(cells))), layout.n_cells)
             if 0 < len(faults) < len(index):
                 stages = adapter.forecast(faults).stages

@@ -132,7 +132,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"adaptfault {args.command}: error: not enough memory ({error})", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
-        print(f"adaptfault {args.command}: interrupted", file=sys.stderr)
+        further = "; run the same command to continue" if getattr(args, "continues", False) else ""
+        print(f"adaptfault {args.command}: interrupted{further}", file=sys.stderr)
         return 130
     except (
         Exception

@@ -43,11 +43,13 @@ def add(commands: Commands) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Predict; the probabilities or values of a recording are the mean over its windows."""
+    """Predict; the probabilities of a recording are those of
+    :func:`adaptfault.evaluation.scores.of_recording`, its values the mean over its windows."""
     import numpy as np
 
     from adaptfault.cli.trained_model import TrainedModel
     from adaptfault.data.windows import make_windows
+    from adaptfault.evaluation.scores import of_recording
 
     trained = TrainedModel.open(args, args.model or args.bundle)
     if args.calibration is None and trained.calibration is not None:
@@ -66,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     results = []
     for i, name in enumerate(recordings.names):
         own = probabilities[windows.recording == i]
-        mean = own.mean(axis=0) if len(own) else None
+        mean = of_recording(own) if len(own) else None
         results.append(
             {
                 "recording": name,

@@ -57,7 +57,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--out", default="adaptfault-paper", metavar="FOLDER", help="default adaptfault-paper"
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, continues=True)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -100,7 +100,7 @@ def add(commands: Commands) -> None:
     )
     add_sign(parser, "X.bundle")
     add_device(parser)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, continues=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -230,11 +230,32 @@ def _trained(
         seed=args.seed,
         repairable=args.repairable,
         checkpoint=checkpoint,
+        on_epoch=_epoch_line(args, training, units),
         progress=progress(args),
     )
     if units is not None:
         units.fold(model)
     return history
+
+
+def _epoch_line(
+    args: argparse.Namespace, training: Windows, units: ValueUnits | None
+) -> Callable[[History], None] | None:
+    """Return what tells each epoch on stderr where no bar is shown; None on a terminal."""
+    if sys.stderr.isatty() or args.quiet:
+        return None
+    from adaptfault.evaluation.scores import chance
+
+    guess = "" if units is not None else f" (guessing reaches {chance(training.y)[0]:.3f})"
+    measure = "R2" if units is not None else "accuracy"
+
+    def told(history: History) -> None:
+        done = history.epochs
+        left = sum(history.seconds) / done * (args.epochs - done)
+        reached = f"validation {measure} {history.validation_accuracy[-1]:.3f}"
+        say(args, f"epoch {done} of {args.epochs}: {reached}{guess}, about {left:.0f} s left")
+
+    return told
 
 
 def _units(args: argparse.Namespace, names: Sequence[str], training: Windows) -> ValueUnits:

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import softmax
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 
 from adaptfault.data.determination import r2
@@ -187,8 +188,7 @@ class ValueScores:
 
 
 def recording_scores(probabilities: ArrayLike, windows: Windows) -> Scores:
-    """Score one decision for each recording: the class with the largest product of its windows'
-    probabilities.
+    """Score one decision for each recording, that of :func:`of_recording`.
 
     Args:
         probabilities: ``[N, n_classes]`` of the windows.
@@ -201,11 +201,25 @@ def recording_scores(probabilities: ArrayLike, windows: Windows) -> Scores:
         ValueError: as :meth:`Scores.of`.
     """
     p = np.asarray(probabilities, dtype=np.float64)
-    logs = np.log(np.maximum(p, np.finfo(np.float32).tiny))
-    _, first, inverse = np.unique(windows.recording, return_index=True, return_inverse=True)
-    summed = np.zeros((len(first), p.shape[1]))
-    np.add.at(summed, inverse, logs)
-    return Scores.of(windows.y[first], summed.argmax(axis=1), n_classes=p.shape[1])
+    numbers, first = np.unique(windows.recording, return_index=True)
+    decided = [of_recording(p[windows.recording == number]).argmax() for number in numbers]
+    return Scores.of(windows.y[first], decided, n_classes=p.shape[1])
+
+
+def of_recording(probabilities: ArrayLike) -> NDArray[np.float64]:
+    """Return the probabilities of the classes for a whole recording, ``[n_classes]``: the geometric
+    mean over its windows, of sum 1.
+
+    The class with the largest is that of the product of the windows. As probabilities they are
+    cautious: windows of one recording count as one.
+
+    Args:
+        probabilities: of its windows, ``[N, n_classes]``, at least one.
+    """
+    p = np.asarray(probabilities, dtype=np.float64)
+    logs = np.log(np.maximum(p, np.finfo(np.float32).tiny)).mean(axis=0)
+    whole: NDArray[np.float64] = softmax(logs)
+    return whole
 
 
 def chance(y: ArrayLike) -> tuple[float, float]:

@@ -1,5 +1,6 @@
 import copy
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -348,7 +349,9 @@ def test_the_worst_wires_and_pads_are_listed_and_mapped(adapter, tmp_path):
     few = Adapter(
         adapter.model, adapter.train.select(slice(0, 60)), adapter.validation.select(slice(0, 60))
     )
-    worst = worst_faults(few, among=2)
+    said: list[str] = []
+    worst = worst_faults(few, among=2, say=said.append)
+    assert any(re.fullmatch(r"1 of \d+, about \d+ s left", text) for text in said)
     assert [len(part) for part in (worst.wires, worst.pairs, worst.pads)] == [16, 1, 2]
     for part in (worst.wires, worst.pairs, worst.pads):
         reached = [loss.expected.likelihood for loss in part]

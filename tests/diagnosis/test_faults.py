@@ -1,7 +1,10 @@
+from typing import get_args
+
 import numpy as np
 import pytest
 
 from diagnostics import Fault, FaultKind, FaultSet, Line
+from diagnostics.faults import KindName
 
 
 def test_fault_kinds_are_strings():
@@ -53,3 +56,7 @@ def test_a_fault_survives_json():
     assert Fault.from_dict(fault.to_dict()) == fault
     with pytest.raises(ValueError, match="at least one cell"):
         Fault(FaultKind.OPEN, ())
+
+
+def test_every_kind_may_be_given_by_its_name():
+    assert set(get_args(KindName)) == {str(kind) for kind in FaultKind}

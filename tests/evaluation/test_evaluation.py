@@ -149,7 +149,7 @@ def test_the_prediction_interval_of_perfect_validation_still_has_a_width():
 
 
 def test_a_recording_is_decided_by_all_its_windows():
-    from adaptfault.evaluation.scores import recording_scores
+    from adaptfault.evaluation.scores import of_recording, recording_scores
 
     likely = np.array([[0.6, 0.4], [0.1, 0.9], [0.6, 0.4], [0.9, 0.1]])
     windows = Windows(
@@ -157,3 +157,7 @@ def test_a_recording_is_decided_by_all_its_windows():
     )
     scores = recording_scores(likely, windows)
     assert (scores.accuracy, scores.n) == (1.0, 2)
+    whole = of_recording(likely[:3])
+    assert whole.sum() == pytest.approx(1)
+    assert whole.argmax() == likely[:3].prod(axis=0).argmax()
+    np.testing.assert_allclose(of_recording(likely[:1]), likely[0])  # one window is itself

@@ -379,6 +379,55 @@ def test_json_lines_of_lists_are_read_and_a_wrong_line_is_named(tmp_path):
         load(tmp_path / "c.jsonl")
 
 
+# nothing in it, or something else
+
+
+@pytest.mark.parametrize(
+    ("info", "rows", "message"),
+    [
+        ("{", None, "is not JSON"),
+        ({"fps": 3}, None, "lists no features"),
+        ({"features": {"tactile": {"dtype": "float32", "shape": ["a"]}}}, None, "--key"),
+        ({"features": {"tactile": {"dtype": "float32", "shape": [4]}}}, None, "holds no data"),
+        ({"features": {"tactile": {"dtype": "float32", "shape": [4]}}}, [], "holds no frames"),
+    ],
+)
+def test_a_lerobot_folder_with_something_else_in_it_says_so(tmp_path, info, rows, message):
+    (tmp_path / "meta").mkdir()
+    text = info if isinstance(info, str) else json.dumps(info)
+    (tmp_path / "meta/info.json").write_text(text)
+    if rows is not None:
+        (tmp_path / "data").mkdir()
+        kind = pa.list_(pa.float32())
+        table = pa.table(
+            {"tactile": pa.array(rows, kind), "episode_index": pa.array([], pa.int64())}
+        )
+        pq.write_table(table, tmp_path / "data/file.parquet")
+    with pytest.raises(InputError, match=message) as told:
+        load(tmp_path)
+    assert len(str(told.value).splitlines()) == 1
+
+
+def test_empty_files_say_that_they_hold_no_frames(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["tactile"] = np.zeros((0, 4))
+    empty = pa.table({"tactile": pa.array([], pa.list_(pa.float32()))})
+    pq.write_table(empty, tmp_path / "a.parquet")
+    for name in ("a.h5", "a.parquet"):
+        with pytest.raises(InputError, match=f"{name}: holds no frames"):
+            load(tmp_path / name)
+
+
+def test_links_that_lead_nowhere_do_no_harm(tmp_path):
+    (touch,) = episodes(n=1)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["tactile"] = touch
+        file["soft"] = h5py.SoftLink("/nowhere")
+        file["outside"] = h5py.ExternalLink("gone.h5", "/a")
+        file["loop"] = h5py.SoftLink("/")
+    check(tmp_path / "a.h5", [touch], (1, *GRID))
+
+
 # which features, and where their readings go
 
 

@@ -114,6 +114,8 @@ def recordings_of(
         pads = Pads.of(sizes, shape)
         facts = _facts(path, contents, names, pads)
         parts = list(_parts(path, contents, episodes, ends, outer=outer))
+        if not any(part.last > part.first for part in parts):
+            raise InputError.at(path, "holds no frames; record it again or remove it")
 
     def blocks(part: _Part) -> Callable[[], Iterator[Block]]:
         return lambda: _blocks(path, opened, part, pads)

@@ -71,12 +71,16 @@ def open(
     recordings = []
     for file in files:
         recordings += list(_episodes(path, file, facts, names, pads, tasks))
+    if not recordings:
+        raise InputError.at(path, "holds no frames; record it again or remove it")
     return recordings
 
 
 def _sizes(about: Mapping[str, Any]) -> Sizes:
     shape = about.get("shape", ())
-    return tuple(int(size) for size in shape) if isinstance(shape, list | tuple) else ()
+    if not isinstance(shape, list) or not all(isinstance(size, int) for size in shape):
+        return ()
+    return tuple(shape)
 
 
 def _episodes(

@@ -54,6 +54,8 @@ def open(
     pads = Pads.of(sizes, shape)
     counts = all(table.whole[name] for name in names)
     facts = Facts(path, counts=counts, shape=pads.shape, present=pads.present)
+    if not sum(table.group_rows):
+        raise InputError.at(path, "holds no frames; record it again or remove it")
     return [
         Recording(facts, blocks_of(table, rows, names, pads), f"{path.name}, {called}", label)
         if called
@@ -129,6 +131,8 @@ class Table:
         number = first_of(EPISODES, self.columns)
         label = first_of(LABELS, self.columns)
         rows = sum(self.group_rows)
+        if not rows:
+            return
         classes = None if label is None else self.column(label)
         if number is None:
             yield None, None if classes is None else _most(classes), (0, rows)

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from adaptfault.adaptation.prediction_sets import PredictionSets
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
 from adaptfault.data.windows import Windows
 from adaptfault.evaluation.scores import Scores, ValueScores
@@ -22,6 +21,7 @@ from adaptfault.models.any_model import network_from_config
 from adaptfault.models.builders import ModelNotAllowed
 from adaptfault.models.heads import Head
 from adaptfault.models.network import logits_of
+from adaptfault.models.prediction_sets import PredictionSets
 from adaptfault.models.store import (
     ADAPTATION,
     SCHEMA,
@@ -151,7 +151,7 @@ class Adaptation:
         """Return for each window the set of classes that holds its true one with probability
         1 - ``alpha``, bool ``[N, n_classes]``.
 
-        :mod:`adaptfault.adaptation.prediction_sets` describes the method and what it assumes. A
+        :mod:`adaptfault.models.prediction_sets` describes the method and what it assumes. A
         robot that acts on sets of a single class only is right about as often as stated; a set of
         several classes, or of none, says that the window does not decide.
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.models.accumulation import ContactStatistics
+from adaptfault.models.prediction_sets import PredictionSets
 from adaptfault.models.store import ADAPTATION, read_attached, read_manifest
 from diagnostics import FaultSet, SensorLayout
 
@@ -36,6 +37,7 @@ class Inference:
         fault_set: F; the readings of its cells cannot reach the output, not even NaN or infinity.
         runtime: "onnx" or "torch".
         contact: for decisions about whole contacts.
+        sets: for sets of classes; None: stored without.
     """
 
     def __init__(
@@ -48,7 +50,9 @@ class Inference:
         n_classes: int,
         contact: ContactStatistics | None = None,
         task: Literal["classification", "regression"] = "classification",
+        sets: PredictionSets | None = None,
     ) -> None:
+        self.sets = sets
         self.contact = ContactStatistics.unknown(layout.n_cells) if contact is None else contact
         self._run = run
         self.runtime = runtime
@@ -87,6 +91,8 @@ class Inference:
             n_classes = int(network["n_classes"])
             stored = manifest.get("contact")
             contact = None if stored is None else ContactStatistics.from_dict(stored)
+            kept = manifest.get("sets")
+            sets = None if kept is None else PredictionSets.from_dict(kept)
             task = manifest.get("task", "classification")
             if task not in ("classification", "regression"):
                 raise ValueError(f"unknown task {task!r}")
@@ -100,7 +106,21 @@ class Inference:
                 f"{folder} has no ONNX file: add one with add_onnx, or run it on torch"
             )
         run = _on_onnx(folder, manifest) if runtime == "onnx" else _on_torch(folder)
-        return cls(run, runtime, layout, fault_set, length, n_classes, contact, task)
+        return cls(run, runtime, layout, fault_set, length, n_classes, contact, task, sets)
+
+    def prediction_sets(self, x: NDArray[Any], alpha: float = 0.1) -> NDArray[np.bool_]:
+        """Return for each window ``[N, T, D]`` the set of classes that holds its true one with
+        probability 1 - ``alpha``, bool ``[N, n_classes]``
+        (:mod:`adaptfault.models.prediction_sets`).
+
+        Raises:
+            ValueError: windows of another shape, an ``alpha`` that is no share, a regression, or an
+                adaptation that was stored without validation.
+        """
+        likely = self.predict_proba(x)
+        if self.sets is None:
+            raise ValueError("sets of classes need validation windows, which were not stored here")
+        return self.sets.sets(likely, alpha)
 
     def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
         """Return the probability of each class for windows ``[N, T, D]`` on the 0..1 scale,

@@ -194,6 +194,12 @@ class Predictor:
         self._keep_up()
         return self._running.model.predict_proba(self._rewired(_finite(x)))
 
+    def prediction_sets(self, x: NDArray[Any], alpha: float = 0.1) -> NDArray[np.bool_]:
+        """Return the sets of classes of windows ``[N, T, D]``, as
+        :meth:`~adaptfault.prediction.inference.Inference.prediction_sets`."""
+        self._keep_up()
+        return self._running.model.prediction_sets(self._rewired(_finite(x)), alpha)
+
     def stream(self, frame: ArrayLike, time: float | None = None) -> Reading:
         """Process one frame and predict from the window that ends with it.
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from conftest import DROPPED, SMALL, small_windows
 
+from adaptfault.adaptation.result import Adaptation
 from adaptfault.prediction.inference import Inference, open_session
 
 WITHOUT_TORCH = """
@@ -49,6 +50,22 @@ def test_both_runtimes_say_the_same(versions, name):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-5)
         assert here.predict(x).tolist() == one.argmax(axis=1).tolist()
         assert here.predict(x).dtype == np.int64
+
+
+@pytest.mark.parametrize("runtime", ["onnx", "torch"])
+def test_sets_of_classes_are_those_of_the_adaptation(versions, runtime):
+    if runtime == "onnx":
+        pytest.importorskip("onnxruntime")
+    x = small_windows(9)
+    adaptation = Adaptation.load(versions["head"])
+    inference = Inference.load(versions["head"], runtime=runtime)
+    sets = inference.prediction_sets(x, alpha=0.2)
+    threshold = adaptation.conformal.threshold(0.2)
+    likely = inference.predict_proba(x)
+    np.testing.assert_array_equal(sets, 1 - likely.astype(float) <= threshold)
+    inference.sets = None
+    with pytest.raises(ValueError, match="need validation windows"):
+        inference.prediction_sets(x)
 
 
 def test_onnx_runtime_does_without_torch(versions, tmp_path):

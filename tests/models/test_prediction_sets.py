@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adaptfault.adaptation.prediction_sets import PredictionSets
+from adaptfault.models.prediction_sets import PredictionSets
 
 
 def drawn(rng: np.random.Generator, recordings: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from adaptfault.cli.inspecting import (
-    healthy_recordings,
-    inspected,
-    reasons_of,
-    reference_bundle,
-    text_of,
-)
+from adaptfault.cli.inspecting import add_reference, inspect_log, text_of, write_page
 from adaptfault.cli.options import (
     Commands,
     add_cache,
@@ -22,11 +17,8 @@ from adaptfault.cli.options import (
     add_untested_code,
     command,
     emit,
-    fit_diagnoser,
-    load_recordings,
-    open_reported,
-    report_inferred,
     report_range,
+    summary_of,
 )
 
 if TYPE_CHECKING:
@@ -49,12 +41,7 @@ def add(commands: Commands) -> None:
     )
     add_recordings(parser)
     given = parser.add_mutually_exclusive_group()
-    given.add_argument(
-        "--reference",
-        nargs="+",
-        metavar="FILE",
-        help="fault-free recordings of the same array, or a bundle",
-    )
+    add_reference(given)
     given.add_argument(
         "--healthy",
         metavar="FIRST:LAST",
@@ -78,20 +65,13 @@ def run(args: argparse.Namespace) -> int:
     """Check a data set; the exit code says how bad it is."""
     from adaptfault.inspection.severity import worst
 
-    bundle = reference_bundle(args)
-    healthy = load_recordings(args, args.reference) if args.reference and bundle is None else None
-    known = bundle.diagnoser() if bundle is not None else healthy
-    log = open_reported(args, args.recordings, None if known is None else known.layout)
-    report_inferred(args, log.inferred)
-    if args.healthy is not None:
-        healthy = _part(args.healthy, log)
-    diagnoser = None if bundle is None else bundle.diagnoser()
-    if healthy is not None:
-        diagnoser = fit_diagnoser(args, healthy)
-    inspection = inspected(args, log, diagnoser, bundle, healthy_recordings(bundle, healthy))
+    part = None if args.healthy is None else partial(_part, args.healthy)
+    inspected = inspect_log(args, part)
+    log = inspected.log
     report_range(log)
+    inspection = inspected.inspection
     checked = _checked(args, log, inspection)
-    reasons = reasons_of(inspection.diagnosis, inspection.findings, bundle, args.untested_code)
+    reasons = inspected.reasons(args.untested_code)
     code = max(worst(reasons), 1 if checked.harms else 0)
     notes = [reason.text for reason in reasons if reason.text] + list(checked.remarks)
     _write(args, log, checked, code, notes)
@@ -118,16 +98,9 @@ def _part(text: str, log: Opened) -> Recordings:
 
 
 def _checked(args: argparse.Namespace, log: Opened, inspection: Inspection) -> DataSetCheck:
-    from collections import Counter
-
-    from adaptfault.data.summary import summarise
     from adaptfault.inspection.data_set import DataSetCheck, starts_and_tares
 
-    classes = {}
-    if log.labels is not None:
-        counts = Counter(log.labels.tolist())
-        classes = {name: counts[i] for i, name in enumerate(log.class_names)}
-    summary = summarise(log.pieces(), log.layout, lengths=log.lengths, classes=classes)
+    summary = summary_of(log)
     begun, tared = starts_and_tares(lambda: iter(log), log.names, log.layout)
     return DataSetCheck(inspection, summary, log.clock, getattr(args, "left_out", 0), begun, tared)
 
@@ -143,11 +116,8 @@ def _write(
     if args.badge:
         atomic_write(args.badge, checked.badge().encode())
     if args.html:
-        from adaptfault.evaluation.html_diagnosis import write_diagnosis
-
-        name = ", ".join(args.recordings)
         compared = bool(args.reference or args.healthy)
-        write_diagnosis(args.html, diagnosis, name=name, reference=compared, code=code, notes=notes)
+        write_page(args, diagnosis, code, notes, compared=compared)
     if args.write_valid:
         from adaptfault.data.recordings.valid import valid_masks, write_valid
 

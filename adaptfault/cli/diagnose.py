@@ -6,13 +6,7 @@ import argparse
 import json
 from typing import TYPE_CHECKING
 
-from adaptfault.cli.inspecting import (
-    healthy_recordings,
-    inspected,
-    reasons_of,
-    reference_bundle,
-    text_of,
-)
+from adaptfault.cli.inspecting import add_reference, inspect_log, text_of, write_page
 from adaptfault.cli.options import (
     Commands,
     add_cache,
@@ -21,10 +15,6 @@ from adaptfault.cli.options import (
     add_untested_code,
     command,
     emit,
-    fit_diagnoser,
-    load_recordings,
-    open_reported,
-    report_inferred,
     report_range,
 )
 
@@ -49,12 +39,7 @@ def add(commands: Commands) -> None:
         commands, "diagnose", "find the faulty cells and wires in a log of recordings", _EXAMPLE
     )
     add_recordings(parser, labels=False)
-    parser.add_argument(
-        "--reference",
-        nargs="+",
-        metavar="FILE",
-        help="fault-free recordings of the same array, or a bundle",
-    )
+    add_reference(parser)
     parser.add_argument("--out", metavar="FILE", help="write the diagnosis as JSON")
     parser.add_argument("--picture", metavar="FILE", help="write the verdict map as PNG")
     parser.add_argument("--html", metavar="FILE", help="write the technician's page")
@@ -70,26 +55,18 @@ def run(args: argparse.Namespace) -> int:
 
     from adaptfault.inspection.severity import worst
 
-    bundle = reference_bundle(args)
-    healthy = load_recordings(args, args.reference) if args.reference and bundle is None else None
-    diagnoser = None if bundle is None else bundle.diagnoser()
-    known = diagnoser or healthy
-    log = open_reported(args, args.recordings, None if known is None else known.layout)
-    report_inferred(args, log.inferred)
-    if healthy is not None:  # fitted once the log is known to be of the same array
-        diagnoser = fit_diagnoser(args, healthy)
-    inspection = inspected(args, log, diagnoser, bundle, healthy_recordings(bundle, healthy))
-    report_range(log)
+    inspected = inspect_log(args)
+    report_range(inspected.log)
+    inspection = inspected.inspection
     diagnosis = inspection.diagnosis
-    findings = inspection.findings
-    reasons = reasons_of(diagnosis, findings, bundle, args.untested_code)
+    reasons = inspected.reasons(args.untested_code)
     code = worst(reasons)
     notes = [reason.text for reason in reasons if reason.text]
     _write(args, diagnosis, code, notes)
     found = {
         **diagnosis.to_dict(),
         **inspection.told,
-        "findings": [asdict(finding) for finding in findings],
+        "findings": [asdict(finding) for finding in inspection.findings],
     }
     emit(args, found, "\n".join([text_of(diagnosis), *notes]))
     return code
@@ -105,10 +82,4 @@ def _write(args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: lis
     if args.picture:
         diagnosis.plot().savefig(args.picture, dpi=150)
     if args.html:
-        from adaptfault.evaluation.html_diagnosis import write_diagnosis
-
-        name = ", ".join(args.recordings)
-        reference = bool(args.reference)
-        write_diagnosis(
-            args.html, diagnosis, name=name, reference=reference, code=code, notes=notes
-        )
+        write_page(args, diagnosis, code, notes, compared=bool(args.reference))

@@ -11,6 +11,7 @@ from adaptfault.cli.options import (
     emit,
     open_reported,
     report_range,
+    summary_of,
 )
 
 _EXAMPLE = """  adaptfault info grasps.npz --picture grasps.png
@@ -39,22 +40,8 @@ def add(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the summary."""
-    from collections import Counter
-
-    from adaptfault.data.summary import summarise
-
     opened = open_reported(args, args.recordings)
-    classes = {}
-    if opened.labels is not None:
-        counts = Counter(opened.labels.tolist())
-        classes = {name: counts[i] for i, name in enumerate(opened.class_names)}
-    summary = summarise(
-        opened.pieces(),
-        opened.layout,
-        lengths=opened.lengths,
-        classes=classes,
-        inferred=opened.inferred,
-    )
+    summary = summary_of(opened, opened.inferred)
     report_range(opened)
     if args.write_layout:
         from adaptfault.data.recordings.facts.layout_file import write_layout

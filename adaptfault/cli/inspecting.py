@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from adaptfault.cli.options import check_scale, fitting_bar, say
+from adaptfault.cli.options import (
+    check_scale,
+    fit_diagnoser,
+    fitting_bar,
+    load_recordings,
+    open_reported,
+    report_inferred,
+    say,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,7 +31,67 @@ _TOLD_BY_THE_DIAGNOSIS = ("static_load", "frozen", "lost_frames")
 _ROWS = 24
 
 
-def inspected(
+@dataclass(frozen=True, eq=False)
+class InspectedLog:
+    """A log, what was found in it, and the bundle that it was inspected with."""
+
+    log: Opened
+    inspection: Inspection
+    bundle: Bundle | None
+
+    def reasons(self, untested_code: int) -> list[Reason]:
+        """Return why somebody has to act; ``untested_code``: severity of a log that tests
+        nothing."""
+        diagnosis = self.inspection.diagnosis
+        return _reasons(diagnosis, self.inspection.findings, self.bundle, untested_code)
+
+
+def add_reference(group: Any) -> None:
+    """Add the option of what a log is compared with to a parser or a group of options."""
+    group.add_argument(
+        "--reference",
+        nargs="+",
+        metavar="FILE",
+        help="fault-free recordings of the same array, or a bundle",
+    )
+
+
+def inspect_log(
+    args: argparse.Namespace, part: Callable[[Opened], Recordings] | None = None
+) -> InspectedLog:
+    """Open a log and inspect it, with the reference that the options state.
+
+    Args:
+        args: the options of :func:`~adaptfault.cli.options.add_recordings`,
+            :func:`add_reference`, :func:`~adaptfault.cli.options.add_cache` and
+            :func:`~adaptfault.cli.options.add_trust`.
+        part: returns the recordings of the log that are healthy, in place of a reference.
+    """
+    bundle = _bundle(args)
+    healthy = load_recordings(args, args.reference) if args.reference and bundle is None else None
+    diagnoser = None if bundle is None else bundle.diagnoser()
+    known = diagnoser or healthy
+    log = open_reported(args, args.recordings, None if known is None else known.layout)
+    report_inferred(args, log.inferred)
+    if part is not None:
+        healthy = part(log)
+    if healthy is not None:  # fitted once the log is known to be of the same array
+        diagnoser = fit_diagnoser(args, healthy)
+    inspection = _inspected(args, log, diagnoser, bundle, _healthy(bundle, healthy))
+    return InspectedLog(log, inspection, bundle)
+
+
+def write_page(
+    args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: list[str], *, compared: bool
+) -> None:
+    """Write the page that ``--html`` asks for; it says what the exit code and the notes say."""
+    from adaptfault.evaluation.html_diagnosis import write_diagnosis
+
+    name = ", ".join(args.recordings)
+    write_diagnosis(args.html, diagnosis, name=name, reference=compared, code=code, notes=notes)
+
+
+def _inspected(
     args: argparse.Namespace,
     log: Opened,
     diagnoser: SelfDiagnosis | None,
@@ -50,9 +119,7 @@ def inspected(
         )
 
 
-def healthy_recordings(
-    bundle: Bundle | None, recordings: Recordings | None
-) -> list[NDArray[Any]] | None:
+def _healthy(bundle: Bundle | None, recordings: Recordings | None) -> list[NDArray[Any]] | None:
     """Return the healthy recordings that were given, else those of a bundle; None without
     either."""
     from adaptfault.data.windows import recordings_of
@@ -64,7 +131,7 @@ def healthy_recordings(
     )
 
 
-def reference_bundle(args: argparse.Namespace) -> Bundle | None:
+def _bundle(args: argparse.Namespace) -> Bundle | None:
     """Return the bundle that is given as reference; None for recordings, and without a
     reference."""
     from adaptfault.cli.trained_model import open_bundle
@@ -76,7 +143,7 @@ def reference_bundle(args: argparse.Namespace) -> Bundle | None:
     return None
 
 
-def reasons_of(
+def _reasons(
     diagnosis: Diagnosis, findings: Sequence[Finding], bundle: Bundle | None, untested_code: int
 ) -> list[Reason]:
     """Return why somebody has to act, in the order of the findings; without text what the diagnosis

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from adaptfault.data.recordings import Loaded, Opened, Problem, Recordings
+    from adaptfault.data.summary import Summary
     from diagnostics import Diagnosis, FaultSet, SelfDiagnosis, SensorLayout
 
 Commands = Any  # argparse's private type of subparsers
@@ -325,6 +326,25 @@ def open_reported(
         )
     _report(args, opened.problems)
     return opened
+
+
+def summary_of(opened: Opened, inferred: Sequence[str] = ()) -> Summary:
+    """Return what recordings hold, ``inferred`` facts of the array included."""
+    from collections import Counter
+
+    from adaptfault.data.summary import summarise
+
+    classes = {}
+    if opened.labels is not None:
+        counts = Counter(opened.labels.tolist())
+        classes = {name: counts[i] for i, name in enumerate(opened.class_names)}
+    return summarise(
+        opened.pieces(),
+        opened.layout,
+        lengths=opened.lengths,
+        classes=classes,
+        inferred=tuple(inferred),
+    )
 
 
 def report_range(opened: Opened) -> None:

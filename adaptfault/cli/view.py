@@ -7,12 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from adaptfault.cli.inspecting import (
-    healthy_recordings,
-    inspected,
-    reasons_of,
-    reference_bundle,
-)
+from adaptfault.cli.inspecting import add_reference, inspect_log
 from adaptfault.cli.options import (
     Commands,
     add_cache,
@@ -20,11 +15,8 @@ from adaptfault.cli.options import (
     add_trust,
     command,
     emit,
-    fit_diagnoser,
-    load_recordings,
     open_reported,
     read_diagnosis,
-    report_inferred,
     report_range,
     say,
 )
@@ -55,12 +47,7 @@ def add(commands: Commands) -> None:
     add_recordings(parser, labels=False)
     given = parser.add_mutually_exclusive_group()
     given.add_argument("--bundle", metavar="BUNDLE", help="the robot's bundle, to diagnose with")
-    given.add_argument(
-        "--reference",
-        nargs="+",
-        metavar="FILE",
-        help="fault-free recordings of the same array, or a bundle",
-    )
+    add_reference(given)
     given.add_argument(
         "--diagnosis", metavar="FILE", help="a diagnosis written by adaptfault diagnose --out"
     )
@@ -134,14 +121,6 @@ def _diagnosed(
         return log, diagnosis, None, []
     if args.bundle is not None:
         args.reference = [args.bundle]
-    bundle = reference_bundle(args)
-    healthy = load_recordings(args, args.reference) if args.reference and bundle is None else None
-    diagnoser = None if bundle is None else bundle.diagnoser()
-    known = diagnoser or healthy
-    log = open_reported(args, args.recordings, None if known is None else known.layout)
-    report_inferred(args, log.inferred)
-    if healthy is not None:
-        diagnoser = fit_diagnoser(args, healthy)
-    inspection = inspected(args, log, diagnoser, bundle, healthy_recordings(bundle, healthy))
-    reasons = reasons_of(inspection.diagnosis, inspection.findings, bundle, 0)
-    return log, inspection.diagnosis, bundle, [reason.text for reason in reasons if reason.text]
+    inspected = inspect_log(args)
+    notes = [reason.text for reason in inspected.reasons(0) if reason.text]
+    return inspected.log, inspected.inspection.diagnosis, inspected.bundle, notes

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +38,12 @@ def open(
         InputError: h5py is not installed, the file is damaged or being written, or the arrays are
             not clear.
     """
-    return recordings_of(path, lambda: opened(path), shape=shape, key=key)
+    return recordings_of(path, partial(opened, path), shape=shape, key=key)
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Contents]:
-    """Open a file for reading.
+def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]:
+    """Open a file for reading; ``names``: of the arrays that are wanted, None: all it holds.
 
     Raises:
         InputError: as :func:`open`.
@@ -55,6 +56,9 @@ def opened(path: Path) -> Iterator[Contents]:
         what = f"is no HDF5 file, is cut off, or is being written ({reason})"
         raise InputError.at(path, f"{what}; close the writer, or copy it again") from None
     with file:
+        if names is not None:
+            yield Contents({name: _array(file[name]) for name in names}, {}, {})
+            return
         arrays: dict[str, Array] = {}
         texts: dict[str, list[str]] = {}
         attributes = {"": dict(file.attrs)}
@@ -65,12 +69,18 @@ def opened(path: Path) -> Iterator[Contents]:
             if not isinstance(found, h5py.Dataset) or not found.shape:
                 return
             if found.dtype.kind in "iuf":
-                arrays[name] = Reversed(found) if _MATLAB in found.attrs else found
+                arrays[name] = _array(found)
             elif found.dtype.kind in "OS" and found.ndim == 1:
                 texts[name] = [_text(value) for value in found[:]]
 
         file.visititems(add)
         yield Contents(arrays, attributes, texts)
+
+
+def _array(stored: Any) -> Array:
+    """Return an array of a file, with its axes as its writer saw them."""
+    array: Array = Reversed(stored) if _MATLAB in stored.attrs else stored
+    return array
 
 
 def _text(value: Any) -> str:

@@ -72,7 +72,8 @@ class Contents:
     texts: Mapping[str, Sequence[str]]
 
 
-Opened = Callable[[], AbstractContextManager[Contents]]
+Opened = Callable[[Sequence[str] | None], AbstractContextManager[Contents]]
+"""Opens a file, and returns all that it holds, or the arrays of some names alone."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ def recordings_of(
     Raises:
         InputError: no array of touch, or several that could be meant.
     """
-    with opened() as contents:
+    with opened(None) as contents:
         arrays = contents.arrays
         ends = next((name for name in arrays if _last(name) in _ENDS), None)
         listed = {name: tuple(array.shape[1:]) for name, array in arrays.items() if name != ends}
@@ -169,25 +170,27 @@ def _parts(
     *,
     outer: bool,
 ) -> Iterator[_Part]:
+    labels = _labels(contents)
     for episode, names in episodes:
         length = min(int(contents.arrays[name].shape[0]) for name in names)
         beside = _beside(contents.arrays, names[0], _CLOCKS, length)
-        labels = _labels(contents, names[0])
         if outer:
             frames = int(contents.arrays[names[0]].shape[1])
             for i in range(length):
                 label = labels[i] if len(labels) == length else None
-                yield _Part(tuple(names), 0, frames, None, i, label)
+                yield _Part(tuple(names), 0, frames, outer=i, label=label)
             continue
         if ends is None:
             own = _attribute(contents, names[0], LABELS)
             label = str(own) if own is not None else (labels[0] if len(labels) == 1 else None)
-            yield _Part(tuple(names), 0, length, beside, None, label, _called(path, episode))
+            name = _called(path, episode)
+            yield _Part(tuple(names), 0, length, beside, label=label, name=name)
             continue
         bounds = _bounds(path, contents, ends, length)
         for i, (first, last) in enumerate(bounds):
             label = labels[i] if len(labels) == len(bounds) else None
-            yield _Part(tuple(names), first, last, beside, None, label, f"{path.name}, episode {i}")
+            name = _called(path, f"episode {i}")
+            yield _Part(tuple(names), first, last, beside, label=label, name=name)
 
 
 def _called(path: Path, episode: str) -> str | None:
@@ -222,8 +225,8 @@ def _beside(
     return None
 
 
-def _labels(contents: Contents, name: str) -> list[str]:
-    """Return the labels of recordings that an array beside the readings holds."""
+def _labels(contents: Contents) -> list[str]:
+    """Return the labels of recordings that an array of the file holds."""
     for other, texts in contents.texts.items():
         if _last(other) in LABELS:
             return list(texts)
@@ -268,11 +271,14 @@ def _positive(value: Any) -> float | None:
 
 
 def _blocks(path: Path, opened: Opened, part: _Part, pads: Pads) -> Iterator[Block]:
-    with opened() as contents:
+    wanted = [*part.names, *([] if part.clock is None else [part.clock])]
+    with opened(wanted) as contents:
         arrays: list[Any] = [contents.arrays[name] for name in part.names]
         if part.outer is not None:
             arrays = [arrays[0][part.outer : part.outer + 1][0]]
-        clock = None if part.clock is None else contents.arrays[part.clock]
+        # times of rows are none of frames
+        has_times = part.clock is not None and pads.steps == 1
+        clock = contents.arrays[str(part.clock)] if has_times else None
         for first in range(part.first, part.last, BLOCK):
             last = min(first + BLOCK, part.last)
             where = f"{part.name or part.names[0]}, frames {first} to {last - 1}"
@@ -285,8 +291,6 @@ def _blocks(path: Path, opened: Opened, part: _Part, pads: Pads) -> Iterator[Blo
                 raise InputError.at(path, what, where) from None
             if any(len(value) != last - first for value in values):
                 raise InputError.at(path, "is cut off", where)
-            if times is not None and pads.steps > 1:
-                times = None  # of rows, not of frames
             yield Block(
                 _numbers(pads.frames(values)), None, None if times is None else times.ravel()
             )

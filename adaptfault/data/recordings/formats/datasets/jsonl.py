@@ -6,6 +6,7 @@ from __future__ import annotations
 import builtins
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,35 +45,62 @@ def open(
     Raises:
         InputError: the file holds no frame, a line is no JSON, or the fields are not clear.
     """
-    episodes: list[Any] = []
-    labels: list[str | None] = []
-    first: dict[str, Any] | None = None
-    for _, line in _lines(path):
-        if first is None:
-            first = line
-        number = line.get(first_of(EPISODES, list(line)) or "")
-        if not episodes or number != episodes[-1]:
-            episodes.append(number)
-            label = line.get(first_of(LABELS, list(line)) or "")
-            labels.append(None if label is None else str(label))
-    if first is None:
-        raise InputError.at(path, "holds no frames; record it again or remove it")
+    problems: list[Problem] = []
+    parts, first = _parts(path, problems)
     fields = {name: _sizes(value) for name, value in first.items()}
     numbers = {name: sizes for name, sizes in fields.items() if sizes is not None}
     names = choose(path, numbers, key)
     sizes = [numbers[name] for name in names]
     pads = Pads.of(sizes, shape)
-    facts = Facts(path, shape=pads.shape, present=pads.present, problems=_cut_off(path))
+    facts = Facts(path, shape=pads.shape, present=pads.present, problems=tuple(problems))
 
-    def blocks(turn: int) -> Callable[[], Iterator[Block]]:
-        return lambda: _blocks(path, names, sizes, pads, turn)
+    def blocks(part: _Part) -> Callable[[], Iterator[Block]]:
+        return lambda: _blocks(path, names, sizes, pads, part)
 
-    return [
-        Recording(
-            facts, blocks(turn), None if number is None else f"{path.name}, episode {number}", label
-        )
-        for turn, (number, label) in enumerate(zip(episodes, labels, strict=True))
+    return [Recording(facts, blocks(part), part.name, part.label) for part in parts]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A line of a file: its number, from 1, and the byte at which it begins."""
+
+    number: int = 1
+    byte: int = 0
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The lines of one recording, which begin at ``first`` and end before ``end``; None: the last
+    one."""
+
+    name: str | None
+    label: str | None
+    first: _Place
+    end: _Place | None
+
+
+def _parts(path: Path, problems: list[Problem]) -> tuple[list[_Part], dict[str, Any]]:
+    """Return the recordings of a file, and its first line.
+
+    Raises:
+        InputError: it holds no frame, or a line is no JSON.
+    """
+    begins: list[tuple[Any, str | None, _Place]] = []
+    first: dict[str, Any] = {}
+    for place, line in _lines(path, _Place(), problems):
+        first = first or line
+        number = line.get(first_of(EPISODES, list(line)) or "")
+        if not begins or number != begins[-1][0]:
+            label = line.get(first_of(LABELS, list(line)) or "")
+            begins.append((number, None if label is None else str(label), place))
+    if not begins:
+        raise InputError.at(path, "holds no frames; record it again or remove it")
+    ends = [*(place for _, _, place in begins[1:]), None]
+    parts = [
+        _Part(None if number is None else f"{path.name}, episode {number}", label, place, end)
+        for (number, label, place), end in zip(begins, ends, strict=True)
     ]
+    return parts, first
 
 
 def _sizes(value: Any) -> Sizes | None:
@@ -84,16 +112,26 @@ def _sizes(value: Any) -> Sizes | None:
     return array.shape if not isinstance(value, str) else None
 
 
-def _lines(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield number and content of each line; a last one that was cut off is left out."""
-    with builtins.open(path, encoding="utf-8-sig", errors="replace") as file:
-        for number, text in enumerate(file, 1):
+def _lines(
+    path: Path, begin: _Place, problems: list[Problem]
+) -> Iterator[tuple[_Place, dict[str, Any]]]:
+    """Yield place and content of each line from ``begin`` on; a last one that was cut off is left
+    out, with a warning in ``problems``."""
+    with builtins.open(path, "rb") as file:
+        file.seek(begin.byte)
+        byte = begin.byte
+        for number, data in enumerate(file, begin.number):
+            place = _Place(number, byte)
+            byte += len(data)
+            text = data.decode("utf-8-sig", "replace")
             if not text.strip():
                 continue
             try:
                 line = json.loads(text)
             except (ValueError, RecursionError):
                 if not text.endswith("\n") and number > 1:
+                    what = "the last line is cut off: the lines before it are kept"
+                    problems.append(Problem("warning", located(path, what)))
                     return
                 raise InputError.at(path, "is no JSON; correct it", f"line {number}") from None
             if isinstance(line, list):
@@ -101,39 +139,21 @@ def _lines(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
             if not isinstance(line, dict):
                 what = "expected an object or a list of readings"
                 raise InputError.at(path, what, f"line {number}")
-            yield number, line
-
-
-def _cut_off(path: Path) -> tuple[Problem, ...]:
-    with builtins.open(path, "rb") as file:
-        lines = file.read().rstrip(b"\r\n").rpartition(b"\n")
-    try:
-        json.loads(lines[2])
-    except (ValueError, RecursionError):
-        what = "the last line is cut off: the lines before it are kept"
-        return (Problem("warning", located(path, what)),)
-    return ()
+            yield place, line
 
 
 def _blocks(
-    path: Path, names: list[str], sizes: list[Sizes], pads: Pads, turn: int
+    path: Path, names: list[str], sizes: list[Sizes], pads: Pads, part: _Part
 ) -> Iterator[Block]:
-    episode: Any = None
-    at = -1
     held: list[tuple[int, list[Any], Any]] = []
     clock: str | None = None
     tick: str | None = None
-    for number, line in _lines(path):
-        this = line.get(first_of(EPISODES, list(line)) or "")
-        if at < 0 or this != episode:
-            at += 1
-            episode = this
-            clock, tick = clock_of(list(line))
-        if at > turn:
+    for place, line in _lines(path, part.first, []):
+        if part.end is not None and place.byte >= part.end.byte:
             break
-        if at < turn:
-            continue
-        held.append((number, [line.get(name) for name in names], line.get(clock or "")))
+        if place == part.first:
+            clock, tick = clock_of(list(line))
+        held.append((place.number, [line.get(name) for name in names], line.get(clock or "")))
         if len(held) == BLOCK:
             yield _block(path, held, sizes, names, pads, tick)
             held = []

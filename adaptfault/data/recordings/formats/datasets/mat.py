@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +50,11 @@ def open(
     if head.startswith(_HDF5) or head[_HEADER:].startswith(_HDF5):
         return hdf5.open(path, shape=shape, key=key)
     _read.cache_clear()  # the file may have changed since
-    return recordings_of(path, lambda: _opened(path), shape=shape, key=key)
+    return recordings_of(path, partial(_opened, path), shape=shape, key=key)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Contents]:
+def _opened(path: Path, names: Sequence[str] | None) -> Iterator[Contents]:
     yield _read(path)
 
 

@@ -6,7 +6,9 @@ A column of lists holds a pad, or each column of numbers a cell. A column ``epis
 
 from __future__ import annotations
 
+import builtins
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -57,9 +59,12 @@ def open(
     if not sum(table.group_rows):
         raise InputError.at(path, "holds no frames; record it again or remove it")
     return [
-        Recording(facts, blocks_of(table, rows, names, pads), f"{path.name}, {called}", label)
-        if called
-        else Recording(facts, blocks_of(table, rows, names, pads), None, label)
+        Recording(
+            facts,
+            blocks_of(table, rows, names, pads),
+            None if called is None else f"{path.name}, {called}",
+            label,
+        )
         for called, label, rows in table.episodes()
     ]
 
@@ -89,8 +94,6 @@ class Table:
         Raises:
             InputError: it is damaged.
         """
-        import builtins
-
         parquet = imported("pyarrow.parquet", path)
         types = imported("pyarrow.types", path)
         sizes: dict[str, Sizes] = {}
@@ -185,8 +188,8 @@ def _first(opened: Any, name: str) -> Sizes:
 
 def _most(classes: NDArray[Any]) -> str | None:
     """Return the most frequent class."""
-    known = [str(value) for value in classes.tolist() if value is not None]
-    return max(sorted(set(known)), key=known.count) if known else None
+    counts = Counter(str(value) for value in classes.tolist() if value is not None)
+    return max(sorted(counts), key=counts.__getitem__, default=None)
 
 
 def blocks_of(
@@ -227,8 +230,6 @@ def _blocks(
 @lru_cache(maxsize=2)
 def _group(path: Path, group: int, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Return the columns of a row group; the last ones stay in memory: episodes share them."""
-    import builtins
-
     parquet = imported("pyarrow.parquet", path)
     try:
         with builtins.open(path, "rb") as file:

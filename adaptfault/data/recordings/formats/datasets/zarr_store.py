@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +39,11 @@ def open(
     Raises:
         InputError: zarr is not installed, the store is damaged, or the arrays are not clear.
     """
-    return recordings_of(path, lambda: _opened(path), shape=shape, key=key)
+    return recordings_of(path, partial(_opened, path), shape=shape, key=key)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Contents]:
+def _opened(path: Path, names: Sequence[str] | None) -> Iterator[Contents]:
     zarr = imported("zarr", path)
     archive = None
     try:
@@ -50,7 +51,12 @@ def _opened(path: Path) -> Iterator[Contents]:
         store = path if archive is None else archive
         root = zarr.open(store, mode="r")
         is_group = isinstance(root, zarr.Group)
-        members = dict(root.members(max_depth=None)) if is_group else {path.stem: root}
+        if not is_group:
+            members = {path.stem: root}
+        elif names is not None:
+            members = {name: root[name] for name in names}
+        else:
+            members = dict(root.members(max_depth=None))
         arrays = {
             name: member
             for name, member in members.items()

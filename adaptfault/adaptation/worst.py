@@ -152,6 +152,7 @@ def worst_faults(
     }
 
     def ranked(sets: Iterable[tuple[str, Iterable[int]]]) -> tuple[Loss, ...]:
+        """Return the losses by faults, the worst first."""
         losses = []
         every = list(sets)
         began = monotonic()

@@ -16,7 +16,7 @@ contact.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -109,11 +109,7 @@ class DataSetCheck:
             "severity": self.severity,
             "healthy_share": self.healthy_share,
             "remarks": list(self.remarks),
-            "clock": {
-                "jitter": self.clock.jitter,
-                "lost": self.clock.lost,
-                "falls": self.clock.falls,
-            },
+            "clock": asdict(self.clock),
             "left_out": self.left_out,
             "begin_in_contact": list(self.begin_in_contact),
             "tared_in_contact": list(self.tared_in_contact),

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.atomic import atomic_write
+from adaptfault.data.atomic import atomic_file
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.formats.datasets.extra import imported
 from diagnostics import Fault, SensorLayout
@@ -68,21 +68,18 @@ def write_valid(
 
 
 def _npz(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayout) -> None:
-    import io
-
     every = list(masks)
     lengths = np.array([len(mask) for mask in every])
     padded = np.zeros((len(every), int(lengths.max()), layout.n_cells), dtype=bool)
     for i, mask in enumerate(every):
         padded[i, : len(mask)] = mask
-    buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        valid=padded.reshape(*padded.shape[:2], *layout.shape),
-        lengths=lengths,
-        names=np.array(names, dtype=np.str_),
-    )
-    atomic_write(path, buffer.getvalue())
+    with atomic_file(path) as name, name.open("wb") as file:
+        np.savez_compressed(
+            file,
+            valid=padded.reshape(*padded.shape[:2], *layout.shape),
+            lengths=lengths,
+            names=np.array(names, dtype=np.str_),
+        )
 
 
 def _parquet(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayout) -> None:
@@ -95,7 +92,7 @@ def _parquet(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayou
         [("episode_index", pa.int64()), ("frame_index", pa.int64())]
         + [(name, kinds) for name in pads]
     )
-    with parquet.ParquetWriter(path, schema) as writer:
+    with atomic_file(path) as place, parquet.ParquetWriter(place, schema) as writer:
         for episode, mask in enumerate(masks):
             by_pad = np.split(mask, layout.pads, axis=1)
             columns = [pa.array(np.full(len(mask), episode)), pa.array(np.arange(len(mask)))]
@@ -117,7 +114,7 @@ def _zarr(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayout) 
 
 def _hdf5(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayout) -> None:
     h5py = imported("h5py", path)
-    with h5py.File(path, "w") as file:
+    with atomic_file(path) as place, h5py.File(place, "w") as file:
         for episode, (mask, name) in enumerate(zip(masks, names, strict=True)):
             group = file.create_group(f"episode_{episode}")
             group.attrs["name"] = name

@@ -125,10 +125,14 @@ class Elapsed:
         rates = [per_tick * ticks for ticks in TICKS.values()]
         return next((_rounded(rate) for rate in rates if _SLOWEST <= rate <= _FASTEST), None)
 
+    def _pooled(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return all rises between times that differ, and how many frames have the earlier one."""
+        steps = np.concatenate([np.empty(0), *self._steps])
+        return steps, np.concatenate([np.empty(0), *self._shared])
+
     def clock(self) -> Clock:
         """Return how regular the times are."""
-        steps = np.concatenate([np.empty(0), *self._steps])
-        shared = np.concatenate([np.empty(0), *self._shared])
+        steps, shared = self._pooled()
         if not len(steps):
             return Clock(None, 0, self.falls)
         with np.errstate(all="ignore"):  # a time may be anything that a file can hold
@@ -143,8 +147,7 @@ class Elapsed:
 
     def _per_tick(self) -> float | None:
         """Return frames a tick."""
-        steps = np.concatenate([np.empty(0), *self._steps])
-        shared = np.concatenate([np.empty(0), *self._shared])
+        steps, shared = self._pooled()
         if not len(steps):
             return None
         period = float(np.median(steps / shared))

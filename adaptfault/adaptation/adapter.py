@@ -65,9 +65,9 @@ class Adapter(FaultFreeModel):
                 front end included, in rounds that each end with a new head. "scratch": a new
                 network is trained on the healthy cells, the paper's protocol. "auto": fill; head,
                 if it improves validation beyond the noise; finetune, if a budget is given and the
-                head keeps less than 99 % of the healthy accuracy. With F empty, "fill" and "auto"
-                are the fault-free model, bit for bit;
-                :attr:`healthy` is that model with as good a head as a repair gets.
+                head keeps less than 99 % of the healthy accuracy. With F empty, "fill" is the
+                fault-free model, bit for bit, and "auto" is :attr:`healthy`, that model with as
+                good a head as a repair gets.
             budget: seconds for the stages after the fill; a stage that does not fit is left out.
                 None: until validation stops improving.
             seed: of training.
@@ -78,7 +78,8 @@ class Adapter(FaultFreeModel):
                 of cells, or no healthy cell left.
         """
         fault_set = self.check(fault_set, method)
-        method = "fill" if method == "auto" and not len(fault_set) else method
+        if method == "auto" and not len(fault_set):
+            return self.healthy
         return Run(
             self, fault_set, budget, seed, progress, lambda: self.fault_free_accuracy
         ).execute(method)

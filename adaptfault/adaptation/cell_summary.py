@@ -1,5 +1,5 @@
-"""Two summaries of the healthy cells of a window, for kernels: each cell by itself, and cells with
-their neighbours."""
+"""Summaries of the healthy cells of a window: each cell by itself, cells with their neighbours, and
+the course of each cell over time."""
 
 from __future__ import annotations
 
@@ -10,15 +10,18 @@ from torch.nn import functional as F
 
 from diagnostics import FaultSet, SensorLayout
 
+COURSE = 5  # numbers of a cell's course
 _REACH = 3  # cells on each side that smoothing with a Gaussian of standard deviation 1 uses
 
 
 class CellSummary(nn.Module):
     """Maps windows of the healthy cells to what does not depend on imputation.
 
-    A summary holds the roots of the mean and the maximum over time. The root stabilises the
-    variance: it raises the weight of light contact. A window that is shifted by a cell is far from
-    the original in the readings of the cells, but near to it after smoothing.
+    The first two, for kernels, hold the roots of the mean and the maximum over time. The root
+    stabilises the variance: it raises the weight of light contact. A window that is shifted by a
+    cell is far from the original in the readings of the cells, but near to it after smoothing. The
+    third, for trees, is the course of each cell: mean, maximum, minimum, standard deviation and
+    mean step from frame to frame, which texture and noise raise.
 
     Args:
         layout: the array.
@@ -49,9 +52,9 @@ class CellSummary(nn.Module):
         ):
             self.register_buffer(name, values, persistent=False)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Map windows ``[N, T, D-k]`` to ``[N, 2 H]`` of the H healthy cells, and
-        ``[N, 2 (P + pads)]``.
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Map windows ``[N, T, D-k]`` to ``[N, 2 H]`` of the H healthy cells,
+        ``[N, 2 (P + pads)]``, and ``[N, 5 H]`` in double precision.
 
         The second summary has the readings of all P positions of the array, smoothed with a
         Gaussian of one cell (dead cells count as 0), and the sum of each pad.
@@ -64,9 +67,19 @@ class CellSummary(nn.Module):
         smooth = F.conv2d(along_rows, self.weights.view(1, 1, -1, 1), padding=(_REACH, 0))
         totals = grid.sum((2, 3)).reshape(n, t, self.pads)
         smooth = smooth.reshape(n, t, self.pads * self.rows * self.cols)[..., self.present]
-        return _over_time(x[..., self.seen]), _over_time(torch.cat([smooth, totals], dim=2))
+        seen = x[..., self.seen]
+        return _over_time(seen), _over_time(torch.cat([smooth, totals], dim=2)), _course(seen)
 
 
 def _over_time(x: Tensor) -> Tensor:
     """Map ``[N, T, p]`` to ``[N, 2 p]``: the roots of mean and maximum."""
     return torch.cat([x.mean(1), x.amax(1)], dim=1).clamp_min(0.0).sqrt()
+
+
+def _course(x: Tensor) -> Tensor:
+    """Map ``[N, T, p]`` to ``[N, 5 p]``: mean, maximum, minimum, standard deviation, mean step."""
+    x = x.double()
+    mean = x.mean(1)
+    spread = (x - mean[:, None]).square().mean(1).sqrt()
+    steps = (x[:, 1:] - x[:, :-1]).abs().sum(1) / max(1, x.shape[1] - 1)
+    return torch.cat([mean, x.amax(1), x.amin(1), spread, steps], dim=1)

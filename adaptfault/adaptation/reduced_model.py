@@ -64,16 +64,18 @@ class ReducedModel(nn.Module):
             )
         return x if self.front is None else self.front(x)
 
-    def views(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def views(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Map windows of the healthy cells ``[N, T, D-k]`` to the input of a head.
 
         Returns:
-            The features of the network ``[N, p]``, both results of
-            :class:`~adaptfault.adaptation.cell_summary.CellSummary`, and the
-            :class:`~adaptfault.adaptation.contact_moments.ContactMoments` of the whole windows.
+            The features of the network ``[N, p]``, the first two results of
+            :class:`~adaptfault.adaptation.cell_summary.CellSummary`, the
+            :class:`~adaptfault.adaptation.contact_moments.ContactMoments` of the whole windows, and
+            the third summary, the course of each cell.
         """
         whole = self.complete(x)
-        return self.network.features(whole), *self.summary(x), self.moments(whole)
+        cells, smooth, course = self.summary(x)
+        return self.network.features(whole), cells, smooth, self.moments(whole), course
 
     def forward(self, x: Tensor) -> Tensor:
         """Map windows of the healthy cells ``[N, T, D-k]``, scaled to 0..1, to logits

@@ -22,6 +22,7 @@ from adaptfault.data.determination import explained
 from adaptfault.data.windows import Windows, evenly
 from adaptfault.models.any_model import device_of
 from adaptfault.models.compact import CompactNetwork
+from adaptfault.models.forest import fit_forest
 from adaptfault.models.heads import (
     MOST_WINDOWS,
     Head,
@@ -31,7 +32,7 @@ from adaptfault.models.heads import (
     log_likelihood,
 )
 from adaptfault.models.history import History
-from adaptfault.models.network import as_tensor, logits_of
+from adaptfault.models.network import TactileTransformer, as_tensor, logits_of
 from adaptfault.models.training import train
 from adaptfault.models.value_units import ValueUnits, foldable
 from diagnostics import FaultSet
@@ -160,6 +161,8 @@ class Run:
     def scratch(self) -> None:
         """Train a new network behind the linear front end, as the paper does for each F."""
         fresh = self.fault_free.fresh(self.seed + 1).to(self.device)
+        if isinstance(fresh, TactileTransformer):
+            fresh.standardise(self.fault_free.train.x)
         self.reduced = self._behind(self.fault_free.imputation.linear(self.fault_set), fresh)
         self.stages.clear()
         began = time.perf_counter()
@@ -279,9 +282,20 @@ class Run:
         held_targets: NDArray[np.float32],
         folds: NDArray[np.int64],
         whole: Tensor | None,
+        *,
+        forest: bool = True,
     ) -> tuple[Head, Tensor]:
         values = self.fault_free.task == "regression"
-        return fit_head(first, second, targets, held_targets, folds, whole=whole, values=values)
+        return fit_head(
+            first,
+            second,
+            targets,
+            held_targets,
+            folds,
+            whole=whole,
+            values=values,
+            forest=forest,
+        )
 
     def _whole(self, *parts: Windows) -> Tensor | None:
         """Return the moments of windows with all cells, those of F included; None if F is empty."""
@@ -334,9 +348,15 @@ class Run:
         second = [v[:held] for v in known]
         whole = self._whole(self.fault_free.train.select(slice(0, _BATCH)))
         whole = None if whole is None else whole[torch.arange(m) % len(few)].roll(-held, 0)
-        self._fit(first, second, targets[held:], targets[:held], np.arange(m) % _FOLDS, whole)
-        fit = (time.perf_counter() - began) * (n / m) ** 2.5  # between distances (2) and solves (3)
-        return bool(pace * n + fit > self.left())
+        folds = np.arange(m) % _FOLDS
+        parts = (first, second, targets[held:], targets[:held], folds, whole)
+        self._fit(*parts, forest=False)
+        kernels = (time.perf_counter() - began) * (n / m) ** 2.5  # distances (2) and solves (3)
+        began = time.perf_counter()
+        values = self.fault_free.task == "regression"
+        fit_forest(known[-1].cpu().numpy(), targets, folds[:held], values=values)
+        trees = (time.perf_counter() - began) * (n / m) ** 1.2  # n log n
+        return bool(pace * n + kernels + trees > self.left())
 
     def _train(
         self,

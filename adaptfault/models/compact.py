@@ -132,7 +132,8 @@ class CompactNetwork(nn.Module):
         precise = copy.deepcopy(network).cpu().double()
         self.register_buffer("present", precise.present.nonzero().flatten())
         frames = torch.eye(self.layout.n_cells, dtype=torch.float64)[self.present]
-        frames = torch.cat([frames, torch.zeros_like(frames[:1])]).reshape(-1, *self.layout.shape)
+        frames = precise.standardised(torch.cat([frames, torch.zeros_like(frames[:1])]))
+        frames = frames.reshape(-1, *self.layout.shape)
         # (cells + 1, d): one cell at 1 each, and no cell
         seen = precise.conv2(precise.conv1(frames)).flatten(1)
         wide = _Wide(seen[:-1] - seen[-1], seen[-1])

@@ -1,12 +1,11 @@
-"""Heads fitted in closed form, without a gradient, to the features of the network and to the
-healthy cells.
+"""Heads fitted without a gradient step to the features of the network and to the healthy cells.
 
-A head is a mixture of kernel ridge regressions on class indicators (as classifiers: Suykens and
-Vandewalle 1999) or on values. Each has a kernel of some views of a window: the penultimate features
-of the network, the healthy cells, these smoothed (:mod:`adaptfault.adaptation.cell_summary`), the
-moments of the contact on each pad in the imputed windows
-(:mod:`adaptfault.adaptation.contact_moments`), and these corrected. The correction is one more
-kernel ridge regression, of the error that the imputation makes on training windows, whose dead
+A head has two experts. The first is a mixture of kernel ridge regressions on class indicators (as
+classifiers: Suykens and Vandewalle 1999) or on values. Each has a kernel of some views of a window:
+the penultimate features of the network, the healthy cells, these smoothed
+(:mod:`adaptfault.adaptation.cell_summary`), the moments of the contact on each pad in the imputed
+windows (:mod:`adaptfault.adaptation.contact_moments`), and these corrected. The correction is one
+more kernel ridge regression, of the error that the imputation makes on training windows, whose dead
 cells are known: what only these windows have helps to learn (privileged information: Vapnik and
 Vashist 2009). It is cross-fitted, so a window is corrected without its own dead cells. A Gaussian
 kernel suits what changes smoothly, a Laplacian kernel what hangs on single values: it is the limit
@@ -14,6 +13,13 @@ of a forest of random trees (Balog, Lakshminarayanan, Ghahramani, Roy and Teh 20
 seen its training windows, so its features tell them apart better than new ones; three of the
 kernels do not use them. The shares of the mixture are those with the highest likelihood of held-out
 windows (stacking of predictive distributions: Yao, Vehtari, Simpson and Gelman 2018).
+
+The second expert is a forest (:mod:`adaptfault.models.forest`) on the course of each healthy cell.
+Trees choose their inputs, so they do not mind rests and gains that differ by cell, and texture
+raises the spread of a cell where it hardly moves its mean. The two are pooled: the product of their
+probabilities, each to the power of a weight (logarithmic opinion pool: Genest and Zidek 1986), or a
+weighted mean of values. The weights, too, have the highest likelihood of held-out windows. In a
+mixture an expert that is often right, but rarely sure, would only take away from the sure one.
 """
 
 from __future__ import annotations
@@ -28,6 +34,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from adaptfault.data.windows import evenly
+from adaptfault.models.forest import TREES, Forest, fit_forest
 
 Views = Sequence[Tensor]
 
@@ -47,18 +54,21 @@ _DISTANCES = (
 _KERNELS = ((0, 1, 2, 5), (6,), (7,), (8,))  # of these; the first also restores
 # indices of the views
 _MOMENTS = 3
-_RESTORED = 4
+_COURSE = 4  # of a forest alone
+_RESTORED = 4  # of the views that kernels have
 _USED = sorted({i for kernel in _KERNELS for i in kernel})
 _RIDGES = (0.2, 0.02, 0.002)  # added to a kernel's diagonal, which is 1
 _SAMPLE = 1_000  # windows on which widths and ridges are chosen, of training and of validation each
 _LINEAR_C = 0.3  # inverse strength of the linear head's ridge penalty
 _EM_STEPS = 100
+_MOST_WEIGHT = 10.0  # of an expert, where all are always right
 _NO_CLASS = -1e4  # logit of a class without training windows
 MOST_WINDOWS = 5_000  # a head's cost grows with their cube
 
 
 class Head(nn.Module):
-    """Kernel expansions: each known window is weighted by its similarity to the input.
+    """Kernel expansions, which weight each known window by its similarity to the input, and a
+    forest.
 
     Args:
         known: the views of the M windows it was fitted on, each ``[M, p]``, the restored moments
@@ -67,6 +77,8 @@ class Head(nn.Module):
         weights: ``[kernels, M, n]``.
         bias: ``[n]``.
         shares: of each kernel in the probabilities or values, summing to 1.
+        forest: of the course of the cells.
+        pooling: weights ``[2]`` of the kernels and of the forest.
         units: of the moments ``[p]``, by which those in ``known`` are divided.
         restoring: weights ``[M, p]`` of the regression that restores moments, in these units.
         values: the outputs are values, not logits.
@@ -76,6 +88,7 @@ class Head(nn.Module):
     weights: Tensor
     bias: Tensor
     shares: Tensor
+    pooling: Tensor
     units: Tensor
     restoring: Tensor
 
@@ -86,6 +99,8 @@ class Head(nn.Module):
         weights: Tensor,
         bias: Tensor,
         shares: Tensor,
+        forest: Forest,
+        pooling: Tensor,
         units: Tensor,
         restoring: Tensor,
         *,
@@ -101,6 +116,8 @@ class Head(nn.Module):
         self.register_buffer("weights", weights)
         self.register_buffer("bias", bias)
         self.register_buffer("shares", shares)
+        self.register_buffer("pooling", pooling)
+        self.forest = forest
 
     @classmethod
     def empty(cls, about: Mapping[str, Any], n: int) -> Head:
@@ -114,6 +131,8 @@ class Head(nn.Module):
             weights=torch.zeros(len(_KERNELS), len(moments), n),
             bias=torch.zeros(n),
             shares=torch.zeros(len(_KERNELS)),
+            forest=Forest.empty(about["forest"], n),
+            pooling=torch.zeros(2),
             units=torch.ones(moments.shape[1]),
             restoring=torch.zeros_like(moments),
             values=about["values"],
@@ -121,10 +140,15 @@ class Head(nn.Module):
 
     @classmethod
     def blank(cls, known: Views, n: int, *, values: bool = False) -> Head:
-        """Build a head for n classes or values that knows four views of some windows and has learnt
+        """Build a head for n classes or values that knows views of some windows and has learnt
         nothing from them."""
-        known = [*known, known[_MOMENTS]]
-        return cls.empty({"known": [list(view.shape) for view in known], "values": values}, n)
+        known = [*known[:_COURSE], known[_MOMENTS]]
+        about = {
+            "known": [list(view.shape) for view in known],
+            "forest": Forest.blank(n).about,
+            "values": values,
+        }
+        return cls.empty(about, n)
 
     @property
     def known(self) -> list[Tensor]:
@@ -134,36 +158,45 @@ class Head(nn.Module):
     @property
     def about(self) -> dict[str, Any]:
         """Argument of :meth:`empty`; JSON-safe."""
-        return {"known": [list(view.shape) for view in self.known], "values": self.values}
+        return {
+            "known": [list(view.shape) for view in self.known],
+            "forest": self.forest.about,
+            "values": self.values,
+        }
 
-    def knowing(self, known: Views) -> Head:
-        """Return the same head with other views of the windows it was fitted on."""
+    def knowing(self, known: Views, forest: Forest) -> Head:
+        """Return the same head with other views of the windows it was fitted on, and another
+        forest."""
         return Head(
             known,
             self.widths,
             self.weights,
             self.bias,
             self.shares,
+            forest,
+            self.pooling,
             self.units,
             self.restoring,
             values=self.values,
         )
 
     def forward(self, views: Views) -> Tensor:
-        """Map views of N windows, each ``[N, p]``, without the restored moments, to logits or
-        values ``[N, n]``."""
-        views = _in_units(views, self.units)
+        """Map the views of N windows, each ``[N, p]``, to logits or values ``[N, n]``."""
+        grown = self.forest(views[_COURSE])
+        views = _in_units(views[:_COURSE], self.units)
         widths = self.widths.double()
         distances = self._distances(views)
         restored = _kernel(distances, widths, _KERNELS[0]) @ self.restoring.double()
         distances |= self._distances([*views, views[_MOMENTS] + restored.float()], _RESTORED)
         outputs = [
-            _kernel(distances, widths, of) @ weights.double()
+            _kernel(distances, widths, of) @ weights.double() + self.bias
             for of, weights in zip(_KERNELS, self.weights, strict=True)
         ]
-        return mixture(
-            [out + self.bias for out in outputs], self.shares, values=self.values
-        ).float()
+        experts = [
+            mixture(outputs, self.shares, values=self.values),
+            grown.double() if self.values else _votes(grown, self.bias),
+        ]
+        return pooled(experts, self.pooling, values=self.values).float()
 
     def _distances(self, views: Views, first: int = 0) -> dict[int, Tensor]:
         """Return the distances to the known windows that kernels use, of the given views from
@@ -194,6 +227,18 @@ def mixture(outputs: Sequence[Tensor], shares: Tensor, *, values: bool = False) 
         torch.log_softmax(out, 1) + share.log() for share, out in zip(shares, outputs, strict=True)
     ]
     return torch.logsumexp(torch.stack(logs), 0)
+
+
+def pooled(outputs: Sequence[Tensor], weights: Tensor, *, values: bool = False) -> Tensor:
+    """Return the weighted sum of outputs ``[N, n]``: of values, or of log probabilities."""
+    known = [out if values else torch.log_softmax(out, 1) for out in outputs]
+    return torch.stack([weight * out for weight, out in zip(weights, known, strict=True)]).sum(0)
+
+
+def _votes(likely: Tensor, bias: Tensor) -> Tensor:
+    """Return the logits of a forest: no class is less likely than one tree of a group would make
+    it."""
+    return torch.log(likely.double() + 1 / TREES) + bias
 
 
 def ridge_regression(
@@ -250,8 +295,9 @@ def fit_head(
     *,
     whole: Tensor | None = None,
     values: bool = False,
+    forest: bool = True,
 ) -> tuple[Head, Tensor]:
-    """Fit a head to all windows; ridges, scales and shares minimise the loss of held-out windows.
+    """Fit a head to all windows; ridges, scales and weights minimise the loss of held-out windows.
 
     The loss is the cross entropy, or the mean squared error of values.
 
@@ -263,13 +309,15 @@ def fit_head(
         folds: int ``[M + n]``; the windows of a fold are held out together.
         whole: the moments ``[M + n, p]`` of the windows with all cells; None: no cell is dead.
         values: the targets are values.
+        forest: False leaves the forest out.
 
     Returns:
         The head, and the outputs ``[n, k]`` for the held windows, each by a head fitted without its
         fold.
     """
     task = (_Values if values else _Classes)(training_targets, held_targets)
-    both = [torch.cat(pair) for pair in zip(training, held, strict=True)]
+    kernels = slice(None, _COURSE)
+    both = [torch.cat(pair) for pair in zip(training[kernels], held[kernels], strict=True)]
     on = both[0].device
     whole = both[_MOMENTS] if whole is None else whole
     units = _units(whole)
@@ -299,17 +347,28 @@ def fit_head(
         all_weights.append(weights * scale.to(on))
         all_held.append(outputs)
     shares = task.shares(all_held)
+    course = torch.cat([training[_COURSE], held[_COURSE]]).cpu().numpy()
+    mixed = mixture(all_held, shares, values=values)
+    trees = Forest.blank(targets.shape[1])
+    pooling = torch.tensor([1.0, 0.0])
+    outputs = mixed
+    if forest:
+        trees, grown = task.said(*fit_forest(course, task.targets.numpy(), folds, values=values))
+        pooling = task.pooling([mixed, grown])
+        outputs = pooled([mixed, grown], pooling, values=values).float()
     head = Head(
         both,
         widths,
         torch.stack(all_weights),
         task.bias.to(on),
         shares.to(on),
+        trees.to(on),
+        pooling.to(on),
         units,
         restoring,
         values=values,
     )
-    return head, mixture(all_held, shares, values=values)
+    return head, outputs
 
 
 def _restore(
@@ -367,6 +426,10 @@ class _Classes:
         scale = calibrate(found + self.bias, self.y)[0]
         return torch.where(self.bias < 0, 0.0, scale), scale * found + self.bias
 
+    def said(self, forest: Forest, likely: Tensor) -> tuple[Forest, Tensor]:
+        """Return a forest, and what it says of held-out windows as logits."""
+        return forest, _votes(likely, self.bias)
+
     def shares(self, logits: Sequence[Tensor]) -> Tensor:
         """Return the shares of a mixture with the highest likelihood of the classes, by expectation
         maximisation."""
@@ -378,6 +441,26 @@ class _Classes:
             of_each = shares * likely
             shares = (of_each / of_each.sum(1, keepdim=True)).mean(0)
         return shares.float()
+
+    def pooling(self, logits: Sequence[Tensor]) -> Tensor:
+        """Return the weights, not negative, of the pool with the highest likelihood of the
+        classes."""
+        from scipy.optimize import minimize
+
+        known = torch.stack([torch.log_softmax(of.double(), 1) for of in logits], 2)
+        labels = torch.from_numpy(self.y)
+        of_truth = known[torch.arange(len(labels)), labels]
+
+        def loss(weights: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+            pool = known @ torch.from_numpy(weights)
+            expected = torch.einsum("nk,nkj->nj", pool.softmax(1), known)
+            lost = nn.functional.cross_entropy(pool, labels)
+            return lost.item(), (expected - of_truth).mean(0).numpy()
+
+        start = np.full(len(logits), 1 / len(logits))
+        bounds = [(0.0, _MOST_WEIGHT)] * len(logits)
+        found = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B")
+        return torch.from_numpy(found.x).float()
 
 
 class _Values:
@@ -400,6 +483,14 @@ class _Values:
     def outputs(self, found: Tensor) -> tuple[Tensor, Tensor]:
         """Return the scale ``[k]`` of the weights, and values."""
         return self.unit, found * self.unit + self.bias
+
+    def said(self, forest: Forest, found: Tensor) -> tuple[Forest, Tensor]:
+        """Return a forest, and what it says of held-out windows, in the unit of the values."""
+        return forest.scaled(self.unit, self.bias), found * self.unit + self.bias
+
+    def pooling(self, values: Sequence[Tensor]) -> Tensor:
+        """Return the weights of the two experts, as :meth:`shares`."""
+        return self.shares(values)
 
     def shares(self, values: Sequence[Tensor]) -> Tensor:
         """Return the shares of the mixture with the least squared error; not negative, of sum 1."""

@@ -29,7 +29,7 @@ from adaptfault.models.checkpoint import (
     write_checkpoint,
 )
 from adaptfault.models.history import History, Stopped
-from adaptfault.models.network import as_tensor, logits_of
+from adaptfault.models.network import TactileTransformer, as_tensor, logits_of
 from adaptfault.models.time_budget import Clock
 from diagnostics import SensorLayout
 
@@ -118,6 +118,8 @@ def train(
     _check_options(epochs, batch_size, learning_rate, averaging)
     clock = Clock(budget)
     _check(model, train, validation)
+    if isinstance(model, TactileTransformer):
+        model.standardise(train.x)
     if repairable:
         if augment is not None:
             raise ValueError(

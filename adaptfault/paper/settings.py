@@ -68,7 +68,7 @@ class Settings:
     grasps: int = 200
     epochs: int = 50
     learning_rate: float = 1e-4
-    network: dict[str, Any] = field(default_factory=dict)
+    network: dict[str, Any] = field(default_factory=lambda: {"inputs": "readings"})
     patience: int | None = 10
     counts: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
     adapted: tuple[int, ...] = (0, 5, 10, 20, 50, 100, 150, 200)
@@ -117,7 +117,7 @@ class Settings:
             return cls(
                 epochs=3,
                 learning_rate=2e-4,
-                network={"padding": "valid", "init": "glorot"},
+                network={"padding": "valid", "init": "glorot", "inputs": "readings"},
                 **small,
             )
         return cls(epochs=20, **small)

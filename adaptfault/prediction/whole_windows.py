@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from adaptfault.adaptation.cell_summary import CellSummary
+from adaptfault.adaptation.cell_summary import COURSE, CellSummary
 from adaptfault.adaptation.reduced_model import ReducedModel
 from adaptfault.imputation.linear import AffineFill
 from adaptfault.imputation.tiled_statistics import LARGE
@@ -79,7 +79,10 @@ class Masked(nn.Module):
         wide = cells.new_zeros(len(cells), 2, int(present.sum()))
         # means and maxima
         wide[..., torch.from_numpy(~faults.mask[present])] = cells.view(len(cells), 2, -1)
-        self.head = model.head.knowing((features, wide.flatten(1), *others))
+        own = np.flatnonzero(~faults.mask[present])
+        course = np.concatenate([own + i * int(present.sum()) for i in range(COURSE)])
+        forest = model.head.forest.reading(course)
+        self.head = model.head.knowing((features, wide.flatten(1), *others), forest)
 
     @staticmethod
     def suits(model: ReducedModel) -> bool:
@@ -93,6 +96,7 @@ class Masked(nn.Module):
         known = torch.where(self.used, x, 0.0)
         filled = nn.functional.linear(known, self.weight, self.bias).clamp(0.0, 1.0)
         whole = torch.where(self.used, x, filled)
-        views = (self.network.features(whole), *self.summary(known), self.moments(whole))
-        outputs: Tensor = self.head(views)
+        cells, smooth, course = self.summary(known)
+        features = self.network.features(whole)
+        outputs: Tensor = self.head((features, cells, smooth, self.moments(whole), course))
         return outputs if self.values else torch.softmax(outputs, dim=1)

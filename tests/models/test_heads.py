@@ -13,19 +13,26 @@ from adaptfault.models.heads import (
     fit_head,
     linear_head,
     mixture,
+    pooled,
     ridge_regression,
 )
 from diagnostics import FaultSet, SensorLayout
 
 
 def windows(n: int = 90, classes: int = 3) -> tuple[list[torch.Tensor], np.ndarray]:
-    """Four views of three classes: the first two each tell another class from the rest, the others
+    """Five views of three classes: the first two each tell another class from the rest, the others
     a little."""
     rng = np.random.default_rng(0)
     y = rng.integers(0, classes, n)
-    told = ((0, 2), (1, 2), (2, 1), (2, 0.5))
+    told = ((0, 2), (1, 2), (2, 1), (2, 0.5), (2, 0.5))
     views = [rng.normal((y == c)[:, None] * far, 1.0, (n, 4)).astype(np.float32) for c, far in told]
-    return [torch.from_numpy(v) for v in views], y
+    return with_course([torch.from_numpy(v) for v in views[:4]], views[4]), y
+
+
+def with_course(views: list[torch.Tensor], course: np.ndarray | None = None) -> list[torch.Tensor]:
+    """The views of kernels, and that of the forest: constant if it is not given."""
+    last = np.zeros((len(views[0]), 1)) if course is None else course
+    return [*views, torch.from_numpy(last).double()]
 
 
 def one_hot(y: np.ndarray, n_classes: int = 3) -> np.ndarray:
@@ -68,8 +75,10 @@ LAYOUT = SensorLayout(2, 4, 3, present=tuple(bool(i != 5) for i in range(24)))
 
 def test_the_summary_of_the_cells_is_the_root_of_mean_and_maximum():
     x = torch.tensor([[[0.0, 0.25], [0.5, 0.25]]])  # one window of two frames
-    cells, _ = CellSummary(SensorLayout(1, 1, 2), FaultSet((), 2))(x)
+    cells, _, course = CellSummary(SensorLayout(1, 1, 2), FaultSet((), 2))(x)
     torch.testing.assert_close(cells, torch.tensor([[0.5, 0.5, 0.5**0.5, 0.5]]))
+    expected = torch.tensor([[0.25, 0.25, 0.5, 0.25, 0.0, 0.25, 0.25, 0.0, 0.5, 0.0]]).double()
+    torch.testing.assert_close(course, expected)
     assert torch.isfinite(
         torch.cat(CellSummary(SensorLayout(1, 1, 2), FaultSet((), 2))(x - 1), 1)
     ).all()
@@ -82,7 +91,7 @@ def test_the_smoothed_summary_is_a_gaussian_filter_of_each_pad_and_its_sum():
     smooth = gaussian_filter(grid, (0, 0, 0, 1, 1), mode="constant", truncate=3).reshape(5, 3, 24)
     frames = np.concatenate([smooth[..., LAYOUT.present.ravel()], grid.sum((3, 4))], axis=2)
     expected = np.sqrt(np.concatenate([frames.mean(1), frames.max(1)], axis=1))
-    _, found = CellSummary(LAYOUT, faults)(torch.from_numpy(x[..., faults.healthy]))
+    _, found, _ = CellSummary(LAYOUT, faults)(torch.from_numpy(x[..., faults.healthy]))
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
 
 
@@ -100,7 +109,7 @@ def test_a_window_that_is_shifted_by_a_cell_is_nearer_after_smoothing():
     frame = np.zeros((8, 8), np.float32)
     frame[2:4, 3:5] = 1.0
     x = torch.from_numpy(np.stack([frame, np.roll(frame, 1, axis=0)]).reshape(2, 1, 64))
-    cells, smooth = (
+    cells, smooth, _ = (
         view / view.norm(dim=1, keepdim=True) for view in CellSummary(layout, FaultSet((), 64))(x)
     )
     assert (smooth[0] - smooth[1]).norm() < 0.7 * (cells[0] - cells[1]).norm()
@@ -136,8 +145,8 @@ def test_views_tell_more_together_than_the_smoothed_cells_alone():
     views, classes = windows()
     first, second = parts(views, 45)
     blind = [
-        [torch.zeros_like(v), torch.zeros_like(v), w, torch.zeros_like(v)]
-        for v, _, w, _ in (first, second)
+        with_course([torch.zeros_like(v), torch.zeros_like(v), w, torch.zeros_like(v)])
+        for v, _, w, _, _ in (first, second)
     ]
     _, alone = fit_head(
         *blind, one_hot(classes[:-45]), one_hot(classes[-45:]), np.arange(len(classes)) % 5
@@ -148,13 +157,20 @@ def test_views_tell_more_together_than_the_smoothed_cells_alone():
     assert head.shares[0] > 0.5
 
 
-def test_shares_follow_the_kernel_that_predicts_held_out_windows():
+def test_weights_follow_the_expert_that_predicts_held_out_windows():
     views, y = windows(300)
     noise = torch.randn(300, 4, generator=torch.Generator().manual_seed(0)) * 5
-    first, second = parts([noise, noise, views[0] + views[1], noise], 150)
-    head, _ = fit_head(first, second, one_hot(y[:150]), one_hot(y[150:]), np.arange(len(y)) % 5)
+    told = views[0] + views[1]
+    classes = one_hot(y[:150]), one_hot(y[150:]), np.arange(len(y)) % 5
+    first, second = parts(with_course([noise, noise, told, noise], noise.numpy()), 150)
+    head, _ = fit_head(first, second, *classes)
     assert head.shares[0] > 0.5
     assert head.shares.sum().item() == pytest.approx(1)
+    assert head.pooling[0] > 2 * head.pooling[1]
+    first, second = parts(with_course([noise, noise, noise, noise], told.numpy()), 150)
+    head, outputs = fit_head(first, second, *classes)
+    assert head.pooling[1] > 0.5
+    assert (outputs.argmax(1).numpy() == y[150:]).mean() > 0.55  # 0.33 by chance
 
 
 def test_probabilities_of_held_out_windows_are_as_sure_as_they_are_right():
@@ -175,7 +191,7 @@ def test_a_class_that_no_window_has_is_never_the_answer():
 
 
 def test_identical_windows_do_not_break_the_fit():
-    views = [torch.ones(20, 3), *torch.zeros(3, 20, 2)]
+    views = with_course([torch.ones(20, 3), *torch.zeros(3, 20, 2)])
     first, second = parts(views, 10)
     head, outputs = fit_head(
         first, second, one_hot(np.arange(10) % 3), one_hot(np.arange(10) % 3), np.arange(20) % 5
@@ -190,7 +206,8 @@ def test_windows_that_differ_by_noise_alone_do_not_break_the_fit(share, noise):
     rng = np.random.default_rng(0)
     x = 0.5 + noise * rng.normal(size=(400, 60))
     x[: round((1 - share) * 400)] = rng.random((round((1 - share) * 400), 60))
-    views = [torch.from_numpy(v.astype(np.float32)) for v in (10 * x, x, x[:, ::2], x[:, :5])]
+    kernels = [torch.from_numpy(v.astype(np.float32)) for v in (10 * x, x, x[:, ::2], x[:, :5])]
+    views = with_course(kernels, x)
     first, second = parts(views, 100)
     classes = one_hot(rng.integers(0, 3, 400))
     head, outputs = fit_head(
@@ -231,6 +248,17 @@ def test_a_mixture_is_the_mean_of_probabilities():
     )
 
 
+def test_a_pool_is_the_product_of_powers_of_probabilities():
+    one, other = torch.randn(2, 6, 3, generator=torch.Generator().manual_seed(0))
+    found = pooled([one, other], torch.tensor([0.3, 0.7])).softmax(1)
+    product = one.softmax(1) ** 0.3 * other.softmax(1) ** 0.7
+    torch.testing.assert_close(found, product / product.sum(1, keepdim=True))
+    alone = pooled([one, other], torch.tensor([1.0, 0.0])).softmax(1)
+    torch.testing.assert_close(alone, one.softmax(1))
+    values = pooled([one, other], torch.tensor([0.3, 0.7]), values=True)
+    torch.testing.assert_close(values, 0.3 * one + 0.7 * other)
+
+
 def test_a_head_comes_back_from_its_state():
     head, _, held, _ = fitted(90)
     again = Head.empty(json.loads(json.dumps(head.about)), 3)
@@ -242,7 +270,7 @@ def test_windows_that_differ_in_one_moment_are_told_apart_by_the_laplacian_kerne
     rng = np.random.default_rng(0)
     moments = rng.random((400, 40)).astype(np.float32)
     y = (moments[:, 0] > 0.5).astype(int) + 2 * (moments[:, 1] > 0.5)
-    views = [*torch.zeros(3, 400, 2), torch.from_numpy(moments)]
+    views = with_course([*torch.zeros(3, 400, 2), torch.from_numpy(moments)])
     first, second = parts(views, 200)
     head, outputs = fit_head(
         first, second, one_hot(y[:200], 4), one_hot(y[200:], 4), np.arange(len(y)) % 5
@@ -259,7 +287,8 @@ def with_dead_cells(n: int = 400) -> tuple[list[torch.Tensor], torch.Tensor, np.
     hidden = cells[:, :1] + cells[:, 1:2] ** 2
     shown = np.zeros((n, 2), np.float32)
     whole = np.hstack([hidden, rng.random((n, 1))]).astype(np.float32)
-    views = [torch.zeros(n, 2), torch.from_numpy(cells), torch.zeros(n, 2), torch.from_numpy(shown)]
+    nothing = torch.zeros(n, 2)
+    views = with_course([nothing, torch.from_numpy(cells), nothing, torch.from_numpy(shown)])
     return views, torch.from_numpy(whole), (hidden[:, 0] > np.median(hidden)).astype(int)
 
 
@@ -293,8 +322,9 @@ def test_moments_count_in_their_own_units():
     scaled = [
         *views[:3],
         views[3] * torch.tensor([1e-3, 1.0, 1e3, 0.0]) + torch.tensor([0.0, 0.0, 0.0, 5.0]),
+        views[4],
     ]
-    plain = [*views[:3], views[3] * torch.tensor([1.0, 1.0, 1.0, 0.0])]
+    plain = [*views[:3], views[3] * torch.tensor([1.0, 1.0, 1.0, 0.0]), views[4]]
     found = []
     for each in (plain, scaled):
         first, second = parts(each, 150)

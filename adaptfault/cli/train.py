@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from adaptfault.models.value_units import ValueUnits
     from diagnostics import SensorLayout
 
+_SOON = 3  # epochs after which a training should be above chance
 _CHECKPOINT = "training.safetensors"
 
 _EXAMPLE = """  adaptfault train grasps/ --out model --epochs 20
@@ -168,6 +169,11 @@ def run(args: argparse.Namespace) -> int:
             task=adapter.task,
         )
         (folder / _CHECKPOINT).unlink()  # the run is complete: nothing is left to resume
+    if isinstance(scores, Scores) and recordings.labels is not None:
+        from adaptfault.evaluation.training_check import rest_level_note
+
+        if note := rest_level_note(recordings.frames, recordings.labels, scores.accuracy):
+            say(args, note)
     problems = _told(args, out, bundled, scores, history, names, extra, (parts[2].y, predicted))
     return int(args.strict and bool(problems))
 
@@ -240,17 +246,25 @@ def _trained(
 
 def _epoch_line(
     args: argparse.Namespace, training: Windows, units: ValueUnits | None
-) -> Callable[[History], None] | None:
-    """Return what tells each epoch on stderr where no bar is shown; None on a terminal."""
-    if sys.stderr.isatty() or args.quiet:
-        return None
+) -> Callable[[History], None]:
+    """Return what tells on stderr a training that is at chance after a few epochs, and each epoch
+    where no bar is shown."""
     from adaptfault.evaluation.scores import chance
 
-    guess = "" if units is not None else f" (guessing reaches {chance(training.y)[0]:.3f})"
+    share, limit = (0.0, 0.0) if units is not None else chance(training.y)
+    guess = "" if units is not None else f" (guessing reaches {share:.3f})"
     measure = "R2" if units is not None else "accuracy"
 
     def told(history: History) -> None:
         done = history.epochs
+        if done == _SOON and max(history.validation_accuracy) < limit:
+            say(
+                args,
+                f"at chance after {done} epochs: if this lasts, the classes do not differ in what"
+                " the cells read, the labels are mixed up, or a higher --learning-rate is needed",
+            )
+        if sys.stderr.isatty():
+            return
         left = sum(history.seconds) / done * (args.epochs - done)
         reached = f"validation {measure} {history.validation_accuracy[-1]:.3f}"
         say(args, f"epoch {done} of {args.epochs}: {reached}{guess}, about {left:.0f} s left")

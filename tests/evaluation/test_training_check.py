@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from adaptfault.evaluation.scores import Scores
-from adaptfault.evaluation.training_check import plot_training, training_problems
+from adaptfault.evaluation.training_check import (
+    plot_training,
+    rest_level_note,
+    training_problems,
+)
 from adaptfault.models.history import History
 
 NAMES = ("ball", "cup", "pen")
@@ -49,6 +53,19 @@ def test_each_sign_of_a_failed_training_is_named_with_likely_causes(confusion, h
     problems = training_problems(scores(confusion), history, NAMES)
     assert len(problems) == 1
     assert expected in problems[0]
+
+
+@pytest.mark.parametrize("drift", [0.0, 5.0])
+def test_rest_levels_that_tell_the_class_raise_a_question(drift):
+    rng = np.random.default_rng(0)
+    labels = np.arange(60) % 3
+    frames = [
+        drift * label + rng.normal(0, 1, (30, 8)) + 50 * (np.arange(30) > 20)[:, None]
+        for label in labels
+    ]
+    note = rest_level_note(frames, labels, 0.95)
+    assert ("made together?" in note) == (drift > 0)
+    assert rest_level_note(frames[:6], labels[:6], 0.95) == ""  # too few to say
 
 
 def test_the_picture_shows_every_class_and_every_epoch():

@@ -179,3 +179,28 @@ def test_dropout_drops_its_share_and_keeps_the_mean():
     assert Dropout(0.0)(x) is x
     with pytest.raises(ValueError, match="dropout must lie"):
         Dropout(1.0)
+
+
+def test_rests_and_the_gain_of_the_readings_change_nothing_of_what_it_learns():
+    layout = SensorLayout(2, 4, 4)
+    x = np.random.default_rng(0).random((20, 5, 32)).astype(np.float32)
+    rests = np.linspace(0.1, 0.5, 32, dtype=np.float32)
+    first, second = (TactileTransformer(layout, 3, length=5).eval() for _ in range(2))
+    first.standardise(x)
+    second.standardise(0.05 * x + rests)
+    a = first.features(torch.from_numpy(x))
+    b = second.features(torch.from_numpy(0.05 * x + rests))
+    torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4)
+    first.standardise(2 * x)  # once is enough
+    assert torch.equal(first.features(torch.from_numpy(x)), a)
+
+
+def test_readings_as_they_are_stay_so():
+    layout = SensorLayout(1, 4, 4)
+    x = np.random.default_rng(0).random((20, 5, 16)).astype(np.float32)
+    plain = TactileTransformer(layout, 3, length=5, inputs="readings").eval()
+    before = plain.features(torch.from_numpy(x))
+    plain.standardise(x)
+    assert torch.equal(plain.features(torch.from_numpy(x)), before)
+    with pytest.raises(ValueError, match="unknown inputs"):
+        TactileTransformer(layout, 3, inputs="loads")

@@ -26,6 +26,7 @@ import numpy as np
 from disk.power_cut_states import Trace, Tree, build
 
 from diagnostics import FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault
+from diagnostics.decision.calibration import Calibrator
 
 LAYOUT = SensorLayout(1, 4, 4)
 CLASSES = ("nothing", "softer", "harder")
@@ -42,16 +43,19 @@ def linear(layout: SensorLayout, n_classes: int, length: int) -> Any:
 
 @contextmanager
 def small_versions() -> Iterator[None]:
-    """Leave out the export, which takes seconds and runs on synced copies, and allow the model
-    above."""
+    """Leave out the export and the calibration, which take seconds and write nothing of their own,
+    and allow the model above."""
     import adaptfault as af
 
     af.allow_model("power_cut:linear")
     absent = ImportError("left out here")
-    with mock.patch.multiple(
-        "adaptfault.prediction.export",
-        add_onnx=mock.Mock(side_effect=absent),
-        graph_of=mock.Mock(side_effect=absent),
+    with (
+        mock.patch.multiple(
+            "adaptfault.prediction.export",
+            add_onnx=mock.Mock(side_effect=absent),
+            graph_of=mock.Mock(side_effect=absent),
+        ),
+        mock.patch.object(Calibrator, "fit", return_value=Calibrator()),
     ):
         yield
 

@@ -19,6 +19,7 @@ from adaptfault.bundle.bundle import Bundle
 from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.data.simulated_grasps import simulate
+from adaptfault.models.store import save_model
 from diagnostics import Fault, FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault
 from diagnostics.decision.calibration import Calibrator
 
@@ -314,7 +315,7 @@ def made_bundle(small_grasps: Recordings, made_once) -> Path:
             "5",
             "--quiet",
         ]
-        with without_export():
+        with without_export(), without_calibration():
             assert main(command) == 0
 
     return made_once("bundle", make) / "robot.bundle"
@@ -372,8 +373,16 @@ def forces_home(small_grasps: Recordings, made_once) -> Path:
         training = ["train", str(home / "grasps"), "--targets", str(home / "targets.csv")]
         training += ["--epochs", "8", "--learning-rate", "1e-3", "--quiet"]
         with without_export(), without_calibration():
-            assert main([*training, "--out", str(home / "model")]) == 0
             assert main([*training, "--out", str(home / "robot.bundle")]) == 0
+        bundled = Bundle.open(home / "robot.bundle").parts.adapter()
+        save_model(
+            home / "model",
+            bundled.model,
+            class_names=VALUES,
+            extra={"split_seed": 0},
+            head=bundled.healthy.model.head,
+            task=bundled.task,
+        )
 
     return made_once("forces", make)
 

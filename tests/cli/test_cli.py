@@ -56,6 +56,7 @@ def write_csv(path: Path, frames: np.ndarray) -> None:
     np.savetxt(path, frames, delimiter=",", fmt="%.4f")
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_a_broken_row_is_diagnosed_adapted_to_and_the_repair_measured(home, small, capsys):
     broken = line_fault(SMALL, Line(1, "row", 2), "short")
     log = small.select([i for i in range(len(small)) if small.labels[i] > 0][:12])
@@ -477,12 +478,13 @@ def numeric_options(
 
 @pytest.mark.parametrize("number", ["nan", "inf", "-inf", "1e400", "-1", "-0.5"])
 def test_every_numeric_option_refuses_what_is_negative_or_not_finite(number, capsys):
-    options = list(numeric_options(_parser()))
+    parser = _parser()  # once: main makes it for each call
+    options = list(numeric_options(parser))
     assert ("maintain", "--budget") in options
     assert ("fleet", "maintain", "--budget") in options
     for option in options:
         with pytest.raises(SystemExit) as end:
-            main([*option, number])
+            parser.parse_args([*option, number])
         assert end.value.code == 3
         assert f"argument {option[-1]}: " in capsys.readouterr().err
 
@@ -588,6 +590,7 @@ def test_exchanged_rows_that_the_version_undoes_are_put_back_in_a_log_too_large_
     )
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_diagnose_tells_of_a_change_of_the_whole_sensor(
     made_bundle, small, later_grasps, uncalibrated, tmp_path, capsys
 ):

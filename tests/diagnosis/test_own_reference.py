@@ -19,6 +19,18 @@ def grasps() -> list[np.ndarray]:
     return [np.asarray(recording, dtype=np.float64) for recording in frames]
 
 
+@pytest.fixture(scope="module")
+def progress() -> list[float]:
+    """What the fixture below was told of its progress."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def own(grasps: list[np.ndarray], progress: list[float]) -> SelfDiagnosis:
+    """Fitted by the healthy log to its first half."""
+    return SelfDiagnosis(LAYOUT).for_log(grasps, progress=progress.append)
+
+
 def failing(grasps: list[np.ndarray], cells: list[int], since: int) -> list[np.ndarray]:
     faults = [Fault(FaultKind.OPEN, (cell,)) for cell in cells]
     after = [
@@ -35,14 +47,15 @@ def test_cells_that_fail_in_the_second_half_are_found_without_a_reference(grasps
     assert all(abs(fault.onset - start) < 300 for fault in diagnosis.faults)
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_cells_that_are_dead_from_the_start_are_found_too(grasps):
     dead = [9, 36]
     diagnosis = SelfDiagnosis(LAYOUT).diagnose(failing(grasps, dead, 0))
     assert sorted(diagnosis.fault_set) == dead
 
 
-def test_of_a_healthy_log_no_cell_is_blamed_and_most_are_alive(grasps):
-    diagnosis = SelfDiagnosis(LAYOUT).diagnose(grasps)
+def test_of_a_healthy_log_no_cell_is_blamed_and_most_are_alive(grasps, own):
+    diagnosis = own.diagnose(grasps)
     assert not diagnosis.faults
     assert (diagnosis.verdicts == Verdict.ALIVE).mean() > 0.9
 
@@ -52,11 +65,11 @@ def test_a_shorter_log_is_no_reference(grasps):
     assert cold.for_log(grasps[: OWN_REFERENCE - 1]) is cold
 
 
-def test_a_fitted_diagnosis_stays_what_it_is(grasps):
-    fitted = SelfDiagnosis(LAYOUT, proof_of_life=False).fit(grasps[:10])
-    assert fitted.for_log(grasps) is fitted
+def test_a_fitted_diagnosis_stays_what_it_is(grasps, own):
+    assert own.for_log(grasps) is own
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_the_diagnosis_itself_is_not_fitted_by_a_log(grasps):
     cold = SelfDiagnosis(LAYOUT)
     cold.diagnose(grasps)
@@ -76,6 +89,7 @@ def test_noise_before_the_first_contact_is_no_reference(grasps):
     assert cold.for_log([*idle, *grasps[20:]]) is cold
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_a_log_with_missing_readings_is_its_own_reference(grasps):
     rng = np.random.default_rng(0)
     gappy = [np.where(rng.random(recording.shape) < 0.2, np.nan, recording) for recording in grasps]
@@ -88,11 +102,10 @@ def test_recordings_of_one_frame_do_not_crash_it(grasps):
     SelfDiagnosis(LAYOUT).diagnose(frames)
 
 
-def test_progress_is_told(grasps):
-    told: list[float] = []
-    SelfDiagnosis(LAYOUT).for_log(grasps, progress=told.append)
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+def test_progress_is_told(own, progress):
+    assert len(progress) > 100
+    assert progress == sorted(progress)
+    assert (progress[0] < 0.1, progress[-1]) == (True, 1.0)
 
 
 def test_a_log_without_any_reading_is_refused():
@@ -100,6 +113,7 @@ def test_a_log_without_any_reading_is_refused():
         SelfDiagnosis(LAYOUT).diagnose([np.full((20, 64), np.nan)] * 40)
 
 
+@pytest.mark.usefixtures("uncalibrated")
 def test_a_cell_that_never_delivers_a_reading_is_faulty_and_does_not_disturb_the_fit(grasps):
     silent = [np.where(np.arange(64) == 30, np.nan, recording) for recording in grasps]
     assert SelfDiagnosis(LAYOUT).diagnose(silent).fault_set == {30}

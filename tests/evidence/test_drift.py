@@ -10,6 +10,7 @@ from diagnostics.healthy.prediction import Prediction
 CELLS = 30
 NEAR = 0.1
 SPREAD = 0.05
+FRAMES = 100  # of a recording
 
 
 def events(n: int, gain: np.ndarray | float = 1.0, *, error: float = SPREAD / 2, own: bool = True):
@@ -112,8 +113,8 @@ def held_beside_contacts(count: int, share: float, seed: int) -> list[np.ndarray
     rng = np.random.default_rng(seed)
     recordings = []
     for _ in range(count):
-        load = np.zeros((160, 4, 6))
-        for first in range(2, 160, 20):
+        load = np.zeros((FRAMES, 4, 6))
+        for first in range(2, FRAMES, 20):
             row = rng.integers(0, 3)
             column = rng.integers(0, 5)
             load[first : first + 16, row : row + 2, column : column + 2] += (
@@ -121,9 +122,9 @@ def held_beside_contacts(count: int, share: float, seed: int) -> list[np.ndarray
             )
         if rng.random() < share:
             load[:, rng.integers(4), 0] += (
-                rng.uniform(0.3, 0.5) + 0.005 * rng.standard_normal(160).cumsum()
+                rng.uniform(0.3, 0.5) + 0.005 * rng.standard_normal(FRAMES).cumsum()
             )
-        readings = load.reshape(160, 24) + 0.002 * rng.standard_normal((160, 24))
+        readings = load.reshape(FRAMES, 24) + 0.002 * rng.standard_normal((FRAMES, 24))
         recordings.append(np.clip(np.round(readings * 255) / 255, 0, 1))
     return recordings
 

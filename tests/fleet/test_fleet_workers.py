@@ -103,6 +103,7 @@ def test_an_address_without_a_port_is_refused_at_once():
         pass
 
 
+@pytest.mark.slow
 def test_a_robot_that_kills_a_dask_worker_stops_no_other(cluster):
     found = errors(done("a b killer c d", dask=cluster))
     assert set(found) == {"killer"}, found

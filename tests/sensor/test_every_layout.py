@@ -111,6 +111,18 @@ def some_faults(layout: SensorLayout, seed: int) -> list[Fault]:
     return [*faults, line_fault(layout, lines[int(rng.integers(len(lines)))], FaultKind.OPEN)]
 
 
+FITTED: dict[str, SelfDiagnosis] = {}
+
+
+def fitted_on(layout: SensorLayout) -> SelfDiagnosis:
+    """The diagnosis of a layout, fitted once."""
+    name = json.dumps(layout.to_dict())
+    if name not in FITTED:
+        with without_calibration():
+            FITTED[name] = SelfDiagnosis(layout).fit(touched(layout, 1))
+    return FITTED[name]
+
+
 every_kind = [example(layout) for layout in KINDS]
 
 
@@ -182,12 +194,10 @@ def tried(diagnosis: Diagnosis, layout: SensorLayout) -> None:
 
 @on_every_kind(2)
 def test_every_call_of_the_diagnosis_ends_well_with_a_reference_and_without(layout: SensorLayout):
-    healthy = touched(layout, 1)
     later = touched(layout, 2)
     broken = [inject(frames, some_faults(layout, 3), layout, seed=4) for frames in later]
     cold = SelfDiagnosis(layout)
-    with without_calibration():
-        fitted = SelfDiagnosis(layout).fit(healthy)
+    fitted = fitted_on(layout)
     again = SelfDiagnosis.from_state(*fitted.state())
     for log in ([np.full_like(later[0], np.nan), *broken], [frames[:1] for frames in later]):
         for diagnoser in (cold, fitted):
@@ -209,8 +219,7 @@ def test_every_call_of_the_diagnosis_ends_well_with_a_reference_and_without(layo
 def test_changes_of_the_sensor_are_looked_for_on_every_kind(layout: SensorLayout):
     healthy = touched(layout, 1)
     later = [np.minimum(1.5 * frames, layout.full_scale) for frames in touched(layout, 2)]
-    with without_calibration():
-        reference = SelfDiagnosis(layout).fit(healthy).reference_
+    reference = fitted_on(layout).reference_
     none = np.zeros(layout.n_cells, bool)
     for excluded in (none, ~none):
         replaced = find_recalibration(later, healthy, reference, layout, excluded, none)

@@ -88,7 +88,7 @@ for name in "$@"; do
             --grasps "$grasps" --frames 60 --classes nothing normal softer harder --out "$raw"
         ;;
     lerobot)
-        raw=$out/lerobot fault=row:1:6=open cause="pad 1, row 6 is open"
+        raw=$out/lerobot-set fault=row:1:6=open cause="pad 1, row 6 is open"
         [ -d "$raw" ] || "${PYTHON:-python3}" "$here/lerobot_set.py" "$raw" --grasps "$grasps"
         ;;
     fabric)

@@ -603,7 +603,9 @@ class SelfDiagnosis:
         value = runs.value
         rests = spatial.scored & stream.rests()
         blinks_to = np.where(
-            2 * intermittency.high > intermittency.blinks, self.layout.full_scale, 0.0
+            2 * intermittency.high > intermittency.blinks,
+            self.layout.full_scale,
+            np.maximum(stream.lowest, 0.0),
         )
         held = stream.reading(value)
         beyond = spatial.scored & ~rests

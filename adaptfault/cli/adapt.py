@@ -133,7 +133,9 @@ def _adapt(
     result: dict[str, Any],
     lines: list[str],
 ) -> None:
-    say(args, f"{len(faults)} of {adapter.model.layout.present.sum()} cells are faulty; adapting")
+    verb = "is" if len(faults) == 1 else "are"
+    cells = adapter.model.layout.present.sum()
+    say(args, f"{len(faults)} of {cells} cells {verb} faulty; adapting")
     adaptation = adapter.adapt(
         faults, method=args.method, budget=args.budget, seed=args.seed, progress=progress(args)
     )

@@ -12,6 +12,7 @@ from adaptfault.cli.inspecting import add_reference, inspect_log, text_of, write
 from adaptfault.cli.options import (
     Commands,
     add_cache,
+    add_count_from,
     add_recordings,
     add_trust,
     add_untested_code,
@@ -55,6 +56,7 @@ def add(commands: Commands) -> None:
         metavar="FILE",
         help="write which readings are valid: .npz, .parquet, .zarr or .h5",
     )
+    add_count_from(parser)
     add_cache(parser)
     add_untested_code(parser)
     add_trust(parser)
@@ -64,6 +66,7 @@ def add(commands: Commands) -> None:
 def run(args: argparse.Namespace) -> int:
     """Check a data set; the exit code says how bad it is."""
     from adaptfault.inspection.severity import worst
+    from diagnostics.decision.numbering import Numbering
 
     part = None if args.healthy is None else partial(_part, args.healthy)
     inspected = inspect_log(args, part)
@@ -75,8 +78,10 @@ def run(args: argparse.Namespace) -> int:
     code = max(worst(reasons), 1 if checked.harms else 0)
     notes = [reason.text for reason in reasons if reason.text] + list(checked.remarks)
     _write(args, log, checked, code, notes)
-    text = [str(checked.summary), "", text_of(inspection.diagnosis), *notes]
-    emit(args, checked.to_dict(), "\n".join(text))
+    numbering = Numbering.from_layout(log.layout, args.count_from)
+    summary = numbering.text(str(checked.summary))
+    text = text_of(inspection.diagnosis, notes, args.count_from)
+    emit(args, checked.to_dict(), f"{summary}\n\n{text}")
     return code
 
 

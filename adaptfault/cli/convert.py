@@ -11,7 +11,7 @@ from adaptfault.cli.selection import add_selection, select
 _EXAMPLE = """\
   adaptfault convert raw/ --shape 10x10 --full-scale 3.3 --unit V --rate 50 --out grasps.npz
       the archive states the layout: no later command needs these options
-  adaptfault convert grasps.npz --out grasps-csv
+  adaptfault convert grasps.npz --out grasps-csv --times
   adaptfault convert grasps.npz --take ::5 --inject row:0:3=open --out broken.npz"""
 
 
@@ -27,6 +27,11 @@ def add(commands: Commands) -> None:
         metavar="PATH",
         help="X.npz, X.npy, X.bag (ROS 2 bag), or a folder for CSV files",
     )
+    parser.add_argument(
+        "--times",
+        action="store_true",
+        help="CSV files begin with a header and a column time_ms of whole milliseconds",
+    )
     add_selection(parser)
     parser.set_defaults(run=run, writes=("out",))
 
@@ -36,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.data.recordings import save
 
     recordings = select(args, load_recordings(args, args.recordings))
-    lost = save(args.out, recordings)
+    lost = save(args.out, recordings, times=args.times)
     for fact in lost:
         say(args, f"not stored in this format: {fact}")
     result = {

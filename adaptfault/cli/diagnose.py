@@ -10,6 +10,7 @@ from adaptfault.cli.inspecting import add_reference, inspect_log, text_of, write
 from adaptfault.cli.options import (
     Commands,
     add_cache,
+    add_count_from,
     add_recordings,
     add_trust,
     add_untested_code,
@@ -43,6 +44,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("--out", metavar="FILE", help="write the diagnosis as JSON")
     parser.add_argument("--picture", metavar="FILE", help="write the verdict map as PNG")
     parser.add_argument("--html", metavar="FILE", help="write the technician's page")
+    add_count_from(parser)
     add_cache(parser)
     add_untested_code(parser)
     add_trust(parser)
@@ -68,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         **inspection.told,
         "findings": [asdict(finding) for finding in inspection.findings],
     }
-    emit(args, found, "\n".join([text_of(diagnosis), *notes]))
+    emit(args, found, text_of(diagnosis, notes, args.count_from))
     return code
 
 
@@ -80,6 +82,6 @@ def _write(args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: lis
     if args.out:
         atomic_write(args.out, json.dumps(diagnosis.to_dict(), allow_nan=False).encode())
     if args.picture:
-        diagnosis.plot().savefig(args.picture, dpi=150)
+        diagnosis.plot(count_from=args.count_from).savefig(args.picture, dpi=150)
     if args.html:
         write_page(args, diagnosis, code, notes, compared=bool(args.reference))

@@ -88,7 +88,15 @@ def write_page(
     from adaptfault.evaluation.html_diagnosis import write_diagnosis
 
     name = ", ".join(args.recordings)
-    write_diagnosis(args.html, diagnosis, name=name, reference=compared, code=code, notes=notes)
+    write_diagnosis(
+        args.html,
+        diagnosis,
+        name=name,
+        reference=compared,
+        code=code,
+        notes=notes,
+        count_from=args.count_from,
+    )
 
 
 def _inspected(
@@ -180,10 +188,14 @@ def _faults(diagnosis: Diagnosis, bundle: Bundle | None) -> tuple[int, str]:
     return 1, f"handled: version {version.number} of {bundle.path} runs without these cells"
 
 
-def text_of(diagnosis: Diagnosis) -> str:
-    """Return the diagnosis as text, with what would test the other cells."""
-    lines = str(diagnosis).splitlines()
-    lines += [f"to test more: {touch}" for touch in diagnosis.coverage.advice[:5]]
+def text_of(diagnosis: Diagnosis, notes: Sequence[str], count_from: int) -> str:
+    """Return the diagnosis as text, with what would test the other cells, and the notes below."""
+    from diagnostics.decision.numbering import Numbering
+
+    numbering = Numbering.from_layout(diagnosis.layout, count_from)
+    lines = diagnosis.text(count_from).splitlines()
+    advice = diagnosis.coverage.advice[:5]
+    lines += [f"to test more: {numbering.text(touch)}" for touch in advice]
     if diagnosis.layout.rows > _ROWS:
         lines.append(lines[0])
-    return "\n".join(lines)
+    return "\n".join([*lines, *map(numbering.text, notes)])

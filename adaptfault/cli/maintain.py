@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from adaptfault.cli.options import (
     Commands,
+    add_count_from,
     add_metrics,
     add_sign,
     add_trust,
@@ -50,6 +51,7 @@ def add(commands: Commands) -> None:
     )
     add_untested_code(parser)
     parser.add_argument("--report", metavar="FILE", help="write the technician's report (HTML)")
+    add_count_from(parser)
     add_metrics(parser)
     add_trust(parser)
     add_sign(parser, "the bundle after the run")
@@ -73,6 +75,7 @@ def _maintain(args: argparse.Namespace) -> int:
     from adaptfault.bundle.signing import sign_bundle
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.new_recordings import load_new_recordings
+    from diagnostics.decision.numbering import Numbering
 
     bundle = Bundle.open(args.bundle, **trust(args))
     incoming = load_new_recordings(bundle, args.recordings)
@@ -95,10 +98,11 @@ def _maintain(args: argparse.Namespace) -> int:
     if args.report:
         from adaptfault.robot.technician_report import write_report
 
-        write_report(args.report, bundle, run=report)
+        write_report(args.report, bundle, run=report, count_from=args.count_from)
     if args.metrics:
         _write_metrics(args, bundle, report)
-    emit(args, report.to_dict(), str(report))
+    numbering = Numbering.from_layout(bundle.layout, args.count_from)
+    emit(args, report.to_dict(), report.text(numbering))
     return report.exit_code
 
 

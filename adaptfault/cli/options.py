@@ -120,6 +120,21 @@ def add_untested_code(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_count_from(parser: argparse.ArgumentParser) -> None:
+    """Add the number of the first pad, row and column."""
+    parser.add_argument(
+        "--count-from",
+        type=int,
+        default=0,
+        choices=(0, 1),
+        metavar="N",
+        help=(
+            "number of the first pad, row, column and cell in text, pages and pictures, 0 or 1"
+            " (default 0; JSON counts from 0)"
+        ),
+    )
+
+
 def add_metrics(parser: argparse.ArgumentParser) -> None:
     """Add the file of metrics."""
     parser.add_argument(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from adaptfault.cli.options import Commands, add_trust, command, emit, trust
+from adaptfault.cli.options import Commands, add_count_from, add_trust, command, emit, trust
 
 
 def add(commands: Commands) -> None:
@@ -20,6 +20,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "--name", metavar="NAME", help="of the robot (default: of the bundle or its folder)"
     )
+    add_count_from(parser)
     add_trust(parser)
     parser.set_defaults(run=run)  # the folder of the page is made
 
@@ -29,6 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.bundle.bundle import Bundle
     from adaptfault.robot.technician_report import write_report
 
-    path = write_report(args.out, Bundle.open(args.bundle, **trust(args)), name=args.name)
+    bundle = Bundle.open(args.bundle, **trust(args))
+    path = write_report(args.out, bundle, name=args.name, count_from=args.count_from)
     emit(args, {"schema": "adaptfault.report/1", "report": str(path)}, f"report: {path}")
     return 0

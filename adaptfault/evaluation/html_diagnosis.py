@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from adaptfault.evaluation.html_page import Picture, render, version_of
 from diagnostics import Diagnosis
 from diagnostics.decision.grouped_faults import by_group
+from diagnostics.decision.numbering import Numbering
 
 Verdict = Literal["call", "watch", "nothing"]
 
@@ -48,6 +50,7 @@ def write_diagnosis(
     reference: bool,
     code: int | None = None,
     notes: Sequence[str] = (),
+    count_from: int = 0,
 ) -> Path:
     """Write the page; return its path.
 
@@ -59,6 +62,7 @@ def write_diagnosis(
         code: the exit code of the command; None: that of the diagnosis.
         notes: sentences below the verdict: a changed sensor, exchanged wires, faults that are
             handled.
+        count_from: number of the first pad, row, column and cell on the page.
 
     Raises:
         OSError: the folder cannot be written.
@@ -89,7 +93,8 @@ def write_diagnosis(
             key=lambda fault: (fault.line is None, -len(fault.cells)),
         ),
         reference=reference,
-        verdicts=Picture.of(diagnosis.plot),
+        numbering=Numbering.from_layout(diagnosis.layout, count_from),
+        verdicts=Picture.of(partial(diagnosis.plot, count_from=count_from)),
         date=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         versions=f"adaptfault {version_of('adaptfault')}",
     )

@@ -9,10 +9,13 @@ from adaptfault.inspection.severity import Reason, worst
 from adaptfault.robot.model_comparison import Judgement
 from adaptfault.robot.sensor_state import weak_base
 from diagnostics import Diagnosis, Fault, FaultSet
+from diagnostics.decision.numbering import Numbering
 from diagnostics.sensor.sensor_change import SensorChange
 
 SCHEMA = "adaptfault.maintenance/1"
 Decision = Literal["unchanged", "deployed", "kept", "refused"]
+
+_FROM_0 = Numbering()
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +85,10 @@ class MaintenanceReport:
         return "; ".join(reason.text for reason in self.reasons)
 
     def __str__(self) -> str:
+        return self.text()
+
+    def text(self, numbering: Numbering = _FROM_0) -> str:
+        """Return the report as text; its first line is of the form of monitoring plugins."""
         status = ("OK", "WARNING", "CRITICAL", "UNKNOWN")[self.exit_code]
         n = self.n_cells or self.fault_set.n_cells
         faulty = len(self.fault_set)
@@ -108,6 +115,7 @@ class MaintenanceReport:
             lines += [f"  {fault.reason}" for fault in self.diagnosis.transport]
             lines.append(f"  {self.diagnosis.coverage}")
             lines += [f"  to test more: {touch}" for touch in self.diagnosis.coverage.advice[:3]]
+        lines = [numbering.text(line) for line in lines]
         lines += [f"  {stage}" for stage in self.stages]
         if self.judgement is not None:
             lines.append(f"  {self.judgement}")

@@ -44,7 +44,8 @@ def repair(run: MaintenanceRun, faulty: FaultSet) -> Iterator[Candidate]:
     if earlier is not None:
         yield Candidate(run.robot.model(earlier), earlier)
         return
-    run.say(f"{len(faulty)} of {len(run.robot.present)} cells are faulty; adapting")
+    verb = "is" if len(faulty) == 1 else "are"
+    run.say(f"{len(faulty)} of {len(run.robot.present)} cells {verb} faulty; adapting")
     for method in ("auto", "fill"):
         yield Candidate(
             run.robot.adapter.adapt(faulty, method=method, budget=run.budget, progress=False)

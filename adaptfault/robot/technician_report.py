@@ -6,6 +6,7 @@ from __future__ import annotations
 import platform
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from adaptfault.evaluation.html_page import Picture, render, version_of
 from adaptfault.robot.sensor_state import SensorState, unhandled_cells
 from diagnostics import Diagnosis
 from diagnostics.decision.grouped_faults import by_group
+from diagnostics.decision.numbering import Numbering
 
 if TYPE_CHECKING:
     from adaptfault.robot.maintenance_report import MaintenanceReport
@@ -35,6 +37,7 @@ def write_report(
     *,
     run: MaintenanceReport | None = None,
     name: str | None = None,
+    count_from: int = 0,
 ) -> Path:
     """Write the page and return its path.
 
@@ -44,6 +47,7 @@ def write_report(
         diagnosis: to show; None: that of ``run``, or the last one in the journal.
         run: a maintenance run that the page is about, also a dry one; None: what the bundle knows.
         name: of the robot; None: of the bundle, or of its folder where that is called robot.bundle.
+        count_from: number of the first pad, row, column and cell on the page.
 
     Raises:
         OSError: the file cannot be written.
@@ -84,7 +88,12 @@ def write_report(
             key=lambda fault: (fault not in unhandled, fault.line is None, -len(fault.cells)),
         ),
         diagnosis=diagnosis,
-        verdicts=None if diagnosis is None else Picture.of(diagnosis.plot),
+        numbering=Numbering.from_layout(bundle.layout, count_from),
+        verdicts=(
+            None
+            if diagnosis is None
+            else Picture.of(partial(diagnosis.plot, count_from=count_from))
+        ),
         dry_run=run is not None and run.dry_run,
         runs=[_shown(one) for one in reversed(runs)],
         problems=problems,

@@ -33,6 +33,7 @@ def draw(
     faults: Sequence[Fault],
     letters: Mapping[FaultKind, str],
     page: float,
+    count_from: int = 0,
 ) -> Figure:
     """Draw each pad: green alive, red faulty, grey untested; the legend explains the letters that
     are on the map.
@@ -43,6 +44,7 @@ def draw(
         faults: in it.
         letters: letter of each fault kind.
         page: width of the page, in inches.
+        count_from: number of the first pad, row and column.
     """
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
@@ -53,8 +55,8 @@ def draw(
     cell_points = 72 * _cell(layout, page)
     for pad, ax in enumerate(axes):
         ax.imshow(layout.grid(colours)[pad], cmap=palette, vmin=-0.5, vmax=3.5)
-        ax.set_title(f"pad {pad}", fontsize=10)
-        _ticks(ax, layout)
+        ax.set_title(f"pad {pad + count_from}", fontsize=10)
+        _ticks(ax, layout, count_from)
         if layout.is_matrix:
             ax.set_xlabel("column", fontsize=8)
             ax.set_ylabel("row", fontsize=8)
@@ -141,7 +143,9 @@ def _cell(layout: SensorLayout, page: float) -> float:
     return min(0.28, 0.8 * page / layout.shape[2], 0.8 * PAGE / layout.rows)
 
 
-def _ticks(ax: Axes, layout: SensorLayout) -> None:
-    ax.set_xticks(range(0, layout.shape[2], max(1, layout.shape[2] // 8)))
-    ax.set_yticks(range(0, layout.rows, max(1, layout.rows // 8)))
+def _ticks(ax: Axes, layout: SensorLayout, count_from: int = 0) -> None:
+    columns = range(0, layout.shape[2], max(1, layout.shape[2] // 8))
+    rows = range(0, layout.rows, max(1, layout.rows // 8))
+    ax.set_xticks(columns, [str(column + count_from) for column in columns])
+    ax.set_yticks(rows, [str(row + count_from) for row in rows])
     ax.tick_params(length=0, labelsize=7)

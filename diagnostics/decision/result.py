@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics.decision.coverage import Coverage, coverage
+from diagnostics.decision.numbering import Numbering
 from diagnostics.decision.static_loads import StaticLoad
 from diagnostics.faults import Fault, FaultKind, FaultSet
 from diagnostics.layout import SensorLayout
@@ -176,8 +177,9 @@ class Diagnosis:
             return 1 if self.static_loads or self.frozen else 0
         return 1 if few and all(f.line is None for f in self.faults) else 2
 
-    def map(self) -> str:
-        """Return the verdicts drawn as text, the pads side by side.
+    def map(self, count_from: int = 0) -> str:
+        """Return the verdicts drawn as text, the pads side by side; pads and rows are numbered from
+        ``count_from``.
 
         ``.`` alive, ``?`` untested, O open, S short, K stuck, A alias, I intermittent, N noisy, D
         drift, F floating, L late, C copy, M clamped, W weak.
@@ -186,18 +188,20 @@ class Diagnosis:
         for fault in self.faults:
             signs[list(fault.cells)] = LETTERS[fault.kind]
         grid = self.layout.grid(np.where(self.layout.present.ravel(), signs, " "))
-        width = max(2 * self.layout.shape[2] - 1, len(f"pad {self.layout.pads - 1}"))
-        lines = [
-            "   ".join(
-                ["    ", *(f"pad {p}".ljust(width) for p in range(self.layout.pads))]
-            ).rstrip()
-        ]
+        names = [f"pad {pad + count_from}" for pad in range(self.layout.pads)]
+        width = max(2 * self.layout.shape[2] - 1, len(names[-1]))
+        lines = ["   ".join(["    ", *(name.ljust(width) for name in names)]).rstrip()]
         for row in range(self.layout.rows):
             cells = [" ".join(grid[pad, row]).ljust(width) for pad in range(self.layout.pads)]
-            lines.append("   ".join([f"{row:4d}", *cells]).rstrip())
+            lines.append("   ".join([f"{row + count_from:4d}", *cells]).rstrip())
         return "\n".join(lines)
 
     def __str__(self) -> str:
+        return self.text()
+
+    def text(self, count_from: int = 0) -> str:
+        """Return the number of faulty cells, the map and the causes as text, positions counted from
+        ``count_from``."""
         found = (
             f"{len(self.fault_set)} faulty cells" if len(self.fault_set) != 1 else "1 faulty cell"
         )
@@ -213,7 +217,8 @@ class Diagnosis:
         recordings = "1 recording" if self.n_recordings == 1 else f"{self.n_recordings} recordings"
         frames = "1 frame" if self.n_frames == 1 else f"{self.n_frames} frames"
         head = f"{found} in {recordings} ({frames}); {self.coverage}"
-        return "\n".join([head, self.map(), *reasons])
+        numbering = Numbering.from_layout(self.layout, count_from)
+        return "\n".join([head, self.map(count_from), *map(numbering.text, reasons)])
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return a pandas DataFrame with a row a cell, in their order.
@@ -249,12 +254,12 @@ class Diagnosis:
             }
         )
 
-    def plot(self, page: float = 10.0) -> Figure:
+    def plot(self, page: float = 10.0, count_from: int = 0) -> Figure:
         """Return the verdict map as a matplotlib Figure; pads that do not fit ``page`` inches side
-        by side go below."""
+        by side go below. Pads, rows and columns are numbered from ``count_from``."""
         from diagnostics.decision.plot import draw
 
-        return draw(self.layout, self.verdicts, self.faults, LETTERS, page)
+        return draw(self.layout, self.verdicts, self.faults, LETTERS, page, count_from)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict (no NaN) that :meth:`from_dict` reads."""

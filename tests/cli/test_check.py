@@ -61,13 +61,17 @@ def test_it_writes_page_badge_json_and_validity(data_set, tmp_path, capsys):
         for option, path in zip(options, outputs.values(), strict=True)
         for part in (option, path)
     ]
-    code = main(["check", str(data_set), "--healthy", "0:20", *paths])
+    code = main(["check", str(data_set), "--healthy", "0:20", "--count-from", "1", *paths])
     told = json.loads(outputs["a.json"].read_text())
     assert told["schema"] == "adaptfault.check/1"
     assert told["inspection"]["diagnosis"]["fault_set"] == [7]
     assert code == 1
-    assert "recordings" in capsys.readouterr().out
-    assert "<h1" in outputs["a.html"].read_text()
+    text = capsys.readouterr().out
+    assert "recordings" in text
+    assert "row 1, column 3" not in text
+    assert "pad 1, row 2, column 4 is short" in text
+    assert "pad 1, row 2, column 4 is short" in outputs["a.html"].read_text()
+    assert "row 1, column 3 is short" in outputs["a.json"].read_text()
     assert "11 of 12 cells" in outputs["a.svg"].read_text()
     with np.load(outputs["valid.npz"]) as archive:
         valid = archive["valid"].reshape(40, -1, 12)

@@ -192,6 +192,12 @@ def test_diagnose_writes_a_page_with_the_verdict_first(file, tmp_path, capsys):
     assert html.index("Call a technician") < html.index("row 3 is short") < html.index("Verdicts")
     assert "not tested" in html
     assert "http" not in html.replace("http-equiv", "")
+    out = tmp_path / "diagnosis.json"
+    diagnose = ("diagnose", broken, "--reference", file, "--count-from", 1)
+    text = run(capsys, *diagnose, "--html", page, "--out", out)[1]
+    assert "row 4 is short" in text
+    assert "row 4 is short" in page.read_text()
+    assert "row 3 is short" in out.read_text()
 
 
 @pytest.mark.parametrize(

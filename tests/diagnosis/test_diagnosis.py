@@ -211,6 +211,22 @@ def test_a_cell_that_blinks_or_is_noisy_is_named_and_dated(
         assert f"blinks between its load and {fault.value:g} N" in fault.reason
 
 
+def test_a_loose_contact_of_a_sensor_with_an_offset_is_told_with_what_it_reads():
+    layout = SensorLayout(1, 3, 4, full_scale=1.0, unit="V", rate=50.0)
+    course = np.maximum(np.sin(np.linspace(-0.5, np.pi + 0.5, 60)), 0)[:, None]
+    rng = np.random.default_rng(0)
+    contacts = [
+        0.1 + course * rng.uniform(0.2, 0.8, 12) + rng.normal(0, 0.002, (60, 12)) for _ in range(28)
+    ]
+    fitted = SelfDiagnosis(layout).fit(contacts[:20])
+    for reads in (0.1, 0.0):
+        loose = Fault("intermittent", (7,), value=reads)
+        log = [inject(one, [loose], layout, seed=i) for i, one in enumerate(contacts[20:])]
+        (fault,) = fitted.diagnose(log).faults
+        assert fault.value == pytest.approx(reads, abs=0.01)
+        assert f"blinks between its load and {fault.value:.4g} V" in fault.reason
+
+
 def test_a_cell_whose_offset_drifts_away_is_found(fitted, log):
     pause = np.zeros((30, 220))
     frames = np.concatenate([part for r in log for part in (r, pause)])

@@ -7,6 +7,7 @@ Those that are marked slow run there and in ``make test-all``, not in ``make tes
 import contextlib
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -60,6 +61,7 @@ SLOW = {  # they take long, or a test of the library proves the same
     "attack.py",
     "io_errors.py",
     "kill_maintenance.py",
+    "lerobot_set.py",
     "own_model.py",
     "picture.py",
     "power_cut.py",
@@ -193,10 +195,10 @@ def test_the_first_hour_ends_with_the_right_verdict_on_a_small_skin(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("array", ["skin", "icub", "insole", "sdh"])
+@pytest.mark.parametrize("array", ["skin", "lerobot", "fabric", "icub", "insole", "sdh"])
 def test_the_first_hour_ends_with_the_right_verdict_on_every_array(array: str, tmp_path: Path):
     data = HOME.parents[1] / "shared/data"
-    if array != "skin" and not data.is_dir():
+    if array not in ("skin", "lerobot") and not data.is_dir():
         pytest.skip("the real recordings are not here")
     command = f"{sys.executable} -W error -m adaptfault"
     environment = {
@@ -205,6 +207,8 @@ def test_the_first_hour_ends_with_the_right_verdict_on_every_array(array: str, t
         "DATA": str(data),
         "EPOCHS": "1",
         "GRASPS": "8",
+        "SLIDES": "::6",
+        "PYTHON": sys.executable,
     }
     environment["PYTHONPATH"] = str(HOME.parent)
     done = subprocess.run(
@@ -216,5 +220,6 @@ def test_the_first_hour_ends_with_the_right_verdict_on_every_array(array: str, t
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     assert f"first_hour: {array}: verdict right" in done.stdout
+    assert re.search(rf"first_hour: {array}: \d+ s for train, exit code 0", done.stdout)
     for page in ("later.html", "diagnosis.html", "maintenance.html", "report.html"):
         assert (tmp_path / array / page).stat().st_size > 10_000

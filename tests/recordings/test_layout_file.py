@@ -118,6 +118,25 @@ def test_frames_of_one_pad_that_may_be_recordings_are_refused_with_both_shapes(t
     assert load(tmp_path / "a.npy", layout="4x6").recordings.frames[0].shape == (60, 24)
 
 
+@pytest.mark.parametrize("beside", [True, False])
+def test_what_a_layout_file_leaves_open_is_taken_from_the_recordings(tmp_path, beside):
+    path = write(
+        tmp_path / "layout.toml", 'pads = 1\nrows = 2\ncols = 3\nwiring = "bus"\nrest = "low"\n'
+    )
+    times = np.round(np.arange(200) * 1000 / 35.7)
+    values = np.random.default_rng(0).integers(20, 700, (200, 6))
+    rows = [",".join(map(str, row)) for row in np.c_[times, values].astype(int)]
+    file = write(tmp_path / "a.csv", "\n".join(["time_ms,a,b,c,d,e,f", *rows]))
+    loaded = load(file, layout=None if beside else path)
+    layout = loaded.recordings.layout
+    assert (layout.wiring, layout.rest, layout.full_scale) == ("bus", "low", 1023)
+    assert layout.unit == "count"
+    assert layout.rate == pytest.approx(35.7, rel=1e-3)
+    assert len(loaded.inferred) == 2
+    write(path, path.read_text() + "rate = 40\n")
+    assert load(file).recordings.layout.rate == 40
+
+
 TOML = """
 pads = 1
 rows = 2

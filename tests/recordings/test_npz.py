@@ -17,7 +17,7 @@ from recording_files import (
     write,
 )
 
-from adaptfault.data.recordings import InputError, Recordings, load, save_npz
+from adaptfault.data.recordings import InputError, Recordings, load, save, save_npz
 from diagnostics import SensorLayout
 
 
@@ -74,6 +74,54 @@ def test_recordings_without_labels_survive_the_round_trip(tmp_path):
     save_npz(tmp_path / "a.npz", Recordings((newtons(5), newtons(4)), PAPER))
     after = load(tmp_path / "a.npz").recordings
     assert (after.labels, after.class_names, len(after)) == (None, (), 2)
+
+
+@pytest.mark.parametrize(
+    "declared",
+    [
+        {"wiring": "bus", "rest": "high"},
+        {"groups": {"chip 0": [0, 1, 2], "chip 1": [3, 4, 5], "board": ["chip 0", "chip 1"]}},
+        {"axes": 3},
+    ],
+)
+def test_an_archive_keeps_the_wiring(tmp_path, declared):
+    layout = SensorLayout(1, 2, 3, full_scale=700, unit="count", **declared)
+    frames = rng.integers(0, 700, (9, layout.n_cells)).astype(np.float32)
+    assert save(tmp_path / "a.npz", Recordings((frames,), layout)) == ()
+    assert load(tmp_path / "a.npz").recordings.layout == layout
+    assert "wiring, groups, axes and rest" in save(
+        tmp_path / "a.npy", Recordings((frames,), layout)
+    )
+
+
+@pytest.mark.parametrize("text", ["no JSON", "[1]", "[" * 100_000, "{}"])
+def test_an_array_called_layout_of_another_kind_declares_nothing(tmp_path, text):
+    file = archive(tmp_path / "a.npz", frames=counts(), layout=np.frombuffer(text.encode(), "u1"))
+    assert load(file).recordings.layout.is_matrix
+
+
+@pytest.mark.parametrize("axes", [0, "3", 1.5, [3]])
+def test_a_wrong_number_of_axes_in_an_archive_is_refused(tmp_path, axes):
+    written = np.frombuffer(json.dumps({"axes": axes}).encode(), "u1")
+    file = archive(tmp_path / "a.npz", frames=counts(), layout=written)
+    assert refusal(file).startswith("layout: ")
+
+
+def test_csv_files_with_times_give_the_same_recordings_and_rate_without_a_layout(tmp_path):
+    layout = SensorLayout(1, 2, 3, full_scale=1023, unit="count", rate=120)
+    frames = tuple(rng.integers(0, 900, (n, 6)).astype(np.float32) for n in (60, 75, 90))
+    save(tmp_path / "csv", Recordings(frames, layout), times=True)
+    first = (tmp_path / "csv/0.csv").read_text().splitlines()
+    assert first[0] == "time_ms,cell0,cell1,cell2,cell3,cell4,cell5"
+    assert [line.split(",")[0] for line in first[1:5]] == ["0", "8", "17", "25"]
+    (tmp_path / "csv/layout.json").unlink()
+    loaded = load(tmp_path / "csv", layout="2x3")
+    assert loaded.problems == ()
+    assert loaded.recordings.layout.rate == pytest.approx(120, rel=1e-3)
+    for one, other in zip(loaded.recordings, frames, strict=True):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(InputError, match="name a folder"):
+        save(tmp_path / "a.npz", Recordings(frames, layout), times=True)
 
 
 def test_a_save_that_fails_leaves_the_old_file_and_no_litter(tmp_path, monkeypatch):

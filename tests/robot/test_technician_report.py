@@ -38,15 +38,22 @@ def told(capsys, *args: object) -> tuple[int, str]:
 
 def test_the_commands_of_a_bundles_life(bundle, log, capsys, tmp_path):
     page = tmp_path / "report.html"
-    code, out = told(capsys, "maintain", bundle.path, log, "--quiet", "--report", page)
+    counted = ("--count-from", 1)
+    code, out = told(capsys, "maintain", bundle.path, log, "--quiet", "--report", page, *counted)
     assert code in (1, 2)
     first = out.splitlines()[0]
     assert re.fullmatch(
         r"ADAPTFAULT (WARNING|CRITICAL) - deployed: .* \| faulty=5;;;0;60 accuracy=[01]\.\d+;;;0;1",
         first,
     )
+    assert "pad 2, row 3 is short" in out
+    assert "pad 2, row 3 is short" in page.read_text()
+    assert page.read_text().count("Pads, rows and columns count from 1.") == 1
+    told(capsys, "report", bundle.path, "--out", page)
     assert "pad 1, row 2 is short" in page.read_text()
     assert page.read_text().count("Pads, rows and columns count from 0.") == 1
+    told(capsys, "report", bundle.path, "--out", page, *counted)
+    assert "pad 2, row 3 is short" in page.read_text()
 
     code, out = told(capsys, "history", bundle.path)
     assert (

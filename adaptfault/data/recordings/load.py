@@ -28,7 +28,7 @@ from adaptfault.data.recordings.doubts import doubts
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.classes import class_indices, label_files
 from adaptfault.data.recordings.facts.infer import PAPER, SLACK
-from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME, layout_beside
+from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME, layout_beside, not_stated
 from adaptfault.data.recordings.facts.rates import Clock, Elapsed
 from adaptfault.data.recordings.facts.resolve import (
     Resolved,
@@ -352,7 +352,9 @@ def open_recordings(
     if not contents:
         raise nothing_left(problems)
     every = [content for _, content in contents]
-    resolved = resolve_layout(every, array, full_scale, unit, rate, tables)
+    resolved = resolve_layout(
+        every, array, full_scale, unit, rate, tables, not_stated(layout, given)
+    )
     problems += resolved.problems
     if tables is not None:
         try:

@@ -6,8 +6,8 @@ A reader of any format returns these; small and large files take the same way.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from adaptfault.data.recordings.errors import InputError, Problem
 
 Shape = tuple[int, int, int]
+
+DECLARED = "wiring", "groups", "axes", "rest"
+"""What readings do not show of a layout."""
 
 BLOCK = 4096
 """Frames that are read at once."""
@@ -54,6 +57,7 @@ class Facts:
         shape: ``(pads, rows, cols)``.
         present: bool ``[pads, rows, cols]``, False = no sensing element.
         full_scale, unit, rate: as in SensorLayout.
+        declared: those of :data:`DECLARED` that the file gives, as in SensorLayout.
         stored: shape of the array in the file, where it holds one.
         problems: warnings of the reader.
     """
@@ -68,6 +72,7 @@ class Facts:
     full_scale: float | None = None
     unit: str | None = None
     rate: float | None = None
+    declared: Mapping[str, Any] = field(default_factory=dict)
     stored: tuple[int, ...] = ()
     problems: tuple[Problem, ...] = ()
 

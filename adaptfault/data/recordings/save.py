@@ -15,6 +15,8 @@ from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.layout_file import LAYOUT_NAME
 from adaptfault.data.recordings.formats.npz import save_npz
+from adaptfault.data.recordings.recording import DECLARED
+from diagnostics import SensorLayout
 
 FORMATS = ".npz, .npy, .bag (a ROS 2 bag) or a folder of CSV files"
 
@@ -24,7 +26,9 @@ _PAUSE = 5.0  # seconds between two recordings in a bag, which separate them
 _BEGIN = 1_700_000_000  # unix time of the first message: a bag needs one, recordings have none
 
 
-def save(path: str | PathLike[str], recordings: Recordings) -> tuple[str, ...]:
+def save(
+    path: str | PathLike[str], recordings: Recordings, *, times: bool = False
+) -> tuple[str, ...]:
     """Write recordings in the format that the name ends in: ``.npz``, ``.npy``, ``.bag``; without
     an ending, CSV files.
 
@@ -33,18 +37,27 @@ def save(path: str | PathLike[str], recordings: Recordings) -> tuple[str, ...]:
     files lie in one folder a class, with ``layout.json`` beside them. A bag holds one
     ``Float32MultiArray`` a frame on ``/tactile``, recordings separated by pauses.
 
+    Args:
+        path: the file, or the folder of CSV files.
+        recordings: what to write.
+        times: CSV files begin with a header and a column ``time_ms`` of whole milliseconds.
+
     Returns:
         What the format cannot hold, one item each.
 
     Raises:
-        InputError: another ending, no recordings, lengths that differ (``.npy``), or rosbags is
-            missing (``.bag``).
+        InputError: another ending, no recordings, lengths that differ (``.npy``), rosbags is
+            missing (``.bag``), or ``times`` where no CSV files are written.
         OSError: the file cannot be written.
     """
     path = Path(path)
     if not len(recordings):
         raise InputError.at(path, "there are no recordings to save; give at least one")
-    lost = () if recordings.targets is None else ("the targets of a regression",)
+    if times and path.suffix:
+        raise InputError.at(path, "only CSV files have times to write; name a folder")
+    lost: tuple[str, ...] = () if recordings.targets is None else ("the targets of a regression",)
+    if path.suffix.lower() in (".npy", ".bag") and set(DECLARED) & set(recordings.layout.to_dict()):
+        lost = ("wiring, groups, axes and rest", *lost)
     match path.suffix.lower():
         case ".npz":
             save_npz(path, recordings)
@@ -54,7 +67,7 @@ def save(path: str | PathLike[str], recordings: Recordings) -> tuple[str, ...]:
         case ".bag":
             return (*_save_bag(path, recordings), *lost)
         case "":
-            return (*_save_csv(path, recordings), *lost)
+            return (*_save_csv(path, recordings, times), *lost)
         case _:
             raise InputError.at(path, f"recordings are saved as {FORMATS}; choose another name")
 
@@ -73,7 +86,7 @@ def _save_npy(path: Path, recordings: Recordings) -> tuple[str, ...]:
     return ("full scale, unit and rate", "masked positions", "labels", "names")
 
 
-def _save_csv(path: Path, recordings: Recordings) -> tuple[str, ...]:
+def _save_csv(path: Path, recordings: Recordings, times: bool) -> tuple[str, ...]:
     path.mkdir(parents=True, exist_ok=True)
     if any(path.iterdir()):
         raise InputError.at(path, "the folder is not empty; choose another name")
@@ -84,9 +97,19 @@ def _save_csv(path: Path, recordings: Recordings) -> tuple[str, ...]:
         if recordings.labels is not None:
             folder = path / _safe(recordings.class_names[int(recordings.labels[i])])
             folder.mkdir(exist_ok=True)
-        text = "".join(",".join(_written(value) for value in row) + "\n" for row in frames.tolist())
+        rows = [",".join(map(_written, row)) for row in frames.tolist()]
+        if times:
+            rows = _timed(rows, recordings.layout)
+        text = "".join(f"{row}\n" for row in rows)
         atomic_write(folder / f"{i:0{digits}d}.csv", text.encode())
     return ("names",)
+
+
+def _timed(rows: list[str], layout: SensorLayout) -> list[str]:
+    """Return a header, and the rows behind their times in whole milliseconds."""
+    header = ",".join(["time_ms", *(f"cell{cell}" for cell in range(layout.n_cells))])
+    period = 1000 / layout.rate
+    return [header, *(f"{round(i * period)},{row}" for i, row in enumerate(rows))]
 
 
 def _written(value: float) -> str:

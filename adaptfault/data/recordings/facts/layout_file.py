@@ -32,6 +32,8 @@ LAYOUT_NAME = "layout.json"
 MOST_CELLS = 1_000_000
 """A layout with more positions is a typing error, and would fill the memory."""
 
+_OF_RECORDINGS = frozenset(("full_scale", "unit", "rate"))
+
 _SIZES = re.compile(r"\s*(?:(\d{1,9})\s*[xX×*,]\s*)?(\d{1,9})\s*[xX×*,]\s*(\d{1,9})\s*", re.ASCII)
 
 
@@ -69,12 +71,34 @@ def layout_beside(paths: Sequence[Path]) -> SensorLayout | None:
     Raises:
         InputError: such a file is no layout.
     """
-    files = [(path if path.is_dir() else path.parent) / LAYOUT_NAME for path in paths]
-    files = [file if file.is_file() else file.with_suffix(".toml") for file in files]
+    files = _files_beside(paths)
     if not files or not all(file.is_file() for file in files):
         return None
-    layouts = {read_layout(file) for file in dict.fromkeys(files)}
+    layouts = {read_layout(file) for file in files}
     return layouts.pop() if len(layouts) == 1 else None
+
+
+def _files_beside(paths: Sequence[Path]) -> list[Path]:
+    files = [(path if path.is_dir() else path.parent) / LAYOUT_NAME for path in paths]
+    files = [file if file.is_file() else file.with_suffix(".toml") for file in files]
+    return list(dict.fromkeys(files))
+
+
+def not_stated(layout: object, paths: Sequence[Path]) -> frozenset[str]:
+    """Return which of full scale, unit and rate the file of a layout leaves to the recordings.
+
+    Args:
+        layout: as the user gives it; None: the file beside the recordings.
+        paths: of the recordings.
+    """
+    if layout is None:
+        files = [file for file in _files_beside(paths) if file.is_file()]
+    elif isinstance(layout, str | PathLike) and not looks_like_shape(str(layout)):
+        files = [Path(layout)]
+    else:
+        files = []
+    missing = [_OF_RECORDINGS - set(_document(file)) for file in files]
+    return frozenset().union(*missing)
 
 
 def read_layout(path: str | PathLike[str]) -> SensorLayout:
@@ -88,7 +112,7 @@ def read_layout(path: str | PathLike[str]) -> SensorLayout:
             of a wrong kind; named.
     """
     path = Path(path)
-    document = _read_toml(path) if path.suffix.lower() == ".toml" else read_json_object(path)
+    document = _document(path)
     for name, kind in (
         ("pads", int),
         ("rows", int),
@@ -144,6 +168,10 @@ def write_layout(
         if value is not None
     ]
     atomic_write(Path(path), ("\n".join(lines) + "\n").encode())
+
+
+def _document(path: Path) -> dict[str, Any]:
+    return _read_toml(path) if path.suffix.lower() == ".toml" else read_json_object(path)
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

@@ -4,7 +4,7 @@ inference."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING, Any
@@ -15,14 +15,14 @@ from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.infer import default_unit, infer_scale, infer_shape
 from adaptfault.data.recordings.facts.layout_file import looks_like_shape, parse_shape, read_layout
 from adaptfault.data.recordings.facts.rates import Elapsed
-from adaptfault.data.recordings.recording import Shape
+from adaptfault.data.recordings.recording import DECLARED, Shape
 from adaptfault.data.recordings.survey import Content
 from diagnostics import SensorLayout
 
 if TYPE_CHECKING:
     from adaptfault.data.calibration import Calibration
 
-_KEPT = "present", "wiring", "groups", "axes", "rest"
+_KEPT = "present", *DECLARED
 """What a layout states besides the shape and what the options override."""
 
 _SAME_RATE = 0.05
@@ -65,9 +65,17 @@ def resolve_layout(
     unit: str | None,
     rate: float | None,
     tables: Calibration | None,
+    unstated: Collection[str] = (),
 ) -> Resolved:
     """Decide on the layout: options first, then a layout that was given, then the files, then
     inference.
+
+    Args:
+        contents: of the files.
+        array: a layout or a shape that was given.
+        full_scale, unit, rate: options.
+        tables: of calibration.
+        unstated: which of these three the layout leaves to the files.
 
     Raises:
         InputError: an option makes no layout, or the shape or the scale cannot be inferred.
@@ -78,6 +86,7 @@ def resolve_layout(
     if isinstance(array, SensorLayout):
         stated: dict[str, Any] = {name: getattr(array, name) for name in (*overrides, *_KEPT)}
         shape = array.shape
+        stated |= {name: _first(getattr(c.facts, name) for c in contents) for name in unstated}
         if tables is not None and array.unit != "N":  # that was the layout of the counts
             stated |= {"full_scale": None, "unit": None}
     else:
@@ -89,6 +98,9 @@ def resolve_layout(
             name: _first(getattr(content.facts, name) for content in fitting)
             for name in (*overrides, "present")
         }
+        stated |= next(
+            (content.facts.declared for content in fitting if content.facts.declared), {}
+        )
         if tables is not None:  # files describe counts
             stated |= {"full_scale": None, "unit": None}
         unknown = [name for name in ("full_scale", "rate") if not (overrides[name] or stated[name])]
@@ -119,9 +131,9 @@ def resolve_layout(
             else default_unit(float(stated["full_scale"]), shape, contents)
         )
         known.setdefault("unit", usual)
-        sizes = (array.pads, array.rows, array.cols) if isinstance(array, SensorLayout) else shape
-        layout = SensorLayout(*sizes, **known)
-    except (TypeError, ValueError) as error:
+        pads, rows, wide = shape
+        layout = SensorLayout(pads, rows, wide // known.get("axes", 1), **known)
+    except (TypeError, ValueError, ZeroDivisionError) as error:
         raise InputError(f"layout: {error}; correct the option") from None
     if stated["rate"] is None:
         inferred.append(f"rate {layout.rate:g} Hz ({reason_of_rate}); otherwise give --rate")

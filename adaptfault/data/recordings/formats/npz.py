@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import re
 import zipfile
@@ -23,7 +24,15 @@ from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.sizes import check_archive, check_array
 from adaptfault.data.recordings.formats.text import read_bytes, read_json_object, shown
-from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape, cut, grid_shape
+from adaptfault.data.recordings.recording import (
+    DECLARED,
+    Block,
+    Facts,
+    Recording,
+    Shape,
+    cut,
+    grid_shape,
+)
 
 SUFFIXES = (".npz",)
 
@@ -38,6 +47,7 @@ _KEYS = (
     "full_scale",
     "rate",
     "unit",
+    "layout",
 )
 _COUNTS = 16  # whole numbers that reach it are counts, in an array of decimals, too
 _RATES = ("sampling_hz", "rate", "rate_hz", "rate_Hz")  # in the JSON file beside an archive
@@ -58,9 +68,10 @@ def open(path: Path, *, shape: Shape | None = None, **stated: Any) -> list[Recor
     ``[n, T, D]``; optional ``lengths`` ``[n]`` (frames after them are padding; or the frames of all
     recordings stand one behind the other, ``[sum of lengths, D]``), ``labels`` ``[n]`` (numbers or
     text), ``class_names``, ``names`` ``[n]``, ``present`` or ``factory_mask`` (bool
-    ``[pads, rows, cols]``, True = a real cell), and the scalars ``full_scale``, ``rate``, ``unit``.
-    A JSON file of the same stem may give ``class_names`` (or ``classes``), ``sampling_hz`` (or
-    ``rate``), ``full_scale`` (a number, or "12 bit") and ``unit``; the archive itself takes
+    ``[pads, rows, cols]``, True = a real cell), and the scalars ``full_scale``, ``rate``, ``unit``
+    and ``layout`` (JSON as uint8, with ``wiring``, ``groups``, ``axes`` and ``rest`` as in a layout
+    file). A JSON file of the same stem may give ``class_names`` (or ``classes``), ``sampling_hz``
+    (or ``rate``), ``full_scale`` (a number, or "12 bit") and ``unit``; the archive itself takes
     precedence.
 
     Args:
@@ -157,10 +168,24 @@ def _read(path: Path, given: Shape | None) -> _Archive:
         full_scale=_scalar(path, arrays, "full_scale", full_scale),
         rate=_scalar(path, arrays, "rate", rate),
         unit=unit or None,
+        declared=_declared(arrays.get("layout")),
         stored=arrays["frames"].shape,
         problems=problems,
     )
     return _Archive(facts, frames, names, labels)
+
+
+def _declared(layout: NDArray[Any] | None) -> dict[str, Any]:
+    """Return what the archive declares of the wiring; an array of another kind declares nothing."""
+    if layout is None or layout.dtype != np.uint8:
+        return {}
+    try:
+        fields = json.loads(layout.tobytes())
+    except (ValueError, RecursionError):
+        return {}
+    if not isinstance(fields, dict):
+        return {}
+    return {name: fields[name] for name in DECLARED if name in fields}
 
 
 def _counts(frames: NDArray[Any]) -> bool:
@@ -203,6 +228,10 @@ def save_npz(path: str | PathLike[str], recordings: Recordings) -> None:
         "rate": np.array(layout.rate),
         "unit": np.array(layout.unit),
     }
+    written = layout.to_dict()
+    declared = {name: written[name] for name in DECLARED if name in written}
+    if declared:
+        arrays["layout"] = np.frombuffer(json.dumps(declared).encode(), np.uint8)
     if recordings.labels is not None:
         arrays |= {
             "labels": recordings.labels,

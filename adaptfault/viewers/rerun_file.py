@@ -27,7 +27,6 @@ from adaptfault.data.recordings.errors import InputError
 from adaptfault.viewers.timed_log import COLOURS, ROOT, Piece, TimedLog
 from diagnostics import Fault, SensorLayout
 
-
 _MISSING = [(0, "", (0, 0, 0, 0)), (1, "no reading", (240, 240, 240, 255))]
 
 

@@ -240,6 +240,8 @@ class Station:
         try:
             self._view.take(frame, session, events)
         except OSError as error:
+            with suppress(OSError):
+                self._view.close()
             self._view = None
             self._trouble(frame.device, f"the view ends: {error}")
 

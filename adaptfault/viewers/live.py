@@ -67,7 +67,9 @@ class LiveView:
         self.layout = layout
         self.clock = clock
         self._repair = repair
-        self._sink = _sink(target, layout, restored=repair is not None, longest=longest)
+        self._longest = longest
+        self._began: float | None = None  # the first frame of the file
+        self._sink = _sink(target, layout, restored=repair is not None)
         self._devices: dict[str, _Device] = {}
 
     @property
@@ -91,8 +93,8 @@ class LiveView:
             repair = None if self._repair is None else self._repair()
             device = _Device(frame.device, self.clock() - frame.time, repair)
             self._devices[frame.device] = device
+        self._keep_short(frame.time + device.offset)
         device.take(frame, session, self.layout)
-        self._sink.tick(device.times[-1])
         self._sink.tell(device, events)
         if device.times[-1] - device.times[0] >= self._sink.span:
             self._sink.write(device)
@@ -112,10 +114,25 @@ class LiveView:
         Raises:
             OSError: the file cannot be written.
         """
+        try:
+            self._write()
+        finally:
+            self._sink.close()
+
+    def _keep_short(self, now: float) -> None:
+        """Begin the next file where the present one is long enough."""
+        if self._began is None:
+            self._began = now
+        if now - self._began >= self._longest:
+            self._write()
+            self._sink.renew()
+            self._began = now
+
+    def _write(self) -> None:
+        """Write the frames that wait."""
         for device in self._devices.values():
             if device.times:
                 self._sink.write(device)
-        self._sink.close()
 
 
 @dataclass(eq=False)
@@ -166,14 +183,15 @@ class _Device:
 
     def _state(self, diagnosis: Diagnosis | None, faulty: FaultSet, layout: SensorLayout) -> None:
         """State what an evaluation found, and all cells that are taken for faulty now."""
-        about = {"hardware_id": self.name}
         if diagnosis is None:
             states = np.full(layout.n_cells, State.UNTESTED, dtype=np.uint8)
             states[~layout.present.ravel()] = State.NO_CELL
-            self.status = stale_array(layout, "not evaluated yet", level=Level.WARN, **about)
+            self.status = stale_array(
+                layout, "not evaluated yet", level=Level.WARN, hardware_id=self.name
+            )
         else:
             states = states_of(diagnosis).ravel()
-            self.status = diagnostic_array(diagnosis, **about)
+            self.status = diagnostic_array(diagnosis, hardware_id=self.name)
         states[faulty.mask] = State.FAULTY
         self.states = layout.grid(states)
 
@@ -193,20 +211,20 @@ class _Sink(Protocol):
     span: float  # seconds of frames that are written at once
     places: list[str]
 
-    def tick(self, now: float) -> None: ...
+    def renew(self) -> None: ...
     def write(self, device: _Device) -> None: ...
     def tell(self, device: _Device, events: Sequence[Event]) -> None: ...
     def close(self) -> None: ...
 
 
-def _sink(target: str, layout: SensorLayout, *, restored: bool, longest: float) -> _Sink:
+def _sink(target: str, layout: SensorLayout, *, restored: bool) -> _Sink:
     ending = Path(target).suffix.lower()
     if ending == ".mcap":
         check_mcap(target)
-        return _McapFiles(Path(target), layout, restored, longest)
+        return _McapFiles(Path(target), layout, restored)
     if ending == ".rrd":
         check_rerun(target)
-        return _RerunFiles(Path(target), layout, restored, longest)
+        return _RerunFiles(Path(target), layout, restored)
     name, _, port = target.partition(":")
     if name == "rerun" and (not port or port.isdecimal()):
         check_rerun(target)
@@ -229,12 +247,11 @@ class _McapFiles:
 
     span = 0.0
 
-    def __init__(self, path: Path, layout: SensorLayout, restored: bool, longest: float) -> None:
+    def __init__(self, path: Path, layout: SensorLayout, restored: bool) -> None:
         self.places: list[str] = []
         self._path = path
         self._layout = layout
         self._restored = restored
-        self._longest = longest
         self._open()
 
     def _open(self) -> None:
@@ -243,22 +260,18 @@ class _McapFiles:
         self.places.append(str(path))
         self._messages = McapMessages(self._file)
         self._arrays: dict[str, McapArray] = {}
-        self._began: float | None = None
         self._flushed = -np.inf
 
-    def tick(self, now: float) -> None:
-        """Write what waits to the disk each second; begin the next file after so long."""
-        began = now if self._began is None else self._began
-        if now - began >= self._longest:
-            self.close()
-            self._open()
-        elif now - self._flushed >= _FLUSHED:
-            self._messages.writer.flush()
-            self._flushed = now
-        self._began = now if self._began is None else self._began
+    def renew(self) -> None:
+        """End the file, and begin the next one."""
+        self.close()
+        self._open()
 
     def write(self, device: _Device) -> None:
-        """Write the frames that wait."""
+        """Write the frames that wait; each second all goes to the disk."""
+        if device.last - self._flushed >= _FLUSHED:
+            self._messages.writer.flush()
+            self._flushed = device.last
         array = self._arrays.get(device.name)
         if array is None:
             array = self._messages.array(self._layout, device.root, restored=self._restored)
@@ -296,13 +309,17 @@ class _Rerun:
         self._stream = rerun.RecordingStream("adaptfault")
         self._arrays: dict[str, RerunArray] = {}
         self._states: dict[str, NDArray[np.uint8] | None] = {}  # as written last
+        rerun.TimeColumn("time", duration=[0.0])  # imports much: now, not at the first frame
+        blueprint([])
         self._connect(self._stream)
 
     def _connect(self, stream: Any) -> None:
         raise NotImplementedError
 
-    def tick(self, now: float) -> None:
-        """Nothing is to do from time to time."""
+    def renew(self) -> None:
+        """End the stream, and begin the next one."""
+        self.close()
+        self._open()
 
     def write(self, device: _Device) -> None:
         """Write the frames that wait, and the states where they changed."""
@@ -346,10 +363,9 @@ class _RerunFiles(_Rerun):
 
     span = _FLUSHED
 
-    def __init__(self, path: Path, layout: SensorLayout, restored: bool, longest: float) -> None:
+    def __init__(self, path: Path, layout: SensorLayout, restored: bool) -> None:
         super().__init__(layout, restored)
         self._path = path
-        self._longest = longest
         self._open()
 
     def _connect(self, stream: Any) -> None:
@@ -357,14 +373,6 @@ class _RerunFiles(_Rerun):
         path.touch()  # raises OSError; Rerun's own thread would only log it
         stream.save(path)
         self.places.append(str(path))
-        self._began: float | None = None
-
-    def tick(self, now: float) -> None:
-        """Begin the next file after so long."""
-        if self._began is not None and now - self._began >= self._longest:
-            self.close()
-            self._open()
-        self._began = now if self._began is None else self._began
 
 
 class _RerunServer(_Rerun):
@@ -378,3 +386,6 @@ class _RerunServer(_Rerun):
     def _connect(self, stream: Any) -> None:
         address = stream.serve_grpc(grpc_port=self._port, server_memory_limit=_MEMORY)
         self.places.append(address)
+
+    def renew(self) -> None:
+        """The stream goes on: its memory is bounded."""

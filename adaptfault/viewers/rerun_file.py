@@ -194,7 +194,8 @@ class RerunArray:
 def _changes(missing: NDArray[np.bool_], before: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return in which frames other positions are missing than in the frame before."""
     earlier = np.concatenate([before[None], missing[:-1]])
-    return (missing != earlier).any(axis=(1, 2))
+    changes: NDArray[np.bool_] = (missing != earlier).any(axis=(1, 2))
+    return changes
 
 
 def blueprint(arrays: Sequence[RerunArray]) -> Any:

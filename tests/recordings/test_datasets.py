@@ -13,6 +13,7 @@ from adaptfault.cli import main
 from adaptfault.data.recordings import load
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.formats.datasets.features import Pads, choose
+from adaptfault.data.recordings.readers import reader_of, readers
 
 h5py = pytest.importorskip("h5py")
 pa = pytest.importorskip("pyarrow")
@@ -204,6 +205,103 @@ def test_parquet_with_lists_of_different_lengths_says_so(tmp_path):
     pq.write_table(pa.table({"tactile": [[1.0, 2.0], [1.0]]}), tmp_path / "a.parquet")
     with pytest.raises(InputError, match="lists of different lengths"):
         load(tmp_path / "a.parquet")
+
+
+# Times and classes where no built-in name fits
+
+
+def lerobot_named(path: Path, touch: list[np.ndarray]) -> Path:
+    extra = {
+        "touch": touch,
+        "elapsed_ms": [np.arange(len(one), dtype=np.float32) * 10 for one in touch],
+        "kind": [np.full((len(one), 1), i % 2, np.float32) for i, one in enumerate(touch)],
+    }
+    return lerobot(path / "set", extra)
+
+
+def parquet_named(path: Path, touch: list[np.ndarray]) -> Path:
+    tables = [
+        pa.table(
+            {
+                "tactile": pa.array(one.tolist()),
+                "trial": pa.array([i] * len(one)),
+                "elapsed_ms": pa.array(np.arange(len(one)) * 10),
+                "kind": pa.array([f"{i % 2}.0"] * len(one)),
+            }
+        )
+        for i, one in enumerate(touch)
+    ]
+    pq.write_table(pa.concat_tables(tables), path / "a.parquet")
+    return path / "a.parquet"
+
+
+def jsonl_named(path: Path, touch: list[np.ndarray]) -> Path:
+    lines = [
+        {"tactile": frame.tolist(), "trial": i, "elapsed_ms": 10 * t, "kind": f"{i % 2}.0"}
+        for i, one in enumerate(touch)
+        for t, frame in enumerate(one)
+    ]
+    (path / "a.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n")
+    return path / "a.jsonl"
+
+
+def hdf5_named(path: Path, touch: list[np.ndarray]) -> Path:
+    with h5py.File(path / "a.h5", "w") as file:
+        for i, one in enumerate(touch):
+            group = file.create_group(f"demo_{i}")
+            group["tactile"] = one
+            group["elapsed_ms"] = np.arange(len(one)) * 10
+            group.attrs["kind"] = f"{i % 2}.0"
+    return path / "a.h5"
+
+
+def zarr_named(path: Path, touch: list[np.ndarray]) -> Path:
+    store(path / "a.zarr", touch)
+    root = zarr.open_group(path / "a.zarr", mode="a")
+    times = np.concatenate([np.arange(len(one)) * 10 for one in touch])
+    kinds = np.concatenate([np.full(len(one), i % 2, np.float32) for i, one in enumerate(touch)])
+    root["data"].create_array("elapsed_ms", data=times)
+    root["data"].create_array("kind", data=kinds)
+    return path / "a.zarr"
+
+
+NAMED = pytest.mark.parametrize(
+    "write", [lerobot_named, parquet_named, jsonl_named, hdf5_named, zarr_named]
+)
+
+
+@NAMED
+def test_times_and_classes_are_where_the_user_says(write, tmp_path):
+    touch = episodes(n=3, grid=(6,))
+    path = write(tmp_path, touch)
+    options = {"layout": "2x3", "time_column": "elapsed_ms", "label_column": "kind"}
+    check(path, touch, (1, 2, 3), **options)
+    loaded = load(path, **options)
+    recordings = loaded.recordings
+    assert [recordings.class_names[label] for label in recordings.labels] == ["0.0", "1.0", "0.0"]
+    times = [block.times for block in loaded_blocks(path, **options)]
+    np.testing.assert_array_equal(times[0], np.arange(30) * 10.0)
+
+
+def loaded_blocks(path: Path, **options: object) -> list:
+    """The first block of each recording, as its reader gives it."""
+    known = readers()
+    reader = reader_of(path, known, is_folder=path.is_dir())
+    found = reader.open(path, **{**options, "shape": (1, 2, 3)})
+    blocks = [next(iter(one.blocks())) for one in found]
+    assert {block.tick for block in blocks} == {"ms"}
+    return blocks
+
+
+@NAMED
+@pytest.mark.parametrize("option", ["time_column", "label_column"])
+def test_a_name_of_times_or_classes_that_is_not_there_is_told_with_those_that_are(
+    write, option, tmp_path
+):
+    path = write(tmp_path, episodes(n=2, grid=(6,)))
+    words = f"--{option.replace('_', '-')} wrong: .*elapsed_ms"
+    with pytest.raises(InputError, match=words):
+        load(path, layout="2x3", **{option: "wrong"})
 
 
 # Zarr

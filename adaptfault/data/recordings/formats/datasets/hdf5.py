@@ -13,7 +13,12 @@ import numpy as np
 
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.data.recordings.formats.datasets.hierarchy import Array, Contents, recordings_of
+from adaptfault.data.recordings.formats.datasets.hierarchy import (
+    Array,
+    Contents,
+    Stated,
+    recordings_of,
+)
 from adaptfault.data.recordings.recording import Recording, Shape
 
 SUFFIXES = (".h5", ".hdf5", ".hdf", ".he5")
@@ -22,7 +27,13 @@ _MATLAB = "MATLAB_class"  # attribute of every array that MATLAB wrote
 
 
 def open(
-    path: Path, *, shape: Shape | None = None, key: str | None = None, **stated: Any
+    path: Path,
+    *,
+    shape: Shape | None = None,
+    key: str | None = None,
+    time_column: str | None = None,
+    label_column: str | None = None,
+    **stated: Any,
 ) -> list[Recording]:
     """Return the recordings of a file: one, one a group (``demo_0``, ``episode_3``), or those that
     ``episode_ends`` divides.
@@ -32,13 +43,16 @@ def open(
         shape: ``(pads, rows, cols)`` where the user states it.
         key: names of the arrays that hold the readings, one a pad; None: found by their names
             (:mod:`adaptfault.data.recordings.formats.datasets.features`).
+        time_column, label_column: arrays or attributes of times and classes; None: found by name.
         stated: what other readers ask for.
 
     Raises:
         InputError: h5py is not installed, the file is damaged or being written, or the arrays are
             not clear.
     """
-    return recordings_of(path, partial(opened, path), shape=shape, key=key)
+    return recordings_of(
+        path, partial(opened, path), shape=shape, key=key, stated=Stated(time_column, label_column)
+    )
 
 
 @contextmanager

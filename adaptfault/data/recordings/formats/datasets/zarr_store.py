@@ -11,7 +11,7 @@ from typing import Any
 
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.data.recordings.formats.datasets.hierarchy import Contents, recordings_of
+from adaptfault.data.recordings.formats.datasets.hierarchy import Contents, Stated, recordings_of
 from adaptfault.data.recordings.recording import Recording, Shape
 
 SUFFIXES = (".zarr.zip",)
@@ -25,7 +25,13 @@ def accepts(path: Path) -> bool:
 
 
 def open(
-    path: Path, *, shape: Shape | None = None, key: str | None = None, **stated: Any
+    path: Path,
+    *,
+    shape: Shape | None = None,
+    key: str | None = None,
+    time_column: str | None = None,
+    label_column: str | None = None,
+    **stated: Any,
 ) -> list[Recording]:
     """Return the recordings of a store: those that ``episode_ends`` divides, one a group, or one.
 
@@ -34,12 +40,15 @@ def open(
         shape: ``(pads, rows, cols)`` where the user states it.
         key: names of the arrays that hold the readings, one a pad; None: found by their names
             (:mod:`adaptfault.data.recordings.formats.datasets.features`).
+        time_column, label_column: arrays or attributes of times and classes; None: found by name.
         stated: what other readers ask for.
 
     Raises:
         InputError: zarr is not installed, the store is damaged, or the arrays are not clear.
     """
-    return recordings_of(path, partial(_opened, path), shape=shape, key=key)
+    return recordings_of(
+        path, partial(_opened, path), shape=shape, key=key, stated=Stated(time_column, label_column)
+    )
 
 
 @contextmanager

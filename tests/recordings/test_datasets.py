@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -158,6 +160,18 @@ def test_two_features_that_could_be_meant_are_named(tmp_path):
     with pytest.raises(InputError, match=r"pressure \[3, 4\], tactile \[3, 4\]; name one with"):
         load(path)
     check(path, touch, (1, *GRID), key="pressure")
+
+
+@pytest.mark.parametrize("other", ["tactile_filtered", "pressure"])
+def test_two_arrays_that_could_be_meant_are_no_pads(other, tmp_path):
+    (touch,) = episodes(n=1)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["tactile"] = touch
+        file[other] = touch
+    message = r"a\.h5: several features could hold the readings of touch: .*; name one with --key"
+    with pytest.raises(InputError, match=message):
+        load(tmp_path / "a.h5")
+    check(tmp_path / "a.h5", [touch], (1, *GRID), key="tactile")
 
 
 def test_of_a_data_set_with_a_truncated_file_the_other_episodes_are_read(tmp_path):
@@ -413,12 +427,65 @@ def test_an_hdf5_file_that_is_cut_off_or_empty_says_so(tmp_path):
     (tmp_path / "cut.h5").write_bytes(whole[:3000])
     (tmp_path / "empty.h5").write_bytes(b"")
     for name in ("cut.h5", "empty.h5"):
-        with pytest.raises(InputError, match="is no HDF5 file, is cut off, or is being written"):
+        with pytest.raises(InputError, match="is no HDF5 file, or is cut off"):
             load(tmp_path / name)
     with h5py.File(tmp_path / "bare.h5", "w"):
         pass
     with pytest.raises(InputError, match="it holds no feature of numbers"):
         load(tmp_path / "bare.h5")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "is being written by another program; wait until it has closed the file"),
+        ({"libver": "latest", "swmr": True}, "is being written, or its writer was killed"),
+    ],
+)
+def test_an_hdf5_file_that_is_being_written_says_so_and_the_others_are_read(
+    options, message, tmp_path
+):
+    (touch,) = episodes(n=1)
+    with h5py.File(tmp_path / "done.h5", "w") as file:
+        file["tactile"] = touch
+    script = f"""
+import h5py, sys
+options = {options!r}
+shared = options.pop("swmr", False)
+file = h5py.File({str(tmp_path / "open.h5")!r}, "w", **options)
+file.create_dataset("tactile", (500, 6), maxshape=(None, 6), chunks=(32, 6))
+if shared:
+    file.swmr_mode = True
+file.flush()
+print("written", flush=True)
+sys.stdin.readline()
+"""
+    writer = subprocess.Popen(
+        [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    with writer:
+        assert writer.stdout.readline() == "written\n"
+        loaded = load(tmp_path)
+        writer.stdin.close()
+    (error,) = [problem.message for problem in loaded.problems if problem.level == "error"]
+    assert f"open.h5: {message}" in error
+    np.testing.assert_array_equal(loaded.recordings.frames[0], flat(touch))
+
+
+@pytest.mark.parametrize("cut", [1, 20, 600])
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_truncated_zarr_chunk_is_named_with_its_remedy(tmp_path, version, cut):
+    touch = episodes(n=6)
+    store(tmp_path / "set.zarr", touch, version)
+    name = "0.0.0" if version == 2 else "c/0/0/0"
+    chunk = tmp_path / "set.zarr/data/left_tactile_data" / name
+    chunk.write_bytes(chunk.read_bytes()[:-cut])
+    loaded = load(tmp_path / "set.zarr")
+    errors = [problem.message for problem in loaded.problems if problem.level == "error"]
+    assert len(loaded.recordings) == 4
+    assert len(errors) == 2
+    assert "episode 0, frames 0 to 29: cannot be read" in errors[0]
+    assert errors[0].endswith("damaged, or cut off; copy it again")
 
 
 def test_mat_of_version_5_is_read_with_fields_of_structures(tmp_path):

@@ -66,9 +66,7 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
     try:
         file = h5py.File(path, "r")
     except OSError as error:
-        reason = str(error).split("(")[-1].rstrip(")")
-        what = f"is no HDF5 file, is cut off, or is being written ({reason})"
-        raise InputError.at(path, f"{what}; close the writer, or copy it again") from None
+        raise InputError.at(path, _unreadable(str(error))) from None
     with file:
         if names is not None:
             yield Contents({name: _array(file[name]) for name in names}, {}, {})
@@ -89,6 +87,17 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
 
         file.visititems(add)
         yield Contents(arrays, attributes, texts)
+
+
+def _unreadable(error: str) -> str:
+    """Return what a message of HDF5 means, and what to do."""
+    if "unable to lock" in error:
+        return "is being written by another program; wait until it has closed the file"
+    if "consistency flags" in error:
+        what = "is being written, or its writer was killed"
+        return f"{what}; wait until it is closed, or run h5clear -s on a copy"
+    reason = error.split("(")[-1].rstrip(")")
+    return f"is no HDF5 file, or is cut off ({reason}); copy it again"
 
 
 def _array(stored: Any) -> Array:

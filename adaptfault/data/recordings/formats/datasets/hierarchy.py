@@ -356,16 +356,19 @@ def _blocks(
         clock = contents.arrays[str(part.clock)] if has_times else None
         for first in range(part.first, part.last, BLOCK):
             last = min(first + BLOCK, part.last)
-            where = f"{part.name or part.names[0]}, frames {first} to {last - 1}"
+            called = (part.name or part.names[0]).removeprefix(f"{path.name}, ")
+            where = f"{called}, frames {first} to {last - 1}"
             try:
                 values = [np.asarray(array[first:last]) for array in arrays]
                 times = None if clock is None else np.asarray(clock[first:last], dtype=np.float64)
             # a damaged chunk raises any of a dozen kinds: the codec's, the store's, Python's
             except Exception as error:
-                what = f"cannot be read ({type(error).__name__}): damaged, or cut off"
+                what = (
+                    f"cannot be read ({type(error).__name__}): damaged, or cut off; copy it again"
+                )
                 raise InputError.at(path, what, where) from None
             if any(len(value) != last - first for value in values):
-                raise InputError.at(path, "is cut off", where)
+                raise InputError.at(path, "is cut off; copy it again", where)
             times = None if times is None else times.ravel()
             yield Block(_numbers(pads.frames(values)), None, times, tick)
 

@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.formats.datasets.extra import imported
@@ -16,6 +20,7 @@ from adaptfault.data.recordings.recording import Recording, Shape
 
 SUFFIXES = (".zarr.zip",)
 
+_BLOSC = 16  # bytes of a chunk's head; the last four are its length
 _MARKS = (".zgroup", ".zarray", ".zattrs", "zarr.json")
 
 
@@ -67,7 +72,7 @@ def _opened(path: Path, names: Sequence[str] | None) -> Iterator[Contents]:
         else:
             members = dict(root.members(max_depth=None))
         arrays = {
-            name: member
+            name: _Whole(member, path) if _is_blosc(member) and archive is None else member
             for name, member in members.items()
             if isinstance(member, zarr.Array) and member.shape and member.dtype.kind in "iuf"
         }
@@ -87,3 +92,38 @@ def _opened(path: Path, names: Sequence[str] | None) -> Iterator[Contents]:
     finally:
         if archive is not None:
             archive.close()
+
+
+def _is_blosc(array: Any) -> bool:
+    """Return whether each file of an array is a chunk that Blosc compressed last."""
+    last = "".join(type(codec).__name__.lower() for codec in array.compressors[-1:])
+    return "blosc" in last and getattr(array, "shards", None) is None
+
+
+class _Whole:
+    """An array whose chunks are checked for their length: Blosc reads on behind the end of a chunk
+    that was cut off, and returns what lies there."""
+
+    def __init__(self, stored: Any, folder: Path) -> None:
+        self._stored = stored
+        self._folder = folder / stored.path
+        self.shape: tuple[int, ...] = stored.shape
+        self.dtype: np.dtype[Any] = stored.dtype
+
+    def __getitem__(self, part: slice) -> Any:
+        for key in self._keys(*part.indices(self.shape[0])[:2]):
+            chunk = self._folder / key
+            if chunk.is_file():  # one that is not there holds the fill value alone
+                with chunk.open("rb") as file:
+                    stated = file.read(_BLOSC)[-4:]
+                if int.from_bytes(stated, "little") != chunk.stat().st_size:
+                    raise ValueError(f"{key} is cut off")
+        return self._stored[part]
+
+    def _keys(self, first: int, last: int) -> Iterator[str]:
+        """Yield the keys of the chunks that hold some rows."""
+        size, *others = self._stored.chunks
+        rows = range(first // size, math.ceil(last / size))
+        grid = [range(math.ceil(n / c)) for n, c in zip(self.shape[1:], others, strict=True)]
+        for place in itertools.product(rows, *grid):
+            yield self._stored.metadata.encode_chunk_key(place)

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
+from operator import methodcaller
 from typing import TYPE_CHECKING
 
 from adaptfault.acquisition.ordering import Frame
@@ -213,8 +214,8 @@ class Station:
             for name, session in self._sessions.items():
                 events = session.idle(now)
                 self._emit(events)
-                if self._view is not None and events:
-                    self._view.tell(name, events)
+                if events:
+                    self._show(name, methodcaller("tell", name, events))
 
     def _take(self, frame: Frame) -> None:
         session = self._sessions.get(frame.device)
@@ -222,28 +223,30 @@ class Station:
             # the receiver has forgotten them
             for gone in self._sessions.keys() - self.receiver.arrivals.keys():
                 self._emit(self._sessions.pop(gone).close())
+                self._show(gone, methodcaller("forget", gone))
             session = self._sessions[frame.device] = self._begin(frame.device)
         frame, outside = self._in_unit(frame)
         self._outside += outside
         events = session.take(frame, time.monotonic())
         self._emit(events)
-        self._show(frame, session, events)
+        self._show(frame.device, methodcaller("take", frame, session, events))
         if any(event.kind in ("fault", "gone") for event in events):
             if self._relay is not None:
                 self._relay.found(frame.device, session.fault_set)
             self._write_metrics(frame.device, frame.time)
 
-    def _show(self, frame: Frame, session: Session, events: list[Event]) -> None:
-        """Show a frame; a view that cannot be written ends, and the station goes on."""
+    def _show(self, device: str, show: Callable[[LiveView], None]) -> None:
+        """Show something of a device; a view that cannot be written ends, and the station goes
+        on."""
         if self._view is None:
             return
         try:
-            self._view.take(frame, session, events)
+            show(self._view)
         except OSError as error:
             with suppress(OSError):
                 self._view.close()
             self._view = None
-            self._trouble(frame.device, f"the view ends: {error}")
+            self._trouble(device, f"the view ends: {error}")
 
     def _close_view(self) -> None:
         if self._view is None:

@@ -108,6 +108,16 @@ class LiveView:
             device.last = self.clock()
             self._sink.tell(device, events)
 
+    def forget(self, name: str) -> None:
+        """Keep nothing of a device that is gone.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        device = self._devices.pop(name, None)
+        if device is not None and device.times:
+            self._sink.write(device)
+
     def close(self) -> None:
         """End the file or the stream.
 

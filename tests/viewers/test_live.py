@@ -168,6 +168,17 @@ def test_rerun_is_told_faults_and_silence(shorted, tmp_path):
 
 
 @ENDINGS
+def test_of_a_device_that_is_gone_all_frames_are_written_and_nothing_is_kept(ending, tmp_path):
+    path = tmp_path / f"live.{ending}"
+    view = LiveView(str(path), SMALL)
+    fed(view, VALUES)
+    view.forget("a")
+    assert not view._devices
+    view.close()
+    np.testing.assert_array_equal(frames_in(path, "a")[1], VALUES)
+
+
+@ENDINGS
 def test_with_a_bundle_restored_frames_stand_beside_those_that_came(ending, made_bundle, tmp_path):
     path = tmp_path / f"live.{ending}"
     bundle = Bundle.open(made_bundle)

@@ -53,6 +53,7 @@ class Monitor:
         self._life = Life.unknown(fitted.layout.n_cells) if proves else None
         self._segments = 0  # since the last proof of life began
         self._known: dict[Key, Fault] = {}
+        self._evaluated: Diagnosis | None = None
         self._time: float | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -152,6 +153,12 @@ class Monitor:
         """The faults that were told and are not gone, without a new evaluation."""
         return tuple(self._known.values())
 
+    @property
+    def evaluated(self) -> Diagnosis | None:
+        """The diagnosis of the last evaluation that is complete, without a new one; None before
+        the first."""
+        return self._evaluated
+
     def _changes(self, diagnosis: Diagnosis) -> tuple[Fault, ...]:
         now = {
             (fault.line, fault.cells[0] if fault.line is None else -1): fault
@@ -169,4 +176,5 @@ class Monitor:
                 text = f"gone since about frame {diagnosis.n_frames}: {fault.reason}"
                 changes.append(replace(fault, probability=0.0, reason=text))
         self._known = now
+        self._evaluated = diagnosis
         return tuple(changes)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.recorder import Recorded, Recorder
 from adaptfault.acquisition.switch import Contact, Rule, Switch
-from diagnostics import Fault, FaultSet, Monitor, SensorLayout
+from diagnostics import Diagnosis, Fault, FaultSet, Monitor, SensorLayout
 
 CONFIRMED_AFTER = 100
 """Number of predicted windows after which a version on probation is confirmed."""
@@ -46,6 +46,8 @@ class StreamingPredictor(Protocol):
 
     @property
     def layout(self) -> SensorLayout: ...  # noqa: D102
+    @property
+    def evaluated(self) -> Diagnosis | None: ...  # noqa: D102
     def stream(self, frame: NDArray[np.float64], time: float | None = None) -> StreamResult: ...  # noqa: D102
     def confirm(self) -> bool | None: ...  # noqa: D102
 

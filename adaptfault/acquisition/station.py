@@ -13,22 +13,26 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
+from operator import methodcaller
 from typing import TYPE_CHECKING
 
 from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.packet import TICKS
 from adaptfault.acquisition.receiver import Receiver
 from adaptfault.acquisition.recorder import Recorder
-from adaptfault.acquisition.relay import Relay, parse_address
+from adaptfault.acquisition.relay import FrameRepair, Relay, parse_address
 from adaptfault.acquisition.session import Event, Session, StreamingPredictor
 from adaptfault.acquisition.switch import Rule, parse_when
 from adaptfault.data.printable import printable
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.robot.metrics import RobotMetrics, cells_by_pad, fault_counts, write_metrics
-from diagnostics import Monitor, SelfDiagnosis, SensorLayout
+from diagnostics import FaultSet, Monitor, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
     from adaptfault.data.calibration import Calibration
+    from adaptfault.imputation.restorer import Restorer
+    from adaptfault.viewers.live import LiveView
 
 SCHEMA = "adaptfault.listen/1"
 
@@ -61,6 +65,8 @@ class Station:
         when: when to record, see :func:`parse_when`.
         metrics: file of metrics for Prometheus, written when faults change and at the end; the
             robots in it are devices.
+        view: file or stream that shows all frames, see
+            :class:`~adaptfault.viewers.live.LiveView`; with a bundle, restored ones, too.
         seconds, frames: when to end; None: never.
         calibration: converts received values into the layout's unit.
         on_event: called with each event in the event loop, instead of printing it.
@@ -90,6 +96,7 @@ class Station:
         relay: str | None = None,
         when: str = "contact",
         metrics: str | os.PathLike[str] | None = None,
+        view: str | None = None,
         seconds: float | None = None,
         frames: int | None = None,
         calibration: Calibration | None = None,
@@ -126,7 +133,9 @@ class Station:
         if record is not None:
             with Recorder(record, layout):  # a folder that cannot be used raises now
                 pass
+        self._restoring: tuple[Restorer, FaultSet] | None = None
         self._relay = None if relay is None else self._make_relay(relay, host, port, ticks)
+        self._view = None if view is None else self._make_view(view)
         if not self._ready:
             self._ready.append(self._monitor())  # takes a second, so before the first frame
         self._first = self._ready[0]
@@ -181,6 +190,7 @@ class Station:
                 self._emit(session.close())
             if self._relay is not None:
                 self._relay.close()
+            self._close_view()
             self._write_metrics()
         self._end()
 
@@ -201,8 +211,11 @@ class Station:
         while True:
             await asyncio.sleep(_CHECK)
             now = time.monotonic()
-            for session in self._sessions.values():
-                self._emit(session.idle(now))
+            for name, session in self._sessions.items():
+                events = session.idle(now)
+                self._emit(events)
+                if events:
+                    self._show(name, methodcaller("tell", name, events))
 
     def _take(self, frame: Frame) -> None:
         session = self._sessions.get(frame.device)
@@ -210,15 +223,38 @@ class Station:
             # the receiver has forgotten them
             for gone in self._sessions.keys() - self.receiver.arrivals.keys():
                 self._emit(self._sessions.pop(gone).close())
+                self._show(gone, methodcaller("forget", gone))
             session = self._sessions[frame.device] = self._begin(frame.device)
         frame, outside = self._in_unit(frame)
         self._outside += outside
         events = session.take(frame, time.monotonic())
         self._emit(events)
+        self._show(frame.device, methodcaller("take", frame, session, events))
         if any(event.kind in ("fault", "gone") for event in events):
             if self._relay is not None:
                 self._relay.found(frame.device, session.fault_set)
             self._write_metrics(frame.device, frame.time)
+
+    def _show(self, device: str, show: Callable[[LiveView], None]) -> None:
+        """Show something of a device; a view that cannot be written ends, and the station goes
+        on."""
+        if self._view is None:
+            return
+        try:
+            show(self._view)
+        except OSError as error:
+            with suppress(OSError):
+                self._view.close()
+            self._view = None
+            self._trouble(device, f"the view ends: {error}")
+
+    def _close_view(self) -> None:
+        if self._view is None:
+            return
+        try:
+            self._view.close()
+        except OSError as error:
+            self._trouble("", f"the view is not complete: {error}")
 
     def _trouble(self, device: str, text: str) -> None:
         session = self._sessions.get(device)
@@ -309,15 +345,34 @@ class Station:
             raise ValueError(
                 f"--relay {address}: this address is listened on; give the consumer another port"
             )
-        from adaptfault.bundle.bundle import Bundle
+        restorer, known = self._restored()
+        return Relay(address, restorer, known, calibration=self.calibration, ticks=ticks)
 
-        bundle = Bundle.open(self.bundle, keys=self._keys, least_serial=self._least_serial)
-        known = bundle.known_faults().fault_set
-        self._say(
-            f"relay to {address}: fitting on the healthy windows of {self.bundle}; {len(known)}"
-            " faulty cells known"
-        )
-        return Relay(address, bundle.restorer(), known, calibration=self.calibration, ticks=ticks)
+    def _make_view(self, target: str) -> LiveView:
+        from adaptfault.viewers.live import LiveView
+
+        repair = None
+        if self.bundle is not None:
+            repair = partial(FrameRepair, *self._restored())
+        view = LiveView(target, self.layout, repair)
+        self._say(f"view: {view.places[0]}")
+        return view
+
+    def _restored(self) -> tuple[Restorer, FaultSet]:
+        """Return what restores frames, fitted once, and the cells that are faulty from the
+        start."""
+        if self._restoring is None:
+            from adaptfault.bundle.bundle import Bundle
+
+            assert self.bundle is not None
+            bundle = Bundle.open(self.bundle, keys=self._keys, least_serial=self._least_serial)
+            known = bundle.known_faults().fault_set
+            self._say(
+                f"restoring: fitting on the healthy windows of {self.bundle}; {len(known)} faulty"
+                " cells known"
+            )
+            self._restoring = (bundle.restorer(), known)
+        return self._restoring
 
     def _handle_command(self, line: str) -> None:
         word = line.strip().lower()
@@ -361,6 +416,9 @@ class Station:
         if self._relay is not None:
             result["relay"] = self._relay.to_dict()
             text += f", {self._relay}"
+        if self._view is not None:
+            result["view"] = list(self._view.places)
+            text += f", view in {', '.join(self._view.places)}"
         print(json.dumps(result, allow_nan=False) if self.as_json else text, flush=True)
 
 

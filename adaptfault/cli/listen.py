@@ -24,6 +24,9 @@ _EXAMPLE = """  adaptfault listen robot.bundle --port 5005 --record today/ --whe
   adaptfault listen robot.bundle --port 5005 --relay 127.0.0.1:5006
       a consumer on port 5006 reads whole frames in the same format:
       faulty cells are restored from the healthy ones
+  adaptfault listen robot.bundle --port 5005 --view today.mcap
+      frames, restored frames, states and faults as adaptfault view writes them;
+      --view rerun serves them to: rerun rerun+http://127.0.0.1:9876/proxy
       on stdin: record, stop, auto (as --when states), quit"""
 
 _WHEN = (
@@ -74,13 +77,19 @@ def add(commands: Commands) -> None:
         metavar="HOST:PORT",
         help="send repaired packets on; restored values have a plus sign; needs BUNDLE",
     )
+    parser.add_argument(
+        "--view",
+        metavar="FILE",
+        help="show all frames: FILE.mcap for Foxglove, FILE.rrd for Rerun, or rerun (rerun:PORT)"
+        " to serve live viewers of Rerun",
+    )
     parser.add_argument("--when", metavar="WHEN", help=_WHEN)
     parser.add_argument("--seconds", type=float, metavar="S", help="end after so long")
     parser.add_argument("--frames", type=int, metavar="N", help="end after so many frames")
     add_metrics(parser)
     add_array(parser)
     add_trust(parser)
-    parser.set_defaults(run=run, writes=("metrics",))
+    parser.set_defaults(run=run, writes=("metrics", "view"))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -145,6 +154,7 @@ def _station(args: argparse.Namespace) -> Station:
         relay=args.relay,
         when=args.when or "contact",
         metrics=args.metrics,
+        view=args.view,
         seconds=args.seconds,
         frames=args.frames,
         calibration=tables,

@@ -94,11 +94,12 @@ def add_recordings(
         help="columns of a text file that hold the readings: names, patterns, or numbers as 2-33",
     )
     group.add_argument("--ignore", metavar="NAMES", help="columns that hold none, in this form")
-    group.add_argument("--time-column", metavar="NAME", help="column of the times")
+    group.add_argument("--time-column", metavar="NAME", help="column, feature or array of times")
     group.add_argument(
         "--label-column",
         metavar="NAME",
-        help="column of the class: the most frequent value is that of the recording",
+        help="column, feature or array of the class: the most frequent value is that of the"
+        " recording",
     )
     group.add_argument(
         "--frames", type=int, metavar="T", help="refuse recordings of another length"

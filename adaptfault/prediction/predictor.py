@@ -22,7 +22,7 @@ from adaptfault.data.windows import hold_missing, scale
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.models.accumulation import ContactDecision
 from adaptfault.prediction.inference import Inference
-from diagnostics import Fault, FaultSet, Monitor, SelfDiagnosis, SensorLayout
+from diagnostics import Diagnosis, Fault, FaultSet, Monitor, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
     from adaptfault.bundle.bundle import Bundle
@@ -162,6 +162,11 @@ class Predictor:
     def running(self) -> Version:
         """The running version: its model, and how readings reach it (``Version.undo``)."""
         return self._running.version
+
+    @property
+    def evaluated(self) -> Diagnosis | None:
+        """What the monitor found last, as :attr:`diagnostics.Monitor.evaluated`."""
+        return self._monitor.evaluated
 
     @property
     def version(self) -> int:

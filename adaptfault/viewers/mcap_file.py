@@ -1,21 +1,23 @@
-"""Writes an MCAP file for Foxglove: JSON messages with its public schemas.
+"""Writes MCAP files for Foxglove: JSON messages with its public schemas.
 
 - ``/tactile/<pad>/readings``: one ``foxglove.Grid`` a frame, field ``reading``
+- ``/tactile/<pad>/restored``: the same, with faulty and missing cells restored, where something
+  restores them
 - ``/tactile/<pad>/states``: one ``foxglove.Grid`` a second, field ``state`` (numbered as in
   :class:`~adaptfault.viewers.timed_log.State`) and its colour
 - ``/diagnostics``: one ``diagnostic_msgs/DiagnosticArray`` a second
 
 Foxglove draws the rows of a grid upwards, so the last row of a pad comes first. The states lie
-below the readings.
+below the readings, the restored ones below the states.
 """
 
 from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from os import PathLike
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +25,7 @@ from numpy.typing import NDArray
 from adaptfault.acquisition.ros import TOPIC, diagnostic_array
 from adaptfault.data.atomic import atomic_file
 from adaptfault.data.recordings.errors import InputError
-from adaptfault.viewers.timed_log import COLOURS, TimedLog
+from adaptfault.viewers.timed_log import COLOURS, ROOT, Piece, TimedLog
 from diagnostics import SensorLayout
 
 FRAME = "tactile"
@@ -47,55 +49,76 @@ def write_mcap(path: str | PathLike[str], log: TimedLog) -> None:
         InputError: the package mcap is not installed.
         OSError: the file cannot be written.
     """
+    check_mcap(path)
+    status = diagnostic_array(log.diagnosis)
+    names = {str(i): name for i, name in enumerate(log.names)}
+    with atomic_file(path) as name, open(name, "wb") as file:
+        messages = McapMessages(file)
+        messages.writer.add_metadata("recordings", names)
+        array = messages.array(log.layout)
+        for piece in log:
+            array.write(piece, log.states, status)
+        messages.finish()
+
+
+def check_mcap(path: str | PathLike[str]) -> None:
+    """Raise InputError where the package mcap is not installed; ``path``: of the file to write."""
     try:
-        from mcap.writer import Writer
+        import mcap.writer  # noqa: F401
     except ImportError:
         what = "MCAP files are written with mcap; install it: pip install 'adaptfault[view]'"
         raise InputError.at(path, what) from None
-    with atomic_file(path) as name, open(name, "wb") as file:
-        writer = Writer(file)
-        writer.start(profile="", library="adaptfault")
-        _Messages(writer, log).write()
-        writer.finish()
 
 
-class _Messages:
-    """The messages of one file."""
+class McapMessages:
+    """The messages of one file.
 
-    def __init__(self, writer: Any, log: TimedLog) -> None:
-        self.writer = writer
-        self.log = log
-        grid = self._schema("foxglove.Grid", GRID)
-        pads = range(log.layout.pads)
-        self.readings = [self._channel(grid, f"/tactile/{pad}/readings") for pad in pads]
-        self.states = [self._channel(grid, f"/tactile/{pad}/states") for pad in pads]
+    Args:
+        file: is written to, and stays open.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        from mcap.writer import Writer
+
+        self.writer = Writer(file)
+        self.writer.start(profile="", library="adaptfault")
+        self._grid = self._schema("foxglove.Grid", GRID)
         kind = "diagnostic_msgs/DiagnosticArray"
-        self.diagnostics = self._channel(self._schema(kind, DIAGNOSTIC_ARRAY), TOPIC)
+        self._diagnostics = self._channel(self._schema(kind, DIAGNOSTIC_ARRAY), TOPIC)
+        self._right = 0.0  # where the next array is drawn
 
-    def write(self) -> None:
-        """Write all messages in the order of their times."""
-        layout = self.log.layout
-        names = {str(i): name for i, name in enumerate(self.log.names)}
-        self.writer.add_metadata("recordings", names)
-        reading = [_grid(layout, pad, _READING, below=False) for pad in range(layout.pads)]
-        shown = [
-            {**_grid(layout, pad, _STATE, below=True), "data": _packed(_coloured(states))}
-            for pad, states in enumerate(self.log.states)
-        ]
-        status = diagnostic_array(self.log.diagnosis)
-        due = -1.0
-        for piece in self.log:
-            for time, frame in zip(piece.times.tolist(), piece.readings, strict=True):
-                stamp = _stamp(time)
-                if time >= due:
-                    due = time + _REPEAT
-                    for channel, grid in zip(self.states, shown, strict=True):
-                        self._add(channel, stamp, {"timestamp": stamp, **grid})
-                    header = {"stamp": stamp, "frame_id": FRAME}
-                    self._add(self.diagnostics, stamp, {**status, "header": header})
-                for channel, grid, pad in zip(self.readings, reading, frame, strict=True):
-                    data = _packed(pad.astype("<f4"))
-                    self._add(channel, stamp, {"timestamp": stamp, **grid, "data": data})
+    def array(self, layout: SensorLayout, root: str = ROOT, *, restored: bool = False) -> McapArray:
+        """Return the channels of one more array, which is drawn to the right of those before.
+
+        Args:
+            layout: of the array.
+            root: what the names of its topics begin with.
+            restored: whether its pieces hold restored frames.
+        """
+        array = McapArray(self, layout, root, restored=restored, right=self._right)
+        self._right += CELL * (layout.pads * (layout.shape[2] + 1) + 1)
+        return array
+
+    def grid_channel(self, topic: str) -> int:
+        """Return a new channel of grids."""
+        return self._channel(self._grid, topic)
+
+    def status(self, time: float, status: Mapping[str, Any]) -> None:
+        """Add a DiagnosticArray, as :func:`~adaptfault.acquisition.ros.diagnostic_array` makes it,
+        at ``time`` (seconds)."""
+        stamp = _stamp(time)
+        header = {"stamp": stamp, "frame_id": FRAME}
+        self.add(self._diagnostics, stamp, {**status, "header": header})
+
+    def add(self, channel: int, stamp: Mapping[str, int], message: Mapping[str, Any]) -> None:
+        """Add a message to a channel."""
+        at = stamp["sec"] * 10**9 + stamp["nsec"]
+        data = json.dumps(message, allow_nan=False).encode()
+        self.writer.add_message(channel, log_time=at, publish_time=at, data=data)
+
+    def finish(self) -> None:
+        """Write the index of the file, its last part."""
+        self.writer.finish()
 
     def _schema(self, name: str, schema: Mapping[str, Any]) -> int:
         data = json.dumps(schema).encode()
@@ -107,17 +130,74 @@ class _Messages:
         )
         return int(channel)
 
-    def _add(self, channel: int, stamp: Mapping[str, int], message: Mapping[str, Any]) -> None:
-        at = stamp["sec"] * 10**9 + stamp["nsec"]
-        data = json.dumps(message, allow_nan=False).encode()
-        self.writer.add_message(channel, log_time=at, publish_time=at, data=data)
+
+class McapArray:
+    """The messages of one array in a file; see :meth:`McapMessages.array`."""
+
+    def __init__(
+        self,
+        messages: McapMessages,
+        layout: SensorLayout,
+        root: str,
+        *,
+        restored: bool,
+        right: float,
+    ) -> None:
+        self._messages = messages
+        self._due = -np.inf
+        self._readings = self._grids(layout, root, "readings", right, 0)
+        self._states = self._grids(layout, root, "states", right, 1)
+        self._restored = self._grids(layout, root, "restored", right, 2) if restored else []
+
+    def write(self, piece: Piece, states: NDArray[np.uint8], status: Mapping[str, Any]) -> None:
+        """Write frames in the order of their times, with the states of all positions once a second.
+
+        Args:
+            piece: the frames.
+            states: uint8 ``[pads, rows, cols]``, the :class:`State` of each position.
+            status: a DiagnosticArray, see :meth:`McapMessages.status`.
+        """
+        for frame, time in enumerate(piece.times.tolist()):
+            stamp = _stamp(time)
+            if time >= self._due:
+                self._due = time + _REPEAT
+                self._add(self._states, stamp, [_coloured(pad) for pad in states])
+                self._messages.status(time, status)
+            self._add(self._readings, stamp, piece.readings[frame].astype("<f4"))
+            if piece.restored is not None:
+                self._add(self._restored, stamp, piece.restored[frame].astype("<f4"))
+
+    def _grids(
+        self, layout: SensorLayout, root: str, what: str, right: float, row: int
+    ) -> list[tuple[int, dict[str, Any]]]:
+        """Return the channel of each pad, and what all its messages share."""
+        packed = _STATE if what == "states" else _READING
+        return [
+            (
+                self._messages.grid_channel(f"{root}/{pad}/{what}"),
+                _grid(layout, pad, packed, right, row),
+            )
+            for pad in range(layout.pads)
+        ]
+
+    def _add(
+        self,
+        grids: list[tuple[int, dict[str, Any]]],
+        stamp: Mapping[str, int],
+        pads: Iterable[NDArray[Any]],
+    ) -> None:
+        for (channel, grid), pad in zip(grids, pads, strict=True):
+            message = {"timestamp": stamp, **grid, "data": _packed(pad)}
+            self._messages.add(channel, stamp, message)
 
 
-def _grid(layout: SensorLayout, pad: int, packed: np.dtype[Any], *, below: bool) -> dict[str, Any]:
-    """Return what all grids of a pad share."""
+def _grid(
+    layout: SensorLayout, pad: int, packed: np.dtype[Any], right: float, row: int
+) -> dict[str, Any]:
+    """Return what all grids of a pad share; ``row``: how many grids lie above it."""
     _, rows, cols = layout.shape
-    x = CELL * (cols + 1) * pad
-    y = -CELL * (rows + 1) if below else 0.0
+    x = right + CELL * (cols + 1) * pad
+    y = -CELL * (rows + 1) * row
     fields = [
         {"name": name, "offset": offset, "type": _NUMERIC[kind.str[1:]]}
         for name, (kind, offset) in _fields(packed)

@@ -1,4 +1,5 @@
-"""A log as viewers show it: readings by pad, the time of each frame, the state of each cell."""
+"""A log, and what devices send, as viewers show them: readings by pad, the time of each frame, the
+state of each cell."""
 
 from __future__ import annotations
 
@@ -12,6 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics import Diagnosis, SensorLayout, Verdict
+
+ROOT = "/tactile"
+"""What the names of all topics and entities begin with."""
 
 PAUSE = 1.0
 """Seconds between two recordings."""
@@ -52,11 +56,29 @@ class Piece:
         recording: its number, from 0.
         times: float ``[t]``, seconds.
         readings: float32 ``[t, pads, rows, cols]``; NaN where a reading is missing, or no cell is.
+        restored: the same frames with faulty and missing cells restored; None: nothing restores
+            them.
     """
 
     recording: int
     times: NDArray[np.float64]
     readings: NDArray[np.float32]
+    restored: NDArray[np.float32] | None = None
+
+
+def on_grid(frames: NDArray[Any], layout: SensorLayout) -> NDArray[np.float32]:
+    """Return frames ``[t, D]`` as float32 ``[t, pads, rows, cols]``, NaN where no cell is."""
+    readings = np.array(frames, dtype=np.float32)
+    readings[:, ~layout.present.ravel()] = np.nan
+    return layout.grid(readings)
+
+
+def states_of(diagnosis: Diagnosis) -> NDArray[np.uint8]:
+    """Return the :class:`State` of each position, uint8 ``[pads, rows, cols]``."""
+    layout = diagnosis.layout
+    states = np.array([_OF_VERDICT[v] for v in diagnosis.verdicts], dtype=np.uint8)
+    states[~layout.present.ravel()] = State.NO_CELL
+    return layout.grid(states)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +120,7 @@ class TimedLog:
     @cached_property
     def states(self) -> NDArray[np.uint8]:
         """uint8 ``[pads, rows, cols]``: the :class:`State` of each position."""
-        states = np.array([_OF_VERDICT[v] for v in self.diagnosis.verdicts], dtype=np.uint8)
-        states[~self.layout.present.ravel()] = State.NO_CELL
-        return self.layout.grid(states)
+        return states_of(self.diagnosis)
 
     def place(self, frame: int) -> tuple[int, float]:
         """Return the recording and the time of a frame, counted over the log."""
@@ -109,12 +129,9 @@ class TimedLog:
         return recording, float(self.starts[recording] + after)
 
     def __iter__(self) -> Iterator[Piece]:
-        absent = ~self.layout.present.ravel()
         before = 0
         for piece in self.pieces():
             recording, start = self.place(before)
             times = start + np.arange(len(piece)) / self.layout.rate
-            readings = np.array(piece, dtype=np.float32)
-            readings[:, absent] = np.nan
-            yield Piece(recording, times, self.layout.grid(readings))
+            yield Piece(recording, times, on_grid(piece, self.layout))
             before += len(piece)

@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from adaptfault.cli import main
 from adaptfault.data.recordings import load
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.formats.datasets.features import Pads, choose
+from adaptfault.data.recordings.readers import reader_of, readers
 
 h5py = pytest.importorskip("h5py")
 pa = pytest.importorskip("pyarrow")
@@ -159,6 +162,18 @@ def test_two_features_that_could_be_meant_are_named(tmp_path):
     check(path, touch, (1, *GRID), key="pressure")
 
 
+@pytest.mark.parametrize("other", ["tactile_filtered", "pressure"])
+def test_two_arrays_that_could_be_meant_are_no_pads(other, tmp_path):
+    (touch,) = episodes(n=1)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["tactile"] = touch
+        file[other] = touch
+    message = r"a\.h5: several features could hold the readings of touch: .*; name one with --key"
+    with pytest.raises(InputError, match=message):
+        load(tmp_path / "a.h5")
+    check(tmp_path / "a.h5", [touch], (1, *GRID), key="tactile")
+
+
 def test_of_a_data_set_with_a_truncated_file_the_other_episodes_are_read(tmp_path):
     touch = episodes()
     path = lerobot(tmp_path / "set", {"tactile": touch})
@@ -204,6 +219,103 @@ def test_parquet_with_lists_of_different_lengths_says_so(tmp_path):
     pq.write_table(pa.table({"tactile": [[1.0, 2.0], [1.0]]}), tmp_path / "a.parquet")
     with pytest.raises(InputError, match="lists of different lengths"):
         load(tmp_path / "a.parquet")
+
+
+# Times and classes where no built-in name fits
+
+
+def lerobot_named(path: Path, touch: list[np.ndarray]) -> Path:
+    extra = {
+        "touch": touch,
+        "elapsed_ms": [np.arange(len(one), dtype=np.float32) * 10 for one in touch],
+        "kind": [np.full((len(one), 1), i % 2, np.float32) for i, one in enumerate(touch)],
+    }
+    return lerobot(path / "set", extra)
+
+
+def parquet_named(path: Path, touch: list[np.ndarray]) -> Path:
+    tables = [
+        pa.table(
+            {
+                "tactile": pa.array(one.tolist()),
+                "trial": pa.array([i] * len(one)),
+                "elapsed_ms": pa.array(np.arange(len(one)) * 10),
+                "kind": pa.array([f"{i % 2}.0"] * len(one)),
+            }
+        )
+        for i, one in enumerate(touch)
+    ]
+    pq.write_table(pa.concat_tables(tables), path / "a.parquet")
+    return path / "a.parquet"
+
+
+def jsonl_named(path: Path, touch: list[np.ndarray]) -> Path:
+    lines = [
+        {"tactile": frame.tolist(), "trial": i, "elapsed_ms": 10 * t, "kind": f"{i % 2}.0"}
+        for i, one in enumerate(touch)
+        for t, frame in enumerate(one)
+    ]
+    (path / "a.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n")
+    return path / "a.jsonl"
+
+
+def hdf5_named(path: Path, touch: list[np.ndarray]) -> Path:
+    with h5py.File(path / "a.h5", "w") as file:
+        for i, one in enumerate(touch):
+            group = file.create_group(f"demo_{i}")
+            group["tactile"] = one
+            group["elapsed_ms"] = np.arange(len(one)) * 10
+            group.attrs["kind"] = f"{i % 2}.0"
+    return path / "a.h5"
+
+
+def zarr_named(path: Path, touch: list[np.ndarray]) -> Path:
+    store(path / "a.zarr", touch)
+    root = zarr.open_group(path / "a.zarr", mode="a")
+    times = np.concatenate([np.arange(len(one)) * 10 for one in touch])
+    kinds = np.concatenate([np.full(len(one), i % 2, np.float32) for i, one in enumerate(touch)])
+    root["data"].create_array("elapsed_ms", data=times)
+    root["data"].create_array("kind", data=kinds)
+    return path / "a.zarr"
+
+
+NAMED = pytest.mark.parametrize(
+    "write", [lerobot_named, parquet_named, jsonl_named, hdf5_named, zarr_named]
+)
+
+
+@NAMED
+def test_times_and_classes_are_where_the_user_says(write, tmp_path):
+    touch = episodes(n=3, grid=(6,))
+    path = write(tmp_path, touch)
+    options = {"layout": "2x3", "time_column": "elapsed_ms", "label_column": "kind"}
+    check(path, touch, (1, 2, 3), **options)
+    loaded = load(path, **options)
+    recordings = loaded.recordings
+    assert [recordings.class_names[label] for label in recordings.labels] == ["0.0", "1.0", "0.0"]
+    times = [block.times for block in loaded_blocks(path, **options)]
+    np.testing.assert_array_equal(times[0], np.arange(30) * 10.0)
+
+
+def loaded_blocks(path: Path, **options: object) -> list:
+    """The first block of each recording, as its reader gives it."""
+    known = readers()
+    reader = reader_of(path, known, is_folder=path.is_dir())
+    found = reader.open(path, **{**options, "shape": (1, 2, 3)})
+    blocks = [next(iter(one.blocks())) for one in found]
+    assert {block.tick for block in blocks} == {"ms"}
+    return blocks
+
+
+@NAMED
+@pytest.mark.parametrize("option", ["time_column", "label_column"])
+def test_a_name_of_times_or_classes_that_is_not_there_is_told_with_those_that_are(
+    write, option, tmp_path
+):
+    path = write(tmp_path, episodes(n=2, grid=(6,)))
+    words = f"--{option.replace('_', '-')} wrong: .*elapsed_ms"
+    with pytest.raises(InputError, match=words):
+        load(path, layout="2x3", **{option: "wrong"})
 
 
 # Zarr
@@ -315,12 +427,65 @@ def test_an_hdf5_file_that_is_cut_off_or_empty_says_so(tmp_path):
     (tmp_path / "cut.h5").write_bytes(whole[:3000])
     (tmp_path / "empty.h5").write_bytes(b"")
     for name in ("cut.h5", "empty.h5"):
-        with pytest.raises(InputError, match="is no HDF5 file, is cut off, or is being written"):
+        with pytest.raises(InputError, match="is no HDF5 file, or is cut off"):
             load(tmp_path / name)
     with h5py.File(tmp_path / "bare.h5", "w"):
         pass
     with pytest.raises(InputError, match="it holds no feature of numbers"):
         load(tmp_path / "bare.h5")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "is being written by another program; wait until it has closed the file"),
+        ({"libver": "latest", "swmr": True}, "is being written, or its writer was killed"),
+    ],
+)
+def test_an_hdf5_file_that_is_being_written_says_so_and_the_others_are_read(
+    options, message, tmp_path
+):
+    (touch,) = episodes(n=1)
+    with h5py.File(tmp_path / "done.h5", "w") as file:
+        file["tactile"] = touch
+    script = f"""
+import h5py, sys
+options = {options!r}
+shared = options.pop("swmr", False)
+file = h5py.File({str(tmp_path / "open.h5")!r}, "w", **options)
+file.create_dataset("tactile", (500, 6), maxshape=(None, 6), chunks=(32, 6))
+if shared:
+    file.swmr_mode = True
+file.flush()
+print("written", flush=True)
+sys.stdin.readline()
+"""
+    writer = subprocess.Popen(
+        [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    with writer:
+        assert writer.stdout.readline() == "written\n"
+        loaded = load(tmp_path)
+        writer.stdin.close()
+    (error,) = [problem.message for problem in loaded.problems if problem.level == "error"]
+    assert f"open.h5: {message}" in error
+    np.testing.assert_array_equal(loaded.recordings.frames[0], flat(touch))
+
+
+@pytest.mark.parametrize("cut", [1, 20, 600])
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_truncated_zarr_chunk_is_named_with_its_remedy(tmp_path, version, cut):
+    touch = episodes(n=6)
+    store(tmp_path / "set.zarr", touch, version)
+    name = "0.0.0" if version == 2 else "c/0/0/0"
+    chunk = tmp_path / "set.zarr/data/left_tactile_data" / name
+    chunk.write_bytes(chunk.read_bytes()[:-cut])
+    loaded = load(tmp_path / "set.zarr")
+    errors = [problem.message for problem in loaded.problems if problem.level == "error"]
+    assert len(loaded.recordings) == 4
+    assert len(errors) == 2
+    assert "episode 0, frames 0 to 29: cannot be read" in errors[0]
+    assert errors[0].endswith("damaged, or cut off; copy it again")
 
 
 def test_mat_of_version_5_is_read_with_fields_of_structures(tmp_path):

@@ -230,6 +230,19 @@ def test_rerun_shows_states_in_colours_with_names(batches, log):
     assert next(one["color"] for one in told if one["id"] == State.NO_CELL) == 0
 
 
+def test_rerun_covers_what_has_no_reading_from_the_frame_on_where_that_changes(batches):
+    of_pad = {pad: batches[f"/tactile/{pad}/readings/missing"] for pad in range(2)}
+    covers = {
+        pad: [np.reshape(image, (3, 4)) for (image,) in column(part, "SegmentationImage:buffer")]
+        for pad, part in of_pad.items()
+    }
+    absent = np.arange(12).reshape(3, 4) == 5
+    np.testing.assert_array_equal(covers[0], [absent])
+    missing = np.arange(12).reshape(3, 4) == 8
+    np.testing.assert_array_equal(covers[1], [missing, np.zeros((3, 4))])
+    assert [seconds_of(of_pad[pad]) for pad in range(2)] == [[0.0], [4.75, 5.0]]
+
+
 def test_rerun_lists_faults_at_their_onset_and_recordings(batches):
     faults = batches["/tactile/faults"]
     assert seconds_of(faults) == [0.0, 4.0]

@@ -2,7 +2,8 @@
 
 A feature is an array with a name and one frame after the other. Without a name from the user, those
 with a word for touch in their names are meant. Several with the same word are the pads of one
-array, in natural order of their names. Pads of different shapes become one layout: rows and columns
+array, in natural order of their names, unless some are another version of others, as ``raw`` and
+``filtered``. Pads of different shapes become one layout: rows and columns
 of the largest, the positions that a pad does not have are absent.
 """
 
@@ -27,6 +28,7 @@ _TOUCH = re.compile(r"tactile|taxel|pressure|touch|skin|fsr", re.IGNORECASE)
 _NO_TOUCH = re.compile(
     r"temp|time|stamp|valid|mask|index|image|rgb|depth|video|calib", re.IGNORECASE
 )
+_VERSION = re.compile(r"raw|filter|smooth|normali|scaled|baseline|diff|mean|std", re.IGNORECASE)
 _SEPARATOR = re.compile(r"[/.]")
 _SHOWN = 12  # features in a message
 
@@ -53,8 +55,10 @@ def choose(path: Path, features: Mapping[str, Sizes], key: str | None = None) ->
         word = _TOUCH.search(name)
         if word and not _NO_TOUCH.search(name):
             words.setdefault(word[0].lower(), []).append(name)
-    if len(words) > 1:
-        found = ", ".join(_shown(name, arrays[name]) for names in words.values() for name in names)
+    named = [name for names in words.values() for name in names]
+    versions = {_version(name) for name in named}
+    if len(words) > 1 or len(versions) > 1:
+        found = ", ".join(_shown(name, arrays[name]) for name in named)
         what = f"several features could hold the readings of touch: {found}; name one with --key"
         raise InputError.at(path, what)
     if words:
@@ -64,6 +68,12 @@ def choose(path: Path, features: Mapping[str, Sizes], key: str | None = None) ->
         return list(arrays)
     what = "no feature has touch, tactile, taxel, pressure, skin or fsr in its name"
     raise InputError.at(path, f"{what}; {_held(features)}; name one with --key")
+
+
+def _version(name: str) -> str:
+    """Return the word of a name that tells how its readings were processed; "" for none."""
+    found = _VERSION.search(name)
+    return "" if found is None else found[0].lower()
 
 
 def _named(path: Path, features: Mapping[str, Sizes], key: str) -> list[str]:

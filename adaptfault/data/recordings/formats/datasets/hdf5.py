@@ -13,7 +13,12 @@ import numpy as np
 
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.data.recordings.formats.datasets.hierarchy import Array, Contents, recordings_of
+from adaptfault.data.recordings.formats.datasets.hierarchy import (
+    Array,
+    Contents,
+    Stated,
+    recordings_of,
+)
 from adaptfault.data.recordings.recording import Recording, Shape
 
 SUFFIXES = (".h5", ".hdf5", ".hdf", ".he5")
@@ -22,7 +27,13 @@ _MATLAB = "MATLAB_class"  # attribute of every array that MATLAB wrote
 
 
 def open(
-    path: Path, *, shape: Shape | None = None, key: str | None = None, **stated: Any
+    path: Path,
+    *,
+    shape: Shape | None = None,
+    key: str | None = None,
+    time_column: str | None = None,
+    label_column: str | None = None,
+    **stated: Any,
 ) -> list[Recording]:
     """Return the recordings of a file: one, one a group (``demo_0``, ``episode_3``), or those that
     ``episode_ends`` divides.
@@ -32,13 +43,16 @@ def open(
         shape: ``(pads, rows, cols)`` where the user states it.
         key: names of the arrays that hold the readings, one a pad; None: found by their names
             (:mod:`adaptfault.data.recordings.formats.datasets.features`).
+        time_column, label_column: arrays or attributes of times and classes; None: found by name.
         stated: what other readers ask for.
 
     Raises:
         InputError: h5py is not installed, the file is damaged or being written, or the arrays are
             not clear.
     """
-    return recordings_of(path, partial(opened, path), shape=shape, key=key)
+    return recordings_of(
+        path, partial(opened, path), shape=shape, key=key, stated=Stated(time_column, label_column)
+    )
 
 
 @contextmanager
@@ -52,9 +66,7 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
     try:
         file = h5py.File(path, "r")
     except OSError as error:
-        reason = str(error).split("(")[-1].rstrip(")")
-        what = f"is no HDF5 file, is cut off, or is being written ({reason})"
-        raise InputError.at(path, f"{what}; close the writer, or copy it again") from None
+        raise InputError.at(path, _unreadable(str(error))) from None
     with file:
         if names is not None:
             yield Contents({name: _array(file[name]) for name in names}, {}, {})
@@ -75,6 +87,17 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
 
         file.visititems(add)
         yield Contents(arrays, attributes, texts)
+
+
+def _unreadable(error: str) -> str:
+    """Return what a message of HDF5 means, and what to do."""
+    if "unable to lock" in error:
+        return "is being written by another program; wait until it has closed the file"
+    if "consistency flags" in error:
+        what = "is being written, or its writer was killed"
+        return f"{what}; wait until it is closed, or run h5clear -s on a copy"
+    reason = error.split("(")[-1].rstrip(")")
+    return f"is no HDF5 file, or is cut off ({reason}); copy it again"
 
 
 def _array(stored: Any) -> Array:

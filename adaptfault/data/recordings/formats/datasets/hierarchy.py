@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.formats.datasets.features import Pads, choose
+from adaptfault.data.recordings.formats.datasets.table import unit_of
 from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
 
 _EPISODE = re.compile(
@@ -35,6 +37,7 @@ _EPISODE = re.compile(
 )
 _ENDS = ("episode_ends", "lengths", "episode_lengths")
 _CLOCKS = ("timestamp", "timestamps", "time", "times", "stamp", "t")
+_SHOWN = 12  # arrays in a message
 LABELS = ("label", "labels", "class", "object", "task")
 RATES = ("rate", "fps", "hz", "sampling_rate", "sampling_hz", "frequency")
 FULL_SCALES = ("full_scale", "max_value")
@@ -77,6 +80,15 @@ Opened = Callable[[Sequence[str] | None], AbstractContextManager[Contents]]
 
 
 @dataclass(frozen=True)
+class Stated:
+    """Names of the arrays of times and of classes, or of an attribute with the class, whole or the
+    last part; None: found by their names."""
+
+    clock: str | None = None
+    label: str | None = None
+
+
+@dataclass(frozen=True)
 class _Part:
     """Where the frames of one recording are."""
 
@@ -90,7 +102,12 @@ class _Part:
 
 
 def recordings_of(
-    path: Path, opened: Opened, *, shape: Shape | None, key: str | None
+    path: Path,
+    opened: Opened,
+    *,
+    shape: Shape | None,
+    key: str | None,
+    stated: Stated,
 ) -> list[Recording]:
     """Return the recordings of a file.
 
@@ -99,9 +116,11 @@ def recordings_of(
         opened: opens it; raises InputError where it cannot be read.
         shape: ``(pads, rows, cols)`` where the user states it.
         key: which arrays hold the readings; None: found by their names.
+        stated: where times and classes are.
 
     Raises:
-        InputError: no array of touch, or several that could be meant.
+        InputError: no array of touch, or several that could be meant; times or classes are not
+            where they are stated.
     """
     with opened(None) as contents:
         arrays = contents.arrays
@@ -114,12 +133,13 @@ def recordings_of(
         sizes = [tuple(map(int, arrays[name].shape[skipped:])) for name in names]
         pads = Pads.of(sizes, shape)
         facts = _facts(path, contents, names, pads)
-        parts = list(_parts(path, contents, episodes, ends, outer=outer))
+        parts = list(_parts(path, contents, episodes, ends, stated, outer=outer))
         if not any(part.last > part.first for part in parts):
             raise InputError.at(path, "holds no frames; record it again or remove it")
 
     def blocks(part: _Part) -> Callable[[], Iterator[Block]]:
-        return lambda: _blocks(path, opened, part, pads)
+        tick = None if stated.clock is None else unit_of(stated.clock)
+        return lambda: _blocks(path, opened, part, pads, tick)
 
     return [Recording(facts, blocks(part), part.name, part.label) for part in parts]
 
@@ -167,28 +187,35 @@ def _parts(
     contents: Contents,
     episodes: Sequence[tuple[str, list[str]]],
     ends: str | None,
+    stated: Stated,
     *,
     outer: bool,
 ) -> Iterator[_Part]:
-    labels = _labels(contents)
+    labels = _labels(contents) if stated.label is None else []
     for episode, names in episodes:
         length = min(int(contents.arrays[name].shape[0]) for name in names)
-        beside = _beside(contents.arrays, names[0], _CLOCKS, length)
+        clocks = _CLOCKS if stated.clock is None else (stated.clock,)
+        beside = _beside(contents.arrays, names[0], clocks, length)
+        if stated.clock is not None and beside is None and not outer:
+            raise _absent(path, "time-column", stated.clock, "of one number a frame", contents)
+        own_labels = _own_labels(path, contents, names[0], stated.label)
         if outer:
             frames = int(contents.arrays[names[0]].shape[1])
             for i in range(length):
-                label = labels[i] if len(labels) == length else None
+                label = labels[i] if len(labels) == length else own_labels(0, frames, i, length)
                 yield _Part(tuple(names), 0, frames, outer=i, label=label)
             continue
         if ends is None:
             own = _attribute(contents, names[0], LABELS)
             label = str(own) if own is not None else (labels[0] if len(labels) == 1 else None)
+            label = own_labels(0, length, 0, 1) or label
             name = _called(path, episode)
             yield _Part(tuple(names), 0, length, beside, label=label, name=name)
             continue
         bounds = _bounds(path, contents, ends, length)
         for i, (first, last) in enumerate(bounds):
             label = labels[i] if len(labels) == len(bounds) else None
+            label = own_labels(first, last, i, len(bounds)) or label
             name = _called(path, f"episode {i}")
             yield _Part(tuple(names), first, last, beside, label=label, name=name)
 
@@ -220,9 +247,55 @@ def _beside(
             within = other.rpartition("/")[0] == above or (
                 depth == 0 and other.startswith(("data/", "meta/"))
             )
-            if within and _last(other) in wanted and tuple(array.shape) in ((length,), (length, 1)):
+            if within and _named(other, wanted) and tuple(array.shape) in ((length,), (length, 1)):
                 return other
     return None
+
+
+def _named(name: str, wanted: Sequence[str]) -> bool:
+    """Return whether a wanted name is this one, or its last part."""
+    return any(f"/{name.lower()}".endswith(f"/{one.lower()}") for one in wanted)
+
+
+def _absent(path: Path, option: str, name: str, what: str, contents: Contents) -> InputError:
+    held = ", ".join(sorted([*contents.arrays, *contents.texts], key=natural_key)[:_SHOWN])
+    return InputError.at(path, f"--{option} {name}: holds no such array {what}; it holds {held}")
+
+
+def _own_labels(
+    path: Path, contents: Contents, name: str, stated: str | None
+) -> Callable[[int, int, int, int], str | None]:
+    """Return what tells the class of the recording with some first and last frame, its number and
+    how many there are, from the array or the attribute that the user states."""
+    if stated is None:
+        return lambda *_: None
+    value = _attribute(contents, name, (stated.lower(),))
+    if value is not None:
+        return lambda *_: str(value)
+    groups = name.split("/")[:-1]
+    above = ["/".join(groups[:depth]) for depth in range(len(groups), -1, -1)]
+    near = [
+        other
+        for group in above
+        for other in (*contents.texts, *contents.arrays)
+        if _named(other, (stated,)) and (not group or other.startswith(f"{group}/"))
+    ]
+    if not near:
+        raise _absent(path, "label-column", stated, "or attribute", contents)
+    held = contents.texts.get(near[0])
+    values = np.asarray(contents.arrays[near[0]][:]).ravel().tolist() if held is None else held
+
+    def label(first: int, last: int, number: int, count: int) -> str:
+        if len(values) == count:
+            return str(values[number])
+        if len(values) < last:
+            what = (
+                f"{near[0]} holds {len(values)} classes; expected one a recording, or one a frame"
+            )
+            raise InputError.at(path, f"--label-column {stated}: {what}")
+        return Counter(map(str, values[first:last])).most_common(1)[0][0]
+
+    return label
 
 
 def _labels(contents: Contents) -> list[str]:
@@ -270,7 +343,9 @@ def _positive(value: Any) -> float | None:
     return float(value) if math.isfinite(value) and value > 0 else None
 
 
-def _blocks(path: Path, opened: Opened, part: _Part, pads: Pads) -> Iterator[Block]:
+def _blocks(
+    path: Path, opened: Opened, part: _Part, pads: Pads, tick: str | None
+) -> Iterator[Block]:
     wanted = [*part.names, *([] if part.clock is None else [part.clock])]
     with opened(wanted) as contents:
         arrays: list[Any] = [contents.arrays[name] for name in part.names]
@@ -281,19 +356,21 @@ def _blocks(path: Path, opened: Opened, part: _Part, pads: Pads) -> Iterator[Blo
         clock = contents.arrays[str(part.clock)] if has_times else None
         for first in range(part.first, part.last, BLOCK):
             last = min(first + BLOCK, part.last)
-            where = f"{part.name or part.names[0]}, frames {first} to {last - 1}"
+            called = (part.name or part.names[0]).removeprefix(f"{path.name}, ")
+            where = f"{called}, frames {first} to {last - 1}"
             try:
                 values = [np.asarray(array[first:last]) for array in arrays]
                 times = None if clock is None else np.asarray(clock[first:last], dtype=np.float64)
             # a damaged chunk raises any of a dozen kinds: the codec's, the store's, Python's
             except Exception as error:
-                what = f"cannot be read ({type(error).__name__}): damaged, or cut off"
+                what = (
+                    f"cannot be read ({type(error).__name__}): damaged, or cut off; copy it again"
+                )
                 raise InputError.at(path, what, where) from None
             if any(len(value) != last - first for value in values):
-                raise InputError.at(path, "is cut off", where)
-            yield Block(
-                _numbers(pads.frames(values)), None, None if times is None else times.ravel()
-            )
+                raise InputError.at(path, "is cut off; copy it again", where)
+            times = None if times is None else times.ravel()
+            yield Block(_numbers(pads.frames(values)), None, times, tick)
 
 
 def _numbers(values: NDArray[Any]) -> NDArray[Any]:

@@ -19,6 +19,8 @@ from adaptfault.data.recordings.formats.datasets.table import (
     LABELS,
     clock_of,
     first_of,
+    named,
+    unit_of,
 )
 from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
 
@@ -28,7 +30,13 @@ _READINGS = "readings"  # of a line that is a list alone
 
 
 def open(
-    path: Path, *, shape: Shape | None = None, key: str | None = None, **stated: Any
+    path: Path,
+    *,
+    shape: Shape | None = None,
+    key: str | None = None,
+    time_column: str | None = None,
+    label_column: str | None = None,
+    **stated: Any,
 ) -> list[Recording]:
     """Return the recordings of a file: one, or one a value of ``episode`` (``episode_index``,
     ``recording``, ``trial``).
@@ -40,22 +48,30 @@ def open(
         shape: ``(pads, rows, cols)`` where the user states it.
         key: names of the fields that hold the readings, one a pad; None: found by their names
             (:mod:`adaptfault.data.recordings.formats.datasets.features`).
+        time_column, label_column: fields of times and classes; None: found by name.
         stated: what other readers ask for.
 
     Raises:
         InputError: the file holds no frame, a line is no JSON, or the fields are not clear.
     """
     problems: list[Problem] = []
-    parts, first = _parts(path, problems)
+    parts, first = _parts(path, problems, label_column)
+    clock, tick = clock_of(list(first))
+    own_clock = named(path, "time-column", time_column, list(first))
+    if own_clock is not None:
+        clock = own_clock
+        tick = unit_of(own_clock)
     fields = {name: _sizes(value) for name, value in first.items()}
     numbers = {name: sizes for name, sizes in fields.items() if sizes is not None}
+    if own_clock is not None:
+        numbers.pop(own_clock, None)
     names = choose(path, numbers, key)
     sizes = [numbers[name] for name in names]
     pads = Pads.of(sizes, shape)
     facts = Facts(path, shape=pads.shape, present=pads.present, problems=tuple(problems))
 
     def blocks(part: _Part) -> Callable[[], Iterator[Block]]:
-        return lambda: _blocks(path, names, sizes, pads, part)
+        return lambda: _blocks(path, names, sizes, pads, part, clock, tick)
 
     return [Recording(facts, blocks(part), part.name, part.label) for part in parts]
 
@@ -79,11 +95,13 @@ class _Part:
     end: _Place | None
 
 
-def _parts(path: Path, problems: list[Problem]) -> tuple[list[_Part], dict[str, Any]]:
+def _parts(
+    path: Path, problems: list[Problem], label_column: str | None
+) -> tuple[list[_Part], dict[str, Any]]:
     """Return the recordings of a file, and its first line.
 
     Raises:
-        InputError: it holds no frame, or a line is no JSON.
+        InputError: it holds no frame, a line is no JSON, or the field of the class is not there.
     """
     begins: list[tuple[Any, str | None, _Place]] = []
     first: dict[str, Any] = {}
@@ -91,7 +109,8 @@ def _parts(path: Path, problems: list[Problem]) -> tuple[list[_Part], dict[str, 
         first = first or line
         number = line.get(first_of(EPISODES, list(line)) or "")
         if not begins or number != begins[-1][0]:
-            label = line.get(first_of(LABELS, list(line)) or "")
+            stated = named(path, "label-column", label_column, list(line))
+            label = line.get(stated or first_of(LABELS, list(line)) or "")
             begins.append((number, None if label is None else str(label), place))
     if not begins:
         raise InputError.at(path, "holds no frames; record it again or remove it")
@@ -143,16 +162,18 @@ def _lines(
 
 
 def _blocks(
-    path: Path, names: list[str], sizes: list[Sizes], pads: Pads, part: _Part
+    path: Path,
+    names: list[str],
+    sizes: list[Sizes],
+    pads: Pads,
+    part: _Part,
+    clock: str | None,
+    tick: str | None,
 ) -> Iterator[Block]:
     held: list[tuple[int, list[Any], Any]] = []
-    clock: str | None = None
-    tick: str | None = None
     for place, line in _lines(path, part.first, []):
         if part.end is not None and place.byte >= part.end.byte:
             break
-        if place == part.first:
-            clock, tick = clock_of(list(line))
         held.append((place.number, [line.get(name) for name in names], line.get(clock or "")))
         if len(held) == BLOCK:
             yield _block(path, held, sizes, names, pads, tick)

@@ -4,7 +4,8 @@ extra "datasets"."""
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from adaptfault.data.recordings.facts.labels import natural_key
 from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.data.recordings.formats.datasets.features import Pads, Sizes, choose
 from adaptfault.data.recordings.formats.datasets.parquet import Table, blocks_of
+from adaptfault.data.recordings.formats.datasets.table import named
 from adaptfault.data.recordings.formats.text import read_json_object
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
 
@@ -28,7 +30,13 @@ def accepts(path: Path) -> bool:
 
 
 def open(
-    path: Path, *, shape: Shape | None = None, key: str | None = None, **stated: Any
+    path: Path,
+    *,
+    shape: Shape | None = None,
+    key: str | None = None,
+    time_column: str | None = None,
+    label_column: str | None = None,
+    **stated: Any,
 ) -> list[Recording]:
     """Return the episodes of a data set; the task of an episode is its class.
 
@@ -39,6 +47,7 @@ def open(
             each.
         key: names of the features that hold the readings, one a pad; None: found by their names
             (:mod:`adaptfault.data.recordings.formats.datasets.features`).
+        time_column, label_column: features of times and classes; None: found by name.
         stated: what other readers ask for.
 
     Raises:
@@ -54,6 +63,8 @@ def open(
         for name, about in features.items()
         if isinstance(about, Mapping) and about.get("dtype") in _NUMBERS
     }
+    _ = named(path, "time-column", time_column, list(features))
+    own_label = named(path, "label-column", label_column, list(features))
     names = choose(path, numbers, key)
     pads = Pads.of([numbers[name] for name in names], shape)
     rate = info.get("fps")
@@ -67,10 +78,11 @@ def open(
     files = sorted(path.glob("data/**/*.parquet"), key=lambda file: natural_key(str(file)))
     if not files:
         raise InputError.at(path, "holds no data/*.parquet; copy the whole data set")
-    tasks = _tasks(path)
+    tasks = {} if own_label is not None else _tasks(path)
     recordings = []
     for file in files:
-        recordings += list(_episodes(path, file, facts, names, pads, tasks))
+        read = partial(Table.read, file, time_column, label_column)
+        recordings += list(_episodes(path, file, read, facts, names, pads, tasks))
     if not recordings:
         raise InputError.at(path, "holds no frames; record it again or remove it")
     return recordings
@@ -84,11 +96,17 @@ def _sizes(about: Mapping[str, Any]) -> Sizes:
 
 
 def _episodes(
-    path: Path, file: Path, facts: Facts, names: list[str], pads: Pads, tasks: Mapping[int, str]
+    path: Path,
+    file: Path,
+    read: Callable[[], Table],
+    facts: Facts,
+    names: list[str],
+    pads: Pads,
+    tasks: Mapping[int, str],
 ) -> Iterator[Recording]:
     """Yield the episodes of a file; one that cannot be read says so when its frames are read."""
     try:
-        table = Table.read(file)
+        table = read()
         missing = [name for name in names if name not in table.sizes]
         if missing:
             raise InputError.at(file, f"holds no column {missing[0]!r}")

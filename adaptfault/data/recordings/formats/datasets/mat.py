@@ -18,6 +18,7 @@ from adaptfault.data.recordings.formats.datasets.hierarchy import (
     RATES,
     UNITS,
     Contents,
+    Stated,
     recordings_of,
 )
 from adaptfault.data.recordings.formats.text import read_bytes
@@ -31,7 +32,13 @@ _SCALARS = (*RATES, *FULL_SCALES, *UNITS, *LABELS)
 
 
 def open(
-    path: Path, *, shape: Shape | None = None, key: str | None = None, **stated: Any
+    path: Path,
+    *,
+    shape: Shape | None = None,
+    key: str | None = None,
+    time_column: str | None = None,
+    label_column: str | None = None,
+    **stated: Any,
 ) -> list[Recording]:
     """Return the recordings of a file; fields of structures are named ``structure/field``.
 
@@ -40,6 +47,7 @@ def open(
         shape: ``(pads, rows, cols)`` where the user states it.
         key: names of the variables that hold the readings, one a pad; None: found by their names
             (:mod:`adaptfault.data.recordings.formats.datasets.features`).
+        time_column, label_column: variables of times and classes; None: found by name.
         stated: what other readers ask for.
 
     Raises:
@@ -48,9 +56,13 @@ def open(
     with path.open("rb") as file:
         head = file.read(_HEADER + len(_HDF5))
     if head.startswith(_HDF5) or head[_HEADER:].startswith(_HDF5):
-        return hdf5.open(path, shape=shape, key=key)
+        return hdf5.open(
+            path, shape=shape, key=key, time_column=time_column, label_column=label_column
+        )
     _read.cache_clear()  # the file may have changed since
-    return recordings_of(path, partial(_opened, path), shape=shape, key=key)
+    return recordings_of(
+        path, partial(_opened, path), shape=shape, key=key, stated=Stated(time_column, label_column)
+    )
 
 
 @contextmanager

@@ -27,6 +27,8 @@ from adaptfault.data.recordings.formats.datasets.table import (
     LABELS,
     clock_of,
     first_of,
+    named,
+    unit_of,
 )
 from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
 
@@ -34,7 +36,13 @@ SUFFIXES = (".parquet", ".pq")
 
 
 def open(
-    path: Path, *, shape: Shape | None = None, key: str | None = None, **stated: Any
+    path: Path,
+    *,
+    shape: Shape | None = None,
+    key: str | None = None,
+    time_column: str | None = None,
+    label_column: str | None = None,
+    **stated: Any,
 ) -> list[Recording]:
     """Return the recordings of a file, one an episode.
 
@@ -43,12 +51,13 @@ def open(
         shape: ``(pads, rows, cols)`` where the user states it.
         key: names of the columns that hold the readings; None: found by their names
             (:mod:`adaptfault.data.recordings.formats.datasets.features`).
+        time_column, label_column: columns of times and classes; None: found by name.
         stated: what other readers ask for.
 
     Raises:
         InputError: pyarrow is not installed, the file is damaged, or the columns are not clear.
     """
-    table = Table.read(path)
+    table = Table.read(path, time_column, label_column)
     names = table.cells(key)
     sizes = [table.sizes[name] for name in names]
     if not any(sizes):  # each column is a cell
@@ -79,6 +88,8 @@ class Table:
         whole: whether its numbers are whole by their type.
         columns: all names.
         group_rows: rows of each row group.
+        clock, tick: the column of times, and its unit.
+        label: the column of classes.
     """
 
     path: Path
@@ -86,13 +97,18 @@ class Table:
     whole: dict[str, bool]
     columns: tuple[str, ...]
     group_rows: tuple[int, ...]
+    clock: str | None = None
+    tick: str | None = None
+    label: str | None = None
 
     @classmethod
-    def read(cls, path: Path) -> Table:
+    def read(
+        cls, path: Path, time_column: str | None = None, label_column: str | None = None
+    ) -> Table:
         """Read the head of a file.
 
         Raises:
-            InputError: it is damaged.
+            InputError: it is damaged, or does not have a column that is named.
         """
         parquet = imported("pyarrow.parquet", path)
         types = imported("pyarrow.types", path)
@@ -113,7 +129,14 @@ class Table:
         # a damaged file raises any of pyarrow's kinds
         except Exception as error:
             raise _damaged(path, error) from None
-        return cls(path, sizes, whole, tuple(schema.names), groups)
+        columns = tuple(schema.names)
+        clock, tick = clock_of(columns)
+        own_clock = named(path, "time-column", time_column, columns)
+        if own_clock is not None:
+            clock = own_clock
+            tick = unit_of(own_clock)
+        label = named(path, "label-column", label_column, columns) or first_of(LABELS, columns)
+        return cls(path, sizes, whole, columns, groups, clock, tick, label)
 
     def cells(self, key: str | None) -> list[str]:
         """Return the columns that hold the readings.
@@ -121,7 +144,7 @@ class Table:
         Raises:
             InputError: they are not clear.
         """
-        aside = {*EPISODES, "frame_index", "index", "task_index", clock_of(self.columns)[0]}
+        aside = {*EPISODES, "frame_index", "index", "task_index", self.clock, self.label}
         listed = {name: sizes for name, sizes in self.sizes.items() if name not in aside}
         if key is not None or (any(map(math.prod, listed.values())) and any(listed.values())):
             return choose(self.path, listed, key)
@@ -132,11 +155,10 @@ class Table:
     def episodes(self) -> Iterator[tuple[str | None, str | None, tuple[int, int]]]:
         """Yield name, class and first and last row of each episode."""
         number = first_of(EPISODES, self.columns)
-        label = first_of(LABELS, self.columns)
         rows = sum(self.group_rows)
         if not rows:
             return
-        classes = None if label is None else self.column(label)
+        classes = None if self.label is None else self.column(self.label)
         if number is None:
             yield None, None if classes is None else _most(classes), (0, rows)
             return
@@ -161,6 +183,8 @@ class Table:
         except Exception as error:
             raise _damaged(self.path, error) from None
         values: NDArray[Any] = read.column(0).to_numpy()
+        if values.dtype.kind == "O" and len(values) and np.shape(values[0]) == (1,):
+            values = np.concatenate(values)  # LeRobot writes numbers as lists of one, too
         return values
 
 
@@ -202,7 +226,7 @@ def blocks_of(
 def _blocks(
     table: Table, rows: tuple[int, int], names: Sequence[str], pads: Pads
 ) -> Iterator[Block]:
-    clock, tick = clock_of(table.columns)
+    clock = table.clock
     begin = 0
     for group, size in enumerate(table.group_rows):
         first = max(rows[0] - begin, 0)
@@ -210,7 +234,7 @@ def _blocks(
         begin += size
         if first >= last:
             continue
-        held = _group(table.path, group, (*names, *([clock] if clock else [])))
+        held = _group(table.path, group, tuple(names), clock)
         for low in range(first, last, BLOCK):
             part = slice(low, min(low + BLOCK, last))
             features = [held[name][part] for name in names]
@@ -218,9 +242,9 @@ def _blocks(
                 features = [np.stack(features, axis=1)]
             values = pads.frames(features)
             times = None
-            unit = tick
+            unit = table.tick
             if clock is not None and pads.steps == 1:
-                times = held[clock][part]
+                times = held[clock][part].ravel()
                 if times.dtype.kind == "M":
                     times = times.astype("datetime64[ns]").astype(np.float64)
                     unit = "ns"
@@ -228,17 +252,24 @@ def _blocks(
 
 
 @lru_cache(maxsize=2)
-def _group(path: Path, group: int, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+def _group(
+    path: Path, group: int, names: tuple[str, ...], clock: str | None
+) -> dict[str, NDArray[Any]]:
     """Return the columns of a row group; the last ones stay in memory: episodes share them."""
+    wanted = [*names, *([] if clock is None else [clock])]
     parquet = imported("pyarrow.parquet", path)
     try:
         with builtins.open(path, "rb") as file:
             table = parquet.ParquetFile(file, pre_buffer=False).read_row_group(
-                group, columns=list(names), use_threads=False
+                group, columns=wanted, use_threads=False
             )
     except Exception as error:
         raise _damaged(path, error) from None
-    return {name: _array(path, table.column(name).combine_chunks(), name) for name in names}
+    held = {name: _array(path, table.column(name).combine_chunks(), name) for name in wanted}
+    for name in names:
+        if held[name].dtype.kind == "f":
+            held[name] = held[name].astype(np.float32)
+    return held
 
 
 def _array(path: Path, column: Any, name: str) -> NDArray[Any]:
@@ -256,8 +287,6 @@ def _array(path: Path, column: Any, name: str) -> NDArray[Any]:
     values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
     if sizes:
         values = values.reshape(-1, *sizes)
-    if values.dtype.kind == "f" and name != clock_of([name])[0]:
-        values = values.astype(np.float32)
     return values
 
 

@@ -32,7 +32,7 @@ from adaptfault.robot.maintenance_report import Decision, MaintenanceReport
 from adaptfault.robot.maintenance_run import MaintenanceRun, Robot
 from adaptfault.robot.model_comparison import Judgement, compare_candidate, score, with_faults
 from adaptfault.robot.repair import Candidate, repair
-from adaptfault.robot.sensor_state import judged_before, unhandled_cells
+from adaptfault.robot.sensor_state import unhandled_cells
 from diagnostics import FaultSet
 from diagnostics.sensor.ageing import cell_condition
 from diagnostics.sensor.sensor_change import SensorChange
@@ -268,7 +268,7 @@ def _decide_faults(run: MaintenanceRun, readings: ChangedReadings) -> _Outcome:
     if faulty == run.version.fault_set:
         text = f"version {number} excludes these cells already" if faulty else "no faulty cell"
         return _Outcome("unchanged", (Reason(_severity(run, faulty), text),), known, readings)
-    judged = judged_before(run.robot.bundle, faulty, number)
+    judged = run.robot.bundle.journal.judged(faulty, number)
     if judged is not None:
         reason = Reason(judged["exit_code"], f"compared before: {judged['reason']}")
         return _Outcome("kept", (reason,), known, readings, judged=judged)
@@ -318,6 +318,7 @@ def _decide_candidate(
             "exit_code": severity,
             "reason": obstacle,
             "fault_set": list(known.fault_set),
+            "classes": [one.to_dict() for one in judgement.recalls],
         }
         measured["accuracy"] = judgement.running
         return _Outcome(

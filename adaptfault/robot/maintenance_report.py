@@ -127,7 +127,7 @@ class MaintenanceReport:
             "version": self.version,
             "faults": [fault.to_dict() for fault in self.faults],
             "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
-            "judgement": None if self.judgement is None else vars(self.judgement),
+            "judgement": None if self.judgement is None else self.judgement.to_dict(),
             "accuracy": self.accuracy,
             "fault_free_accuracy": self.fault_free_accuracy,
             "measure": self.measure,

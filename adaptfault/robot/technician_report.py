@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from adaptfault.bundle.bundle import Bundle
 from adaptfault.bundle.pointer import Pointer
+from adaptfault.evaluation.class_recall import class_name
 from adaptfault.evaluation.html_page import Picture, render, version_of
 from adaptfault.robot.sensor_state import SensorState, unhandled_cells
 from diagnostics import Diagnosis
@@ -19,6 +20,7 @@ from diagnostics.decision.grouped_faults import by_group
 if TYPE_CHECKING:
     from adaptfault.robot.maintenance_report import MaintenanceReport
 
+_LISTED = 8  # classes in the table: a size
 
 _HEADLINES = (
     "Nothing to do",
@@ -66,6 +68,8 @@ def write_report(
     unhandled = by_group(
         [fault for fault in state.known.faults if fault in state.unhandled], bundle.layout
     )
+    recalls = [] if run is not None and run.dry_run else list(bundle.class_recalls())
+    recalls.sort(key=lambda one: one.low)
     handled = [fault for fault in state.known.faults if fault not in state.unhandled]
     return render(
         path,
@@ -83,6 +87,9 @@ def write_report(
             [*unhandled, *by_group(handled, bundle.layout)],
             key=lambda fault: (fault not in unhandled, fault.line is None, -len(fault.cells)),
         ),
+        recalls=recalls[:_LISTED],
+        other_recalls=recalls[_LISTED:],
+        class_name=lambda label: class_name(label, bundle.class_names),
         diagnosis=diagnosis,
         verdicts=None if diagnosis is None else Picture.of(diagnosis.plot),
         dry_run=run is not None and run.dry_run,

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from adaptfault.inspection.severity import Reason, worst
 from adaptfault.robot.model_comparison import Judgement
+from adaptfault.robot.routine import RoutineResult
 from adaptfault.robot.sensor_state import weak_base
 from diagnostics import Diagnosis, Fault, FaultSet
 from diagnostics.sensor.sensor_change import SensorChange
@@ -48,6 +49,7 @@ class MaintenanceReport:
         seconds: wall clock.
         n_cells: cells of the array, without masked positions; 0 where that is not known.
         measure: what ``accuracy`` is, "accuracy" or "R2"; where none was measured, "accuracy".
+        selftest: what the log of a self-test routine tested; None: it is none.
     """
 
     decision: Decision
@@ -70,6 +72,7 @@ class MaintenanceReport:
     seconds: float = 0.0
     n_cells: int = 0
     measure: str = "accuracy"
+    selftest: RoutineResult | None = None
 
     @property
     def exit_code(self) -> int:
@@ -108,6 +111,8 @@ class MaintenanceReport:
             lines += [f"  {fault.reason}" for fault in self.diagnosis.transport]
             lines.append(f"  {self.diagnosis.coverage}")
             lines += [f"  to test more: {touch}" for touch in self.diagnosis.coverage.advice[:3]]
+        if self.selftest is not None:
+            lines.append(f"  {self.selftest}")
         lines += [f"  {stage}" for stage in self.stages]
         if self.judgement is not None:
             lines.append(f"  {self.judgement}")
@@ -134,6 +139,7 @@ class MaintenanceReport:
             "change": None if self.change is None else vars(self.change),
             "rewiring": list(self.rewiring),
             "replaced_pads": list(self.replaced_pads),
+            "selftest": None if self.selftest is None else self.selftest.to_dict(),
             "stages": list(self.stages),
             "used": list(self.used),
             "left_out": list(self.left_out),

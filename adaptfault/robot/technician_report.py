@@ -90,6 +90,7 @@ def write_report(
         recalls=recalls[:_LISTED],
         other_recalls=recalls[_LISTED:],
         class_name=lambda label: class_name(label, bundle.class_names),
+        selftest=None if run is None else run.selftest,
         diagnosis=diagnosis,
         verdicts=None if diagnosis is None else Picture.of(diagnosis.plot),
         dry_run=run is not None and run.dry_run,

@@ -159,7 +159,9 @@ class Adaptation:
         predicted = self._outputs(windows).argmax(1).numpy()
         return class_recalls(windows.y, predicted, windows.recording, new=np.inf)
 
-    def prediction_sets(self, x: NDArray[Any] | Tensor, alpha: float = 0.1) -> NDArray[np.bool_]:
+    def prediction_sets(
+        self, x: NDArray[Any] | Tensor, alpha: float = 0.1, *, by_class: bool = False
+    ) -> NDArray[np.bool_]:
         """Return for each window the set of classes that holds its true one with probability
         1 - ``alpha``, bool ``[N, n_classes]``.
 
@@ -170,12 +172,14 @@ class Adaptation:
         Args:
             x: windows ``[N, T, D]``, 0..1; the cells in F may hold anything.
             alpha: the share of windows whose true class may be missing, between 0 and 1.
+            by_class: the share holds for the windows of each class, and not only of all. Needs
+                1 / alpha - 1 validation recordings of a class, which else is in every set.
 
         Raises:
             ValueError: ``alpha`` is outside; a regression; or the adaptation was stored without
                 validation.
         """
-        return self.conformal.sets(self.predict_proba(x), alpha)
+        return self.conformal.sets(self.predict_proba(x), alpha, by_class)
 
     @cached_property
     def conformal(self) -> PredictionSets:

@@ -456,6 +456,7 @@ def _report(
         change=change,
         dry_run=run.dry_run,
         n_cells=len(robot.present),
+        set_size=robot.bundle.versions[number].set_size,
         measure="accuracy" if judgement is None else judgement.measure,
         **({} if outcome.told is None else outcome.told.told),
         left_out=run.left_out,

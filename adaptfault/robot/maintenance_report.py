@@ -49,6 +49,8 @@ class MaintenanceReport:
         seconds: wall clock.
         n_cells: cells of the array, without masked positions; 0 where that is not known.
         measure: what ``accuracy`` is, "accuracy" or "R2"; where none was measured, "accuracy".
+        set_size: mean number of classes in the sets of the version that runs now, which hold the
+            true class with probability 0.9, on its validation; None: unknown, or a regression.
         selftest: what the log of a self-test routine tested; None: it is none.
     """
 
@@ -72,6 +74,7 @@ class MaintenanceReport:
     seconds: float = 0.0
     n_cells: int = 0
     measure: str = "accuracy"
+    set_size: float | None = None
     selftest: RoutineResult | None = None
 
     @property
@@ -99,6 +102,8 @@ class MaintenanceReport:
             f"version {self.version} runs; {faulty} of {n} cells {'is' if faulty == 1 else 'are'}"
             " faulty"
         )
+        if self.set_size is not None:
+            lines.append(f"  sets that hold the class at 90 %: {self.set_size:.2f} classes")
         if weak_base(self.accuracy, self.fault_free_accuracy):
             both = f"{self.accuracy:.3f} repaired, {self.fault_free_accuracy:.3f} healthy"
             lines.append(
@@ -136,6 +141,7 @@ class MaintenanceReport:
             "accuracy": self.accuracy,
             "fault_free_accuracy": self.fault_free_accuracy,
             "measure": self.measure,
+            "set_size": self.set_size,
             "change": None if self.change is None else vars(self.change),
             "rewiring": list(self.rewiring),
             "replaced_pads": list(self.replaced_pads),

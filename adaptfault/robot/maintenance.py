@@ -434,7 +434,8 @@ def _report(
     """Return the report; what is told of the log comes before the decision, and the worst first."""
     robot = run.robot
     readings = outcome.readings
-    number = run.version.number if outcome.deploys is None else outcome.deploys
+    version = run.version if outcome.deploys is None else robot.bundle.versions[outcome.deploys]
+    number = version.number
     judgement = outcome.measured.get("judgement")
     change = None
     reasons: list[Reason] = []
@@ -456,7 +457,7 @@ def _report(
         change=change,
         dry_run=run.dry_run,
         n_cells=len(robot.present),
-        set_size=robot.bundle.versions[number].set_size,
+        set_size=version.set_size,
         measure="accuracy" if judgement is None else judgement.measure,
         **({} if outcome.told is None else outcome.told.told),
         left_out=run.left_out,

@@ -51,7 +51,8 @@ if TYPE_CHECKING:
     from adaptfault.prediction.predictor import Predictor, Reading
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.maintenance_report import MaintenanceReport
-    from adaptfault.robot.selftest import Routine, plan_selftest
+    from adaptfault.robot.routine import Routine
+    from adaptfault.robot.selftest import plan_selftest
 
 __version__ = "0.1.0"
 
@@ -149,7 +150,7 @@ _HOMES = {
     "ReducedModel": "adaptation.reduced_model",
     "Restorer": "imputation.restorer",
     "Station": "acquisition",
-    "Routine": "robot.selftest",
+    "Routine": "robot.routine",
     "Scores": "evaluation.scores",
     "Summary": "data.summary",
     "Sensitivity": "evaluation.sensitivity",

@@ -106,6 +106,9 @@ class Session:
         clock: returns the local time.
         accumulate: tell the class of the whole contact so far, which the watcher accumulates, and
             not that of the last window. Every contact is decided anew.
+
+    Where the watcher gives the set of classes of a window, the event of a class tells it, and comes
+    whenever the class or the set changes.
     """
 
     def __init__(
@@ -125,6 +128,7 @@ class Session:
         self.accumulate = accumulate
         self.switch = None if rule is None else Switch(rule)
         self.label: Any = None
+        self.classes: tuple[int, ...] | None = None
         self.faults: tuple[Fault, ...] = ()
         self._classified = 0
         self._confirmed = self._confirm_failed = False
@@ -198,21 +202,23 @@ class Session:
         if self.accumulate:
             probabilities = getattr(reading, "contact", None)
             decided = None if probabilities is None else int(np.argmax(probabilities))
-        if decided == self.label:
+        classes = getattr(reading, "classes", None)
+        if decided == self.label and classes == self.classes:
             return events
         self.label = decided
+        self.classes = classes
         if decided is None:  # the contact has ended
             return events
         share = float(np.max(probabilities))
         label = self.label.item() if isinstance(self.label, np.generic) else self.label
         names = getattr(self.watcher, "class_names", ())
         text = f"{names[label] if names else label} ({share:.0%})"
-        return [
-            *events,
-            self._event(
-                "class", text, label=label, probability=share, dropped=len(reading.fault_set)
-            ),
-        ]
+        data = {"label": label, "probability": share, "dropped": len(reading.fault_set)}
+        if classes is not None:
+            inside = [str(names[one] if names else one) for one in classes]
+            text += f", one of {{{', '.join(inside)}}}"
+            data["classes"] = list(classes)
+        return [*events, self._event("class", text, **data)]
 
     def _confirm(self) -> list[Event]:
         """Confirm the running version; a failure is reported once and repeated after as many

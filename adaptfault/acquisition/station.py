@@ -71,13 +71,15 @@ class Station:
         calibration: converts received values into the layout's unit.
         on_event: called with each event in the event loop, instead of printing it.
         accumulate: tell one class for a whole contact, see :class:`Session`; needs a bundle.
+        sets: tell the set of classes of each window that holds the true one with probability
+            1 - ``sets``, see :class:`Predictor`; needs a bundle.
         as_json: one JSON object per line.
         quiet: no output on stderr.
 
     Raises:
         ValueError: neither layout nor bundle, an unknown rule, a calibration of another layout, a
-            relay that has no bundle or sends to the port it listens on, or ``accumulate`` without a
-            bundle or with a regression.
+            relay that has no bundle or sends to the port it listens on, or ``accumulate`` or
+            ``sets`` without a bundle, with a regression, or together.
     """
 
     def __init__(
@@ -102,6 +104,7 @@ class Station:
         calibration: Calibration | None = None,
         on_event: Callable[[Event], None] | None = None,
         accumulate: bool = False,
+        sets: float | None = None,
         as_json: bool = False,
         quiet: bool = False,
     ) -> None:
@@ -117,8 +120,13 @@ class Station:
         self.quiet = quiet
         self.on_event = self._print if on_event is None else on_event
         self.accumulate = accumulate
+        self.sets = sets
         if accumulate and bundle is None:
             raise ValueError("--accumulate needs BUNDLE: classes are accumulated over a contact")
+        if sets is not None and bundle is None:
+            raise ValueError("--sets needs BUNDLE: its model classifies the windows")
+        if sets is not None and accumulate:
+            raise ValueError("--sets are of windows, --accumulate is of contacts: give one of them")
         self._ready: list[StreamingPredictor | Monitor] = []
         if bundle is not None:
             predictor = self._predictor()
@@ -332,6 +340,7 @@ class Station:
                 keys=self._keys,
                 least_serial=self._least_serial,
                 accumulate=self.accumulate,
+                sets=self.sets,
             )
         except ImportError as error:
             raise ValueError(

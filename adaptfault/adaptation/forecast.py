@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.determination import explained
+from adaptfault.evaluation.class_recall import ClassRecall, class_recalls
 from adaptfault.evaluation.scores import mean_interval, prediction_interval
 from diagnostics import FaultSet
 
@@ -83,6 +84,7 @@ class Forecast:
         n_recordings: number of validation recordings.
         n_new: number of new recordings whose accuracy the intervals hold.
         measure: what is expected, "accuracy" or "R2".
+        classes: recall of each class at the best measured stage; none of a regression.
     """
 
     fault_set: FaultSet
@@ -92,6 +94,7 @@ class Forecast:
     n_recordings: int
     n_new: float
     measure: str = "accuracy"
+    classes: tuple[ClassRecall, ...] = ()
 
     @classmethod
     def of(
@@ -117,15 +120,18 @@ class Forecast:
         count = len(np.unique(recording))
         new = count if new is None else new
         if len(predicted) == 1:
-            return cls(fault_set, stages, None, 0.0, count, new)
+            recalls = class_recalls(y, predicted["fault-free"], recording, new=new)
+            return cls(fault_set, stages, None, 0.0, count, new, classes=recalls)
         best = _add_trained(stages)
         last = predicted["fill" if best is stages["fill"] else "head"]
+        recalls = class_recalls(y, last, recording, new=new)
         classes = np.unique(y)
         lost = [
             ((predicted["fault-free"] == y) * 1.0 - (last == y))[y == c].mean() for c in classes
         ]
         worst = int(np.argmax(lost))
-        return cls(fault_set, stages, int(classes[worst]), float(lost[worst]), count, new)
+        loss = float(lost[worst])
+        return cls(fault_set, stages, int(classes[worst]), loss, count, new, classes=recalls)
 
     @classmethod
     def of_values(
@@ -162,6 +168,11 @@ class Forecast:
             )
         return "\n".join(lines)
 
+    def by_class(self, names: Sequence[str] = ()) -> str:
+        """Return the recall of each class as text, the class with the lowest limit first."""
+        ordered = sorted(self.classes, key=lambda one: one.low)
+        return "\n".join(f"  {one.named(names)}" for one in ordered)
+
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-safe dict."""
         return {
@@ -172,6 +183,7 @@ class Forecast:
             "worst_loss": self.worst_loss,
             "n_recordings": self.n_recordings,
             "n_new": None if np.isinf(self.n_new) else self.n_new,
+            "classes": [one.to_dict() for one in self.classes],
         }
 
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
 from adaptfault.data.windows import Windows
+from adaptfault.evaluation.class_recall import ClassRecall, class_recalls
 from adaptfault.evaluation.scores import Scores, ValueScores
 from adaptfault.imputation.linear import AffineFill, NearestFill
 from adaptfault.imputation.tiled import TiledFill
@@ -76,6 +77,7 @@ class Adaptation:
     _scores: Scores | ValueScores | None = field(default=None, repr=False)
     _contact: ContactStatistics | None = field(default=None, repr=False)
     _conformal: PredictionSets | None = field(default=None, repr=False)
+    _recalls: tuple[ClassRecall, ...] = field(default=(), repr=False)
 
     def predict(self, x: NDArray[Any] | Tensor) -> NDArray[Any]:
         """Return the class of each window ``[N, T, D]``, int64 ``[N]``, or its values, float32
@@ -147,7 +149,19 @@ class Adaptation:
             raise ValueError("a regression has no classes: use scores")
         return scores.by_class
 
-    def prediction_sets(self, x: NDArray[Any] | Tensor, alpha: float = 0.1) -> NDArray[np.bool_]:
+    @cached_property
+    def recalls(self) -> tuple[ClassRecall, ...]:
+        """Recall of each class on validation without F, with its 95 % interval and the class that
+        it is most often taken for; none of a regression, or where validation is not stored."""
+        windows = self._validation
+        if windows is None or self.task == "regression":
+            return self._recalls
+        predicted = self._outputs(windows).argmax(1).numpy()
+        return class_recalls(windows.y, predicted, windows.recording, new=np.inf)
+
+    def prediction_sets(
+        self, x: NDArray[Any] | Tensor, alpha: float = 0.1, *, by_class: bool = False
+    ) -> NDArray[np.bool_]:
         """Return for each window the set of classes that holds its true one with probability
         1 - ``alpha``, bool ``[N, n_classes]``.
 
@@ -158,12 +172,14 @@ class Adaptation:
         Args:
             x: windows ``[N, T, D]``, 0..1; the cells in F may hold anything.
             alpha: the share of windows whose true class may be missing, between 0 and 1.
+            by_class: the share holds for the windows of each class, and not only of all. Needs
+                1 / alpha - 1 validation recordings of a class, which else is in every set.
 
         Raises:
             ValueError: ``alpha`` is outside; a regression; or the adaptation was stored without
                 validation.
         """
-        return self.conformal.sets(self.predict_proba(x), alpha)
+        return self.conformal.sets(self.predict_proba(x), alpha, by_class)
 
     @cached_property
     def conformal(self) -> PredictionSets:
@@ -208,6 +224,7 @@ class Adaptation:
             "scores": self.scores.to_dict(),
             "contact": None if (contact := self.contact) is None else contact.to_dict(),
             "sets": self._sets_to_dict(),
+            "classes": [one.to_dict() for one in self.recalls],
         }
         save_tensors(path, ADAPTATION, about, model.state_dict())
 
@@ -248,6 +265,7 @@ class Adaptation:
             contact = None if stored is None else ContactStatistics.from_dict(stored)
             kept = about.get("sets")
             sets = None if kept is None else PredictionSets.from_dict(kept)
+            recalls = tuple(ClassRecall.from_dict(one) for one in about.get("classes", ()))
         except ModelNotAllowed:
             raise
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
@@ -262,6 +280,7 @@ class Adaptation:
             _scores=scores,
             _contact=contact,
             _conformal=sets,
+            _recalls=recalls,
         )
 
 

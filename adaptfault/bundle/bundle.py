@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from adaptfault.adaptation.result import Adaptation
     from adaptfault.data.calibration import Calibration
     from adaptfault.data.windows import Windows
+    from adaptfault.evaluation.class_recall import ClassRecall
     from adaptfault.imputation.restorer import Restorer
     from adaptfault.models.any_model import AnyModel
     from adaptfault.models.network import TactileTransformer
@@ -382,6 +383,56 @@ class Bundle:
             return KnownFaults(self.layout.n_cells)
         with decoding(self.journal.path):
             return KnownFaults.from_dict(known)
+
+    def class_recalls(self) -> tuple[ClassRecall, ...]:
+        """Return the recall of each class by the running version, under the known faults.
+
+        It was measured on validation recordings without F when the version was made. Where the
+        version uses known faulty cells, it is that of the comparison with these faults; without
+        one, and of a regression, there is none. Needs no torch.
+
+        Raises:
+            Damaged: no version can be read.
+        """
+        from adaptfault.evaluation.class_recall import ClassRecall
+        from adaptfault.models.store import ADAPTATION, MANIFEST, read_manifest
+
+        version = self.active()
+        faulty = self.known_faults().fault_set
+        if faulty - version.fault_set:
+            path = self.journal.path
+            measured = self.journal.judged(faulty, version.number) or {}
+        else:
+            path = version.folder / MANIFEST
+            with decoding(path):
+                measured = read_manifest(version.folder, ADAPTATION)
+        with decoding(path):
+            return tuple(ClassRecall.from_dict(one) for one in measured.get("classes", ()))
+
+    def allows(self, label: str | int, *, min_recall: float) -> bool:
+        """Return whether a program may rely on a class: whether the lower limit of the 95 %
+        interval of its recall is at least ``min_recall``.
+
+        The recall is that of :meth:`class_recalls`. A class without one is not allowed: none is
+        while the running version uses a cell that is known to be faulty, unless it was compared
+        with this fault.
+
+        Args:
+            label: name of the class, or its number.
+            min_recall: above 0, at most 1.
+
+        Raises:
+            ValueError: no such class, or no such recall.
+            Damaged: no version can be read.
+        """
+        if not 0 < min_recall <= 1:
+            raise ValueError(f"min_recall is a share of windows, above 0 to 1; got {min_recall}")
+        if isinstance(label, str) and label not in self.class_names:
+            known = ", ".join(self.class_names) or "classes have numbers"
+            raise ValueError(f"the bundle has no class {label!r}: {known}")
+        number = self.class_names.index(label) if isinstance(label, str) else label
+        lows = [one.low for one in self.class_recalls() if one.label == number]
+        return bool(lows) and lows[0] >= min_recall
 
     def maintenance(self, *, dry_run: bool = False) -> AbstractContextManager[None]:
         """Hold the maintenance lock, one run at a time; raises Busy. A dry run goes on without

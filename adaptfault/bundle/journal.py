@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from adaptfault.bundle.checksummed_json import (
@@ -23,6 +23,9 @@ from adaptfault.bundle.checksummed_json import (
 )
 from adaptfault.bundle.lock import PATIENCE, Busy, locked
 from adaptfault.data.atomic import atomic_write
+
+if TYPE_CHECKING:
+    from diagnostics import FaultSet
 
 NAME = "journal.sqlite"
 _CHECKSUM = "journal.sha256"
@@ -266,6 +269,15 @@ class Journal:
             if key in document:
                 return document[key]
         return None
+
+    def judged(self, faulty: FaultSet, version: int) -> dict[str, Any] | None:
+        """Return the last comparison if it was for these faults and this version; None
+        otherwise."""
+        judged = self.last("judged")
+        if judged is None:
+            return None
+        asked = (faulty.cells, version)
+        return dict(judged) if (tuple(judged["fault_set"]), judged["version"]) == asked else None
 
     def _select(self, query: str, parameters: Sequence[Any] = ()) -> Iterator[Any]:
         """Yield rows; none where there is no journal yet.

@@ -105,6 +105,17 @@ class Version:
         holds."""
         return {name: getattr(self, name).tolist() for name in ("source", "gain", "offset")}
 
+    @cached_property
+    def set_size(self) -> float | None:
+        """Mean number of classes in the sets of its validation windows that hold the true class
+        with probability 0.9; None of a regression, or where it is not stored."""
+        from adaptfault.models.store import ADAPTATION, read_manifest
+
+        with decoding(self.folder):
+            sets = read_manifest(self.folder, ADAPTATION).get("sets") or {}
+            size = sets.get("size")
+            return None if size is None else float(size)
+
     def undo(self, frames: NDArray[Any], full_scale: float | None = None) -> NDArray[Any]:
         """Return frames ``[..., D]`` as the model reads them: wires put back, replaced pads
         recalibrated.

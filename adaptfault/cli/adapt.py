@@ -147,9 +147,12 @@ def _adapt(
         "scores": adaptation.scores.to_dict(),
         "stages": [vars(stage) for stage in adaptation.stages],
     }
+    sets = adaptation.conformal.size if adaptation.task == "classification" else None
+    result["set_size"] = sets
     lines += [
         f"validation, fault-free: {adapter.measure} {adapter.fault_free_accuracy:.3f}",
         f"validation, {len(faults)} cells removed: {adaptation.scores}",
+        *([] if sets is None else [f"sets that hold the class at 90 %: {sets:.2f} classes"]),
         *(f"  {stage}" for stage in adaptation.stages),
         f"adapted model: {args.out}",
     ]

@@ -20,7 +20,8 @@ from adaptfault.cli.options import (
 
 _EXAMPLE = """  adaptfault forecast robot.bundle --worst --picture worst.png
       which wire, which two wires and which pad would cost most accuracy after a repair
-  adaptfault forecast model grasps/ --faults diagnosis.json"""
+  adaptfault forecast model grasps/ --faults diagnosis.json
+  adaptfault forecast robot.bundle --faults 3,17 --classes"""
 
 
 def add(commands: Commands) -> None:
@@ -50,6 +51,11 @@ def add(commands: Commands) -> None:
         ),
     )
     parser.add_argument(
+        "--classes",
+        action="store_true",
+        help="with --faults: the recall of each class as well, and what it is confused with",
+    )
+    parser.add_argument(
         "--worst",
         action="store_true",
         help="forecast each wire, each pad and pairs of the worst wires; lists the worst",
@@ -77,10 +83,15 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError("--picture needs --worst: it is a map of all wires")
     if args.new is not None and args.worst:
         raise ValueError("--new needs --faults")
+    if args.classes and args.worst:
+        raise ValueError("--classes needs --faults")
     adapter = open_adapter(args).to(device(args))
     if not args.worst:
         forecast = adapter.forecast(fault_set(args.faults, adapter.layout), recordings=args.new)
-        emit(args, forecast.to_dict(), str(forecast))
+        text = str(forecast)
+        if args.classes:
+            text += f"\nclasses at the best measured stage:\n{forecast.by_class(_names(args))}"
+        emit(args, forecast.to_dict(), text)
         return 0
     from adaptfault.adaptation.worst import worst_faults
 
@@ -89,3 +100,16 @@ def run(args: argparse.Namespace) -> int:
         worst.plot().savefig(args.picture, dpi=120)
     emit(args, worst.to_dict(), str(worst))
     return 0
+
+
+def _names(args: argparse.Namespace) -> tuple[str, ...]:
+    """Return the names of the classes, where the model is stored with names."""
+    from adaptfault.cli.trained_model import open_bundle
+    from adaptfault.models.store import SCHEMA, read_manifest, schema_of
+
+    bundle = open_bundle(args, args.model)
+    if bundle is not None:
+        return bundle.class_names
+    if schema_of(args.model) != SCHEMA:
+        return ()
+    return tuple(read_manifest(args.model, SCHEMA)["class_names"])

@@ -71,6 +71,13 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="tell the class of a whole contact, not of each window; needs BUNDLE",
     )
+    parser.add_argument(
+        "--sets",
+        type=float,
+        metavar="ALPHA",
+        help="tell the set of classes of each window, too, that holds the true one with"
+        " probability 1 - ALPHA; needs BUNDLE",
+    )
     parser.add_argument("--record", metavar="FOLDER", help="record into this folder, CSV")
     parser.add_argument(
         "--relay",
@@ -159,6 +166,7 @@ def _station(args: argparse.Namespace) -> Station:
         frames=args.frames,
         calibration=tables,
         accumulate=args.accumulate,
+        sets=args.sets,
         as_json=args.json,
         quiet=args.quiet,
     )

@@ -28,7 +28,8 @@ _EXAMPLE = """  adaptfault maintain robot.bundle today/
       recordings seen before are skipped
       exit code: 0 nothing to do, 1 faults that are handled, or a warning,
       2 a person is needed, 3 unusable input
-  adaptfault maintain robot.bundle today/ --dry-run --report report.html"""
+  adaptfault maintain robot.bundle today/ --dry-run --report report.html
+  adaptfault maintain robot.bundle selftest/ --after routine.json"""
 
 
 def add(commands: Commands) -> None:
@@ -48,6 +49,12 @@ def add(commands: Commands) -> None:
     parser.add_argument("--dry-run", action="store_true", help="report only, change nothing")
     parser.add_argument(
         "--budget", type=float, metavar="S", help="seconds that an adaptation may take"
+    )
+    parser.add_argument(
+        "--after",
+        metavar="ROUTINE",
+        help="the recordings are a log of this self-test (selftest --out): say what it left"
+        " untested, and the next best recording",
     )
     add_untested_code(parser)
     parser.add_argument("--report", metavar="FILE", help="write the technician's report (HTML)")
@@ -75,8 +82,10 @@ def _maintain(args: argparse.Namespace) -> int:
     from adaptfault.bundle.signing import sign_bundle
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.new_recordings import load_new_recordings
+    from adaptfault.robot.routine import Routine
     from diagnostics.decision.numbering import Numbering
 
+    routine = None if args.after is None else Routine.read(args.after)
     bundle = Bundle.open(args.bundle, **trust(args))
     incoming = load_new_recordings(bundle, args.recordings)
     for problem in incoming.problems:
@@ -88,6 +97,7 @@ def _maintain(args: argparse.Namespace) -> int:
         dry_run=args.dry_run,
         budget=args.budget,
         untested_code=args.untested_code,
+        routine=routine,
         say=lambda text: say(args, text),
     )
     if args.sign and not args.dry_run:

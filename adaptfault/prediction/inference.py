@@ -108,19 +108,32 @@ class Inference:
         run = _on_onnx(folder, manifest) if runtime == "onnx" else _on_torch(folder)
         return cls(run, runtime, layout, fault_set, length, n_classes, contact, task, sets)
 
-    def prediction_sets(self, x: NDArray[Any], alpha: float = 0.1) -> NDArray[np.bool_]:
+    def prediction_sets(
+        self, x: NDArray[Any], alpha: float = 0.1, *, by_class: bool = False
+    ) -> NDArray[np.bool_]:
         """Return for each window ``[N, T, D]`` the set of classes that holds its true one with
-        probability 1 - ``alpha``, bool ``[N, n_classes]``
+        probability 1 - ``alpha``, bool ``[N, n_classes]``; ``by_class``: of each class
         (:mod:`adaptfault.models.prediction_sets`).
 
         Raises:
             ValueError: windows of another shape, an ``alpha`` that is no share, a regression, or an
                 adaptation that was stored without validation.
         """
-        likely = self.predict_proba(x)
+        return self.sets_of(self.predict_proba(x), alpha, by_class=by_class)
+
+    def sets_of(
+        self, likely: NDArray[np.float32], alpha: float, *, by_class: bool = False
+    ) -> NDArray[np.bool_]:
+        """Return the sets of classes, bool ``[N, n_classes]``, for probabilities
+        ``[N, n_classes]`` of this model.
+
+        Raises:
+            ValueError: an ``alpha`` that is no share, or an adaptation that was stored without
+                validation.
+        """
         if self.sets is None:
             raise ValueError("sets of classes need validation windows, which were not stored here")
-        return self.sets.sets(likely, alpha)
+        return self.sets.sets(likely, alpha, by_class)
 
     def predict_proba(self, x: NDArray[Any]) -> NDArray[np.float32]:
         """Return the probability of each class for windows ``[N, T, D]`` on the 0..1 scale,

@@ -50,6 +50,8 @@ class Reading:
             contact; None without contact, or where the predictor does not accumulate.
         name: name of the class; None where there is no label, or classes have no names.
         faults: all faults that the monitor knows now, as :attr:`diagnostics.Monitor.faults`.
+        classes: the set of classes that holds the true one as often as was asked for, ascending;
+            None where there is no label, no sets were asked for, or the version has none.
         values: float32 ``[k]``, those of a regression for the window that ends with this frame;
             None until a window is full, and of a classifier.
     """
@@ -63,6 +65,7 @@ class Reading:
     name: str | None = None
     faults: tuple[Fault, ...] = ()
     values: NDArray[np.float32] | None = None
+    classes: tuple[int, ...] | None = None
 
     def __str__(self) -> str:
         confidence = "" if self.probabilities is None else f" ({self.probabilities.max():.2f})"
@@ -96,14 +99,23 @@ class Predictor:
         accumulate: :meth:`stream` also accumulates the probabilities of the windows of one contact,
             calibrated on validation recordings, and begins anew at its release
             (:mod:`adaptfault.models.accumulation`).
+        sets: :meth:`stream` also gives the set of classes of each window that holds the true one
+            with probability 1 - ``sets``; None: no sets.
 
     Raises:
-        FileNotFoundError, ValueError: no version of the bundle can be loaded; ``accumulate`` with a
-            regression.
+        FileNotFoundError, ValueError: no version of the bundle can be loaded; ``accumulate`` or
+            ``sets`` with a regression, ``sets`` that is no share.
     """
 
-    def __init__(self, open_bundle: Callable[[], Bundle], *, accumulate: bool = False) -> None:
+    def __init__(
+        self,
+        open_bundle: Callable[[], Bundle],
+        *,
+        accumulate: bool = False,
+        sets: float | None = None,
+    ) -> None:
         self._open = open_bundle
+        self._sets = sets
         self._accumulate = accumulate
         bundle = open_bundle()
         self._pointer = bundle.pointer
@@ -124,6 +136,9 @@ class Predictor:
             raise ValueError(
                 "a regression has no class probabilities to accumulate: leave accumulate out"
             )
+        if sets is not None:
+            none = np.zeros((0, self._running.model.length, self.layout.n_cells), np.float32)
+            self._running.model.prediction_sets(none, sets)
         self._decision = self._new_decision()
         self.reset()
 
@@ -135,8 +150,10 @@ class Predictor:
         keys: Sequence[str | os.PathLike[str]] | None = None,
         least_serial: int = 0,
         accumulate: bool = False,
+        sets: float | None = None,
     ) -> Predictor:
-        """Open the bundle in a folder and start its active version; ``accumulate`` as in the class.
+        """Open the bundle in a folder and start its active version; ``accumulate`` and ``sets`` as
+        in the class.
 
         Args:
             path: of the bundle.
@@ -150,7 +167,9 @@ class Predictor:
         from adaptfault.bundle.bundle import Bundle
 
         return cls(
-            lambda: Bundle.open(path, keys=keys, least_serial=least_serial), accumulate=accumulate
+            lambda: Bundle.open(path, keys=keys, least_serial=least_serial),
+            accumulate=accumulate,
+            sets=sets,
         )
 
     @property
@@ -199,11 +218,14 @@ class Predictor:
         self._keep_up()
         return self._running.model.predict_proba(self._rewired(_finite(x)))
 
-    def prediction_sets(self, x: NDArray[Any], alpha: float = 0.1) -> NDArray[np.bool_]:
+    def prediction_sets(
+        self, x: NDArray[Any], alpha: float = 0.1, *, by_class: bool = False
+    ) -> NDArray[np.bool_]:
         """Return the sets of classes of windows ``[N, T, D]``, as
         :meth:`~adaptfault.prediction.inference.Inference.prediction_sets`."""
         self._keep_up()
-        return self._running.model.prediction_sets(self._rewired(_finite(x)), alpha)
+        x = self._rewired(_finite(x))
+        return self._running.model.prediction_sets(x, alpha, by_class=by_class)
 
     def stream(self, frame: ArrayLike, time: float | None = None) -> Reading:
         """Process one frame and predict from the window that ends with it.
@@ -236,7 +258,7 @@ class Predictor:
         self._last = np.where(np.isnan(scaled), self._last, scaled)
         # All cells are kept, the dropped ones too: the next version may use them.
         self._frames = np.concatenate([self._frames, self._last[None]])[-model.length :]
-        label = probabilities = name = values = None
+        label = probabilities = name = values = classes = None
         full = len(self._frames) == model.length
         if full and model.task == "regression":
             values = model.predict(self._frames[None])[0]
@@ -244,6 +266,9 @@ class Predictor:
             probabilities = model.predict_proba(self._frames[None])[0]
             label = int(probabilities.argmax())
             name = self.class_names[label] if self.class_names else None
+            if self._sets is not None and model.sets is not None:
+                (inside,) = model.sets_of(probabilities[None], self._sets)
+                classes = tuple(np.flatnonzero(inside).tolist())
         contact = (
             None if self._decision is None else self._decision.update(self._last, probabilities)
         )
@@ -257,6 +282,7 @@ class Predictor:
             name,
             self._monitor.faults,
             values,
+            classes,
         )
 
     def _new_decision(self) -> ContactDecision | None:

@@ -32,7 +32,8 @@ from adaptfault.robot.maintenance_report import Decision, MaintenanceReport
 from adaptfault.robot.maintenance_run import MaintenanceRun, Robot
 from adaptfault.robot.model_comparison import Judgement, compare_candidate, score, with_faults
 from adaptfault.robot.repair import Candidate, repair
-from adaptfault.robot.sensor_state import judged_before, unhandled_cells
+from adaptfault.robot.routine import Routine
+from adaptfault.robot.sensor_state import unhandled_cells
 from diagnostics import FaultSet
 from diagnostics.sensor.ageing import cell_condition
 from diagnostics.sensor.sensor_change import SensorChange
@@ -51,6 +52,7 @@ def maintain(
     dry_run: bool = False,
     budget: float | None = None,
     untested_code: int = 1,
+    routine: Routine | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> MaintenanceReport:
     """Inspect new recordings and update the running version where that is needed.
@@ -68,12 +70,17 @@ def maintain(
         budget: seconds that an adaptation may take.
         untested_code: exit code where no fault is known and the recordings test less than 5 % of
             the cells.
+        routine: of which the recordings are a log: the report says what it left untested, and the
+            next best recording.
         say: receives one line of progress before each long step.
 
     Raises:
         Busy: another maintenance run holds the lock.
         Damaged: a needed part of the bundle fails its checksum.
+        ValueError: the routine is for another number of cells.
     """
+    if routine is not None:
+        routine.check(bundle.layout)
     began = time.perf_counter()
     with bundle.maintenance(dry_run=dry_run):
         if not dry_run:
@@ -91,7 +98,7 @@ def maintain(
             left_out=tuple(text for one in fresh if (text := one.left_out(bundle.layout))),
         )
         usable = [recording for recording in fresh if recording.problem is None]
-        report = _maintained(run, usable, untested_code) if usable else _idle(run, fresh)
+        report = _maintained(run, usable, untested_code, routine) if usable else _idle(run, fresh)
     return replace(report, seconds=time.perf_counter() - began)
 
 
@@ -144,7 +151,10 @@ def _idle(run: MaintenanceRun, fresh: Sequence[IncomingRecording]) -> Maintenanc
 
 
 def _maintained(
-    run: MaintenanceRun, usable: Sequence[IncomingRecording], untested_code: int
+    run: MaintenanceRun,
+    usable: Sequence[IncomingRecording],
+    untested_code: int,
+    routine: Routine | None,
 ) -> MaintenanceReport:
     """Inspect usable recordings, decide, and journal the run unless it is a dry run."""
     run.say(f"inspecting {len(usable)} new recordings")
@@ -156,6 +166,8 @@ def _maintained(
     report = _report(run, outcome, inspection, untested_code)
     if outcome.used:
         report = replace(report, used=tuple(recording.name for recording in usable))
+    if routine is not None and report.diagnosis is not None:
+        report = replace(report, selftest=routine.after(report.diagnosis, len(usable)))
     if not run.dry_run:
         _write(run, outcome, report, usable)
     return report
@@ -268,7 +280,7 @@ def _decide_faults(run: MaintenanceRun, readings: ChangedReadings) -> _Outcome:
     if faulty == run.version.fault_set:
         text = f"version {number} excludes these cells already" if faulty else "no faulty cell"
         return _Outcome("unchanged", (Reason(_severity(run, faulty), text),), known, readings)
-    judged = judged_before(run.robot.bundle, faulty, number)
+    judged = run.robot.bundle.journal.judged(faulty, number)
     if judged is not None:
         reason = Reason(judged["exit_code"], f"compared before: {judged['reason']}")
         return _Outcome("kept", (reason,), known, readings, judged=judged)
@@ -318,6 +330,7 @@ def _decide_candidate(
             "exit_code": severity,
             "reason": obstacle,
             "fault_set": list(known.fault_set),
+            "classes": [one.to_dict() for one in judgement.recalls],
         }
         measured["accuracy"] = judgement.running
         return _Outcome(
@@ -421,7 +434,8 @@ def _report(
     """Return the report; what is told of the log comes before the decision, and the worst first."""
     robot = run.robot
     readings = outcome.readings
-    number = run.version.number if outcome.deploys is None else outcome.deploys
+    version = run.version if outcome.deploys is None else robot.bundle.versions[outcome.deploys]
+    number = version.number
     judgement = outcome.measured.get("judgement")
     change = None
     reasons: list[Reason] = []
@@ -443,6 +457,7 @@ def _report(
         change=change,
         dry_run=run.dry_run,
         n_cells=len(robot.present),
+        set_size=version.set_size,
         measure="accuracy" if judgement is None else judgement.measure,
         **({} if outcome.told is None else outcome.told.told),
         left_out=run.left_out,

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from adaptfault.inspection.severity import Reason, worst
 from adaptfault.robot.model_comparison import Judgement
+from adaptfault.robot.routine import RoutineResult
 from adaptfault.robot.sensor_state import weak_base
 from diagnostics import Diagnosis, Fault, FaultSet
 from diagnostics.decision.numbering import Numbering
@@ -51,6 +52,9 @@ class MaintenanceReport:
         seconds: wall clock.
         n_cells: cells of the array, without masked positions; 0 where that is not known.
         measure: what ``accuracy`` is, "accuracy" or "R2"; where none was measured, "accuracy".
+        set_size: mean number of classes in the sets of the version that runs now, which hold the
+            true class with probability 0.9, on its validation; None: unknown, or a regression.
+        selftest: what the log of a self-test routine tested; None: it is none.
     """
 
     decision: Decision
@@ -73,6 +77,8 @@ class MaintenanceReport:
     seconds: float = 0.0
     n_cells: int = 0
     measure: str = "accuracy"
+    set_size: float | None = None
+    selftest: RoutineResult | None = None
 
     @property
     def exit_code(self) -> int:
@@ -103,6 +109,8 @@ class MaintenanceReport:
             f"version {self.version} runs; {faulty} of {n} cells {'is' if faulty == 1 else 'are'}"
             " faulty"
         )
+        if self.set_size is not None:
+            lines.append(f"  sets that hold the class at 90 %: {self.set_size:.2f} classes")
         if weak_base(self.accuracy, self.fault_free_accuracy):
             both = f"{self.accuracy:.3f} repaired, {self.fault_free_accuracy:.3f} healthy"
             lines.append(
@@ -115,6 +123,8 @@ class MaintenanceReport:
             lines += [f"  {fault.reason}" for fault in self.diagnosis.transport]
             lines.append(f"  {self.diagnosis.coverage}")
             lines += [f"  to test more: {touch}" for touch in self.diagnosis.coverage.advice[:3]]
+        if self.selftest is not None:
+            lines.append(f"  {self.selftest}")
         lines = [numbering.text(line) for line in lines]
         lines += [f"  {stage}" for stage in self.stages]
         if self.judgement is not None:
@@ -135,13 +145,15 @@ class MaintenanceReport:
             "version": self.version,
             "faults": [fault.to_dict() for fault in self.faults],
             "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
-            "judgement": None if self.judgement is None else vars(self.judgement),
+            "judgement": None if self.judgement is None else self.judgement.to_dict(),
             "accuracy": self.accuracy,
             "fault_free_accuracy": self.fault_free_accuracy,
             "measure": self.measure,
+            "set_size": self.set_size,
             "change": None if self.change is None else vars(self.change),
             "rewiring": list(self.rewiring),
             "replaced_pads": list(self.replaced_pads),
+            "selftest": None if self.selftest is None else self.selftest.to_dict(),
             "stages": list(self.stages),
             "used": list(self.used),
             "left_out": list(self.left_out),

@@ -4,7 +4,7 @@ injected."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from adaptfault.data.determination import explained
 from adaptfault.data.windows import Windows
+from adaptfault.evaluation.class_recall import ClassRecall, class_recalls
 from diagnostics import Fault, SensorLayout, inject
 
 Predict = Callable[[NDArray[np.float32]], NDArray[Any]]
@@ -32,6 +33,7 @@ class Judgement:
         collapsed: classes of which the candidate keeps less than half of the running model's
             recall; values of which it keeps less than half of the R2.
         measure: "accuracy" or "R2".
+        recalls: of the running model, each class with a 95 % interval; none of a regression.
     """
 
     running: float
@@ -41,11 +43,16 @@ class Judgement:
     high: float
     collapsed: tuple[int, ...]
     measure: str = "accuracy"
+    recalls: tuple[ClassRecall, ...] = field(default=(), repr=False)
 
     @property
     def better(self) -> bool:
         """Whether the lower limit of the gain is positive."""
         return self.low > 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a JSON-safe dict, without the recalls."""
+        return {name: value for name, value in vars(self).items() if name != "recalls"}
 
     def __str__(self) -> str:
         return (
@@ -112,7 +119,14 @@ def compare_candidate(
         high=float(high),
         collapsed=_collapsed(predicted, windows.y, inverse, drawn),
         measure=measure_of(windows),
+        recalls=_recalls(predicted[0], windows),
     )
+
+
+def _recalls(predicted: NDArray[Any], windows: Windows) -> tuple[ClassRecall, ...]:
+    if windows.y.ndim == 2:
+        return ()
+    return class_recalls(windows.y, predicted, windows.recording, new=np.inf)
 
 
 def _collapsed(

@@ -6,21 +6,22 @@ in a repetition with probability
     p_ic = (l_ic + r_gc) / 2
 
 l_ic is 1 where it loaded the cell, r_gc the share of the recordings of its class that did (of all
-recordings without classes). A cell counts as tested by two loads, so a routine R tests
+recordings without classes). Repetitions are independent, so a routine R loads cell c in N_c of
+them, a Poisson binomial number. A cell counts as tested by M = 3 loads
+(:data:`~adaptfault.robot.routine.LOADS`), and R tests
 
-    sum_c w_c min(1, sum_{i in R} p_ic / 2)
+    sum_c w_c E[min(M, N_c)] / M
 
-This is submodular: the greedy choice reaches 1 - 1/e of the best one at least (Nemhauser, Wolsey
-and Fisher 1978). The weights w are the accuracy that is lost if the cell is dead and not in F,
-plus one window, so that no cell is worth nothing.
+The next recording adds sum_c w_c p_ic P(N_c < M) / M. This is submodular: the greedy choice reaches
+1 - 1/e of the best one at least (Nemhauser, Wolsey and Fisher 1978). The weights w are the accuracy
+that is lost if the cell is dead and not in F, plus one window, so that no cell is worth nothing.
 
 Not considered: how hard a fault is to see where neighbours say little about a cell.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,81 +30,16 @@ from numpy.typing import NDArray
 from adaptfault.bundle.bundle import Bundle
 from adaptfault.data.recordings import Recordings
 from adaptfault.evaluation.sensitivity import sensitivity
+from adaptfault.robot.routine import LOADS, Repertoire, Routine
 from diagnostics import Diagnosis, FaultSet, SensorLayout, Verdict
 from diagnostics.preprocessing.levels import LIGHT, LOW
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
 
-SCHEMA = "adaptfault.routine/1"
-
 Floats = NDArray[np.float64]
 
-_LOADS = 2  # of a cell that tests it
 _ENOUGH = 0.99  # of what the whole repertoire tests
-
-
-@dataclass(frozen=True)
-class Routine:
-    """Recordings to repeat.
-
-    Attributes:
-        recordings: their indices in the repertoire, in the order of choice.
-        names: of these recordings.
-        tested: share of what matters that is tested before and after.
-        reached: the share after each recording.
-        seconds: how long all take.
-    """
-
-    recordings: tuple[int, ...]
-    names: tuple[str, ...]
-    tested: tuple[float, float]
-    reached: tuple[float, ...]
-    seconds: float
-
-    def __str__(self) -> str:
-        before, after = self.tested
-        head = (
-            f"{len(self.recordings)} recordings, {self.seconds:.0f} s: test {after:.0%} of what"
-            f" matters, {before:.0%} before"
-        )
-        lines = [
-            f"{share:5.0%} after {name}"
-            for share, name in zip(self.reached, self.names, strict=True)
-        ]
-        return "\n".join([head, *lines])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return a JSON-safe dict that :meth:`from_dict` reads."""
-        return {
-            "schema": SCHEMA,
-            "recordings": list(self.recordings),
-            "names": list(self.names),
-            "tested": list(self.tested),
-            "reached": list(self.reached),
-            "seconds": self.seconds,
-        }
-
-    @classmethod
-    def from_dict(cls, d: Mapping[str, Any]) -> Routine:
-        """Rebuild a routine from :meth:`to_dict`.
-
-        Raises:
-            ValueError: it is none.
-        """
-        if not isinstance(d, Mapping) or d.get("schema") != SCHEMA:
-            raise ValueError(f"expected a routine with schema {SCHEMA!r}")
-        try:
-            before, after = map(float, d["tested"])
-            return cls(
-                tuple(map(int, d["recordings"])),
-                tuple(map(str, d["names"])),
-                (before, after),
-                tuple(map(float, d["reached"])),
-                float(d["seconds"]),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"the routine is damaged: {error}") from None
 
 
 def plan_selftest(
@@ -150,13 +86,15 @@ def plan_selftest(
         if isinstance(repertoire, Recordings)
         else tuple(f"recording {i}" for i in range(len(frames)))
     )
-    likely = load_probability(frames, layout, labels)
-    if not likely.any():
+    loaded = loads(frames, layout)
+    if not loaded.any():
         raise ValueError("no recording of the repertoire loads any cell: record contacts")
     durations = np.array([len(one) / layout.rate for one in frames])
     weights = cell_weights(adapter, faulty)
-    begun = np.zeros(layout.n_cells) if tested is None else np.where(tested, float(_LOADS), 0.0)
-    chosen, reached = _greedy(likely, weights, durations, begun, seconds, n)
+    gestures = np.zeros(len(frames), np.int64) if labels is None else np.asarray(labels)
+    every = Repertoire.from_loads(loaded, gestures, tuple(names), weights)
+    begun = np.zeros(layout.n_cells, bool) if tested is None else tested
+    chosen, reached = greedy(every.likely, weights, durations, begun, seconds, n)
     if not chosen:
         raise ValueError(
             f"no recording that tests anything new fits into {seconds:g} s; the shortest takes"
@@ -164,27 +102,25 @@ def plan_selftest(
             if seconds is not None
             else "the last log tested all that the repertoire can test"
         )
-    before = float(weights @ np.minimum(1, begun / _LOADS))
+    before = float(weights[begun].sum())
     return Routine(
         tuple(chosen),
         tuple(names[i] for i in chosen),
         (before, reached[-1]),
         tuple(reached),
         float(durations[chosen].sum()),
+        every,
     )
 
 
-def load_probability(
-    frames: Sequence[Floats], layout: SensorLayout, labels: NDArray[np.int64] | None = None
-) -> Floats:
-    """Return the probability that a repetition of each recording loads each cell, ``[n, D]``.
+def loads(frames: Sequence[Floats], layout: SensorLayout) -> NDArray[np.bool_]:
+    """Return which cells each recording loads, bool ``[n, D]``.
 
     A cell is loaded where its reading leaves its rest by 5 % of the range that the array shows.
 
     Args:
         frames: recordings ``[T, D]``.
         layout: the array.
-        labels: classes ``[n]``, whose recordings repeat each other; None: not known.
     """
     every = np.concatenate(frames)
     known = np.where(np.isfinite(every), every, np.nan)
@@ -194,16 +130,11 @@ def load_probability(
     falls = np.nanmean(known[:, present] - least[1]) < 0  # load lowers the readings
     rest[present] = least[2] if falls else least[0]
     span = np.nanmax(np.abs(known[:, present] - rest[present]), initial=0.0)
-    loaded = np.zeros((len(frames), layout.n_cells))
+    loaded = np.zeros((len(frames), layout.n_cells), bool)
     for i, recording in enumerate(frames):
         most = np.nanmax(np.abs(recording - rest), axis=0, initial=0.0, where=~np.isnan(recording))
         loaded[i] = present & (most > LIGHT * span)
-    groups = np.zeros(len(frames), np.int64) if labels is None else np.asarray(labels)
-    share = np.empty_like(loaded)
-    for group in np.unique(groups):
-        of_it = groups == group
-        share[of_it] = loaded[of_it].mean(axis=0)
-    return (loaded + share) / 2
+    return loaded
 
 
 def cell_weights(adapter: Adapter, faulty: FaultSet | None = None) -> Floats:
@@ -231,24 +162,33 @@ def _known(bundle: Bundle) -> tuple[FaultSet, NDArray[np.bool_] | None]:
     return faulty, Diagnosis.from_dict(runs[-1]).verdicts != Verdict.UNTESTED
 
 
-def _greedy(
+def greedy(
     likely: Floats,
     weights: Floats,
     durations: Floats,
-    begun: Floats,
+    tested: NDArray[np.bool_],
     seconds: float | None,
     n: int | None,
 ) -> tuple[list[int], list[float]]:
-    """Return the chosen recordings, and the share that is tested after each."""
+    """Return the chosen recordings, and the share that is tested after each.
+
+    Args:
+        likely: probability that a repetition loads a cell, ``[n, D]``.
+        weights: of the cells, ``[D]``.
+        durations: of the recordings, seconds ``[n]``.
+        tested: cells that need no test, bool ``[D]``.
+        seconds, n: the budget; None: as many as test 99 % of what all recordings test.
+    """
     limit = len(likely) if n is None else n
-    most = _share(begun + likely.sum(axis=0), weights)
-    loads = begun.copy()
+    begun = np.zeros((LOADS, likely.shape[1]))
+    begun[0] = ~tested
+    most = share_tested(likely, weights, begun)
     left = np.inf if seconds is None else seconds
+    fewer = begun
     chosen: list[int] = []
     reached: list[float] = []
     while len(chosen) < limit:
-        now = _share(loads, weights)
-        gains = np.minimum(1, (loads + likely) / _LOADS) @ weights - now
+        gains = likely @ (weights * fewer.sum(axis=0)) / LOADS
         gains[chosen] = 0.0
         gains[durations > left] = 0.0
         rate = gains if seconds is None else gains / durations
@@ -256,13 +196,36 @@ def _greedy(
         if gains[best] <= 0:
             break
         chosen.append(best)
-        loads = loads + likely[best]
+        fewer = _repeated(fewer, likely[best])
         left -= float(durations[best])
-        reached.append(_share(loads, weights))
+        reached.append(_share(fewer, weights))
         if n is None and seconds is None and reached[-1] >= _ENOUGH * most:
             break
     return chosen, reached
 
 
-def _share(loads: Floats, weights: Floats) -> float:
-    return float(np.minimum(1, loads / _LOADS) @ weights)
+def share_tested(likely: Floats, weights: Floats, begun: Floats) -> float:
+    """Return the share of the weights ``[D]`` that repetitions of all given recordings are expected
+    to test.
+
+    Args:
+        likely: probability that a repetition loads a cell, ``[n, D]``.
+        weights: of the cells, ``[D]``.
+        begun: P(N = 0, 1, 2 loads) of each cell before, ``[3, D]``.
+    """
+    fewer = begun
+    for one in likely:
+        fewer = _repeated(fewer, one)
+    return _share(fewer, weights)
+
+
+def _repeated(fewer: Floats, likely: Floats) -> Floats:
+    """Return P(N = 0, 1, 2 loads) ``[3, D]`` after one more repetition."""
+    after = fewer * (1 - likely)
+    after[1:] += fewer[:-1] * likely
+    return after
+
+
+def _share(fewer: Floats, weights: Floats) -> float:
+    missing = np.arange(LOADS, 0, -1) @ fewer / LOADS
+    return float((1 - missing) @ weights)

@@ -17,18 +17,10 @@ from diagnostics import Fault, FaultSet
 _WEAK = 0.02
 
 
-def judged_before(bundle: Bundle, faulty: FaultSet, version: int) -> dict[str, Any] | None:
-    """Return the last comparison if it was for these faults and this version; None otherwise."""
-    judged = bundle.journal.last("judged")
-    if judged is None or (tuple(judged["fault_set"]), judged["version"]) != (faulty.cells, version):
-        return None
-    return dict(judged)
-
-
 def unhandled_cells(bundle: Bundle, faulty: FaultSet, version: Version) -> FaultSet:
     """Return the faulty cells that a version still uses, without having been measured to be as good
     with them."""
-    judged = judged_before(bundle, faulty, version.number)
+    judged = bundle.journal.judged(faulty, version.number)
     tolerated = judged is not None and judged["exit_code"] < 2
     return FaultSet((), faulty.n_cells) if tolerated else faulty - version.fault_set
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from adaptfault.bundle.bundle import Bundle
 from adaptfault.bundle.pointer import Pointer
+from adaptfault.evaluation.class_recall import class_name
 from adaptfault.evaluation.html_page import Picture, render, version_of
 from adaptfault.robot.sensor_state import SensorState, unhandled_cells
 from diagnostics import Diagnosis
@@ -21,6 +22,7 @@ from diagnostics.decision.numbering import Numbering
 if TYPE_CHECKING:
     from adaptfault.robot.maintenance_report import MaintenanceReport
 
+_LISTED = 8  # classes in the table: a size
 
 _HEADLINES = (
     "Nothing to do",
@@ -70,6 +72,8 @@ def write_report(
     unhandled = by_group(
         [fault for fault in state.known.faults if fault in state.unhandled], bundle.layout
     )
+    recalls = [] if run is not None and run.dry_run else list(bundle.class_recalls())
+    recalls.sort(key=lambda one: one.low)
     handled = [fault for fault in state.known.faults if fault not in state.unhandled]
     return render(
         path,
@@ -87,6 +91,10 @@ def write_report(
             [*unhandled, *by_group(handled, bundle.layout)],
             key=lambda fault: (fault not in unhandled, fault.line is None, -len(fault.cells)),
         ),
+        recalls=recalls[:_LISTED],
+        other_recalls=recalls[_LISTED:],
+        class_name=lambda label: class_name(label, bundle.class_names),
+        selftest=None if run is None else run.selftest,
         diagnosis=diagnosis,
         numbering=Numbering.from_layout(bundle.layout, count_from),
         verdicts=(

@@ -37,6 +37,7 @@ class Reading:
     events: tuple[Fault, ...] = ()
     faults: tuple[Fault, ...] = ()
     contact: object = None
+    classes: object = None
 
 
 class Scripted:
@@ -112,6 +113,20 @@ def test_accumulated_classes_are_told_once_a_contact_and_do_not_flip():
         (0.4, "0 (90%)"),
         (0.5, "1 (80%)"),
     ]
+
+
+def test_a_set_of_classes_is_told_when_it_changes():
+    likely = np.array([0.6, 0.3, 0.1])
+    sets = [(0,), (0,), (0, 1), ()]
+    readings = [Reading(0, probabilities=likely, classes=one) for one in sets]
+    session = Session("a", Scripted(readings))
+    events = [event for one in frames(4) for event in session.take(one, one.time)]
+    assert [event.text for event in events] == [
+        "0 (60%), one of {0}",
+        "0 (60%), one of {0, 1}",
+        "0 (60%), one of {}",
+    ]
+    assert events[1].to_dict()["classes"] == [0, 1]
 
 
 def test_faults_are_told_when_they_come_and_when_they_go():
@@ -500,6 +515,7 @@ def test_frames_beyond_the_wanted_number_count_as_dropped(listened):
         (["--port", "0", "--host", "256.1.1.1", "--seconds", "1"], ""),
         (["--port", "0", "--ticks", "0"], "--ticks 0"),
         (["--port", "0", "--accumulate"], "--accumulate needs BUNDLE"),
+        (["--port", "0", "--sets", "0.1"], "--sets needs BUNDLE"),
         (["--port", "0", "--frames", "0"], "--frames 0"),
         (["--port", "0", "--record", ""], "--record '': name a folder"),
         (["", "--port", "0"], ": expected a bundle"),

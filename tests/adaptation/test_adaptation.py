@@ -14,6 +14,7 @@ from adaptfault.adaptation.forecast import Expected, Forecast
 from adaptfault.adaptation.reduced_model import ReducedModel, phi
 from adaptfault.adaptation.result import Adaptation
 from adaptfault.data.windows import Windows
+from adaptfault.evaluation.class_recall import class_recalls
 from adaptfault.evaluation.scores import evaluate
 from adaptfault.imputation.linear import AffineFill
 from adaptfault.models.compact import CompactNetwork
@@ -328,6 +329,8 @@ def test_the_forecast_names_the_class_that_loses_most():
     predicted = {"fault-free": y, "fill": np.zeros_like(y), "head": lost}
     forecast = Forecast.of(F, y, np.arange(60), predicted)
     assert (forecast.worst_class, forecast.worst_loss) == (1, 0.5)
+    assert forecast.classes == class_recalls(y, predicted["head"], np.arange(60))
+    assert [one["label"] for one in forecast.to_dict()["classes"]] == [0, 1, 2]
     assert forecast.stages["scratch"].accuracy == forecast.stages["head"].accuracy
     assert forecast.stages["scratch"].high >= forecast.stages["fault-free"].accuracy
 

@@ -48,6 +48,50 @@ def test_too_few_recordings_give_sets_of_all_classes():
     assert sets.sets(np.array([[1.0, 0.0, 0.0, 0.0]]), 0.1).all()
 
 
+def unequal(rng: np.random.Generator, recordings: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same where class 0 is harder to tell than the others."""
+    likely, y, recording = drawn(rng, recordings)
+    likely[y == 0, 0] *= 0.2
+    return likely / likely.sum(axis=1, keepdims=True), y, recording
+
+
+def test_sets_by_class_hold_each_class_as_often_as_stated():
+    rng = np.random.default_rng(3)
+    held = {False: [], True: []}
+    for _ in range(200):
+        fitted = PredictionSets.fit(*unequal(rng, 120))
+        likely, y, recording = unequal(rng, 60)
+        first = [np.flatnonzero(recording == one)[0] for one in range(60)]
+        for by_class in held:
+            inside = fitted.sets(likely, 0.1, by_class)[np.arange(len(y)), y][first]
+            held[by_class].append([inside[y[first] == label].mean() for label in range(4)])
+    error = np.std(held[True], axis=0) / np.sqrt(200)
+    assert (np.mean(held[True], axis=0) > 0.9 - 3 * error).all()
+    assert (np.mean(held[True], axis=0) < 0.97).all()
+    assert np.mean(held[False], axis=0)[0] < 0.8
+
+
+def test_a_class_with_too_few_recordings_is_in_every_set_by_class():
+    likely, y, recording = drawn(np.random.default_rng(4), 80)
+    kept = ~np.isin(recording, np.unique(recording[y == 2])[8:])
+    sets = PredictionSets.fit(likely[kept], y[kept], recording[kept]).sets(likely, 0.1, True)
+    assert sets[:, 2].all()
+    assert not sets.all(axis=0)[[0, 1, 3]].any()
+
+
+def test_what_is_stored_tells_the_sets_by_class_and_their_mean_size():
+    likely, y, recording = drawn(np.random.default_rng(5), 100)
+    fitted = PredictionSets.fit(likely, y, recording)
+    assert fitted.size == fitted.sets(likely, 0.1).sum(axis=1).mean()
+    stored = PredictionSets.from_dict(fitted.to_dict())
+    assert stored.size == fitted.size
+    assert (stored.sets(likely, 0.1, True) >= fitted.sets(likely, 0.1, True)).all()
+    without = fitted.to_dict()
+    del without["by_class"]
+    with pytest.raises(ValueError, match="need validation by class"):
+        PredictionSets.from_dict(without).sets(likely, 0.1, True)
+
+
 @pytest.mark.parametrize("alpha", [0.0, 1.0, -1, np.nan])
 def test_an_alpha_that_is_no_share_is_refused(alpha):
     with pytest.raises(ValueError, match="alpha is the share of wrong sets"):

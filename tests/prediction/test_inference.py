@@ -63,6 +63,9 @@ def test_sets_of_classes_are_those_of_the_adaptation(versions, runtime):
     threshold = adaptation.conformal.threshold(0.2)
     likely = inference.predict_proba(x)
     np.testing.assert_array_equal(sets, 1 - likely.astype(float) <= threshold)
+    by_class = inference.prediction_sets(x, alpha=0.2, by_class=True)
+    thresholds = [one.threshold(0.2) for one in adaptation.conformal.by_class]
+    np.testing.assert_array_equal(by_class, 1 - likely.astype(float) <= thresholds)
     inference.sets = None
     with pytest.raises(ValueError, match="need validation windows"):
         inference.prediction_sets(x)

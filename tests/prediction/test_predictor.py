@@ -406,6 +406,23 @@ def test_a_robot_streams_without_torch(versions):
     assert subprocess.run(command, check=False).returncode == 0  # what it asserts
 
 
+def test_a_predictor_tells_the_set_of_classes_of_each_window_where_it_is_asked_to(carried):
+    frames = presses(3, 30)
+    plain = running(carried)
+    with_sets = Predictor(lambda: carried, sets=0.3)
+    for frame in frames:
+        alone = plain.stream(frame)
+        reading = with_sets.stream(frame)
+        assert alone.classes is None
+        assert (reading.classes is None) == (reading.label is None)
+        if reading.classes is not None:
+            threshold = with_sets._running.model.sets.threshold(0.3)
+            likely = reading.probabilities.astype(float)
+            assert reading.classes == tuple(np.flatnonzero(1 - likely <= threshold))
+    with pytest.raises(ValueError, match="alpha is the share of wrong sets"):
+        Predictor(lambda: carried, sets=1.0)
+
+
 def test_a_predictor_accumulates_over_a_contact_only_where_it_is_asked_to(carried):
     frames = presses(3, 60)
     plain = running(carried)

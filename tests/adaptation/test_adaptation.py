@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import Clock
+from sklearn.ensemble import ExtraTreesClassifier
 
 from adaptfault.adaptation import stages
 from adaptfault.adaptation.adapter import Adapter
@@ -104,6 +105,33 @@ def test_a_sensor_without_faults_gets_the_best_model_too(half_trained):
     adapted = half_trained.adapt([])
     assert adapted.model.head is not None
     np.testing.assert_array_equal(adapted.predict_proba(x), half_trained.healthy.predict_proba(x))
+
+
+@pytest.mark.parametrize("lost", [[], F])
+def test_where_cells_have_rests_and_gains_of_their_own_a_repair_keeps_up_with_trees(lost):
+    rng = np.random.default_rng(2)
+    gain = rng.uniform(0.1, 0.5, D)
+    rest = rng.uniform(0.1, 0.4, D)
+    parts = []
+    for n, seed in ((200, 0), (100, 1), (400, 2)):
+        windows = blobs(n, seed)
+        x = gain * windows.x + rest + rng.normal(0, 0.01, windows.x.shape)
+        parts.append(replace(windows, x=x.astype(np.float32)))
+    training, validation, test = parts
+    untrained = TactileTransformer(LAYOUT, 3)
+    repaired = Adapter(untrained, training, validation).adapt(lost, progress=False)
+    healthy = np.setdiff1d(np.arange(D), list(lost))
+
+    def course(windows: Windows) -> np.ndarray:
+        x = windows.x[..., healthy]
+        return np.hstack([x.mean(1), x.max(1), x.std(1)])
+
+    known = np.vstack([course(training), course(validation)])
+    trees = ExtraTreesClassifier(300, random_state=0)
+    trees.fit(known, np.concatenate([training.y, validation.y]))
+    reached = (repaired.predict(test.x) == test.y).mean()
+    assert reached > trees.score(course(test), test.y) - 0.02
+    assert reached > 0.75
 
 
 @pytest.mark.parametrize("method", ["fill", "head", "finetune"])

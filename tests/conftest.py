@@ -213,6 +213,7 @@ def export_versions(home: Path) -> None:
                 pooling=torch.tensor([0.9, 0.3]),
                 units=torch.ones(known[-1].shape[1]),
                 restoring=torch.zeros_like(known[-1]),
+                rest=torch.linspace(0, 0.1, 18),
             )
         model = ReducedModel(network, fault_set, front, head).eval()
         Adaptation(model, fault_set, (Stage("fill", 0.1),), _validation=windows).save(home / name)

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -25,6 +26,8 @@ from diagnostics import SensorLayout
 
 Task = Literal["classification", "regression"]
 Network = TactileTransformer | AnyModel
+
+_REST = 0.05  # quantile of the readings of a cell
 
 
 class FaultFreeModel:
@@ -79,6 +82,12 @@ class FaultFreeModel:
     def statistics(self) -> CellStatistics:
         """Moments of the fault-free frames, estimated once and used for each F."""
         return CellStatistics.fit(self.train)
+
+    @cached_property
+    def rest(self) -> Tensor:
+        """What each cell reads without load, float32 ``[D]``: the 5 % quantile of its readings."""
+        readings = self.train.x.reshape(-1, self.train.x.shape[2])
+        return torch.from_numpy(np.quantile(readings, _REST, axis=0).astype(np.float32))
 
     @cached_property
     def compact(self) -> CompactNetwork | None:

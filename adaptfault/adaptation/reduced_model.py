@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -33,7 +34,11 @@ class ReducedModel(nn.Module):
         fault_set: F, the dropped cells.
         front: from ``[N, T, D-k]`` to ``[N, T, D]``; None where F is empty.
         head: uses the features of the network and the healthy cells; None: the head of the network.
+        rest: what each cell reads without load ``[D]``, for a head to come; None: 0.
     """
+
+    rest: Tensor
+    healthy: Tensor
 
     def __init__(
         self,
@@ -41,12 +46,17 @@ class ReducedModel(nn.Module):
         fault_set: FaultSet,
         front: nn.Module | None,
         head: Head | None = None,
+        rest: Tensor | None = None,
     ) -> None:
         super().__init__()
+        rest = torch.zeros(fault_set.n_cells) if rest is None else rest
+        self.register_buffer("rest", rest, persistent=False)
         self.network = network
         self.fault_set = fault_set
         self.head = head
         self.front = front if len(fault_set) else None
+        healthy = torch.from_numpy(fault_set.healthy.copy())
+        self.register_buffer("healthy", healthy, persistent=False)
         self.summary = CellSummary(network.layout, fault_set)
         self.moments = ContactMoments(network.layout)
 
@@ -71,11 +81,14 @@ class ReducedModel(nn.Module):
             The features of the network ``[N, p]``, the first two results of
             :class:`~adaptfault.adaptation.cell_summary.CellSummary`, the
             :class:`~adaptfault.adaptation.contact_moments.ContactMoments` of the whole windows, and
-            the third summary, the course of each cell.
+            the third summary, the course of each cell. Summaries and moments are those of loads:
+            the readings above the rest of each cell.
         """
+        rest = self.rest if self.head is None else self.head.rest
         whole = self.complete(x)
-        cells, smooth, course = self.summary(x)
-        return self.network.features(whole), cells, smooth, self.moments(whole), course
+        cells, smooth, course = self.summary(loads(x, rest[self.healthy]))
+        moments = self.moments(loads(whole, rest))
+        return self.network.features(whole), cells, smooth, moments, course
 
     def forward(self, x: Tensor) -> Tensor:
         """Map windows of the healthy cells ``[N, T, D-k]``, scaled to 0..1, to logits
@@ -84,6 +97,11 @@ class ReducedModel(nn.Module):
             self.network(self.complete(x)) if self.head is None else self.head(self.views(x))
         )
         return logits
+
+
+def loads(x: Tensor, rest: Tensor) -> Tensor:
+    """Return readings ``[..., D]`` above the rest ``[D]`` of each cell, at least 0."""
+    return (x - rest).clamp_min(0.0)
 
 
 def phi(x: NDArray[Any], fault_set: FaultSet) -> NDArray[Any]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from adaptfault.adaptation.fault_free import FaultFreeModel, Network
-from adaptfault.adaptation.reduced_model import ReducedModel, reduce_windows
+from adaptfault.adaptation.reduced_model import ReducedModel, loads, reduce_windows
 from adaptfault.adaptation.result import Adaptation, Stage
 from adaptfault.data.determination import explained
 from adaptfault.data.windows import Windows, evenly
@@ -293,6 +293,7 @@ class Run:
             held_targets,
             folds,
             whole=whole,
+            rest=self.reduced.rest,
             values=values,
             forest=forest,
         )
@@ -302,19 +303,26 @@ class Run:
         if not len(self.fault_set):
             return None
         return torch.cat(
-            [self.reduced.moments(as_tensor(part.x).to(self.device)) for part in parts]
+            [
+                self.reduced.moments(loads(as_tensor(part.x).to(self.device), self.reduced.rest))
+                for part in parts
+            ]
         )
 
     def _behind(self, front: nn.Module | None, network: Network) -> ReducedModel:
         """Return the reduced model of a front end and a network, on the device of the adapter."""
-        return ReducedModel(network, self.fault_set, front).to(self.device).eval()
+        rest = self.fault_free.rest
+        reduced = ReducedModel(network, self.fault_set, front, rest=rest)
+        return reduced.to(self.device).eval()
 
     def _quickly(self, reduced: ReducedModel) -> ReducedModel:
         """Return the same model with its network in low-rank form, if there is one for these
         weights."""
         if self.quick is None:
             return reduced
-        same = ReducedModel(reduced.network, self.fault_set, reduced.front, reduced.head)
+        same = ReducedModel(
+            reduced.network, self.fault_set, reduced.front, reduced.head, reduced.rest
+        )
         same.add_module("network", self.quick)
         return same.eval()
 

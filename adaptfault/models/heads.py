@@ -81,6 +81,7 @@ class Head(nn.Module):
         pooling: weights ``[2]`` of the kernels and of the forest.
         units: of the moments ``[p]``, by which those in ``known`` are divided.
         restoring: weights ``[M, p]`` of the regression that restores moments, in these units.
+        rest: what each cell reads without load ``[D]``; the views are those of the loads above it.
         values: the outputs are values, not logits.
     """
 
@@ -91,6 +92,7 @@ class Head(nn.Module):
     pooling: Tensor
     units: Tensor
     restoring: Tensor
+    rest: Tensor
 
     def __init__(
         self,
@@ -103,6 +105,7 @@ class Head(nn.Module):
         pooling: Tensor,
         units: Tensor,
         restoring: Tensor,
+        rest: Tensor,
         *,
         values: bool = False,
     ) -> None:
@@ -112,6 +115,7 @@ class Head(nn.Module):
             self.register_buffer(f"known{i}", view)
         self.register_buffer("units", units)
         self.register_buffer("restoring", restoring)
+        self.register_buffer("rest", rest)
         self.register_buffer("widths", widths)
         self.register_buffer("weights", weights)
         self.register_buffer("bias", bias)
@@ -135,17 +139,19 @@ class Head(nn.Module):
             pooling=torch.zeros(2),
             units=torch.ones(moments.shape[1]),
             restoring=torch.zeros_like(moments),
+            rest=torch.zeros(about["cells"]),
             values=about["values"],
         )
 
     @classmethod
-    def blank(cls, known: Views, n: int, *, values: bool = False) -> Head:
-        """Build a head for n classes or values that knows views of some windows and has learnt
-        nothing from them."""
+    def blank(cls, known: Views, n: int, cells: int, *, values: bool = False) -> Head:
+        """Build a head for n classes or values that knows views of some windows, of so many cells,
+        and has learnt nothing from them."""
         known = [*known[:_COURSE], known[_MOMENTS]]
         about = {
             "known": [list(view.shape) for view in known],
             "forest": Forest.blank(n).about,
+            "cells": cells,
             "values": values,
         }
         return cls.empty(about, n)
@@ -161,6 +167,7 @@ class Head(nn.Module):
         return {
             "known": [list(view.shape) for view in self.known],
             "forest": self.forest.about,
+            "cells": len(self.rest),
             "values": self.values,
         }
 
@@ -177,6 +184,7 @@ class Head(nn.Module):
             self.pooling,
             self.units,
             self.restoring,
+            self.rest,
             values=self.values,
         )
 
@@ -294,6 +302,7 @@ def fit_head(
     folds: NDArray[np.int64],
     *,
     whole: Tensor | None = None,
+    rest: Tensor | None = None,
     values: bool = False,
     forest: bool = True,
 ) -> tuple[Head, Tensor]:
@@ -308,6 +317,7 @@ def fit_head(
             without windows is never predicted.
         folds: int ``[M + n]``; the windows of a fold are held out together.
         whole: the moments ``[M + n, p]`` of the windows with all cells; None: no cell is dead.
+        rest: what each cell reads without load ``[D]``, kept for the views of other windows.
         values: the targets are values.
         forest: False leaves the forest out.
 
@@ -366,6 +376,7 @@ def fit_head(
         pooling.to(on),
         units,
         restoring,
+        torch.zeros(1) if rest is None else rest,
         values=values,
     )
     return head, outputs

@@ -119,7 +119,7 @@ def graph_of(network: TactileTransformer | AnyModel, *, values: bool = False) ->
     model = ReducedModel(copy.deepcopy(network).cpu(), none, None).eval()
     with torch.no_grad():
         views = model.views(torch.from_numpy(_probes(model, _EXAMPLE)))
-    model.head = Head.blank(views, network.n_classes, values=values)
+    model.head = Head.blank(views, network.n_classes, network.layout.n_cells, values=values)
     whole = _whole(model, values)
     return _stripped(_translate(whole, torch.from_numpy(_probes(model, _EXAMPLE)), values), whole)
 

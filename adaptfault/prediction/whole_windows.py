@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from adaptfault.adaptation.cell_summary import COURSE, CellSummary
-from adaptfault.adaptation.reduced_model import ReducedModel
+from adaptfault.adaptation.reduced_model import ReducedModel, loads
 from adaptfault.imputation.linear import AffineFill
 from adaptfault.imputation.tiled_statistics import LARGE
 from adaptfault.models.heads import Head
@@ -96,7 +96,10 @@ class Masked(nn.Module):
         known = torch.where(self.used, x, 0.0)
         filled = nn.functional.linear(known, self.weight, self.bias).clamp(0.0, 1.0)
         whole = torch.where(self.used, x, filled)
-        cells, smooth, course = self.summary(known)
+        rest = self.head.rest
+        cells, smooth, course = self.summary(torch.where(self.used, loads(x, rest), 0.0))
         features = self.network.features(whole)
-        outputs: Tensor = self.head((features, cells, smooth, self.moments(whole), course))
+        outputs: Tensor = self.head(
+            (features, cells, smooth, self.moments(loads(whole, rest)), course)
+        )
         return outputs if self.values else torch.softmax(outputs, dim=1)

@@ -103,7 +103,7 @@ def test_a_large_array_is_exported_without_a_matrix_of_its_cells(monkeypatch):
     none = FaultSet((), 18)
     model = ReducedModel(TactileTransformer(SensorLayout(2, 3, 3), 3, length=5), none, None).eval()
     with torch.no_grad():
-        model.head = Head.blank(model.views(torch.from_numpy(small_windows(4))), 3)
+        model.head = Head.blank(model.views(torch.from_numpy(small_windows(4))), 3, 18)
     assert isinstance(export._whole(model), Selected)
     monkeypatch.undo()
     assert isinstance(export._whole(model), Masked)

@@ -21,12 +21,12 @@ Not modelled: cells that couple through the skin, hysteresis and relaxation, a p
 from __future__ import annotations
 
 import argparse
-import os
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from adaptfault import Recordings, save_npz
@@ -36,7 +36,7 @@ from diagnostics.simulation.circuit import Circuit
 LAYOUT = SensorLayout.paper()
 PITCH = 0.0034  # metres between cells
 DOME = 0.004  # radius of a cell's dome: more than half the pitch, so that they overlap
-CELL = 4000.0  # newtons a metre
+CELL = 2000.0  # newtons a metre
 TIMESTEP = 0.005
 HELD = 300  # frames of 10 ms: a recording is two grasps of 3 s
 CLOSING = (20, 80)  # the pads start to close, and the fixture lets go, in frames of 10 ms
@@ -63,17 +63,17 @@ class Object:
     size: tuple[float, ...]
     half: float
     turn: tuple[float, float, float] = (0, 0, 0)
-    stiffness: float = 1e5
+    stiffness: float = 5e4
     friction: float = 0.7
 
 
 OBJECTS = {
     "small ball": Object("sphere", (9,), 9),
     "large ball": Object("sphere", (22,), 22),
-    "soft ball": Object("sphere", (22,), 22, stiffness=1200, friction=1.0),
+    "soft ball": Object("sphere", (22,), 22, stiffness=600, friction=1.0),
     "cube": Object("box", (10, 10, 10), 10),
     "plate": Object("box", (4, 14, 16), 4, friction=0.4),
-    "soft block": Object("box", (12, 14, 16), 12, stiffness=800, friction=1.0),
+    "soft block": Object("box", (12, 14, 16), 12, stiffness=400, friction=1.0),
     "edge": Object("box", (10, 10, 15), 14.1, turn=(0, 0, 45)),
     "rod": Object("cylinder", (7, 25), 7, friction=0.5),
     "disc": Object("cylinder", (13, 6), 6, turn=(0, 90, 0)),
@@ -128,13 +128,13 @@ def scene(thing: Object) -> mujoco.MjModel:
       <actuator><motor joint="pad0" name="grip"/></actuator>
     </mujoco>"""
     model = mujoco.MjModel.from_xml_string(text)
-    # In equilibrium a contact carries d / (1 - d) * k * depth / (inverse mass of the two bodies),
-    # with impedance d and k = stiffness / d**2 (MuJoCo, "Solver parameters").
+    # At rest a contact carries stiffness * depth / ((1 - impedance) * inverse mass of the two
+    # bodies) (MuJoCo, "Solver parameters").
     series = 1 / (1 / CELL + 1 / thing.stiffness)
     impedance = 0.5
     body = model.body("object").id
     inverse = model.body_invweight0[[1, body], 0].sum()
-    stiffness = series * inverse * impedance * (1 - impedance)
+    stiffness = series * inverse * (1 - impedance)
     model.geom_solref[: LAYOUT.n_cells] = (-stiffness, -2 * np.sqrt(stiffness))
     return model
 
@@ -171,6 +171,9 @@ def grasp(name: str, seed: int) -> Floats:
     Args:
         name: which of ``OBJECTS``.
         seed: draws poses, grip forces and slips.
+
+    Raises:
+        RuntimeError: MuJoCo warned, as of an unstable step.
     """
     thing = OBJECTS[name]
     rng = np.random.default_rng([seed, list(OBJECTS).index(name)])
@@ -205,6 +208,8 @@ def grasp(name: str, seed: int) -> Floats:
             mujoco.mj_step(model, data, round(0.01 / TIMESTEP))
             if tick % 10 == 9:
                 frames.append(loads(data))
+    if any(warning.number for warning in data.warning):
+        raise RuntimeError(f"{name}, seed {seed}: MuJoCo warned, see MUJOCO_LOG.TXT")
     return np.array(frames, np.float32)
 
 
@@ -220,20 +225,21 @@ def read(forces: Floats, circuit: Circuit, seed: int) -> Floats:
     return np.clip(np.rint(readings / step) * step, 0, LAYOUT.full_scale).astype(np.float32)
 
 
-def record(grasps: int, *, seed: int = 0, jobs: int | None = None) -> list[Floats]:
-    """Return the forces of ``grasps`` recordings of each object, object by object."""
-    names = np.repeat(list(OBJECTS), grasps).tolist()
-    seeds = [seed + number for number in range(grasps)] * len(OBJECTS)
-    with ProcessPoolExecutor(jobs or os.cpu_count()) as pool:
-        return list(pool.map(grasp, names, seeds, chunksize=4))
+def record(grasps: int, *, seed: int = 0, objects: Sequence[str] = tuple(OBJECTS)) -> list[Floats]:
+    """Return the forces of ``grasps`` recordings of each object, object by object, from all CPUs.
+
+    Recording ``number`` of an object has the seed ``seed + number``.
+    """
+    tasks = [delayed(grasp)(name, seed + number) for name in objects for number in range(grasps)]
+    return list(Parallel(n_jobs=-1)(tasks))
 
 
-def as_recordings(frames: list[Floats]) -> Recordings:
+def as_recordings(frames: Sequence[Floats], objects: Sequence[str] = tuple(OBJECTS)) -> Recordings:
     """Return readings, as many of each object, with their classes and names."""
-    grasps = len(frames) // len(OBJECTS)
-    labels = np.repeat(np.arange(len(OBJECTS)), grasps)
-    names = tuple(f"{name}/{number:04d}" for name in OBJECTS for number in range(grasps))
-    return Recordings(tuple(frames), LAYOUT, labels, tuple(OBJECTS), names)
+    grasps = len(frames) // len(objects)
+    labels = np.repeat(np.arange(len(objects)), grasps)
+    names = tuple(f"{name}/{number:04d}" for name in objects for number in range(grasps))
+    return Recordings(tuple(frames), LAYOUT, labels, tuple(objects), names)
 
 
 def main() -> None:

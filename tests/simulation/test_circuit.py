@@ -335,6 +335,7 @@ def test_with_floating_lines_an_open_cell_reads_what_sneaks_around_it():
         (CutLine(BIT, 1), "row or column"),
         (CutLine(Line(0, "row", 7), 1), "not a wire"),
         (ShortedLine(ROW, "earth"), "'supply' or 'ground'"),
+        (BridgedLines(ROW, -5.0), "must be positive"),
         (BridgedLines(Line(0, "column", 5)), "last of its kind"),
         (StuckBit(ROW, 1), "row_address or column_address"),
         (StuckBit(BIT, 2), "level 0 or 1"),

@@ -1,4 +1,4 @@
-"""The gripper in MuJoCo obeys the laws that its page states, and its damages break what they name."""
+"""The gripper in MuJoCo obeys the laws that it states, and its damages break what they name."""
 
 import numpy as np
 import pytest
@@ -6,16 +6,15 @@ import pytest
 from diagnostics import FaultSet
 
 mujoco = pytest.importorskip("mujoco")
-
-import mujoco_bench
-import mujoco_gripper
-from mujoco_bench import Damage, damages
-from mujoco_gripper import CELL, LAYOUT, OBJECTS
+mujoco_gripper = pytest.importorskip("mujoco_gripper")
+mujoco_bench = pytest.importorskip("mujoco_bench")
+CELL = mujoco_gripper.CELL
+LAYOUT = mujoco_gripper.LAYOUT
 
 
 @pytest.mark.parametrize("name", ["small ball", "soft ball", "disc"])
 def test_a_dome_in_series_with_the_object_is_a_spring_of_the_stated_stiffness(name: str):
-    thing = OBJECTS[name]
+    thing = mujoco_gripper.OBJECTS[name]
     model = mujoco_gripper.scene(thing)
     data = mujoco.MjData(model)
     data.ctrl[0] = 2 * 20.0
@@ -43,7 +42,7 @@ def test_a_slip_moves_the_load_along_the_pads():
         places = np.array([mujoco_gripper.place(cell) for cell in range(forces.shape[1])])
         return forces @ places / forces.sum(axis=1, keepdims=True)
 
-    way = [np.ptp(centre(seed), axis=0).max() / mujoco_gripper.PITCH for seed in range(8)]
+    way = [np.ptp(centre(seed), axis=0).max() / mujoco_gripper.PITCH for seed in range(6)]
     assert min(way) < 0.3  # held still
     assert max(way) > 0.7
 
@@ -63,14 +62,14 @@ def test_facing_cells_carry_the_same_of_a_plate():
         assert mujoco_gripper.place(cell) == pytest.approx(mujoco_gripper.place(facing))
 
 
-def faulty(damage: Damage) -> FaultSet:
+def faulty(damage: "mujoco_bench.Damage") -> FaultSet:
     cells = np.flatnonzero(damage.errors() > mujoco_bench.FAULTY)
     return FaultSet(tuple(cells.tolist()), LAYOUT.n_cells)
 
 
 def test_each_damage_breaks_the_cells_that_it_names():
     life = [np.eye(LAYOUT.n_cells)[[5]]]  # one cell does all the work
-    nothing, short, knife, cable, wear, drop = damages(life)
+    nothing, short, knife, cable, wear, drop = mujoco_bench.damages(life)
     assert not nothing.errors().any()
     assert faulty(short) >= FaultSet((LAYOUT.cell(0, 6, 4),), LAYOUT.n_cells)
     severed = [LAYOUT.cell(0, r, c) for r in range(5) for c in range(7 - r, LAYOUT.cols)]
@@ -83,7 +82,7 @@ def test_each_damage_breaks_the_cells_that_it_names():
 
 
 def test_a_cable_opens_while_its_pad_is_loaded_and_closes_again():
-    cable = damages([np.ones((1, LAYOUT.n_cells))])[3]
+    cable = mujoco_bench.damages([np.ones((1, LAYOUT.n_cells))])[3]
     row = [LAYOUT.cell(1, 5, c) for c in range(LAYOUT.cols)]
     forces = np.full((3, LAYOUT.n_cells), 0.1)
     forces[1] = 1.0
@@ -93,7 +92,7 @@ def test_a_cable_opens_while_its_pad_is_loaded_and_closes_again():
 
 
 def test_wear_grows_with_age():
-    wear = damages([np.ones((1, LAYOUT.n_cells))])[4]
+    wear = mujoco_bench.damages([np.ones((1, LAYOUT.n_cells))])[4]
     forces = np.ones((1, LAYOUT.n_cells))
     young, old = (wear.read(forces, seed=0, age=age).mean() for age in (0.0, 1.0))
     assert old == pytest.approx(young / 4, rel=0.05)

@@ -161,23 +161,20 @@ class Bench:
 
 
 def named(report: af.MaintenanceReport) -> str:
-    """Return the two largest root causes, and how many others there are."""
+    """Return the largest root cause and how many others there are; without faults the reasons."""
     faults = sorted(report.faults, key=lambda fault: -len(fault.cells))
-    told = [fault.reason for fault in faults[:2]]
-    more = [f"{len(faults) - 2} more"] if len(faults) > 2 else []
-    return "; ".join(told + more) or "-"
+    if not faults:
+        return "; ".join(reason.text for reason in report.reasons)
+    told = faults[0].reason.split(";")[0]
+    return told if len(faults) == 1 else f"{told}; {len(faults) - 1} more"
 
 
-def build(folder: Path, grasps: int, epochs: int, objects: Sequence[str]) -> Bench:
-    """Record, train and write the bundle."""
-    life_grasps = -(-200 * grasps // 20 // len(objects))
-    later_grasps = max(1, grasps // 3)
-    counts = np.array([grasps, life_grasps, later_grasps])
-    forces = mujoco_gripper.record(counts.sum(), objects=objects)
+def build(folder: Path, grasps: Sequence[int], epochs: int, objects: Sequence[str]) -> Bench:
+    """Record, train, write the bundle; ``grasps`` of each object: to train, in a life, later."""
+    forces = mujoco_gripper.record(sum(grasps), objects=objects)
     of_object = np.arange(len(forces)).reshape(len(objects), -1)
-    first, life, later = (
-        part.ravel() for part in np.split(of_object, np.cumsum(counts)[:-1], axis=1)
-    )
+    parts = np.split(of_object, np.cumsum(grasps)[:-1], axis=1)
+    first, life, later = (part.ravel() for part in parts)
     order = np.random.default_rng(0).permutation(life)
     frames = [mujoco_gripper.read(forces[i], HEALTHY, i) for i in first]
     recordings = mujoco_gripper.as_recordings(frames, objects)
@@ -197,7 +194,7 @@ def build(folder: Path, grasps: int, epochs: int, objects: Sequence[str]) -> Ben
         folder / "robot.bundle",
         [forces[i] for i in order],
         [forces[i] for i in later],
-        np.repeat(np.arange(len(objects)), later_grasps),
+        np.repeat(np.arange(len(objects)), grasps[2]),
     )
 
 
@@ -210,10 +207,8 @@ def main() -> None:
     began = time.perf_counter()
     objects = list(OBJECTS)[: 4 if args.small else None]
     with tempfile.TemporaryDirectory() as folder:
-        if args.small:
-            bench = build(Path(folder), grasps=8, epochs=1, objects=objects)
-        else:
-            bench = build(Path(folder), grasps=20, epochs=8, objects=objects)
+        grasps = (8, 10, 2) if args.small else (14, 17, 4)
+        bench = build(Path(folder), grasps, 1 if args.small else 6, objects)
         print(
             f"recorded, trained and bundled after {time.perf_counter() - began:.0f} s", flush=True
         )

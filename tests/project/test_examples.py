@@ -43,6 +43,7 @@ LESS = {  # they take minutes
     "soak.py": ["--hours", "12", "--frames", "500"],
     "any_model.py": ["--small"],
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
+    "iclabel.py": ["--components", "5"],
     "mujoco_bench.py": ["--small"],
     "mujoco_gripper.py": ["--grasps", "1"],
 }
@@ -60,6 +61,7 @@ SLOW = {  # they take long, or a test of the library proves the same
     "fleet_scaling.py",
     "forecast_intervals.py",
     "attack.py",
+    "iclabel.py",
     "io_errors.py",
     "kill_maintenance.py",
     "mujoco_bench.py",
@@ -89,6 +91,7 @@ SLOW_ON_RECORDINGS = {
 # others do without, and say so
 NEEDS = {
     "deploy_speed.py": "onnxruntime",
+    "iclabel.py": "mne_icalabel",
     "mujoco_bench.py": "mujoco",
     "mujoco_gripper.py": "mujoco",
     "ros_latency.py": "rclpy",

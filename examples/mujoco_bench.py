@@ -15,9 +15,11 @@ import argparse
 import shutil
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import chain
 from pathlib import Path
 
 import mujoco_gripper
@@ -161,12 +163,14 @@ class Bench:
 
 
 def named(report: af.MaintenanceReport) -> str:
-    """Return the largest root cause and how many others there are; without faults the reasons."""
-    faults = sorted(report.faults, key=lambda fault: -len(fault.cells))
-    if not faults:
+    """Return how many root causes of each kind there are, and the largest one; without faults the
+    reasons."""
+    if not report.faults:
         return "; ".join(reason.text for reason in report.reasons)
-    told = faults[0].reason.split(";")[0]
-    return told if len(faults) == 1 else f"{told}; {len(faults) - 1} more"
+    kinds = Counter(str(fault.kind) for fault in report.faults)
+    largest = max(report.faults, key=lambda fault: len(fault.cells))
+    counts = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+    return f"{counts}: {largest.reason.split(';')[0]}"
 
 
 def build(folder: Path, grasps: Sequence[int], epochs: int, objects: Sequence[str]) -> Bench:
@@ -214,8 +218,11 @@ def main() -> None:
         )
         heads = ["fault", "faulty", "found", "blamed", "decision", "broken", "repaired", "named"]
         widths = (24, 7, 6, 7, 15, 7, 9, 0)
-        for row in [heads, *map(bench.row, damages(bench.life))]:
-            print("".join(f"{value:{width}}" for value, width in zip(row, widths, strict=True)))
+        for row in chain([heads], map(bench.row, damages(bench.life))):
+            print(
+                "".join(f"{value:{width}}" for value, width in zip(row, widths, strict=True)),
+                flush=True,
+            )
     print(f"{time.perf_counter() - began:.0f} s in all")
 
 

@@ -74,9 +74,13 @@ class ShortedLine:
 
 @dataclass(frozen=True)
 class BridgedLines:
-    """A row or column touches the next one (index + 1), at their driven ends."""
+    """A row or column touches the next one (index + 1), at their driven ends.
+
+    ``ohms`` is the resistance between the two, as of water; None: ``short_ohms``, two conductors.
+    """
 
     line: Line
+    ohms: float | None = None
 
 
 @dataclass(frozen=True)
@@ -358,10 +362,11 @@ class _Pad:
                 case ShortedLine(to=to):
                     static[wire, wire] += short
                     source[wire] += short if to == "supply" else 0.0
-                case BridgedLines():
+                case BridgedLines(ohms=ohms):
                     pair = np.array([wire, wire + 1])
-                    static[pair, pair] += short
-                    static[pair, pair[::-1]] -= short
+                    joined = 1 / (ohms or circuit.short_ohms)
+                    static[pair, pair] += joined
+                    static[pair, pair[::-1]] -= joined
                 case StuckBit(line, level) if line.kind == "row_address":
                     drive = _stick(drive, line.index, level)
                 case StuckBit(line, level):
@@ -407,6 +412,8 @@ def _check(fault: NetlistFault, layout: SensorLayout) -> None:
             layout.rows if line.kind == "row" else layout.cols
         ):
             raise ValueError(f"{fault}: {line} is the last of its kind; name the one before it")
+        case BridgedLines(_, float(ohms)) if not ohms > 0:
+            raise ValueError(f"{fault}: ohms must be positive; None for short_ohms")
         case StuckBit(_, level) if level not in (0, 1):
             raise ValueError(f"{fault}: a bit sticks at level 0 or 1")
         case StuckConverter(_, value) if not np.isfinite(value):

@@ -44,6 +44,9 @@ LESS = {  # they take minutes
     "soak.py": ["--hours", "12", "--frames", "500"],
     "any_model.py": ["--small"],
     "fleet_scaling.py": ["--robots", "4", "--batch", "2", "--adapted", "1"],
+    "iclabel.py": ["--components", "5"],
+    "mujoco_bench.py": ["--small"],
+    "mujoco_gripper.py": ["--grasps", "1"],
 }
 SLOW = {  # they take long, or a test of the library proves the same
     "any_model.py",
@@ -59,9 +62,12 @@ SLOW = {  # they take long, or a test of the library proves the same
     "fleet_scaling.py",
     "forecast_intervals.py",
     "attack.py",
+    "iclabel.py",
     "io_errors.py",
     "kill_maintenance.py",
     "lerobot_set.py",
+    "mujoco_bench.py",
+    "mujoco_gripper.py",
     "own_model.py",
     "picture.py",
     "power_cut.py",
@@ -87,14 +93,22 @@ SLOW_ON_RECORDINGS = {
 # others do without, and say so
 NEEDS = {
     "deploy_speed.py": "onnxruntime",
+    "iclabel.py": "mne_icalabel",
+    "mujoco_bench.py": "mujoco",
+    "mujoco_gripper.py": "mujoco",
     "ros_latency.py": "rclpy",
 }
 
 
+def skip_without_its_package(name: str) -> None:
+    """Skip the test of an example that needs a package which is not here."""
+    if (package := NEEDS.get(name)) and importlib.util.find_spec(package) is None:
+        pytest.skip(f"{name} needs {package}")
+
+
 def run(example: Path, folder: Path, *arguments: str | Path) -> str:
     """Run an example without a warning; return what it prints."""
-    if (package := NEEDS.get(example.name)) and importlib.util.find_spec(package) is None:
-        pytest.skip(f"{example.name} needs {package}")
+    skip_without_its_package(example.name)
     # rclpy brings a parser that imports sre_parse.
     environment = {**os.environ, "PYTHONWARNINGS": "error,ignore:module 'sre_:DeprecationWarning"}
     command = [sys.executable, example, *arguments]
@@ -135,6 +149,7 @@ def test_the_example_runs_on_recordings(name: str, small_grasps: Recordings, tmp
 @pytest.mark.parametrize("name", [path.stem for path in EXAMPLES if "__main__" in path.read_text()])
 def test_what_an_example_imports_is_there(name: str):
     """Also of those that are slow: a move within the library breaks them first."""
+    skip_without_its_package(f"{name}.py")
     spec = importlib.util.spec_from_file_location(f"example_{name}", HOME / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None

@@ -276,6 +276,17 @@ def test_bridged_lines_read_the_mean_where_an_equal_switch_grounds_the_one_not_s
         np.testing.assert_allclose(read[:, cells], mean, atol=0.02 * LAYOUT.full_scale)
 
 
+def test_water_between_two_rows_drives_the_other_one_through_a_voltage_divider():
+    """Supply, switch of the driven row, water, switch of the grounded row, ground."""
+    below = LAYOUT.cell(0, ROW.index + 1, 2)
+    force = np.zeros((1, LAYOUT.n_cells))
+    force[0, below] = 2.0
+    circuit = Circuit(LAYOUT, faults=(BridgedLines(ROW, 630.0),), load_ohms=0.1)
+    read = circuit.read(force)[0]
+    assert read[CELL] == pytest.approx(2.0 * 70 / (70 + 630 + 70), rel=0.03)
+    assert read[below] == pytest.approx(2.0 * 700 / 770, rel=0.03)
+
+
 def test_a_row_on_the_supply_stays_alive_and_adds_itself_to_all_other_rows():
     circuit = Circuit(LAYOUT, "grounded", load_ohms=0.1, switch_ohms=10, short_ohms=0.1)
     read = LAYOUT.grid(circuit.with_faults(ShortedLine(ROW, "supply")).read(FORCES))[:, 0]
@@ -335,6 +346,7 @@ def test_with_floating_lines_an_open_cell_reads_what_sneaks_around_it():
         (CutLine(BIT, 1), "row or column"),
         (CutLine(Line(0, "row", 7), 1), "not a wire"),
         (ShortedLine(ROW, "earth"), "'supply' or 'ground'"),
+        (BridgedLines(ROW, -5.0), "must be positive"),
         (BridgedLines(Line(0, "column", 5)), "last of its kind"),
         (StuckBit(ROW, 1), "row_address or column_address"),
         (StuckBit(BIT, 2), "level 0 or 1"),

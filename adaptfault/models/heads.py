@@ -4,15 +4,16 @@ A head has two experts. The first is a mixture of kernel ridge regressions on cl
 classifiers: Suykens and Vandewalle 1999) or on values. Each has a kernel of some views of a window:
 the penultimate features of the network, the healthy cells, these smoothed
 (:mod:`adaptfault.adaptation.cell_summary`), the moments of the contact on each pad in the imputed
-windows (:mod:`adaptfault.adaptation.contact_moments`), and these corrected. The correction is one
-more kernel ridge regression, of the error that the imputation makes on training windows, whose dead
-cells are known: what only these windows have helps to learn (privileged information: Vapnik and
-Vashist 2009). It is cross-fitted, so a window is corrected without its own dead cells. A Gaussian
-kernel suits what changes smoothly, a Laplacian kernel what hangs on single values: it is the limit
-of a forest of random trees (Balog, Lakshminarayanan, Ghahramani, Roy and Teh 2016). The network has
-seen its training windows, so its features tell them apart better than new ones; three of the
-kernels do not use them. The shares of the mixture are those with the highest likelihood of held-out
-windows (stacking of predictive distributions: Yao, Vehtari, Simpson and Gelman 2018).
+windows (:mod:`adaptfault.adaptation.contact_moments`), and these corrected. All but the features
+are of loads, the readings above the rest of each cell. The correction is one more kernel ridge
+regression, of the error that the imputation makes on training windows, whose dead cells are known:
+what only these windows have helps to learn (privileged information: Vapnik and Vashist 2009). It is
+cross-fitted, so a window is corrected without its own dead cells. A Gaussian kernel suits what
+changes smoothly, a Laplacian kernel what hangs on single values: it is the limit of a forest of
+random trees (Balog, Lakshminarayanan, Ghahramani, Roy and Teh 2016). The network has seen its
+training windows, so its features tell them apart better than new ones; three of the kernels do not
+use them. The shares of the mixture are those with the highest likelihood of held-out windows
+(stacking of predictive distributions: Yao, Vehtari, Simpson and Gelman 2018).
 
 The second expert is a forest (:mod:`adaptfault.models.forest`) on the course of each healthy cell.
 Trees choose their inputs, so they do not mind rests and gains that differ by cell, and texture

@@ -16,7 +16,7 @@ from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
 from diagnostics.decision.certificate import Certificate, certify
 from diagnostics.decision.line_cover import candidate_groups
 from diagnostics.decision.result import Diagnosis
-from diagnostics.decision.root_causes import CellFindings, root_causes
+from diagnostics.decision.root_causes import OF_WIRES, CellFindings, root_causes
 from diagnostics.decision.serialization import (
     Arrays,
     from_state,
@@ -610,6 +610,12 @@ class SelfDiagnosis:
         held = stream.reading(value)
         beyond = spatial.scored & ~rests
         kind = np.where(by_life & faulty, life.kind, -1)
+        # Not certain one by one: a wire that fails now and then makes its cells fail together.
+        unsure = judged & ~faulty & ~life.shown & (life.kind < len(OF_WIRES)) & (life.evidence > 0)
+        # What lies still on a pad was not known when life was tested.
+        pad = stream.layout.pad_of
+        unsure &= ~np.isin(pad, pad[explained])
+        told = np.where(unsure, life.kind, kind)
         source = np.where(life.source < 0, np.nan, self._order[life.source])
         of_life = np.stack(
             [held, stream.reading(stream.scale.baseline), life.lag * PIECE, source, life.highest]
@@ -628,12 +634,12 @@ class SelfDiagnosis:
             drifting=drifting,
             gain=np.where(drifting, spatial.factor, np.nan),
             value=np.where(
-                kind >= 0,
-                of_life[kind, np.arange(len(kind))],
+                told >= 0,
+                of_life[told, np.arange(len(kind))],
                 np.where(intermittent, stream.reading(blinks_to), held),
             ),
             since=np.select(
-                [silent, intermittent, noisy, drifting, kind >= 0],
+                [silent, intermittent, noisy, drifting, told >= 0],
                 [
                     runs.missed_since,
                     intermittency.blinks_since,
@@ -646,12 +652,17 @@ class SelfDiagnosis:
             probability=probability,
             # A cell at rest supports a broken line by the events alone, without the prior of its
             # value.
-            weight=np.where(known, CERTAIN_RATIO, np.where(kind >= 0, life.evidence, weight)),
+            weight=np.select(
+                [known, kind >= 0, unsure],
+                [CERTAIN_RATIO, life.evidence, life.evidence],
+                weight,
+            ),
             events=np.where(
-                intermittent, intermittency.blinks, np.where(kind >= 0, life.units, spatial.events)
+                intermittent, intermittency.blinks, np.where(told >= 0, life.units, spatial.events)
             ),
             known=known,
             refuted=kind,
+            unsure=np.where(unsure, life.kind, -1),
             share=life.share,
             typical=self._typical(stream),
         )

@@ -31,6 +31,9 @@ REFUTED_KINDS = (
     FaultKind.CLAMPED,
 )
 
+# Those that a wire has which fails now and then, as one that opens under load.
+OF_WIRES = REFUTED_KINDS[:2]
+
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -58,6 +61,7 @@ class CellFindings:
         known: cells that were dead in the reference already.
         refuted: int, number of the fault in ``evidence.life.FAULTS`` of cells that move and are
             proved not to be alive; -1: others.
+        unsure: int, the same of cells that may have one of the ``OF_WIRES``; -1: others.
         share: float, of the contacts in which such a cell was dead.
     """
 
@@ -77,6 +81,7 @@ class CellFindings:
     events: NDArray[np.intp]
     known: Mask
     refuted: NDArray[np.intp]
+    unsure: NDArray[np.intp]
     share: Floats
     zero: Mask | None = None
     typical: Floats | None = None
@@ -125,7 +130,9 @@ def _causes(
 ) -> list[tuple[FaultKind, float | None, Cause]]:
     """Return kind, value and cause of each fault; ``common``: lower limit of the prevalence of one
     kind."""
-    causes = []
+    causes = _of_failing_wires(found, aliased, layout, common)
+    aliased = aliased.copy()
+    aliased[[cell for _, _, cause in causes for cell in cause.cells]] = True
     for kind, faulty, consistent, value in _groups(found, layout.full_scale):
         # A working cell contradicts a broken wire; so does one with another fault, or another
         # value.
@@ -141,6 +148,26 @@ def _causes(
         )
         causes += [(kind, value, cause) for cause in explained]
     return causes
+
+
+def _of_failing_wires(
+    found: CellFindings, aliased: Mask, layout: SensorLayout, common: float
+) -> list[tuple[FaultKind, float | None, Cause]]:
+    """Return the wires that fail now and then.
+
+    One by one their cells may be uncertain, or look as if they moved by themselves: a wire that
+    opens under load leaves each of them its light contacts. They fail together.
+    """
+    likely = np.maximum(found.refuted, found.unsure)
+    consistent = (likely >= 0) & (likely < len(OF_WIRES))
+    contradicting = (found.alive | found.faulty) & ~consistent | aliased
+    faulty = found.faulty & consistent
+    explained = _explained(
+        faulty & ~aliased, consistent & ~aliased, contradicting, found, layout, common
+    )
+    wires = [cause for cause in explained if cause.line is not None and cause.proven]
+    kinds = [OF_WIRES[int(np.median(likely[list(cause.seen)]))] for cause in wires]
+    return [(kind, None, cause) for kind, cause in zip(kinds, wires, strict=True)]
 
 
 def _explained(
@@ -298,7 +325,8 @@ def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
             else layout.place(int(fault.value))
         )
         return f"repeats {source}"
-    if fault.kind is FaultKind.INTERMITTENT and found.refuted[fault.cells[0]] >= 0:
+    comes_and_goes = np.maximum(found.refuted, found.unsure) >= 0
+    if fault.kind is FaultKind.INTERMITTENT and comes_and_goes[list(fault.cells)].any():
         share = float(np.median(found.share[list(fault.cells)]))
         return (
             f"reads nothing in {share:.0%} of the contacts that load the cells around it, and its"

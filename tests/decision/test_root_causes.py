@@ -28,6 +28,7 @@ HEALTHY = CellFindings(
     events=np.zeros(CELLS, np.intp),
     known=NONE,
     refuted=np.full(CELLS, -1),
+    unsure=np.full(CELLS, -1),
     share=ZERO,
 )
 
@@ -204,6 +205,34 @@ def test_a_changed_gain_and_an_offset_are_different_drifts():
 def test_a_loose_wire_makes_its_whole_row_blink():
     (fault,) = causes(moving(HEALTHY, "intermittent", row(1, 5)))
     assert (fault.kind, fault.line) == (FaultKind.INTERMITTENT, Line(1, "row", 5))
+
+
+def test_a_wire_that_opens_under_load_is_named_though_none_of_its_cells_is_certain():
+    row = LAYOUT.cells_on(Line(1, "row", 4))
+    comes_and_goes = 1
+    found = replace(
+        HEALTHY,
+        alive=~at(row),
+        unsure=np.where(at(row), comes_and_goes, -1),
+        weight=np.where(at(row), 5.0, 0.0),
+        share=np.where(at(row), 0.4, 0.0),
+        since=np.zeros(CELLS, np.intp),
+    )
+    (fault,), _ = root_causes(found, (), LAYOUT)
+    assert (fault.kind, fault.line, fault.cells) == (
+        FaultKind.INTERMITTENT,
+        Line(1, "row", 4),
+        tuple(row.tolist()),
+    )
+    assert "reads nothing in 40% of the contacts" in fault.reason
+    apart = [0, 13, 26, 39, 52, 65]
+    scattered = replace(
+        HEALTHY,
+        alive=~at(apart),
+        unsure=np.where(at(apart), comes_and_goes, -1),
+        weight=np.where(at(apart), 5.0, 0.0),
+    )
+    assert root_causes(scattered, (), LAYOUT) == ((), ())
 
 
 def test_cells_that_deliver_nothing_are_open_and_have_no_value():

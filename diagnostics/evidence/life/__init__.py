@@ -11,7 +11,8 @@ with four faults: the level is independent of the others (its own frequencies in
 the piece out); it is that of the prediction some pieces ago (late); it is the healthy one up to its
 highest reading (clamped); it repeats the reading of a cell beside it, or their mean (copy). A fault
 that comes and goes reads as at rest in the units of a two-state Markov chain (forward algorithm);
-one that was there once and has gone is none. A unit has two pieces, 16 frames. Either side errs in
+one that was there once and has gone is none. A contact that opens under load reads as at rest where
+the predicted level exceeds one of four limits, and as a healthy cell below. A unit has two pieces, 16 frames. Either side errs in
 a share e of the units (contamination, Huber 1964), k units of the same loads count as one, and of
 what remains a share c is independent (variance of sums of successive units of healthy cells):
 
@@ -25,7 +26,8 @@ reference recordings, with dead ones beside them, below the threshold, for a log
 Cells that are refuted are replaced by what the others say, the worst of all first, until nothing
 changes.
 
-Not detected: faults that leave loads nearly as predicted (a peak that is kept), rare ones, the mean
+Not detected: cells of a wire that all open under load where only they tell of the contact, because
+they vouch for each other; faults that leave loads nearly as predicted (a peak that is kept), rare ones, the mean
 of the cells beside one where some of these are dead, and what moves where the reference or the log
 has no contact.
 """

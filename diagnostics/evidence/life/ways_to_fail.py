@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_expit, logsumexp
 
-from diagnostics.evidence.life.healthy_table import THRESHOLD, Cells, Floats, LifeModel, Mask
+from diagnostics.evidence.life.healthy_table import (
+    BESIDE,
+    THRESHOLD,
+    Cells,
+    Floats,
+    LifeModel,
+    Mask,
+)
 from diagnostics.evidence.life.levels_in_log import LifeLog, bounded
 from diagnostics.evidence.life.record import LifeRecord
 from diagnostics.preprocessing.levels import MAJORITY, TESTED
@@ -22,6 +29,7 @@ from diagnostics.preprocessing.levels import MAJORITY, TESTED
 REFUTED = 4.0  # evidence from which on a cell is replaced
 
 _LAGS = (1, 2, 3, 4)  # pieces
+_LIMITS = 4  # of the load from which on a contact opens
 # Gain and offset, as a share of full scale, of a cell that reads otherwise than it did, but follows
 # the others: a grid.
 _OTHERWISE = (
@@ -48,6 +56,7 @@ class Suspicion:
         healthy: float ``[n, D]``, log P(level | healthy).
         context: int ``[n, D]``, what the others say.
         independent, intermittent: float ``[D]``, evidence.
+        opens: float ``[D]``, evidence of a cell that is dead where its load exceeds some level.
         by_unit: float ``[units, D]``, evidence of each unit for an independent cell.
         dead: float ``[units, D]``, evidence of each unit for a cell that is dead for a time.
         dying: float ``[units, D]``, P(dead) in each unit, given the units up to it.
@@ -57,6 +66,7 @@ class Suspicion:
     context: NDArray[np.intp]
     independent: Floats
     intermittent: Floats
+    opens: Floats
     by_unit: Floats
     dead: Floats
     dying: Floats
@@ -64,7 +74,8 @@ class Suspicion:
     def refuted(self, log: LifeLog) -> Mask:
         """Return the cells that either fault explains better, bool ``[D]``."""
         factors = log.model.factors(log.units)
-        evidence = np.maximum(self.independent * factors[0], self.intermittent * factors[1])
+        comes_and_goes = np.maximum(self.intermittent, self.opens)
+        evidence = np.maximum(self.independent * factors[0], comes_and_goes * factors[1])
         found: Mask = evidence > REFUTED
         return found
 
@@ -157,7 +168,10 @@ def suspicion(log: LifeLog, known: Mask) -> Generator[None, None, Suspicion]:
     by_unit = log.counted(log.own - healthy)
     dead = log.counted(log.at_rest - healthy)
     intermittent, dying = _dies_and_recovers(dead)
-    return Suspicion(healthy, context, by_unit.sum(axis=0), intermittent, by_unit, dead, dying)
+    opens = yield from _opens(log, healthy, context)
+    return Suspicion(
+        healthy, context, by_unit.sum(axis=0), intermittent, opens, by_unit, dead, dying
+    )
 
 
 def ways_to_fail(
@@ -186,7 +200,8 @@ def ways_to_fail(
     now = _since_it_works(seen.by_unit)
     works = now < -THRESHOLD
     independent = np.where(works, np.minimum(seen.independent, now), seen.independent)
-    intermittent = seen.intermittent - np.logaddexp(0.0, _up_to_some_unit(seen.dead))
+    recovers = seen.intermittent - np.logaddexp(0.0, _up_to_some_unit(seen.dead))
+    intermittent = np.logaddexp(recovers, seen.opens) - np.log(2)
     tested = np.abs(seen.dead) > TESTED
     gone = (seen.dying > MAJORITY) & tested
     share = gone.sum(axis=0) / np.maximum(tested.sum(axis=0), 1)
@@ -224,6 +239,21 @@ def follows_otherwise(
         evidence = _from_some_unit(log.counted(changed - healthy, cells))
         best = np.maximum(best, evidence)
     return best - independent
+
+
+def _opens(
+    log: LifeLog, healthy: Floats, context: NDArray[np.intp]
+) -> Generator[None, None, Floats]:
+    """Yield between steps; return the evidence ``[D]`` of a cell that is dead where the others say
+    that its load exceeds some level, and healthy below."""
+    expected = context // (len(BESIDE) + 1)
+    ratio = log.at_rest - healthy
+    evidence = []
+    for level in np.linspace(1, len(log.model.predicted), _LIMITS).astype(np.intp):
+        evidence.append(log.counted(np.where(expected >= level, ratio, 0.0)).sum(axis=0))
+        yield
+    found: Floats = logsumexp(evidence, axis=0) - np.log(_LIMITS)
+    return found
 
 
 def _dies_and_recovers(dead: Floats) -> tuple[Floats, Floats]:

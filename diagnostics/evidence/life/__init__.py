@@ -12,9 +12,10 @@ the piece out); it is that of the prediction some pieces ago (late); it is the h
 highest reading (clamped); it repeats the reading of a cell beside it, or their mean (copy). A fault
 that comes and goes reads as at rest in the units of a two-state Markov chain (forward algorithm);
 one that was there once and has gone is none. A contact that opens under load reads as at rest where
-the predicted level exceeds one of four limits, and as a healthy cell below. A unit has two pieces, 16 frames. Either side errs in
-a share e of the units (contamination, Huber 1964), k units of the same loads count as one, and of
-what remains a share c is independent (variance of sums of successive units of healthy cells):
+the predicted level exceeds one of four limits, and as a healthy cell below. A unit has two pieces,
+16 frames. Either side errs in a share e of the units (contamination, Huber 1964), k units of the
+same loads count as one, and of what remains a share c is independent (variance of sums of
+successive units of healthy cells):
 
     evidence = sum over u of  w_u log ((1 - e) exp(r_u) + e) / ((1 - e) + e exp(r_u)),
     w_u = c / k_u
@@ -27,9 +28,9 @@ Cells that are refuted are replaced by what the others say, the worst of all fir
 changes.
 
 Not detected: cells of a wire that all open under load where only they tell of the contact, because
-they vouch for each other; faults that leave loads nearly as predicted (a peak that is kept), rare ones, the mean
-of the cells beside one where some of these are dead, and what moves where the reference or the log
-has no contact.
+they vouch for each other; faults that leave loads nearly as predicted (a peak that is kept), rare
+ones, the mean of the cells beside one where some of these are dead, and what moves where the
+reference or the log has no contact.
 """
 
 from __future__ import annotations

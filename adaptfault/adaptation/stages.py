@@ -41,7 +41,7 @@ Method = Literal["auto", "fill", "head", "finetune", "scratch"]
 
 # auto does not fine-tune a repair that keeps this share of the healthy validation accuracy
 _ENOUGH = 0.99
-_NOISE = 1.0  # standard errors of its gain on validation that a stage of auto has to exceed
+_NOISE = 1.0  # standard errors of a gain on validation that auto takes for noise
 # of fine-tuning
 _ROUND_EPOCHS = 2
 _ROUNDS = 6
@@ -221,7 +221,7 @@ class Run:
         head, logits = fitted
         self.head_seconds = time.perf_counter() - start
         reached = self._quality(logits)
-        better = reached > before and self._exceeds_noise(logits)
+        better = self._is_better(name, logits, reached > before)
         if better:
             reduced.head = head
             self.reduced = reduced
@@ -230,19 +230,25 @@ class Run:
         self.stages.append(Stage(name, time.perf_counter() - began, kept[0]))
         return better
 
-    def _exceeds_noise(self, outputs: Tensor) -> bool:
-        """Return whether the gain of new validation outputs exceeds its standard error ``noise``
-        times.
+    def _is_better(self, name: str, outputs: Tensor, improves: bool) -> bool:
+        """Return whether a stage with these validation outputs is kept; ``improves``: its score is
+        higher.
 
-        The gain is that of the logarithm of the probability of the true class, or of R2. Its
-        standard error is that of a mean of clusters, one for each recording.
+        For auto the gain counts in its standard errors: that of the logarithm of the probability of
+        the true class, or of R2; the standard error is that of a mean of clusters, one for each
+        recording. A head is kept unless it loses more than ``noise`` of them: it is scored on
+        windows that it has not seen, but the network was chosen on these. Fine-tuning has to gain
+        as much.
         """
         if not self.noise:
-            return True
+            return improves
         gain = self._merit(outputs) - self._merit(self.held_out())
         _, inverse = np.unique(self.validation.recording, return_inverse=True)
         deviation = np.bincount(inverse, weights=gain - gain.mean())
-        return bool(gain.mean() > self.noise * np.sqrt((deviation**2).sum()) / len(gain))
+        least = self.noise * np.sqrt((deviation**2).sum()) / len(gain)
+        if name == "head":
+            return bool(gain.mean() > -least)
+        return improves and bool(gain.mean() > least)
 
     def _merit(self, outputs: Tensor) -> NDArray[np.float64]:
         """Return for each validation window the log probability of its class, or its share of

@@ -50,7 +50,8 @@ class StuckCells:
         with torch.no_grad():
             # absent positions contribute 0
             cells = torch.diag(model.present.to(model.head.weight.dtype))
-            frames = _convolved(model, torch.cat([cells, torch.zeros_like(cells[:1])]))
+            frames = model.standardised(torch.cat([cells, torch.zeros_like(cells[:1])]))
+            frames = _convolved(model, frames)
             # of one unit in each cell; the last is that of no pressure, (D + 1, d)
             frames[:-1] -= frames[-1]
             reader = cast(EncoderBlock, model.blocks[0]).qkv

@@ -24,8 +24,8 @@ def windows(n: int, seed: int) -> Windows:
     rng = np.random.default_rng(seed)
     y = rng.integers(0, 3, n)
     press = np.zeros((3, 1, 5, 6))
-    press[1, :, :2] = 0.5
-    press[2, :, 3:] = 0.5
+    press[1, :, :2] = 0.2
+    press[2, :, 3:] = 0.2
     x = (press[y][:, None] + rng.normal(0, 0.15, (n, 10, *LAYOUT.shape)) - 0.1).clip(0, 1) * PRESENT
     x[(y == 0) & (rng.random(n) < 0.5)] = 0
     return Windows(x.reshape(n, 10, -1).astype(np.float32), y, np.arange(n))

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from adaptfault.data.windows import make_windows, recordings_of, scale
 from adaptfault.inspection.inspection import inspect
 from adaptfault.inspection.severity import Reason
 from adaptfault.prediction.predictor import Predictor
+from adaptfault.robot import maintenance
 from adaptfault.robot.maintenance import maintain
 from adaptfault.robot.maintenance_report import MaintenanceReport
 from adaptfault.robot.model_comparison import Judgement
@@ -289,9 +291,25 @@ def as_another_specimen(recordings, layout, pad, seed=0):
     return [np.clip(gain * r + offset, 0, layout.full_scale) for r in recordings]
 
 
+def test_a_replaced_pad_that_costs_nothing_is_told_and_not_undone(
+    bundle, later_grasps, monkeypatch
+):
+    monkeypatch.setattr(SelfDiagnosis, "rewiring", lambda *given: None)
+    report = maintain(bundle, as_another_specimen(later_grasps, bundle.layout, pad=1))
+    assert (report.decision, report.exit_code) == ("unchanged", 1)
+    assert "not undone: version 1 is as good without it" in str(report)
+
+
 def test_a_replaced_pad_is_recalibrated_without_labels(bundle, later_grasps, monkeypatch):
     # on 30 cells, gains look like exchanged rows
     monkeypatch.setattr(SelfDiagnosis, "rewiring", lambda *given: None)
+    # three classes are told apart by any gains: here they are not
+    judged = maintenance._judged_readings
+    monkeypatch.setattr(
+        maintenance,
+        "_judged_readings",
+        lambda *given: replace(judged(*given), running=0.5, gain=0.5, low=0.4, high=0.6),
+    )
     layout = bundle.layout
     healthy = bundle.diagnoser().diagnose(later_grasps).fault_set
     log = as_another_specimen(later_grasps, layout, pad=1)

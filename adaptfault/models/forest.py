@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 GROUPS = 5  # of trees, each fitted without one fold of the held-out windows
 TREES = 40  # of a group
-_DEPTH = 24  # the most splits between a root and a leaf
+_DEPTH = 16  # the most splits between a root and a leaf
 
 
 class Forest(nn.Module):
@@ -108,9 +108,12 @@ class Forest(nn.Module):
         threshold now and then.
         """
         node = self.roots.long().expand(x.shape[0], -1)
+        feature = self.feature.long()
+        threshold = self.threshold.double()
+        right = self.right.long()
         for _ in range(_DEPTH):
-            left = x.gather(1, self.feature[node].long()) <= self.threshold[node].double()
-            node = torch.where(left, node + 1, self.right[node].long())
+            left = x.gather(1, feature[node]) <= threshold[node]
+            node = torch.where(left, node + 1, right[node])
         return self.outputs[self.row[node].long()].mean(1)
 
 

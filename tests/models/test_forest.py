@@ -40,7 +40,7 @@ def test_a_group_of_trees_says_what_scikit_learns_say(values):
     group = forests._grown(x.astype(np.float32), targets, 3, values)
     kind = ExtraTreesRegressor if values else ExtraTreesClassifier
     share = 1 / 3 if values else "sqrt"
-    peer = kind(8, max_depth=24, max_features=share, random_state=3)
+    peer = kind(8, max_depth=16, max_features=share, random_state=3)
     peer.fit(x.astype(np.float32), targets if values else y)
     others = np.random.default_rng(1).random((500, 6))
     expected = peer.predict(others) if values else peer.predict_proba(others)

@@ -2,14 +2,15 @@
 
 For each array and split a network is trained once. Then cells die: none, 10 %, 50 %, a line, a
 pad. ``auto`` repairs the network; trees, boosting and an SVC are trained anew on summaries of the
-healthy cells (mean, maximum and standard deviation over a window), the network anew on request.
+healthy cells (mean, maximum and standard deviation over a window), and with ``--anew`` a network.
 All learn from the same training and validation windows.
 
     python benchmarks/repair.py hand fabric --splits 0 1
-    python benchmarks/repair.py --splits 40 41 42 --anew          # all arrays, the table
+    python examples/mujoco_gripper.py --grasps 40 --out build/physics.npz
+    python benchmarks/repair.py --splits 40 41 42 --physics build/physics.npz
 
 Results go to ``--out`` as they come, a line of JSON each; killed and started again, it goes on
-where it was.
+where it was. At the end a table: mean accuracy over the splits.
 """
 
 from __future__ import annotations
@@ -17,12 +18,14 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from other_sensors import of_each, read_with, remade
+from other_sensors import Change, of_each, read_with, remade
 from sklearn.ensemble import ExtraTreesClassifier, HistGradientBoostingClassifier
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
@@ -108,32 +111,27 @@ def simulated(split: int) -> Task:
     return by_recording(af.simulate(30, seed=1000 + split), split)
 
 
-def counts(split: int) -> Task:
-    """The simulated grasps in counts of 10 bits, with rests and gains of their own."""
-    recordings = af.simulate(30, seed=2000 + split)
+def counted(share: float) -> Change:
+    """Read a share of full scale in counts of 10 bits, with rests and gains of their own."""
 
     def change(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         gained = np.minimum(x * (0.5 + of_each(1.0, x)), 1)
-        return read_with(0.002, 0.1, 1023)(0.3 * gained, rng)
+        return read_with(0.002, 0.1, 1023)(share * gained, rng)
 
-    return by_recording(remade(recordings, change), split)
+    return change
 
 
-def physics(split: int, raw: bool = False) -> Task:
-    """Grasps of a physics simulator, in newton."""
-    with np.load("/tmp/physics.npz") as arrays:
-        frames = arrays["frames"].astype(np.float32)
-        labels = arrays["labels"].astype(np.int64)
-    top = float(np.quantile(frames[frames > 0], 0.999))
-    layout = SensorLayout(*frames.shape[2:], full_scale=top, unit="N")
-    recordings = af.Recordings(tuple(of.reshape(len(of), -1) for of in frames), layout, labels)
+def counts(split: int) -> Task:
+    """The simulated grasps in counts of 10 bits, with rests and gains of their own."""
+    recordings = af.simulate(30, seed=2000 + split)
+    return by_recording(remade(recordings, counted(0.3)), split)
+
+
+def physics(split: int, path: Path, raw: bool = False) -> Task:
+    """Grasps of a physics simulator, in newton; ``raw``: in counts, as :func:`counts`."""
+    recordings = af.load(path).recordings
     if raw:
-
-        def change(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-            gained = np.minimum(x * (0.5 + of_each(1.0, x)), 1)
-            return read_with(0.002, 0.1, 1023)(gained, rng)
-
-        recordings = remade(recordings, change)
+        recordings = remade(recordings, counted(1.0))
     return by_recording(recordings, split)
 
 
@@ -146,9 +144,6 @@ ARRAYS: dict[str, Callable[[int], Task]] = {
     "simulated": simulated,
     "counts": counts,
 }
-if Path("/tmp/physics.npz").exists():
-    ARRAYS["physics"] = physics
-    ARRAYS["physics, counts"] = lambda split: physics(split, raw=True)
 
 
 def cases(layout: SensorLayout, seed: int) -> dict[str, FaultSet]:
@@ -183,10 +178,13 @@ PEERS: dict[str, Callable[[], object]] = {
 }
 
 
+ADAPTED = {"network": "fill", "auto": "auto", "anew": "scratch"}
+
+
 def network(name: str, task: Task, split: int, epochs: int, folder: Path) -> af.TactileTransformer:
     """Return the trained network, from ``folder`` if it is there."""
     path = folder / f"{name}-{split}-{epochs}".replace(" ", "-")
-    if (path / "model.json").exists() or path.exists():
+    if path.exists():
         return af.load_model(path)
     model = af.TactileTransformer(
         task.layout, task.n_classes, length=task.train.x.shape[1], seed=split
@@ -197,63 +195,82 @@ def network(name: str, task: Task, split: int, epochs: int, folder: Path) -> af.
 
 
 def rows(
-    name: str, split: int, epochs: int, folder: Path, done: set[tuple], only: list[str] | None
-) -> Iterator[dict[str, object]]:
-    """Yield a row for each fault set and method that is not done yet."""
-    task = ARRAYS[name](split)
-    model = network(name, task, split, epochs, folder)
+    task: Task,
+    model: af.TactileTransformer,
+    split: int,
+    methods: list[str],
+    done: set[tuple[str, str]],
+) -> Iterator[tuple[str, str, float, float]]:
+    """Yield fault set, method, accuracy and seconds of what is not done yet."""
     adapter = af.Adapter(model, task.train, task.validation)
     x, y = task.known()
-
-    def row(faults: str, method: str, right: np.ndarray, began: float) -> dict[str, object]:
-        return {
-            "array": name,
-            "split": split,
-            "faults": faults,
-            "method": method,
-            "accuracy": float(right.mean()),
-            "seconds": round(time.perf_counter() - began, 2),
-        }
-
     for faults, dead in cases(task.layout, split).items():
-        for method in ("network", "auto", *PEERS):
-            if (name, split, faults, method) in done or (only and method not in only):
+        for method in methods:
+            if (faults, method) in done:
                 continue
             began = time.perf_counter()
-            if method == "network":
-                filled = adapter.adapt(dead, method="fill", progress=False)
-                predicted = filled.predict(task.test.x)
-            elif method == "auto":
-                repaired = adapter.adapt(dead, progress=False)
-                took = time.perf_counter() - began
+            if method in ADAPTED:
+                repaired = adapter.adapt(dead, method=ADAPTED[method], progress=False)
+                seconds = time.perf_counter() - began
                 predicted = repaired.predict(task.test.x)
-                began = time.perf_counter() - took
             else:
                 classifier = PEERS[method]().fit(summary(x[..., dead.healthy]), y)
+                seconds = time.perf_counter() - began
                 predicted = classifier.predict(summary(task.test.x[..., dead.healthy]))
-            yield row(faults, method, predicted == task.test.y, began)
+            yield faults, method, float((predicted == task.test.y).mean()), seconds
+
+
+def table(kept: list[dict]) -> str:
+    """Return mean accuracies over the splits, a line for each array and fault set."""
+    found = defaultdict(lambda: defaultdict(list))
+    for row in kept:
+        found[row["array"], row["faults"]][row["method"]].append(row["accuracy"])
+    lines = []
+    for (array, faults), of in found.items():
+        means = ", ".join(f"{method} {np.mean(each):.3f}" for method, each in of.items())
+        spread = float(np.std(of["auto"])) if "auto" in of else 0.0
+        lines.append(f"{array}, {faults}: {means} (auto varies by {spread:.3f})")
+    return "\n".join(lines)
 
 
 def main() -> None:
     """Run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("arrays", nargs="*", default=list(ARRAYS))
+    parser.add_argument("arrays", nargs="*")
     parser.add_argument("--splits", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--epochs", type=int, default=12)
-    parser.add_argument("--only", nargs="+")
+    parser.add_argument("--only", nargs="+", choices=[*ADAPTED, *PEERS])
+    parser.add_argument("--anew", action="store_true", help="a network trained anew, too")
+    parser.add_argument("--physics", type=Path, help="grasps of examples/mujoco_gripper.py")
     parser.add_argument("--out", type=Path, default=Path("build/repair/rows.jsonl"))
     args = parser.parse_args()
+    arrays = dict(ARRAYS)
+    if args.physics is not None:
+        arrays["physics"] = partial(physics, path=args.physics)
+        arrays["physics, counts"] = partial(physics, path=args.physics, raw=True)
+    methods = args.only or [name for name in (*ADAPTED, *PEERS) if name != "anew" or args.anew]
     args.out.parent.mkdir(parents=True, exist_ok=True)
     lines = args.out.read_text().splitlines() if args.out.exists() else []
     kept = [json.loads(line) for line in lines]
-    done = {(of["array"], of["split"], of["faults"], of["method"]) for of in kept}
     with args.out.open("a") as stream:
-        for name in args.arrays or ARRAYS:
+        for name in args.arrays or arrays:
             for split in args.splits:
-                for of in rows(name, split, args.epochs, args.out.parent, done, args.only):
-                    stream.write(json.dumps(of) + "\n")
+                done = {
+                    (row["faults"], row["method"])
+                    for row in kept
+                    if (row["array"], row["split"]) == (name, split)
+                }
+                task = arrays[name](split)
+                if done >= {(faults, of) for faults in cases(task.layout, split) for of in methods}:
+                    continue
+                model = network(name, task, split, args.epochs, args.out.parent)
+                for faults, method, accuracy, seconds in rows(task, model, split, methods, done):
+                    row = {"array": name, "split": split, "faults": faults, "method": method}
+                    row |= {"accuracy": accuracy, "seconds": round(seconds, 2)}
+                    kept.append(row)
+                    stream.write(json.dumps(row) + "\n")
                     stream.flush()
-                    print(of, flush=True)
+    print(table(kept))
 
 
 if __name__ == "__main__":

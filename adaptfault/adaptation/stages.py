@@ -42,6 +42,7 @@ Method = Literal["auto", "fill", "head", "finetune", "scratch"]
 # auto does not fine-tune a repair that keeps this share of the healthy validation accuracy
 _ENOUGH = 0.99
 _NOISE = 1.0  # standard errors of a gain on validation that auto takes for noise
+_CHOSEN = 2.0  # those by which the best of several epochs looks better than it is
 # of fine-tuning
 _ROUND_EPOCHS = 2
 _ROUNDS = 6
@@ -236,19 +237,19 @@ class Run:
 
         For auto the gain counts in its standard errors: that of the logarithm of the probability of
         the true class, or of R2; the standard error is that of a mean of clusters, one for each
-        recording. A head is kept unless it loses more than ``noise`` of them: it is scored on
-        windows that it has not seen, but the network was chosen on these. Fine-tuning has to gain
-        as much.
+        recording. A head is kept unless it loses more than two of them: it is scored on windows
+        that it has not seen, but the network is the best of its epochs on these. Fine-tuning has to
+        gain more than one.
         """
         if not self.noise:
             return improves
         gain = self._merit(outputs) - self._merit(self.held_out())
         _, inverse = np.unique(self.validation.recording, return_inverse=True)
         deviation = np.bincount(inverse, weights=gain - gain.mean())
-        least = self.noise * np.sqrt((deviation**2).sum()) / len(gain)
+        error = np.sqrt((deviation**2).sum()) / len(gain)
         if name == "head":
-            return bool(gain.mean() > -least)
-        return improves and bool(gain.mean() > least)
+            return bool(gain.mean() > -_CHOSEN * error)
+        return improves and bool(gain.mean() > self.noise * error)
 
     def _merit(self, outputs: Tensor) -> NDArray[np.float64]:
         """Return for each validation window the log probability of its class, or its share of

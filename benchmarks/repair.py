@@ -25,6 +25,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from arrays import DATA, FABRIC, FINGERTIPS, HAND, SOLES
 from other_sensors import Change, of_each, read_with, remade
 from sklearn.ensemble import ExtraTreesClassifier, HistGradientBoostingClassifier
 from sklearn.pipeline import make_pipeline
@@ -35,7 +36,6 @@ import adaptfault as af
 from adaptfault.data.windows import evenly
 from diagnostics import FaultSet, SensorLayout
 
-DATA = Path(__file__).parents[2] / "shared" / "data"
 MOST = 2_500  # windows of training and validation
 
 
@@ -68,29 +68,29 @@ def by_recording(recordings: af.Recordings, split: int, length: int = 10) -> Tas
     return Task(recordings.layout, *af.split(windows, seed=split))
 
 
-def stored(file: str, layout: str | None = None) -> af.Recordings:
-    return af.load(DATA / file, layout=layout).recordings
+def stored(file: str) -> af.Recordings:
+    return af.load(DATA / file).recordings
 
 
 def hand(split: int) -> Task:
-    return by_recording(stored("sdh2x13x6_grasps36.npz"), split)
+    return by_recording(stored(HAND), split)
 
 
 def fingertips(split: int) -> Task:
-    return by_recording(stored("icub5x1x12_grasps11.npz"), split, length=4)
+    return by_recording(stored(FINGERTIPS), split, length=4)
 
 
 def soles(split: int) -> Task:
-    return by_recording(stored("insole2x33x15.npz"), split)
+    return by_recording(stored(SOLES), split)
 
 
 def fabric(split: int, change: Callable[[np.ndarray], np.ndarray] = lambda x: x) -> Task:
     """One repetition of each slide to learn from, the other one as test; ``split`` chooses which,
     and what is validated on."""
-    with np.load(DATA / "fabric4x4_slides7.npz") as arrays:
-        frames = np.split(arrays["frames"].astype(np.float32), np.cumsum(arrays["lengths"])[:-1])
-        labels = arrays["labels"].astype(np.int64)
-        trial = arrays["trial"]
+    with np.load(DATA / FABRIC) as kept:
+        frames = np.split(kept["frames"].astype(np.float32), np.cumsum(kept["lengths"])[:-1])
+        labels = kept["labels"].astype(np.int64)
+        trial = kept["trial"]
     layout = SensorLayout(1, 4, 4, full_scale=1023, unit="count", rate=35.7, wiring="bus")
     windows = af.make_windows([change(of) for of in frames], labels, layout)
     first = split % 2

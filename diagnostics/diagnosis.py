@@ -652,11 +652,7 @@ class SelfDiagnosis:
             probability=probability,
             # A cell at rest supports a broken line by the events alone, without the prior of its
             # value.
-            weight=np.select(
-                [known, kind >= 0, unsure],
-                [CERTAIN_RATIO, life.evidence, life.evidence],
-                weight,
-            ),
+            weight=np.where(known, CERTAIN_RATIO, np.where(told >= 0, life.evidence, weight)),
             events=np.where(
                 intermittent, intermittency.blinks, np.where(told >= 0, life.units, spatial.events)
             ),

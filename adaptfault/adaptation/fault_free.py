@@ -126,11 +126,14 @@ class FaultFreeModel:
         return isinstance(self.model, TactileTransformer) or self.model.has_features
 
     def fresh(self, seed: int) -> Network:
-        """Return the network with new initial weights."""
+        """Return the network with new initial weights, that of the paper standardised as for a
+        first training."""
         model = self.model
-        if isinstance(model, TactileTransformer):
-            return type(model).from_config({**model.config, "seed": seed})
-        return model.fresh(seed)
+        if not isinstance(model, TactileTransformer):
+            return model.fresh(seed)
+        fresh = type(model).from_config({**model.config, "seed": seed})
+        fresh.standardise(self.train.x)
+        return fresh
 
 
 def _wrapped(

@@ -32,7 +32,7 @@ from adaptfault.models.heads import (
     log_likelihood,
 )
 from adaptfault.models.history import History
-from adaptfault.models.network import TactileTransformer, as_tensor, logits_of
+from adaptfault.models.network import as_tensor, logits_of
 from adaptfault.models.training import train
 from adaptfault.models.value_units import ValueUnits, foldable
 from diagnostics import FaultSet
@@ -162,8 +162,6 @@ class Run:
     def scratch(self) -> None:
         """Train a new network behind the linear front end, as the paper does for each F."""
         fresh = self.fault_free.fresh(self.seed + 1).to(self.device)
-        if isinstance(fresh, TactileTransformer):
-            fresh.standardise(self.fault_free.train.x)
         self.reduced = self._behind(self.fault_free.imputation.linear(self.fault_set), fresh)
         self.stages.clear()
         began = time.perf_counter()

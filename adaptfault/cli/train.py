@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -251,7 +252,7 @@ def _epoch_line(
     where no bar is shown."""
     from adaptfault.evaluation.scores import chance
 
-    share, limit = (0.0, 0.0) if units is not None else chance(training.y)
+    share, limit = (0.0, -math.inf) if units is not None else chance(training.y)
     guess = "" if units is not None else f" (guessing reaches {share:.3f})"
     measure = "R2" if units is not None else "accuracy"
 

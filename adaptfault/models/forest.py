@@ -167,7 +167,8 @@ def _grown(x: NDArray[np.float32], targets: NDArray[np.float32], seed: int, valu
     counts = [tree.node_count for tree in trees]
     roots = np.cumsum([0, *counts[:-1]])
     own = np.arange(sum(counts))
-    leaf = np.concatenate([tree.feature for tree in trees]) < 0
+    feature = np.concatenate([tree.feature for tree in trees])
+    leaf = feature < 0
     right = np.concatenate([tree.children_right for tree in trees]) + np.repeat(roots, counts)
     threshold = np.concatenate([tree.threshold for tree in trees])
     outputs = np.concatenate([tree.value for tree in trees])
@@ -177,7 +178,6 @@ def _grown(x: NDArray[np.float32], targets: NDArray[np.float32], seed: int, valu
     every[:, slice(None) if values else ensemble.classes_] = rows
     rows_of_nodes = np.zeros(len(leaf), dtype=np.int32)
     rows_of_nodes[leaf] = row.ravel()
-    feature = np.concatenate([tree.feature for tree in trees])
     return Forest(
         roots=_tensor(roots),
         feature=_tensor(np.where(leaf, 0, feature)),

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from adaptfault.acquisition.ros import TOPIC, diagnostic_array
 from adaptfault.data.atomic import atomic_file
-from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.viewers.timed_log import COLOURS, ROOT, Piece, TimedLog
 from diagnostics import SensorLayout
 
@@ -63,11 +63,8 @@ def write_mcap(path: str | PathLike[str], log: TimedLog) -> None:
 
 def check_mcap(path: str | PathLike[str]) -> None:
     """Raise InputError where the package mcap is not installed; ``path``: of the file to write."""
-    try:
-        import mcap.writer  # noqa: F401
-    except ImportError:
-        what = "MCAP files are written with mcap; install it: pip install 'adaptfault[view]'"
-        raise InputError.at(path, what) from None
+    what = "MCAP files are written with mcap; install it: pip install 'adaptfault[view]'"
+    imported("mcap.writer", path, what)
 
 
 class McapMessages:

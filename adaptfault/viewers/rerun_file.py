@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.atomic import atomic_file
-from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.formats.datasets.extra import imported
 from adaptfault.viewers.timed_log import COLOURS, ROOT, Piece, TimedLog
 from diagnostics import Fault, SensorLayout
 
@@ -60,11 +60,8 @@ def write_rrd(path: str | PathLike[str], log: TimedLog) -> None:
 def check_rerun(path: str | PathLike[str]) -> None:
     """Raise InputError where the package rerun-sdk is not installed; ``path``: of the file to
     write."""
-    try:
-        import rerun  # noqa: F401
-    except ImportError:
-        what = "RRD files are written with rerun-sdk; install it: pip install 'adaptfault[view]'"
-        raise InputError.at(path, what) from None
+    what = "RRD files are written with rerun-sdk; install it: pip install 'adaptfault[view]'"
+    imported("rerun", path, what)
 
 
 class RerunArray:

@@ -28,7 +28,7 @@ Cells that are refuted are replaced by what the others say, the worst of all fir
 changes.
 
 Not detected: cells of a wire that all open under load where only they tell of the contact, because
-they vouch for each other; faults that leave loads nearly as predicted (a peak that is kept), rare
+they predict each other; faults that leave loads nearly as predicted (a peak that is kept), rare
 ones, the mean of the cells beside one where some of these are dead, and what moves where the
 reference or the log has no contact.
 """

@@ -177,7 +177,7 @@ class LifeTest:
 
         They are worse than any cell beside them, and half as bad as the worst of all.
         """
-        plain = np.maximum(np.maximum(seen.independent, seen.intermittent), seen.opens)
+        plain = np.maximum(seen.independent, seen.comes_and_goes)
         predicts = bad & self.known
         of_beside = np.where((beside >= 0) & self.known[beside], plain[beside], -np.inf)
         of_all = plain.max(initial=-np.inf, where=predicts)

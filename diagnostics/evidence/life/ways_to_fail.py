@@ -71,11 +71,15 @@ class Suspicion:
     dead: Floats
     dying: Floats
 
+    @property
+    def comes_and_goes(self) -> Floats:
+        """float ``[D]``, evidence of a cell that is dead in some units, or under load."""
+        return np.maximum(self.intermittent, self.opens)
+
     def refuted(self, log: LifeLog) -> Mask:
         """Return the cells that either fault explains better, bool ``[D]``."""
         factors = log.model.factors(log.units)
-        comes_and_goes = np.maximum(self.intermittent, self.opens)
-        evidence = np.maximum(self.independent * factors[0], comes_and_goes * factors[1])
+        evidence = np.maximum(self.independent * factors[0], self.comes_and_goes * factors[1])
         found: Mask = evidence > REFUTED
         return found
 

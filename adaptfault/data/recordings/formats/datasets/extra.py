@@ -1,16 +1,21 @@
-"""Imports the packages of the extra "datasets" where they are used."""
+"""Imports packages of extras where they are used."""
 
 from __future__ import annotations
 
 from importlib import import_module
-from pathlib import Path
+from os import PathLike
 from typing import Any
 
 from adaptfault.data.recordings.errors import InputError
 
 
-def imported(package: str, path: Path) -> Any:
+def imported(package: str, path: str | PathLike[str], what: str = "") -> Any:
     """Return a package.
+
+    Args:
+        package: its name, or that of a module in it.
+        path: the file that it is needed for.
+        what: the error where it is not installed; "": that it comes with the extra "datasets".
 
     Raises:
         InputError: it is not installed.
@@ -18,5 +23,5 @@ def imported(package: str, path: Path) -> Any:
     try:
         return import_module(package)
     except ImportError:
-        what = f"needs {package}, which is not installed; pip install 'adaptfault[datasets]'"
-        raise InputError.at(path, what) from None
+        missing = f"needs {package}, which is not installed; pip install 'adaptfault[datasets]'"
+        raise InputError.at(path, what or missing) from None

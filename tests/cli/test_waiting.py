@@ -1,11 +1,15 @@
 """Who waits is told how long, and what to do after an interruption."""
 
+import argparse
 import re
 
 import numpy as np
 import pytest
 
 from adaptfault.cli import main
+from adaptfault.cli.train import _epoch_line
+from adaptfault.data.windows import Windows
+from adaptfault.models.history import History
 
 
 @pytest.fixture
@@ -49,3 +53,16 @@ def test_after_an_interruption_it_says_whether_the_same_command_continues(
     assert main([command, str(grasps_file), *out]) == 130
     told = capsys.readouterr().err
     assert ("run the same command to continue" in told) is continues
+
+
+@pytest.mark.parametrize("of_values", [True, False])
+def test_a_training_at_chance_after_three_epochs_is_told_and_one_of_values_never_is(
+    of_values, capsys
+):
+    args = argparse.Namespace(quiet=False, epochs=5)
+    y = np.arange(30) % 3
+    windows = Windows(np.zeros((30, 2, 4), np.float32), y, np.arange(30))
+    units = object() if of_values else None
+    told = _epoch_line(args, windows, units)
+    told(History((1.0,) * 3, (1.0,) * 3, (-0.2, -0.1, 0.0), (1.0,) * 3, best_epoch=3))
+    assert ("at chance after 3 epochs" in capsys.readouterr().err) == (not of_values)

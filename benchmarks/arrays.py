@@ -24,7 +24,7 @@ FINGERTIPS = "icub5x1x12_grasps11.npz"
 SOLES = "insole2x33x15.npz"
 FABRIC = "fabric4x4_slides7.npz"
 MAIN = ("cells", "onset", "healthy")
-LIFE = ("moving", "proven", "own_reference")
+LIFE = ("moving", "proven", "failing", "own_reference")
 SKIN = (*MAIN, "lines", "cold", "static")
 EVERY = (
     "cells",

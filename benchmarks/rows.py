@@ -797,6 +797,55 @@ def proven(bench: Bench) -> Iterator[Count]:
     yield Count("  alive of the cells in use", alive, used)
 
 
+def failing_cases() -> dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]]:
+    """Return by name in which frames ``[T]`` a wire fails, of the loads ``[T]`` of its pad."""
+
+    def under_load(load: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return load > np.quantile(load[load > 0], rng.choice([0.3, 0.5, 0.7]))
+
+    def flickers(load: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        lengths = rng.integers(5, 60, len(load))
+        fails = rng.random(len(load)) < 0.4
+        return np.repeat(fails, lengths)[: len(load)]
+
+    return {"opens under load": under_load, "flickers": flickers}
+
+
+def failing(bench: Bench) -> Iterator[Count]:
+    """A row or column that fails now and then, of which at least 3 cells are loaded in 3
+    recordings: is it named?"""
+    layout = bench.layout
+    span = highest(bench)
+    rest = rest_levels(bench)
+    for case, fails in failing_cases().items():
+        named = logs = blamed = alive = cells = 0
+        for _, log, rng in bench.logs(IN_USE):
+            loaded = [(frames - rest > VISIBLE * span).any(axis=0) for frames in log]
+            used = np.sum(loaded, axis=0) >= USED
+            choice = [line for line in wires(layout) if used[list(layout.cells_on(line))].sum() > 2]
+            if not choice:
+                continue
+            line = choice[rng.integers(len(choice))]
+            of_wire = np.asarray(layout.cells_on(line))
+            whole = np.concatenate(log)
+            load = np.maximum(whole - rest, 0)[:, layout.pad_of == line.pad].sum(axis=1)
+            gone = fails(load, rng)
+            seen = whole.copy()
+            seen[np.ix_(gone, of_wire)] = rest[of_wire]
+            diagnosis = bench.proving.diagnose(parted(seen, log))
+            wrong = np.abs(seen - whole)[:, of_wire] > VISIBLE * span
+            can = of_wire[wrong.sum(axis=0) >= TESTABLE]
+            called = (diagnosis.verdicts == Verdict.ALIVE) & (diagnosis.probability < DOUBTED)
+            logs += 1
+            named += any(fault.line == line for fault in diagnosis.faults)
+            blamed += len(set(diagnosis.fault_set) - set(of_wire.tolist()))
+            alive += int(called[can].sum())
+            cells += len(can)
+        yield Count(f"a wire {case}: named", named, logs)
+        yield Count(f"a wire {case}: healthy cells blamed in a log", blamed, logs, higher=False)
+        yield Count(f"a wire {case}: its cells called alive", alive, cells, higher=False)
+
+
 def rewired(bench: Bench) -> Iterator[Count]:
     """Wirings that change a visible number of readings; told right: put back as they were."""
     layout, choice = bench.layout, wirings(bench.layout)
@@ -1119,6 +1168,7 @@ ROWS: dict[str, Callable[[Bench], Iterator[Count]]] = {
         gain,
         moving,
         proven,
+        failing,
         rewired,
         groups,
         replaced,

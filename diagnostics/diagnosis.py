@@ -593,8 +593,9 @@ class SelfDiagnosis:
         # The model of life errs where its reference has no like: only what is far beyond its limits
         # is faulty.
         refuted = np.where(judged, expit(life.evidence + logit(EXPECTED) - CERTAIN_RATIO / 2), 0.0)
-        # a constant run tells more: its value, its onset
-        by_life = judged & (refuted > stuck) & (stuck < MAJORITY)
+        # a constant run tells more: its value, its onset; but not of a wire that comes and goes
+        on_wire = judged & (life.wire >= 0)
+        by_life = judged & (refuted > stuck) & (stuck < MAJORITY) | on_wire
         probability = np.where(
             present, np.where(certain, _CERTAIN, np.maximum(stuck, refuted)), 0.0
         )
@@ -659,6 +660,8 @@ class SelfDiagnosis:
             known=known,
             refuted=kind,
             unsure=np.where(unsure, life.kind, -1),
+            wire=np.where(on_wire, life.wire, -1),
+            of_wire=life.of_wire,
             share=life.share,
             typical=self._typical(stream),
         )

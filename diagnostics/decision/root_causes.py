@@ -62,6 +62,8 @@ class CellFindings:
         refuted: int, number of the fault in ``evidence.life.FAULTS`` of cells that move and are
             proved not to be alive; -1: others.
         unsure: int, the same of cells that may have one of the ``OF_WIRES``; -1: others.
+        wire: int, number of the proven wire of such a cell, from 0; -1: others.
+        of_wire: float, P(this wire fails).
         share: float, of the contacts in which such a cell was dead.
     """
 
@@ -82,6 +84,8 @@ class CellFindings:
     known: Mask
     refuted: NDArray[np.intp]
     unsure: NDArray[np.intp]
+    wire: NDArray[np.intp]
+    of_wire: Floats
     share: Floats
     zero: Mask | None = None
     typical: Floats | None = None
@@ -130,9 +134,15 @@ def _causes(
 ) -> list[tuple[FaultKind, float | None, Cause]]:
     """Return kind, value and cause of each fault; ``common``: lower limit of the prevalence of one
     kind."""
-    causes = _of_failing_wires(found, aliased, layout, common)
+    causes = _proven_wires(found, aliased, layout)
     aliased = aliased.copy()
     aliased[[cell for _, _, cause in causes for cell in cause.cells]] = True
+    joined = _of_failing_wires(found, aliased, layout, common)
+    aliased[[cell for _, _, cause in joined for cell in cause.cells]] = True
+    causes += joined
+    # A wire has no rest level of its own: cells that no longer return to theirs drift one by one.
+    drifting = np.flatnonzero(found.faulty & found.drifting & np.isnan(found.gain) & ~aliased)
+    causes += [(FaultKind.DRIFT, None, Cause(None, (c,), (c,), 1.0)) for c in drifting.tolist()]
     for kind, faulty, consistent, value in _groups(found, layout.full_scale):
         # A working cell contradicts a broken wire; so does one with another fault, or another
         # value.
@@ -147,6 +157,31 @@ def _causes(
             faulty & ~aliased, consistent & ~aliased, contradicting, found, layout, common
         )
         causes += [(kind, value, cause) for cause in explained]
+    return causes
+
+
+def _proven_wires(
+    found: CellFindings, aliased: Mask, layout: SensorLayout
+) -> list[tuple[FaultKind, float | None, Cause]]:
+    """Return the wires that are proved to fail now and then."""
+    free = ~aliased
+    causes: list[tuple[FaultKind, float | None, Cause]] = []
+    for number in range(int(found.wire.max()) + 1):
+        seen = np.flatnonzero((found.wire == number) & free)
+        holds = [
+            line
+            for line in layout.lines
+            if not line.kind.endswith("_address") and np.isin(seen, layout.cells_on(line)).all()
+        ]
+        if not len(seen) or not holds:
+            continue
+        line = min(holds, key=lambda line: len(layout.cells_on(line)))
+        cells = layout.cells_on(line)
+        cells = cells[free[cells]]
+        free[cells] = False
+        probability = float(found.of_wire[seen[0]])
+        cause = Cause(line, tuple(cells.tolist()), tuple(seen.tolist()), probability)
+        causes.append((FaultKind.INTERMITTENT, None, cause))
     return causes
 
 
@@ -203,7 +238,6 @@ def _groups(
     moving = found.intermittent | found.noisy | found.drifting | (found.refuted >= 0)
     constant = faulty & ~found.silent & ~moving
     of_gain = found.drifting & np.isfinite(found.gain)
-    of_offset = found.drifting & ~of_gain
     groups: list[tuple[FaultKind, Mask, Mask, float | None]] = [
         (FaultKind.OPEN, faulty & found.silent, found.silent, None),
         (FaultKind.OPEN, constant & found.rests, found.rests, None),
@@ -211,10 +245,7 @@ def _groups(
         *([] if found.zero is None else [(FaultKind.OPEN, constant & found.zero, found.zero, 0.0)]),
         (FaultKind.INTERMITTENT, faulty & found.intermittent, found.intermittent, None),
         (FaultKind.NOISY, faulty & found.noisy, found.noisy, None),
-        *(
-            (FaultKind.DRIFT, faulty & drifting, drifting, None)
-            for drifting in (of_offset, of_gain)
-        ),
+        (FaultKind.DRIFT, faulty & of_gain, of_gain, None),
     ]
     for number, kind in enumerate(REFUTED_KINDS):
         refuted = found.refuted == number

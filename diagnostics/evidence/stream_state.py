@@ -322,8 +322,7 @@ class StreamState:
             first: an earlier test, whose result this one begins with.
         """
         eligible = self.received & ~self.silent & ~explained & (self.reference.dead == 0)
-        known = None if first is None else first.known
-        return LifeTest(evidence, eligible, constant, known)
+        return LifeTest(evidence, eligible, constant, first)
 
     def spatial(self, explained: Mask | None = None, misleading: Mask | None = None) -> Test:
         """Return the spatial test of all constant cells.

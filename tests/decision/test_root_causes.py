@@ -29,6 +29,8 @@ HEALTHY = CellFindings(
     known=NONE,
     refuted=np.full(CELLS, -1),
     unsure=np.full(CELLS, -1),
+    wire=np.full(CELLS, -1),
+    of_wire=np.zeros(CELLS),
     share=ZERO,
 )
 
@@ -327,12 +329,19 @@ def test_a_wire_broken_in_the_reference_is_named_and_a_later_one_includes_cells_
     assert "; 1 more, not tested, is inferred" in fault.reason
 
 
+def test_cells_of_a_row_that_no_longer_return_to_their_rest_level_are_no_broken_wire():
+    faults = causes(moving(HEALTHY, "drifting", row(1, 5)))
+    assert {fault.line for fault in faults} == {None}
+    assert sorted(cell for fault in faults for cell in fault.cells) == row(1, 5).tolist()
+
+
 @pytest.mark.parametrize(
     ("cells", "said"),
-    [([7], "pad 0, row 1, column 1 drifts: it moves"), (row(1, 5), "pad 1, row 5 drifts: each of")],
+    [([7], "pad 0, row 1, column 1 drifts: it is"), (row(1, 5), "pad 1, row 5 drifts: each of")],
 )
 def test_the_verb_of_a_sentence_fits_the_kind(cells, said):
-    (fault,) = causes(moving(HEALTHY, "drifting", cells))
+    weak = replace(moving(HEALTHY, "drifting", cells), gain=np.where(at(cells), 0.35, np.nan))
+    (fault,) = causes(weak)
     assert fault.reason.startswith(said)
     copied = replace(moving(HEALTHY, "noisy", [8]), noisy=NONE, refuted=np.where(at([8]), 3, -1))
     (copy,) = causes(replace(copied, value=np.where(at([8]), 9.0, np.nan)))
@@ -344,7 +353,9 @@ def test_the_verb_of_a_sentence_fits_the_kind(cells, said):
 
 def test_a_wire_that_possibly_drifts_may_drift():
     cells = at(row(0, 3)[2:])
-    found = replace(HEALTHY, alive=~cells, drifting=cells, weight=np.where(cells, 3.02, 0.0))
+    weight = np.where(cells, 3.02, 0.0)
+    gain = np.where(cells, 0.35, np.nan)
+    found = replace(HEALTHY, alive=~cells, drifting=cells, weight=weight, gain=gain)
     _, (possible,) = root_causes(found, (), LAYOUT)
     assert "pad 0, row 3 may drift from column 2 on" in possible.reason
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adaptfault.data.recordings import Recordings
-from diagnostics import Fault, FaultKind, Monitor, SelfDiagnosis, Verdict, inject
+from diagnostics import Fault, FaultKind, Line, Monitor, SelfDiagnosis, Verdict, inject
 from diagnostics.evidence.life import EvidenceOfLog, LifeRecord, LifeTest
 from diagnostics.evidence.life.healthy_table import ConditionalMean
 from diagnostics.evidence.life.record import KEPT
@@ -85,6 +85,25 @@ def test_a_cell_that_is_dead_in_every_second_recording_is_not_called_alive(fitte
     ]
     found = fitted.diagnose(seen)
     assert found.verdicts[cell] != Verdict.ALIVE or found.probability[cell] >= 0.1
+
+
+@pytest.mark.parametrize("line", [Line(0, "row", 6), Line(1, "column", 4)])
+def test_a_wire_that_opens_under_load_or_flickers_is_named_and_none_of_its_cells_is_called_alive(
+    fitted, log, line
+):
+    layout = fitted.layout
+    cells = layout.cells_on(line)
+    whole = np.concatenate(log)
+    load = whole[:, layout.pad_of == line.pad].sum(axis=1)
+    flickers = np.repeat(np.random.default_rng(0).random(len(load) // 30 + 1) < 0.4, 30)
+    for fails in (load > np.quantile(load[load > 0], 0.4), flickers[: len(load)]):
+        seen = whole.copy()
+        seen[np.ix_(fails, cells)] = 0.0
+        found = fitted.diagnose(np.split(seen, np.cumsum([len(frames) for frames in log])[:-1]))
+        assert {fault.line for fault in found.faults if fault.line is not None} == {line}
+        assert set(found.fault_set) <= set(cells.tolist())
+        alive = (found.verdicts[cells] == Verdict.ALIVE) & (found.probability[cells] < 0.1)
+        assert not alive.any()
 
 
 def test_healthy_cells_in_use_are_shown_to_be_alive_and_none_is_blamed(fitted, log, used):
@@ -217,8 +236,27 @@ def test_a_second_test_of_the_same_log_finds_what_the_first_did_and_asks_the_mod
     first = LifeTest(evidence, every)
     life = first.finish()
     evidence.log.healthy = None
-    again = LifeTest(evidence, every, known=first.known).finish()
+    again = LifeTest(evidence, every, first=first).finish()
     np.testing.assert_array_equal(again.evidence, life.evidence)
+
+
+def test_what_the_others_say_of_a_wire_is_the_regression_of_its_sum_on_the_known_ones_off_it():
+    rng = np.random.default_rng(0)
+    loads = rng.normal(size=(300, 6)) @ rng.normal(size=(6, 6)) + 3
+    cells = np.arange(6)
+    mean = ConditionalMean.fit(loads, cells, cells)
+    known = np.array([True, True, False, True, True, True])
+    on = np.isin(cells, [3, 4, 5])
+    of = np.isin(cells, [3, 4])
+    z = (loads - mean.mean) / mean.scale
+    others = np.flatnonzero(known & ~on)
+    expected = mean.mean[of].sum()
+    for cell in np.flatnonzero(of):
+        weights = np.linalg.solve(
+            mean.covariance[np.ix_(others, others)], mean.covariance[others, cell]
+        )
+        expected = expected + z[:, others] @ weights * mean.scale[cell]
+    np.testing.assert_allclose(mean.expected_sum(loads, known, on, of), expected)
 
 
 def test_what_the_others_say_of_a_cell_is_the_regression_on_the_known_ones_without_itself():

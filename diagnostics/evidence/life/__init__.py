@@ -27,8 +27,10 @@ reference recordings, with dead ones beside them, below the threshold, for a log
 Cells that are refuted are replaced by what the others say, the worst of all first, until nothing
 changes.
 
-Not detected: cells of a wire that all open under load where only they tell of the contact, because
-they predict each other; faults that leave loads nearly as predicted (a peak that is kept), rare
+Cells of a wire that fails now and then predict each other: wires are tested as such
+(:mod:`diagnostics.evidence.life.wires`).
+
+Not detected: faults that leave loads nearly as predicted (a peak that is kept), rare
 ones, the mean of the cells beside one where some of these are dead, and what moves where the
 reference or the log has no contact.
 """

@@ -9,31 +9,37 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit
 
 from diagnostics.events.tiles import MOST_CELLS, tiles
+from diagnostics.evidence.life.fitting_wires import fit_wires, unknown_parts
+from diagnostics.evidence.life.folds import Fold, folds_of, joined, logs_of
 from diagnostics.evidence.life.healthy_table import (
     AMID,
     BESIDE,
     FAULTS,
-    GUESS,
     UNLOADED,
     ConditionalMean,
     Floats,
     LifeModel,
-    Mask,
     levels_of,
     loaded_beside,
 )
 from diagnostics.evidence.life.levels_in_log import LifeLog
 from diagnostics.evidence.life.proof import LifeTest
-from diagnostics.evidence.life.record import KEPT, PIECE, LifeRecord
+from diagnostics.evidence.life.tables import (
+    LEVELS,
+    OWN_ERRS,
+    counts_of,
+    edges_of,
+    log_table,
+    predicted_edges,
+    shares_of_errors,
+    shrinkage_of,
+)
 from diagnostics.evidence.life.ways_to_fail import EvidenceOfLog
+from diagnostics.evidence.life.wires import tested_wires
 from diagnostics.evidence.stepping import finished
-from diagnostics.healthy.cross_fitting import FOLDS
-from diagnostics.preprocessing.levels import FEWEST, MAJORITY
-from diagnostics.preprocessing.offset import OffsetTracker
-from diagnostics.preprocessing.readings import SEGMENT, RecordingBlocks
+from diagnostics.preprocessing.levels import FEWEST
 from diagnostics.preprocessing.scale import Array
 
 if TYPE_CHECKING:
@@ -41,15 +47,9 @@ if TYPE_CHECKING:
     from diagnostics.preprocessing.offset import ReferenceOffset
     from diagnostics.preprocessing.scale import Scale
 
-_LEVELS = 12  # of the root load: a size
-_PREDICTED = 16  # levels of the prediction: a size
-_OWN_ERRS = 20.0  # pseudo-count of independent units of all cells, in the frequencies of each cell
-_SHRINKAGES = (4.0, 16.0, 64.0, 256.0, 1024.0)  # pseudo-counts of the table of all cells: a grid
-_CONTAMINATIONS = (0.01, 0.02, 0.04, 0.08)  # shares e: a grid
 _ERRS = 0.05  # share e of the units, before it is known
 _LONGEST = 16  # units in a sum: a size
 _CORRELATED = 0.25  # correlation of successive units that is small
-_MOST_PIECES = 6000  # of the reference: a size
 _MOST_DISCOUNT = 0.5  # of the factors
 _HALF_DISCOUNT = 100.0  # units of the reference that halve it
 _DEAD = 0.08  # share of the cells that are dead in some simulated logs
@@ -64,111 +64,28 @@ def fit_life(
     tolerance: float,
 ) -> LifeModel | None:
     """Fit the model to fault-free recordings, ``[T, D]`` each; None: too few of them."""
-    parts = _folds(recordings, layout, scale, offset)
+    parts = folds_of(recordings, layout, scale, offset)
     if parts is None:
         return None
     return _Fit(parts, layout, tolerance).model()
-
-
-@dataclass(frozen=True)
-class _Fold:
-    """Pieces of some reference recordings: loads and readings ``[n, D]``, piece numbers int
-    ``[n]``."""
-
-    loads: Array
-    readings: Array
-    piece: NDArray[np.intp]
-
-    def copy(self) -> _Fold:
-        """Return a copy whose loads and readings can be changed."""
-        return _Fold(self.loads.copy(), self.readings.copy(), self.piece)
-
-    def kill(self, cell: int, source: int, rng: np.random.Generator) -> None:
-        """Let a cell read, equally often, what another one (``source``) read at other times, or
-        nothing."""
-        if rng.random() < MAJORITY:
-            self.loads[:, cell] = 0.0
-            # NaN without any reading
-            self.readings[:, cell] = np.fmin.reduce(self.readings[:, cell])
-            return
-        order = rng.permutation(len(self.loads))
-        self.loads[:, cell] = self.loads[order, source]
-        self.readings[:, cell] = self.readings[order, source]
-
-
-def _folds(
-    recordings: Sequence[Floats], layout: SensorLayout, scale: Scale, offset: ReferenceOffset
-) -> list[_Fold] | None:
-    """Return the pieces of the reference in folds of whole recordings, with offsets tracked as in a
-    log."""
-    blocks = RecordingBlocks.of(recordings)
-    order = np.random.default_rng(0).permutation(len(blocks))
-    frames = np.cumsum([len(blocks.given[i]) for i in order])
-    order = order[: max(FEWEST, int(np.searchsorted(frames, _MOST_PIECES * SEGMENT // 4)))]
-    if len(order) < FEWEST:
-        return None
-    present = layout.present.ravel()
-    folds = []
-    for k in range(FOLDS):
-        mine = order[k::FOLDS]
-        parts = []
-        begin = 0
-        for some in np.array_split(mine, max(1, len(mine) // FEWEST)):
-            log = np.concatenate([blocks[i] for i in some])
-            record, begin = _recorded(log, begin, present, scale, offset)
-            if record.number:
-                parts.append(_Fold(record.loads, record.means, record.piece))
-        if not parts:
-            return None
-        folds.append(_joined(parts))
-    return folds if min(len(fold.loads) for fold in folds) >= FEWEST else None
-
-
-def _joined(parts: Sequence[_Fold]) -> _Fold:
-    return _Fold(
-        np.concatenate([part.loads for part in parts]),
-        np.concatenate([part.readings for part in parts]),
-        np.concatenate([part.piece for part in parts]),
-    )
-
-
-def _recorded(
-    log: Floats, begin: int, present: Mask, scale: Scale, offset: ReferenceOffset
-) -> tuple[LifeRecord, int]:
-    """Return the record of a log, of any length, and the number of the segment after it."""
-    tracked = OffsetTracker.begin(log.shape[1])
-    root: list[Array] = []
-    readings: list[Array] = []
-    number: list[int] = []
-    for first in range(0, len(log), SEGMENT):
-        frames = log[first : first + SEGMENT]
-        tracked = tracked.extend(frames, scale, present, offset)
-        loads = tracked.on(scale).root_load(tracked.off(frames))
-        one = LifeRecord().extend(
-            np.where(present, loads, np.float32(0)), frames, begin + first // SEGMENT
-        )
-        root += one.root
-        readings += one.readings
-        number += one.number
-    return LifeRecord(tuple(root), tuple(readings), tuple(number)), begin + len(log) // SEGMENT + 1
 
 
 class _Fit:
     """Fits the model by cross-fitting: tables, units and factors from folds that the predictions
     were not fitted on."""
 
-    def __init__(self, folds: list[_Fold], layout: SensorLayout, tolerance: float) -> None:
+    def __init__(self, folds: list[Fold], layout: SensorLayout, tolerance: float) -> None:
         self._folds = folds
         self._layout = layout
         self._tolerance = tolerance
         self._present = layout.present.ravel()
         self._rng = np.random.default_rng(0)
-        every = _joined(folds)
-        self._levels = _edges(every.loads[:, self._present], _LEVELS)
+        every = joined(folds)
+        self._levels = edges_of(every.loads[:, self._present], LEVELS)
         self._full = self._means(every.loads)
         self._used = (every.loads > UNLOADED).sum(axis=0) >= FEWEST
         self._held_out = [
-            self._means(_joined([other for j, other in enumerate(folds) if j != k]).loads)
+            self._means(joined([other for j, other in enumerate(folds) if j != k]).loads)
             for k in range(len(folds))
         ]
 
@@ -197,17 +114,21 @@ class _Fit:
             reached=np.zeros((len(FAULTS), n_cells)),
             units=1,
             counts=1.0,
+            wires=None,
         )
         seen = [self._expected(replace(blank, means=means), fold) for means, fold in self._cross()]
-        predicted = self._predicted_edges([expected for expected, _ in seen])
+        predicted = predicted_edges(
+            np.concatenate([of[:, self._present].ravel() for of, _ in seen]),
+            np.concatenate([fold.loads[:, self._present].ravel() for fold in self._folds]),
+        )
         counts = np.stack(
             [self._counts(fold, *of, predicted) for fold, of in zip(self._folds, seen, strict=True)]
         )
         total = counts.sum(axis=0)
-        shrinkage = self._shrinkage(counts, total)
-        fitted = replace(blank, predicted=predicted, table=_table(total, shrinkage))
+        shrinkage = shrinkage_of(counts, total)
+        fitted = replace(blank, predicted=predicted, table=log_table(total, shrinkage))
         held_out = [
-            replace(fitted, means=means, table=_table(total - counts[k], shrinkage))
+            replace(fitted, means=means, table=log_table(total - counts[k], shrinkage))
             for k, (means, _) in enumerate(self._cross())
         ]
         by_unit = [
@@ -215,23 +136,25 @@ class _Fit:
             for model, fold in zip(held_out, self._folds, strict=True)
         ]
         independent = self._independent_share(held_out)
-        errs, of_others = self._errs(by_unit, independent)
+        errs, of_others = shares_of_errors(by_unit, independent, self._present, self._used)
         fitted = self._beside(replace(fitted, independent=independent, errs=errs))
         held_out = [
             replace(of, independent=independent, errs=own, equal=fitted.equal, amid=fitted.amid)
             for of, own in zip(held_out, of_others, strict=True)
         ]
+        wires, of_folds = fit_wires(held_out, self._folds, self._layout)
+        held_out = [replace(of, wires=own) for of, own in zip(held_out, of_folds, strict=True)]
         # First with the dead cells known: else healthy cells would be taken for dead ones, and
         # mislead the others.
-        reached, units = self._reached(held_out, informed=True)
-        held_out = [replace(of, reached=reached, units=units) for of in held_out]
-        reached = np.maximum(reached, self._reached(held_out, informed=False)[0])
+        informed = self._reached(held_out, informed=True)
+        held_out = [informed.on(of, 1.0) for of in held_out]
+        reached = informed.and_of(self._reached(held_out, informed=False))
         of_all = independent * sum(map(len, by_unit))
         # Few units contain few unusual contacts.
-        counted = 1 - _MOST_DISCOUNT / (1 + of_all / _HALF_DISCOUNT)
-        return replace(fitted, reached=reached, units=units, counts=counted)
+        factor = 1 - _MOST_DISCOUNT / (1 + of_all / _HALF_DISCOUNT)
+        return reached.on(replace(fitted, wires=wires), factor)
 
-    def _cross(self) -> list[tuple[tuple[ConditionalMean, ...], _Fold]]:
+    def _cross(self) -> list[tuple[tuple[ConditionalMean, ...], Fold]]:
         return list(zip(self._held_out, self._folds, strict=True))
 
     def _beside(self, model: LifeModel) -> LifeModel:
@@ -254,12 +177,12 @@ class _Fit:
         loaded *= model.independent
         amid *= model.independent
         usual = (same.sum() + 1) / (loaded.sum() + 1)
-        equal = (same + usual * _OWN_ERRS) / (loaded + _OWN_ERRS)
+        equal = (same + usual * OWN_ERRS) / (loaded + OWN_ERRS)
         shared = (amid.sum(axis=0) + 1) / (amid.sum() + len(AMID) + 1)
-        amid = (amid + shared * _OWN_ERRS) / (amid.sum(axis=1, keepdims=True) + _OWN_ERRS)
+        amid = (amid + shared * OWN_ERRS) / (amid.sum(axis=1, keepdims=True) + OWN_ERRS)
         return replace(model, equal=equal, amid=amid)
 
-    def _expected(self, model: LifeModel, fold: _Fold) -> tuple[Floats, NDArray[np.intp]]:
+    def _expected(self, model: LifeModel, fold: Fold) -> tuple[Floats, NDArray[np.intp]]:
         """Return predictions in which some cells are unknown, as in a log with dead ones, and
         levels of loads beside.
 
@@ -267,53 +190,24 @@ class _Fit:
         """
         found = np.empty(fold.loads.shape)
         near = np.empty(fold.loads.shape, np.intp)
-        parts = np.array_split(np.arange(len(fold.loads)), FOLDS)
-        for part, left_out in zip(parts, np.linspace(0.0, 0.15, len(parts)), strict=True):
-            known = self._present & (self._rng.random(len(self._present)) >= left_out)
+        for part, known in unknown_parts(len(fold.loads), self._present, self._rng):
             found[part] = model.expected(fold.loads[part], known)
             near[part] = loaded_beside(fold.loads[part], known, self._layout.beside)
         return found, near
 
-    def _predicted_edges(self, expected: list[Floats]) -> Floats:
-        loaded = [
-            of[:, self._present][fold.loads[:, self._present] > UNLOADED]
-            for of, fold in zip(expected, self._folds, strict=True)
-        ]
-        every = np.concatenate([of[:, self._present].ravel() for of in expected])
-        share = np.linspace(0, 1, _PREDICTED // 2 + 1)[1:-1]
-        edges: Floats = np.unique(
-            np.concatenate([np.quantile(every, share), np.quantile(np.concatenate(loaded), share)])
-        )
-        return edges
-
     def _counts(
-        self, fold: _Fold, expected: Floats, near: NDArray[np.intp], predicted: Floats
+        self, fold: Fold, expected: Floats, near: NDArray[np.intp], predicted: Floats
     ) -> Floats:
         """Return how often each cell had each level in each context, ``[D, M, K]``; ``[1, M, K]``
         of a large array."""
         around = len(BESIDE) + 1
-        m = (len(predicted) + 1) * around
-        k = len(self._levels) + 1
-        d = len(self._present)
         context = levels_of(expected, predicted).astype(np.intp) * around + near
         level = levels_of(fold.loads, self._levels)
-        tables = d if self._present.sum() <= MOST_CELLS else 1
-        index = (np.arange(d) % tables * m + context) * k + level
-        counted = np.bincount(index[:, self._present].ravel(), minlength=tables * m * k)
-        return counted.astype(np.float64).reshape(tables, m, k)
+        tables = len(self._present) if self._present.sum() <= MOST_CELLS else 1
+        shape = (tables, (len(predicted) + 1) * around, len(self._levels) + 1)
+        return counts_of(context, level, shape, self._present)
 
-    def _shrinkage(self, counts: Floats, total: Floats) -> Floats:
-        """Return the pseudo-count of each cell, ``[tables, 1, 1]``: the likeliest for folds that it
-        has not seen."""
-        likelihood = []
-        for shrinkage in _SHRINKAGES:
-            each = [(of * _table(total - of, shrinkage)).sum(axis=(1, 2)) for of in counts]
-            likelihood.append(np.sum(each, axis=0))
-        best = np.argmax(likelihood, axis=0)
-        found: Floats = np.asarray(_SHRINKAGES)[best][:, None, None]
-        return found
-
-    def _independent(self, model: LifeModel, fold: _Fold) -> Floats:
+    def _independent(self, model: LifeModel, fold: Fold) -> Floats:
         """Return the log ratio independent of the others : healthy of each unit of a fold,
         ``[units, D]``."""
         log = LifeLog(fold.loads, fold.readings, fold.piece, model, self._layout.beside)
@@ -332,7 +226,7 @@ class _Fit:
         """
         each = []
         for model, fold in zip(held_out, self._folds, strict=True):
-            for record in _logs(fold):
+            for record in logs_of(fold):
                 log = LifeLog(record.loads, record.means, record.piece, model, self._layout.beside)
                 healthy, _ = finished(log.healthy(self._present))
                 counted = log.counted(log.own - healthy)
@@ -347,42 +241,8 @@ class _Fit:
                 return min(1.0, alone / together)
             m *= 2
 
-    def _errs(self, ratios: list[Floats], independent: float) -> tuple[Floats, list[Floats]]:
-        """Return the share of units in which each healthy cell contradicts, ``[D]``, and the same
-        without each fold.
-
-        The share of all cells is the likeliest of a grid; that of a cell has it as prior.
-
-        Args:
-            ratios: log ratio independent : healthy of each unit, ``[units, D]``, for each fold.
-            independent: share of the units that count as independent of each other.
-        """
-        every = np.concatenate(ratios)[:, self._present].ravel()
-        usual = max(
-            _CONTAMINATIONS,
-            key=lambda e: float(np.logaddexp(np.log1p(-e), np.log(e) + every).sum()),
-        )
-        erred = independent * np.stack(
-            [expit(ratio + np.log(usual / (1 - usual))).sum(axis=0) for ratio in ratios]
-        )
-        units = independent * np.array([len(ratio) for ratio in ratios])[:, None]
-
-        def share(erred: Floats, units: Floats) -> Floats:
-            found: Floats = (erred.sum(axis=0) + usual * _OWN_ERRS) / (units.sum() + _OWN_ERRS)
-            # The rule of three: what was never seen in n units.
-            found = np.clip(found, max(usual / 2, 3 / units.sum()), MAJORITY / 2)
-            # what the reference hardly loaded is hardly known
-            return np.where(self._used, found, MAJORITY / 2)
-
-        without = [
-            share(np.delete(erred, k, axis=0), np.delete(units, k, axis=0))
-            for k in range(len(ratios))
-        ]
-        return share(erred, units), without
-
-    def _reached(self, held_out: list[LifeModel], *, informed: bool) -> tuple[Floats, int]:
-        """Return the evidence ``[5, D]`` that healthy cells reach in logs with dead ones, and the
-        units of these logs.
+    def _reached(self, held_out: list[LifeModel], *, informed: bool) -> _Reached:
+        """Return what healthy cells and wires reach in logs with dead cells.
 
         Cells where contacts end are predicted worse than others: the limit is the highest evidence
         of the cell itself, and at least what all but a few of the cells reach.
@@ -394,6 +254,8 @@ class _Fit:
         cells = np.flatnonzero(self._present)
         reached = np.full((len(FAULTS), len(self._present)), -np.inf)
         usual = []
+        of_wires: list[Floats] = []
+        of_wire = np.random.default_rng(0)
         units = []
         for model, fold in zip(held_out, self._folds, strict=True):
             for dead_share in (0.0, _DEAD, _DEAD):
@@ -403,7 +265,7 @@ class _Fit:
                     broken.kill(cell, int(self._rng.choice(cells)), self._rng)
                 healthy = np.setdiff1d(cells, dead)
                 known = np.isin(np.arange(len(self._present)), healthy)
-                for record in _logs(broken):
+                for record in logs_of(broken):
                     evidence = EvidenceOfLog.of(record, model, self._layout.beside)
                     if evidence is None:
                         continue
@@ -415,42 +277,44 @@ class _Fit:
                     reached[:, healthy] = np.maximum(reached[:, healthy], found)
                     usual.append(found)
                     units.append(evidence.log.units)
+                    if model.wires is not None:
+                        out = model.wires.on[of_wire.integers(len(model.wires.on))]
+                        for without in (np.zeros_like(out), out):
+                            steps = tested_wires(
+                                evidence.log,
+                                model.wires,
+                                known & ~without,
+                                self._present & ~without,
+                            )
+                            of_wires.append(finished(steps).evidence)
         most = np.quantile(np.concatenate(usual, axis=1), _HEALTHY, axis=1)
-        return np.maximum(reached, most[:, None]), int(np.median(units))
+        reached = np.maximum(reached, most[:, None])
+        wires = np.zeros((1, 0))
+        if of_wires:
+            wires = np.max(of_wires, axis=0)[None]
+        return _Reached(reached, wires, int(np.median(units)))
 
 
-def _logs(fold: _Fold) -> list[LifeRecord]:
-    """Return the pieces as records of logs, each of as many segments as are kept of a log."""
-    numbers, begins = np.unique(fold.piece // (SEGMENT // PIECE), return_index=True)
-    loads = np.split(fold.loads, begins[1:])
-    readings = np.split(fold.readings, begins[1:])
-    return [
-        LifeRecord(
-            tuple(loads[first : first + KEPT]),
-            tuple(readings[first : first + KEPT]),
-            tuple(numbers[first : first + KEPT].tolist()),
+@dataclass(frozen=True)
+class _Reached:
+    """Evidence that healthy cells ``[5, D]`` and wires ``[1, W]`` reach in logs of so many
+    units."""
+
+    cells: Floats
+    wires: Floats
+    units: int
+
+    def and_of(self, other: _Reached) -> _Reached:
+        """Return what they reach in either kind of logs."""
+        return replace(
+            self,
+            cells=np.maximum(self.cells, other.cells),
+            wires=np.maximum(self.wires, other.wires),
         )
-        for first in range(0, len(numbers), KEPT)
-    ]
 
-
-def _edges(values: Array, n: int) -> Floats:
-    """Return limits of n levels: of loads that are none, and equally many of the others."""
-    loaded = values[values > UNLOADED]
-    if not len(loaded):
-        return np.array([UNLOADED, 0.5])
-    return np.unique(np.append(UNLOADED, np.quantile(loaded, np.linspace(0, 1, n)[1:-1]))).astype(
-        np.float64
-    )
-
-
-def _table(counts: Floats, shrinkage: Floats | float) -> Array:
-    """Return log P(level | prediction) of each cell, ``[D, M, K]``, shrunk towards that of all
-    cells."""
-    pooled = counts.sum(axis=0)
-    usual = pooled.sum(axis=0) / pooled.sum()
-    shared = (pooled + usual) / (pooled.sum(axis=1, keepdims=True) + 1)
-    shared = (1 - GUESS) * shared + GUESS / counts.shape[2]
-    table = (counts + shrinkage * shared) / (counts.sum(axis=2, keepdims=True) + shrinkage)
-    log_table: Array = np.log(table).astype(np.float32)
-    return log_table
+    def on(self, model: LifeModel, counts: float) -> LifeModel:
+        """Return the model with these limits, and a factor on all evidence."""
+        wires = model.wires
+        if wires is not None:
+            wires = replace(wires, reached=self.wires, units=self.units, counts=counts)
+        return replace(model, reached=self.cells, units=self.units, counts=counts, wires=wires)

@@ -3,7 +3,7 @@ predicted level)."""
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -25,7 +25,9 @@ Levels = NDArray[np.uint8]
 
 FAULTS = ("independent", "intermittent", "late", "copy", "clamped")
 COPY = FAULTS.index("copy")
+INTERMITTENT = FAULTS.index("intermittent")
 UNLOADED = 1e-3  # root load up to which a piece counts as unloaded
+REFUTED = 4.0  # evidence from which on a cell predicts no others
 THRESHOLD = 9.0  # evidence of a certain fault: with its prior, P(faulty) = 0.994
 GUESS = 0.005  # of a uniform distribution over the levels, in any table: models err
 # evidence that a healthy cell may reach in a log as long as those of the reference, though none did
@@ -98,6 +100,26 @@ class ConditionalMean:
         expected: Floats = expected_z * self.scale[self.place] + self.mean[self.place]
         return expected
 
+    def expected_sum(self, loads: Array, known: Mask, on: Mask, of: Mask) -> Floats:
+        """Return the expected sum ``[n]`` of the loads of the outputs in ``of`` (bool ``[D]``).
+
+        Args:
+            loads: ``[n, D]``.
+            known: bool ``[D]``, cells that predict others.
+            on: bool ``[D]``, the cells of a wire, those in ``of`` among them: they do not.
+        """
+        known = (known & ~on)[self.inputs]
+        outputs = self.place[of[self.outputs]]
+        total = self.mean[outputs].sum()
+        if not known.any() or not len(outputs):
+            return np.full(len(loads), total)
+        weight = np.zeros(len(known))
+        weight[outputs] = self.scale[outputs]
+        regression = regression_on_known(self.covariance, self.precision, known)
+        z = _standardised(loads[:, self.inputs[known]], self.mean[known], self.scale[known])
+        expected: Floats = total + z @ (weight[~known] @ regression)
+        return expected
+
 
 def _standardised(loads: NDArray[np.floating], mean: Floats, scale: Floats) -> Floats:
     inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
@@ -136,43 +158,142 @@ def loaded_beside(loads: Array, known: Mask, beside: Cells) -> Levels:
 
 
 @dataclass(frozen=True)
-class LifeModel:
-    """What healthy cells do, given the others.
+class HealthyTable:
+    """P(observed level | context) of healthy loads, and how far they go.
 
     Attributes:
-        means: predictions, for each tile; each cell is an output of one.
         levels: float ``[K - 1]``, root loads between the levels that are observed.
         predicted: float ``[M - 1]``, the same of those that are predicted.
-        table: float ``[D, M, K]``, log P(observed level | context) of each healthy cell;
+        table: float ``[D, M, K]``, log P(observed level | context) of each healthy load;
             ``[1, M, K]``: of all.
-        equal: float ``[D, 8]``, probability that a healthy cell reads the same as one beside it
-            throughout a unit.
-        amid: float ``[D, 5]``, probability of each level of how far a healthy cell reads from the
-            mean beside it.
         independent: share of the units that count as independent of each other: those of one
             contact are alike.
         errs: float ``[D]``, share e of the units.
-        tolerance: a cell whose readings lie within this of its highest one reads it, in the
-            layout's unit.
-        reached: float ``[5, D]``, evidence that a healthy cell reaches in a log, for each of the
-            ``FAULTS``.
+        reached: float ``[faults, D]``, evidence that a healthy load reaches in a log.
         units: number of units of these logs.
         counts: factor on all evidence, 0 to 1: a reference of few units contains few unusual
             contacts.
     """
 
-    means: tuple[ConditionalMean, ...]
     levels: Floats
     predicted: Floats
     table: Array
-    equal: Floats
-    amid: Floats
     independent: float
     errs: Floats
-    tolerance: float
     reached: Floats
     units: int
     counts: float
+
+    def factors(self, units: int) -> Floats:
+        """Return the factors ``[faults, D]`` on the evidence in a log of so many units: healthy
+        loads stay below the limit.
+
+        The evidence against a healthy load that the model predicts badly grows with the length of
+        the log; a log that is longer than those of the reference may hold contacts that are like
+        none of these.
+        """
+        unseen = np.zeros((len(self.reached), 1))
+        unseen[0] = _UNSEEN
+        reached = np.maximum(self.reached, unseen) * max(1.0, units / self.units)
+        factors: Floats = self.counts * THRESHOLD / np.maximum(THRESHOLD, MARGIN * reached)
+        return factors
+
+    @cached_property
+    def probabilities(self) -> Floats:
+        """P(observed level | context), shape of ``table``."""
+        return np.exp(self.table.astype(np.float64))
+
+    def of_cell(self, cells: Cells) -> Cells:
+        """Return where the table of each is."""
+        return cells % len(self.table)
+
+
+@dataclass(frozen=True)
+class WireModel(HealthyTable):
+    """Mean loads of healthy wires, given the cells that are not on them.
+
+    Attributes:
+        on: bool ``[W, D]``, cells on each wire.
+        beside: bool ``[W, D]``, cells beside these that are not.
+    """
+
+    on: Mask
+    beside: Mask
+
+    def told(self, loads: Array, known: Mask) -> Mask:
+        """Return in which pieces some known cell off each wire is loaded, bool ``[n, W]``.
+
+        The others tell nothing of a wire where none of them is loaded: the pieces that are kept of
+        a log hold some load, which is then its own, or that of a faulty cell.
+        """
+        others = (~self.on & known).astype(np.float32)
+        found: Mask = (loads > UNLOADED).astype(np.float32) @ others.T > 0
+        return found
+
+    def contexts(self, expected: Floats, loads: Array, known: Mask) -> NDArray[np.intp]:
+        """Return what the others say of each wire, 0 to M - 1, int ``[n, W]``.
+
+        Args:
+            expected: mean loads that they predict, ``[n, W]``.
+            loads: root loads ``[n, D]``.
+            known: bool ``[D]``, cells that predict others.
+        """
+        near = (self.beside & known).astype(np.float32)
+        loaded = (loads > UNLOADED).astype(np.float32) @ near.T
+        share = loaded / np.maximum(near.sum(axis=1), 1)
+        level = levels_of(expected, self.predicted).astype(np.intp)
+        return level * (len(BESIDE) + 1) + levels_of(share, np.asarray(BESIDE))
+
+    def mean_loads(self, values: Array, eligible: Mask) -> Floats:
+        """Return the means ``[n, W]`` over the eligible cells (bool ``[D]``) of each wire, of
+        values ``[n, D]``."""
+        of = (self.on & eligible).astype(np.float64)
+        found: Floats = values @ (of / np.maximum(of.sum(axis=1, keepdims=True), 1)).T
+        return found
+
+    def expected(
+        self, means: Sequence[ConditionalMean], loads: Array, known: Mask, eligible: Mask
+    ) -> Generator[None, None, Floats]:
+        """Yield between steps; return the mean load that the known cells off each wire predict,
+        ``[n, W]``.
+
+        Args:
+            means: predictions of the cells.
+            loads: root loads ``[n, D]``.
+            known: bool ``[D]``, cells that predict others.
+            eligible: bool ``[D]``, cells over which the mean is taken.
+        """
+        found = np.zeros((len(loads), len(self.on)))
+        for w, on in enumerate(self.on):
+            of = on & eligible
+            for mean in means:
+                if of[mean.outputs].any():
+                    found[:, w] += mean.expected_sum(loads, known, on, of)
+            found[:, w] /= max(1, of.sum())
+            yield
+        return found
+
+
+@dataclass(frozen=True)
+class LifeModel(HealthyTable):
+    """What healthy cells do, given the others: ``reached`` is of the ``FAULTS``.
+
+    Attributes:
+        means: predictions, for each tile; each cell is an output of one.
+        equal: float ``[D, 8]``, probability that a healthy cell reads the same as one beside it
+            throughout a unit.
+        amid: float ``[D, 5]``, probability of each level of how far a healthy cell reads from the
+            mean beside it.
+        tolerance: a cell whose readings lie within this of its highest one reads it, in the
+            layout's unit.
+        wires: of the cells' wires; None: there are none with enough cells.
+    """
+
+    means: tuple[ConditionalMean, ...]
+    equal: Floats
+    amid: Floats
+    tolerance: float
+    wires: WireModel | None
 
     def check(self, layout: SensorLayout) -> None:
         """Raise ValueError unless this is a model of ``layout``."""
@@ -224,24 +345,6 @@ class LifeModel:
         around = loaded_beside(loads, known, beside)
         return level.astype(np.intp) * (len(BESIDE) + 1) + around
 
-    def factors(self, units: int) -> Floats:
-        """Return the factors ``[5, D]`` on the evidence in a log of so many units: healthy cells
-        stay below the limit.
-
-        The evidence against a healthy cell that the model predicts badly grows with the length of
-        the log; a log that is longer than those of the reference may hold contacts that are like
-        none of these.
-        """
-        unseen = np.array([_UNSEEN, 0.0, 0.0, 0.0, 0.0])[:, None]
-        reached = np.maximum(self.reached, unseen) * max(1.0, units / self.units)
-        factors: Floats = self.counts * THRESHOLD / np.maximum(THRESHOLD, MARGIN * reached)
-        return factors
-
-    @cached_property
-    def probabilities(self) -> Floats:
-        """P(observed level | context) of each healthy cell, shape of ``table``."""
-        return np.exp(self.table.astype(np.float64))
-
     def otherwise(self, gain: float, offset: float, cells: Cells) -> Floats:
         """Return P(observed level | context) of cells with a gain and an offset (of full scale),
         ``[cells, M, K]``."""
@@ -256,7 +359,3 @@ class LifeModel:
         for before, after in enumerate(becomes.tolist()):
             found[:, :, after] += (1 - GUESS) * table[:, :, before]
         return found
-
-    def of_cell(self, cells: Cells) -> Cells:
-        """Return where the table of each cell is."""
-        return cells % len(self.table)

@@ -14,6 +14,7 @@ from diagnostics.evidence.life.healthy_table import (
     UNLOADED,
     Cells,
     Floats,
+    HealthyTable,
     Levels,
     LifeModel,
     Mask,
@@ -33,48 +34,39 @@ _TOGETHER = 48  # units that are compared in one step: a size
 _SATURATED = 50.0  # log ratio of a unit beyond which nothing changes
 
 
-class LifeLog:
-    """Levels of a log, and how likely they are.
+class LevelLog:
+    """Levels of loads in a log, and how likely they are.
 
     Args:
         loads: mean root loads of the pieces, ``[n, D]``.
-        readings: their mean readings ``[n, D]``, in the layout's unit.
+        read: bool ``[n, D]``, those that were read.
         piece: number of each, int ``[n]``, ascending.
-        model: of healthy cells.
-        beside: int ``[D, 8]``, the cells beside each; -1: none.
+        model: of healthy loads.
+        weight: of each unit ``[units]``; None: see the property.
 
     Attributes:
         level: of each load, ``[n, D]``.
+        read: bool ``[n, D]``, those that were read.
         unit_begins: int ``[units]``, number of the first piece of each unit.
     """
 
     def __init__(
         self,
-        loads: Array,
-        readings: Array,
+        loads: NDArray[np.floating],
+        read: Mask,
         piece: NDArray[np.intp],
-        model: LifeModel,
-        beside: Cells,
+        model: HealthyTable,
+        weight: Floats | None = None,
     ) -> None:
-        self.model = model
-        self.beside = beside
+        self.table = model
         self.loads = loads
-        self.readings = readings
+        self._weight = weight
         self.level = levels_of(loads, model.levels)
-        self._piece = piece
-        self._read = np.isfinite(self.readings)
-        self._all_read = bool(self._read.all())
+        self.piece = piece
+        self.read = read
+        self._all_read = bool(read.all())
         self.unit_begins = np.flatnonzero(np.diff(piece // UNIT, prepend=-1))
         self._cell = np.arange(self.level.shape[1])
-
-    def prepared(self) -> Iterator[None]:
-        """Yield after the work that every test needs, unless it is done."""
-        if "weight" in vars(self):
-            return
-        _ = self.own, self.at_rest
-        yield
-        self.weight = yield from self._weighed()
-        yield
 
     @property
     def units(self) -> int:
@@ -84,13 +76,13 @@ class LifeLog:
     @property
     def begins(self) -> NDArray[np.intp]:
         """Number of the first frame of each unit, int ``[units]``."""
-        found: NDArray[np.intp] = self._piece[self.unit_begins] * PIECE
+        found: NDArray[np.intp] = self.piece[self.unit_begins] * PIECE
         return found
 
     @cached_property
     def own(self) -> Floats:
         """Log frequency of each level in the other pieces of the cell, ``[n, D]``."""
-        n_levels = len(self.model.levels) + 1
+        n_levels = len(self.table.levels) + 1
         others = np.maximum(_counted(self.level, n_levels) - 1, 0)
         log_frequency = np.log((others + 1 / n_levels) / len(self.level))
         found: Floats = log_frequency[self._cell, self.level]
@@ -99,17 +91,19 @@ class LifeLog:
     @cached_property
     def at_rest(self) -> Floats:
         """Log probability of each level of a cell without load, ``[n, D]``."""
-        n_levels = len(self.model.levels) + 1
+        n_levels = len(self.table.levels) + 1
         loaded = np.log((1 - _AT_REST) / (n_levels - 1))
         found = np.full(self.level.shape, loaded)
         found[self.level == 0] = np.log(_AT_REST)
         return found
 
-    @cached_property
+    @property
     def weight(self) -> Floats:
         """Weight of each unit ``[units]``: share of independent ones, over 1 + k with k others of
         the same loads."""
-        return finished(self._weighed())
+        if self._weight is None:
+            self._weight = finished(self._weighed())
+        return self._weight
 
     def _weighed(self) -> Generator[None, None, Floats]:
         """Yield between steps; return the weight of each unit."""
@@ -117,17 +111,16 @@ class LifeLog:
         novelty = yield from _novelty(
             np.add.reduceat(self.loads, self.unit_begins, axis=0) / length
         )
-        return self.model.independent * novelty
+        return self.table.independent * novelty
 
-    def healthy(self, known: Mask) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
-        """Yield between steps; return log P(level | healthy) and the context, ``[n, D]`` each.
-
-        Args:
-            known: bool ``[D]``, the cells that predict others.
-        """
-        context = yield from self.model.contexts(self.loads, known, self.beside)
-        table = self.model.probabilities[self.model.of_cell(self._cell)]
-        return self.tilted(table, context, self.level), context
+    def prepared(self) -> Iterator[None]:
+        """Yield after the work that every test needs, unless it is done."""
+        if self._weight is not None:
+            return
+        _ = self.own, self.at_rest
+        yield
+        self._weight = yield from self._weighed()
+        yield
 
     def tilted(
         self, table: Floats, context: NDArray[np.intp], level: NDArray[np.integer]
@@ -164,7 +157,7 @@ class LifeLog:
         Args:
             cells: int ``[D]``, which cells these are; None: all.
         """
-        errs = self.model.errs if cells is None else self.model.errs[cells]
+        errs = self.table.errs if cells is None else self.table.errs[cells]
         found: Floats = bounded(self.by_unit(ratio, cells), errs) * self.weight[:, None]
         return found
 
@@ -172,10 +165,51 @@ class LifeLog:
         """Return the sums over the pieces of each unit that were read, ``[units, D]``; arguments as
         in counted."""
         if not self._all_read:
-            read = self._read if cells is None else self._read[:, cells]
+            read = self.read if cells is None else self.read[:, cells]
             ratio = np.where(read, ratio, 0.0)
         summed: Floats = np.add.reduceat(ratio, self.unit_begins, axis=0)
         return summed
+
+    def any_by_unit(self, holds: Mask) -> Mask:
+        """Return whether something holds in a piece of each unit, bool ``[units, D]``, of each
+        piece ``[n, D]``."""
+        found: Mask = np.logical_or.reduceat(holds, self.unit_begins, axis=0)
+        return found
+
+
+class LifeLog(LevelLog):
+    """Levels of the cells in a log.
+
+    Args:
+        loads: mean root loads of the pieces, ``[n, D]``.
+        readings: their mean readings ``[n, D]``, in the layout's unit.
+        piece: number of each, int ``[n]``, ascending.
+        model: of healthy cells.
+        beside: int ``[D, 8]``, the cells beside each; -1: none.
+    """
+
+    def __init__(
+        self,
+        loads: Array,
+        readings: Array,
+        piece: NDArray[np.intp],
+        model: LifeModel,
+        beside: Cells,
+    ) -> None:
+        super().__init__(loads, np.isfinite(readings), piece, model)
+        self.model = model
+        self.beside = beside
+        self.readings = readings
+
+    def healthy(self, known: Mask) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
+        """Yield between steps; return log P(level | healthy) and the context, ``[n, D]`` each.
+
+        Args:
+            known: bool ``[D]``, the cells that predict others.
+        """
+        context = yield from self.model.contexts(self.loads, known, self.beside)
+        table = self.model.probabilities[self.model.of_cell(self._cell)]
+        return self.tilted(table, context, self.level), context
 
     def same(self, k: int) -> tuple[Mask, Mask]:
         """Return in which units a cell and its neighbour k are both loaded, and read the same,
@@ -215,16 +249,10 @@ class LifeLog:
         yield
         usual_beside = (total_beside - farthest) / (count - 1)
         distance = np.abs(self.readings - mean) / (usual_beside + self.model.tolerance)
-        some &= (self.level > 0) & self._read & (has.sum(axis=1) > 1) & np.isfinite(distance)
+        some &= (self.level > 0) & self.read & (has.sum(axis=1) > 1) & np.isfinite(distance)
         total = np.add.reduceat(np.where(some, distance, 0.0), self.unit_begins, axis=0)
         pieces = np.add.reduceat(some.astype(np.intp), self.unit_begins, axis=0)
         return pieces > 0, levels_of(total / np.maximum(pieces, 1), np.asarray(AMID))
-
-    def any_by_unit(self, holds: Mask) -> Mask:
-        """Return whether something holds in a piece of each unit, bool ``[units, D]``, of each
-        piece ``[n, D]``."""
-        found: Mask = np.logical_or.reduceat(holds, self.unit_begins, axis=0)
-        return found
 
 
 def _counted(numbers: NDArray[np.integer], n: int) -> NDArray[np.intp]:

@@ -9,15 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logit, logsumexp
 
-from diagnostics.evidence.life.healthy_table import COPY, THRESHOLD, Cells, Floats, Mask
+from diagnostics.evidence.life.healthy_table import (
+    COPY,
+    INTERMITTENT,
+    REFUTED,
+    THRESHOLD,
+    Cells,
+    Floats,
+    Mask,
+)
 from diagnostics.evidence.life.levels_in_log import LifeLog
 from diagnostics.evidence.life.ways_to_fail import (
-    REFUTED,
     EvidenceOfLog,
     Suspicion,
     WaysToFail,
     follows_otherwise,
 )
+from diagnostics.evidence.life.wires import FailingWires, failing_wires
 from diagnostics.evidence.stepping import finished
 from diagnostics.preprocessing.levels import DOUBTED, EXPECTED, FEWEST, MAJORITY
 
@@ -47,6 +55,8 @@ class Life:
         against: bool ``[units, D]``, units against the cell.
         begins: int ``[units]``, number of the first frame of each.
         highest: float, highest reading of a piece, in the layout's unit.
+        wire: int, number of the wire that fails now and then, from 0; -1: none.
+        of_wire: float, P(this wire fails); 0: none.
         floats: bool, certain cells that do not follow the others at all, not with a lower gain
             either.
         contradicting: share of the tested cells that are refuted, where it is so large that all are
@@ -65,6 +75,8 @@ class Life:
     against: Mask
     begins: NDArray[np.intp]
     highest: Floats
+    wire: NDArray[np.intp]
+    of_wire: Floats
     floats: Mask
     contradicting: float
 
@@ -87,6 +99,8 @@ class Life:
             against=no[None],
             begins=zero[:1],
             highest=nothing,
+            wire=zero - 1,
+            of_wire=nothing,
             floats=no,
             contradicting=0.0,
         )
@@ -121,10 +135,11 @@ class LifeTest:
         evidence: what the log says; None: it holds too little, and tells nothing.
         eligible: bool ``[D]``, cells that are present and not explained otherwise.
         constant: bool ``[D]``, cells that look stuck now, and predict no others; None: none.
-        known: bool ``[D]``, cells that may predict others at first, of an earlier test; None: all.
+        first: an earlier test, whose result this one begins with; None: there is none.
 
     Attributes:
         known: bool ``[D]``, the cells that predict others.
+        wires: what the wires say; None: not yet tested.
     """
 
     def __init__(
@@ -132,14 +147,16 @@ class LifeTest:
         evidence: EvidenceOfLog | None,
         eligible: Mask,
         constant: Mask | None = None,
-        known: Mask | None = None,
+        first: LifeTest | None = None,
     ) -> None:
         self._evidence = evidence
         self._eligible = eligible
         self._constant = np.zeros_like(eligible) if constant is None else constant
         self.known = eligible & ~self._constant
-        if known is not None:
-            self.known &= known
+        self.wires: FailingWires | None = None
+        if first is not None:
+            self.known &= first.known
+            self.wires = first.wires
 
     def finish(self) -> Life:
         """Return the result."""
@@ -152,25 +169,40 @@ class LifeTest:
             return Life.unknown(len(self._eligible))
         log = evidence.log
         yield from log.prepared()
+        if self.wires is None:
+            yield from self._settled(evidence, np.zeros_like(self._eligible))
+            known = self._eligible & ~self._constant
+            self.wires = yield from failing_wires(log, self.known, known)
+            if self.wires.refuted.any():
+                yield from self._settled(evidence, self.wires.refuted)
+        else:
+            yield from self._settled(evidence, self.wires.refuted)
+        wires = self.wires
+        ways = yield from evidence.ways(self.known)
+        yield
+        life = _concluded(log, ways, self._eligible, self._constant, wires)
+        life = yield from _without_followers(log, ways, life)
+        return life
+
+    def _settled(self, evidence: EvidenceOfLog, out: Mask) -> Generator[None, None, None]:
+        """Yield between steps; find the cells that predict others, without those that are
+        ``out`` (bool ``[D]``)."""
+        log = evidence.log
         refuted = np.zeros(len(self._eligible), np.intp)  # how often each cell was
+        self.known = self.known & ~out
         seen = yield from evidence.suspicion(self.known)
         for _ in range(_ROUNDS):
             bad = self._eligible & seen.refuted(log)
             gone = self._worst(seen, bad, log.beside)
             refuted += gone
             # A cell that the others beside it had made look wrong comes back, but once only.
-            returns = self._eligible & ~self._constant & ~bad & (refuted < _OFTEN)
+            returns = self._eligible & ~self._constant & ~out & ~bad & (refuted < _OFTEN)
             known = self.known & ~gone | returns
             if (known == self.known).all():
                 break
             self.known = known
             yield
             seen = yield from evidence.suspicion(known)
-        ways = yield from evidence.ways(self.known)
-        yield
-        life = _concluded(log, ways, self._eligible, self._constant)
-        life = yield from _without_followers(log, ways, life)
-        return life
 
     def _worst(self, seen: Suspicion, bad: Mask, beside: Cells) -> Mask:
         """Return the worst of the ``bad`` cells that predict others, bool ``[D]``.
@@ -205,29 +237,34 @@ def _without_followers(log: LifeLog, ways: WaysToFail, life: Life) -> Generator[
     return replace(life, evidence=evidence, floats=floats)
 
 
-def _concluded(log: LifeLog, ways: WaysToFail, eligible: Mask, constant: Mask) -> Life:
+def _concluded(
+    log: LifeLog, ways: WaysToFail, eligible: Mask, constant: Mask, wires: FailingWires
+) -> Life:
     """Return the result."""
     scaled = ways.evidence * log.model.factors(log.units)
     any_fault = logsumexp(scaled + np.log(_SHARES)[:, None], axis=0)
-    evidence = np.where(eligible, any_fault, 0.0)
-    kind = ways.evidence.argmax(axis=0)
+    of_wire = np.where(wires.refuted, wires.evidence, any_fault)
+    evidence = np.where(eligible, of_wire, 0.0)
+    kind = np.where(wires.refuted, INTERMITTENT, ways.evidence.argmax(axis=0))
+    against = np.where(wires.refuted, wires.against, ways.against)
     refuted = eligible & (evidence > REFUTED)
     certain = refuted & (evidence > THRESHOLD)
     depends = (ways.now < -_SHOWN) & (ways.evidence[0] < 0)
     # Of two cells that read the same, either may be the copy.
-    in_doubt = (evidence > _DOUBT) | (scaled[COPY] > -_EITHER)
+    in_doubt = (evidence > _DOUBT) | (scaled[COPY] > -_EITHER) | (wires.evidence > _DOUBT)
     shown = eligible & depends & ~in_doubt & ~refuted
     moving = ~constant
-    against = int((refuted & moving).sum())
-    tested = int(((shown | refuted) & moving).sum())
-    contradicting = against / max(tested, 1)
-    if contradicting > _DISTURBED and against >= FEWEST:
+    alone = moving & ~wires.refuted
+    contradict = int((refuted & alone).sum())
+    tested = int(((shown | refuted) & alone).sum())
+    contradicting = contradict / max(tested, 1)
+    if contradicting > _DISTURBED and contradict >= FEWEST:
         evidence = np.minimum(evidence, 0.0)
         refuted = np.zeros_like(refuted)
         certain = np.zeros_like(certain)
     else:
         contradicting = 0.0
-    first = log.begins[ways.against.argmax(axis=0)]
+    first = log.begins[against.argmax(axis=0)]
     return Life(
         evidence=evidence,
         kind=kind,
@@ -236,11 +273,13 @@ def _concluded(log: LifeLog, ways: WaysToFail, eligible: Mask, constant: Mask) -
         certain=certain,
         lag=ways.lag,
         source=ways.source,
-        share=ways.share,
-        since=np.where(ways.against[0], 0, first),
-        against=ways.against,
+        share=np.where(wires.refuted, wires.share, ways.share),
+        since=np.where(against[0], 0, first),
+        against=against,
         begins=log.begins,
         highest=ways.highest,
+        wire=wires.wire,
+        of_wire=wires.probability,
         floats=certain & (kind == 0),
         contradicting=contradicting,
     )

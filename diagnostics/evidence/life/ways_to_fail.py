@@ -16,6 +16,7 @@ from scipy.special import log_expit, logsumexp
 
 from diagnostics.evidence.life.healthy_table import (
     BESIDE,
+    REFUTED,
     THRESHOLD,
     Cells,
     Floats,
@@ -23,13 +24,17 @@ from diagnostics.evidence.life.healthy_table import (
     Mask,
 )
 from diagnostics.evidence.life.levels_in_log import LifeLog, bounded
+from diagnostics.evidence.life.over_time import (
+    dies_and_recovers,
+    from_some_unit,
+    opens_under_load,
+    since_it_works,
+    up_to_some_unit,
+)
 from diagnostics.evidence.life.record import LifeRecord
 from diagnostics.preprocessing.levels import MAJORITY, TESTED
 
-REFUTED = 4.0  # evidence from which on a cell is replaced
-
 _LAGS = (1, 2, 3, 4)  # pieces
-_LIMITS = 4  # of the load from which on a contact opens
 # Gain and offset, as a share of full scale, of a cell that reads otherwise than it did, but follows
 # the others: a grid.
 _OTHERWISE = (
@@ -43,8 +48,6 @@ _KEPT = 3  # answers: a size
 # P(distance from the mean beside it) of a cell that reads it; dead cells beside it read otherwise.
 _AMID = (0.7, 0.15, 0.07, 0.04, 0.04)
 _CERTAINLY_NOT = 1e3  # evidence against what is impossible
-_FAILS = 0.1  # probability per unit
-_RECOVERS = 0.3  # probability per unit
 _AGAINST = 1.0  # log ratio from which on a unit speaks against a cell
 
 
@@ -171,8 +174,9 @@ def suspicion(log: LifeLog, known: Mask) -> Generator[None, None, Suspicion]:
     yield
     by_unit = log.counted(log.own - healthy)
     dead = log.counted(log.at_rest - healthy)
-    intermittent, dying = _dies_and_recovers(dead)
-    opens = yield from _opens(log, healthy, context)
+    intermittent, dying = dies_and_recovers(dead)
+    around = len(BESIDE) + 1
+    opens = yield from opens_under_load(log, log.at_rest - healthy, context // around)
     return Suspicion(
         healthy, context, by_unit.sum(axis=0), intermittent, opens, by_unit, dead, dying
     )
@@ -201,10 +205,10 @@ def ways_to_fail(
     late = logsumexp(lagged, axis=0) - np.log(len(lagged))
     clamped = _clamped(log, seen.context)
     # What was dead once, and works again, is no fault any more.
-    now = _since_it_works(seen.by_unit)
+    now = since_it_works(seen.by_unit)
     works = now < -THRESHOLD
     independent = np.where(works, np.minimum(seen.independent, now), seen.independent)
-    recovers = seen.intermittent - np.logaddexp(0.0, _up_to_some_unit(seen.dead))
+    recovers = seen.intermittent - np.logaddexp(0.0, up_to_some_unit(seen.dead))
     intermittent = np.logaddexp(recovers, seen.opens) - np.log(2)
     tested = np.abs(seen.dead) > TESTED
     gone = (seen.dying > MAJORITY) & tested
@@ -233,79 +237,16 @@ def follows_otherwise(
     context = ways.context[:, cells]
     level = log.level[:, cells]
     own = log.own[:, cells]
-    independent = _from_some_unit(log.counted(own - healthy, cells))
+    independent = from_some_unit(log.counted(own - healthy, cells))
     best = np.full(len(cells), -np.inf)
     each = _at_once(level.size)
     for k, (gain, offset) in enumerate(_OTHERWISE):
         if k % each == 0:
             yield
         changed = log.tilted(log.model.otherwise(gain, offset, cells), context, level)
-        evidence = _from_some_unit(log.counted(changed - healthy, cells))
+        evidence = from_some_unit(log.counted(changed - healthy, cells))
         best = np.maximum(best, evidence)
     return best - independent
-
-
-def _opens(
-    log: LifeLog, healthy: Floats, context: NDArray[np.intp]
-) -> Generator[None, None, Floats]:
-    """Yield between steps; return the evidence ``[D]`` of a cell that is dead where the others say
-    that its load exceeds some level, and healthy below."""
-    expected = context // (len(BESIDE) + 1)
-    ratio = log.at_rest - healthy
-    evidence = []
-    for level in np.linspace(1, len(log.model.predicted), _LIMITS).astype(np.intp):
-        evidence.append(log.counted(np.where(expected >= level, ratio, 0.0)).sum(axis=0))
-        yield
-    found: Floats = logsumexp(evidence, axis=0) - np.log(_LIMITS)
-    return found
-
-
-def _dies_and_recovers(dead: Floats) -> tuple[Floats, Floats]:
-    """Return the log evidence ``[D]`` of a cell that dies and recovers, and P(dead) in each unit
-    ``[units, D]``.
-
-    Args:
-        dead: float ``[units, D]``, log ratio dead : healthy, bounded.
-    """
-    likelihood = np.exp(dead)
-    gone = np.full(dead.shape[1], _FAILS)
-    dying = np.empty(dead.shape)
-    total = np.empty(dead.shape)
-    total_before = 1 + _FAILS
-    # The forward algorithm; the probabilities are scaled to a sum of 1 after each unit.
-    gone /= total_before
-    for u, ratio in enumerate(likelihood):
-        stays = (1 - _FAILS) - (1 - _FAILS - _RECOVERS) * gone
-        gone = (1 - stays) * ratio
-        total[u] = stays + gone
-        gone /= total[u]
-        dying[u] = gone
-    return np.log(total).sum(axis=0) + np.log(total_before), dying
-
-
-def _from_some_unit(dead: Floats) -> Floats:
-    """Return the log evidence ``[D]`` of a cell that is dead from a unit on, half of them from the
-    first."""
-    before = np.cumsum(dead, axis=0)
-    later = logsumexp(before[-1] - before, axis=0) - np.log(len(dead))
-    found: Floats = np.logaddexp(before[-1], later) - np.log(2)
-    return found
-
-
-def _up_to_some_unit(dead: Floats) -> Floats:
-    """Return the log evidence ``[D]`` of a cell that was dead up to a unit, and works again."""
-    before = np.cumsum(dead, axis=0)
-    prior = np.log(_FAILS * _RECOVERS) - np.log(len(dead))
-    found: Floats = logsumexp(before, axis=0) + prior
-    return found
-
-
-def _since_it_works(dead: Floats) -> Floats:
-    """Return the log ratio dead : healthy ``[D]`` after the unit up to which a cell was most likely
-    dead, if any."""
-    before = np.cumsum(dead, axis=0)
-    found: Floats = before[-1] - np.maximum(before.max(axis=0), 0.0)
-    return found
 
 
 def _late(log: LifeLog, seen: Suspicion, lag: int) -> Floats:

@@ -1,0 +1,158 @@
+"""Wires that fail now and then: is the mean load of their cells what the cells off them say?
+
+The cells of a wire fail together, and predict each other: one by one they look healthy. A wire is
+tested as a cell is, with the mean root load of its cells, the prediction by the cells that are not
+on it, and a table of its own; it is at rest in the units of a two-state Markov chain, or where its
+predicted level exceeds one of four limits. The worst wire is taken out of the predictors first.
+
+Not detected: wires of fewer than three cells, a wire without others that could tell of its load,
+one that healthy contacts often leave alone (an edge), one whose cells keep a load or another rest
+level while it is open. A wire that breaks once and for all is found by its constant cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from diagnostics.evidence.life.healthy_table import (
+    BESIDE,
+    THRESHOLD,
+    Floats,
+    Mask,
+    WireModel,
+)
+from diagnostics.evidence.life.levels_in_log import LevelLog, LifeLog
+from diagnostics.evidence.life.over_time import (
+    dies_and_recovers,
+    from_some_unit,
+    opens_under_load,
+)
+from diagnostics.preprocessing.levels import CERTAIN_RATIO, EXPECTED_LATE, MAJORITY, TESTED
+
+FEWEST_CELLS = 3  # of a wire, from which on they tell of it
+# Evidence that makes up for how rare broken wires are, and for contacts unlike the reference's.
+_BROKEN = CERTAIN_RATIO / 2 - float(np.log(EXPECTED_LATE))
+_PROVEN = _BROKEN + float(np.log(9.0))  # at odds of 9
+_MOST_WIRES = 4  # that fail in a log: a size
+_AGAINST = 1.0  # log ratio from which on a unit speaks against a wire
+
+
+@dataclass(frozen=True)
+class WireTest:
+    """What a log says of each wire, given the cells that predict others.
+
+    Attributes:
+        evidence: float ``[W]``, log ratio fails now and then : healthy, before the factors.
+        dead: float ``[units, W]``, the same of each unit, at rest.
+    """
+
+    evidence: Floats
+    dead: Floats
+
+
+@dataclass(frozen=True)
+class FailingWires:
+    """What the wires say of each cell.
+
+    Attributes:
+        evidence: float ``[D]``, of the worst wire of each cell, after the factors; 0: none.
+        wire: int ``[D]``, number of the wire that fails, from 0; -1: none.
+    probability: float ``[D]``, of this wire; 0: none.
+        against: bool ``[units, D]``, units in which these were at rest.
+    share: float ``[D]``, of the tested units.
+    """
+
+    evidence: Floats
+    wire: NDArray[np.intp]
+    probability: Floats
+    against: Mask
+    share: Floats
+
+    @property
+    def refuted(self) -> Mask:
+        """bool ``[D]``, cells on wires that fail."""
+        found: Mask = self.wire >= 0
+        return found
+
+
+def wire_log(
+    log: LifeLog, wires: WireModel, known: Mask, eligible: Mask
+) -> Generator[None, None, tuple[LevelLog, NDArray[np.intp], Floats]]:
+    """Yield between steps; return the levels of the wires, what the others say of them, and
+    log P(level | healthy), ``[n, W]``.
+
+    Args:
+        log: the levels of the cells.
+        wires: the model.
+        known: bool ``[D]``, cells that predict others.
+        eligible: bool ``[D]``, cells that tell of their wire.
+    """
+    read = np.isfinite(wires.mean_loads(log.readings, eligible))
+    read &= wires.told(log.loads, known)
+    own = LevelLog(wires.mean_loads(log.loads, eligible), read, log.piece, wires, log.weight)
+    expected = yield from wires.expected(log.model.means, log.loads, known, eligible)
+    context = wires.contexts(expected, log.loads, known)
+    table = wires.probabilities[wires.of_cell(np.arange(len(wires.on)))]
+    healthy = own.tilted(table, context, own.level)
+    return own, context, healthy
+
+
+def tested_wires(
+    log: LifeLog, wires: WireModel, known: Mask, eligible: Mask
+) -> Generator[None, None, WireTest]:
+    """Yield between steps; return the evidence of each wire; arguments as in :func:`wire_log`."""
+    own, context, healthy = yield from wire_log(log, wires, known, eligible)
+    yield
+    ratio = own.at_rest - healthy
+    # A load that is not predicted, as of a faulty cell on the wire, is no sign of an open one.
+    ratio = np.where(own.level > 0, np.minimum(ratio, 0.0), ratio)
+    dead = own.counted(ratio)
+    intermittent, _ = dies_and_recovers(dead)
+    opens = yield from opens_under_load(own, ratio, context // (len(BESIDE) + 1))
+    evidence = np.maximum(intermittent, opens)
+    # Its cells tell more of a wire that broke once and for all: the value that they hold, since
+    # when.
+    evidence = np.where(from_some_unit(dead) < evidence, evidence, 0.0)
+    enough = (wires.on & eligible).sum(axis=1) >= FEWEST_CELLS
+    # Where healthy ones look as if they failed, the others do not tell of the wire.
+    enough &= wires.reached[0] < THRESHOLD
+    # An open wire reads one and the same: rest levels that creep look like loads, and like none.
+    readings = wires.mean_loads(log.readings, eligible)
+    without = np.where((own.level == 0) & (ratio > 0) & own.read, readings, np.nan)
+    wanders = np.fmax.reduce(without) - np.fmin.reduce(without)
+    enough &= ~(wanders > 2 * log.model.tolerance)
+    # Those beside it tell most of a wire.
+    enough &= (wires.beside & known).sum(axis=1) >= MAJORITY * wires.beside.sum(axis=1)
+    return WireTest(np.where(enough, evidence, 0.0), dead)
+
+
+def failing_wires(log: LifeLog, known: Mask, eligible: Mask) -> Generator[None, None, FailingWires]:
+    """Yield between steps; return what the wires say of each cell; arguments as in
+    :func:`wire_log`."""
+    evidence = np.zeros(len(known))
+    wire = np.full(len(known), -1)
+    probability = np.zeros(len(known))
+    against = np.zeros((log.units, len(known)), bool)
+    share = np.zeros(len(known))
+    wires = log.model.wires
+    for _ in range(0 if wires is None else _MOST_WIRES):
+        assert wires is not None
+        found = yield from tested_wires(log, wires, known & (wire < 0), eligible & (wire < 0))
+        scaled = found.evidence * wires.factors(log.units)[0]
+        of_cell = np.where(wires.on & eligible & (wire < 0), scaled[:, None], 0.0).max(axis=0)
+        evidence = np.maximum(evidence, of_cell)
+        worst = int(np.argmax(scaled))
+        if scaled[worst] <= _PROVEN:
+            break
+        on = wires.on[worst] & eligible & (wire < 0)
+        dead = found.dead[:, worst]
+        against[:, on] = (dead > _AGAINST)[:, None]
+        share[on] = (dead > TESTED).sum() / max(1, (np.abs(dead) > TESTED).sum())
+        wire[on] = wire.max() + 1
+        probability[on] = expit(scaled[worst] - _BROKEN)
+    return FailingWires(evidence, wire, probability, against, share)

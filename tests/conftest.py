@@ -19,9 +19,13 @@ from adaptfault.bundle.bundle import Bundle
 from adaptfault.cli import main
 from adaptfault.data.recordings import Recordings, save_npz
 from adaptfault.data.simulated_grasps import simulate
+from adaptfault.models import forest
 from adaptfault.models.store import save_model
 from diagnostics import Fault, FaultSet, Line, SelfDiagnosis, SensorLayout, inject, line_fault
 from diagnostics.decision.calibration import Calibrator
+
+_TREES = forest.TREES
+_WITH_TREES = ("forest", "heads")
 
 # The same few examples on every machine.
 hypothesis.settings.register_profile(
@@ -32,19 +36,38 @@ hypothesis.settings.load_profile("few")
 
 @pytest.hookimpl(trylast=True)  # after the choice of tests
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put what needs a costly fixture together, so that the processes of ``pytest -n 2`` do not
-    wait for each other.
+    """Put what needs a costly fixture together, so that the processes of ``pytest -n 2`` neither
+    wait for each other nor make the fixtures of a module twice.
 
     Each process gets one half: the first begins with the fitted diagnosis, the second with the
-    bundle.
+    bundle. Tests that share nothing end each half: an idle process takes them over from there.
     """
-    parts: dict[str, list[pytest.Item]] = {"fitted": [], "made_bundle": [], "versions": [], "": []}
+    parts: dict[str, list[pytest.Item]] = {
+        "fitted": [],
+        "made_bundle": [],
+        "versions": [],
+        "graph": [],
+        "of a module": [],
+        "": [],
+    }
     for item in items:
         names = getattr(item, "fixturenames", ())
-        parts[next((costly for costly in parts if costly in names), "")].append(item)
-    fitted, bundle, versions, others = parts.values()
-    half = max(0, len(items) // 2 - len(fitted))
-    items[:] = [*fitted, *others[:half], *bundle, *versions, *others[half:]]
+        costly = next((name for name in parts if name in names), "")
+        if not costly and shares_with_its_module(item):
+            costly = "of a module"
+        parts[costly].append(item)
+    fitted, bundle, versions, graph, of_module, others = parts.values()
+    first = [*fitted, *of_module]
+    rest = max(0, len(items) // 2 - len(first))
+    items[:] = [*first, *others[:rest], *bundle, *versions, *graph, *others[rest:]]
+
+
+def shares_with_its_module(item: pytest.Item) -> bool:
+    """Return whether a test has a fixture of the scope of a module."""
+    fixtures = getattr(item, "_fixtureinfo", None)
+    if fixtures is None:
+        return False
+    return any(made[-1].scope == "module" for made in fixtures.name2fixturedefs.values())
 
 
 @pytest.fixture(scope="session")
@@ -150,6 +173,20 @@ def versions(made_once) -> dict[str, Path]:
     parts."""
     home = made_once("versions", export_versions)
     return {name: home / name for name in DROPPED}
+
+
+@pytest.fixture(scope="session")
+def small_graph(versions: dict[str, Path], made_once) -> bytes:
+    """The ONNX graph of this network with any head in closed form."""
+
+    def make(home: Path) -> None:
+        from adaptfault.adaptation.result import Adaptation
+        from adaptfault.prediction.export import graph_of
+
+        network = Adaptation.load(versions["whole"]).model.network
+        (home / "graph.onnx").write_bytes(graph_of(network))
+
+    return (made_once("graph", make) / "graph.onnx").read_bytes()
 
 
 def small_forest(course: Any) -> Any:
@@ -284,6 +321,22 @@ def without_export() -> Iterator[None]:
         patch.setattr("adaptfault.prediction.export.add_onnx", missing)
         patch.setattr("adaptfault.prediction.export.graph_of", missing)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_trees() -> Iterator[None]:
+    """Let a head have 40 trees in place of 200, which take most of its time; see ``all_trees``."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in _WITH_TREES:
+            patch.setattr(f"adaptfault.models.{module}.TREES", 8)
+        yield
+
+
+@pytest.fixture
+def all_trees(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a head have its 200 trees, where its accuracy is what is proven."""
+    for module in _WITH_TREES:
+        monkeypatch.setattr(f"adaptfault.models.{module}.TREES", _TREES)
 
 
 @contextmanager

@@ -53,6 +53,7 @@ _WIDE = 1.5  # standardised errors beyond this count less (Huber 1964)
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Learned = tuple[Floats, Floats]  # log gain and offset of each cell, [D]
 
 
 @dataclass(frozen=True)
@@ -125,14 +126,15 @@ def find_recalibration(
         return None
     fit = _Fit(reference, layout, used, np.quantile(np.concatenate(old), LOW, axis=0))
     halves = new[::2], new[1::2]
-    # of pseudo-likelihood in each recording, [recordings, with gains or without, pads]
+    of_halves = [fit.learned(half) for half in halves]
+    differing = [on for on in fit.pads if fit.differ(on & used, *of_halves)]
+    if not differing:
+        return None
+    clear = [on & ~statically_loaded for on in differing]
+    # of pseudo-likelihood in each recording, [recordings, with gains or without, differing pads]
     gains = []
-    of_halves = []
-    for learned, other in (halves, halves[::-1]):
-        log_gain, offset = fit.learned(learned)
-        of_halves.append((log_gain, offset))
+    for (log_gain, offset), other in zip(of_halves, halves[::-1], strict=True):
         plain = fit.scores(other, 0 * log_gain, 0 * offset)
-        clear = [on & ~statically_loaded for on in fit.pads]
         gains.append(
             [
                 [fit.scores(other, s * log_gain * on, offset * on) - plain for on in clear]
@@ -141,26 +143,25 @@ def find_recalibration(
         )
     gained = np.concatenate(gains, axis=2)
     best = gained.mean(axis=2).argmax(axis=0)
+    certain = [i for i in range(len(differing)) if _certain(gained[best[i], i])]
+    if not certain:
+        return None
     log_gain, offset = fit.learned(new)
     gain = np.ones_like(log_gain)
     rest = reference.scale.baseline
     replaced = []
     moved = np.zeros_like(offset)
-    for pad, on in enumerate(fit.pads):
-        correlation, errors = _correlation(offset, on & ~statically_loaded, layout)
+    for i in certain:
+        on = differing[i]
+        correlation, errors = _correlation(offset, clear[i], layout)
         # A strap or an object loads neighbouring cells alike; what lies on few pairs of cells is
         # not told from it.
         hidden = correlation > _ERRORS * errors or (
             statically_loaded[on].any() and not np.isfinite(errors)
         )
-        (gain_1, offset_1), (gain_2, offset_2) = of_halves
-        by_gain = _common_spread(gain_1, gain_2, on & used)
-        by_offset = _common_spread(offset_1, offset_2, on & used)
-        # What is learned is shrunk: half of what matters is enough.
-        differ = by_gain >= np.log(GAIN) / 2 or by_offset >= SLIGHT / 2 * reference.scale.full_scale
-        if differ and _certain(gained[best[pad], pad]) and not hidden:
-            replaced.append(pad)
-            gain[on] = np.exp(log_gain[on]) if best[pad] == 0 else 1.0
+        if not hidden:
+            replaced.append(int(layout.pad_of[on][0]))
+            gain[on] = np.exp(log_gain[on]) if best[i] == 0 else 1.0
             moved[on] = (rest + offset - gain * rest)[on]
     return Recalibration(gain, moved, tuple(replaced), len(new)) if replaced else None
 
@@ -220,7 +221,18 @@ class _Fit:
         present = self.layout.present.ravel()
         return [(self.layout.pad_of == i) & present for i in range(self.layout.pads)]
 
-    def learned(self, recordings: Sequence[Floats]) -> tuple[Floats, Floats]:
+    def differ(self, on: Mask, one: Learned, other: Learned) -> bool:
+        """Return whether either half of a log gives some cells (bool ``[D]``) the same gains or
+        offsets, which differ between the cells.
+
+        What is learned is shrunk: half of what matters is enough.
+        """
+        by_gain = _common_spread(one[0], other[0], on)
+        by_offset = _common_spread(one[1], other[1], on)
+        slight = SLIGHT * self.reference.scale.full_scale
+        return bool(by_gain >= np.log(GAIN) / 2 or by_offset >= slight / 2)
+
+    def learned(self, recordings: Sequence[Floats]) -> Learned:
         """Return log gain and offset of each cell, ``[D]``; the offset in the layout's unit, of the
         baseline."""
         offset = np.quantile(np.concatenate(recordings), LOW, axis=0) - self.least

@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics.events.contact_events import THE_SAME, Summary, count_repeats
+from diagnostics.events.contact_events import THE_SAME, count_repeats
 from diagnostics.healthy.model import contact_events
 from diagnostics.healthy.prediction import MIN_P_FLOOR, OUTLIERS, log_student_t
 from diagnostics.preprocessing.levels import CERTAIN_RATIO, MAJORITY
@@ -248,11 +248,36 @@ class _Test:
         """Log likelihood of what each channel did, given its own other events alone, ``[n, D]``."""
         return _log_likelihood_alone(self._features(np.arange(len(self.used))))
 
+    @cached_property
+    def _frames(self) -> tuple[Floats, Cells]:
+        """The frames of all events, one after the other ``[T, D]``, and where each event ends."""
+        return np.concatenate(self.events), np.cumsum([len(frames) for frames in self.events])
+
+    @cached_property
+    def _unmoved(self) -> NDArray[np.float32]:
+        """The features of the events as they came, ``[n, 4, D]``."""
+        return self._features_of(np.arange(len(self.used)), self.scale)
+
     def _features(self, source: Cells) -> NDArray[np.float32]:
         """Return the features of the events with the readings put back, ``[n, 4, D]``."""
-        near = self.scale.root_near
-        roots = (self.scale.root_load(frames[:, source]) for frames in self.events)
-        return np.stack([Summary.of(root, 0, near).features() for root in roots])
+        moved = np.flatnonzero(source != np.arange(len(source)))
+        features = self._unmoved.copy()
+        features[:, :, moved] = self._features_of(source[moved], self.scale.of(moved))
+        return features
+
+    def _features_of(self, channels: Cells, scale: Scale) -> NDArray[np.float32]:
+        """Return what :meth:`Summary.features` says of some channels, ``[n, 4, channels]``, in all
+        events at once."""
+        frames, ends = self._frames
+        root = scale.root_load(frames[:, channels])
+        first = np.append(0, ends[:-1])
+        lengths = (ends - first)[:, None].astype(np.float32)
+        most = np.maximum.reduceat(root, first, axis=0)
+        # not reduceat: it rounds otherwise
+        total = np.stack([of_event.sum(axis=0) for of_event in np.split(root, ends[:-1])])
+        loaded = np.add.reduceat(root > scale.root_near, first, axis=0, dtype=np.float32)
+        ever = (loaded > 0).astype(np.float32)
+        return np.stack([most, total / lengths, ever, loaded / lengths], axis=1)
 
     def settled(self, source: Cells, score: _Score) -> _Score:
         """Return the score of one permutation once its faulty channels are no predictors;

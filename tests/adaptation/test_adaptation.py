@@ -119,6 +119,7 @@ def textures(n: int, seed: int) -> Windows:
     return Windows(x.astype(np.float32), y, np.arange(n))
 
 
+@pytest.mark.usefixtures("all_trees")
 def test_a_repair_keeps_up_with_trees_where_texture_tells_the_class():
     training, validation, test = textures(200, 0), textures(100, 1), textures(400, 2)
     untrained = TactileTransformer(LAYOUT, 3)
@@ -157,12 +158,12 @@ def test_the_reduced_model_refuses_windows_with_the_faulty_cells_still_in(adapte
 # Stages
 
 
-def test_each_stage_repairs_and_none_is_worse_than_the_one_before(adapter):
-    broken = adapter.validation.x.copy()
+def test_each_stage_repairs_and_none_is_worse_than_the_one_before(quick):
+    broken = quick.validation.x.copy()
     broken[:, :, list(F)] = 1.0
-    collapsed = (adapter.model.predict(broken) == adapter.validation.y).mean()
+    collapsed = (quick.model.predict(broken) == quick.validation.y).mean()
     reached = [
-        adapter.adapt(F, method=m, progress=False).scores.accuracy
+        quick.adapt(F, method=m, progress=False).scores.accuracy
         for m in ("fill", "head", "finetune")
     ]
     assert collapsed < 0.7

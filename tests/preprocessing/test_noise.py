@@ -13,10 +13,12 @@ LAYOUT = SensorLayout(1, 8, 8, full_scale=4095, unit="count", rate=20.0)
 PRESENT = np.ones(64, bool)
 
 
-def touched(seed: int, noise: float, layout: SensorLayout = LAYOUT) -> list[np.ndarray]:
+def touched(
+    seed: int, noise: float, layout: SensorLayout = LAYOUT, each: int = 12
+) -> list[np.ndarray]:
     """Grasps at a rest of 1 %, with noise of this share of full scale."""
     rng = np.random.default_rng(seed)
-    frames = simulate(40, layout, n_frames=60, seed=seed).frames
+    frames = simulate(each, layout, n_frames=60, seed=seed).frames
     read = (
         0.01 * layout.full_scale + 0.9 * f + rng.normal(0, noise * layout.full_scale, f.shape)
         for f in frames
@@ -38,7 +40,7 @@ def untouched(
 @pytest.fixture(scope="module")
 def fitted() -> SelfDiagnosis:
     with without_calibration():
-        return SelfDiagnosis(LAYOUT).fit(touched(0, 0.0005))
+        return SelfDiagnosis(LAYOUT).fit(touched(0, 0.0005, each=40))
 
 
 @settings(max_examples=50, deadline=None)

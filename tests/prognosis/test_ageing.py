@@ -152,7 +152,7 @@ def test_runs_of_a_robot_show_the_cell_that_weakens_and_when_it_will_be_too_weak
     assert "no run has measured" in capsys.readouterr().out
     today = datetime(2026, 1, 1, tzinfo=timezone.utc)
     grasps = af.simulate(8, layout, n_frames=40, seed=100, classes=power_cut.CLASSES[1:])
-    for week in range(13):
+    for week in range(10):
         rng = np.random.default_rng(week)
         frames = [
             np.abs(np.concatenate([f, 0 * f]) + rng.normal(0, 0.01, (80, layout.n_cells)))
@@ -168,12 +168,12 @@ def test_runs_of_a_robot_show_the_cell_that_weakens_and_when_it_will_be_too_weak
         monkeypatch.setattr("adaptfault.robot.maintenance.now", lambda day=day: day)
         assert main(["maintain", str(path), str(tmp_path / f"{week}.npz"), "--quiet"]) in (0, 1, 2)
     table = AgeingTable.of(Bundle.open(path))
-    assert table.values.shape == (13, 4, layout.n_cells)
+    assert table.values.shape == (10, 4, layout.n_cells)
     assert table.times[-1] in table.last_alive
     capsys.readouterr()
     assert main([*command, "--picture", str(tmp_path / "trend.png")]) == 0
     text = capsys.readouterr().out
-    assert "13 runs from 2026-01-01" in text
+    assert "10 runs from 2026-01-01" in text
     assert f"{layout.place(weak)}: gain" in text
     assert (tmp_path / "trend.png").stat().st_size > 1000
     assert main([*command, "--json"]) == 0

@@ -36,7 +36,7 @@ ON_RECORDINGS = {
 LESS = {  # they take minutes
     "attack.py": ["--small"],
     "design_study.py": ["--small"],
-    "force.py": ["--grasps", "12", "--epochs", "2"],
+    "force.py": ["--grasps", "8", "--epochs", "1"],
     "fine_tuning.py": ["--small"],
     "forecast_intervals.py": ["--small"],
     "restore_speed.py": ["--grasps", "1", "--repeats", "5"],

@@ -644,7 +644,7 @@ def test_each_reading_has_one_position_and_absent_ones_hold_0(sizes):
 
 
 def test_a_lerobot_data_set_goes_through_info_diagnose_and_convert(tmp_path, grasps, capsys):
-    which = [i for i in range(len(grasps)) if i % 20 < 6]
+    which = [i for i in range(len(grasps)) if i % 20 < 2]
     touch = [grasps.frames[i].reshape(-1, 2, 11, 10) for i in which]
     left = [one[:, 0] for one in touch]
     right = [one[:, 1] for one in touch]

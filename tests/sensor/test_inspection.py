@@ -2,6 +2,7 @@
 blame."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,7 +45,10 @@ def reference() -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def known(reference, made_once) -> SelfDiagnosis:
-    return SelfDiagnosis(LAYOUT).fit(reference)
+    def make(folder: Path) -> None:
+        SelfDiagnosis(LAYOUT).fit(reference).save(folder / "known.npz")
+
+    return SelfDiagnosis.load(made_once("known", make) / "known.npz")
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,11 @@ from pathlib import Path
 import gestures
 import numpy as np
 import static_holds
-from other_sensors import DRIFTS, SENSORS, remade
+from other_sensors import DRIFTS, SENSORS
 from random_sensors import draw
 from rows import Bench
 
+from adaptfault.bench.changes import remade
 from adaptfault.data.recordings import Recordings, load
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import SensorLayout

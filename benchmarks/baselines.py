@@ -1,11 +1,21 @@
-"""Simple detectors beside ours: python benchmarks/diagnosis.py --method baselines:Constant
+"""Methods beside ours, by the doors that are open to all, in the folder ``benchmarks``:
 
-Each has ``fit`` and ``detect``, as any detector of ``--method`` does.
+    python diagnosis.py --method baselines:Constant
+    python -m adaptfault.bench run FOLDER --diagnoser baselines:Constant --out constant.json
+    python -m adaptfault.bench run FOLDER --repairer baselines:Trees --out trees.json
+
+Public tools (``pip install 'adaptfault[compare]'``) have the settings they ship with.
 """
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterable
+
 import numpy as np
+from compare_tools import Known, mne_lof, pyprep_ransac, spikeinterface_r2
+from repair import PEERS, summary
+from sklearn.impute import KNNImputer
 
 from diagnostics import SensorLayout
 
@@ -77,3 +87,122 @@ class Capa:
                 end == length and end - start >= LASTING * length for start, end in segments
             )
         return faulty
+
+
+class Saqc:
+    """SaQC's flagConstants, with its threshold of 0: a cell is faulty if it is constant over the
+    last quarter of the log."""
+
+    def fit(self, recordings: list[np.ndarray], layout: SensorLayout) -> Saqc:
+        """Learn nothing."""
+        return self
+
+    def detect(self, recordings: list[np.ndarray]) -> np.ndarray:
+        """Return bool ``[D]``."""
+        import pandas as pd
+        from saqc import SaQC
+
+        whole = np.concatenate(recordings)
+        times = pd.date_range("2000-01-01", periods=len(whole), freq="s")
+        names = [str(cell) for cell in range(whole.shape[1])]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what SaQC calls of pandas is deprecated
+            quality = SaQC(pd.DataFrame(whole, index=times, columns=names))
+            quality = quality.flagConstants(names, window=round(LASTING * len(whole)))
+            flags = quality.flags.to_pandas()
+        return np.array([flags[name].iloc[-1] > 0 for name in names])
+
+
+class Tool:
+    """A public tool as :mod:`compare_tools` calls it."""
+
+    def fit(self, recordings: list[np.ndarray], layout: SensorLayout) -> Tool:
+        """Keep the layout; the tools learn nothing."""
+        self.known = Known(layout, np.concatenate(recordings))
+        return self
+
+    def detect(self, recordings: list[np.ndarray]) -> np.ndarray:
+        """Return bool ``[D]``."""
+        found = [int(cell) for cell in self.call(recordings)]
+        return np.isin(np.arange(self.known.layout.n_cells), found)
+
+    def call(self, log: list[np.ndarray]) -> Iterable[int | str]:
+        """Return the cells that the tool calls bad."""
+        raise NotImplementedError
+
+
+class MneLof(Tool):
+    """MNE, find_bad_channels_lof."""
+
+    def call(self, log: list[np.ndarray]) -> Iterable[int | str]:
+        """Return bad channels."""
+        return mne_lof(self.known, 1.5, log)
+
+
+class Pyprep(Tool):
+    """pyprep, RANSAC."""
+
+    def call(self, log: list[np.ndarray]) -> Iterable[int | str]:
+        """Return bad channels."""
+        return pyprep_ransac(self.known, 0.75, log)
+
+
+class SpikeInterface(Tool):
+    """SpikeInterface, neighborhood_r2."""
+
+    def call(self, log: list[np.ndarray]) -> Iterable[int | str]:
+        """Return bad channels."""
+        return spikeinterface_r2(self.known, 0.9, log)
+
+
+class Trees:
+    """ExtraTrees, trained anew on the healthy cells."""
+
+    def fit(self, x: np.ndarray, y: np.ndarray, faults: np.ndarray, layout: SensorLayout) -> Trees:
+        """Train."""
+        self.healthy = ~faults
+        self.trees = PEERS["trees"]().set_params(n_jobs=1).fit(summary(x[..., self.healthy]), y)
+        return self
+
+    def predict(self, x: np.ndarray) -> np.ndarray:
+        """Return classes ``[N]``."""
+        return self.trees.predict(summary(x[..., self.healthy]))
+
+
+class Zeros:
+    """ExtraTrees trained before the fault; dead cells read 0."""
+
+    def fit(self, x: np.ndarray, y: np.ndarray, faults: np.ndarray, layout: SensorLayout) -> Zeros:
+        """Train if there are no trees yet."""
+        self.faults = faults
+        self.x = x
+        if not hasattr(self, "trees"):
+            self.trees = PEERS["trees"]().set_params(n_jobs=1).fit(summary(x), y)
+        return self
+
+    def filled(self, x: np.ndarray) -> np.ndarray:
+        """Return windows whose dead cells are filled."""
+        return np.where(self.faults, 0.0, x)
+
+    def predict(self, x: np.ndarray) -> np.ndarray:
+        """Return classes ``[N]``."""
+        return self.trees.predict(summary(self.filled(x)))
+
+
+class Mean(Zeros):
+    """The same; dead cells read their mean in training."""
+
+    def filled(self, x: np.ndarray) -> np.ndarray:
+        """Return windows whose dead cells are filled."""
+        return np.where(self.faults, self.x.mean(axis=(0, 1)), x)
+
+
+class Knn(Zeros):
+    """The same; dead cells read what they do in the nearest frames of training
+    (``KNNImputer``)."""
+
+    def filled(self, x: np.ndarray) -> np.ndarray:
+        """Return windows whose dead cells are filled."""
+        imputer = KNNImputer(keep_empty_features=True).fit(self.x.reshape(-1, x.shape[2]))
+        missing = np.where(self.faults, np.nan, x)
+        return imputer.transform(missing.reshape(-1, x.shape[2])).reshape(x.shape)

@@ -17,9 +17,10 @@ import argparse
 
 import numpy as np
 from arrays import ARRAYS
-from rows import STUCK_KINDS, Bench, broken, draw_faults, kind_of_cells
+from rows import Bench, draw_faults, kind_of_cells
 from scipy.optimize import minimize
 
+from adaptfault.bench.changes import STUCK_KINDS, broken
 from diagnostics import SelfDiagnosis
 
 SIMULATED = ("grasps, 1 x 12 x 12", "grasps, 2 x 11 x 10", "posture, seat", "posture, rests at 5 %")

@@ -27,8 +27,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
-from rows import broken, draw_faults
+from rows import draw_faults
 
+from adaptfault.bench.changes import broken
 from adaptfault.data.recordings import Recordings, load
 from adaptfault.data.simulated_grasps import simulate
 from diagnostics import SelfDiagnosis, SensorLayout

@@ -26,9 +26,11 @@ from pathlib import Path
 import numpy as np
 from arrays import ARRAYS, SPEED, Array
 from joblib import Parallel, delayed, parallel_config
-from own_method import ROWS_OF_F, find_method, needs_only_f
+from own_method import ROWS_OF_F, needs_only_f
 from rows import ROWS
 from tqdm import tqdm
+
+from adaptfault.bench.methods import DIAGNOSER, find_method
 
 Key = tuple[str, str]  # array, row
 Samples = dict[tuple[int, int], dict]  # by split and repeat
@@ -203,7 +205,7 @@ def main() -> int:
         )
     for name in options.method:
         try:
-            find_method(name)()
+            find_method(name, DIAGNOSER)()
         except (ImportError, ValueError) as error:
             parser.error(str(error))
     kept = (

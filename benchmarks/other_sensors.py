@@ -6,34 +6,9 @@ between: the reference is the plain one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-
 import numpy as np
 
-from adaptfault.data.recordings import Recordings
-
-Frames = np.ndarray
-# of readings as a share of full scale, 0..1
-Change = Callable[[Frames, np.random.Generator], Frames]
-
-
-def read_with(noise: float = 0.0, rest: float = 0.0, steps: int = 4095) -> Change:
-    """Read with noise, cells resting at 0.5 to 1.5 times ``rest``, and a converter of so many
-    steps."""
-
-    def change(frames: Frames, rng: np.random.Generator) -> Frames:
-        # the same in all recordings
-        offset = rest * np.random.default_rng(0).uniform(0.5, 1.5, frames.shape[1])
-        read = frames * (1 - 1.5 * rest) + offset + noise * rng.standard_normal(frames.shape)
-        return np.clip(np.round(read * steps) / steps, 0, 1)
-
-    return change
-
-
-def of_each(spread: float, frames: Frames) -> Frames:
-    # the same in all recordings
-    return np.random.default_rng(1).uniform(0, spread, frames.shape[1])
+from adaptfault.bench.changes import Change, Frames, of_each, read_with, wandering
 
 
 def one_supply(moves: float = 0.0) -> Change:
@@ -66,7 +41,7 @@ SENSORS: dict[str, Change] = {
     "root of the load": lambda x, rng: np.sqrt(x),
     "every second frame": lambda x, rng: x[::2],
     "all wander, 0 to 2 %": lambda x, rng: np.minimum(x + rng.uniform(0, 0.02), 1),
-    "each wanders, 0 to 2 %": lambda x, rng: np.minimum(x + rng.uniform(0, 0.02, x.shape[1]), 1),
+    "each wanders, 0 to 2 %": wandering,
     "supply sags": one_supply(),
     "supply sags, pads wander by 2 %": one_supply(0.02),
 }
@@ -80,13 +55,3 @@ DRIFTS: dict[str, Change] = {
     "gain 0.9": lambda x, rng: 0.9 * x,
     "gain 1.15": lambda x, rng: np.minimum(1.15 * x, 1),
 }
-
-
-def remade(recordings: Recordings, change: Change) -> Recordings:
-    """Return what another sensor, of full scale 1, would have recorded."""
-    rng = np.random.default_rng(0)
-    full_scale = recordings.layout.full_scale
-    frames = tuple(
-        change(np.asarray(f, dtype=np.float64) / full_scale, rng) for f in recordings.frames
-    )
-    return replace(recordings, frames=frames, layout=replace(recordings.layout, full_scale=1.0))

@@ -7,16 +7,13 @@ cells are faulty, so only rows that need no more than F are run for it.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
-from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
+from adaptfault.bench.methods import DIAGNOSER, copies, find_method, of_each_cell
 from diagnostics import Fault, FaultSet, SensorLayout
 
 ROWS_OF_F = ("cells", "onset", "dither", "missing", "many", "healthy", "holds", "moving")
@@ -24,18 +21,6 @@ ROWS_OF_F = ("cells", "onset", "dither", "missing", "many", "healthy", "holds", 
 
 FIGURES_OF_F = (": precision", ": recall", ": false alarms")
 """How the names of their figures end that need no more than F."""
-
-
-class Detector(Protocol):
-    """What the benchmark asks of a method."""
-
-    def fit(self, recordings: list[np.ndarray], layout: SensorLayout) -> Detector:
-        """Learn from healthy recordings ``[T, D]``."""
-        ...
-
-    def detect(self, recordings: list[np.ndarray]) -> np.ndarray:
-        """Return bool ``[D]``: True where a cell is faulty."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -80,7 +65,7 @@ class OwnMethod:
     def __init__(self, name: str, layout: SensorLayout) -> None:
         self.name = name
         self.layout = layout
-        self.detector = find_method(name)()
+        self.detector = find_method(name, DIAGNOSER)()
 
     def fit(self, recordings: Iterable[np.ndarray]) -> OwnMethod:
         """Fit the detector to copies of healthy recordings."""
@@ -93,53 +78,8 @@ class OwnMethod:
         Raises:
             ValueError: what it returns is no bool ``[D]``.
         """
-        faulty = np.asarray(self.detector.detect(copies(log)))
-        if faulty.dtype != bool or faulty.shape != (self.layout.n_cells,):
-            raise ValueError(
-                f"{self.name}: detect returned {faulty.dtype} of shape {faulty.shape}; expected"
-                f" bool of shape ({self.layout.n_cells},), one value a cell, True where it is"
-                " faulty; correct detect"
-            )
-        return Found(self.layout, faulty & self.layout.present.ravel())
-
-
-def copies(recordings: Iterable[np.ndarray]) -> list[np.ndarray]:
-    """Return recordings that a detector may change."""
-    return [np.array(frames, dtype=np.float64) for frames in recordings]
-
-
-def find_method(name: str) -> Callable[[], Detector]:
-    """Return the class or function ``module:Name``; modules of the working directory are found,
-    too.
-
-    Raises:
-        ValueError: the text is no such name, or it has no ``fit`` and ``detect``.
-        ImportError: there is no such module, or it needs one that is missing.
-    """
-    module, colon, attribute = name.partition(":")
-    if not (module and colon and attribute):
-        raise ValueError(
-            f"method {name!r}: expected module:Name, such as my_package:MyDetector; write it so"
-        )
-    if str(Path.cwd()) not in sys.path:
-        sys.path.append(str(Path.cwd()))
-    try:
-        found = import_module(module)
-    except ImportError as error:
-        raise ImportError(
-            f"method {name!r}: {module} cannot be imported ({error}); install it, or run the"
-            " script where it lies"
-        ) from error
-    if not hasattr(found, attribute):
-        raise ValueError(f"method {name!r}: {module} has no {attribute}; correct the name")
-    build = getattr(found, attribute)
-    lacking = [part for part in ("fit", "detect") if not hasattr(build, part)]
-    if isinstance(build, type) and lacking:
-        raise ValueError(
-            f"method {name!r}: it has no {' and no '.join(lacking)}; a detector has"
-            " fit(recordings, layout) and detect(recordings); add what is missing"
-        )
-    return build
+        faulty = of_each_cell(self.detector.detect(copies(log)), self.name, "detect", self.layout)
+        return Found(self.layout, faulty)
 
 
 def needs_only_f(figure: str) -> bool:

@@ -13,9 +13,9 @@ from collections.abc import Callable
 import gestures
 import numpy as np
 import static_holds
-from other_sensors import Change, Frames, remade
 from scipy.signal import lfilter
 
+from adaptfault.bench.changes import Change, Frames, remade
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.simulated_grasps import CLASS_NAMES, simulate
 from diagnostics import SensorLayout

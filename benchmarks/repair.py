@@ -26,15 +26,15 @@ from pathlib import Path
 
 import numpy as np
 from arrays import DATA, FABRIC, FINGERTIPS, HAND, SOLES
-from other_sensors import Change, of_each, read_with, remade
 from sklearn.ensemble import ExtraTreesClassifier, HistGradientBoostingClassifier
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 import adaptfault as af
+from adaptfault.bench.changes import counted, fault_sets, remade
 from adaptfault.data.windows import evenly
-from diagnostics import FaultSet, SensorLayout
+from diagnostics import SensorLayout
 
 MOST = 2_500  # windows of training and validation
 
@@ -111,16 +111,6 @@ def simulated(split: int) -> Task:
     return by_recording(af.simulate(30, seed=1000 + split), split)
 
 
-def counted(share: float) -> Change:
-    """Read a share of full scale in counts of 10 bits, with rests and gains of their own."""
-
-    def change(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        gained = np.minimum(x * (0.5 + of_each(1.0, x)), 1)
-        return read_with(0.002, 0.1, 1023)(share * gained, rng)
-
-    return change
-
-
 def counts(split: int) -> Task:
     """The simulated grasps in counts of 10 bits, with rests and gains of their own."""
     recordings = af.simulate(30, seed=2000 + split)
@@ -144,26 +134,6 @@ ARRAYS: dict[str, Callable[[int], Task]] = {
     "simulated": simulated,
     "counts": counts,
 }
-
-
-def cases(layout: SensorLayout, seed: int) -> dict[str, FaultSet]:
-    """Return the fault sets."""
-    rng = np.random.default_rng(100 + seed)
-    present = np.flatnonzero(layout.present)
-    index = np.arange(layout.n_cells).reshape(layout.shape)
-    sets = {
-        "none": np.array([], int),
-        "10 %": rng.choice(present, max(1, round(0.1 * len(present))), replace=False),
-        "50 %": rng.choice(present, len(present) // 2, replace=False),
-    }
-    if layout.pads > 1:
-        sets["a pad"] = index[seed % layout.pads].ravel()
-    if layout.rows > 1:
-        sets["a line"] = index[seed % layout.pads, layout.rows // 2].ravel()
-    return {
-        name: FaultSet(tuple(int(c) for c in cells if layout.present.flat[c]), layout.n_cells)
-        for name, cells in sets.items()
-    }
 
 
 def summary(x: np.ndarray) -> np.ndarray:
@@ -204,7 +174,7 @@ def rows(
     """Yield fault set, method, accuracy and seconds of what is not done yet."""
     adapter = af.Adapter(model, task.train, task.validation)
     x, y = task.known()
-    for faults, dead in cases(task.layout, split).items():
+    for faults, dead in fault_sets(task.layout, split).items():
         for method in methods:
             if (faults, method) in done:
                 continue
@@ -261,7 +231,9 @@ def main() -> None:
                     if (row["array"], row["split"]) == (name, split)
                 }
                 task = arrays[name](split)
-                if done >= {(faults, of) for faults in cases(task.layout, split) for of in methods}:
+                if done >= {
+                    (faults, of) for faults in fault_sets(task.layout, split) for of in methods
+                }:
                     continue
                 model = network(name, task, split, args.epochs, args.out.parent)
                 for faults, method, accuracy, seconds in rows(task, model, split, methods, done):

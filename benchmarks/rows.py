@@ -20,6 +20,17 @@ import numpy as np
 from own_method import Found, OwnMethod
 from sklearn.ensemble import ExtraTreesClassifier
 
+from adaptfault.bench.changes import (
+    STUCK_KINDS,
+    TESTABLE,
+    VISIBLE,
+    Log,
+    broken,
+    differs,
+    faults_of,
+    held,
+    parted,
+)
 from adaptfault.data.recordings import Recordings
 from diagnostics import (
     Diagnosis,
@@ -37,14 +48,7 @@ from diagnostics import (
 from diagnostics.sensor.recalibration import find_recalibration
 from diagnostics.sensor.sensor_change import pad_change
 
-Log = list[np.ndarray]
-STUCK_KINDS = ("open", "short", "stuck")
-# of full scale; frames
-VISIBLE = 0.05
-TESTABLE = 10
-# frames of a static hold; of a window in which a cell can raise a false alarm
-HELD = 300
-WINDOW = 50
+WINDOW = 50  # frames in which a cell can raise a false alarm
 REPEATED = 100  # frames of a frozen stream, beyond the longest repetition that still counts as idle
 CHANGING = (FaultKind.INTERMITTENT, FaultKind.NOISY, FaultKind.DRIFT)
 # times the load; what is left at the end
@@ -208,38 +212,7 @@ def draw_faults(
 ) -> list[Fault]:
     present = np.flatnonzero(layout.present)
     cells = rng.choice(present, round(share * len(present)), replace=False)
-    return [
-        Fault(
-            kind,
-            (int(cell),),
-            value=rng.uniform(0.1, 0.9) * layout.full_scale if kind == "stuck" else None,
-        )
-        for cell, kind in zip(
-            cells, rng.choice([FaultKind(k) for k in kinds], len(cells)), strict=True
-        )
-    ]
-
-
-def broken(
-    log: Log, faults: list[Fault], layout: SensorLayout, onset: float, dither: float, seed: int
-):
-    """Yield the recordings of a log that breaks after a share ``onset`` of its frames."""
-    start = round(onset * sum(map(len, log)))
-    for i, frames in enumerate(log):
-        here = [
-            Fault(f.kind, f.cells, line=f.line, value=f.value, onset=max(0, start)) for f in faults
-        ]
-        yield inject(frames, here, layout, seed=1000 * seed + i, dither=dither)
-        start -= len(frames)
-
-
-def differs(a: np.ndarray, b: np.ndarray, layout: SensorLayout) -> np.ndarray:
-    return np.abs(np.nan_to_num(a - b)) > VISIBLE * layout.full_scale
-
-
-def parted(whole: np.ndarray, log: Log) -> Log:
-    """Return the frames ``[T, D]`` of a whole log as its recordings."""
-    return np.split(whole, np.cumsum([len(frames) for frames in log])[:-1])
+    return faults_of(cells, kinds, layout, rng)
 
 
 def kind_of_cells(faults: Sequence[Fault]) -> dict[int, FaultKind]:
@@ -486,17 +459,6 @@ def address(bench: Bench) -> Iterator[Count]:
     yield Count("  other cells blamed in a log", blamed, asked, higher=False)
 
 
-def held(log: Log, layout: SensorLayout, rng: np.random.Generator) -> Log:
-    """Return a log in which the last frame of each recording is held, the loaded cells within +-1
-    converter count."""
-    count = layout.full_scale / 4095
-    seen = []
-    for frames in log:
-        jitter = count * rng.integers(-1, 2, (HELD, layout.n_cells)) * (frames[-1] > count)
-        seen.append(np.concatenate([frames, np.clip(frames[-1] + jitter, 0.0, layout.full_scale)]))
-    return seen
-
-
 def windows_of(log: Log, layout: SensorLayout) -> int:
     """Return in how many windows a cell could raise a false alarm."""
     return round(layout.present.sum() * sum(map(len, log)) / WINDOW)
@@ -516,7 +478,7 @@ def healthy(bench: Bench) -> Iterator[Count]:
 def holds(bench: Bench) -> Iterator[Count]:
     false = windows = 0
     for _, log, rng in bench.logs():
-        seen = held(log, bench.layout, rng)
+        seen = [held(frames, rng, bench.layout.full_scale) for frames in log]
         false = false + len(bench.fitted.diagnose(seen).fault_set)
         windows = windows + windows_of(seen, bench.layout)
     yield Count("healthy, held: false alarms", 1e6 * false, windows, "in 1e6 windows", higher=False)

@@ -42,6 +42,41 @@ def test_with_one_window_a_recording_the_threshold_is_that_of_split_conformal_pr
         assert sets.threshold(alpha) == pytest.approx(np.sort(scores)[rank - 1])
 
 
+class Given:
+    """A classifier for MAPIE whose inputs are its probabilities."""
+
+    def __init__(self, n_classes: int) -> None:
+        self.classes_ = np.arange(n_classes)
+        self.n_features_in_ = n_classes
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return True
+
+    def fit(self, x: np.ndarray, y: np.ndarray) -> "Given":
+        return self
+
+    def predict_proba(self, x: np.ndarray) -> np.ndarray:
+        return x
+
+    def predict(self, x: np.ndarray) -> np.ndarray:
+        return x.argmax(axis=1)
+
+
+@pytest.mark.parametrize("recordings", [25, 60, 300])
+def test_with_one_window_a_recording_the_sets_are_those_of_mapie(recordings):
+    mapie = pytest.importorskip("mapie.classification", reason="pip install mapie")
+    rng = np.random.default_rng(recordings)
+    y = rng.integers(0, 4, recordings)
+    likely = rng.dirichlet(np.ones(4), recordings) + np.eye(4)[y] * rng.random((recordings, 1))
+    likely /= likely.sum(axis=1, keepdims=True)
+    new = rng.dirichlet(np.ones(4), 500)
+    ours = PredictionSets.fit(likely, y, np.arange(recordings))
+    for alpha in (0.05, 0.1, 0.3):
+        theirs = mapie.SplitConformalClassifier(Given(4), 1 - alpha, conformity_score="lac")
+        _, sets = theirs.conformalize(likely, y).predict_set(new)
+        assert np.array_equal(ours.sets(new, alpha), sets[:, :, 0])
+
+
 def test_too_few_recordings_give_sets_of_all_classes():
     sets = PredictionSets.fit(*drawn(np.random.default_rng(1), 8))
     assert sets.threshold(0.1) == np.inf

@@ -14,9 +14,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 
 import diagnosis
 from arrays import Array, grasps, simulated
-from own_method import FIGURES_OF_F, ROWS_OF_F, OwnMethod, find_method
+from own_method import FIGURES_OF_F, ROWS_OF_F, OwnMethod
 from rows import ROWS
 
+from adaptfault.bench.methods import DIAGNOSER, find_method
 from diagnostics import SensorLayout
 
 HOME = Path(__file__).resolve().parents[2]
@@ -111,13 +112,13 @@ def test_what_is_no_detector_is_refused_with_what_to_do(tmp_path, monkeypatch, c
     )
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ValueError, match="expected module:Name, such as my_package:MyDetector"):
-        find_method("baselines")
+        find_method("baselines", DIAGNOSER)
     with pytest.raises(ValueError, match="baselines has no Nothing; correct the name"):
-        find_method("baselines:Nothing")
-    with pytest.raises(ValueError, match=r"it has no detect; a detector has fit.*add what"):
-        find_method("method_of_a_kind:Half")
+        find_method("baselines:Nothing", DIAGNOSER)
+    with pytest.raises(ValueError, match=r"it has no detect; a method has fit.*add what"):
+        find_method("method_of_a_kind:Half", DIAGNOSER)
     with pytest.raises(ImportError, match="no_such_module cannot be imported"):
-        find_method("no_such_module:Name")
+        find_method("no_such_module:Name", DIAGNOSER)
     with pytest.raises(ValueError, match=r"returned int64 of shape \(2,\); expected bool of"):
         OwnMethod("method_of_a_kind:Numbers", LAYOUT).diagnose([np.zeros((3, 16))])
     with pytest.raises(SystemExit):

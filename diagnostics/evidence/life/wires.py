@@ -38,7 +38,7 @@ FEWEST_CELLS = 3  # of a wire, from which on they tell of it
 # Evidence that makes up for how rare broken wires are, and for contacts unlike the reference's.
 _BROKEN = CERTAIN_RATIO / 2 - float(np.log(EXPECTED_LATE))
 _PROVEN = _BROKEN + float(np.log(9.0))  # at odds of 9
-_MOST_WIRES = 4  # that fail in a log: a size
+_MOST_WIRES = 4  # that fail in a log: where more do, the whole array is disturbed
 _AGAINST = 1.0  # log ratio from which on a unit speaks against a wire
 
 
@@ -62,9 +62,9 @@ class FailingWires:
     Attributes:
         evidence: float ``[D]``, of the worst wire of each cell, after the factors; 0: none.
         wire: int ``[D]``, number of the wire that fails, from 0; -1: none.
-    probability: float ``[D]``, of this wire; 0: none.
+        probability: float ``[D]``, of this wire; 0: none.
         against: bool ``[units, D]``, units in which these were at rest.
-    share: float ``[D]``, of the tested units.
+        share: float ``[D]``, share of the tested units in which they were at rest.
     """
 
     evidence: Floats
@@ -140,14 +140,16 @@ def failing_wires(log: LifeLog, known: Mask, eligible: Mask) -> Generator[None, 
     against = np.zeros((log.units, len(known)), bool)
     share = np.zeros(len(known))
     wires = log.model.wires
-    for _ in range(0 if wires is None else _MOST_WIRES):
-        assert wires is not None
+    while wires is not None:
         found = yield from tested_wires(log, wires, known & (wire < 0), eligible & (wire < 0))
         scaled = found.evidence * wires.factors(log.units)[0]
         of_cell = np.where(wires.on & eligible & (wire < 0), scaled[:, None], 0.0).max(axis=0)
         evidence = np.maximum(evidence, of_cell)
         worst = int(np.argmax(scaled))
         if scaled[worst] <= _PROVEN:
+            break
+        if wire.max() + 1 == _MOST_WIRES:
+            wire[:] = -1
             break
         on = wires.on[worst] & eligible & (wire < 0)
         dead = found.dead[:, worst]

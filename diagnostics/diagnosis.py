@@ -16,7 +16,7 @@ from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
 from diagnostics.decision.certificate import Certificate, certify
 from diagnostics.decision.line_cover import candidate_groups
 from diagnostics.decision.result import Diagnosis
-from diagnostics.decision.root_causes import CellFindings, root_causes
+from diagnostics.decision.root_causes import OF_WIRES, CellFindings, root_causes
 from diagnostics.decision.serialization import (
     Arrays,
     from_state,
@@ -593,10 +593,8 @@ class SelfDiagnosis:
         # The model of life errs where its reference has no like: only what is far beyond its limits
         # is faulty.
         refuted = np.where(judged, expit(life.evidence + logit(EXPECTED) - CERTAIN_RATIO / 2), 0.0)
-        # What lies still on a pad was not known when life was tested.
-        pad = stream.layout.pad_of
-        on_wire = judged & (life.wire >= 0) & ~np.isin(pad, pad[explained])
         # a constant run tells more: its value, its onset; but not of a wire that comes and goes
+        on_wire = judged & (life.wire >= 0)
         by_life = judged & (refuted > stuck) & (stuck < MAJORITY) | on_wire
         probability = np.where(
             present, np.where(certain, _CERTAIN, np.maximum(stuck, refuted)), 0.0
@@ -613,7 +611,12 @@ class SelfDiagnosis:
         held = stream.reading(value)
         beyond = spatial.scored & ~rests
         kind = np.where(by_life & faulty, life.kind, -1)
-        told = np.where(on_wire, life.kind, kind)
+        # Not certain one by one: a wire that fails now and then makes its cells fail together.
+        unsure = judged & ~faulty & ~life.shown & (life.kind < len(OF_WIRES)) & (life.evidence > 0)
+        # What lies still on a pad was not known when life was tested.
+        pad = stream.layout.pad_of
+        unsure &= ~np.isin(pad, pad[explained])
+        told = np.where(unsure, life.kind, kind)
         source = np.where(life.source < 0, np.nan, self._order[life.source])
         of_life = np.stack(
             [held, stream.reading(stream.scale.baseline), life.lag * PIECE, source, life.highest]
@@ -656,6 +659,7 @@ class SelfDiagnosis:
             ),
             known=known,
             refuted=kind,
+            unsure=np.where(unsure, life.kind, -1),
             wire=np.where(on_wire, life.wire, -1),
             of_wire=life.of_wire,
             share=life.share,

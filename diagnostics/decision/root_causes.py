@@ -31,6 +31,9 @@ REFUTED_KINDS = (
     FaultKind.CLAMPED,
 )
 
+# Those that a wire has which fails now and then, as one that opens under load.
+OF_WIRES = REFUTED_KINDS[:2]
+
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -58,6 +61,7 @@ class CellFindings:
         known: cells that were dead in the reference already.
         refuted: int, number of the fault in ``evidence.life.FAULTS`` of cells that move and are
             proved not to be alive; -1: others.
+        unsure: int, the same of cells that may have one of the ``OF_WIRES``; -1: others.
         wire: int, number of the proven wire of such a cell, from 0; -1: others.
         of_wire: float, P(this wire fails).
         share: float, of the contacts in which such a cell was dead.
@@ -79,6 +83,7 @@ class CellFindings:
     events: NDArray[np.intp]
     known: Mask
     refuted: NDArray[np.intp]
+    unsure: NDArray[np.intp]
     wire: NDArray[np.intp]
     of_wire: Floats
     share: Floats
@@ -129,9 +134,12 @@ def _causes(
 ) -> list[tuple[FaultKind, float | None, Cause]]:
     """Return kind, value and cause of each fault; ``common``: lower limit of the prevalence of one
     kind."""
-    causes = _failing_wires(found, aliased, layout)
+    causes = _proven_wires(found, aliased, layout)
     aliased = aliased.copy()
     aliased[[cell for _, _, cause in causes for cell in cause.cells]] = True
+    joined = _of_failing_wires(found, aliased, layout, common)
+    aliased[[cell for _, _, cause in joined for cell in cause.cells]] = True
+    causes += joined
     # A wire has no rest level of its own: cells that no longer return to theirs drift one by one.
     drifting = np.flatnonzero(found.faulty & found.drifting & np.isnan(found.gain) & ~aliased)
     causes += [(FaultKind.DRIFT, None, Cause(None, (c,), (c,), 1.0)) for c in drifting.tolist()]
@@ -152,7 +160,7 @@ def _causes(
     return causes
 
 
-def _failing_wires(
+def _proven_wires(
     found: CellFindings, aliased: Mask, layout: SensorLayout
 ) -> list[tuple[FaultKind, float | None, Cause]]:
     """Return the wires that are proved to fail now and then."""
@@ -175,6 +183,26 @@ def _failing_wires(
         cause = Cause(line, tuple(cells.tolist()), tuple(seen.tolist()), probability)
         causes.append((FaultKind.INTERMITTENT, None, cause))
     return causes
+
+
+def _of_failing_wires(
+    found: CellFindings, aliased: Mask, layout: SensorLayout, common: float
+) -> list[tuple[FaultKind, float | None, Cause]]:
+    """Return the wires that fail now and then.
+
+    One by one their cells may be uncertain, or look as if they moved by themselves: a wire that
+    opens under load leaves each of them its light contacts. They fail together.
+    """
+    likely = np.maximum(found.refuted, found.unsure)
+    consistent = (likely >= 0) & (likely < len(OF_WIRES))
+    contradicting = (found.alive | found.faulty) & ~consistent | aliased
+    faulty = found.faulty & consistent
+    explained = _explained(
+        faulty & ~aliased, consistent & ~aliased, contradicting, found, layout, common
+    )
+    wires = [cause for cause in explained if cause.line is not None and cause.proven]
+    kinds = [OF_WIRES[int(np.median(likely[list(cause.seen)]))] for cause in wires]
+    return [(kind, None, cause) for kind, cause in zip(kinds, wires, strict=True)]
 
 
 def _explained(
@@ -328,7 +356,7 @@ def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
             else layout.place(int(fault.value))
         )
         return f"repeats {source}"
-    comes_and_goes = (found.refuted >= 0) | (found.wire >= 0)
+    comes_and_goes = np.maximum(found.refuted, found.unsure) >= 0
     if fault.kind is FaultKind.INTERMITTENT and comes_and_goes[list(fault.cells)].any():
         share = float(np.median(found.share[list(fault.cells)]))
         return (

@@ -28,6 +28,7 @@ HEALTHY = CellFindings(
     events=np.zeros(CELLS, np.intp),
     known=NONE,
     refuted=np.full(CELLS, -1),
+    unsure=np.full(CELLS, -1),
     wire=np.full(CELLS, -1),
     of_wire=np.zeros(CELLS),
     share=ZERO,
@@ -208,24 +209,32 @@ def test_a_loose_wire_makes_its_whole_row_blink():
     assert (fault.kind, fault.line) == (FaultKind.INTERMITTENT, Line(1, "row", 5))
 
 
-def test_a_wire_that_is_proved_to_fail_is_one_fault_though_none_of_its_cells_is_certain():
+def test_a_wire_that_opens_under_load_is_named_though_none_of_its_cells_is_certain():
     row = LAYOUT.cells_on(Line(1, "row", 4))
+    comes_and_goes = 1
     found = replace(
         HEALTHY,
         alive=~at(row),
-        wire=np.where(at(row[1:]), 0, -1),
-        of_wire=np.where(at(row[1:]), 0.97, 0.0),
+        unsure=np.where(at(row), comes_and_goes, -1),
+        weight=np.where(at(row), 5.0, 0.0),
         share=np.where(at(row), 0.4, 0.0),
         since=np.zeros(CELLS, np.intp),
     )
     (fault,), _ = root_causes(found, (), LAYOUT)
-    assert (fault.kind, fault.line, fault.probability) == (
+    assert (fault.kind, fault.line, fault.cells) == (
         FaultKind.INTERMITTENT,
         Line(1, "row", 4),
-        0.97,
+        tuple(row.tolist()),
     )
-    assert fault.cells == tuple(row.tolist())
     assert "reads nothing in 40% of the contacts" in fault.reason
+    apart = [0, 13, 26, 39, 52, 65]
+    scattered = replace(
+        HEALTHY,
+        alive=~at(apart),
+        unsure=np.where(at(apart), comes_and_goes, -1),
+        weight=np.where(at(apart), 5.0, 0.0),
+    )
+    assert root_causes(scattered, (), LAYOUT) == ((), ())
 
 
 def test_cells_that_deliver_nothing_are_open_and_have_no_value():

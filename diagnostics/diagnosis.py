@@ -593,8 +593,11 @@ class SelfDiagnosis:
         # The model of life errs where its reference has no like: only what is far beyond its limits
         # is faulty.
         refuted = np.where(judged, expit(life.evidence + logit(EXPECTED) - CERTAIN_RATIO / 2), 0.0)
+        # What lies still on a pad was not known when life was tested.
+        pad = stream.layout.pad_of
+        clear = ~np.isin(pad, pad[explained])
         # a constant run tells more: its value, its onset; but not of a wire that comes and goes
-        on_wire = judged & (life.wire >= 0)
+        on_wire = judged & clear & (life.wire >= 0)
         by_life = judged & (refuted > stuck) & (stuck < MAJORITY) | on_wire
         probability = np.where(
             present, np.where(certain, _CERTAIN, np.maximum(stuck, refuted)), 0.0
@@ -613,9 +616,7 @@ class SelfDiagnosis:
         kind = np.where(by_life & faulty, life.kind, -1)
         # Not certain one by one: a wire that fails now and then makes its cells fail together.
         unsure = judged & ~faulty & ~life.shown & (life.kind < len(OF_WIRES)) & (life.evidence > 0)
-        # What lies still on a pad was not known when life was tested.
-        pad = stream.layout.pad_of
-        unsure &= ~np.isin(pad, pad[explained])
+        unsure &= clear
         told = np.where(unsure, life.kind, kind)
         source = np.where(life.source < 0, np.nan, self._order[life.source])
         of_life = np.stack(

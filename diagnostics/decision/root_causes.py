@@ -356,7 +356,7 @@ def _does(fault: Fault, found: CellFindings, layout: SensorLayout) -> str:
             else layout.place(int(fault.value))
         )
         return f"repeats {source}"
-    comes_and_goes = np.maximum(found.refuted, found.unsure) >= 0
+    comes_and_goes = np.max([found.refuted, found.unsure, found.wire], axis=0) >= 0
     if fault.kind is FaultKind.INTERMITTENT and comes_and_goes[list(fault.cells)].any():
         share = float(np.median(found.share[list(fault.cells)]))
         return (

@@ -237,6 +237,24 @@ def test_a_wire_that_opens_under_load_is_named_though_none_of_its_cells_is_certa
     assert root_causes(scattered, (), LAYOUT) == ((), ())
 
 
+def test_a_wire_that_is_proved_to_fail_is_one_fault_with_all_of_its_cells():
+    row = LAYOUT.cells_on(Line(1, "row", 4))
+    found = replace(
+        HEALTHY,
+        alive=~at(row),
+        wire=np.where(at(row[1:]), 0, -1),
+        of_wire=np.where(at(row[1:]), 0.97, 0.0),
+        since=np.zeros(CELLS, np.intp),
+    )
+    (fault,), _ = root_causes(found, (), LAYOUT)
+    assert (fault.kind, fault.line, fault.probability) == (
+        FaultKind.INTERMITTENT,
+        Line(1, "row", 4),
+        0.97,
+    )
+    assert fault.cells == tuple(row.tolist())
+
+
 def test_cells_that_deliver_nothing_are_open_and_have_no_value():
     found = replace(dead(HEALTHY, [7]), silent=at([7]), rests=NONE, value=np.full(CELLS, np.nan))
     (fault,) = causes(found)

@@ -623,16 +623,19 @@ def fitting_bar(args: argparse.Namespace) -> Iterator[Callable[[float], None]]:
 
     form = "{desc}: {percentage:3.0f}%|{bar}| [{elapsed}<{remaining}]"
     hide = None if (shown := progress(args)) is None else not shown
-    began = monotonic()
+    first: tuple[float, float] | None = None
     told = False
     with tqdm(total=1.0, desc="fitting", bar_format=form, disable=hide, leave=False) as bar:
 
         def advance(share: float) -> None:
-            nonlocal told
+            nonlocal first, told
             bar.update(share - bar.n)
-            if bar.disable and not told and share >= _KNOWN_FROM:
+            if first is None and share > 0:  # what comes before is no part of the share
+                first = (monotonic(), share)
+            elif first is not None and bar.disable and not told and share >= first[1] + _KNOWN_FROM:
                 told = True
-                left = (monotonic() - began) * (1 - share) / share
+                began, before = first
+                left = (monotonic() - began) * (1 - share) / (share - before)
                 if left >= _WORTH_TELLING:
                     say(args, f"fitting: about {left:.0f} s left")
 

@@ -258,6 +258,7 @@ class SelfDiagnosis:
         self,
         recordings: ArrayLike | Sequence[ArrayLike],
         *,
+        classes: ArrayLike | None = None,
         progress: Callable[[float], None] = lambda share: None,
     ) -> SelfDiagnosis:
         """Return what :meth:`diagnose` judges a log with: this diagnosis, or in a cold start one
@@ -273,6 +274,8 @@ class SelfDiagnosis:
 
         Args:
             recordings: a log, as for :meth:`diagnose`.
+            classes: the class of each recording, ``[n]``: of each class the first half is taken, as
+                recordings that lie class by class say nothing of other classes. None: unknown.
             progress: as for :meth:`fit`.
 
         Raises:
@@ -281,7 +284,7 @@ class SelfDiagnosis:
         log = checked_recordings(recordings, self.layout)
         if self.reference_ is not None or len(log) < OWN_REFERENCE:
             return self
-        first = log[: len(log) // 2]
+        first = RecordingBlocks([log.given[i] for i in _first_half(len(log), classes)])
         if not _shows_contacts(first, log, self.layout):
             return self
         own = SelfDiagnosis(**self.get_params())
@@ -758,6 +761,15 @@ def axis_planes(layout: SensorLayout) -> tuple[SensorLayout, NDArray[np.intp]]:
     return replace(
         layout, pads=pads, axes=1, present=present, wiring="bus", groups=None, rest=rest
     ), order
+
+
+def _first_half(n: int, classes: ArrayLike | None) -> list[int]:
+    """Return the first half of n recordings, or of those of each class."""
+    if classes is None:
+        return list(range(n // 2))
+    label = np.asarray(classes)
+    each = [np.flatnonzero(label == one) for one in np.unique(label)]
+    return sorted(int(i) for of_class in each for i in of_class[: (len(of_class) + 1) // 2])
 
 
 def _shows_contacts(first: RecordingBlocks, log: RecordingBlocks, layout: SensorLayout) -> bool:

@@ -123,7 +123,12 @@ def _inspected(
     say(args, f"diagnosing {len(log)} recording{'s' * (len(log) != 1)}")
     with fitting_bar(args) as advance:
         return inspect_parts(
-            parts(), cold, reference=healthy, n_recordings=len(log), progress=advance
+            parts(),
+            cold,
+            reference=healthy,
+            n_recordings=len(log),
+            classes=log.labels,
+            progress=advance,
         )
 
 

@@ -120,6 +120,7 @@ def inspect(
     diagnoser: SelfDiagnosis,
     *,
     reference: ArrayLike | Sequence[ArrayLike] | None = None,
+    classes: ArrayLike | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Inspection:
     """Return everything that a log tells about a sensor.
@@ -132,6 +133,7 @@ def inspect(
         diagnoser: fitted on healthy recordings of the same array; one that is not fitted is a cold
             start, for which see :meth:`diagnostics.SelfDiagnosis.for_log`.
         reference: these recordings. None: nothing is compared with them.
+        classes: the class of each recording of the log, ``[n]``, for a cold start; None: unknown.
         progress: receives the share of the fit that is done, where a cold start fits to the log.
 
     Raises:
@@ -151,7 +153,7 @@ def inspect(
         return Inspection(ChangedReadings(None, None, log, _untold(log, layout)), tuple(findings))
     common = None
     if diagnoser.reference_ is None:
-        fitted = diagnoser.for_log(log, progress=progress)
+        fitted = diagnoser.for_log(log, classes=classes, progress=progress)
         readings = ChangedReadings(None, None, log, fitted.diagnose(log))
     else:
         readings, common = _judged(log, healthy, diagnoser)

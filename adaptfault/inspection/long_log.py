@@ -21,6 +21,7 @@ def inspect_parts(
     *,
     reference: ArrayLike | Sequence[ArrayLike] | None = None,
     n_recordings: int = 1,
+    classes: ArrayLike | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Inspection:
     """Return everything that a log tells about a sensor, as
@@ -34,6 +35,7 @@ def inspect_parts(
         parts: at least one list of recordings ``[T, D]``, in time order.
         diagnoser, reference, progress: as for ``inspect``.
         n_recordings: number of recordings in all parts, of which long ones are cut.
+        classes: as for ``inspect``, of one part; of several they are not used.
 
     Raises:
         ValueError: recordings that do not fit the layout, or hold no frame.
@@ -41,7 +43,7 @@ def inspect_parts(
     first = next(parts)
     second = next(parts, None)
     if second is None:
-        return inspect(first, diagnoser, reference=reference, progress=progress)
+        return inspect(first, diagnoser, reference=reference, classes=classes, progress=progress)
     fitted = diagnoser
     if diagnoser.reference_ is None:
         fitted = diagnoser.for_log(first, progress=progress)

@@ -68,6 +68,23 @@ def test_a_shorter_log_is_no_reference(grasps):
     assert cold.for_log(grasps[: OWN_REFERENCE - 1]) is cold
 
 
+def test_of_a_log_that_lies_class_by_class_the_first_half_of_each_class_is_the_reference(
+    grasps, monkeypatch
+):
+    taken = []
+
+    def fitted(self, first, progress, suspected):
+        taken.extend(first.given)
+        return self
+
+    monkeypatch.setattr(SelfDiagnosis, "_fit", fitted)
+    log = grasps[:40]
+    SelfDiagnosis(LAYOUT).for_log(log, classes=[0] * 30 + [1] * 10)
+    wanted = [*log[:15], *log[30:35]]
+    assert len(taken) == len(wanted)
+    assert all(np.array_equal(a, b) for a, b in zip(taken, wanted, strict=True))
+
+
 def test_a_fitted_diagnosis_stays_what_it_is(grasps, own):
     assert own.for_log(grasps) is own
 

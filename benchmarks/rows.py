@@ -709,6 +709,17 @@ def moving_cases(bench: Bench) -> dict[str, Callable[[Log, Log, int, np.random.G
     }
 
 
+def in_use(log: Log, rest: np.ndarray, span: float) -> np.ndarray:
+    """Return the cells that at least 3 recordings load, bool ``[D]``."""
+    loaded = [(frames - rest > VISIBLE * span).any(axis=0) for frames in log]
+    return np.sum(loaded, axis=0) >= USED
+
+
+def called_alive(diagnosis: Diagnosis | Found) -> np.ndarray:
+    """Return the cells that are called alive, bool ``[D]``."""
+    return (diagnosis.verdicts == Verdict.ALIVE) & (diagnosis.probability < DOUBTED)
+
+
 def moving(bench: Bench) -> Iterator[Count]:
     """Dead cells that move; testable is what reads otherwise by more than 5 % of the range in use
     in 10 frames."""
@@ -731,12 +742,11 @@ def moving(bench: Bench) -> Iterator[Count]:
             can = np.intersect1d(dead, np.flatnonzero(wrong.sum(axis=0) >= TESTABLE))
             diagnosis = bench.proving.diagnose(seen)
             found = np.flatnonzero(diagnosis.fault_set.mask)
-            called = (diagnosis.verdicts == Verdict.ALIVE) & (diagnosis.probability < DOUBTED)
             testable += len(can)
             hit += len(np.intersect1d(found, can))
             true += len(np.intersect1d(found, dead))
             false += len(np.setdiff1d(found, dead))
-            alive += int(called[can].sum())
+            alive += int(called_alive(diagnosis)[can].sum())
         yield Count(f"{case}: recall", hit, testable)
         yield Count(f"{case}: precision", true, true + false)
         yield Count(f"{case}: called alive", alive, testable, higher=False)
@@ -749,8 +759,7 @@ def proven(bench: Bench) -> Iterator[Count]:
     rest = rest_levels(bench)
     blamed = alive = used = 0
     for _, log, _ in bench.logs(IN_USE):
-        loaded = [(frames - rest > VISIBLE * span).any(axis=0) for frames in log]
-        tested = (np.sum(loaded, axis=0) >= USED) & bench.layout.present.ravel()
+        tested = in_use(log, rest, span) & bench.layout.present.ravel()
         diagnosis = bench.proving.diagnose(log)
         blamed += len(diagnosis.fault_set)
         used += int(tested.sum())
@@ -782,8 +791,7 @@ def failing(bench: Bench) -> Iterator[Count]:
     for case, fails in failing_cases().items():
         named = logs = blamed = alive = cells = 0
         for _, log, rng in bench.logs(IN_USE):
-            loaded = [(frames - rest > VISIBLE * span).any(axis=0) for frames in log]
-            used = np.sum(loaded, axis=0) >= USED
+            used = in_use(log, rest, span)
             choice = [line for line in wires(layout) if used[list(layout.cells_on(line))].sum() > 2]
             if not choice:
                 continue
@@ -797,11 +805,10 @@ def failing(bench: Bench) -> Iterator[Count]:
             diagnosis = bench.proving.diagnose(parted(seen, log))
             wrong = np.abs(seen - whole)[:, of_wire] > VISIBLE * span
             can = of_wire[wrong.sum(axis=0) >= TESTABLE]
-            called = (diagnosis.verdicts == Verdict.ALIVE) & (diagnosis.probability < DOUBTED)
             logs += 1
             named += any(fault.line == line for fault in diagnosis.faults)
             blamed += len(set(diagnosis.fault_set) - set(of_wire.tolist()))
-            alive += int(called[can].sum())
+            alive += int(called_alive(diagnosis)[can].sum())
             cells += len(can)
         yield Count(f"a wire {case}: named", named, logs)
         yield Count(f"a wire {case}: healthy cells blamed in a log", blamed, logs, higher=False)

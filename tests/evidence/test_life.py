@@ -240,11 +240,16 @@ def test_a_second_test_of_the_same_log_finds_what_the_first_did_and_asks_the_mod
     np.testing.assert_array_equal(again.evidence, life.evidence)
 
 
-def test_what_the_others_say_of_a_wire_is_the_regression_of_its_sum_on_the_known_ones_off_it():
+def six_correlated_cells() -> tuple[np.ndarray, np.ndarray, ConditionalMean]:
     rng = np.random.default_rng(0)
     loads = rng.normal(size=(300, 6)) @ rng.normal(size=(6, 6)) + 3
     cells = np.arange(6)
     mean = ConditionalMean.fit(loads, cells, cells)
+    return loads, cells, mean
+
+
+def test_what_the_others_say_of_a_wire_is_the_regression_of_its_sum_on_the_known_ones_off_it():
+    loads, cells, mean = six_correlated_cells()
     known = np.array([True, True, False, True, True, True])
     on = np.isin(cells, [3, 4, 5])
     of = np.isin(cells, [3, 4])
@@ -260,10 +265,7 @@ def test_what_the_others_say_of_a_wire_is_the_regression_of_its_sum_on_the_known
 
 
 def test_what_the_others_say_of_a_cell_is_the_regression_on_the_known_ones_without_itself():
-    rng = np.random.default_rng(0)
-    loads = rng.normal(size=(300, 6)) @ rng.normal(size=(6, 6)) + 3
-    cells = np.arange(6)
-    mean = ConditionalMean.fit(loads, cells, cells)
+    loads, cells, mean = six_correlated_cells()
     known = np.array([True, True, False, True, False, True])
     expected = mean.predict(loads, known)
     z = (loads - mean.mean) / mean.scale

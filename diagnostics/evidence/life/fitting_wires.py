@@ -84,7 +84,7 @@ def fit_wires(
         on=on,
         beside=np.stack([layout.with_neighbours(of) & present & ~of for of in on]),
     )
-    loads = [blank.mean_loads(fold.loads, present) for fold in folds]
+    loads = [blank.means(fold.loads, present) for fold in folds]
     expected = [
         _expected(blank, model, fold, present) for model, fold in zip(held_out, folds, strict=True)
     ]

@@ -27,6 +27,7 @@ FAULTS = ("independent", "intermittent", "late", "copy", "clamped")
 COPY = FAULTS.index("copy")
 INTERMITTENT = FAULTS.index("intermittent")
 UNLOADED = 1e-3  # root load up to which a piece counts as unloaded
+AGAINST = 1.0  # log ratio from which on a unit speaks against a cell, or a wire
 REFUTED = 4.0  # evidence from which on a cell predicts no others
 THRESHOLD = 9.0  # evidence of a certain fault: with its prior, P(faulty) = 0.994
 GUESS = 0.005  # of a uniform distribution over the levels, in any table: models err
@@ -244,7 +245,7 @@ class WireModel(HealthyTable):
         level = levels_of(expected, self.predicted).astype(np.intp)
         return level * (len(BESIDE) + 1) + levels_of(share, np.asarray(BESIDE))
 
-    def mean_loads(self, values: Array, eligible: Mask) -> Floats:
+    def means(self, values: Array, eligible: Mask) -> Floats:
         """Return the means ``[n, W]`` over the eligible cells (bool ``[D]``) of each wire, of
         values ``[n, D]``."""
         of = (self.on & eligible).astype(np.float64)

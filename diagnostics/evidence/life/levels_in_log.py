@@ -39,21 +39,20 @@ class LevelLog:
 
     Args:
         loads: mean root loads of the pieces, ``[n, D]``.
-        read: bool ``[n, D]``, those that were read.
+        readings: their mean readings ``[n, D]``, in the layout's unit; NaN: none.
         piece: number of each, int ``[n]``, ascending.
         model: of healthy loads.
         weight: of each unit ``[units]``; None: see the property.
 
     Attributes:
         level: of each load, ``[n, D]``.
-        read: bool ``[n, D]``, those that were read.
         unit_begins: int ``[units]``, number of the first piece of each unit.
     """
 
     def __init__(
         self,
         loads: NDArray[np.floating],
-        read: Mask,
+        readings: NDArray[np.floating],
         piece: NDArray[np.intp],
         model: HealthyTable,
         weight: Floats | None = None,
@@ -63,8 +62,9 @@ class LevelLog:
         self._weight = weight
         self.level = levels_of(loads, model.levels)
         self.piece = piece
-        self.read = read
-        self._all_read = bool(read.all())
+        self.readings = readings
+        self._read = np.isfinite(readings)
+        self._all_read = bool(self._read.all())
         self.unit_begins = np.flatnonzero(np.diff(piece // UNIT, prepend=-1))
         self._cell = np.arange(self.level.shape[1])
 
@@ -165,7 +165,7 @@ class LevelLog:
         """Return the sums over the pieces of each unit that were read, ``[units, D]``; arguments as
         in counted."""
         if not self._all_read:
-            read = self.read if cells is None else self.read[:, cells]
+            read = self._read if cells is None else self._read[:, cells]
             ratio = np.where(read, ratio, 0.0)
         summed: Floats = np.add.reduceat(ratio, self.unit_begins, axis=0)
         return summed
@@ -196,10 +196,9 @@ class LifeLog(LevelLog):
         model: LifeModel,
         beside: Cells,
     ) -> None:
-        super().__init__(loads, np.isfinite(readings), piece, model)
+        super().__init__(loads, readings, piece, model)
         self.model = model
         self.beside = beside
-        self.readings = readings
 
     def healthy(self, known: Mask) -> Generator[None, None, tuple[Floats, NDArray[np.intp]]]:
         """Yield between steps; return log P(level | healthy) and the context, ``[n, D]`` each.
@@ -249,7 +248,7 @@ class LifeLog(LevelLog):
         yield
         usual_beside = (total_beside - farthest) / (count - 1)
         distance = np.abs(self.readings - mean) / (usual_beside + self.model.tolerance)
-        some &= (self.level > 0) & self.read & (has.sum(axis=1) > 1) & np.isfinite(distance)
+        some &= (self.level > 0) & self._read & (has.sum(axis=1) > 1) & np.isfinite(distance)
         total = np.add.reduceat(np.where(some, distance, 0.0), self.unit_begins, axis=0)
         pieces = np.add.reduceat(some.astype(np.intp), self.unit_begins, axis=0)
         return pieces > 0, levels_of(total / np.maximum(pieces, 1), np.asarray(AMID))

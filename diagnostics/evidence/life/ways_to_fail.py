@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import log_expit, logsumexp
 
 from diagnostics.evidence.life.healthy_table import (
+    AGAINST,
     BESIDE,
     REFUTED,
     THRESHOLD,
@@ -48,7 +49,6 @@ _KEPT = 3  # answers: a size
 # P(distance from the mean beside it) of a cell that reads it; dead cells beside it read otherwise.
 _AMID = (0.7, 0.15, 0.07, 0.04, 0.04)
 _CERTAINLY_NOT = 1e3  # evidence against what is impossible
-_AGAINST = 1.0  # log ratio from which on a unit speaks against a cell
 
 
 @dataclass(frozen=True)
@@ -213,8 +213,8 @@ def ways_to_fail(
     tested = np.abs(seen.dead) > TESTED
     gone = (seen.dying > MAJORITY) & tested
     share = gone.sum(axis=0) / np.maximum(tested.sum(axis=0), 1)
-    moves = log.by_unit(log.own - seen.healthy) > _AGAINST
-    rests = seen.dead > _AGAINST
+    moves = log.by_unit(log.own - seen.healthy) > AGAINST
+    rests = seen.dead > AGAINST
     return WaysToFail(
         evidence=np.stack([independent, intermittent, late, copy, clamped]),
         lag=np.array(_LAGS)[np.argmax(lagged, axis=0)],

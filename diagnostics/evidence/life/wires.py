@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from diagnostics.evidence.life.healthy_table import (
+    AGAINST,
     BESIDE,
     THRESHOLD,
     Floats,
@@ -39,7 +40,6 @@ FEWEST_CELLS = 3  # of a wire, from which on they tell of it
 _BROKEN = CERTAIN_RATIO / 2 - float(np.log(EXPECTED_LATE))
 _PROVEN = _BROKEN + float(np.log(9.0))  # at odds of 9
 _MOST_WIRES = 4  # that fail in a log: where more do, the whole array is disturbed
-_AGAINST = 1.0  # log ratio from which on a unit speaks against a wire
 
 
 @dataclass(frozen=True)
@@ -92,13 +92,12 @@ def wire_log(
         known: bool ``[D]``, cells that predict others.
         eligible: bool ``[D]``, cells that tell of their wire.
     """
-    read = np.isfinite(wires.mean_loads(log.readings, eligible))
-    read &= wires.told(log.loads, known)
-    own = LevelLog(wires.mean_loads(log.loads, eligible), read, log.piece, wires, log.weight)
+    told = wires.told(log.loads, known)
+    readings = np.where(told, wires.means(log.readings, eligible), np.nan)
+    own = LevelLog(wires.means(log.loads, eligible), readings, log.piece, wires, log.weight)
     expected = yield from wires.expected(log.model.means, log.loads, known, eligible)
     context = wires.contexts(expected, log.loads, known)
-    table = wires.probabilities[wires.of_cell(np.arange(len(wires.on)))]
-    healthy = own.tilted(table, context, own.level)
+    healthy = own.tilted(wires.probabilities, context, own.level)
     return own, context, healthy
 
 
@@ -122,8 +121,7 @@ def tested_wires(
     # Where healthy ones look as if they failed, the others do not tell of the wire.
     enough &= wires.reached[0] < THRESHOLD
     # An open wire reads one and the same: rest levels that creep look like loads, and like none.
-    readings = wires.mean_loads(log.readings, eligible)
-    without = np.where((own.level == 0) & (ratio > 0) & own.read, readings, np.nan)
+    without = np.where((own.level == 0) & (ratio > 0), own.readings, np.nan)
     wanders = np.fmax.reduce(without) - np.fmin.reduce(without)
     enough &= ~(wanders > 2 * log.model.tolerance)
     # Those beside it tell most of a wire.
@@ -153,7 +151,7 @@ def failing_wires(log: LifeLog, known: Mask, eligible: Mask) -> Generator[None, 
             break
         on = wires.on[worst] & eligible & (wire < 0)
         dead = found.dead[:, worst]
-        against[:, on] = (dead > _AGAINST)[:, None]
+        against[:, on] = (dead > AGAINST)[:, None]
         share[on] = (dead > TESTED).sum() / max(1, (np.abs(dead) > TESTED).sum())
         wire[on] = wire.max() + 1
         probability[on] = expit(scaled[worst] - _BROKEN)

@@ -26,6 +26,7 @@ SOLES = "insole2x33x15.npz"
 FABRIC = "fabric4x4_slides7.npz"
 MAIN = ("cells", "onset", "healthy")
 LIFE = ("moving", "proven", "failing", "own_reference")
+DISTURBED = ("disturbed", "untested", "offsets", "short", "monitored")
 SKIN = (*MAIN, "lines", "cold", "static")
 EVERY = (
     "cells",
@@ -182,6 +183,15 @@ ARRAYS = [
             ("fingertips", real(FINGERTIPS), 20, 6, FINGERTIPS),
             ("soles", real(SOLES), 10, 2, SOLES),
             ("sliding finger", slides, 30, 9, FABRIC),  # one dead cell a log
+        )
+    ),
+    *(
+        Array(f"{name}, disturbed", DISTURBED, bench, logs, 1, logs // 5, DISTURBED, file)
+        for name, bench, logs, file in (
+            ("hand", real(HAND), 10, HAND),
+            ("fingertips", real(FINGERTIPS), 10, FINGERTIPS),
+            ("soles", real(SOLES), 5, SOLES),
+            ("sliding finger", slides, 10, FABRIC),
         )
     ),
     Array(

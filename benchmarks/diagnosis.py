@@ -25,13 +25,15 @@ from pathlib import Path
 
 import numpy as np
 from arrays import ARRAYS, SPEED, Array
+from disturbances import ROWS as OF_DISTURBANCES
 from joblib import Parallel, delayed, parallel_config
 from own_method import ROWS_OF_F, needs_only_f
-from rows import ROWS
+from rows import ROWS as OF_FAULTS
 from tqdm import tqdm
 
 from adaptfault.bench.methods import DIAGNOSER, find_method
 
+ROWS = OF_FAULTS | OF_DISTURBANCES
 Key = tuple[str, str]  # array, row
 Samples = dict[tuple[int, int], dict]  # by split and repeat
 

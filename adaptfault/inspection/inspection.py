@@ -19,13 +19,9 @@ from adaptfault.inspection.converter_range import within_range
 from adaptfault.inspection.severity import Name, of_faults, of_finding, untested, worst
 from diagnostics import Diagnosis, SelfDiagnosis, SensorLayout
 from diagnostics.diagnosis import checked_recordings
-from diagnostics.sensor.disturbance import (
-    CommonMode,
-    Disturbance,
-    find_common_mode,
-    find_disturbances,
-    find_sentinel,
-)
+from diagnostics.sensor.common_mode import CommonMode, find_common_mode
+from diagnostics.sensor.converter_change import find_converter_change
+from diagnostics.sensor.disturbance import Disturbance, find_disturbances, find_sentinel
 from diagnostics.sensor.recalibration import Recalibration
 from diagnostics.sensor.rewiring import Rewiring
 from diagnostics.sensor.sensor_change import SensorChange
@@ -152,6 +148,11 @@ def inspect(
         findings = [_finding(one) for one in disturbances]
         return Inspection(ChangedReadings(None, None, log, _untold(log, layout)), tuple(findings))
     common = None
+    if diagnoser.reference_ is not None and diagnoser.load_ is None:
+        converter = find_converter_change(log, healthy, layout, disturbances)
+        if converter is not None:  # the reference, as this converter reads it
+            healthy = converter.of(healthy)
+            diagnoser = SelfDiagnosis(**diagnoser.get_params()).fit(healthy, progress=progress)
     if diagnoser.reference_ is None:
         fitted = diagnoser.for_log(log, classes=classes, progress=progress)
         readings = ChangedReadings(None, None, log, fitted.diagnose(log))

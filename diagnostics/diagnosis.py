@@ -16,7 +16,12 @@ from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
 from diagnostics.decision.certificate import Certificate, certify
 from diagnostics.decision.line_cover import candidate_groups
 from diagnostics.decision.result import Diagnosis
-from diagnostics.decision.root_causes import OF_WIRES, CellFindings, root_causes
+from diagnostics.decision.root_causes import (
+    OF_WIRES,
+    CellFindings,
+    root_causes,
+    without_unused,
+)
 from diagnostics.decision.serialization import (
     Arrays,
     from_state,
@@ -448,9 +453,11 @@ class SelfDiagnosis:
         ):
             weight[group] = np.maximum(weight[group], together(surprisal)[group])
             yield
+        unused = stream.unused(found.alive)[self._place]
         found = replace(found, weight=weight).of(self._place)
         causes, possible = root_causes(found, aliases, self.layout)
-        probability = found.probability.copy()
+        causes, cut_off = without_unused(causes, unused, self.layout)
+        probability = np.where(unused, np.minimum(found.probability, MAJORITY), found.probability)
         inferred = np.zeros(self.layout.n_cells, bool)
         still = [load.of(self._order, self.layout) for load in still]
         for load in still:
@@ -485,7 +492,7 @@ class SelfDiagnosis:
             evidence={name: values[self._place] for name, values in evidence.items()},
             n_frames=stream.transport.seen,
             n_recordings=n_recordings,
-            possible=possible,
+            possible=(*possible, *cut_off),
             static_loads=tuple(still),
             contradicting=life.contradicting,
         )

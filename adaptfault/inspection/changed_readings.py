@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnostics import Diagnosis, FaultKind, SelfDiagnosis
+from diagnostics import Diagnosis, FaultKind, FaultSet, SelfDiagnosis
 from diagnostics.sensor.recalibration import Recalibration, find_recalibration, recalibrated
 from diagnostics.sensor.rewiring import Rewiring
 from diagnostics.sensor.sensor_change import SensorChange, find_change
@@ -86,7 +86,11 @@ class ChangedReadings:
 
 
 def find_changed_readings(
-    diagnoser: SelfDiagnosis, frames: Frames, healthy: Sequence[NDArray[Any]]
+    diagnoser: SelfDiagnosis,
+    frames: Frames,
+    healthy: Sequence[NDArray[Any]],
+    *,
+    disturbed: bool = False,
 ) -> ChangedReadings:
     """Return what changed between cells and readings, and the diagnosis with it undone.
 
@@ -94,12 +98,21 @@ def find_changed_readings(
         diagnoser: fitted, or not: then nothing is found.
         frames: recordings ``[T, D]``, as the running version undoes them.
         healthy: those of the reference, with which pads are compared.
+        disturbed: a disturbance of the array may explain what differs: then wires are exchanged
+            only where fewer cells are faulty once they are put back.
     """
+    as_found = None
     rewiring = diagnoser.rewiring(frames)
     if rewiring is not None:
         put_back = [rewiring.undo(recording) for recording in frames]
-        return ChangedReadings(rewiring, None, put_back, diagnoser.diagnose(put_back))
-    as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
+        exchanged = ChangedReadings(rewiring, None, put_back, diagnoser.diagnose(put_back))
+        if not disturbed:
+            return exchanged
+        as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
+        if exchanged.diagnosis.n_lost < as_found.diagnosis.n_lost:
+            return exchanged
+    if as_found is None:
+        as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
     recalibration = _recalibration(diagnoser, frames, healthy, as_found.diagnosis)
     if recalibration is None:
         return as_found
@@ -113,14 +126,18 @@ def find_sensor_change(
     """Return how a pad, or all cells together, differ from the healthy recordings; None where they
     do not.
 
-    Faulty cells, and those that a static load may reach, do not count.
+    Faulty cells, those of possible wires, and those that a static load may reach do not count.
 
     Args:
         diagnoser: fitted.
         readings: of the log.
         healthy: recordings ``[T, D]`` of the reference.
     """
-    excluded = readings.diagnosis.fault_set | readings.diagnosis.disturbed
+    diagnosis = readings.diagnosis
+    possible = tuple({cell for wire in diagnosis.possible for cell in wire.cells})
+    excluded = (
+        diagnosis.fault_set | diagnosis.disturbed | FaultSet(possible, diagnoser.layout.n_cells)
+    )
     loads = as_loads(diagnoser, readings.frames)
     return find_change(loads, as_loads(diagnoser, healthy), diagnoser.layout, excluded)
 

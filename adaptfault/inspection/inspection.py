@@ -31,6 +31,8 @@ SCHEMA = "adaptfault.inspection/1"
 OF_CELLS = ("fault", "wire", "static_load", "frozen", "lost_frames", "untested")
 """Names of the findings that the diagnosis of the cells gives."""
 
+_OF_ALL_CELLS = ("noise", "quantised", "saturated", "normalised")
+
 _EXPLAIN_A_CHANGE = ("normalised", "ramp", "hum", "crosstalk")
 
 
@@ -157,7 +159,8 @@ def inspect(
         fitted = diagnoser.for_log(log, classes=classes, progress=progress)
         readings = ChangedReadings(None, None, log, fitted.diagnose(log))
     else:
-        readings, common = _judged(log, healthy, diagnoser)
+        told = any(one.name in _OF_ALL_CELLS for one in disturbances)
+        readings, common = _judged(log, healthy, diagnoser, disturbed=told)
     if common is not None:
         disturbances.append(common.disturbance)
     change = _change(_with_offset(readings, common, log), healthy, diagnoser, disturbances)
@@ -191,29 +194,31 @@ def _disturbances(
 
 
 def _judged(
-    log: list[NDArray[np.float64]], healthy: list[NDArray[np.float64]], diagnoser: SelfDiagnosis
+    log: list[NDArray[np.float64]],
+    healthy: list[NDArray[np.float64]],
+    diagnoser: SelfDiagnosis,
+    *,
+    disturbed: bool,
 ) -> tuple[ChangedReadings, CommonMode | None]:
     """Return the diagnosis of a log, and the common mode that it does without; None: the log as it
     is.
 
-    A common mode is one explanation beside the faults that it explains away.
+    A common mode is one explanation beside the faults that it explains away. ``disturbed``: other
+    disturbances are known.
     """
-    as_it_is = find_changed_readings(diagnoser, log, healthy)
     common = find_common_mode(log, healthy, diagnoser.layout) if healthy else None
+    disturbed = disturbed or common is not None
+    as_it_is = find_changed_readings(diagnoser, log, healthy, disturbed=disturbed)
     if common is None:
         return as_it_is, None
-    without = find_changed_readings(diagnoser, common.undo(log, diagnoser.layout), healthy)
+    undone = common.undo(log, diagnoser.layout)
+    without = find_changed_readings(diagnoser, undone, healthy, disturbed=True)
     explanations = len(without.diagnosis.faults) + 1
     if explanations > len(as_it_is.diagnosis.faults) and _is_converter(as_it_is.diagnosis):
         return as_it_is, None
-    if _lost(without.diagnosis) > _lost(as_it_is.diagnosis):
+    if without.diagnosis.n_lost > as_it_is.diagnosis.n_lost:
         return as_it_is, None
     return without, common
-
-
-def _lost(diagnosis: Diagnosis) -> int:
-    """Return the number of cells that are faulty, or disturbed by a static load."""
-    return len(diagnosis.fault_set | diagnosis.disturbed)
 
 
 def _is_converter(diagnosis: Diagnosis) -> bool:

@@ -139,6 +139,20 @@ class Diagnosis:
             tuple(beside[beside >= 0].tolist()), self.layout.n_cells
         )
 
+    @property
+    def n_lost(self) -> int:
+        """The number of cells that are faulty, or disturbed by a static load."""
+        return len(self.fault_set | self.disturbed)
+
+    @property
+    def unused(self) -> tuple[Fault, ...]:
+        """The possible wires of whole pads: nothing touched these, or they are cut off."""
+        pads = [
+            set(np.flatnonzero((self.layout.pad_of == pad) & self.layout.present.ravel()).tolist())
+            for pad in range(self.layout.pads)
+        ]
+        return tuple(wire for wire in self.possible if set(wire.cells) in pads)
+
     def suspects(self, probability: float = 0.02) -> FaultSet:
         """Return F and every tested cell with at least this P(faulty): the cells that a classifier
         should ignore.

@@ -129,6 +129,34 @@ def root_causes(
     )
 
 
+def without_unused(
+    faults: Sequence[Fault], unused: Mask, layout: SensorLayout
+) -> tuple[tuple[Fault, ...], tuple[Fault, ...]]:
+    """Return the faults that reach beyond the ``unused`` cells (bool ``[D]``), and the wires of
+    their pads as possible ones.
+
+    A pad that nothing touches reads as one that is cut off at its rest.
+    """
+    others = tuple(fault for fault in faults if not unused[list(fault.cells)].all())
+    cut_off = []
+    for pad in np.unique(layout.pad_of[unused]).tolist():
+        cells = np.flatnonzero(unused & (layout.pad_of == pad))
+        holding = [
+            line for line in reversed(layout.lines) if np.isin(cells, layout.cells_on(line)).all()
+        ]
+        if not holding:
+            continue
+        line = min(holding, key=lambda line: len(layout.cells_on(line)))
+        reason = (
+            f"nothing touched pad {pad}, or {line} is open: its cells hold the readings that they"
+            " have without contact; touch it to tell"
+        )
+        cut_off.append(
+            Fault(FaultKind.OPEN, tuple(cells.tolist()), line=line, probability=0.5, reason=reason)
+        )
+    return others, tuple(cut_off)
+
+
 def _causes(
     found: CellFindings, aliased: Mask, layout: SensorLayout, common: float
 ) -> list[tuple[FaultKind, float | None, Cause]]:

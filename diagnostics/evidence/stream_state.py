@@ -44,7 +44,7 @@ from diagnostics.evidence.term import ConstantCells, Term
 from diagnostics.evidence.weak_response import WeakResponse
 from diagnostics.healthy.nearest_neighbours import NearestNeighbours
 from diagnostics.healthy.prediction import OUTLIERS
-from diagnostics.preprocessing.levels import LIGHT, SUSPICIOUS
+from diagnostics.preprocessing.levels import LIGHT, MAJORITY, SUSPICIOUS
 from diagnostics.preprocessing.noise import NoiseNow
 from diagnostics.preprocessing.offset import OffsetTracker
 from diagnostics.preprocessing.readings import SEGMENT, held
@@ -237,6 +237,23 @@ class StreamState:
         return np.isfinite(self.runs.value) & (
             self.scale.root_load(self.runs.value) <= self.scale.root_near
         )
+
+    def unused(self, alive: Mask) -> Mask:
+        """Return the cells at rest of pads that nothing shows to be in use, bool ``[D]``.
+
+        Such a pad has no cell that is ``alive``, and most of its cells hold the reading that they
+        have without contact, while another pad is in use. Nothing touched it, or it is cut off
+        where it rests: the readings are the same.
+        """
+        held = np.nan_to_num(np.abs(self.runs.value - self.scale.baseline), nan=np.inf)
+        still = self.present & (held <= self.scale.near)
+        of_pad = self.layout.pad_of
+        pads = self.layout.pads
+        share = np.bincount(of_pad[still], minlength=pads)
+        cells = np.bincount(of_pad[self.present], minlength=pads)
+        used = np.bincount(of_pad[alive], minlength=pads) > 0
+        idle = ~used & (share > MAJORITY * cells)
+        return np.asarray(still & idle[of_pad] & bool(used.any()))
 
     def temporal(self) -> NDArray[np.float64]:
         """Log likelihood ratio of the constant run, its level and noise, and the jump into it,

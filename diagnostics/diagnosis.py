@@ -16,12 +16,7 @@ from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
 from diagnostics.decision.certificate import Certificate, certify
 from diagnostics.decision.line_cover import candidate_groups
 from diagnostics.decision.result import Diagnosis
-from diagnostics.decision.root_causes import (
-    OF_WIRES,
-    CellFindings,
-    root_causes,
-    without_unused,
-)
+from diagnostics.decision.root_causes import OF_WIRES, CellFindings, cut_off, root_causes
 from diagnostics.decision.serialization import (
     Arrays,
     from_state,
@@ -454,10 +449,9 @@ class SelfDiagnosis:
             weight[group] = np.maximum(weight[group], together(surprisal)[group])
             yield
         unused = stream.unused(found.alive)[self._place]
-        found = replace(found, weight=weight).of(self._place)
+        found = replace(found, weight=weight).of(self._place).without(unused)
         causes, possible = root_causes(found, aliases, self.layout)
-        causes, cut_off = without_unused(causes, unused, self.layout)
-        probability = np.where(unused, np.minimum(found.probability, MAJORITY), found.probability)
+        probability = found.probability.copy()
         inferred = np.zeros(self.layout.n_cells, bool)
         still = [load.of(self._order, self.layout) for load in still]
         for load in still:
@@ -492,7 +486,7 @@ class SelfDiagnosis:
             evidence={name: values[self._place] for name, values in evidence.items()},
             n_frames=stream.transport.seen,
             n_recordings=n_recordings,
-            possible=(*possible, *cut_off),
+            possible=(*possible, *cut_off(unused, self.layout)),
             static_loads=tuple(still),
             contradicting=life.contradicting,
         )

@@ -132,7 +132,8 @@ def inspect(
             start, for which see :meth:`diagnostics.SelfDiagnosis.for_log`.
         reference: these recordings. None: nothing is compared with them.
         classes: the class of each recording of the log, ``[n]``, for a cold start; None: unknown.
-        progress: receives the share of the fit that is done, where a cold start fits to the log.
+        progress: receives the share of the fit that is done, where a cold start fits to the log, or
+            where the converter changed and the reference is learned as it would read it.
 
     Raises:
         ValueError: recordings that do not fit the layout, or hold no frame.
@@ -150,17 +151,19 @@ def inspect(
         findings = [_finding(one) for one in disturbances]
         return Inspection(ChangedReadings(None, None, log, _untold(log, layout)), tuple(findings))
     common = None
-    if diagnoser.reference_ is not None and diagnoser.load_ is None:
-        converter = find_converter_change(log, healthy, layout, disturbances)
-        if converter is not None:  # the reference, as this converter reads it
-            healthy = converter.of(healthy)
-            diagnoser = SelfDiagnosis(**diagnoser.get_params()).fit(healthy, progress=progress)
     if diagnoser.reference_ is None:
         fitted = diagnoser.for_log(log, classes=classes, progress=progress)
         readings = ChangedReadings(None, None, log, fitted.diagnose(log))
     else:
         told = any(one.name in _OF_ALL_CELLS for one in disturbances)
         readings, common = _judged(log, healthy, diagnoser, disturbed=told)
+        converter = find_converter_change(log, healthy, layout, disturbances)
+        if converter is not None and diagnoser.load_ is None:
+            seen = converter.of(healthy)
+            behind = SelfDiagnosis(**diagnoser.get_params()).fit(seen, progress=progress)
+            others = _judged(log, seen, behind, disturbed=told)
+            if others[0].diagnosis.n_lost <= readings.diagnosis.n_lost:
+                (readings, common), diagnoser, healthy = others, behind, seen
     if common is not None:
         disturbances.append(common.disturbance)
     change = _change(_with_offset(readings, common, log), healthy, diagnoser, disturbances)

@@ -147,11 +147,17 @@ class Diagnosis:
     @property
     def unused(self) -> tuple[Fault, ...]:
         """The possible wires of whole pads: nothing touched these, or they are cut off."""
+        layout = self.layout
         pads = [
-            set(np.flatnonzero((self.layout.pad_of == pad) & self.layout.present.ravel()).tolist())
-            for pad in range(self.layout.pads)
+            np.flatnonzero((layout.pad_of == pad) & layout.present.ravel())
+            for pad in range(layout.pads)
         ]
-        return tuple(wire for wire in self.possible if set(wire.cells) in pads)
+        return tuple(
+            wire
+            for wire in self.possible
+            if wire.line is not None
+            and any(np.isin(pad, layout.cells_on(wire.line)).all() for pad in pads)
+        )
 
     def suspects(self, probability: float = 0.02) -> FaultSet:
         """Return F and every tested cell with at least this P(faulty): the cells that a classifier

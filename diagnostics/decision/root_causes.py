@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from diagnostics.decision.line_cover import Cause, solve
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.layout import SensorLayout
-from diagnostics.preprocessing.levels import ANYWHERE, SLIGHT, SUSPICIOUS
+from diagnostics.preprocessing.levels import ANYWHERE, MAJORITY, SLIGHT, SUSPICIOUS
 from diagnostics.wiring import LineKind, action, counted
 
 # Of the cells that are refuted, in the order of ``evidence.life.FAULTS``.
@@ -97,6 +97,19 @@ class CellFindings:
             **{name: values[cells] for name, values in vars(self).items() if values is not None},
         )
 
+    def without(self, cells: Mask) -> CellFindings:
+        """Return the findings without those about some cells (bool ``[D]``), which have readings but
+        were not tested."""
+        masks = ("faulty", "alive", "rests", "full", "zero", "intermittent", "noisy", "drifting")
+        numbers = ("refuted", "unsure", "wire")
+        found = {name: getattr(self, name) for name in (*masks, *numbers)}
+        return replace(
+            self,
+            probability=np.where(cells, np.minimum(self.probability, MAJORITY), self.probability),
+            **{name: found[name] & ~cells for name in masks if found[name] is not None},
+            **{name: np.where(cells, -1, found[name]) for name in numbers},
+        )
+
 
 def root_causes(
     found: CellFindings, aliases: Sequence[Fault], layout: SensorLayout
@@ -129,16 +142,10 @@ def root_causes(
     )
 
 
-def without_unused(
-    faults: Sequence[Fault], unused: Mask, layout: SensorLayout
-) -> tuple[tuple[Fault, ...], tuple[Fault, ...]]:
-    """Return the faults that reach beyond the ``unused`` cells (bool ``[D]``), and the wires of
-    their pads as possible ones.
-
-    A pad that nothing touches reads as one that is cut off at its rest.
-    """
-    others = tuple(fault for fault in faults if not unused[list(fault.cells)].all())
-    cut_off = []
+def cut_off(unused: Mask, layout: SensorLayout) -> tuple[Fault, ...]:
+    """Return the possible wires of pads with ``unused`` cells (bool ``[D]``): a pad that nothing
+    touches reads as one that is cut off at its rest."""
+    faults = []
     for pad in np.unique(layout.pad_of[unused]).tolist():
         cells = np.flatnonzero(unused & (layout.pad_of == pad))
         holding = [
@@ -151,10 +158,10 @@ def without_unused(
             f"nothing touched pad {pad}, or {line} is open: its cells hold the readings that they"
             " have without contact; touch it to tell"
         )
-        cut_off.append(
+        faults.append(
             Fault(FaultKind.OPEN, tuple(cells.tolist()), line=line, probability=0.5, reason=reason)
         )
-    return others, tuple(cut_off)
+    return tuple(faults)
 
 
 def _causes(

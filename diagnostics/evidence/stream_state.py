@@ -241,17 +241,18 @@ class StreamState:
     def unused(self, alive: Mask) -> Mask:
         """Return the cells at rest of pads that nothing shows to be in use, bool ``[D]``.
 
-        Such a pad has no cell that is ``alive``, and most of its cells hold the reading that they
-        have without contact, while another pad is in use. Nothing touched it, or it is cut off
-        where it rests: the readings are the same.
+        Such a pad has no loaded cell that is ``alive``, and most of its cells were never loaded,
+        nor hold a reading below their rest, while another pad is in use. Nothing touched it, or it
+        is cut off where it rests: the readings are the same.
         """
-        held = np.nan_to_num(np.abs(self.runs.value - self.scale.baseline), nan=np.inf)
-        still = self.present & (held <= self.scale.near)
+        below = self.runs.value < self.scale.baseline - self.scale.near
+        below &= ~self.runs.moved
+        still = self.present & ~below & ~self.touched & np.isfinite(self.lowest)
         of_pad = self.layout.pad_of
         pads = self.layout.pads
         share = np.bincount(of_pad[still], minlength=pads)
         cells = np.bincount(of_pad[self.present], minlength=pads)
-        used = np.bincount(of_pad[alive], minlength=pads) > 0
+        used = np.bincount(of_pad[alive & self.touched], minlength=pads) > 0
         idle = ~used & (share > MAJORITY * cells)
         return np.asarray(still & idle[of_pad] & bool(used.any()))
 

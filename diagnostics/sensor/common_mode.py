@@ -8,9 +8,9 @@ by how much the lowest c_t of successive recordings lies outside that of the ref
 
 Each cell reads it with a gain of its own: a model of rank one. The gain is the median over pairs of
 frames with different excess of the ratio of both differences, a Theil-Sen slope (Sen 1968), in the
-frames of each recording in which contacts load the pad least. Where the excess is there under load
-alone (crosstalk), the gain is 1 if that slope over all frames exceeds one half, else 0. A cell that
-is stuck has gain 0 and keeps its readings.
+frames in which contacts load the pad least. It is 1 where the gains of most cells differ by less
+than an eighth, and where the excess comes with the load (crosstalk), for cells with a slope above
+one half over all frames. A cell that is stuck has gain 0 and keeps its readings.
 
 Not detected: a common mode where contacts load three quarters of the cells of a pad, one within the
 range of the reference, and what fewer than five recordings show.
@@ -209,9 +209,17 @@ def _gains(
             continue
         contact = _contact(above - slope * of_pad[:, None])
         idle = contact <= np.quantile(contact, LEAST_LOADED)
-        slope = _slopes(above[idle], of_pad[idle])
-        gains[cells] = np.where(slope > LOW, slope, 0.0)
+        own = _slopes(above[idle], of_pad[idle])
+        follows = own > LOW
+        alike = not follows.any() or _spread(own[follows]) < LEAST_LOADED / 2
+        gains[cells] = own > MAJORITY if alike else np.where(follows, own, 0.0)
     return gains, comes_with_load
+
+
+def _spread(gains: Floats) -> float:
+    """Return by which share of their median gains differ from it, the median of that."""
+    middle = np.median(gains)
+    return float(np.median(np.abs(gains / middle - 1)))
 
 
 def _contact(above: Floats) -> Floats:

@@ -2,13 +2,14 @@
 
 Where the end of the range cuts readings off, or their steps are coarse, a healthy cell looks like
 one that is stuck or blinks. The same can be done to the reference: then a log is judged by what
-healthy cells read behind the same converter. Of a reading x of a cell that rests at r::
+healthy cells read behind the same converter. Of a reading x of a cell::
 
     saturated:  y = min(r + g (x - r), top)
     quantised:  z = the highest level of the log that is at most y, or the nearest one
 
-``top`` is the highest reading. The gain g maps the quantile of the loads in the reference that the
-share of readings at the top is in the log onto the top (quantile mapping). Bits that are cut off
+``top`` is the highest reading; r is where the cell rests, or 0 where cells rest higher now, as the
+gain moves them. The gain g maps the quantile of the loads in the reference that the share of
+readings at the top is in the log onto the top (quantile mapping). Bits that are cut off
 leave the level below, rounding leaves the nearest one: that counts which leaves a share of the
 readings in the lowest level nearer to that of the log.
 """
@@ -19,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import SLIGHT
@@ -38,14 +40,14 @@ class ConverterChange:
     """What a converter does to readings.
 
     Attributes:
-        rest: of each cell in the reference, ``[D]``.
-        gain: of the load.
+        fixed: reading of each cell that the gain leaves as it is, ``[D]``.
+        gain: of what is above.
         top: highest reading.
         levels: that it can read, ``[n]``, in order; None: as in the reference.
         bounds: lowest reading that gives each of the levels but the lowest, ``[n - 1]``.
     """
 
-    rest: Floats
+    fixed: Floats
     gain: float = 1.0
     top: float = np.inf
     levels: Floats | None = None
@@ -58,11 +60,18 @@ class ConverterChange:
     def _of(self, frames: Floats) -> Floats:
         read = frames
         if np.isfinite(self.top):
-            read = np.minimum(self.rest + self.gain * (frames - self.rest), self.top)
+            read = np.minimum(self.fixed + self.gain * (frames - self.fixed), self.top)
         if self.levels is None or self.bounds is None:
             return read
         level = self.levels[np.searchsorted(self.bounds, read, side="right")]
         return np.where(np.isnan(read), np.nan, level)
+
+    def shifts(self, rest: Floats, now: Floats, cells: NDArray[np.bool_]) -> float:
+        """Return by how much some cells (bool ``[D]``), which rested at ``rest``, rest elsewhere
+        than it would make of that, ``[cells]`` both: the median."""
+        fixed = self.fixed[cells]
+        made = np.minimum(fixed + self.gain * (rest - fixed), self.top)
+        return float(np.nanmedian(np.abs(made - now)))
 
 
 def find_converter_change(
@@ -85,15 +94,15 @@ def find_converter_change(
     moving = layout.present.ravel() & (high - low > SLIGHT * layout.full_scale)
     if not reference or not moving.any() or not {"quantised", "saturated"} & sizes.keys():
         return None
-    change = ConverterChange(rest_of(reference, layout))
+    rest = rest_of(reference, layout)
+    change = ConverterChange(rest)
     log = np.concatenate(recordings)[:, moving]
-    healthy = np.concatenate(reference)[:, moving]
     if "saturated" in sizes:
         top = float(high[moving].max())
-        rest = change.rest[moving]
-        reached = float(np.nanquantile(healthy - rest, 1 - _share(log, top)))
-        gain = (top - float(np.median(rest))) / max(reached, SLIGHT * top)
-        change = replace(change, gain=gain, top=top)
+        at_top = _share(log, top)
+        either = [_amplifying(fixed, top, at_top, reference, moving) for fixed in (rest, 0 * rest)]
+        now = rest_of(recordings, layout)[moving]
+        change = min(either, key=lambda one: one.shifts(rest[moving], now, moving))
     if sizes.get("quantised", 0.0) < 2 * change.gain:  # the gain makes such steps
         return change
     levels = _levels(log)
@@ -104,6 +113,17 @@ def find_converter_change(
     above = _share(log, float(levels[1]))
     bounds = min((levels[1:], nearest), key=lambda one: abs(above - _share(read, float(one[0]))))
     return replace(change, levels=levels, bounds=bounds)
+
+
+def _amplifying(
+    fixed: Floats, top: float, at_top: float, reference: Recordings, moving: NDArray[np.bool_]
+) -> ConverterChange:
+    """Return the change with which a share ``at_top`` of the readings of ``moving`` cells (bool
+    ``[D]``) in the reference reaches the ``top``."""
+    above = (np.concatenate(reference) - fixed)[:, moving]
+    reached = float(np.nanquantile(above, 1 - at_top))
+    gain = (top - float(np.median(fixed[moving]))) / max(reached, SLIGHT * top)
+    return ConverterChange(fixed, gain, top)
 
 
 def _levels(log: Floats) -> Floats:

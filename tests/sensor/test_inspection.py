@@ -150,14 +150,52 @@ def test_more_noise_of_all_cells_is_told(known, reference, log, times):
     assert found.severity >= 1
 
 
-def test_lost_bits_of_the_converter_are_told(known, reference, log):
-    assert "quantised" in names(af.inspect([r // 64 * 64 for r in log], known, reference=reference))
+def fewer_bits(frames: np.ndarray) -> np.ndarray:
+    return frames // 32 * 32
 
 
-def test_an_amplifier_that_saturates_is_told(known, reference, log):
-    assert "saturated" in names(
-        af.inspect([np.minimum(8 * r, 700) for r in log], known, reference=reference)
-    )
+def saturated(frames: np.ndarray) -> np.ndarray:
+    return np.minimum(8 * frames, 700)
+
+
+@pytest.mark.parametrize(("changed", "name"), [(fewer_bits, "quantised"), (saturated, "saturated")])
+def test_behind_a_changed_converter_a_dead_cell_is_found_and_at_most_one_other_is_blamed(
+    known, reference, log, busy, changed, name
+):
+    seen = [changed(r) for r in log]
+    for frames in seen:
+        frames[:, busy] = 0
+    found = af.inspect(seen, known, reference=reference)
+    assert name in names(found)
+    assert busy in found.diagnosis.fault_set
+    assert len(found.diagnosis.fault_set) <= 2
+
+
+def test_each_cell_that_creeps_by_its_own_offset_is_a_ramp_and_hardly_one_is_blamed(
+    known, reference, log
+):
+    offset = np.random.default_rng(0).uniform(0, 0.08 * 1023, D)
+    creeping = [counts(r + offset * i / len(log)) for i, r in enumerate(log)]
+    blamed = len(known.diagnose(creeping).fault_set)
+    found = af.inspect(creeping, known, reference=reference)
+    assert "ramp" in names(found)
+    assert len(found.diagnosis.fault_set) < blamed / 4
+
+
+def test_a_pad_that_nothing_touches_is_not_faulty_but_untested_and_a_dead_cell_on_it_is_found(
+    known, reference, log
+):
+    rng = np.random.default_rng(0)
+    untouched = [r.copy() for r in log]
+    idle = np.quantile(np.concatenate(reference)[:, D // 2 :], 0.02, axis=0)
+    for frames in untouched:
+        frames[:, D // 2 :] = counts(idle + rng.normal(0, NOISE, (len(frames), D // 2)))
+        frames[:, -1] = 1023
+    found = af.inspect(untouched, known, reference=reference)
+    assert found.diagnosis.fault_set == {D - 1}
+    (wire,) = found.diagnosis.possible
+    assert wire.reason.startswith("nothing touched pad 1, or pad 1, converter channel is open")
+    assert ("untested", 1) in {(one.name, one.severity) for one in found.findings}
 
 
 def test_a_number_that_a_driver_writes_for_no_value_is_told_with_its_count(

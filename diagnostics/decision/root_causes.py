@@ -98,7 +98,7 @@ class CellFindings:
         )
 
     def without(self, cells: Mask) -> CellFindings:
-        """Return the findings without those about some cells (bool ``[D]``), which have readings but
+        """Return the findings without those about some cells, bool ``[D]``, which have readings but
         were not tested."""
         masks = ("faulty", "alive", "rests", "full", "zero", "intermittent", "noisy", "drifting")
         numbers = ("refuted", "unsure", "wire")

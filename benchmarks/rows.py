@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from itertools import combinations
 
@@ -47,6 +47,7 @@ from diagnostics import (
 )
 from diagnostics.sensor.recalibration import find_recalibration
 from diagnostics.sensor.sensor_change import pad_change
+from diagnostics.simulation.circuit import Circuit, StuckCell
 
 WINDOW = 50  # frames in which a cell can raise a false alarm
 REPEATED = 100  # frames of a frozen stream, beyond the longest repetition that still counts as idle
@@ -64,6 +65,7 @@ IN_USE = 40  # recordings of a log in which dead cells move
 MOVING_SHARE = 0.08  # share of its cells that are dead
 USED = 3  # recordings that load a cell: then the log tests it
 DOUBTED = 0.1  # P(faulty) below which a cell counts as called alive
+WORN = 0.35  # of its load that a patch reads at the end of a log
 DEAD_BEFORE = 0.04  # share of the cells that were dead when the reference was recorded
 
 
@@ -815,6 +817,68 @@ def failing(bench: Bench) -> Iterator[Count]:
         yield Count(f"a wire {case}: its cells called alive", alive, cells, higher=False)
 
 
+def crossing(bench: Bench) -> Iterator[Count]:
+    """The layers of a loaded cell touch: on a grounded read-out it reads full scale, and the rest
+    of its row and its column a part of their load."""
+    layout = bench.layout
+    span = highest(bench)
+    rest = rest_levels(bench)
+    healthy = Circuit(replace(layout, full_scale=span))
+    logs = found = blamed = alive = moved = 0
+    for _, log, rng in bench.logs(IN_USE):
+        whole = np.concatenate(log)
+        used = np.flatnonzero(in_use(log, rest, span) & layout.present.ravel())
+        if not len(used):
+            continue
+        cell = int(rng.choice(used))
+        load = np.clip(whole - rest, 0, span)
+        shorted = healthy.with_faults(StuckCell(cell, 0.0)).read(load)
+        seen = whole + shorted - healthy.read(load)
+        diagnosis = bench.proving.diagnose(parted(seen, log))
+        wrong = (np.abs(seen - whole) > VISIBLE * span).sum(axis=0) >= TESTABLE
+        others = np.setdiff1d(np.flatnonzero(wrong), [cell])
+        logs += 1
+        found += cell in diagnosis.fault_set
+        blamed += len(set(diagnosis.fault_set) - set(np.flatnonzero(wrong).tolist()) - {cell})
+        alive += int(called_alive(diagnosis)[others].sum())
+        moved += len(others)
+    yield Count("a shorted crossing: found", found, logs)
+    yield Count(
+        "a shorted crossing: cells it leaves alone blamed in a log", blamed, logs, higher=False
+    )
+    yield Count("a shorted crossing: cells it changes called alive", alive, moved, higher=False)
+
+
+def worn(bench: Bench) -> Iterator[Count]:
+    """A cell and those around it, at least 3 of them in use, fade together to 0.35 of their load
+    over a log."""
+    layout = bench.layout
+    span = highest(bench)
+    rest = rest_levels(bench)
+    logs = found = blamed = alive = cells = 0
+    for _, log, rng in bench.logs(IN_USE):
+        used = in_use(log, rest, span)
+        patches = [np.array([cell, *neighbours(layout, cell)]) for cell in np.flatnonzero(used)]
+        patches = [patch for patch in patches if used[patch].sum() > 2]
+        if not patches:
+            continue
+        patch = patches[rng.integers(len(patches))]
+        whole = np.concatenate(log)
+        gain = np.linspace(1, WORN, len(whole))[:, None]
+        seen = whole.copy()
+        seen[:, patch] = rest[patch] + gain * (whole - rest)[:, patch]
+        diagnosis = bench.proving.diagnose(parted(seen, log))
+        can = patch[used[patch]]
+        logs += 1
+        found += len(diagnosis.fault_set & set(can.tolist()))
+        blamed += len(set(diagnosis.fault_set) - set(patch.tolist()))
+        alive += int(called_alive(diagnosis)[can].sum())
+        cells += len(can)
+    yield Count("a patch wears to 0.35: found", found, cells)
+    yield Count("a patch wears to 0.35: other cells blamed in a log", blamed, logs, higher=False)
+    yield Count("a patch wears to 0.35: called alive", alive, cells, higher=False)
+
+
 def rewired(bench: Bench) -> Iterator[Count]:
     """Wirings that change a visible number of readings; told right: put back as they were."""
     layout, choice = bench.layout, wirings(bench.layout)
@@ -1138,6 +1202,8 @@ ROWS: dict[str, Callable[[Bench], Iterator[Count]]] = {
         moving,
         proven,
         failing,
+        crossing,
+        worn,
         rewired,
         groups,
         replaced,

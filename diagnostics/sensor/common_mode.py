@@ -10,7 +10,8 @@ Each cell reads it with a gain of its own: a model of rank one. The gain is the 
 frames with different excess of the ratio of both differences, a Theil-Sen slope (Sen 1968), in the
 frames in which contacts load the pad least. It is 1 where the gains of most cells differ by less
 than an eighth, and where the excess comes with the load (crosstalk), for cells with a slope above
-one half over all frames. A cell that is stuck has gain 0 and keeps its readings.
+one half over all frames. A cell that is stuck has gain 0 and keeps its readings. Where cells creep
+apart from recording to recording, what each rests higher by in nine successive ones is taken out.
 
 Not detected: a common mode where contacts load three quarters of the cells of a pad, one within the
 range of the reference, and what fewer than five recordings show.
@@ -18,7 +19,7 @@ range of the reference, and what fewer than five recordings show.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,20 +50,31 @@ class CommonMode:
     Attributes:
         excess: ``[T, pads]`` of each recording, in the layout's unit.
         gains: ``[D]``, how much of it each cell reads; 0 where it does not.
+        rest: ``[D]``, reading of each cell without contact, in the layout's unit.
+        creep: ``[R, D]``, by how much cells that creep apart rest higher in each recording: taken
+            out in place of the excess. None: they do not.
         disturbance: how it is told.
     """
 
     excess: tuple[Floats, ...]
     gains: Floats
+    rest: Floats
     disturbance: Disturbance
+    creep: Floats | None = None
 
     def undo(self, recordings: Recordings, layout: SensorLayout) -> list[Floats]:
         """Return recordings ``[T, D]`` without it, within 0 and full scale."""
         cleaned = []
-        for frames, excess in zip(recordings, self.excess, strict=True):
+        for i, (frames, excess) in enumerate(zip(recordings, self.excess, strict=True)):
             shared = self.gains * excess[:, layout.pad_of]
-            moved = np.clip(frames - shared, 0.0, layout.full_scale)
-            cleaned.append(np.where(shared == 0, frames, moved))
+            if self.creep is not None:
+                shared = np.where(self.gains > 0, self.creep[i], 0.0) + np.zeros_like(frames)
+            without = frames - shared
+            # What it would move below its rest has less of it: clipped at 0, it would look stuck.
+            low = known_quantile(without, LOW, axis=0)
+            most = np.maximum(shared.max(axis=0), 0.0)
+            moved = without + np.clip(np.nan_to_num(self.rest - low), 0.0, most)
+            cleaned.append(np.where(shared == 0, frames, np.clip(moved, 0.0, layout.full_scale)))
         return cleaned
 
 
@@ -111,7 +123,22 @@ def find_common_mode(
     of_pad = [one[:, largest] for one in excess]
     name, what = _told(of_pad, comes_with_load=bool(comes_with_load[largest]))
     reason = f"{what} of {size:.3g} {layout.unit}, which the cells of a pad share"
-    return CommonMode(tuple(excess), gains, Disturbance(name, size, reason))
+    found = CommonMode(tuple(excess), gains, rest, Disturbance(name, size, reason))
+    if name != "ramp" or np.isin(gains, [0, 1]).all():
+        return found
+    return replace(found, creep=_creep(recordings, rest))
+
+
+def _creep(recordings: Recordings, rest: Floats) -> Floats:
+    """Return by how much each cell rests higher in each recording, ``[R, D]``: the median of its
+    low quantile less ``rest``, at least 0, over up to nine successive recordings with that one in
+    their middle."""
+    low = np.stack([known_quantile(frames, LOW, axis=0) for frames in recordings]) - rest
+    count = len(low)
+    reach = [min(i, count - 1 - i, _NEAR) for i in range(count)]
+    near = [low[i - n : i + n + 1] for i, n in enumerate(reach)]
+    middle = np.stack([known_quantile(few, 0.5, axis=0) for few in near])
+    return np.nan_to_num(middle).clip(0.0, None)
 
 
 def _shifts(new: Floats, rests: Floats) -> Floats:
@@ -211,8 +238,10 @@ def _gains(
         idle = contact <= np.quantile(contact, LEAST_LOADED)
         own = _slopes(above[idle], of_pad[idle])
         follows = own > LOW
-        alike = not follows.any() or _spread(own[follows]) < LEAST_LOADED / 2
-        gains[cells] = own > MAJORITY if alike else np.where(follows, own, 0.0)
+        if not follows.any() or _spread(own[follows]) < LEAST_LOADED / 2:
+            gains[cells] = own > MAJORITY
+        else:
+            gains[cells] = np.where(follows, own, 0.0)
     return gains, comes_with_load
 
 

@@ -47,7 +47,7 @@ def test_without_it_the_cells_read_what_they_would_have():
     undone = np.concatenate(found.undo(shaking(2, gain), LAYOUT))
     truth = np.concatenate(contacts(2))
     alive = np.arange(D) != DEAD
-    assert np.median(np.abs(undone - truth)[:, alive]) < 10
+    assert np.median(np.abs(undone - truth)[:, alive]) < 15
     assert (undone[:, DEAD] == 2000).all()
 
 

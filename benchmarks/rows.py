@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from itertools import combinations
 
@@ -823,7 +823,7 @@ def crossing(bench: Bench) -> Iterator[Count]:
     layout = bench.layout
     span = highest(bench)
     rest = rest_levels(bench)
-    healthy = Circuit(replace(layout, full_scale=span))
+    healthy = Circuit(layout)
     logs = found = blamed = alive = moved = 0
     for _, log, rng in bench.logs(IN_USE):
         whole = np.concatenate(log)
@@ -831,7 +831,7 @@ def crossing(bench: Bench) -> Iterator[Count]:
         if not len(used):
             continue
         cell = int(rng.choice(used))
-        load = np.clip(whole - rest, 0, span)
+        load = np.clip(whole - rest, 0, None)
         shorted = healthy.with_faults(StuckCell(cell, 0.0)).read(load)
         seen = whole + shorted - healthy.read(load)
         diagnosis = bench.proving.diagnose(parted(seen, log))

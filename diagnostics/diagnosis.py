@@ -16,7 +16,13 @@ from diagnostics.decision.calibration import Calibrator, faulty_at, kinds
 from diagnostics.decision.certificate import Certificate, certify
 from diagnostics.decision.line_cover import candidate_groups
 from diagnostics.decision.result import Diagnosis
-from diagnostics.decision.root_causes import OF_WIRES, CellFindings, cut_off, root_causes
+from diagnostics.decision.root_causes import (
+    OF_WIRES,
+    CellFindings,
+    cut_off,
+    pulling,
+    root_causes,
+)
 from diagnostics.decision.serialization import (
     Arrays,
     from_state,
@@ -27,10 +33,12 @@ from diagnostics.decision.serialization import (
 from diagnostics.decision.static_loads import StaticLoad, find_static_loads
 from diagnostics.events.constant_runs import SHORTEST_RUN
 from diagnostics.evidence.life import PIECE, Life
+from diagnostics.evidence.life.pulled_lines import pulled_lines
 from diagnostics.evidence.reference import Reference, highest_reading, living, tolerance_of
 from diagnostics.evidence.spatial import Exclusion, Spatial
 from diagnostics.evidence.stepping import finished
 from diagnostics.evidence.stream_state import StreamState
+from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.reference_faults import find_reference_faults, never_moved
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import (
@@ -461,8 +469,10 @@ class SelfDiagnosis:
             probability[cells] = np.maximum(probability[cells], fault.probability or 0.0)
             inferred[cells] = True
         # Noise alone is no test; nor is movement, where the reference tells how cells depend on
-        # each other.
-        shown = life.shown | (stream.reference.dead > 0)
+        # each other; nor is a line that a shorted crossing pulls.
+        pulled = yield from self._pulled(stream, life, causes)
+        causes = pulling(causes, pulled[self._place], self.layout)
+        shown = (life.shown | (stream.reference.dead > 0)) & ~pulled
         scale = stream.scale
         intermittency = stream.intermittency
         working = np.empty_like(inferred)
@@ -519,6 +529,23 @@ class SelfDiagnosis:
         suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
         life = yield from stream.proof_of_life(evidence, explained, suspected, first).steps()
         return life
+
+    def _pulled(
+        self, stream: StreamState, life: Life, causes: Sequence[Fault]
+    ) -> Generator[None, None, NDArray[np.bool_]]:
+        """Yield between steps; return the cells on lines that a shorted crossing pulls, bool
+        ``[D]``."""
+        shorts = [f.cells[0] for f in causes if f.kind is FaultKind.SHORT and f.line is None]
+        evidence = None
+        if shorts and stream.reference.life is not None and not stream.noisier:
+            evidence = stream.evidence_of_life()
+        if evidence is None:
+            return np.zeros(self.layout.n_cells, bool)
+        faulty = np.zeros(self.layout.n_cells, bool)
+        faulty[[cell for fault in causes for cell in fault.cells]] = True
+        known = stream.received & ~stream.silent & ~life.refuted & ~faulty[self._order]
+        shorted = self._place[np.asarray(shorts)]
+        return (yield from pulled_lines(evidence.log, shorted, known))
 
     @staticmethod
     def _misleading(stream: StreamState, life: Life) -> NDArray[np.bool_]:

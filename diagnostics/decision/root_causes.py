@@ -142,6 +142,28 @@ def root_causes(
     )
 
 
+def pulling(faults: Sequence[Fault], pulled: Mask, layout: SensorLayout) -> tuple[Fault, ...]:
+    """Return the faults, and of shorted cells that their row and column read too little where cells
+    on these are ``pulled`` (bool ``[D]``)."""
+    told = []
+    for fault in faults:
+        beside: set[int] = set()
+        if fault.kind is FaultKind.SHORT and fault.line is None and pulled.any():
+            lines = [line for line in layout.lines if line.kind in ("row", "column")]
+            on = [layout.cells_on(line) for line in lines]
+            beside = {
+                int(c) for cells in on if fault.cells[0] in cells for c in cells[pulled[cells]]
+            }
+        if beside:
+            reason = (
+                f"{fault.reason}; {len(beside)} cells of its row and column read a part of their"
+                " load through it, and are not tested"
+            )
+            fault = replace(fault, reason=reason)
+        told.append(fault)
+    return tuple(told)
+
+
 def cut_off(unused: Mask, layout: SensorLayout) -> tuple[Fault, ...]:
     """Return the possible wires of pads with ``unused`` cells (bool ``[D]``): a pad that nothing
     touches reads as one that is cut off at its rest."""

@@ -13,6 +13,7 @@ from diagnostics.evidence.life import EvidenceOfLog, LifeRecord, LifeTest
 from diagnostics.evidence.life.healthy_table import ConditionalMean
 from diagnostics.evidence.life.record import KEPT
 from diagnostics.evidence.stepping import finished
+from diagnostics.simulation.circuit import Circuit, StuckCell
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +105,29 @@ def test_a_wire_that_opens_under_load_or_flickers_is_named_and_none_of_its_cells
         assert set(found.fault_set) <= set(cells.tolist())
         alive = (found.verdicts[cells] == Verdict.ALIVE) & (found.probability[cells] < 0.1)
         assert not alive.any()
+
+
+def test_cells_that_read_a_part_of_their_load_through_a_shorted_crossing_are_not_called_alive(
+    fitted, log, used
+):
+    layout = fitted.layout
+    cell = int(used[0])
+    circuit = Circuit(layout)
+    shorted = circuit.with_faults(StuckCell(cell, 0.0))
+    whole = np.concatenate(log)
+    seen = np.clip(whole + shorted.read(whole) - circuit.read(whole), 0, layout.full_scale)
+    wrong = (np.abs(seen - whole) > 0.05 * layout.full_scale).sum(axis=0) >= 10
+    wrong[cell] = False
+    assert wrong.sum() > 5
+    found = fitted.diagnose([seen])
+    fault = next(fault for fault in found.faults if cell in fault.cells)
+    assert (fault.kind, fault.cells) == (FaultKind.SHORT, (cell,))
+    assert found.fault_set - {cell} <= set(np.flatnonzero(wrong).tolist())
+    assert "cells of its row and column read a part of their load through it" in fault.reason
+    alone = fitted.diagnose(broken(log, Fault(FaultKind.SHORT, (cell,)), fitted))
+    assert "through it" not in alone.faults[0].reason
+    alive = [(d.verdicts == Verdict.ALIVE)[wrong].sum() for d in (found, alone)]
+    assert alive[0] < alive[1] / 4
 
 
 def test_healthy_cells_in_use_are_shown_to_be_alive_and_none_is_blamed(fitted, log, used):

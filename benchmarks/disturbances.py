@@ -137,8 +137,9 @@ def blamed_and_wires(inspection: af.Inspection) -> np.ndarray:
 
 
 def is_told(inspection: af.Inspection) -> bool:
-    """Return whether a finding speaks of the sensor, rather than of its cells."""
-    return any(finding.name not in OF_CELLS for finding in inspection.findings)
+    """Return whether a finding speaks of the sensor, or of what was not tested."""
+    of_cells = {*OF_CELLS} - {"untested"}
+    return any(finding.name not in of_cells for finding in inspection.findings)
 
 
 def disturbed(bench: Bench) -> Iterator[Count]:

@@ -414,7 +414,8 @@ class SelfDiagnosis:
         Args:
             stream: the state of the log.
             n_recordings: of which it consists.
-            life: the last result of :meth:`proof`, which is then not repeated; None: it is.
+            life: the last result of :meth:`proof`, which is then not repeated, nor are the lines
+                of a shorted crossing tested; None: they are.
         """
         stream = stream.complete()
         if not stream.received.any():
@@ -423,6 +424,7 @@ class SelfDiagnosis:
         yield
         explained = copies
         still = list[StaticLoad]()
+        whole = life is None
         if life is None:
             life = yield from self._proof(stream, copies)
         log_ratio = self._log_ratio(stream, life)
@@ -470,8 +472,10 @@ class SelfDiagnosis:
             inferred[cells] = True
         # Noise alone is no test; nor is movement, where the reference tells how cells depend on
         # each other; nor is a line that a shorted crossing pulls.
-        pulled = yield from self._pulled(stream, life, causes)
-        causes = pulling(causes, pulled[self._place], self.layout)
+        pulled = np.zeros_like(inferred)
+        if whole:
+            pulled = yield from self._pulled(stream, life, causes)
+            causes = pulling(causes, pulled[self._place], self.layout)
         shown = (life.shown | (stream.reference.dead > 0)) & ~pulled
         scale = stream.scale
         intermittency = stream.intermittency

@@ -458,9 +458,12 @@ class SelfDiagnosis:
         ):
             weight[group] = np.maximum(weight[group], together(surprisal)[group])
             yield
-        unused = stream.unused(found.alive)[self._place]
-        found = replace(found, weight=weight).of(self._place).without(unused)
+        found = replace(found, weight=weight).of(self._place)
         causes, possible = root_causes(found, aliases, self.layout)
+        unused = self._unused(stream, found.alive, causes)
+        if unused.any():
+            found = found.without(unused)
+            causes, possible = root_causes(found, aliases, self.layout)
         probability = found.probability.copy()
         inferred = np.zeros(self.layout.n_cells, bool)
         still = [load.of(self._order, self.layout) for load in still]
@@ -533,6 +536,18 @@ class SelfDiagnosis:
         suspected = spatial.scored & (found.faulty | stream.suspected(spatial))
         life = yield from stream.proof_of_life(evidence, explained, suspected, first).steps()
         return life
+
+    def _unused(
+        self, stream: StreamState, alive: NDArray[np.bool_], causes: Sequence[Fault]
+    ) -> NDArray[np.bool_]:
+        """Return the cells that are blamed although nothing may have touched their pad, and those
+        at rest beside them, bool ``[D]``. Most logs leave some pad alone and blame no cell of it.
+        """
+        unused = stream.unused(alive[self._order])[self._place]
+        blamed = np.zeros_like(unused)
+        blamed[[cell for fault in causes for cell in fault.cells]] = True
+        pad = self.layout.pad_of
+        return np.asarray(unused & np.isin(pad, pad[unused & blamed]))
 
     def _pulled(
         self, stream: StreamState, life: Life, causes: Sequence[Fault]

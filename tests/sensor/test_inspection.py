@@ -198,6 +198,15 @@ def test_a_pad_that_nothing_touches_is_not_faulty_but_untested_and_a_dead_cell_o
     assert ("untested", 1) in {(one.name, one.severity) for one in found.findings}
 
 
+def test_a_pad_that_one_recording_does_not_touch_is_not_told(known, reference, log):
+    one = log[0].copy()
+    idle = np.quantile(np.concatenate(reference)[:, D // 2 :], 0.02, axis=0)
+    one[:, D // 2 :] = counts(idle)
+    found = af.inspect([one], known, reference=reference)
+    assert found.diagnosis.possible == ()
+    assert found.diagnosis.fault_set == set()
+
+
 def test_a_number_that_a_driver_writes_for_no_value_is_told_with_its_count(
     known, reference, log, busy
 ):

@@ -98,8 +98,9 @@ def find_changed_readings(
         diagnoser: fitted, or not: then nothing is found.
         frames: recordings ``[T, D]``, as the running version undoes them.
         healthy: those of the reference, with which pads are compared.
-        disturbed: a disturbance of the array may explain what differs: then wires are exchanged
-            only where fewer cells are faulty once they are put back.
+        disturbed: a disturbance of the array may explain what differs: then no pad counts as
+            replaced, and wires as exchanged only where fewer cells are faulty once they are put
+            back.
     """
     as_found = None
     rewiring = diagnoser.rewiring(frames)
@@ -113,7 +114,9 @@ def find_changed_readings(
             return exchanged
     if as_found is None:
         as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
-    recalibration = _recalibration(diagnoser, frames, healthy, as_found.diagnosis)
+    recalibration = None
+    if not disturbed:
+        recalibration = _recalibration(diagnoser, frames, healthy, as_found.diagnosis)
     if recalibration is None:
         return as_found
     undone = [recalibration.undo(recording, diagnoser.layout.full_scale) for recording in frames]

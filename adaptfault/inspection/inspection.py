@@ -162,7 +162,7 @@ def inspect(
             seen = converter.of(healthy)
             behind = SelfDiagnosis(**diagnoser.get_params()).fit(seen, progress=progress)
             others = _judged(log, seen, behind, disturbed=told)
-            if others[0].diagnosis.n_lost <= readings.diagnosis.n_lost:
+            if len(others[0].diagnosis.fault_set) <= len(readings.diagnosis.fault_set):
                 (readings, common), diagnoser, healthy = others, behind, seen
     if common is not None:
         disturbances.append(common.disturbance)

@@ -4,7 +4,7 @@ Where the end of the range cuts readings off, or their steps are coarse, a healt
 one that is stuck or blinks. The same can be done to the reference: then a log is judged by what
 healthy cells read behind the same converter. Of a reading x of a cell::
 
-    saturated:  y = min(r + g (x - r), top)
+    saturated:  y = r + g (x - r), within 0 and top
     quantised:  z = the highest level of the log that is at most y, or the nearest one
 
 ``top`` is the highest reading; r is where the cell rests, or 0 where cells rest higher now, as the
@@ -60,7 +60,7 @@ class ConverterChange:
     def _of(self, frames: Floats) -> Floats:
         read = frames
         if np.isfinite(self.top):
-            read = np.minimum(self.fixed + self.gain * (frames - self.fixed), self.top)
+            read = np.clip(self.fixed + self.gain * (frames - self.fixed), 0.0, self.top)
         if self.levels is None or self.bounds is None:
             return read
         level = self.levels[np.searchsorted(self.bounds, read, side="right")]

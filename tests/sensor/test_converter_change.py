@@ -49,6 +49,7 @@ def test_an_amplifier_that_saturates_is_done_to_the_reference(gain):
     assert change.top == 3000
     assert change.gain == pytest.approx(gain, rel=0.35)
     read = np.concatenate(change.of(loads(1)))
+    assert read.min() >= 0
     assert np.abs(read - np.concatenate([amplified(f) for f in loads(1)])).mean() < 250
 
 

@@ -178,7 +178,7 @@ def cut_off(unused: Mask, layout: SensorLayout) -> tuple[Fault, ...]:
         line = min(holding, key=lambda line: len(layout.cells_on(line)))
         reason = (
             f"nothing touched pad {pad}, or {line} is open: its cells hold the readings that they"
-            " have without contact; touch it to tell"
+            " have without contact; press on it to tell"
         )
         faults.append(
             Fault(FaultKind.OPEN, tuple(cells.tolist()), line=line, probability=0.5, reason=reason)

@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from rows import IN_USE, Bench, Count, draw_faults, highest, rest_levels
+from rows import IN_USE, Bench, Count, Tally, draw_faults, highest, rest_levels
 
 import adaptfault as af
-from adaptfault.bench.changes import STUCK_KINDS, TESTABLE, Log, broken, differs, parted
+from adaptfault.bench.changes import STUCK_KINDS, Log, broken, parted
 from adaptfault.inspection.inspection import OF_CELLS
 from diagnostics import Monitor
 
@@ -29,8 +29,8 @@ def along(whole: np.ndarray) -> np.ndarray:
 
 
 def noise_of(bench: Bench) -> float:
-    """Return the noise of the reference: the median over cells of the deviation of what differs
-    from frame to frame at rest."""
+    """Return the noise of the reference: the standard deviation that the median step between two
+    frames stands for, at least ``NOISE``."""
     frames = np.asarray(bench.recordings.frames[bench.reference[0]], dtype=np.float64)
     steps = np.abs(np.diff(frames, axis=0))
     return max(float(np.median(steps)) / 0.95, NOISE * bench.layout.full_scale)
@@ -147,27 +147,20 @@ def disturbed(bench: Bench) -> Iterator[Count]:
     too."""
     for case, change in cases(bench).items():
         wrong = np.zeros(2)
-        told = hit = testable = true = false = 0
+        told = 0
+        tally = Tally()
         for seed, log, rng in bench.logs(IN_USE):
             seen = parted(read(change(np.concatenate(log), rng), bench), log)
             inspection = inspected(seen, bench)
             wrong += blamed_and_wires(inspection)
             told += is_told(inspection)
             faults = draw_faults(bench.layout, BESIDE, STUCK_KINDS, rng)
-            dead = {cell for fault in faults for cell in fault.cells}
             dying = list(broken(seen, faults, bench.layout, 0.0, 0.0, seed))
-            other = differs(np.concatenate(seen), np.concatenate(dying), bench.layout)
-            can = set(np.flatnonzero(other.sum(axis=0) >= TESTABLE).tolist())
-            found = inspected(dying, bench).diagnosis.fault_set
-            hit += len(found & can)
-            testable += len(can)
-            true += len(found & dead)
-            false += len(found - dead)
+            tally.add(seen, dying, faults, inspected(dying, bench).diagnosis, 0)
         yield Count(f"{case}: cells blamed in a log", wrong[0], bench.count, higher=False)
         yield Count(f"{case}: wires invented in a log", wrong[1], bench.count, higher=False)
         yield Count(f"{case}: told", told, bench.count)
-        yield Count(f"{case}, 8 % dead: precision", true, true + false)
-        yield Count(f"{case}, 8 % dead: recall", hit, testable)
+        yield from tally.counts(f"{case}, 8 % dead")
 
 
 def untested(bench: Bench) -> Iterator[Count]:

@@ -424,7 +424,7 @@ class SelfDiagnosis:
         yield
         explained = copies
         still = list[StaticLoad]()
-        whole = life is None
+        tests_lines = life is None
         if life is None:
             life = yield from self._proof(stream, copies)
         log_ratio = self._log_ratio(stream, life)
@@ -476,8 +476,8 @@ class SelfDiagnosis:
         # Noise alone is no test; nor is movement, where the reference tells how cells depend on
         # each other; nor is a line that a shorted crossing pulls.
         pulled = np.zeros_like(inferred)
-        if whole:
-            pulled = yield from self._pulled(stream, life, causes)
+        if tests_lines:
+            pulled = yield from self._pulled(stream, life, causes, inferred)
             causes = pulling(causes, pulled[self._place], self.layout)
         shown = (life.shown | (stream.reference.dead > 0)) & ~pulled
         scale = stream.scale
@@ -550,18 +550,20 @@ class SelfDiagnosis:
         return np.asarray(unused & np.isin(pad, pad[unused & blamed]))
 
     def _pulled(
-        self, stream: StreamState, life: Life, causes: Sequence[Fault]
+        self,
+        stream: StreamState,
+        life: Life,
+        causes: Sequence[Fault],
+        faulty: NDArray[np.bool_],
     ) -> Generator[None, None, NDArray[np.bool_]]:
         """Yield between steps; return the cells on lines that a shorted crossing pulls, bool
-        ``[D]``."""
+        ``[D]``; ``faulty`` ones (bool ``[D]``), those of the ``causes``, tell nothing of a line."""
         shorts = [f.cells[0] for f in causes if f.kind is FaultKind.SHORT and f.line is None]
         evidence = None
         if shorts and stream.reference.life is not None and not stream.noisier:
             evidence = stream.evidence_of_life()
         if evidence is None:
             return np.zeros(self.layout.n_cells, bool)
-        faulty = np.zeros(self.layout.n_cells, bool)
-        faulty[[cell for fault in causes for cell in fault.cells]] = True
         known = stream.received & ~stream.silent & ~life.refuted & ~faulty[self._order]
         shorted = self._place[np.asarray(shorts)]
         return (yield from pulled_lines(evidence.log, shorted, known))

@@ -102,21 +102,19 @@ def find_changed_readings(
             replaced, and wires as exchanged only where fewer cells are faulty once they are put
             back.
     """
-    as_found = None
+    exchanged = None
     rewiring = diagnoser.rewiring(frames)
     if rewiring is not None:
         put_back = [rewiring.undo(recording) for recording in frames]
         exchanged = ChangedReadings(rewiring, None, put_back, diagnoser.diagnose(put_back))
         if not disturbed:
             return exchanged
-        as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
-        if exchanged.diagnosis.n_lost < as_found.diagnosis.n_lost:
+    as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
+    if disturbed:
+        if exchanged is not None and exchanged.diagnosis.n_lost < as_found.diagnosis.n_lost:
             return exchanged
-    if as_found is None:
-        as_found = ChangedReadings(None, None, frames, diagnoser.diagnose(frames))
-    recalibration = None
-    if not disturbed:
-        recalibration = _recalibration(diagnoser, frames, healthy, as_found.diagnosis)
+        return as_found
+    recalibration = _recalibration(diagnoser, frames, healthy, as_found.diagnosis)
     if recalibration is None:
         return as_found
     undone = [recalibration.undo(recording, diagnoser.layout.full_scale) for recording in frames]

@@ -157,8 +157,10 @@ def inspect(
     else:
         told = any(one.name in _OF_ALL_CELLS for one in disturbances)
         readings, common = _judged(log, healthy, diagnoser, disturbed=told)
-        converter = find_converter_change(log, healthy, layout, disturbances)
-        if converter is not None and diagnoser.load_ is None:
+        converter = None
+        if diagnoser.load_ is None:
+            converter = find_converter_change(log, healthy, layout, disturbances)
+        if converter is not None:
             seen = converter.of(healthy)
             behind = SelfDiagnosis(**diagnoser.get_params()).fit(seen, progress=progress)
             others = _judged(log, seen, behind, disturbed=told)

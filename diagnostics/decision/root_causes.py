@@ -145,22 +145,21 @@ def root_causes(
 def pulling(faults: Sequence[Fault], pulled: Mask, layout: SensorLayout) -> tuple[Fault, ...]:
     """Return the faults, and of shorted cells that their row and column read too little where cells
     on these are ``pulled`` (bool ``[D]``)."""
-    told = []
-    for fault in faults:
-        beside: set[int] = set()
-        if fault.kind is FaultKind.SHORT and fault.line is None and pulled.any():
-            lines = [line for line in layout.lines if line.kind in ("row", "column")]
-            on = [layout.cells_on(line) for line in lines]
-            beside = {
-                int(c) for cells in on if fault.cells[0] in cells for c in cells[pulled[cells]]
-            }
+    told = list(faults)
+    if not pulled.any():
+        return tuple(told)
+    lines = [layout.cells_on(line) for line in layout.lines if line.kind in ("row", "column")]
+    for i, fault in enumerate(faults):
+        if fault.kind is not FaultKind.SHORT or fault.line is not None:
+            continue
+        crossing = [cells for cells in lines if fault.cells[0] in cells]
+        beside = {cell for cells in crossing for cell in cells[pulled[cells]].tolist()}
         if beside:
             reason = (
                 f"{fault.reason}; {len(beside)} cells of its row and column read a part of their"
                 " load through it, and are not tested"
             )
-            fault = replace(fault, reason=reason)
-        told.append(fault)
+            told[i] = replace(fault, reason=reason)
     return tuple(told)
 
 

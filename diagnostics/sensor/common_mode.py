@@ -68,7 +68,7 @@ class CommonMode:
         for i, (frames, excess) in enumerate(zip(recordings, self.excess, strict=True)):
             shared = self.gains * excess[:, layout.pad_of]
             if self.creep is not None:
-                shared = np.where(self.gains > 0, self.creep[i], 0.0) + np.zeros_like(frames)
+                shared = np.broadcast_to(self.creep[i], frames.shape)
             without = frames - shared
             # What it would move below its rest has less of it: clipped at 0, it would look stuck.
             low = known_quantile(without, LOW, axis=0)
@@ -126,7 +126,7 @@ def find_common_mode(
     found = CommonMode(tuple(excess), gains, rest, Disturbance(name, size, reason))
     if name != "ramp" or np.isin(gains, [0, 1]).all():
         return found
-    return replace(found, creep=_creep(recordings, rest))
+    return replace(found, creep=np.where(gains > 0, _creep(recordings, rest), 0.0))
 
 
 def _creep(recordings: Recordings, rest: Floats) -> Floats:

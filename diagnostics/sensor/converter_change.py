@@ -28,8 +28,9 @@ from diagnostics.sensor.disturbance import (
     Disturbance,
     Floats,
     Recordings,
-    extremes_of,
+    moving_cells,
     rest_of,
+    share_at,
 )
 
 _CELLS = 3  # that read a level of the converter: others are noise of a broken cell
@@ -90,8 +91,7 @@ def find_converter_change(
         disturbances: of the log.
     """
     sizes = {one.name: one.size for one in disturbances}
-    low, high = extremes_of(recordings)
-    moving = layout.present.ravel() & (high - low > SLIGHT * layout.full_scale)
+    moving, high = moving_cells(recordings, layout)
     if not reference or not moving.any() or not {"quantised", "saturated"} & sizes.keys():
         return None
     rest = rest_of(reference, layout)
@@ -99,7 +99,7 @@ def find_converter_change(
     log = np.concatenate(recordings)[:, moving]
     if "saturated" in sizes:
         top = float(high[moving].max())
-        at_top = _share(log, top)
+        at_top = share_at(log, top)
         either = [_amplifying(fixed, top, at_top, reference, moving) for fixed in (rest, 0 * rest)]
         now = rest_of(recordings, layout)[moving]
         change = min(either, key=lambda one: one.shifts(rest[moving], now, moving))
@@ -110,8 +110,8 @@ def find_converter_change(
         return change
     nearest = (levels[1:] + levels[:-1]) / 2
     read = np.concatenate(change.of(reference))[:, moving]
-    above = _share(log, float(levels[1]))
-    bounds = min((levels[1:], nearest), key=lambda one: abs(above - _share(read, float(one[0]))))
+    above = share_at(log, float(levels[1]))
+    bounds = min((levels[1:], nearest), key=lambda one: abs(above - share_at(read, float(one[0]))))
     return replace(change, levels=levels, bounds=bounds)
 
 
@@ -131,9 +131,3 @@ def _levels(log: Floats) -> Floats:
     of_cells = [np.unique(of_cell[np.isfinite(of_cell)]) for of_cell in log.T]
     values, cells = np.unique(np.concatenate(of_cells), return_counts=True)
     return np.asarray(values[cells >= min(_CELLS, log.shape[1])])
-
-
-def _share(readings: Floats, least: float) -> float:
-    """Return the share of the received readings that are at least ``least``."""
-    received = readings[np.isfinite(readings)]
-    return float((received >= least).mean()) if received.size else 0.0

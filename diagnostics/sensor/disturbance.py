@@ -143,6 +143,13 @@ def extremes_of(recordings: Recordings) -> tuple[Floats, Floats]:
     return lowest, highest
 
 
+def moving_cells(recordings: Recordings, layout: SensorLayout) -> tuple[NDArray[np.bool_], Floats]:
+    """Return the cells whose readings differ, bool ``[D]``, and the highest reading of each,
+    ``[D]``."""
+    low, high = extremes_of(recordings)
+    return layout.present.ravel() & (high - low > SLIGHT * layout.full_scale), high
+
+
 def _differs(new: Floats, old: Floats) -> bool:
     """Return whether the statistic of the recordings of a log is larger than that of the reference,
     not by chance."""
@@ -210,15 +217,14 @@ def _saturated(
 ) -> Disturbance | None:
     rest = rest_of(reference, layout)
     near = SLIGHT * layout.full_scale
-    low, high = extremes_of(recordings)
-    moving = layout.present.ravel() & (high - low > near)
+    moving, high = moving_cells(recordings, layout)
     if not moving.any():
         return None
     top = float(high[moving].max())
     at_top = high[moving] >= top
     before = float(np.nanmax(extremes_of(reference)[1][moving]))
     new, old = (
-        np.array([_share(frames[:, moving], rest[moving] + near, level) for frames in given])
+        np.array([share_at(frames[:, moving], level, rest[moving] + near) for frames in given])
         for given, level in ((recordings, top), (reference, before))
     )
     if not _differs(new, old) or np.median(new) < MARGIN * LOW or at_top.mean() < LEAST_LOADED:
@@ -229,8 +235,9 @@ def _saturated(
     )
 
 
-def _share(frames: Floats, loaded_from: Floats, level: float) -> float:
-    """Return the share of loaded readings at ``level``, 0 without any."""
+def share_at(frames: Floats, level: float, loaded_from: Floats | float = -np.inf) -> float:
+    """Return the share of the received readings above ``loaded_from`` that are at least ``level``;
+    0 without any."""
     loaded = frames > loaded_from
     return float((frames[loaded] >= level).mean()) if loaded.any() else 0.0
 
@@ -265,13 +272,13 @@ def _silent(
         given = frames[:, present]
         return bool((np.fmax.reduce(given) > np.fmin.reduce(given)).any())
 
-    def changes_atrest_of(frames: Floats) -> bool:
+    def changes_at_rest(frames: Floats) -> bool:
         load = np.nan_to_num(frames[:, present]).mean(axis=1)
         return changes(frames[load <= np.quantile(load, LOW)])
 
     if any(changes(frames) for frames in recordings):
         return None
-    usual = np.mean([changes_atrest_of(frames) for frames in reference])
+    usual = np.mean([changes_at_rest(frames) for frames in reference])
     idle = (1 - usual) ** len(recordings)
     if idle >= P_MIN:
         return None

@@ -150,6 +150,10 @@ def test_more_noise_of_all_cells_is_told(known, reference, log, times):
     assert found.severity >= 1
 
 
+def test_lost_bits_of_the_converter_are_told(known, reference, log):
+    assert "quantised" in names(af.inspect([r // 64 * 64 for r in log], known, reference=reference))
+
+
 def fewer_bits(frames: np.ndarray) -> np.ndarray:
     return frames // 32 * 32
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, located
 from adaptfault.data.recordings.facts.infer import GIVE_LAYOUT, SLACK, describe_width
 from adaptfault.data.recordings.facts.rates import Elapsed
 from adaptfault.data.recordings.survey import Content
@@ -58,7 +58,9 @@ def check_readings(
     for i, survey in enumerate(content.surveys):
         error = ""
         if not survey.length:
-            error = "holds no frames; record it again or remove it"
+            error = NO_FRAMES
+        elif survey.width != layout.n_cells:
+            error = f"{survey.width} values a frame where the others have {layout.n_cells}"
         elif length is not None and survey.length != length:
             error = (
                 f"{_rows(content, survey.length)} where {length} were expected; record it again or"

@@ -85,7 +85,7 @@ def _last_axis(contents: Sequence[Content]) -> str | None:
     for content in contents:
         if content.shape is None or len(content.facts.stored) not in (4, 5):
             continue
-        frames = content.surveys[0].head.reshape(-1, *content.shape)
+        frames = content.head.reshape(-1, *content.shape)
         if len(frames) < 3 or content.shape[2] < 3 * len(frames):
             continue
         along_frames = _change(frames, 0)

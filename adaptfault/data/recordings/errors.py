@@ -9,6 +9,9 @@ from typing import Literal
 
 from adaptfault.data.printable import printable
 
+NO_FRAMES = "holds no frames; record it again or remove it"
+"""What is said of a recording that is empty."""
+
 
 class InputError(ValueError):
     """A file or an option of the user is unusable. One line:
@@ -19,6 +22,13 @@ class InputError(ValueError):
         """Return the error ``what`` in a file, at the place ``where`` ("line 7", "recording 3,
         frame 12")."""
         return cls(located(path, what, where))
+
+    @classmethod
+    def unexpected(cls, path: str | PathLike[str], error: Exception) -> InputError:
+        """Return the error for a file that made a library fail in a way that its reader does not
+        foresee; the library's words are not passed on."""
+        what = f"cannot be read ({type(error).__name__}): damaged, or another kind than its name"
+        return cls.at(path, f"{what} says; write it again, or leave it out")
 
 
 @dataclass(frozen=True)

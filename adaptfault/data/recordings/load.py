@@ -341,6 +341,10 @@ def open_recordings(
             content = surveyor(recordings, problems, progress)
         except InputError as error:
             problems.append(Problem("error", str(error)))
+        # whatever the library of a format raises, the other files are read
+        except Exception as error:
+            unexpected = InputError.unexpected(file.path, error)
+            problems.append(Problem("error", str(unexpected)))
         else:
             contents.append((file, content))
     problems += _passed_over(notes)

@@ -3,6 +3,7 @@ readings, what is missing, the times. What fits into memory is kept, so that it 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.recordings.errors import InputError, Problem
+from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem
 from adaptfault.data.recordings.facts.rates import Elapsed
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
 
@@ -51,6 +52,11 @@ class Survey:
     beyond: int = 0
     elapsed: Elapsed | None = None
     tick: str | None = None
+
+    @property
+    def width(self) -> int:
+        """Readings in a frame."""
+        return int(self.head.shape[1])
 
     def add(self, block: Block) -> None:
         """Take in the next frames."""
@@ -128,8 +134,19 @@ class Content:
 
     @property
     def width(self) -> int:
-        """D, the number of readings in a frame."""
-        return int(self.surveys[0].head.shape[1])
+        """D, the number of readings in a frame of most recordings that hold frames."""
+        widths = Counter(survey.width for survey in self.surveys if survey.length)
+        return widths.most_common(1)[0][0]
+
+    @property
+    def head(self) -> NDArray[np.float64]:
+        """The first frames of the first recording of this width, ``[t, D]``."""
+        return next(survey.head for survey in self.surveys if survey.width == self.width)
+
+    @property
+    def tick(self) -> str | None:
+        """Unit of its clock."""
+        return next((survey.tick for survey in self.surveys if survey.elapsed is not None), None)
 
     @property
     def counts(self) -> bool:
@@ -154,7 +171,7 @@ class Content:
         if self.facts.rate is not None:
             return self.facts.rate
         elapsed = self.elapsed
-        return None if elapsed is None else elapsed.rate(self.surveys[0].tick)
+        return None if elapsed is None else elapsed.rate(self.tick)
 
     def where(self, recording: int, frame: int | None = None) -> str:
         """Return the place of a recording or a frame in this file as text.
@@ -208,10 +225,16 @@ class Surveyor:
             except InputError as error:
                 failed.append(error)
                 continue
+            # whatever a library raises, the other recordings are read
+            except Exception as error:
+                failed.append(InputError.unexpected(recording.facts.path, error))
+                continue
             surveyed.append(survey)
             kept.append(recording)
         if not kept:
             raise failed[0] if failed else InputError("holds no recordings")
+        if not any(survey.length for survey in surveyed):
+            raise InputError.at(kept[0].facts.path, NO_FRAMES)
         problems += [Problem("error", str(error)) for error in failed]
         facts = kept[0].facts
         problems += facts.problems

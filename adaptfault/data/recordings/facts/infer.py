@@ -97,7 +97,7 @@ def _unknown_shape(content: Content) -> str:
     width = content.width
     stored = content.facts.stored
     text = f"{width} value{'s' * (width != 1)} a frame, and nothing states their rows and columns; "
-    column = content.surveys[0].head[:, 0]
+    column = content.head[:, 0]
     if content.text and width > 1 and len(column) > 2 and (np.diff(column) > 0).all():
         text += (
             "the first column rises from line to line: if it is a time or the number of the frame,"
@@ -124,7 +124,7 @@ def _sides(cells: int) -> str:
 
 def describe_width(content: Content, expected: int) -> str:
     """Return a sentence on frames that have another width than expected, with the likely cause."""
-    head = content.surveys[0].head
+    head = content.head
     width = content.width
     text = f"{width} value{'s' * (width != 1)} a frame, expected {expected}"
     if width == expected + 1 and content.text:

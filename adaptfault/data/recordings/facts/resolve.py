@@ -146,8 +146,8 @@ def _measured_rate(contents: Sequence[Content]) -> tuple[float | None, str]:
     clocks = [content for content in contents if content.elapsed is not None]
     if not clocks:
         return None, "assumed: no file states one"
-    tick = clocks[0].surveys[0].tick
-    same = [content for content in clocks if content.surveys[0].tick == tick]
+    tick = clocks[0].tick
+    same = [content for content in clocks if content.tick == tick]
     elapsed = Elapsed.of_all(content.elapsed for content in same)
     rate = None if elapsed is None else elapsed.rate(tick)
     if rate is None:

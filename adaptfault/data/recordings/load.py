@@ -39,8 +39,8 @@ from adaptfault.data.recordings.facts.resolve import (
 )
 from adaptfault.data.recordings.facts.targets import TargetTable, target_files
 from adaptfault.data.recordings.files import Found, find
-from adaptfault.data.recordings.readers import readers
-from adaptfault.data.recordings.recording import BLOCK, Shape
+from adaptfault.data.recordings.readers import check_stated, readers
+from adaptfault.data.recordings.recording import BLOCK
 from adaptfault.data.recordings.survey import Content, Surveyor
 from diagnostics import SensorLayout
 
@@ -208,7 +208,8 @@ class Opened:
 def load(
     paths: PathName | Iterable[PathName],
     *,
-    layout: SensorLayout | Shape | PathName | None = None,
+    layout: SensorLayout | Sequence[int] | PathName | None = None,
+    shape: Sequence[int] | str | None = None,
     labels: PathName | None = None,
     frames: int | None = None,
     calibration: Calibration | PathName | None = None,
@@ -230,6 +231,7 @@ def load(
             order.
         layout: the array; a layout file; a shape ``(2, 13, 6)``, "2x13x6" or, for one pad, "13x6".
             None: from the files, see Notes.
+        shape: a shape alone, in the same forms, in place of ``layout``.
         labels: a table with the columns ``file,label``, paths relative to it. None: a folder's
             ``labels.csv``.
         frames: the number of frames that each recording must have; None = any.
@@ -241,8 +243,9 @@ def load(
             ``frame``, and one for each value, paths relative to it; a file has one recording, and
             one that is not in the table is left out. Labels are not read then.
         stated: what readers want to know: ``topic`` and ``field``, where the readings are in bags,
-            see :func:`adaptfault.data.recordings.formats.bag.open`; ``columns``, ``ignore``,
-            ``time_column`` and ``label_column``, where they are in text files, see
+            see :func:`adaptfault.data.recordings.formats.bag.open`; ``key``, which arrays or
+            features of a data set hold them; ``columns``, ``ignore``, ``time_column`` and
+            ``label_column``, where they are in text files, see
             :func:`adaptfault.data.recordings.formats.csv_folder.open`.
 
     Raises:
@@ -261,6 +264,7 @@ def load(
     opened = open_recordings(
         paths,
         layout=layout,
+        shape=shape,
         labels=labels,
         frames=frames,
         calibration=calibration,
@@ -287,7 +291,8 @@ def load(
 def open_recordings(
     paths: PathName | Iterable[PathName],
     *,
-    layout: SensorLayout | Shape | PathName | None = None,
+    layout: SensorLayout | Sequence[int] | PathName | None = None,
+    shape: Sequence[int] | str | None = None,
     labels: PathName | None = None,
     frames: int | None = None,
     calibration: Calibration | PathName | None = None,
@@ -305,8 +310,8 @@ def open_recordings(
     Args:
         room: bytes of frames that are kept in memory; None: all.
         progress: receives the number of frames of each block of the first reading.
-        paths, layout, labels, frames, calibration, full_scale, unit, rate, strict, targets, stated:
-            as for :func:`load`.
+        paths, layout, shape, labels, frames, calibration, full_scale, unit, rate, strict, targets,
+            stated: as for :func:`load`.
 
     Raises:
         InputError: as :func:`load`.
@@ -318,8 +323,14 @@ def open_recordings(
         raise InputError(
             f"frames {frames}: expected the number of frames a recording must have, at least 1"
         )
+    if layout is not None and shape is not None:
+        raise InputError("layout and shape both given: one of them is enough")
+    layout = shape if layout is None else layout
+    check_stated(stated)
+    if "key" in stated and not isinstance(stated["key"], str | None):
+        stated["key"] = ",".join(stated["key"])
     array = given_array(layout) if layout is not None else layout_beside(given)
-    shape = array.shape if isinstance(array, SensorLayout) else array
+    grid = array.shape if isinstance(array, SensorLayout) else array
     tables = _calibration(calibration)
     if labels is not None and targets is not None:
         raise InputError(
@@ -334,7 +345,7 @@ def open_recordings(
     notes: list[Path] = []
     for file in found:
         try:
-            recordings = list(file.reader.open(file.path, shape=shape, **stated))
+            recordings = list(file.reader.open(file.path, shape=grid, **stated))
             if not recordings:
                 notes.append(file.path)
                 continue

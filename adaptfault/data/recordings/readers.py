@@ -19,11 +19,14 @@ used by every command::
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 from functools import cache
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any, Protocol
 
 from adaptfault.data.plugins import plugins
+from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.recording import Recording
 
 GROUP = "adaptfault.readers"
@@ -62,6 +65,22 @@ class Reader(Protocol):
 def readers() -> Mapping[str, Reader]:
     """Return the reader of each format by its name."""
     return plugins(GROUP, BUILT_IN)
+
+
+def check_stated(stated: Mapping[str, Any]) -> None:
+    """Raise InputError where a keyword is nearly one that a reader asks for.
+
+    Another name may be one that a reader of another package takes without naming it.
+    """
+    known: set[str] = set()
+    for reader in readers().values():
+        for name, parameter in signature(reader.open).parameters.items():
+            if parameter.kind is Parameter.KEYWORD_ONLY:
+                known.add(name)
+    for name in stated:
+        close = [] if name in known else get_close_matches(name, known, 1)
+        if close:
+            raise InputError(f"{name}=: there is no such keyword; is {close[0]}= meant?")
 
 
 def suffixes(known: Mapping[str, Reader]) -> tuple[str, ...]:

@@ -50,7 +50,7 @@ class Facts:
 
     Attributes:
         path: the file.
-        counts: whether the readings are stored as whole numbers; None: their values tell.
+        counts: whether the readings are stored as whole numbers; else their values tell.
         text: whether it is a text file, whose lines are named in messages.
         class_names: the order of the classes, if the file gives one.
         numbered: the class names are the numbers of the labels, because the file gives no names.
@@ -63,7 +63,7 @@ class Facts:
     """
 
     path: Path
-    counts: bool | None = None
+    counts: bool = False
     text: bool = False
     class_names: tuple[str, ...] = ()
     numbered: bool = False

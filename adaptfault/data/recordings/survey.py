@@ -16,6 +16,7 @@ from adaptfault.data.recordings.facts.rates import Elapsed
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
 
 _HEAD = 100  # first frames of a recording, for messages
+_COUNTS = 16  # whole numbers that reach it are counts, in an array of decimals, too
 _SAMPLE = 2000  # readings of a recording, in which the step of a converter is looked for
 
 
@@ -150,10 +151,12 @@ class Content:
 
     @property
     def counts(self) -> bool:
-        """Whether the readings are whole numbers: by their type, or in a text by their values."""
-        if self.facts.counts is not None:
-            return self.facts.counts
-        return all(survey.whole for survey in self.surveys)
+        """Whether the readings are counts of a converter: by their type, or by their values, which
+        are whole and in a file of decimals not all small."""
+        if self.facts.counts:
+            return True
+        is_whole = all(survey.whole for survey in self.surveys)
+        return is_whole and (self.text or self.largest >= _COUNTS)
 
     @property
     def largest(self) -> float:

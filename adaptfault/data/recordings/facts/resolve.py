@@ -45,17 +45,18 @@ class Resolved:
 
 
 def given_array(
-    layout: SensorLayout | Shape | Sequence[int] | str | PathLike[str] | None,
+    layout: SensorLayout | Sequence[int] | str | PathLike[str] | None,
 ) -> SensorLayout | Shape | None:
     """Return a layout, or at least its shape, from any of the forms in which the user may give
     it."""
     if layout is None or isinstance(layout, SensorLayout):
         return layout
-    if isinstance(layout, tuple | list):
-        return parse_shape("x".join(map(str, layout)))
-    if isinstance(layout, str) and looks_like_shape(layout):
+    if isinstance(layout, PathLike) or (isinstance(layout, str) and not looks_like_shape(layout)):
+        return read_layout(layout)
+    if isinstance(layout, str):
         return parse_shape(layout)
-    return read_layout(layout)  # type: ignore[arg-type]
+    sizes = layout if isinstance(layout, Iterable) else [layout]
+    return parse_shape("x".join(map(str, sizes)))
 
 
 def resolve_layout(

@@ -49,7 +49,6 @@ _KEYS = (
     "unit",
     "layout",
 )
-_COUNTS = 16  # whole numbers that reach it are counts, in an array of decimals, too
 _RATES = ("sampling_hz", "rate", "rate_hz", "rate_Hz")  # in the JSON file beside an archive
 _BITS = re.compile(r"\s*(\d{1,2})[ -]?bits?\b", re.ASCII)
 
@@ -160,7 +159,7 @@ def _read(path: Path, given: Shape | None) -> _Archive:
             problems = (*problems, Problem("warning", located(path.with_suffix(".json"), what)))
     facts = Facts(
         path,
-        counts=_counts(arrays["frames"]),
+        counts=arrays["frames"].dtype.kind in "iu",
         class_names=class_names,
         numbered=numbered,
         shape=shape,
@@ -186,15 +185,6 @@ def _declared(layout: NDArray[Any] | None) -> dict[str, Any]:
     if not isinstance(fields, dict):
         return {}
     return {name: fields[name] for name in DECLARED if name in fields}
-
-
-def _counts(frames: NDArray[Any]) -> bool:
-    """Return whether readings are counts, by their type or because all are whole numbers."""
-    if frames.dtype.kind in "iu":
-        return True
-    known = frames[np.isfinite(frames)]
-    whole = known.size > 0 and known.max() >= _COUNTS and np.array_equal(known, np.rint(known))
-    return bool(whole)
 
 
 def save_npz(path: str | PathLike[str], recordings: Recordings) -> None:

@@ -592,8 +592,10 @@ class SelfDiagnosis:
         self, log: RecordingBlocks, needed: NDArray[np.bool_] | None = None
     ) -> Diagnosis:
         stream = self.stream(needed)
-        for frames in log.blocks():
-            stream.extend(frames)
+        for i in range(len(log)):
+            stream.begin_recording()
+            for frames in log[i : i + 1].blocks():
+                stream.extend(frames)
         return self.evaluate(stream, n_recordings=len(log))
 
     @staticmethod

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from diagnostics.faults import Fault, FaultKind
+from diagnostics.faults import Fault, FaultKind, KindName
 from diagnostics.layout import SensorLayout
 from diagnostics.preprocessing.levels import LIGHT
 from diagnostics.wiring import Line
@@ -240,7 +240,7 @@ def _blinking(frames: int, rng: np.random.Generator) -> NDArray[np.bool_]:
 def line_fault(
     layout: SensorLayout,
     line: Line,
-    kind: FaultKind,
+    kind: FaultKind | KindName,
     *,
     value: float | None = None,
     onset: int | None = None,
@@ -253,7 +253,7 @@ def line_fault(
     Args:
         layout: the array.
         line: the wire.
-        kind: kind of the fault.
+        kind: kind of the fault, or its name.
         value: as in :class:`~diagnostics.faults.Fault`.
         onset: first faulty frame; None: from the first frame on.
         break_at: a row or column is broken between positions ``break_at - 1`` and ``break_at``

@@ -592,10 +592,8 @@ class SelfDiagnosis:
         self, log: RecordingBlocks, needed: NDArray[np.bool_] | None = None
     ) -> Diagnosis:
         stream = self.stream(needed)
-        for i in range(len(log)):
-            stream.begin_recording()
-            for frames in log[i : i + 1].blocks():
-                stream.extend(frames)
+        for frames in log.blocks():
+            stream.extend(frames)
         return self.evaluate(stream, n_recordings=len(log))
 
     @staticmethod

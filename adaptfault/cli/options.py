@@ -54,7 +54,7 @@ def add_recordings(
     read; ``targets``: models of values, too, learn from them."""
     help_ = (
         "file or folder of recordings: CSV and other text, NPZ, NPY, ROS 2 bags, LeRobot, Zarr,"
-        " HDF5, MAT, Parquet, JSON lines"
+        " HDF5, netCDF, MAT, Parquet, JSON lines"
     )
     if option:
         parser.add_argument("--recordings", nargs="+", metavar="FILE", help=help_)

@@ -53,7 +53,6 @@ def inspect_parts(
         one = inspect(part, fitted, reference=reference)
         with one_thread():
             for frames in one.readings.frames:
-                stream.begin_recording()
                 stream.extend(frames)
         inspected.append(_without_frames(one))
     return _together(inspected, fitted.evaluate(stream, n_recordings=n_recordings))

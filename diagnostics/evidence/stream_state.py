@@ -144,8 +144,6 @@ class StreamState:
         self._absent = not self.present.all()  # whether some position has no cell
         self._buffer = np.empty((SEGMENT, layout.n_cells))
         self._numbers = np.empty(SEGMENT, np.intp)
-        self._begins = np.zeros(SEGMENT, bool)  # frames that begin a recording
-        self._begins_next = False
         self._filled = 0
         # the test of old events, and the events to keep
         self._dropping: tuple[Test, TiledEvents] | None = None
@@ -155,10 +153,6 @@ class StreamState:
     def begun(self) -> list[int]:
         """First frames of the last contact events of the skin as a whole."""
         return self._begun if self.tiled else [event.first for event in self.local.of[0].kept]
-
-    def begin_recording(self) -> None:
-        """Take the next frame as the first one of a recording: it does not follow the last one."""
-        self._begins_next = True
 
     def extend(self, frames: NDArray[np.float64]) -> bool:
         """Take in frames ``[t, D]`` of readings; return whether a segment was completed."""
@@ -188,9 +182,6 @@ class StreamState:
             chosen = new[taken : taken + n]
             self._buffer[self._filled : self._filled + n] = frames[chosen]
             self._numbers[self._filled : self._filled + n] = chosen + before
-            self._begins[self._filled : self._filled + n] = False
-            self._begins[self._filled] = self._begins_next
-            self._begins_next = False
             self._filled += n
             taken += n
             if self._filled == SEGMENT:
@@ -521,7 +512,6 @@ class StreamState:
         self._drop()
         frames = self._buffer[: self._filled]
         numbers = self._numbers[: self._filled]
-        begins = self._begins[: self._filled]
         self._filled = 0
         self._offsets = self._offsets.extend(
             frames, self.reference.scale, self.present, self.reference.offset
@@ -578,9 +568,7 @@ class StreamState:
             # between two lines.
             frames = np.where(runs.moved, frames, np.nan)
         usual = self.reference.usual.with_noise(noise / plain.full_scale)
-        self.intermittency = self.intermittency.extend(
-            known, root, numbers, noisy, usual, still, begins=begins
-        )
+        self.intermittency = self.intermittency.extend(known, root, numbers, noisy, usual, still)
         # Lines that only have noise where they rest agree by chance.
         telling = informative(frames, still, clear) & self.touched
         self.duplicates = self.duplicates.extend(frames, numbers, telling, plain.near)

@@ -217,7 +217,9 @@ def test_parquet_with_a_column_a_cell_is_one_recording(tmp_path):
 
 def test_parquet_with_lists_of_different_lengths_says_so(tmp_path):
     pq.write_table(pa.table({"tactile": [[1.0, 2.0], [1.0]]}), tmp_path / "a.parquet")
-    with pytest.raises(InputError, match="lists of different lengths"):
+    with pytest.raises(
+        InputError, match="row 1: tactile holds a list of 1 where the first row has 2"
+    ):
         load(tmp_path / "a.parquet")
 
 

@@ -60,3 +60,14 @@ def test_what_a_library_says_reaches_nobody_and_the_good_file_is_read(tmp_path, 
     assert len(loaded.recordings) == 1
     (told,) = messages(loaded, "error")
     assert "bad.npy: cannot be read (IndexError)" in told
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".zarr"])
+@pytest.mark.parametrize("which", [0, 1])
+def test_an_episode_of_another_width_is_left_out_wherever_it_stands(suffix, which, tmp_path):
+    recordings = [readings(9, (2, 4) if i == which else GRID) for i in range(3)]
+    loaded = load(episodes_of(tmp_path / f"a{suffix}", recordings))
+    assert loaded.recordings.layout.shape == (1, *GRID)
+    assert len(loaded.recordings) == 2
+    (told,) = messages(loaded, "error")
+    assert "8 values a frame" in told

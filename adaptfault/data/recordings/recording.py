@@ -60,6 +60,10 @@ class Facts:
         declared: those of :data:`DECLARED` that the file gives, as in SensorLayout.
         stored: shape of the array in the file, where it holds one.
         problems: warnings of the reader.
+        sizes: of a frame in each array that holds readings, in the order in which these stand in a
+            frame.
+        places: int ``[n]``, where in a frame the readings of all arrays belong; None: one after
+            the other.
     """
 
     path: Path
@@ -75,6 +79,8 @@ class Facts:
     declared: Mapping[str, Any] = field(default_factory=dict)
     stored: tuple[int, ...] = ()
     problems: tuple[Problem, ...] = ()
+    sizes: tuple[tuple[int, ...], ...] = ()
+    places: NDArray[np.intp] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +92,16 @@ class Recording:
         blocks: reads its frames from the first to the last, each time it is called.
         name: how the file calls it.
         label: its class.
+        arrays: of the file that hold its readings.
+        number: how the file numbers it; None: it does not.
     """
 
     facts: Facts
     blocks: Callable[[], Iterator[Block]]
     name: str | None = None
     label: str | None = None
+    arrays: tuple[str, ...] = ()
+    number: int | None = None
 
     @property
     def frames(self) -> NDArray[Any]:

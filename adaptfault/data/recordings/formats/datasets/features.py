@@ -29,8 +29,16 @@ _NO_TOUCH = re.compile(
     r"temp|time|stamp|valid|mask|index|image|rgb|depth|video|calib", re.IGNORECASE
 )
 _VERSION = re.compile(r"raw|filter|smooth|normali|scaled|baseline|diff|mean|std", re.IGNORECASE)
+_EPISODE = re.compile(
+    r"(?:demo|ep|episode|traj|trajectory|trial|rec|recording|sample|run|grasp|seq|sequence|rollout"
+    r"|log|)[_-]?\d+",
+    re.IGNORECASE,
+)
 _SEPARATOR = re.compile(r"[/.]")
 _SHOWN = 12  # features in a message
+
+GUESSED = "nothing states rows and columns, so each is taken as one row; --shape states them"
+"""What is said of flat features."""
 
 Sizes = tuple[int, ...]
 
@@ -50,15 +58,11 @@ def choose(path: Path, features: Mapping[str, Sizes], key: str | None = None) ->
     if key is not None:
         return _named(path, features, key)
     arrays = {name: sizes for name, sizes in features.items() if math.prod(sizes) > 1}
-    words: dict[str, list[str]] = {}
-    for name in sorted(arrays, key=natural_key):
-        word = _TOUCH.search(name)
-        if word and not _NO_TOUCH.search(name):
-            words.setdefault(word[0].lower(), []).append(name)
+    words = _by_word(arrays) or _by_word(features)
     named = [name for names in words.values() for name in names]
     versions = {_version(name) for name in named}
     if len(words) > 1 or len(versions) > 1:
-        found = ", ".join(_shown(name, arrays[name]) for name in named)
+        found = ", ".join(_shown(name, features[name]) for name in named)
         what = f"several features could hold the readings of touch: {found}; name one with --key"
         raise InputError.at(path, what)
     if words:
@@ -66,8 +70,41 @@ def choose(path: Path, features: Mapping[str, Sizes], key: str | None = None) ->
         return names
     if len(arrays) == 1:
         return list(arrays)
+    cells = [name for name in features if not _NO_TOUCH.search(name)]
+    if cells and not arrays:  # each is a cell
+        return cells
     what = "no feature has touch, tactile, taxel, pressure, skin or fsr in its name"
     raise InputError.at(path, f"{what}; {_held(features)}; name one with --key")
+
+
+def by_episode(names: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Return the arrays of each episode by the names that they have in every episode.
+
+    ``{"demo_0": {"data/tactile": "data/demo_0/tactile"}}``; groups whose names count, as
+    ``demo_0``, are episodes.
+    """
+    grouped: dict[str, dict[str, str]] = {}
+    for name in names:
+        *groups, last = name.split("/")
+        episode = [group for group in groups if _EPISODE.fullmatch(group)]
+        common = [group for group in groups if group not in episode]
+        grouped.setdefault("/".join(episode), {})["/".join([*common, last])] = name
+    return grouped
+
+
+def is_touch(name: str) -> bool:
+    """Return whether a feature holds touch by its name."""
+    return _TOUCH.search(name) is not None and _NO_TOUCH.search(name) is None
+
+
+def _by_word(features: Mapping[str, Sizes]) -> dict[str, list[str]]:
+    """Return the features of touch by the word that tells it, in natural order."""
+    words: dict[str, list[str]] = {}
+    for name in sorted(features, key=natural_key):
+        word = _TOUCH.search(name)
+        if word and is_touch(name):
+            words.setdefault(word[0].lower(), []).append(name)
+    return words
 
 
 def _version(name: str) -> str:
@@ -107,6 +144,11 @@ def _shown(name: str, sizes: Sizes) -> str:
     return f"{name} {list(sizes)}" if sizes else name
 
 
+def shown(sizes: Sizes) -> str:
+    """Return the sizes of a frame as text: "3 x 4"."""
+    return " x ".join(map(str, sizes or (1,)))
+
+
 @dataclass(frozen=True)
 class Pads:
     """Features as the pads of one array.
@@ -116,11 +158,13 @@ class Pads:
         steps: frames that one row of the data set holds: touch that is faster than the other
             features comes in windows.
         shape: ``(pads, rows, cols)``; None: one flat feature.
+        is_guessed: whether flat features were taken as one row each.
     """
 
     sizes: tuple[Sizes, ...]
     steps: int
     shape: Shape | None
+    is_guessed: bool = False
 
     @classmethod
     def of(cls, sizes: Sequence[Sizes], given: Shape | None = None) -> Pads:
@@ -129,16 +173,17 @@ class Pads:
         sizes = [size or (1,) for size in sizes]
         total = sum(map(math.prod, sizes))
         cells = math.prod(given) if given else total
-        if len(sizes) == 1:
-            windowed = cells < total and total % cells == 0 and sizes[0][0] == total // cells
-            if windowed:
-                return cls((sizes[0][1:],), sizes[0][0], given)
-            if given is not None or len(sizes[0]) == 1:
-                return cls(tuple(sizes), 1, given)
+        fitting = given if cells == total else None
+        is_windowed = len(sizes) == 1 and cells < total == cells * sizes[0][0]
+        if is_windowed:
+            return cls((sizes[0][1:],), sizes[0][0], given)
+        is_flat = all(len(size) == 1 for size in sizes) if len(sizes) == 1 else total == len(sizes)
+        if fitting or is_flat:
+            return cls(tuple(sizes), 1, fitting)
         grids = [_grid(size) for size in sizes]
         pads = sum(grid[0] for grid in grids)
         shape = (pads, max(grid[1] for grid in grids), max(grid[2] for grid in grids))
-        return cls(tuple(sizes), 1, given if cells == total and given else shape)
+        return cls(tuple(sizes), 1, shape, all(len(size) == 1 for size in sizes))
 
     @property
     def present(self) -> NDArray[np.bool_] | None:
@@ -148,6 +193,11 @@ class Pads:
         present = np.zeros(self.shape, dtype=bool)
         present.ravel()[self._places] = True
         return present
+
+    @property
+    def places(self) -> NDArray[np.intp] | None:
+        """Where in a frame ``[D]`` each reading belongs; None: one after the other."""
+        return None if self._is_plain else self._places
 
     @property
     def _is_plain(self) -> bool:

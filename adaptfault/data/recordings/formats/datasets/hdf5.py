@@ -1,8 +1,13 @@
-"""Reads HDF5 files (ACT, robomimic, laboratories) and MAT files of version 7.3; needs the extra
-"datasets"."""
+"""Reads HDF5 files (ACT, robomimic, laboratories), netCDF 4 and MAT files of version 7.3; needs the
+extra "datasets".
+
+What lies in another file is not read: an external link, a virtual array or external storage could
+bring any file of the computer among the readings.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -10,20 +15,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.facts.declared import too_large, too_much
+from adaptfault.data.recordings.formats.datasets import netcdf
+from adaptfault.data.recordings.formats.datasets.chooser import Stated, recordings_of
+from adaptfault.data.recordings.formats.datasets.contents import Contents, element
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.data.recordings.formats.datasets.hierarchy import (
-    Array,
-    Contents,
-    Stated,
-    recordings_of,
-)
 from adaptfault.data.recordings.recording import Recording, Shape
 
-SUFFIXES = (".h5", ".hdf5", ".hdf", ".he5")
+SUFFIXES = (".h5", ".hdf5", ".hdf", ".he5", ".nc", ".nc4", ".cdf")
 
 _MATLAB = "MATLAB_class"  # attribute of every array that MATLAB wrote
+_EMPTY = "MATLAB_empty"  # attribute of one that stores its sizes, because it holds nothing
+_HIDDEN = "#"  # begins the names of MATLAB's own groups
 
 
 def open(
@@ -50,9 +56,8 @@ def open(
         InputError: h5py is not installed, the file is damaged or being written, or the arrays are
             not clear.
     """
-    return recordings_of(
-        path, partial(opened, path), shape=shape, key=key, stated=Stated(time_column, label_column)
-    )
+    held = partial(netcdf.opened if netcdf.is_classic(path) else opened, path)
+    return recordings_of(path, held, shape=shape, key=key, stated=Stated(time_column, label_column))
 
 
 @contextmanager
@@ -68,25 +73,87 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
     except OSError as error:
         raise InputError.at(path, _unreadable(str(error))) from None
     with file:
+        contents = Contents()
         if names is not None:
-            yield Contents({name: _array(file[name]) for name in names}, {}, {})
+            contents.arrays.update({name: _array(_found(file, name)) for name in names})
+        else:
+            try:
+                contents.attributes[""] = dict(file.attrs)
+                _collect(file, contents)
+            # a damaged file raises any of a dozen kinds
+            except Exception as error:
+                what = f"is damaged ({type(error).__name__}); copy it again"
+                raise InputError.at(path, what) from None
+        yield contents
+
+
+def _collect(file: Any, contents: Contents) -> None:
+    h5py = imported("h5py", file.filename)
+
+    def add_link(name: str, link: Any) -> None:
+        if isinstance(link, h5py.ExternalLink):
+            what = f"is a link into another file, {link.filename}; copy what it leads to into one"
+            contents.left_out[name] = f"{what}, with h5copy"
+
+    def add(name: str, found: Any) -> None:
+        if name.startswith(_HIDDEN):
             return
-        arrays: dict[str, Array] = {}
-        texts: dict[str, list[str]] = {}
-        attributes = {"": dict(file.attrs)}
+        attributes = dict(found.attrs)
+        if not isinstance(found, h5py.Dataset):
+            if attributes:
+                contents.attributes.setdefault(name, {}).update(attributes)
+            return
+        why = _refused(found)
+        if why is not None:
+            contents.left_out[name] = why
+        elif h5py.check_ref_dtype(found.dtype) is not None:
+            _add_cells(file, contents, name, found)
+        elif h5py.check_vlen_dtype(found.dtype) is not None and not h5py.check_string_dtype(
+            found.dtype
+        ):
+            contents.left_out[name] = "holds lists of different lengths; save one array a frame"
+        elif found.shape is not None:
+            _add(contents, name, found, attributes)
 
-        def add(name: str, found: Any) -> None:
-            if len(found.attrs):
-                attributes[name] = dict(found.attrs)
-            if not isinstance(found, h5py.Dataset) or not found.shape:
-                return
-            if found.dtype.kind in "iuf":
-                arrays[name] = _array(found)
-            elif found.dtype.kind in "OS" and found.ndim == 1:
-                texts[name] = [_text(value) for value in found[:]]
+    file.visititems_links(add_link)
+    file.visititems(add)
 
-        file.visititems(add)
-        yield Contents(arrays, attributes, texts)
+
+def _add(contents: Contents, name: str, found: Any, attributes: dict[str, Any]) -> None:
+    text = _matlab_text(found)
+    if text is not None:
+        contents.add(name, np.array(text))
+    elif _EMPTY in attributes:
+        contents.add(name, np.zeros(tuple(map(int, found[:].ravel()[::-1]))))
+    else:
+        contents.add(name, _array(found), attributes)
+
+
+def _add_cells(file: Any, contents: Contents, name: str, found: Any) -> None:
+    """Take in a cell array, or a field of an array of structures, of MATLAB: its elements are
+    references."""
+    held = [file[reference] for reference in found[...].ravel()]
+    arrays = [one for one in held if hasattr(one, "shape") and _refused(one) is None]
+    texts = [_matlab_text(one) for one in arrays]
+    if texts and all(isinstance(text, str) for text in texts):
+        contents.add(name, np.array(texts))
+        return
+    for place, one in enumerate(arrays):
+        _add(contents, element(name, place), one, dict(one.attrs))
+
+
+def _refused(found: Any) -> str | None:
+    """Return why an array is not read; None where it is."""
+    if found.external:
+        return "lies in another file (external storage); copy it into this one with h5repack"
+    if found.is_virtual:
+        sources = {source.file_name for source in found.virtual_sources()}
+        if sources - {"."}:
+            return "is made of other files (virtual); copy it into this one with h5repack"
+    size = math.prod(found.shape or ()) * found.dtype.itemsize
+    if found.chunks is not None and (why := too_large(found.chunks, found.dtype.itemsize)):
+        return why
+    return too_much(size, size if found.is_virtual else found.id.get_storage_size())
 
 
 def _unreadable(error: str) -> str:
@@ -96,18 +163,30 @@ def _unreadable(error: str) -> str:
     if "consistency flags" in error:
         what = "is being written, or its writer was killed"
         return f"{what}; wait until it is closed, or run h5clear -s on a copy"
-    reason = error.split("(")[-1].rstrip(")")
-    return f"is no HDF5 file, or is cut off ({reason}); copy it again"
+    return "is no HDF5 file, or is cut off; copy it again"
 
 
-def _array(stored: Any) -> Array:
+def _found(file: Any, name: str) -> Any:
+    """Return an array of a file by the name that it has among the contents."""
+    if name in file:
+        return file[name]
+    group, number, last = name.rsplit("/", 2)
+    holder = file[f"{group}/{last}"] if f"{group}/{last}" in file else file[group]
+    return file[holder[...].ravel()[int(number)]]
+
+
+def _array(stored: Any) -> Any:
     """Return an array of a file, with its axes as its writer saw them."""
-    array: Array = Reversed(stored) if _MATLAB in stored.attrs else stored
-    return array
+    return Reversed(stored) if _MATLAB in stored.attrs else stored
 
 
-def _text(value: Any) -> str:
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+def _matlab_text(stored: Any) -> str | list[str] | None:
+    """Return the text of an array of characters that MATLAB wrote; None where it is none."""
+    if stored.attrs.get(_MATLAB) not in (b"char", "char") or _EMPTY in stored.attrs:
+        return None
+    rows = np.atleast_2d(np.asarray(stored[...], dtype="<u2").T)
+    texts = [row.tobytes().decode("utf-16-le", "replace").rstrip() for row in rows]
+    return texts[0] if len(texts) == 1 else texts
 
 
 class Reversed:
@@ -127,5 +206,7 @@ class Reversed:
         kind: np.dtype[Any] = self._stored.dtype
         return kind
 
-    def __getitem__(self, part: slice) -> Any:
+    def __getitem__(self, part: Any) -> NDArray[Any]:
+        if isinstance(part, tuple):  # of the last axis, which is stored as the first
+            return np.asarray(self._stored[part[-1]]).T
         return np.asarray(self._stored[..., part]).T

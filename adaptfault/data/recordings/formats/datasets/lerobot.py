@@ -4,16 +4,19 @@ extra "datasets"."""
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, located
 from adaptfault.data.recordings.facts.labels import natural_key
+from adaptfault.data.recordings.formats.datasets import parquet
+from adaptfault.data.recordings.formats.datasets.chooser import Stated, recordings_of
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.data.recordings.formats.datasets.features import Pads, Sizes, choose
-from adaptfault.data.recordings.formats.datasets.parquet import Table, blocks_of
+from adaptfault.data.recordings.formats.datasets.features import GUESSED, Pads, Sizes, choose
 from adaptfault.data.recordings.formats.datasets.table import named
 from adaptfault.data.recordings.formats.text import read_json_object
 from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
@@ -21,7 +24,8 @@ from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
 SUFFIXES = ()
 
 _INFO = "meta/info.json"
-_NUMBERS = ("float16", "float32", "float64", "int8", "int16", "int32", "int64", "uint8", "uint16")
+_TASK = "task_index"
+_NUMBERS = re.compile(r"u?int(8|16|32|64)|float(16|32|64)")
 
 
 def accepts(path: Path) -> bool:
@@ -58,11 +62,11 @@ def open(
     features = info.get("features")
     if not isinstance(features, Mapping):
         raise InputError.at(path / _INFO, "lists no features; expected a LeRobot data set")
-    numbers = {
-        name: _sizes(about)
-        for name, about in features.items()
-        if isinstance(about, Mapping) and about.get("dtype") in _NUMBERS
-    }
+    numbers = {}
+    for name, about in features.items():
+        sizes = _sizes(about)
+        if sizes is not None:
+            numbers[name] = sizes
     _ = named(path, "time-column", time_column, list(features))
     own_label = named(path, "label-column", label_column, list(features))
     names = choose(path, numbers, key)
@@ -73,52 +77,64 @@ def open(
         counts=all("int" in features[name]["dtype"] for name in names),
         shape=pads.shape,
         present=pads.present,
+        sizes=pads.sizes,
+        places=pads.places,
+        problems=(Problem("warning", located(path, f"{', '.join(names)}: {GUESSED}")),)
+        if pads.is_guessed
+        else (),
         rate=float(rate) * pads.steps if isinstance(rate, int | float) and rate > 0 else None,
     )
     files = sorted(path.glob("data/**/*.parquet"), key=lambda file: natural_key(str(file)))
     if not files:
         raise InputError.at(path, "holds no data/*.parquet; copy the whole data set")
     tasks = {} if own_label is not None else _tasks(path)
+    places = Stated(time_column, _TASK if tasks else own_label)
+    chosen = {name: numbers[name] for name in names}
     recordings = []
     for file in files:
-        read = partial(Table.read, file, time_column, label_column)
-        recordings += list(_episodes(path, file, read, facts, names, pads, tasks))
+        for recording in _episodes(path, file, shape, places, chosen, facts):
+            task = tasks.get(recording.label or "", recording.label)
+            recordings.append(replace(recording, facts=facts, label=task))
     if not recordings:
-        raise InputError.at(path, "holds no frames; record it again or remove it")
+        raise InputError.at(path, NO_FRAMES)
     return recordings
 
 
-def _sizes(about: Mapping[str, Any]) -> Sizes:
+def _sizes(about: object) -> Sizes | None:
+    """Return the sizes of a frame of a feature; None where it is none of numbers."""
+    if not isinstance(about, Mapping) or not _NUMBERS.fullmatch(str(about.get("dtype"))):
+        return None
     shape = about.get("shape", ())
     if not isinstance(shape, list) or not all(isinstance(size, int) for size in shape):
-        return ()
-    return tuple(shape)
+        return None
+    return () if shape == [1] else tuple(shape)
 
 
 def _episodes(
     path: Path,
     file: Path,
-    read: Callable[[], Table],
+    shape: Shape | None,
+    stated: Stated,
+    chosen: Mapping[str, Sizes],
     facts: Facts,
-    names: list[str],
-    pads: Pads,
-    tasks: Mapping[int, str],
 ) -> Iterator[Recording]:
     """Yield the episodes of a file; one that cannot be read says so when its frames are read."""
+    opened = partial(parquet.opened, file)
     try:
-        table = read()
-        missing = [name for name in names if name not in table.sizes]
-        if missing:
-            raise InputError.at(file, f"holds no column {missing[0]!r}")
-        episodes = list(table.episodes())
-        task = table.column("task_index") if "task_index" in table.columns else None
+        with opened(None) as contents:
+            if stated.label == _TASK and _TASK not in contents.arrays:
+                stated = replace(stated, label=None)
+        recordings = recordings_of(
+            file, opened, shape=shape, key=",".join(chosen), stated=stated, known=chosen
+        )
     except InputError as error:
+        if str(error).endswith(NO_FRAMES):
+            return
         yield Recording(facts, _failing(error), file.relative_to(path).as_posix())
         return
-    for called, label, rows in episodes:
-        if task is not None and tasks:
-            label = tasks.get(int(task[rows[0]]), label)
-        yield Recording(facts, blocks_of(table, rows, names, pads), called, label)
+    for recording in recordings:
+        name = None if recording.number is None else f"episode {recording.number}"
+        yield replace(recording, name=name)
 
 
 def _failing(error: InputError) -> Any:
@@ -128,18 +144,19 @@ def _failing(error: InputError) -> Any:
     return blocks
 
 
-def _tasks(path: Path) -> dict[int, str]:
+def _tasks(path: Path) -> dict[str, str]:
     """Return the name of each task; none where they cannot be read: they are optional."""
     lines = path / "meta/tasks.jsonl"
     table = path / "meta/tasks.parquet"
     try:
         if lines.is_file():
             held = [json.loads(line) for line in lines.read_text("utf-8").splitlines() if line]
-            return {int(one["task_index"]): str(one["task"]) for one in held}
+            return {str(int(one[_TASK])): str(one["task"]) for one in held}
         if table.is_file():
             read = imported("pyarrow.parquet", table).read_table(table).to_pydict()
-            names = next(column for name, column in read.items() if name != "task_index")
-            return dict(zip(map(int, read["task_index"]), map(str, names), strict=True))
+            names = next(column for name, column in read.items() if name != _TASK)
+            numbers = [str(int(number)) for number in read[_TASK]]
+            return dict(zip(numbers, map(str, names), strict=True))
     except (OSError, ValueError, KeyError, TypeError, StopIteration):
         pass
     return {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache, partial
@@ -11,16 +12,10 @@ from typing import Any
 import numpy as np
 
 from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.facts.sizes import MOST_BYTES
 from adaptfault.data.recordings.formats.datasets import hdf5
-from adaptfault.data.recordings.formats.datasets.hierarchy import (
-    FULL_SCALES,
-    LABELS,
-    RATES,
-    UNITS,
-    Contents,
-    Stated,
-    recordings_of,
-)
+from adaptfault.data.recordings.formats.datasets.chooser import Stated, recordings_of
+from adaptfault.data.recordings.formats.datasets.contents import Contents, element
 from adaptfault.data.recordings.formats.text import read_bytes
 from adaptfault.data.recordings.recording import Recording, Shape
 
@@ -28,7 +23,9 @@ SUFFIXES = (".mat",)
 
 _HDF5 = b"\x89HDF"
 _HEADER = 512  # bytes that MATLAB writes before the HDF5 file
-_SCALARS = (*RATES, *FULL_SCALES, *UNITS, *LABELS)
+_HEAD = 128  # bytes before the first element of version 5
+_COMPRESSED = 15  # type of an element
+_PIECE = 1 << 20  # bytes that are unpacked at once, to count them
 
 
 def open(
@@ -40,7 +37,8 @@ def open(
     label_column: str | None = None,
     **stated: Any,
 ) -> list[Recording]:
-    """Return the recordings of a file; fields of structures are named ``structure/field``.
+    """Return the recordings of a file; fields of structures are named ``structure/field``, elements
+    of an array of structures or of a cell array ``array/0``, ``array/1``.
 
     Args:
         path: the file.
@@ -55,13 +53,14 @@ def open(
     """
     with path.open("rb") as file:
         head = file.read(_HEADER + len(_HDF5))
-    if head.startswith(_HDF5) or head[_HEADER:].startswith(_HDF5):
-        return hdf5.open(
-            path, shape=shape, key=key, time_column=time_column, label_column=label_column
-        )
+    is_hdf5 = head.startswith(_HDF5) or head[_HEADER:].startswith(_HDF5)
     _read.cache_clear()  # the file may have changed since
     return recordings_of(
-        path, partial(_opened, path), shape=shape, key=key, stated=Stated(time_column, label_column)
+        path,
+        partial(hdf5.opened if is_hdf5 else _opened, path),
+        shape=shape,
+        key=key,
+        stated=Stated(time_column, label_column),
     )
 
 
@@ -78,30 +77,61 @@ def _read(path: Path) -> Contents:
     from scipy.io import loadmat
 
     data = read_bytes(path)
+    contents = Contents()
     try:
-        stored = loadmat(BytesIO(data), simplify_cells=True)  # type: ignore[arg-type]
+        if _unpacked(data) > MOST_BYTES:
+            what = f"unpacks to more than {MOST_BYTES:,} bytes; split it into several files"
+            raise InputError.at(path, what)
+        stored = loadmat(BytesIO(data), chars_as_strings=True)  # type: ignore[arg-type]
+        for name, value in stored.items():
+            if not name.startswith("__"):
+                _add(contents, name, value)
+    except InputError:
+        raise
     # a damaged file raises any of a dozen kinds: scipy's, zlib's, struct's
     except Exception as error:
         what = f"is no MAT file, or is damaged ({type(error).__name__}); save it again"
         raise InputError.at(path, what) from None
-    arrays: dict[str, Any] = {}
-    texts: dict[str, list[str]] = {}
-    attributes: dict[str, dict[str, Any]] = {"": {}}
+    return contents
 
-    def add(name: str, value: Any) -> None:
-        if isinstance(value, dict):
-            for field, held in value.items():
-                if not field.startswith("__"):
-                    add(f"{name}/{field}" if name else field, held)
+
+def _unpacked(data: bytes) -> int:
+    """Return the bytes of all elements of a file of version 5, unpacked; counting ends above
+    :data:`MOST_BYTES`."""
+    total = len(data)
+    at = _HEAD
+    order = "big" if data[126:128] == b"MI" else "little"
+    while at + 8 <= len(data) and total <= MOST_BYTES:
+        kind = int.from_bytes(data[at : at + 4], order)  # type: ignore[arg-type]
+        size = int.from_bytes(data[at + 4 : at + 8], order)  # type: ignore[arg-type]
+        at += 8
+        if kind == _COMPRESSED:
+            unpacker = zlib.decompressobj()
+            rest = data[at : at + size]
+            while rest and not unpacker.eof and total <= MOST_BYTES:
+                total += len(unpacker.decompress(rest, _PIECE))
+                rest = unpacker.unconsumed_tail
+        at += size
+    return total
+
+
+def _add(contents: Contents, name: str, value: Any) -> None:
+    """Take in a variable: fields of structures and elements of cell arrays one by one."""
+    array = np.asarray(value)
+    if array.dtype.names:
+        for field in array.dtype.names:
+            for place, one in enumerate(array[field].ravel()):
+                number = "" if array.size == 1 else f"/{place}"
+                _add(contents, f"{name}{number}/{field}", one)
+    elif array.dtype.kind == "O" and array.shape:  # without axes: a sparse matrix, a handle
+        held = [np.asarray(one) for one in array.ravel()]
+        if held and all(one.dtype.kind == "U" for one in held):
+            contents.add(name, np.array(["".join(one.ravel()) for one in held]))
             return
-        group, _, last = name.rpartition("/")
-        if last.lower() in _SCALARS and np.size(value) == 1:
-            attributes.setdefault(group, {})[last] = value
-        array = np.asarray(value)
-        if array.ndim and array.dtype.kind in "iuf":
-            arrays[name] = array
-        elif array.ndim == 1 and array.dtype.kind in "UO":
-            texts[name] = [str(text) for text in array.tolist()]
-
-    add("", stored)
-    return Contents(arrays, attributes, texts)
+        for place, one in enumerate(held):
+            _add(contents, name if len(held) == 1 else element(name, place), one)
+    elif array.dtype.kind == "U":
+        texts = np.char.rstrip(array.ravel())
+        contents.add(name, texts.reshape(()) if texts.size == 1 else texts)
+    else:
+        contents.add(name, array)

@@ -1,18 +1,16 @@
-"""Reads Parquet files; needs the extra "datasets".
+"""Opens Parquet files; needs the extra "datasets".
 
-A column of lists holds a pad, or each column of numbers a cell. A column ``episode_index`` (or
-``episode``, ``recording``, ``trial``) divides the rows into recordings.
+A column of lists or of Arrow's tensors holds a pad, or each column of numbers a cell. A column
+``episode_index`` (or ``episode``, ``recording``, ``trial``) divides the rows into recordings.
 """
 
 from __future__ import annotations
 
 import builtins
 import math
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
-from itertools import pairwise
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.facts.declared import too_large, too_much
+from adaptfault.data.recordings.formats.datasets.chooser import Stated, recordings_of
+from adaptfault.data.recordings.formats.datasets.contents import Contents
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.data.recordings.formats.datasets.features import Pads, Sizes, choose
-from adaptfault.data.recordings.formats.datasets.table import (
-    EPISODES,
-    LABELS,
-    clock_of,
-    first_of,
-    named,
-    unit_of,
-)
-from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
+from adaptfault.data.recordings.formats.datasets.features import Sizes
+from adaptfault.data.recordings.recording import Recording, Shape
 
 SUFFIXES = (".parquet", ".pq")
 
@@ -57,239 +50,241 @@ def open(
     Raises:
         InputError: pyarrow is not installed, the file is damaged, or the columns are not clear.
     """
-    table = Table.read(path, time_column, label_column)
-    names = table.cells(key)
-    sizes = [table.sizes[name] for name in names]
-    if not any(sizes):  # each column is a cell
-        sizes = [(len(names),)]
-    pads = Pads.of(sizes, shape)
-    counts = all(table.whole[name] for name in names)
-    facts = Facts(path, counts=counts, shape=pads.shape, present=pads.present)
-    if not sum(table.group_rows):
-        raise InputError.at(path, "holds no frames; record it again or remove it")
-    return [
-        Recording(
-            facts,
-            blocks_of(table, rows, names, pads),
-            None if called is None else f"{path.name}, {called}",
-            label,
-        )
-        for called, label, rows in table.episodes()
-    ]
+    return recordings_of(
+        path, partial(opened, path), shape=shape, key=key, stated=Stated(time_column, label_column)
+    )
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
-    """The columns of a file.
+@contextmanager
+def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]:
+    """Open a file; ``names``: of the columns that are wanted, None: all it holds.
 
-    Attributes:
+    Raises:
+        InputError: pyarrow is not installed, or the file is damaged.
+    """
+    parquet = imported("pyarrow.parquet", path)
+    contents = Contents(is_table=True)
+    try:
+        with builtins.open(path, "rb") as file:
+            held = parquet.ParquetFile(file, pre_buffer=False)
+            about = held.metadata
+            groups = tuple(about.row_group(i).num_rows for i in range(about.num_row_groups))
+            columns = held.schema_arrow
+            every = columns.names
+            wanted = tuple(every) if names is None else tuple(names)
+            for field in columns:
+                if field.name not in wanted:
+                    continue
+                if every.count(field.name) > 1:
+                    contents.left_out[field.name] = "stands twice in the file; rename one of them"
+                    continue
+                column = _Column.of(path, held, field, groups, () if names is None else wanted)
+                if column is not None:
+                    _add(contents, field.name, column, path.stat().st_size)
+    # a damaged file raises any of pyarrow's kinds
+    except Exception as error:
+        raise _damaged(path, error) from None
+    yield contents
+
+
+def _add(contents: Contents, name: str, column: _Column, stored: int) -> None:
+    row = math.prod(column.shape[1:]) * column.dtype.itemsize
+    largest = max(column.groups, default=0)
+    why = too_large((largest, row), 1) or too_much(column.shape[0] * row, stored)
+    if why is None:
+        contents.add(name, column)
+    else:
+        contents.left_out[name] = why
+
+
+class _Column:
+    """A column of numbers, times or texts, ``[rows, ...]``, read by row groups.
+
+    Args:
         path: the file.
-        sizes: of a frame in each column of numbers; ``()`` for a single number.
-        whole: whether its numbers are whole by their type.
-        columns: all names.
-        group_rows: rows of each row group.
-        clock, tick: the column of times, and its unit.
-        label: the column of classes.
+        name: of the column.
+        sizes: of one row.
+        dtype: of its values.
+        groups: rows of each row group.
+        beside: columns that are read along with it.
     """
 
-    path: Path
-    sizes: dict[str, Sizes]
-    whole: dict[str, bool]
-    columns: tuple[str, ...]
-    group_rows: tuple[int, ...]
-    clock: str | None = None
-    tick: str | None = None
-    label: str | None = None
+    def __init__(
+        self,
+        path: Path,
+        name: str,
+        sizes: Sizes,
+        dtype: np.dtype[Any],
+        groups: tuple[int, ...],
+        beside: tuple[str, ...],
+    ) -> None:
+        self.path = path
+        self.name = name
+        self.shape = (sum(groups), *sizes)
+        self.dtype = dtype
+        self.groups = groups
+        self.beside = beside or (name,)
 
     @classmethod
-    def read(
-        cls, path: Path, time_column: str | None = None, label_column: str | None = None
-    ) -> Table:
-        """Read the head of a file.
+    def of(
+        cls,
+        path: Path,
+        held: Any,
+        field: Any,
+        groups: tuple[int, ...],
+        beside: tuple[str, ...],
+    ) -> _Column | None:
+        """Return a column of an open file; None where it holds something else."""
+        inner, sizes = _unpacked(path, field.type)
+        dtype = _dtype(path, inner)
+        if dtype is None:
+            return None
+        if sizes is None:
+            sizes = _first(held, field.name) if groups else (0,)
+        return cls(path, field.name, sizes, dtype, groups, beside)
 
-        Raises:
-            InputError: it is damaged, or does not have a column that is named.
-        """
-        parquet = imported("pyarrow.parquet", path)
-        types = imported("pyarrow.types", path)
-        sizes: dict[str, Sizes] = {}
-        whole: dict[str, bool] = {}
-        try:
-            with builtins.open(path, "rb") as file:
-                opened = parquet.ParquetFile(file, pre_buffer=False)
-                schema = opened.schema_arrow
-                about = opened.metadata
-                groups = tuple(about.row_group(i).num_rows for i in range(about.num_row_groups))
-                for field in schema:
-                    inner, stated = _unpacked(field.type)
-                    if not (types.is_integer(inner) or types.is_floating(inner)):
-                        continue
-                    whole[field.name] = types.is_integer(inner)
-                    sizes[field.name] = _first(opened, field.name) if stated is None else stated
-        # a damaged file raises any of pyarrow's kinds
-        except Exception as error:
-            raise _damaged(path, error) from None
-        columns = tuple(schema.names)
-        clock, tick = clock_of(columns)
-        own_clock = named(path, "time-column", time_column, columns)
-        if own_clock is not None:
-            clock = own_clock
-            tick = unit_of(own_clock)
-        label = named(path, "label-column", label_column, columns) or first_of(LABELS, columns)
-        return cls(path, sizes, whole, columns, groups, clock, tick, label)
-
-    def cells(self, key: str | None) -> list[str]:
-        """Return the columns that hold the readings.
-
-        Raises:
-            InputError: they are not clear.
-        """
-        aside = {*EPISODES, "frame_index", "index", "task_index", self.clock, self.label}
-        listed = {name: sizes for name, sizes in self.sizes.items() if name not in aside}
-        if key is not None or (any(map(math.prod, listed.values())) and any(listed.values())):
-            return choose(self.path, listed, key)
-        if not listed:
-            raise InputError.at(self.path, f"holds no numbers; its columns: {self.columns}")
-        return list(listed)
-
-    def episodes(self) -> Iterator[tuple[str | None, str | None, tuple[int, int]]]:
-        """Yield name, class and first and last row of each episode."""
-        number = first_of(EPISODES, self.columns)
-        rows = sum(self.group_rows)
-        if not rows:
-            return
-        classes = None if self.label is None else self.column(self.label)
-        if number is None:
-            yield None, None if classes is None else _most(classes), (0, rows)
-            return
-        numbers = self.column(number)
-        begins = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
-        bounds = [0, *begins.tolist(), rows]
-        for first, last in pairwise(bounds):
-            of_it = None if classes is None else _most(classes[first:last])
-            yield f"episode {numbers[first]}", of_it, (first, last)
-
-    def column(self, name: str) -> NDArray[Any]:
-        """Return a whole column of numbers or text.
-
-        Raises:
-            InputError: the file is damaged.
-        """
-        parquet = imported("pyarrow.parquet", self.path)
-        try:
-            read = parquet.read_table(
-                self.path, columns=[name], partitioning=None, use_threads=False
-            )
-        except Exception as error:
-            raise _damaged(self.path, error) from None
-        values: NDArray[Any] = read.column(0).to_numpy()
-        if values.dtype.kind == "O" and len(values) and np.shape(values[0]) == (1,):
-            values = np.concatenate(values)  # LeRobot writes numbers as lists of one, too
-        return values
+    def __getitem__(self, part: slice) -> NDArray[Any]:
+        first, last, _ = part.indices(self.shape[0])
+        pieces = [np.empty((0, *self.shape[1:]), self.dtype)]
+        begin = 0
+        for group, rows in enumerate(self.groups):
+            low = max(first - begin, 0)
+            high = min(last - begin, rows)
+            if low < high:
+                table = _group(self.path, group, self.beside)
+                column = table.column(self.name).combine_chunks().slice(low, high - low)
+                pieces.append(_array(self.path, column, self, begin + low))
+            begin += rows
+        return np.concatenate(pieces[1:] or pieces)
 
 
-def _unpacked(kind: Any) -> tuple[Any, Sizes | None]:
-    """Return the type of the numbers in a column, and the sizes of a frame; None where only its
-    values tell them."""
+def _unpacked(path: Path, kind: Any) -> tuple[Any, Sizes | None]:
+    """Return the type of the values in a column, and the sizes of a row; None where only its values
+    tell them.
+
+    Types of an extension, as those that LeRobot's libraries register, are read as they are stored.
+    """
+    pa = imported("pyarrow", path)
     sizes: list[int] = []
     stated = True
-    while hasattr(kind, "value_type"):
-        if hasattr(kind, "list_size"):
+    while True:
+        if isinstance(kind, pa.FixedShapeTensorType):
+            sizes += _tensor(kind)
+            kind = kind.value_type
+        elif isinstance(kind, pa.BaseExtensionType):
+            kind = kind.storage_type
+        elif pa.types.is_fixed_size_list(kind):
             sizes.append(kind.list_size)
-        else:
+            kind = kind.value_type
+        elif pa.types.is_list(kind) or pa.types.is_large_list(kind):
             stated = False
-        kind = kind.value_type
-    return kind, tuple(sizes) if stated else None
+            kind = kind.value_type
+        elif pa.types.is_dictionary(kind):
+            kind = kind.value_type
+        else:
+            return kind, tuple(sizes) if stated else None
 
 
-def _first(opened: Any, name: str) -> Sizes:
-    """Return the sizes of the first frame in a column of lists."""
-    batches = opened.iter_batches(batch_size=1, row_groups=[0], columns=[name], use_threads=False)
-    first = next(batches, None)
-    value = None if first is None or not len(first) else first.column(0)[0].as_py()
-    return () if value is None else np.shape(value)
+def _tensor(kind: Any) -> list[int]:
+    """Return the sizes of a tensor with its axes in the order in which its writer sees them."""
+    order = kind.permutation or range(len(kind.shape))
+    return [kind.shape[axis] for axis in order]
 
 
-def _most(classes: NDArray[Any]) -> str | None:
-    """Return the most frequent class."""
-    counts = Counter(str(value) for value in classes.tolist() if value is not None)
-    return max(sorted(counts), key=counts.__getitem__, default=None)
+def _dtype(path: Path, kind: Any) -> np.dtype[Any] | None:
+    """Return numpy's type for the values of a column; None where they are no numbers, times or
+    texts."""
+    types = imported("pyarrow.types", path)
+    if types.is_integer(kind) or types.is_floating(kind):
+        number: np.dtype[Any] = np.dtype(kind.to_pandas_dtype())
+        return number
+    if types.is_decimal(kind):
+        return np.dtype(np.float64)
+    if types.is_timestamp(kind) or types.is_time(kind) or types.is_date(kind):
+        return np.dtype("datetime64[ns]")
+    if types.is_duration(kind):
+        return np.dtype("timedelta64[ns]")
+    is_text = types.is_string(kind) or types.is_large_string(kind) or types.is_string_view(kind)
+    return np.dtype(object) if is_text else None
 
 
-def blocks_of(
-    table: Table, rows: tuple[int, int], names: Sequence[str], pads: Pads
-) -> Callable[[], Iterator[Block]]:
-    """Return what reads the rows of one episode."""
-    return lambda: _blocks(table, rows, names, pads)
-
-
-def _blocks(
-    table: Table, rows: tuple[int, int], names: Sequence[str], pads: Pads
-) -> Iterator[Block]:
-    clock = table.clock
-    begin = 0
-    for group, size in enumerate(table.group_rows):
-        first = max(rows[0] - begin, 0)
-        last = min(rows[1] - begin, size)
-        begin += size
-        if first >= last:
-            continue
-        held = _group(table.path, group, tuple(names), clock)
-        for low in range(first, last, BLOCK):
-            part = slice(low, min(low + BLOCK, last))
-            features = [held[name][part] for name in names]
-            if not any(table.sizes[name] for name in names):
-                features = [np.stack(features, axis=1)]
-            values = pads.frames(features)
-            times = None
-            unit = table.tick
-            if clock is not None and pads.steps == 1:
-                times = held[clock][part].ravel()
-                if times.dtype.kind == "M":
-                    times = times.astype("datetime64[ns]").astype(np.float64)
-                    unit = "ns"
-            yield Block(values, None, None if times is None else times.astype(np.float64), unit)
+def _first(held: Any, name: str) -> Sizes:
+    """Return the sizes of the first row in a column of lists that is there."""
+    for batch in held.iter_batches(batch_size=64, columns=[name], use_threads=False):
+        for value in batch.column(0):
+            row = value.as_py()
+            if row is not None:
+                return np.shape(row)
+    return (0,)
 
 
 @lru_cache(maxsize=2)
-def _group(
-    path: Path, group: int, names: tuple[str, ...], clock: str | None
-) -> dict[str, NDArray[Any]]:
+def _group(path: Path, group: int, names: tuple[str, ...]) -> Any:
     """Return the columns of a row group; the last ones stay in memory: episodes share them."""
-    wanted = [*names, *([] if clock is None else [clock])]
     parquet = imported("pyarrow.parquet", path)
     try:
         with builtins.open(path, "rb") as file:
-            table = parquet.ParquetFile(file, pre_buffer=False).read_row_group(
-                group, columns=wanted, use_threads=False
+            return parquet.ParquetFile(file, pre_buffer=False).read_row_group(
+                group, columns=list(names), use_threads=False
             )
     except Exception as error:
         raise _damaged(path, error) from None
-    held = {name: _array(path, table.column(name).combine_chunks(), name) for name in wanted}
-    for name in names:
-        if held[name].dtype.kind == "f":
-            held[name] = held[name].astype(np.float32)
-    return held
 
 
-def _array(path: Path, column: Any, name: str) -> NDArray[Any]:
-    """Return a column as an array ``[n, ...]``; missing numbers are NaN."""
-    sizes = []
-    while hasattr(column.type, "value_type") and hasattr(column, "flatten"):
-        n = len(column)
-        if column.null_count:
-            raise InputError.at(path, f"rows without {name}; leave them out")
-        flat = column.flatten()
-        if n and len(flat) % n:
-            raise InputError.at(path, f"{name} has lists of different lengths; give all the same")
-        sizes.append(len(flat) // n if n else 0)
-        column = flat
+def _array(path: Path, column: Any, about: _Column, first: int) -> NDArray[Any]:
+    """Return rows of a column as an array ``[n, ...]``; missing numbers are NaN.
+
+    Raises:
+        InputError: a row holds another number of values than the first of the file.
+    """
+    pa = imported("pyarrow", path)
+    compute = imported("pyarrow.compute", path)
+    rows = len(column)
+    sizes = list(about.shape[1:])
+    order = None
+    while True:
+        kind = column.type
+        if isinstance(kind, pa.FixedShapeTensorType):
+            order = kind.permutation
+            column = column.storage
+        elif isinstance(kind, pa.BaseExtensionType):
+            column = column.storage
+        elif pa.types.is_nested(kind):
+            lengths = compute.list_value_length(column).fill_null(-1).to_numpy()
+            expected = math.prod(sizes) if order else sizes[0]
+            wrong = np.flatnonzero(lengths != expected)
+            if len(wrong):
+                row = first + int(wrong[0]) * rows // max(len(lengths), 1)
+                came = "no list" if lengths[wrong[0]] < 0 else f"a list of {lengths[wrong[0]]}"
+                what = f"{about.name} holds {came} where the first row has {expected}"
+                raise InputError.at(path, f"{what}; give all rows the same", f"row {row}")
+            column = column.flatten()
+            sizes = sizes[1:]
+        elif pa.types.is_dictionary(kind):
+            column = column.dictionary_decode()
+        else:
+            break
+    values = _numpy(pa, column)
+    if order:
+        stored = np.argsort(order)
+        physical = [about.shape[1:][axis] for axis in stored]
+        return values.reshape(rows, *physical).transpose(0, *(axis + 1 for axis in order))
+    return values.reshape(rows, *about.shape[1:])
+
+
+def _numpy(pa: Any, column: Any) -> NDArray[Any]:
+    """Return a flat column; times of day count from midnight."""
+    kind = column.type
+    if pa.types.is_time(kind):
+        whole = column.cast(pa.int32() if kind.bit_width == 32 else pa.int64()).cast(pa.int64())
+        column = whole.view(pa.timestamp(kind.unit))
+    if pa.types.is_decimal(kind):
+        column = column.cast(pa.float64())
     values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
-    if sizes:
-        values = values.reshape(-1, *sizes)
     return values
 
 
 def _damaged(path: Path, error: Exception) -> InputError:
-    reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-    return InputError.at(path, f"is no Parquet file, or is cut off ({reason}); copy it again")
+    if isinstance(error, InputError):
+        return error
+    return InputError.at(path, "is no Parquet file, or is cut off; copy it again")

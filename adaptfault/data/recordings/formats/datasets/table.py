@@ -1,5 +1,4 @@
-"""Rows of a table by episode: what Parquet files, LeRobot data sets and JSON lines have in
-common."""
+"""How rows of a table are called that are no readings: times, episodes, classes."""
 
 from __future__ import annotations
 
@@ -10,11 +9,16 @@ from pathlib import Path
 from adaptfault.data.recordings.errors import InputError
 
 CLOCK = re.compile(
-    r"(?:.*[./_])?(?:time|times|timestamp|stamp|t)(?:_?(s|ms|us|ns))?", re.IGNORECASE
+    r"(?:.*[./_])?(?:time|times|timestamp|timestamps|stamp|t)(?:_?(s|ms|us|ns))?", re.IGNORECASE
 )
 """Name of a column of times, and its unit."""
 
 _UNIT = re.compile(r"_(s|ms|us|ns)$", re.IGNORECASE)
+_SINCE = re.compile(
+    r"(?:(s|sec|secs|seconds?)|(ms|msecs?|milliseconds?)|(us|microseconds?)|(ns|nanoseconds?))"
+    r"(?: since .*)?",
+    re.IGNORECASE,
+)
 _SHOWN = 12  # columns in a message
 
 EPISODES = ("episode_index", "episode", "episode_id", "recording", "trial")
@@ -22,6 +26,9 @@ EPISODES = ("episode_index", "episode", "episode_id", "recording", "trial")
 
 LABELS = ("label", "class", "object", "task")
 """Names of a column of classes, in the order of preference."""
+
+NUMBERS = ("frame_index", "index", "task_index")
+"""Names of columns of numbers that are no readings."""
 
 
 def first_of(wanted: Sequence[str], columns: Sequence[str]) -> str | None:
@@ -47,8 +54,12 @@ def named(path: Path, option: str, stated: str | None, columns: Sequence[str]) -
     raise InputError.at(path, f"--{option} {stated}: {count}; name one of {held}")
 
 
-def unit_of(name: str) -> str | None:
-    """Return the unit in which a name of times ends, as in ``elapsed_ms``; None: it states none."""
+def unit_of(name: str, units: object = None) -> str | None:
+    """Return the unit of times: what their attribute ``units`` says, as "milliseconds since
+    2020-01-01", or the ending of their name, as in ``elapsed_ms``; None: nothing states it."""
+    stated = _SINCE.fullmatch(units.strip()) if isinstance(units, str) else None
+    if stated is not None:
+        return ("s", "ms", "us", "ns")[(stated.lastindex or 1) - 1]
     found = _UNIT.search(name)
     return None if found is None else found[1].lower()
 

@@ -1,0 +1,542 @@
+"""Finds the recordings in a file of named arrays, the same way for HDF5, Zarr, MAT, netCDF and
+Parquet: which arrays are readings, where times, episodes and classes are.
+
+Episodes are
+
+- groups: ``demo_0/obs/tactile``, ``demo_1/obs/tactile``;
+- parts of arrays that hold all of them one behind the other, with ``episode_ends`` or ``lengths``
+  beside, or a column ``episode_index`` that numbers the rows;
+- the first axis of an array ``[n, T, ...]`` named ``frames``;
+- otherwise the whole array is one recording ``[T, ...]``.
+
+Arrays of one episode whose names differ are the pads of one array.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, located
+from adaptfault.data.recordings.facts.labels import natural_key
+from adaptfault.data.recordings.formats.datasets.axes import TimeLast, Vector, is_time_last
+from adaptfault.data.recordings.formats.datasets.contents import (
+    CLASSES,
+    FULL_SCALES,
+    NUMBERS,
+    RATES,
+    TEXTS,
+    TIMES,
+    UNITS,
+    Array,
+    Contents,
+    Opened,
+    Packing,
+    texts,
+)
+from adaptfault.data.recordings.formats.datasets.features import (
+    GUESSED,
+    Pads,
+    Sizes,
+    by_episode,
+    choose,
+    is_touch,
+    shown,
+)
+from adaptfault.data.recordings.formats.datasets.table import CLOCK, EPISODES, unit_of
+from adaptfault.data.recordings.formats.datasets.table import NUMBERS as NUMBERED
+from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
+
+_ENDS = ("episode_ends", "lengths", "episode_lengths")
+_SHOWN = 12  # arrays in a message
+_BESIDE = ("", "data", "meta")  # groups in which arrays of the whole file stand
+_ROOM = 64 << 20  # bytes of readings that are read at once
+_MOST_CELLS = 1_000_000  # of a frame; more is damage, or an attack on the memory
+_LONGEST_UNIT = 16
+
+
+@dataclass(frozen=True)
+class Stated:
+    """Names of the arrays of times and of classes, or of an attribute with the class, whole or the
+    last part; None: found by their names."""
+
+    clock: str | None = None
+    label: str | None = None
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Where the frames of one recording are.
+
+    Attributes:
+        names: of its arrays, one a pad.
+        first, last: its frames in them, ``last`` excluded.
+        clock: the array of its times.
+        outer: which recording of an array ``[n, T, ...]`` it is.
+        label: its class.
+        group: the group that is this episode; "" for the file.
+        number: how the file numbers it.
+    """
+
+    names: tuple[str, ...]
+    first: int
+    last: int
+    clock: str | None = None
+    outer: int | None = None
+    label: str | None = None
+    group: str = ""
+    number: int | str | None = None
+
+    @property
+    def name(self) -> str | None:
+        """How the file calls it."""
+        if self.number is not None:
+            return f"episode {self.number}"
+        return self.group or None
+
+
+def recordings_of(
+    path: Path,
+    opened: Opened,
+    *,
+    shape: Shape | None,
+    key: str | None,
+    stated: Stated,
+    known: Mapping[str, Sizes] | None = None,
+) -> list[Recording]:
+    """Return the recordings of a file.
+
+    Args:
+        path: of the file, for messages.
+        opened: opens it; raises InputError where it cannot be read.
+        shape: ``(pads, rows, cols)`` where the user states it.
+        key: which arrays hold the readings; None: found by their names.
+        stated: where times and classes are.
+        known: sizes of a frame of each array, where another file states them.
+
+    Raises:
+        InputError: no array of touch, or several that could be meant; times or classes are not
+            where they are stated.
+    """
+    with opened(None) as contents:
+        chooser = _Chooser(path, contents, shape, stated, known)
+        parts = list(chooser.parts(chooser.episodes(key)))
+        if not any(part.last > part.first for part in parts):
+            raise InputError.at(path, NO_FRAMES)
+        common = Counter(chooser.sizes(part) for part in parts if part.last > part.first)
+        sizes = common.most_common(1)[0][0]
+        pads = Pads.of(sizes, shape)
+        usual = next(part for part in parts if chooser.sizes(part) == sizes)
+        facts = chooser.facts(usual, pads)
+        found = []
+        for part in parts:
+            blocks = partial(_blocks, path, opened, chooser.readings(part), pads)
+            if chooser.sizes(part) != sizes and part.last > part.first:
+                blocks = partial(_refused, path, part, chooser.sizes(part), sizes)
+            name = None if part.name is None else f"{path.name}, {part.name}"
+            number = part.number if isinstance(part.number, int) else None
+            found.append(Recording(facts, blocks, name, part.label, part.names, number))
+    return found
+
+
+def last_part(name: str) -> str:
+    """Return the name of an array without its groups."""
+    return name.rpartition("/")[2].lower()
+
+
+@dataclass(frozen=True)
+class _Readings:
+    """What is read of one recording.
+
+    Attributes:
+        part: where its frames are.
+        packings: of its arrays.
+        turned: whether the time is their last axis.
+        tick: unit of its times.
+    """
+
+    part: _Part
+    packings: tuple[Packing, ...]
+    turned: bool
+    tick: str | None
+
+
+class _Chooser:
+    """What the arrays of one open file are."""
+
+    def __init__(
+        self,
+        path: Path,
+        contents: Contents,
+        shape: Shape | None,
+        stated: Stated,
+        known: Mapping[str, Sizes] | None,
+    ) -> None:
+        self.path = path
+        self.contents = contents
+        self.shape = shape
+        self.stated = stated
+        self.known = known
+        arrays = contents.arrays
+        self.ends = next((name for name in arrays if last_part(name) in _ENDS), None)
+        self.outer = False
+        aside = (*EPISODES, *CLASSES, *_given(stated))
+        self._beside: dict[str, list[str]] = {}
+        for name in arrays:
+            if last_part(name) in aside or CLOCK.fullmatch(last_part(name)):
+                self._beside.setdefault(name.rpartition("/")[0], []).append(name)
+        self._texts: dict[str, list[str]] = {}
+
+    # readings
+
+    def episodes(self, key: str | None) -> list[tuple[str, list[str]]]:
+        """Return the group of each episode, and the names of its arrays of readings."""
+        arrays = self.contents.arrays
+        listed = {name: self._sizes(name) for name in arrays if self._may_be_readings(name)}
+        if self.known is not None:
+            listed = {name: size for name, size in self.known.items() if name in arrays}
+        grouped = by_episode(sorted(listed, key=natural_key))
+        features: dict[str, Sizes] = {}
+        for names in grouped.values():
+            features |= {common: listed[name] for common, name in names.items()}
+        try:
+            chosen = choose(self.path, features if self.known is None else self.known, key)
+        except InputError:
+            self._refuse_left_out(key)
+            raise
+        found = [
+            (episode, [names[common] for common in chosen])
+            for episode, names in grouped.items()
+            if all(common in names for common in chosen)
+        ]
+        if not found:
+            self._refuse_left_out(key)
+            missing = next((name for name in chosen if name not in arrays), None)
+            what = f"no episode holds all of {', '.join(chosen)}"
+            raise InputError.at(
+                self.path, what if missing is None else f"holds no column {missing!r}"
+            )
+        first = found[0][1]
+        self.outer = self.ends is None and self._holds_recordings(first)
+        return found
+
+    def _may_be_readings(self, name: str) -> bool:
+        array = self.contents.arrays[name]
+        last = last_part(name)
+        if array.dtype.kind not in NUMBERS or name == self.ends:
+            return False
+        if len(array.shape) == 1:
+            aside = (*EPISODES, *NUMBERED, *CLASSES, *_given(self.stated))
+            return last not in aside and not CLOCK.fullmatch(last)
+        return last not in _given(self.stated)
+
+    def _refuse_left_out(self, key: str | None) -> None:
+        """Raise the reason why an array that is meant was left out."""
+        for name, why in self.contents.left_out.items():
+            asked = key is not None and last_part(name) in map(last_part, key.split(","))
+            if asked or (key is None and is_touch(name)):
+                raise InputError.at(self.path, f"{name} {why}")
+
+    def _sizes(self, name: str) -> Sizes:
+        if self.known is not None and name in self.known:
+            return self.known[name]
+        sizes = tuple(map(int, self.contents.arrays[name].shape))
+        if self._is_turned(name):
+            return sizes[:-1]
+        return sizes[2:] if self.outer else sizes[1:]
+
+    def sizes(self, part: _Part) -> tuple[Sizes, ...]:
+        """Return the sizes of a frame of each array of a recording.
+
+        Raises:
+            InputError: a frame is larger than any sensor.
+        """
+        sizes = tuple(self._sizes(name) for name in part.names)
+        cells = sum(map(math.prod, sizes))
+        if cells > _MOST_CELLS:
+            what = f"{part.names[0]} declares {cells:,} numbers a frame"
+            raise InputError.at(self.path, f"{what}; expected at most {_MOST_CELLS:,}")
+        return sizes
+
+    def _holds_recordings(self, names: Sequence[str]) -> bool:
+        """Return whether the first axis counts recordings, not frames."""
+        sizes = tuple(map(int, self.contents.arrays[names[0]].shape))
+        if len(names) > 1 or len(sizes) < 3 or self.contents.is_table:
+            return False
+        if self.shape is not None:
+            cells = math.prod(self.shape)
+            return math.prod(sizes[1:]) != cells and math.prod(sizes[2:]) == cells
+        return len(sizes) == 5 or last_part(names[0]) in ("frames", "recordings")
+
+    def _length(self, name: str) -> int:
+        shape = self.contents.arrays[name].shape
+        return int(shape[-1] if self._is_turned(name) else shape[0])
+
+    def _is_turned(self, name: str) -> bool:
+        """Return whether the last axis of an array is the time."""
+        sizes = tuple(map(int, self.contents.arrays[name].shape))
+        return not self.contents.is_table and is_time_last(sizes, self.shape)
+
+    def readings(self, part: _Part) -> _Readings:
+        """Return what is read of a recording."""
+        packings = [Packing.of(self.contents.attributes.get(name, {})) for name in part.names]
+        tick = None
+        if part.clock is not None:
+            units = self.contents.attributes.get(part.clock, {}).get("units")
+            tick = unit_of(part.clock, units)
+        return _Readings(part, tuple(packings), self._is_turned(part.names[0]), tick)
+
+    def facts(self, part: _Part, pads: Pads) -> Facts:
+        """Return what the file states of its array, from one of its recordings."""
+        contents = self.contents
+        name = part.names[0]
+        rate = contents.positive(name, RATES)
+        unit = contents.attribute(name, UNITS)
+        packings = self.readings(part).packings
+        whole = all(contents.arrays[one].dtype.kind in "iu" for one in part.names)
+        return Facts(
+            self.path,
+            counts=whole and not any(one.is_scaled for one in packings),
+            shape=pads.shape,
+            present=pads.present,
+            full_scale=contents.positive(name, FULL_SCALES),
+            unit=unit if isinstance(unit, str) and 0 < len(unit) <= _LONGEST_UNIT else None,
+            rate=None if rate is None else rate * pads.steps,
+            stored=tuple(map(int, contents.arrays[name].shape)),
+            problems=tuple(self._told(part, pads)),
+            sizes=pads.sizes,
+            places=pads.places,
+        )
+
+    def _told(self, part: _Part, pads: Pads) -> Iterator[Problem]:
+        """Yield warnings of what was left out, and of what was decided without being stated."""
+        told = []
+        if self._is_turned(part.names[0]):
+            told.append(f"{part.names[0]} has the time as its last axis: read as frames of cells")
+        if pads.is_guessed:
+            told.append(f"{', '.join(part.names)}: {GUESSED}")
+        left_out = list(self.contents.left_out.items())
+        told += [f"{name} is left out: it {why}" for name, why in left_out[:_SHOWN]]
+        if len(left_out) > _SHOWN:
+            told.append(f"{len(left_out) - _SHOWN} more arrays are left out for such reasons")
+        for what in told:
+            yield Problem("warning", located(self.path, what))
+
+    # episodes
+
+    def parts(self, episodes: Sequence[tuple[str, list[str]]]) -> Iterator[_Part]:
+        """Yield the recordings in the arrays of each episode."""
+        for place, (group, names) in enumerate(episodes):
+            length = min(self._length(name) for name in names)
+            clock = self._clock(names[0], length)
+            label = self._classes(names[0])
+            start = partial(_Part, tuple(names), clock=clock, group=group)
+            if self.outer:
+                frames = int(self.contents.arrays[names[0]].shape[1])
+                for i in range(length):
+                    yield start(0, frames, outer=i, clock=None, label=label(0, frames, i, length))
+                continue
+            column = self._near(names[0], EPISODES, length) if self.ends is None else None
+            if self.ends is not None:
+                bounds = self._bounds(self.ends, length)
+            elif column is not None and not group:
+                bounds = self._runs(column)
+            else:
+                yield start(0, length, label=label(0, length, place, len(episodes)))
+                continue
+            for i, (number, first, last) in enumerate(bounds):
+                named = label(first, last, i, len(bounds))
+                yield start(first, last, label=named, number=number)
+
+    def _bounds(self, name: str, length: int) -> list[tuple[int | str, int, int]]:
+        """Return number, first frame and the one behind the last of each episode."""
+        stored = np.asarray(self.contents.arrays[name][:]).ravel().astype(np.int64)
+        ends = stored if last_part(name) == _ENDS[0] else np.cumsum(stored)
+        if not len(ends) or (np.diff(ends, prepend=0) < 0).any():
+            what = f"{name} does not rise; it holds where each episode ends"
+            raise InputError.at(self.path, what)
+        if ends[-1] > length:
+            what = f"{name} ends at frame {ends[-1]}, but the readings hold {length}: cut off?"
+            raise InputError.at(self.path, what)
+        bounds = enumerate(pairwise([0, *ends.tolist()]))
+        return [(number, first, last) for number, (first, last) in bounds]
+
+    def _runs(self, name: str) -> list[tuple[int | str, int, int]]:
+        """Return the value of a column that numbers the episodes, and the rows in which it holds
+        it, as :meth:`_bounds`."""
+        array = self.contents.arrays[name]
+        stored = np.asarray(array[:]).ravel()
+        if array.dtype.kind in TEXTS:
+            stored = np.array(texts(stored))
+        if stored.dtype.kind == "f" and not np.isfinite(stored).all():
+            raise InputError.at(self.path, f"rows without {name}; leave them out")
+        begins = np.flatnonzero(stored[1:] != stored[:-1]) + 1
+        bounds = pairwise([0, *begins.tolist(), len(stored)] if len(stored) else [])
+        return [(_plain_number(stored[first]), first, last) for first, last in bounds]
+
+    # times and classes
+
+    def _near(self, name: str, wanted: Sequence[str], length: int | None = None) -> str | None:
+        """Return an array in the group of ``name``, or above it: the first of the names that are
+        wanted.
+
+        Args:
+            name: of an array of readings.
+            wanted: the last part of names.
+            length: how many values it holds; None: any number.
+        """
+        arrays = self.contents.arrays
+        for group in self._groups(name):
+            named = {last_part(one): one for one in reversed(self._beside.get(group, []))}
+            for one in wanted:
+                found = named.get(one)
+                if found and (length is None or _is_vector(arrays[found], length)):
+                    return found
+        return None
+
+    def _groups(self, name: str) -> list[str]:
+        """Return the group of an array, those above it, and those of the whole file."""
+        groups = name.split("/")[:-1]
+        above = ["/".join(groups[:depth]) for depth in range(len(groups), 0, -1)]
+        return list(dict.fromkeys([*above, *_BESIDE]))
+
+    def _clock(self, name: str, length: int) -> str | None:
+        stated = self.stated.clock
+        arrays = self.contents.arrays
+        near = [one for group in self._groups(name) for one in self._beside.get(group, [])]
+        for other in near if stated is None else [*near, stated]:
+            if stated is None:
+                is_meant = CLOCK.fullmatch(last_part(other)) is not None
+            else:
+                is_meant = f"/{other.lower()}".endswith(f"/{stated.lower()}")
+            if is_meant and other in arrays and _is_vector(arrays[other], length):
+                return other
+        if stated is None or self.outer:
+            return None
+        raise self._absent("time-column", stated, " of one number a frame")
+
+    def _absent(self, option: str, name: str, what: str) -> InputError:
+        held = ", ".join(sorted(self.contents.arrays, key=natural_key)[:_SHOWN])
+        told = f"--{option} {name}: holds no such array{what}; it holds {held}"
+        return InputError.at(self.path, told)
+
+    def _classes(self, name: str) -> Callable[[int, int, int, int], str | None]:
+        """Return what tells the class of the recording with some first and last frame, its number
+        and how many there are."""
+        stated = self.stated.label
+        wanted = CLASSES if stated is None else (last_part(stated),)
+        value = self.contents.attribute(name, wanted)
+        if value is not None:
+            return lambda *_: str(value)
+        holder = self._near(name, wanted)
+        if stated is not None and (holder is None or stated in self.contents.arrays):
+            holder = stated
+        if holder is None:
+            return lambda *_: None
+        if holder not in self.contents.arrays:
+            raise self._absent("label-column", str(stated), " or attribute")
+        if holder not in self._texts:
+            self._texts[holder] = texts(self.contents.arrays[holder][:])
+        return partial(self._class_of, holder, self._texts[holder])
+
+    def _class_of(
+        self, holder: str, values: Sequence[str], first: int, last: int, number: int, count: int
+    ) -> str | None:
+        if len(values) == count:
+            return values[number] or None
+        if len(values) >= last:
+            counts = Counter(value for value in values[first:last] if value)
+            return max(sorted(counts), key=counts.__getitem__, default=None)
+        if self.stated.label is None:
+            return None
+        what = f"{holder} holds {len(values)} classes; expected one a recording, or one a frame"
+        raise InputError.at(self.path, f"--label-column {self.stated.label}: {what}")
+
+
+def _given(stated: Stated) -> list[str]:
+    return [last_part(name) for name in (stated.clock, stated.label) if name is not None]
+
+
+def _is_vector(array: Array, length: int) -> bool:
+    """Return whether an array holds one number, time or text a frame."""
+    shape = tuple(map(int, array.shape))
+    return shape in ((length,), (length, 1), (1, length))
+
+
+def _plain_number(value: Any) -> int | str:
+    """Return the number of an episode; a text stays one."""
+    plain = value.item()
+    if isinstance(plain, float) and plain.is_integer():
+        return int(plain)
+    return plain if isinstance(plain, int) else str(plain)
+
+
+def _refused(
+    path: Path, part: _Part, came: Sequence[Sizes], expected: Sequence[Sizes]
+) -> Iterator[Block]:
+    """Raise that frames of one recording have other sizes than those of the others."""
+    each = [(one, other) for one, other in zip(came, expected, strict=True) if one != other]
+    one, other = each[0]
+    cells = f"{math.prod(one)} values a frame, {shown(one)}, where the others have {shown(other)}"
+    raise InputError.at(path, f"{cells}; load it apart", part.name or part.names[0])
+
+
+def _blocks(path: Path, opened: Opened, held: _Readings, pads: Pads) -> Iterator[Block]:
+    part = held.part
+    # times of rows are none of frames
+    clock = part.clock if pads.steps == 1 else None
+    wanted = [*part.names, *([] if clock is None else [clock])]
+    with opened(wanted) as contents:
+        arrays: list[Any] = [contents.arrays[name] for name in part.names]
+        if held.turned:
+            arrays = [TimeLast(array) for array in arrays]
+        if part.outer is not None:
+            arrays = [arrays[0][part.outer : part.outer + 1][0]]
+        times = None if clock is None else Vector(contents.arrays[clock])
+        row = sum(math.prod(sizes) for sizes in pads.sizes) * 8
+        step = max(1, min(BLOCK, _ROOM // max(row, 1)))
+        for first in range(part.first, part.last, step):
+            last = min(first + step, part.last)
+            where = f"{part.name or part.names[0]}, frames {first} to {last - 1}"
+            try:
+                values = [np.asarray(array[first:last]) for array in arrays]
+                stamps = None if times is None else np.asarray(times[first:last])
+            except InputError:
+                raise
+            # a damaged chunk raises any of a dozen kinds: the codec's, the store's, Python's
+            except Exception as error:
+                what = (
+                    f"cannot be read ({type(error).__name__}): damaged, or cut off; copy it again"
+                )
+                raise InputError.at(path, what, where) from None
+            if any(len(value) != last - first for value in values):
+                raise InputError.at(path, "is cut off; copy it again", where)
+            packed = zip(held.packings, values, strict=True)
+            frames = pads.frames([packing.unpacked(value) for packing, value in packed])
+            yield _block(frames, stamps, held.tick)
+
+
+def _block(frames: NDArray[Any], stamps: NDArray[Any] | None, tick: str | None) -> Block:
+    """Return frames with their times; times of numpy, and written ones, count in nanoseconds."""
+    if stamps is None:
+        return Block(frames)
+    if stamps.dtype.kind in TEXTS:
+        try:
+            stamps = np.array(texts(stamps), dtype="datetime64[ns]")
+        except ValueError:
+            return Block(frames)
+    if stamps.dtype.kind in TIMES:
+        unset = np.isnat(stamps)
+        kind = f"{'datetime64' if stamps.dtype.kind == 'M' else 'timedelta64'}[ns]"
+        stamps = np.where(unset, np.nan, stamps.astype(kind).astype(np.int64).astype(np.float64))
+        tick = "ns"
+    return Block(frames, None, stamps.astype(np.float64), tick)

@@ -1,0 +1,188 @@
+"""What a file of named arrays holds, whatever its format: arrays by name, attributes, and what had
+to be left out.
+
+HDF5, Zarr, MAT, netCDF and Parquet are opened as these contents; :mod:`.hierarchy` finds readings,
+times, episodes and classes in them, the same way for all.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+NUMBERS = "iuf"
+TIMES = "mM"
+TEXTS = "OSUT"
+"""Kinds of numpy's types."""
+
+RATES = ("rate", "fps", "hz", "sampling_rate", "sampling_hz", "frequency")
+FULL_SCALES = ("full_scale", "max_value")
+UNITS = ("unit", "units")
+CLASSES = ("label", "labels", "class", "object", "task")
+"""Names of attributes, and of arrays that hold one value."""
+
+_SCALARS = (*RATES, *FULL_SCALES, *UNITS, *CLASSES)
+
+
+class Array(Protocol):
+    """An array in a file; a slice of it is read."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Sizes of the axes."""
+        ...
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the numbers."""
+        ...
+
+    def __getitem__(self, part: slice, /) -> Any: ...
+
+
+@dataclass
+class Contents:
+    """An open file.
+
+    Attributes:
+        arrays: of numbers, times and texts, by their names with groups, as "data/tactile".
+        attributes: of each group and array that has some; "" is the file itself.
+        left_out: arrays that cannot be read, and why.
+        is_table: its first axis counts rows, so it is the time.
+    """
+
+    arrays: dict[str, Array] = field(default_factory=dict)
+    attributes: dict[str, dict[str, Any]] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    is_table: bool = False
+
+    def add(self, name: str, array: Array, attributes: Mapping[str, Any] | None = None) -> None:
+        """Take in an array: one value under a name of :data:`RATES` and the like is an attribute of
+        its group, and what holds neither numbers, times nor texts is left out."""
+        group, _, last = name.rpartition("/")
+        size = math.prod(array.shape)
+        kind = array.dtype.kind
+        if kind == "c":
+            self.left_out[name] = "holds complex numbers; save their real part or their amplitude"
+        elif size == 1 and last.lower() in _SCALARS:
+            value = np.asarray(array[:] if array.shape else array).ravel()[0]
+            self.attributes.setdefault(group, {})[last] = value
+        elif kind == "V":
+            self.left_out[name] = "holds records of several fields; save each field as an array"
+        elif array.shape and kind in NUMBERS + TIMES + TEXTS:
+            self.arrays[name] = array
+        if attributes:
+            self.attributes.setdefault(name, {}).update(attributes)
+
+    def attribute(self, name: str, wanted: Sequence[str]) -> Any:
+        """Return an attribute of an array, of a group that holds it, or of the file; None where
+        there is none of one value."""
+        parts = name.split("/")
+        for depth in range(len(parts), -1, -1):
+            held = self.attributes.get("/".join(parts[:depth]), {})
+            for known, value in held.items():
+                if known.lower() in wanted and np.size(value) == 1:
+                    return plain(np.asarray(value).item())
+        return None
+
+    def positive(self, name: str, wanted: Sequence[str]) -> float | None:
+        """Return an attribute that is a number above 0; None where there is none."""
+        value = self.attribute(name, wanted)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return None
+        return float(value) if math.isfinite(value) and value > 0 else None
+
+
+Opened = Callable[[Sequence[str] | None], AbstractContextManager[Contents]]
+"""Opens a file, and returns all that it holds, or the arrays of some names alone."""
+
+
+def element(name: str, place: int) -> str:
+    """Return the name of an element of an array of arrays: a group that counts, as of episodes."""
+    group, _, last = name.rpartition("/")
+    return f"{group or last}/{place}/{last}"
+
+
+def plain(value: Any) -> Any:
+    """Return bytes as text, anything else as it is."""
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+
+
+def texts(values: Any) -> list[str]:
+    """Return the values of an array as text."""
+    return [str(plain(value)) for value in np.asarray(values).ravel().tolist()]
+
+
+@dataclass(frozen=True)
+class Packing:
+    """How CF conventions, and xarray with them, store readings: ``stored * scale + offset``.
+
+    Attributes:
+        missing: stored values that stand for a missing reading.
+        scale, offset: of the others.
+    """
+
+    missing: tuple[float, ...] = ()
+    scale: float = 1.0
+    offset: float = 0.0
+
+    @classmethod
+    def of(cls, attributes: Mapping[str, Any]) -> Packing:
+        """Return what the attributes of an array say."""
+        missing = [
+            _number(value)
+            for name in ("_FillValue", "missing_value")
+            if name in attributes
+            for value in np.asarray(attributes[name]).ravel().tolist()
+        ]
+        scale = _number(_first(attributes.get("scale_factor", 1.0)))
+        offset = _number(_first(attributes.get("add_offset", 0.0)))
+        known = tuple(value for value in missing if not math.isnan(value))
+        return cls(known, scale or math.nan, offset)
+
+    @property
+    def is_scaled(self) -> bool:
+        """Whether readings are other numbers than what is stored."""
+        return (self.scale, self.offset) != (1.0, 0.0)
+
+    def unpacked(self, stored: NDArray[Any]) -> NDArray[Any]:
+        """Return readings; whole numbers keep their type where none is missing."""
+        is_missing = np.isin(stored, self.missing) if self.missing else np.zeros(1, bool)
+        if not self.is_scaled and not is_missing.any():
+            return as_readings(stored)
+        # float64 before the scale: a 32-bit count does not fit float32
+        values = stored.astype(np.float64) * self.scale + self.offset
+        if is_missing.any():
+            values[is_missing] = np.nan
+        return as_readings(values)
+
+
+def as_readings(values: NDArray[Any]) -> NDArray[Any]:
+    """Return whole numbers as they are, others as float32."""
+    if values.dtype.kind in "iu":
+        return values
+    with np.errstate(all="ignore"):  # what float32 cannot hold becomes infinite, and is missing
+        return values.astype(np.float32)
+
+
+def _first(value: Any) -> Any:
+    return np.asarray(value).ravel()[0] if np.size(value) else math.nan
+
+
+def _number(value: Any) -> float:
+    """Return an attribute as a number; xarray writes decimals in Zarr 3 as the text of their
+    bytes. NaN: it is none."""
+    try:
+        if isinstance(value, str) and len(value) == 12:
+            return float(struct.unpack("<d", base64.b64decode(value, validate=True))[0])
+        return float(value)
+    except (TypeError, ValueError):
+        return math.nan

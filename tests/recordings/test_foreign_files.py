@@ -1,0 +1,279 @@
+"""Valid files as pyarrow, h5py, zarr, xarray, scipy and MATLAB write them are read, or the true
+reason is told."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+import scipy.io
+from recording_files import messages, refusal
+
+from adaptfault.data.recordings import load
+
+h5py = pytest.importorskip("h5py")
+pa = pytest.importorskip("pyarrow")
+pq = pytest.importorskip("pyarrow.parquet")
+zarr = pytest.importorskip("zarr")
+
+X = np.random.default_rng(0).integers(0, 4096, (60, 12)).astype(np.float32)
+GRID = "3x4"
+
+
+class Registered(pa.ExtensionType):
+    """What the libraries of LeRobot register for features of rows and columns."""
+
+    def __init__(self):
+        super().__init__(pa.list_(pa.list_(pa.float32())), "tests.array_2d")
+
+    def __arrow_ext_serialize__(self):
+        return b""
+
+    @classmethod
+    def __arrow_ext_deserialize__(cls, storage, data):
+        return cls()
+
+
+@pytest.fixture
+def registered():
+    kind = Registered()
+    pa.register_extension_type(kind)
+    yield kind
+    pa.unregister_extension_type(kind.extension_name)
+
+
+def table(path, **columns):
+    pq.write_table(pa.table(columns), path)
+    return path
+
+
+def lists(values, kind=None):
+    return pa.array(values.tolist(), kind or pa.list_(pa.float32(), values.shape[1]))
+
+
+def check(path, *, rate=10.0, expected=X, **options):
+    loaded = load(path, **{"layout": GRID, **options})
+    np.testing.assert_array_equal(np.concatenate(loaded.recordings.frames), expected)
+    assert loaded.recordings.layout.shape == (1, 3, 4)
+    assert loaded.recordings.layout.rate == pytest.approx(rate)
+    return loaded
+
+
+def test_columns_of_arrows_own_tensors_are_read_in_the_order_of_their_writer(tmp_path):
+    grid = X.reshape(-1, 3, 4)
+    plain = pa.FixedShapeTensorArray.from_numpy_ndarray(grid)
+    check(table(tmp_path / "a.parquet", tactile=plain), layout=None)
+    stored = np.ascontiguousarray(grid.transpose(0, 2, 1)).ravel()
+    kind = pa.fixed_shape_tensor(pa.float32(), (4, 3), permutation=(1, 0))
+    storage = pa.FixedSizeListArray.from_arrays(pa.array(stored), 12)
+    turned = pa.ExtensionArray.from_storage(kind, storage)
+    np.testing.assert_array_equal(turned.to_numpy_ndarray(), grid)
+    check(table(tmp_path / "b.parquet", tactile=turned), layout=None)
+
+
+def test_a_type_that_another_library_registers_is_read_as_it_is_stored(tmp_path, registered):
+    kind = pa.list_(pa.list_(pa.float32()))
+    stored = pa.array(X.reshape(-1, 3, 4).tolist(), kind)
+    column = pa.ExtensionArray.from_storage(registered, stored)
+    check(table(tmp_path / "a.parquet", tactile=column), layout=None)
+
+
+def test_times_of_day_dates_and_written_times_give_the_rate(tmp_path):
+    ticks = np.arange(60) * 10
+    dates = np.datetime64("2026-01-01", "ns") + ticks * np.timedelta64(1_000_000, "ns")
+    for name, times in (
+        ("of_day", pa.array(ticks.astype(np.int32), pa.time32("ms"))),
+        ("of_day_ns", pa.array(ticks * 1_000_000, pa.time64("ns"))),
+        ("since", pa.array(ticks * 1000, pa.duration("us"))),
+        ("written", pa.array(np.datetime_as_string(dates).tolist())),
+    ):
+        check(table(tmp_path / f"{name}.parquet", time=times, tactile=lists(X)), rate=100)
+    root = zarr.open_group(tmp_path / "dates.zarr", mode="w")
+    root.create_array("tactile", data=X)
+    root.create_array("time", data=dates)
+    check(tmp_path / "dates.zarr", rate=100)
+    with h5py.File(tmp_path / "since.nc", "w") as file:
+        file["tactile"] = X
+        file["time"] = ticks
+        file["time"].attrs["units"] = "milliseconds since 2026-01-01"
+    check(tmp_path / "since.nc", rate=100)
+
+
+def test_missing_readings_and_scales_of_cf_are_used(tmp_path):
+    stored = np.where(X < 400, -1, X).astype(np.int16)
+    expected = np.where(X < 400, np.nan, X / 2 + 1).astype(np.float32)
+    packing = {"_FillValue": -1, "scale_factor": 0.5, "add_offset": 1.0}
+    array = zarr.open_group(tmp_path / "a.zarr", mode="w").create_array("tactile", data=stored)
+    array.attrs.update(packing)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["tactile"] = stored
+        file["tactile"].attrs.update({k: np.array([v]) for k, v in packing.items()})
+    for name in ("a.zarr", "a.h5"):
+        check(tmp_path / name, expected=expected)
+
+
+def test_netcdf_of_all_versions_is_read(tmp_path):
+    with h5py.File(tmp_path / "four.nc", "w") as file:
+        file["tactile"] = X.reshape(-1, 3, 4)
+        file["time"] = np.arange(60) / 50
+    with scipy.io.netcdf_file(tmp_path / "three.nc", "w") as file:
+        for name, size in (("time", 60), ("row", 3), ("column", 4)):
+            file.createDimension(name, size)
+        file.createVariable("tactile", "f4", ("time", "row", "column"))[:] = X.reshape(-1, 3, 4)
+        times = file.createVariable("time", "f8", ("time",))
+        times[:] = np.arange(60) / 50
+        times.units = "seconds since 2026-01-01"
+    for name in ("four.nc", "three.nc"):
+        check(tmp_path / name, layout=None, rate=50)
+
+
+def test_frames_that_were_appended_after_consolidation_are_read(tmp_path):
+    root = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=2)
+    array = root.create_array("tactile", data=X[:40], chunks=(20, 12))
+    zarr.consolidate_metadata(root.store)
+    array.append(X[40:])
+    check(tmp_path / "a.zarr")
+
+
+@pytest.mark.parametrize("key", [None, "data/tactile"])
+def test_of_a_zarr_with_a_codec_that_is_not_installed_the_touch_is_read(key, tmp_path):
+    root = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=2)
+    data = root.create_group("data")
+    data.create_array("tactile", data=X)
+    data.create_array("camera", data=np.zeros((60, 8, 8, 3), np.uint8))
+    described = tmp_path / "a.zarr/data/camera/.zarray"
+    about = json.loads(described.read_text()) | {"compressor": {"id": "imagecodecs_jpegxl"}}
+    described.write_text(json.dumps(about))
+    loaded = check(tmp_path / "a.zarr", key=key)
+    assert "data/camera is left out: it cannot be read" in messages(loaded, "warning")[0]
+    described.rename(tmp_path / "a.zarr/data/tactile/.zarray")
+    assert "data/tactile cannot be read" in refusal(tmp_path / "a.zarr", layout=GRID)
+
+
+def matlab_text(file, name, text):
+    file[name] = np.array([ord(c) for c in text], np.uint16)[:, None]
+    file[name].attrs["MATLAB_class"] = np.bytes_("char")
+
+
+def test_matlab_files_of_both_versions_give_the_same(tmp_path):
+    for place, called in enumerate(("mug", "sponge")):
+        part = X[place * 30 :][:30].reshape(-1, 3, 4)
+        scipy.io.savemat(
+            tmp_path / f"five{place}.mat", {"tactile": part, "object": called, "rate": 40.0}
+        )
+        with h5py.File(tmp_path / f"seven{place}.mat", "w", userblock_size=512) as file:
+            file["tactile"] = part.T
+            file["tactile"].attrs["MATLAB_class"] = np.bytes_("single")
+            matlab_text(file, "object", called)
+            file["rate"] = np.array([[40.0]])
+            file["rate"].attrs["MATLAB_class"] = np.bytes_("double")
+    for version in ("five", "seven"):
+        paths = [tmp_path / f"{version}{place}.mat" for place in (0, 1)]
+        loaded = check(paths, layout=None, rate=40)
+        assert loaded.recordings.class_names == ("mug", "sponge")
+
+
+def test_arrays_of_structures_and_cells_of_matlab_are_episodes(tmp_path):
+    demos = np.zeros((1, 2), dtype=[("tactile", "O"), ("label", "O")])
+    demos[0, 0] = (X[:30], "mug")
+    demos[0, 1] = (X[30:], "cup")
+    scipy.io.savemat(tmp_path / "a.mat", {"demo": demos})
+    loaded = check(tmp_path / "a.mat")
+    assert loaded.recordings.labels.tolist() == [1, 0]
+    cells = np.empty((1, 2), object)
+    cells[0, :] = [X[:30], X[30:]]
+    scipy.io.savemat(tmp_path / "b.mat", {"tactile": cells})
+    check(tmp_path / "b.mat")
+    with h5py.File(tmp_path / "c.mat", "w", userblock_size=512) as file:
+        for name in ("tactile", "label"):
+            references = []
+            for place, called in enumerate(("mug", "cup")):
+                held = f"#refs#/{name}{place}"
+                if name == "tactile":
+                    file[held] = X[place * 30 :][:30].T
+                    file[held].attrs["MATLAB_class"] = np.bytes_("single")
+                else:
+                    matlab_text(file, held, called)
+                references.append([file[held].ref])
+            file.create_dataset(f"demo/{name}", data=references, dtype=h5py.ref_dtype)
+    loaded = check(tmp_path / "c.mat")
+    assert loaded.recordings.labels.tolist() == [1, 0]
+
+
+def test_cells_by_frames_are_turned_where_the_shape_tells_and_it_is_said(tmp_path):
+    scipy.io.savemat(tmp_path / "a.mat", {"tactile": X.T})
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["tactile"] = X.T.reshape(3, 4, 60)
+        file["time"] = np.arange(60) / 25
+    zarr.open_group(tmp_path / "c.zarr", mode="w").create_array("tactile", data=X.T)
+    for name, rate in (("a.mat", 10), ("b.h5", 25), ("c.zarr", 10)):
+        loaded = check(tmp_path / name, rate=rate)
+        assert "time as its last axis" in messages(loaded, "warning")[0]
+
+
+@pytest.mark.parametrize("width", [2, 10, 24])
+@pytest.mark.parametrize("suffix", [".parquet", ".h5", ".mat", ".zarr", ".npz"])
+def test_a_file_of_another_width_is_left_out_and_the_good_one_is_read(suffix, width, tmp_path):
+    table(tmp_path / "good.parquet", tactile=lists(X))
+    path = tmp_path / f"other{suffix}"
+    other = np.ones((20, width), np.float32)
+    match suffix:
+        case ".parquet":
+            table(path, tactile=lists(other))
+        case ".h5":
+            with h5py.File(path, "w") as file:
+                file["tactile"] = other
+        case ".mat":
+            scipy.io.savemat(path, {"tactile": other})
+        case ".zarr":
+            zarr.open_group(path, mode="w").create_array("tactile", data=other)
+        case ".npz":
+            np.savez(path, frames=other)
+    loaded = check(tmp_path)
+    (told,) = messages(loaded, "error")
+    assert f"other{suffix}" in told
+    assert f"{width} values a frame, expected 12" in told
+
+
+def test_lists_of_different_lengths_are_refused_with_their_row(tmp_path):
+    rows = [[1.0, 2.0], [3.0, 4.0, 5.0], [6.0]] * 4
+    path = table(tmp_path / "a.parquet", tactile=pa.array(rows, pa.list_(pa.float32())))
+    assert "row 1: tactile holds a list of 3 where the first row has 2" in refusal(path)
+
+
+@pytest.mark.parametrize("kind", ["link", "virtual", "raw"])
+def test_what_lies_in_another_file_is_not_read(kind, tmp_path):
+    secret = tmp_path / "secret"
+    secret.write_bytes(os.urandom(12 * 4 * 4))
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["tactile"] = X
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        if kind == "link":
+            file["tactile"] = h5py.ExternalLink("other.h5", "/tactile")
+        elif kind == "virtual":
+            layout = h5py.VirtualLayout((60, 12), np.float32)
+            layout[:] = h5py.VirtualSource("other.h5", "tactile", (60, 12))
+            file.create_virtual_dataset("tactile", layout)
+        else:
+            raw = [(str(secret), 0, 12 * 4 * 4)]
+            file.create_dataset("tactile", (4, 12), np.float32, external=raw)
+    told = refusal(tmp_path / "a.h5", layout=GRID)
+    assert "tactile" in told
+    assert {"link": "other.h5", "virtual": "virtual", "raw": "external storage"}[kind] in told
+
+
+def test_flat_features_that_are_taken_as_rows_are_told(tmp_path):
+    path = table(tmp_path / "a.parquet", tactile_l=lists(X[:, :6]), tactile_r=lists(X[:, 6:]))
+    loaded = load(path)
+    assert loaded.recordings.layout.shape == (2, 1, 6)
+    assert "each is taken as one row; --shape states them" in messages(loaded, "warning")[0]
+    assert not load(path, layout="2x2x3").problems
+
+
+def test_complex_numbers_and_records_are_refused_by_what_they_are(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["tactile"] = X * 1j
+    assert "tactile holds complex numbers" in refusal(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["tactile"] = np.zeros(5, [("time", "f8"), ("cells", "f4", 12)])
+    assert "tactile holds records of several fields" in refusal(tmp_path / "b.h5")

@@ -226,7 +226,8 @@ def test_the_examples_on_the_page_of_formats_are_read(tmp_path):
     loaded = load(write(tmp_path / "2.csv", second), layout="1x2", label_column="object")
     assert loaded.recordings.layout.rate == 100
     assert loaded.recordings.class_names == ("mug",)
-    assert "--ignore object" in refusal(tmp_path / "2.csv", layout="1x2")
+    loaded = load(tmp_path / "2.csv", layout="1x2", ignore="object")
+    assert loaded.recordings.labels is None
     loaded = load(write(tmp_path / "3.txt", third))
     assert loaded.recordings.frames[0].shape == (2, 6)
     assert loaded.recordings.layout.shape == (1, 2, 3)
@@ -349,7 +350,7 @@ def test_a_tekscan_file_of_other_rows_than_it_states_is_refused(tmp_path):
 def table(tmp_path):
     """A file with times, notes, readings, a second device and a class."""
     rows = [
-        f"{i},2025-03-01 10:00:{i:02d},grasp,{line},{7 * i},{'mug' if i < 20 else 'none'}"
+        f"{i},2025-03-01 10:00:{i:02d},grasp,{line},{7 * i},mug"
         for i, line in enumerate(text(VALUES).splitlines())
     ]
     header = f"frame,when,note,{NAMES},imu,object"
@@ -397,13 +398,25 @@ def test_a_column_that_is_not_there_is_refused_with_those_that_are(table, option
 
 def test_more_columns_than_cells_are_told_with_the_options_that_choose(table):
     message = refusal(table, layout="1x2", ignore="when,note,object")
-    assert "7 values a frame, expected 2: --columns or --ignore says which" in message
+    assert "6 values a frame, expected 2: --columns or --ignore says which" in message
 
 
-def test_columns_of_text_are_named_with_the_option_that_leaves_them_out(table):
-    message = refusal(table, layout="2x3")
-    assert "a.csv, line 2, column 3: 'grasp' is not a number" in message
-    assert message.split("(no recording")[0].strip().endswith("--ignore note,object")
+def test_columns_of_text_are_named_with_the_option_that_leaves_them_out(tmp_path):
+    rows = [f"grasp,{line}" for line in text(VALUES).splitlines()]
+    header = "note,thumb,index,middle,ring,little,palm"
+    file = write(tmp_path / "a.csv", "\n".join([header, *rows]) + "\n")
+    message = refusal(file, layout="2x3")
+    assert "a.csv, line 2, column 1: 'grasp' is not a number" in message
+    assert message.split("(no recording")[0].strip().endswith("--ignore note")
+    is_read(file, ignore="note")
+
+
+def test_what_is_not_numbered_beside_numbered_readings_is_left_out_and_told(table):
+    loaded = load(table, layout="2x3")
+    np.testing.assert_array_equal(loaded.recordings.frames[0], VALUES.astype(np.float32))
+    told = "a.csv: when, note, imu left out, as no reading beside c*; otherwise give --columns"
+    assert told in loaded.inferred
+    assert loaded.recordings.class_names == ("mug",)
 
 
 def test_columns_without_names_are_known_by_number(tmp_path):
@@ -480,3 +493,130 @@ def test_frames_that_are_counted_without_a_header_are_told_as_before(tmp_path):
     rows = [f"{i},{row}" for i, row in enumerate(text(newtons(200, 6)).splitlines())]
     message = refusal(write(tmp_path / "a.csv", "\n".join(rows)))
     assert "the first column rises from line to line" in message
+
+
+# Lines in quotes, columns that are told by their names
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_lines_in_quotes_as_a_whole_are_read(tmp_path, separator):
+    lines = [f"time_ms{separator}{NAMES.replace(',', separator)}"]
+    rows = separated(separator).splitlines()
+    lines += [f"{20 * i}{separator}{row}" for i, row in enumerate(rows)]
+    file = write(tmp_path / "a.csv", "\n".join(f'"{line}"' for line in lines) + "\n")
+    is_read(file)
+    assert load(file, layout="2x3").recordings.layout.rate == 50
+    pieces = list(csv_blocks(file, 301))
+    np.testing.assert_array_equal(
+        np.concatenate([piece.values for piece in pieces]), VALUES.astype(np.float32)
+    )
+
+
+TIMES = {
+    "time_ms": [str(20 * i) for i in range(30)],
+    "TIMESTAMP": [f"2024-06-15 13:22:{17 + i / 50:06.3f}" for i in range(30)],
+    "timestamp": [f"{1718450000 + i / 50:.2f}" for i in range(30)],
+    "host_time": [f"{i / 50:.2f}" for i in range(30)],
+    "Time (s)": [f"{i / 50:.2f}" for i in range(30)],
+}
+
+
+@pytest.mark.parametrize("name", TIMES)
+@pytest.mark.parametrize("place", [0, 1, 4, 7])
+def test_times_are_found_by_name_wherever_they_stand_and_are_no_cell(tmp_path, name, place):
+    header = ["object", *NAMES.split(",")]
+    header.insert(place, name)
+    lines = [",".join(header)]
+    for moment, row in zip(TIMES[name], text(VALUES).splitlines(), strict=True):
+        cells = ["mug", *row.split(",")]
+        cells.insert(place, moment)
+        lines.append(",".join(cells))
+    file = write(tmp_path / "a.csv", "\n".join(lines) + "\n")
+    for options in ({}, {"columns": "c*"}):
+        loaded = load(file, layout="2x3", **options)
+        np.testing.assert_array_equal(loaded.recordings.frames[0], VALUES.astype(np.float32))
+        assert loaded.recordings.layout.rate == 50
+        assert loaded.recordings.class_names == ("mug",)
+    assert "6 values a frame, expected 7" in refusal(file, layout="1x7")
+
+
+def test_a_first_column_that_rises_in_equal_steps_is_a_time_also_where_columns_are_named(tmp_path):
+    rows = [f"{i / 100:.2f},{row}" for i, row in enumerate(text(VALUES).splitlines())]
+    file = write(tmp_path / "a.csv", "\n".join(rows))
+    for options in ({}, {"columns": "1-6"}):
+        loaded = load(file, layout="2x3", **options)
+        np.testing.assert_array_equal(loaded.recordings.frames[0], VALUES.astype(np.float32))
+        assert loaded.recordings.layout.rate == 100
+        assert "is the first column a time?" in messages(loaded, "warning")[0]
+
+
+@pytest.mark.parametrize("extra", ["flags", "MAX_VALUE", "PACKAGE_SIZE"])
+def test_a_column_that_is_not_numbered_as_the_readings_is_left_out_and_told(tmp_path, extra):
+    rows = [f"{row},0" for row in text(VALUES).splitlines()]
+    header = f"R_ch0,R_ch1,R_ch2,L_ch0,L_ch1,L_ch2,{extra}"
+    file = write(tmp_path / "a.csv", "\n".join([header, *rows]) + "\n")
+    loaded = load(file)
+    np.testing.assert_array_equal(loaded.recordings.frames[0], VALUES.astype(np.float32))
+    assert loaded.recordings.layout.shape == (2, 1, 3)
+    told = f"a.csv: {extra} left out, as no reading beside R_ch*, L_ch*; otherwise give --columns"
+    assert told in loaded.inferred
+    assert "nothing states their rows and columns" in messages(loaded, "warning")[0]
+    assert frames(file, layout="1x7").shape == (30, 7)
+
+
+def test_numbers_of_rows_and_columns_in_the_names_are_the_shape(tmp_path):
+    names = [f"r{row}c{col}" for row in range(2) for col in range(3)]
+    file = write(tmp_path / "a.csv", ",".join(names) + "\n" + text(VALUES))
+    assert load(file).recordings.layout.shape == (1, 2, 3)
+    names = names[3:] + names[:3]  # another order than row by row
+    file = write(tmp_path / "b.csv", ",".join(names) + "\n" + text(VALUES))
+    assert "nothing states their rows and columns" in refusal(file)
+
+
+# Episodes and classes in columns
+
+
+def labelled(path, classes, episodes=None):
+    """A file of VALUES, repeated, with a class a line."""
+    values = np.tile(VALUES, (len(classes) // len(VALUES) + 1, 1))[: len(classes)]
+    header = f"{'' if episodes is None else 'episode_index,'}{NAMES},task"
+    lines = [header]
+    for i, row in enumerate(text(values).splitlines()):
+        number = "" if episodes is None else f"{episodes[i]},"
+        lines.append(f"{number}{row},{classes[i]}")
+    return write(path, "\n".join(lines) + "\n"), values.astype(np.float32)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_column_of_episodes_divides_a_table(tmp_path, encoding, end, monkeypatch):
+    episodes = np.repeat([7, 8, 3], [40, 1, 59])
+    classes = np.repeat(["a", "b", "a"], [40, 1, 59])
+    file, values = labelled(tmp_path / "a.csv", classes, episodes)
+    file.write_bytes(file.read_text().replace("\n", end).encode(encoding))
+    for size in (2_000_000, 97):
+        monkeypatch.setattr("adaptfault.data.recordings.formats.spans.PIECE", size)
+        monkeypatch.setattr("adaptfault.data.recordings.formats.csv_folder.PIECE", size)
+        recordings = load(file, layout="2x3").recordings
+        assert [name.rpartition(" ")[2] for name in recordings.names] == ["7", "8", "3"]
+        assert [recordings.class_names[i] for i in recordings.labels] == ["a", "b", "a"]
+        np.testing.assert_array_equal(np.concatenate(recordings.frames), values)
+        assert [len(frames) for frames in recordings.frames] == [40, 1, 59]
+
+
+def test_a_class_that_changes_for_long_begins_a_recording_and_this_is_told(tmp_path):
+    classes = np.repeat(["sit", "lean", "stand", "sit"], 20)
+    file, _ = labelled(tmp_path / "a.csv", classes)
+    loaded = load(file, layout="2x3")
+    found = [loaded.recordings.class_names[i] for i in loaded.recordings.labels]
+    assert found == ["sit", "lean", "stand", "sit"]
+    assert "a.csv: a recording begins where the class changes, 4 in all" in loaded.inferred
+
+
+def test_a_class_that_changes_all_the_time_is_told_with_what_is_lost(tmp_path):
+    file, _ = labelled(tmp_path / "a.csv", ["stable", "slip", "slip"] * 20)
+    loaded = load(file, layout="2x3")
+    assert loaded.recordings.class_names == ("slip",)
+    (told,) = messages(loaded, "warning")
+    assert "the class changes 39 times within a recording" in told
+    assert "that of 20 of 60 frames is lost" in told

@@ -59,6 +59,9 @@ class Facts:
         full_scale, unit, rate: as in SensorLayout.
         declared: those of :data:`DECLARED` that the file gives, as in SensorLayout.
         stored: shape of the array in the file, where it holds one.
+        shape_reason: what the shape was inferred from; "" where the file states it.
+        inferred: one sentence for each other thing that the reader inferred, with the option that
+            states it.
         problems: warnings of the reader.
         sizes: of a frame in each array that holds readings, in the order in which these stand in a
             frame.
@@ -78,6 +81,8 @@ class Facts:
     rate: float | None = None
     declared: Mapping[str, Any] = field(default_factory=dict)
     stored: tuple[int, ...] = ()
+    shape_reason: str = ""
+    inferred: tuple[str, ...] = ()
     problems: tuple[Problem, ...] = ()
     sizes: tuple[tuple[int, ...], ...] = ()
     places: NDArray[np.intp] | None = None

@@ -61,16 +61,18 @@ class Scale:
 
 
 def infer_shape(contents: Sequence[Content]) -> tuple[Shape, str]:
-    """Return the shape that a file states, or the paper's for frames of 220 readings, and the
-    reason.
+    """Return the shape that a file states, or one that names in a file show, or the paper's for
+    frames of 220 readings, and the reason.
 
     The reason is empty where a file states pads, rows and columns.
 
     Raises:
         InputError: no file states a shape and the frames have another width.
     """
-    for content in contents:
+    for content in sorted(contents, key=lambda one: bool(one.facts.shape_reason)):
         if content.shape is not None:
+            if content.facts.shape_reason:
+                return content.shape, content.facts.shape_reason
             stored = list(content.facts.stored)
             several = len(stored) == 4 and content.shape[0] == 1 and stored[1] > 1
             return (
@@ -111,12 +113,12 @@ def _unknown_shape(content: Content) -> str:
         else ""
     )
     return (
-        f"{text}give --shape (rows x columns, such as {_sides(width)}) or --layout FILE (layout= in"
+        f"{text}give --shape (rows x columns, such as {sides(width)}) or --layout FILE (layout= in"
         f" Python){grid}"
     )
 
 
-def _sides(cells: int) -> str:
+def sides(cells: int) -> str:
     """Return the rows and columns of the squarest array of so many cells."""
     rows = max(rows for rows in range(1, math.isqrt(cells) + 1) if cells % rows == 0)
     return f"{rows}x{cells // rows}"
@@ -135,7 +137,10 @@ def describe_width(content: Content, expected: int) -> str:
             " or 'frame'"
         )
     if width == expected - 1 and content.text:
-        return f"{text}: a column is missing, write an empty cell for a missing reading"
+        return (
+            f"{text}: a column is missing, write an empty cell for a missing reading; one of times,"
+            " classes or states is no reading, --columns takes it as one"
+        )
     if width > expected and content.text and content.shape is None:
         return f"{text}: --columns or --ignore says which columns are readings"
     return text

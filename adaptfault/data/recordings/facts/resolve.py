@@ -7,12 +7,18 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from adaptfault.data.recordings.errors import InputError, Problem, located
-from adaptfault.data.recordings.facts.infer import default_unit, infer_scale, infer_shape
+from adaptfault.data.recordings.facts.infer import (
+    default_unit,
+    infer_scale,
+    infer_shape,
+    sides,
+)
 from adaptfault.data.recordings.facts.layout_file import looks_like_shape, parse_shape, read_layout
 from adaptfault.data.recordings.facts.rates import Elapsed
 from adaptfault.data.recordings.recording import DECLARED, Shape
@@ -81,7 +87,7 @@ def resolve_layout(
     Raises:
         InputError: an option makes no layout, or the shape or the scale cannot be inferred.
     """
-    inferred: list[str] = []
+    inferred = _of_readers(contents)
     problems: list[Problem] = []
     overrides = {"full_scale": full_scale, "unit": unit, "rate": rate}
     if isinstance(array, SensorLayout):
@@ -94,6 +100,7 @@ def resolve_layout(
         shape, reason = (array, "") if array else infer_shape(contents)
         if reason:
             inferred.append(f"shape {'x'.join(map(str, shape))} ({reason}); otherwise give --shape")
+        problems += _without_rows(contents, shape)
         fitting = [c for c in contents if c.shape in (None, shape)]
         stated = {
             name: _first(getattr(content.facts, name) for content in fitting)
@@ -140,6 +147,33 @@ def resolve_layout(
         inferred.append(f"rate {layout.rate:g} Hz ({reason_of_rate}); otherwise give --rate")
     problems += [] if tables is not None else _contradicted(contents, layout)
     return Resolved(layout, tuple(inferred), tuple(problems))
+
+
+def _of_readers(contents: Sequence[Content]) -> list[str]:
+    """Return what readers inferred, each sentence once, with the file."""
+    paths: dict[str, list[Path]] = {}
+    for content in contents:
+        for text in content.facts.inferred:
+            paths.setdefault(text, []).append(content.path)
+    found = []
+    for text, of in paths.items():
+        more = f" and {len(of) - 1} more" if len(of) > 1 else ""
+        found.append(f"{of[0].name}{more}: {text}")
+    return found
+
+
+def _without_rows(contents: Sequence[Content], shape: Shape) -> list[Problem]:
+    """Warn where pads are told by names alone, so that their rows and columns are unknown."""
+    told = [c for c in contents if c.shape == shape and c.facts.shape_reason]
+    if not told or shape[1] > 1 or shape[2] == 1:
+        return []
+    pads, _, cells = shape
+    what = (
+        f"{told[0].facts.shape_reason}, and nothing states their rows and columns: taken as {pads}"
+        f" pads without rows, so that a broken row or column shows as single cells; give --shape"
+        f" {pads}x{sides(cells)}, or {pads}x1x{cells} if they have none"
+    )
+    return [Problem("warning", located(told[0].path, what))]
 
 
 def _measured_rate(contents: Sequence[Content]) -> tuple[float | None, str]:

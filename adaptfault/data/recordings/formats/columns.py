@@ -3,10 +3,10 @@ options, by the header, or by what the first lines hold."""
 
 from __future__ import annotations
 
+import math
 import re
-from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -14,6 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.facts.roles import (
+    EPISODES,
+    LABELS,
+    clock_of,
+    families,
+    first_of,
+    is_clock,
+    no_readings,
+    shape_of,
+    unit_of,
+)
+from adaptfault.data.recordings.facts.roles import readings as readings_of
 from adaptfault.data.recordings.formats.dialect import (
     Dialect,
     bare,
@@ -21,27 +33,10 @@ from adaptfault.data.recordings.formats.dialect import (
     is_written_out,
     numbered,
 )
-from adaptfault.data.recordings.formats.text import shown
+from adaptfault.data.recordings.formats.text import shown as quoted
+from adaptfault.data.recordings.recording import Shape
 
 Names = str | Iterable[str | int]
-
-_TIME = re.compile(
-    r"[%#]?(?:rosbag[_ ]?)?(?:time(?:[_ ]?stamp)?|stamp|t|epoch|elapsed|zeit|uhrzeit|clock)"
-    r"(?:[_ ]?[\[(]?(s|sec|secs|seconds|ms|us|ns)[\])]?)?",
-    re.IGNORECASE | re.ASCII,
-)
-"""Names of a column of times, also as rostopic, plotjuggler and Arduino sketches write them."""
-
-_UNITS = {
-    **dict.fromkeys(("s", "sec", "secs", "seconds"), "s"),
-    **dict.fromkeys(("ms", "millis", "milliseconds"), "ms"),
-    **dict.fromkeys(("us", "micros", "microseconds"), "us"),
-    "ns": "ns",
-}
-_ALONE = ("seconds", "secs", "millis", "milliseconds", "micros", "microseconds")
-"""Units that name a column of times by themselves."""
-
-_NUMBER = re.compile(r"|unnamed: 0|index|(?:frame|sample)(?:[_ ]?(?:id|no|number))?", re.IGNORECASE)
 
 _RANGE = re.compile(r"(\d+)(?:-(\d+))?", re.ASCII)
 
@@ -50,6 +45,7 @@ _YEARS = 1e9, 4.2e9  # seconds since 1970: 2001 to 2103
 
 _LEAST = 5  # lines that show that a column rises
 _RISES = 0.95  # share of its steps
+_EVEN = 1e-3  # of a step, by which equal ones differ
 _FAR = 10.0  # times the largest reading
 _LOOK = 2_000_000  # characters in which that reading is looked for
 _LISTED = 12  # columns that a message names
@@ -65,6 +61,10 @@ class Columns:
         clock: of times; None without one.
         unit: of the times, where it is known.
         label: of the class; None without one.
+        episode: of the number of the episode; None without one.
+        shape: ``(pads, rows, cols)`` that the names of the readings show; None: they show none.
+        shape_reason: how they show it.
+        inferred: what was chosen by names, with the option that states it.
         has_text: whether columns that are not used hold text or dates.
         problems: warnings.
     """
@@ -74,6 +74,10 @@ class Columns:
     clock: int | None = None
     unit: str | None = None
     label: int | None = None
+    episode: int | None = None
+    shape: Shape | None = None
+    shape_reason: str = ""
+    inferred: tuple[str, ...] = ()
     has_text: bool = False
     problems: tuple[Problem, ...] = ()
 
@@ -91,6 +95,7 @@ def choose_columns(
     ignore: Names | None = None,
     time_column: str | int | None = None,
     label_column: str | int | None = None,
+    shape: Shape | None = None,
 ) -> Columns:
     """Return what the columns of a file hold.
 
@@ -101,72 +106,109 @@ def choose_columns(
             neither ignored nor another column.
         ignore: what is no reading, in the same form.
         time_column, label_column: of times and of the class.
+        shape: ``(pads, rows, cols)`` where the user states it.
 
     Raises:
         InputError: a column is not there, a reading is text, or no column holds readings.
     """
     table = _Named(path, dialect)
-    leading, clock, unit = _leading(table.names)
-    if time_column is not None:
-        clock = table.one("time-column", time_column)
-        unit = _unit(table.names[clock]) if table.names else None
-    label = None if label_column is None else table.one("label-column", label_column)
-    no_readings = set() if ignore is None else set(table.several("ignore", ignore))
-    if label is not None:
-        no_readings.add(label)
-    if columns is None:
-        readings = [i for i in range(dialect.width) if i >= leading and i != clock]
-    else:
-        readings = table.several("columns", columns)
-        if time_column is None and clock in readings:
-            clock = None
-    if clock in no_readings and time_column is None:
-        clock = None
-    readings = [i for i in readings if i not in no_readings and i != clock]
+    ignored = set() if ignore is None else set(table.several("ignore", ignore))
+    wanted = None if columns is None else table.several("columns", columns)
+    roles = _Roles.of(table, {*ignored, *(wanted or ())}, time_column, label_column)
+    aside = {*no_readings(table.names), *roles.columns}
+    readings = [i for i in range(dialect.width) if i not in aside] if wanted is None else wanted
+    inferred: tuple[str, ...] = ()
     problems: tuple[Problem, ...] = ()
-    if columns is None and clock is None and leading == 0 and readings[:1] == [0]:
-        ticks = _clock_of(path, dialect, readings)
+    if roles.clock is None and 0 not in ignored and (0 in readings) == (wanted is None):
+        fills = shape is not None and math.prod(shape) == len(readings)
+        ticks = _clock_of(path, dialect, even=wanted is not None or not fills)
         if ticks is not None:
-            clock = 0
-            unit = ticks or None
-            readings = readings[1:]
+            roles = replace(roles, clock=0, unit=ticks or None)
             what = (
                 "is the first column a time? it was taken as one; --time-column says which,"
                 " --columns says which columns are readings"
             )
             problems = (Problem("warning", located(path, what)),)
+    readings = [i for i in readings if i not in ignored and i not in roles.columns]
+    if wanted is None:
+        readings, inferred = _numbered(table.names, readings, shape)
     table.refuse_text(readings)
     if not readings:
-        held = "numbers of frames" if clock is None else "a column of times"
+        held = "numbers of frames" if roles.clock is None else "a column of times"
         raise InputError.at(
             path, f"holds {held} and no readings; add one column a cell", table.first_line
         )
-    others = set(range(dialect.width)) - {*readings, clock}
+    shown = shape_of([table.names[i] for i in readings]) if shape is None and table.names else None
+    others = set(range(dialect.width)) - {*readings, roles.clock}
     return Columns(
         dialect.width,
         tuple(readings),
-        clock,
-        unit,
-        label,
+        roles.clock,
+        roles.unit,
+        roles.label,
+        roles.episode,
+        None if shown is None else shown[0],
+        "" if shown is None else shown[1],
+        inferred,
         table.has_unreadable(others),
         problems,
     )
 
 
-def label_of(path: Path, dialect: Dialect, column: int) -> str:
-    """Return the most frequent value of a column.
+@dataclass(frozen=True)
+class _Roles:
+    """The columns that are no readings, but say something of them."""
 
-    Raises:
-        InputError: the column is empty.
-    """
-    values: Counter[str] = Counter()
-    for at, line in numbered(path):
-        if at > dialect.skip and line and not is_comment(line):
-            values[(*dialect.split(line), *[""] * dialect.width)[column]] += 1
-    del values[""]
-    if not values:
-        raise InputError.at(path, f"column {column} is empty; --label-column names the class")
-    return values.most_common(1)[0][0]
+    clock: int | None
+    unit: str | None
+    label: int | None
+    episode: int | None
+
+    @property
+    def columns(self) -> set[int | None]:
+        return {self.clock, self.label, self.episode}
+
+    @classmethod
+    def of(
+        cls,
+        table: _Named,
+        taken: Collection[int],
+        time_column: str | int | None,
+        label_column: str | int | None,
+    ) -> _Roles:
+        """Find them by options, or by names among the columns that are not ``taken``."""
+        free = ["" if i in taken else name for i, name in enumerate(table.names)]
+        clock = _at(free, clock_of(free))
+        if time_column is not None:
+            clock = table.one("time-column", time_column)
+        label = _at(free, first_of(LABELS, free))
+        if label_column is not None:
+            label = table.one("label-column", label_column)
+        unit = None if clock is None or not table.names else unit_of(table.names[clock])
+        return cls(clock, unit, label, _at(free, first_of(EPISODES, free)))
+
+
+def _at(names: Sequence[str], name: str | None) -> int | None:
+    """Return the column with a name."""
+    return None if name is None else names.index(name)
+
+
+def _numbered(
+    names: Sequence[str], columns: list[int], shape: Shape | None
+) -> tuple[list[int], tuple[str, ...]]:
+    """Return which of some columns are readings by their names, and a sentence on the others."""
+    if not names:
+        return columns, ()
+    cells = None if shape is None else math.prod(shape)
+    kept = [columns[i] for i in readings_of([names[i] for i in columns], cells)]
+    others = [names[i] or str(i) for i in columns if i not in kept]
+    if not others:
+        return kept, ()
+    more = f", ... ({len(others)} in all)" if len(others) > _LISTED else ""
+    kinds = ", ".join(families([names[i] for i in kept]))
+    beside = f" beside {kinds}" if kinds else ""
+    what = f"{', '.join(others[:_LISTED])}{more} left out, as no reading{beside}"
+    return kept, (f"{what}; otherwise give --columns",)
 
 
 class _Named:
@@ -243,7 +285,7 @@ class _Named:
         cell = self._dialect.split(self._dialect.probe[0])[text[0]]
         named = ",".join(self.names[i] if self.names and self.names[i] else str(i) for i in text)
         what = (
-            f"{shown(cell)} is not a number; write the reading, or leave a column"
+            f"{quoted(cell)} is not a number; write the reading, or leave a column"
             f" of text out: --ignore {named}"
         )
         raise InputError.at(self.path, what, f"{self.first_line}, column {text[0] + 1}")
@@ -255,47 +297,23 @@ def _names_of_times(dialect: Dialect) -> tuple[str, ...]:
         return ()
     above = dialect.preamble[-1]
     cells = dialect.split(above)
-    if _leading(cells)[1] is None or len(dialect.texts(above)) < len(cells):
+    if not is_clock(cells[0]) or len(dialect.texts(above)) < len(cells):
         return ()
     return tuple((*cells, *[""] * dialect.width)[: dialect.width])
 
 
-def _leading(names: Sequence[str]) -> tuple[int, int | None, str | None]:
-    """Return how many of the first columns hold no readings by their names, which of them holds
-    times, and the unit of these."""
-    count = 0
-    clock = None
-    unit = None
-    for column, name in enumerate(names):
-        is_time = _TIME.fullmatch(name) is not None or name.lower() in _ALONE
-        if clock is None and is_time:
-            count = column + 1
-            clock = column
-            unit = _unit(name)
-        elif _NUMBER.fullmatch(name) and column < 2:
-            count = column + 1
-        else:
-            break
-    return count, clock, unit
-
-
-def _unit(name: str) -> str | None:
-    """Return the unit in the name of a column of times."""
-    time = _TIME.fullmatch(name)
-    return _UNITS.get((name if time is None else time[1] or "").lower())
-
-
-def _clock_of(path: Path, dialect: Dialect, readings: Sequence[int]) -> str | None:
+def _clock_of(path: Path, dialect: Dialect, *, even: bool) -> str | None:
     """Return the unit of the times in the first column, "" if it is unknown; None where the column
     is a cell's or counts the frames.
 
-    Times rise in 95 % of the steps, and are dates since 1970 or 10 times as far as any reading.
+    Times rise in 95 % of the steps, and are dates since 1970, or reach 10 times as far as any
+    reading, or, with ``even``, rise in equal steps as no other column does.
     """
     cells = [dialect.first(line) for line in dialect.probe]
     if len(cells) >= 2 and all(map(is_written_out, cells)):
         return "s"
     numbers = [dialect.number(cell) for cell in cells]
-    if None in numbers or len(numbers) < _LEAST or len(readings) < 2:
+    if None in numbers or len(numbers) < _LEAST or dialect.width < 3:
         return None
     times = np.array(numbers, dtype=np.float64)
     if np.mean(np.diff(times) > 0) < _RISES:
@@ -306,9 +324,17 @@ def _clock_of(path: Path, dialect: Dialect, readings: Sequence[int]) -> str | No
     if np.array_equal(times, np.rint(times)) and np.median(np.diff(times)) == 1:
         return None
     values = _first_values(path, dialect)
+    if even and _is_even(values[:, 0]) and not any(map(_is_even, values.T[1:])):
+        return ""
     largest = np.nanmax(np.abs(values[:, 1:]), initial=0.0)
     rises = np.mean(np.diff(values[:, 0]) > 0) >= _RISES
     return "" if rises and np.nanmax(values[:, 0]) > _FAR * largest else None
+
+
+def _is_even(column: NDArray[np.float64]) -> bool:
+    """Return whether numbers rise in equal steps, as far as their decimals tell."""
+    steps = np.diff(column)
+    return bool(len(steps) >= _LEAST and steps.min() > 0 and np.ptp(steps) <= _EVEN * steps.mean())
 
 
 def _first_values(path: Path, dialect: Dialect) -> NDArray[np.float64]:

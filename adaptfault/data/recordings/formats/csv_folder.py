@@ -8,8 +8,7 @@ its columns hold (:mod:`.columns`).
 from __future__ import annotations
 
 import builtins
-import codecs
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.sizes import LONGEST_LINE
-from adaptfault.data.recordings.formats.columns import Columns, Names, choose_columns, label_of
+from adaptfault.data.recordings.formats.columns import Columns, Names, choose_columns
 from adaptfault.data.recordings.formats.dialect import (
     CLOCK,
     COMMENTS,
@@ -32,9 +31,11 @@ from adaptfault.data.recordings.formats.dialect import (
     is_written_out,
     number,
     numbered,
+    unquoted,
 )
 from adaptfault.data.recordings.formats.matrices import matrices
 from adaptfault.data.recordings.formats.rows import parse_rows
+from adaptfault.data.recordings.formats.spans import PIECE, Span, cell_of, pieces, spans_of
 from adaptfault.data.recordings.formats.text import (
     LATIN,
     check_text,
@@ -42,12 +43,9 @@ from adaptfault.data.recordings.formats.text import (
     numbered_lines,
     shown,
 )
-from adaptfault.data.recordings.recording import Block, Facts, Recording
+from adaptfault.data.recordings.recording import Block, Facts, Recording, Shape
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".asc")
-
-PIECE = 2_000_000
-"""Bytes of text that are parsed at once."""
 
 _TABLES = (".csv", ".tsv")
 """Suffixes of files that are tables; others may be notes."""
@@ -58,6 +56,7 @@ _HEAD = 4096  # bytes in which zeros show that a file is binary
 def open(
     path: Path,
     *,
+    shape: Shape | None = None,
     columns: Names | None = None,
     ignore: Names | None = None,
     time_column: str | int | None = None,
@@ -68,22 +67,24 @@ def open(
     tabs or blanks, with or without a header line and lines of text above it. A file of blocks of
     lines has one matrix a frame, see :mod:`.matrices`.
 
-    A first column that the header names as a time (``time``, ``timestamp``, ``t``, with a unit as
-    in ``time_ms``) is no reading; it gives the rate. One without a name, or called ``index``,
-    ``frame`` or ``sample``, is none either. A first column without such a name is taken as a time,
-    with a warning, where it rises far beyond all readings. An empty cell and ``nan`` are missing
-    readings and become NaN. Blank lines and comments are skipped. A last line that a power failure
-    cut off is left out with a warning, and so is everything from zero bytes on, which stand for
-    data that did not reach the disk. A cut inside the last number of a full line cannot be
-    detected.
+    A column that the header names as a time (``time``, ``timestamp``, ``t``, with a unit as in
+    ``time_ms``) is no reading, wherever it stands; it gives the rate. One that numbers the episodes
+    (``episode_index``, ``trial``) or names the class (``label``, ``task``) divides the lines into
+    recordings. A first column without a name, or called ``index``, ``frame`` or ``sample``, is no
+    reading either, nor is a column that is not numbered where most are. A first column without a
+    name of a time is taken as one, with a warning, where it rises in equal steps, or far beyond all
+    readings. An empty cell and ``nan`` are missing readings and become NaN. Blank lines and
+    comments are skipped. A last line that a power failure cut off is left out with a warning, and
+    so is everything from zero bytes on, which stand for data that did not reach the disk. A cut
+    inside the last number of a full line cannot be detected.
 
     Args:
         path: the file. One that may be notes, as ``.txt``, gives no recording if it holds no line
             of numbers.
+        shape: ``(pads, rows, cols)`` where the user states it.
         columns, ignore: what is a reading and what is not: names, patterns, or numbers from 0, as
             "2-33"; several are separated by commas.
-        time_column, label_column: the column of times, and of the class, whose most frequent value
-            counts.
+        time_column, label_column: the column of times, and of the class.
         stated: what other readers ask for.
 
     Raises:
@@ -101,10 +102,22 @@ def open(
         return []
     if dialect.rows:
         return matrices(path, dialect)
-    held = choose_columns(path, dialect, columns, ignore, time_column, label_column)
-    label = None if held.label is None else label_of(path, dialect, held.label)
-    facts = Facts(path, text=True, problems=held.problems)
-    return [Recording(facts, lambda: _blocks(path, dialect, held, PIECE), label=label)]
+    held = choose_columns(path, dialect, columns, ignore, time_column, label_column, shape)
+    spans, division = spans_of(path, dialect, held)
+    lost = (Problem("warning", located(path, division.lost)),) if division.lost else ()
+    facts = Facts(
+        path,
+        text=True,
+        shape=held.shape,
+        inferred=tuple(filter(None, (*held.inferred, division.inferred))),
+        shape_reason=held.shape_reason,
+        problems=(*held.problems, *lost),
+    )
+
+    def blocks(span: Span) -> Callable[[], Iterator[Block]]:
+        return lambda: _blocks(path, dialect, held, PIECE, span)
+
+    return [Recording(facts, blocks(span), span.name, span.label) for span in spans]
 
 
 def csv_blocks(path: Path, size: int = PIECE) -> Iterator[Block]:
@@ -117,7 +130,7 @@ def csv_blocks(path: Path, size: int = PIECE) -> Iterator[Block]:
     dialect = find_dialect(path)
     if dialect is None:
         raise _no_numbers(path)
-    yield from _blocks(path, dialect, choose_columns(path, dialect), size)
+    yield from _blocks(path, dialect, choose_columns(path, dialect), size, Span())
 
 
 def _no_numbers(path: Path) -> InputError:
@@ -154,12 +167,14 @@ class _Before:
         return _Before(self.lines + piece.count(b"\n"), last.decode("utf-8", LATIN))
 
 
-def _blocks(path: Path, dialect: Dialect, columns: Columns, size: int) -> Iterator[Block]:
-    before = _Before()
+def _blocks(
+    path: Path, dialect: Dialect, columns: Columns, size: int, span: Span
+) -> Iterator[Block]:
+    before = _Before(span.lines)
     rest = b""
     length = 0
     try:
-        for data, is_last in _read(path, dialect, size):
+        for data, is_last in pieces(path, dialect, size, span.begin, span.end):
             rest += data
             cut = len(rest) if is_last else rest.rfind(b"\n") + 1
             piece = rest[:cut]
@@ -178,22 +193,6 @@ def _blocks(path: Path, dialect: Dialect, columns: Columns, size: int) -> Iterat
         raise InputError.at(path, "holds no readings; record it again or remove it")
 
 
-def _read(path: Path, dialect: Dialect, size: int) -> Iterator[tuple[bytes, bool]]:
-    """Yield the bytes of a file, as UTF-8, and whether they are the last: behind zero bytes nothing
-    is data."""
-    decoder = codecs.getincrementaldecoder("utf-16")("replace")
-    with builtins.open(path, "rb") as file:
-        while True:
-            data = file.read(size)
-            is_last = len(data) < size
-            if dialect.encoding == "utf-16":
-                data = decoder.decode(data).encode("utf-8", "replace")
-            is_last = is_last or b"\0" in data
-            yield data, is_last
-            if is_last:
-                break
-
-
 def _parse(path: Path, data: bytes, before: _Before, dialect: Dialect, columns: Columns) -> Block:
     whole, zeros, _ = data.partition(b"\0")
     is_text = data.isascii() and (
@@ -203,6 +202,8 @@ def _parse(path: Path, data: bytes, before: _Before, dialect: Dialect, columns: 
     written = whole if (whole or before.lines) and zeros and is_text else data
     text = decoded(path, written, latin=True)
     rows, numbers = numbered_lines(text)
+    if '"' in text:
+        rows = [unquoted(row) for row in rows]
     problems: tuple[Problem, ...] = ()
     above = rows[-2] if len(rows) > 1 else before.last
     if (
@@ -230,7 +231,7 @@ def _parse(path: Path, data: bytes, before: _Before, dialect: Dialect, columns: 
         return Block(nothing, lines, problems=problems)
     unit = columns.unit
     clock = columns.clock
-    if clock is not None and is_written_out(_cell(rows[0], clock, dialect)):
+    if clock is not None and is_written_out(cell_of(rows[0], clock, dialect)):
         rows = [_in_seconds(row, clock, dialect) for row in rows]
         unit = "s"
     kind = np.float32 if clock is None else np.float64  # float32 holds a unix time to two minutes
@@ -245,15 +246,11 @@ def _parse(path: Path, data: bytes, before: _Before, dialect: Dialect, columns: 
     return Block(readings, lines, times, unit, problems)
 
 
-def _cell(row: str, column: int, dialect: Dialect) -> str:
-    return bare((*row.split(dialect.separator or None, column + 1), *[""] * (column + 1))[column])
-
-
 def _in_seconds(row: str, column: int, dialect: Dialect) -> str:
     """Return a line with the date in a column as seconds; what is no date stays, for the parser to
     name."""
     cells = row.split(dialect.separator or None, column + 1)
-    written = _cell(row, column, dialect)
+    written = cell_of(row, column, dialect)
     if clock := CLOCK.fullmatch(written):
         seconds = float(clock[3].replace(",", "."))
         cells[column] = repr(3600 * int(clock[1]) + 60 * int(clock[2]) + seconds)
@@ -266,7 +263,7 @@ def _in_seconds(row: str, column: int, dialect: Dialect) -> str:
 
 def _is_cut(line: str, before: str, dialect: Dialect) -> bool:
     """Return whether a line stops short, compared with the line before it."""
-    cells, cells_before = (dialect.split(row) for row in (line, before))
+    cells, cells_before = (dialect.split(row) for row in (line, unquoted(before)))
     last = cells[-1]
     stops = len(cells) < len(cells_before) or dialect.number(last) is None
     return stops and dialect.number(cells_before[-1]) is not None

@@ -132,6 +132,16 @@ def is_comment(line: str) -> bool:
     return line.lstrip().startswith(COMMENTS)
 
 
+def unquoted(line: str) -> str:
+    """Return a line without the double quotes that some loggers write around it as a whole."""
+    written = line.strip()
+    if written.count('"') < 2 or not (written[0] == written[-1] == '"'):
+        return line
+    within = written[1:-1].replace('""', "")
+    is_whole = '"' not in within and any(one in within for one in _SEPARATORS if one)
+    return written[1:-1].replace('""', '"') if is_whole else line
+
+
 def is_written_out(cell: str) -> bool:
     """Return whether a cell holds a date, or a time of day."""
     return DATE.fullmatch(cell) is not None or CLOCK.fullmatch(cell) is not None
@@ -165,7 +175,7 @@ def numbered(path: Path) -> Iterator[tuple[int, str]]:
                 at += 1
                 whole = "".join([*parts, line])
                 parts = []
-                yield at, whole if whole.strip() else ""
+                yield at, unquoted(whole) if whole.strip() else ""
             if "\0" in chunk:
                 return
             parts.append(rest)
@@ -173,7 +183,7 @@ def numbered(path: Path) -> Iterator[tuple[int, str]]:
                 break
     whole = "".join(parts)
     if whole:
-        yield at + 1, whole if whole.strip() else ""
+        yield at + 1, unquoted(whole) if whole.strip() else ""
 
 
 def find_dialect(path: Path) -> Dialect | None:

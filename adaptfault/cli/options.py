@@ -360,6 +360,7 @@ def summary_of(opened: Opened, inferred: Sequence[str] = ()) -> Summary:
         lengths=opened.lengths,
         classes=classes,
         inferred=tuple(inferred),
+        seconds=opened.seconds,
     )
 
 

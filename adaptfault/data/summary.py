@@ -37,6 +37,7 @@ class Summary:
         missing: int ``[D]``, missing readings.
         classes: recordings of each class; empty without labels.
         inferred: see :class:`~adaptfault.data.recordings.load.Loaded`.
+        seconds: how long the recordings took, by their times; None: by the rate.
     """
 
     layout: SensorLayout
@@ -49,6 +50,14 @@ class Summary:
     missing: NDArray[np.int64]
     classes: dict[str, int] = field(default_factory=dict)
     inferred: tuple[str, ...] = ()
+    seconds: float | None = None
+
+    @property
+    def duration(self) -> float:
+        """Seconds that the recordings took."""
+        if self.seconds is not None:
+            return self.seconds
+        return float(self.lengths.sum() / self.layout.rate)
 
     @property
     def silent(self) -> NDArray[np.intp]:
@@ -65,6 +74,7 @@ class Summary:
             "layout": self.layout.to_dict(),
             "recordings": len(self.lengths),
             "frames": int(self.lengths.sum()),
+            "seconds": self.duration,
             "lengths": {"least": int(self.lengths.min()), "most": int(self.lengths.max())},
             "lowest": _least(self.lowest[present]),
             "highest": _most(self.highest[present]),
@@ -88,9 +98,7 @@ class Summary:
             else f"{least} to {most} frames each"
         )
         rows = {
-            "recordings": (
-                f"{len(self.lengths)} of {frames}, {self.lengths.sum() / layout.rate:.0f} s in all"
-            ),
+            "recordings": f"{len(self.lengths)} of {frames}, {self.duration:.0f} s in all",
             "array": str(layout),
             "readings": self._readings(),
             "rest level": f"{_number(_median(self.rest[present]))} (median over the cells)",
@@ -162,6 +170,7 @@ def summarise(
     lengths: Sequence[int] | None = None,
     classes: dict[str, int] | None = None,
     inferred: tuple[str, ...] = (),
+    seconds: float | None = None,
 ) -> Summary:
     """Summarise recordings, or pieces of them, in one pass and constant memory.
 
@@ -169,7 +178,7 @@ def summarise(
         recordings: arrays ``[T, D]`` in the layout's unit; NaN = missing.
         layout: the array.
         lengths: frames of each recording, where pieces are given; None: those of the arrays.
-        classes, inferred: stored in the summary.
+        classes, inferred, seconds: stored in the summary.
 
     Raises:
         ValueError: no recording, or one that does not fit the layout.
@@ -207,6 +216,7 @@ def summarise(
         missing=np.int64(sum(seen_frames)) - finite,
         classes=dict(classes or {}),
         inferred=inferred,
+        seconds=seconds,
     )
 
 

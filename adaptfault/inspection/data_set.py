@@ -74,6 +74,8 @@ class DataSetCheck:
             found.append(f"about {self.clock.lost} frames are missing between the times")
         if self.clock.falls:
             found.append(f"the clock falls back {self.clock.falls} times")
+        if self.clock.disorder:
+            found.append(self.clock.disorder)
         if self.clock.jitter is not None and self.clock.jitter > _JITTER:
             found.append(f"the period between frames varies by {self.clock.jitter:.0%}")
         if self.begin_in_contact:

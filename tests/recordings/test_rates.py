@@ -61,3 +61,32 @@ def test_times_that_may_be_anything_give_the_same_in_any_pieces(times, pieces):
         rate = rate_of(times, tick)
         assert rate is None or 0 < rate < np.inf
         assert rate_of(times, tick, pieces) == rate
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    swaps=st.sets(st.integers(1, 97), max_size=12),
+    rate=st.sampled_from(RATES),
+    lost=st.sets(st.integers(2, 97), max_size=5),
+)
+def test_frames_that_changed_places_are_counted_and_none_of_them_is_lost(swaps, rate, lost):
+    times = np.delete(np.arange(100) / rate, sorted(lost))
+    kept = [i for i in sorted(swaps) if not swaps & {i - 1, i - 2} and i + 1 < len(times)]
+    for i in kept:
+        times[[i, i + 1]] = times[[i + 1, i]]
+    elapsed = Elapsed()
+    elapsed.add(times)
+    clock = elapsed.clock()
+    assert (clock.late, clock.falls) == (len(kept), 0)
+    assert clock.pairs or not clock.late
+    assert clock.lost == len(lost)
+    assert elapsed.rate("s") == pytest.approx(rate, rel=0.01)
+
+
+def test_a_recording_takes_as_long_as_its_times_span_with_pauses_and_lost_frames():
+    times = np.delete(np.arange(1000) * 20.0, np.arange(401, 900, 2))
+    times[300:] += 60_000
+    elapsed = Elapsed()
+    elapsed.add(times)
+    assert elapsed.seconds("ms") == pytest.approx(80, rel=1e-3)
+    assert Elapsed.of_all([elapsed, elapsed]).seconds("ms") == pytest.approx(160, rel=1e-3)

@@ -70,8 +70,8 @@ def check_readings(
             problems.append(Problem("error", str(content.error(error, i))))
             continue
         kept.append(i)
-        if survey.elapsed is not None and survey.elapsed.falls:
-            problems.append(_falls(content, i, survey.elapsed))
+        if survey.elapsed is not None:
+            problems += _disorder(content, i, survey.elapsed)
         for name, found, at in (
             ("infinite", survey.infinite, survey.first_infinite),
             ("missing", survey.missing, survey.first_missing),
@@ -91,11 +91,18 @@ def check_readings(
     return kept, problems
 
 
-def _falls(content: Content, i: int, elapsed: Elapsed) -> Problem:
-    times = "1 time is" if elapsed.falls == 1 else f"{elapsed.falls} times are"
-    what = f"{times} before the one before, first in {content.where(i, elapsed.first_fall)}"
-    what += ": the clock was reset, or the frames are not in order; kept as they stand"
-    return Problem("warning", located(content.path, what))
+def _disorder(content: Content, i: int, elapsed: Elapsed) -> list[Problem]:
+    """Warn of frames in the wrong order, and of a clock that falls back."""
+    found = []
+    if disorder := elapsed.clock().disorder:
+        where = content.where(i, elapsed.first_late)
+        found.append(f"{disorder}, the first in {where}: kept as they stand")
+    if elapsed.falls:
+        times = "1 time is" if elapsed.falls == 1 else f"{elapsed.falls} times are"
+        what = f"{times} before the one before, first in {content.where(i, elapsed.first_fall)}"
+        what += ": the clock was reset, or the frames are not in order; kept as they stand"
+        found.append(what)
+    return [Problem("warning", located(content.path, what)) for what in found]
 
 
 def without_infinite(frames: NDArray[Any]) -> NDArray[Any]:

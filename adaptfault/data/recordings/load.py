@@ -134,6 +134,22 @@ class Opened:
         )
         return Clock() if elapsed is None else elapsed.clock()
 
+    @property
+    def seconds(self) -> float:
+        """How long the recordings took: by their times where there are some, else by their
+        rate."""
+        surveys = [c.surveys[i] for _, c, kept in self._usable for i in kept]
+        timed = Elapsed.of_all(survey.elapsed for survey in surveys)
+        usual = None if timed is None else timed.unit()
+        total = 0.0
+        for survey in surveys:
+            unit = survey.tick or usual
+            if survey.elapsed is None or unit is None:
+                total += survey.length / self.layout.rate
+            else:
+                total += survey.elapsed.seconds(unit)
+        return total
+
     def __len__(self) -> int:
         return len(self.lengths)
 

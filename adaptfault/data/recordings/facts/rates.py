@@ -28,6 +28,7 @@ _SLOWEST = 2.0  # Hz: of a clock whose unit is not stated
 _FASTEST = 2000.0
 _PAUSE = 20.0  # median periods: a longer one is a pause and tells nothing
 _MOST_TICKS = 1e30  # frames a tick: no clock
+_FEW = 20  # frames, behind which a frame in the wrong order is no longer looked for
 _TURNS = 3  # of p and n_i
 _NEAR = 0.2  # a multiple of the period is whole
 _MOST = 0.9  # share of the steps that are whole multiples, where frames may be lost
@@ -40,29 +41,53 @@ class Clock:
     Attributes:
         jitter: robust standard deviation of the period, as a share of it; None without times.
         lost: frames that are missing between two times; 0 where the jitter hides them.
-        falls: how often a time is before the one before it.
+        falls: how often the clock falls back.
+        late: frames that come behind a later one.
+        pairs: whether each of these is exchanged with its neighbour.
     """
 
     jitter: float | None = None
     lost: int = 0
     falls: int = 0
+    late: int = 0
+    pairs: bool = False
+
+    @property
+    def disorder(self) -> str:
+        """A sentence on frames in the wrong order; "" where there are none."""
+        if not self.late:
+            return ""
+        what = "pair" if self.pairs else "frame"
+        verb = " of frames" * self.pairs + (" is" if self.late == 1 else " are")
+        return f"{self.late} {what}{'s' * (self.late != 1)}{verb} in the wrong order"
+
+
+@dataclass(frozen=True)
+class _Order:
+    """The times of one recording in their order.
+
+    Attributes:
+        stretches: between falls of the clock, each sorted.
+        first_fall, first_late: place of the first fall, and of the first frame in the wrong order.
+        late, pairs: as in :class:`Clock`.
+    """
+
+    stretches: tuple[NDArray[np.float64], ...]
+    first_fall: int = 0
+    first_late: int = 0
+    late: int = 0
+    pairs: bool = False
 
 
 class Elapsed:
-    """The times of one recording or of several, in the ticks of their clock.
-
-    Attributes:
-        falls: how often a time is before the one before it.
-        first_fall: the line of the first, or its frame.
-    """
+    """The times of one recording or of several, in the ticks of their clock."""
 
     def __init__(self) -> None:
-        self.falls = 0
-        self.first_fall = 0
-        self._steps: list[NDArray[np.float64]] = []
-        self._shared: list[NDArray[np.float64]] = []
-        self._last: tuple[float, int] | None = None
+        self._parts: list[Elapsed] = [self]
+        self._times: list[NDArray[np.float64]] = []
+        self._places: list[NDArray[np.intp]] = []
         self._frames = 0
+        self._order: _Order | None = None
 
     @classmethod
     def of_all(cls, several: Iterable[Elapsed | None]) -> Elapsed | None:
@@ -71,44 +96,52 @@ class Elapsed:
         if not given:
             return None
         every = cls()
-        for one in given:
-            if one.falls and not every.falls:
-                every.first_fall = one.first_fall
-            every.falls += one.falls
-            every._steps += one._steps
-            every._shared += one._shared
+        every._parts = [part for one in given for part in one._parts]
         return every
 
     def add(self, times: NDArray[np.float64], lines: NDArray[np.intp] | None = None) -> None:
         """Take in the times of the next frames; what is not finite tells nothing."""
         known = np.isfinite(times)
-        at = np.flatnonzero(known)
-        values = times[known]
-        if not len(values):
-            self._frames += len(times)
-            return
-        carried = 1
-        if self._last is not None:
-            values = np.concatenate([[self._last[0]], values])
-            at = np.concatenate([[-1], at])
-            carried = self._last[1]
-        begins = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1])
-        shared = np.diff(np.concatenate([begins, [len(values)]])).astype(np.float64)
-        shared[0] += carried - 1
-        distinct = values[begins]
-        with np.errstate(all="ignore"):  # a time may be anything that a file can hold
-            steps = np.diff(distinct)
-        falling = np.flatnonzero(steps < 0)
-        if len(falling):
-            frame = int(at[begins[falling[0] + 1]])
-            if not self.falls:
-                self.first_fall = self._frames + frame if lines is None else int(lines[frame])
-            self.falls += len(falling)
-        rises = np.isfinite(steps) & (steps > 0)
-        self._steps.append(steps[rises])
-        self._shared.append(shared[:-1][rises])
-        self._last = (float(distinct[-1]), int(shared[-1]))
+        places = np.arange(self._frames, self._frames + len(times)) if lines is None else lines
+        self._times.append(times[known])
+        self._places.append(places[known])
         self._frames += len(times)
+        self._order = None
+
+    @property
+    def falls(self) -> int:
+        """How often the clock falls back."""
+        return sum(max(0, len(part._ordered().stretches) - 1) for part in self._parts)
+
+    @property
+    def first_fall(self) -> int:
+        """The line of the first fall, or its frame."""
+        return next((p._ordered().first_fall for p in self._parts if p.falls), 0)
+
+    @property
+    def first_late(self) -> int:
+        """The line of the first frame in the wrong order, or its number."""
+        found = (part._ordered() for part in self._parts)
+        return next((order.first_late for order in found if order.late), 0)
+
+    def _ordered(self) -> _Order:
+        """Return the times of this recording, each stretch between two falls of the clock
+        sorted."""
+        if self._order is None:
+            times = np.concatenate([np.empty(0), *self._times])
+            places = np.concatenate([np.empty(0, np.intp), *self._places])
+            self._order = _in_order(times, places)
+        return self._order
+
+    def seconds(self, tick: str) -> float:
+        """Return how long the recordings took by their times, whose unit is ``tick``: pauses and
+        lost frames count."""
+        with np.errstate(all="ignore"):
+            per_tick = self._per_tick()
+            stretches = [one for part in self._parts for one in part._ordered().stretches]
+            spans = sum(float(one[-1] - one[0]) for one in stretches if len(one))
+            period = 0.0 if per_tick is None else 1 / per_tick
+            return (spans + period * len(stretches)) / TICKS[tick]
 
     def rate(self, tick: str | None) -> float | None:
         """Return frames a second; None where no time rises, or no unit gives 2 to 2000 Hz.
@@ -122,19 +155,40 @@ class Elapsed:
             return None
         if tick is not None:
             return _rounded(per_tick * TICKS[tick])
-        rates = [per_tick * ticks for ticks in TICKS.values()]
-        return next((_rounded(rate) for rate in rates if _SLOWEST <= rate <= _FASTEST), None)
+        unit = self.unit()
+        return None if unit is None else _rounded(per_tick * TICKS[unit])
+
+    def unit(self) -> str | None:
+        """Return the first of s, ms, us and ns with which the rate is 2 to 2000 Hz; None: none."""
+        with np.errstate(all="ignore"):
+            per_tick = self._per_tick() or 0.0
+        for tick, ticks in TICKS.items():
+            if _SLOWEST <= per_tick * ticks <= _FASTEST:
+                return tick
+        return None
 
     def _pooled(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return all rises between times that differ, and how many frames have the earlier one."""
-        steps = np.concatenate([np.empty(0), *self._steps])
-        return steps, np.concatenate([np.empty(0), *self._shared])
+        steps = [np.empty(0)]
+        shared = [np.empty(0)]
+        for part in self._parts:
+            for times in part._ordered().stretches:
+                begins = np.flatnonzero(np.r_[True, times[1:] != times[:-1]])
+                with np.errstate(all="ignore"):  # a time may be anything that a file can hold
+                    rises = np.diff(times[begins])
+                usable = np.isfinite(rises) & (rises > 0)
+                steps.append(rises[usable])
+                shared.append(np.diff(begins)[usable].astype(np.float64))
+        return np.concatenate(steps), np.concatenate(shared)
 
     def clock(self) -> Clock:
         """Return how regular the times are."""
         steps, shared = self._pooled()
+        orders = [part._ordered() for part in self._parts]
+        late = sum(order.late for order in orders)
+        pairs = all(order.pairs for order in orders if order.late)
         if not len(steps):
-            return Clock(None, 0, self.falls)
+            return Clock(None, 0, self.falls, late, pairs)
         with np.errstate(all="ignore"):  # a time may be anything that a file can hold
             periods = steps / shared
             period = float(np.median(periods))
@@ -143,7 +197,7 @@ class Elapsed:
             whole = np.maximum(1, np.rint(multiples))
             regular = np.mean(np.abs(multiples - whole) < _NEAR) >= _MOST
         lost = int((whole - 1).sum()) if regular else 0
-        return Clock(jitter if np.isfinite(jitter) else None, lost, self.falls)
+        return Clock(jitter if np.isfinite(jitter) else None, lost, self.falls, late, pairs)
 
     def _per_tick(self) -> float | None:
         """Return frames a tick."""
@@ -161,6 +215,46 @@ class Elapsed:
                 return float(shared.sum() / steps.sum())
             period = float(steps.sum() / (shared * whole).sum())
         return 1 / period
+
+
+def _in_order(times: NDArray[np.float64], places: NDArray[np.intp]) -> _Order:
+    """Return the times of a recording in order.
+
+    A frame is late that comes behind later ones, is followed within a few frames by one that is
+    later than all, or by the end, and whose time no other frame has. Any other fall is one of the
+    clock.
+    """
+    falls = np.flatnonzero(times[1:] < times[:-1]) + 1
+    late: list[int] = []
+    pairs: list[bool] = []
+    cuts: list[int] = []
+    begin = 0
+    seen = 0
+    latest = -np.inf
+    for fall in falls.tolist():
+        latest = max(latest, float(times[seen:fall].max()))
+        seen = fall
+        near = times[fall : fall + _FEW]
+        back = np.flatnonzero(near > latest)
+        behind = int(back[0]) if len(back) else len(near)
+        before = times[max(begin, fall - _FEW) : fall]
+        around = np.concatenate([before, near[:behind]])
+        ends = fall + _FEW > len(times) and near.min() > before.min()
+        if (len(back) or ends) and len(np.unique(around)) == len(around):
+            late.append(fall)
+            pairs.append(behind == np.count_nonzero(before > times[fall]) == 1)
+        else:
+            cuts.append(fall)
+            begin = fall
+            latest = -np.inf
+    stretches = np.split(times, cuts) if len(times) else []
+    return _Order(
+        tuple(np.sort(one) for one in stretches),
+        int(places[cuts[0]]) if cuts else 0,
+        int(places[late[0]]) if late else 0,
+        len(late),
+        bool(late) and all(pairs),
+    )
 
 
 def _rounded(rate: float) -> float:

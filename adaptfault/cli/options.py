@@ -82,7 +82,11 @@ def add_recordings(
                 " file,frame and one for each value"
             ),
         )
-    group.add_argument("--topic", metavar="NAME", help="topic of a bag that holds the readings")
+    group.add_argument(
+        "--topic",
+        metavar="NAMES",
+        help="topics of a bag that hold the readings, one a pad: names or patterns as '/tactile/*'",
+    )
     group.add_argument(
         "--field",
         metavar="PATH",

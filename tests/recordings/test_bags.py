@@ -274,3 +274,188 @@ def test_a_bag_is_diagnosed_from_the_command_line(tmp_path, grasps, capsys):
     assert main(["diagnose", str(next(bag.glob("*.mcap"))), "--json", "--topic", "/tactile"]) == 2
     reasons = [fault["reason"] for fault in json.loads(capsys.readouterr().out)["faults"]]
     assert any("pad 1, row 5 is short" in reason for reason in reasons)
+
+
+# Fields of any message
+
+
+XELA = {
+    "xela/msg/Taxel": "uint16 x\nuint16 y\nuint16 z\n",
+    "xela/msg/Sensor": "float64 time\nxela/Taxel[] taxels\nint16[] temps\n",
+    "xela/msg/Stream": "xela/Sensor[] sensors\n",
+    "hand/msg/Press": "float32[6] pressure\nfloat32[6] temperature\nuint32 lost\n",
+    "hand/msg/Hand": "hand/Press[] press\n",
+}
+
+
+def write_messages(path, kind, messages, topic="/tact"):
+    store = types()
+    for name, text in XELA.items():
+        store.register(typesys.get_types_from_msg(text, name))
+    writer = rosbag2.Writer(path, version=8, storage_plugin=rosbag2.StoragePlugin.MCAP)
+    with writer:
+        connection = writer.add_connection(topic, kind, typestore=store)
+        for i, message in enumerate(messages(store.types)):
+            writer.write(connection, 10**18 + i * 10**7, store.serialize_cdr(message, kind))
+    return path
+
+
+def test_single_numbers_in_lists_of_messages_are_reached_and_temperatures_are_no_readings(tmp_path):
+    counts = rng.integers(0, 4096, (12, 2, 3, 3)).astype(np.uint16)
+
+    def stream(known):
+        Taxel, Sensor, Stream = (known[f"xela/msg/{n}"] for n in ("Taxel", "Sensor", "Stream"))
+        for frame in counts:
+            yield Stream(
+                sensors=[
+                    Sensor(
+                        time=0.0,
+                        taxels=[Taxel(*taxel.tolist()) for taxel in sensor],
+                        temps=np.zeros(3, np.int16),
+                    )
+                    for sensor in frame
+                ]
+            )
+
+    bag = write_messages(tmp_path / "xela", "xela/msg/Stream", stream)
+    told = refusal(bag, topic="/tact")
+    assert "sensors.taxels.x, sensors.taxels.y, sensors.taxels.z; give --field" in told
+    loaded = load(bag, topic="/tact", field="sensors.taxels.z", layout="2x1x3")
+    np.testing.assert_array_equal(loaded.recordings.frames[0], counts[..., 2].reshape(12, -1))
+    loaded = load(bag, topic="/tact", field="sensors.taxels", layout="2x3x3")
+    np.testing.assert_array_equal(loaded.recordings.frames[0], counts.reshape(12, -1))
+    assert "has no array sensors.gone" in refusal(bag, topic="/tact", field="sensors.gone")
+
+
+def test_of_several_arrays_that_of_touch_is_read_where_one_is_named_so(tmp_path):
+    values = rng.normal(10, 1, (12, 2, 6)).astype(np.float32)
+
+    def hands(known):
+        Press, Hand = known["hand/msg/Press"], known["hand/msg/Hand"]
+        hot = np.full(6, 30, np.float32)
+        for frame in values:
+            yield Hand(press=[Press(pressure=one, temperature=hot, lost=0) for one in frame])
+
+    bag = write_messages(tmp_path / "hand", "hand/msg/Hand", hands)
+    loaded = load(bag, topic="/tact", layout="2x2x3")
+    np.testing.assert_array_equal(loaded.recordings.frames[0], values.reshape(12, -1))
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_fields_of_a_cloud_are_read_by_their_names_and_its_bytes_never(big, tmp_path):
+    order = ">" if big else "<"
+    packed = np.dtype({"names": ["x", "intensity"], "formats": [f"{order}f4"] * 2, "itemsize": 12})
+    points = np.zeros((12, 3, 4), packed)
+    points["intensity"] = rng.random((12, 3, 4))
+
+    def clouds(known):
+        Field = known["sensor_msgs/msg/PointField"]
+        Header = known["std_msgs/msg/Header"]
+        fields = [Field("x", 0, 7, 1), Field("intensity", 4, 7, 1)]
+        stamp = known["builtin_interfaces/msg/Time"](0, 0)
+        for frame in points:
+            data = np.frombuffer(frame.tobytes(), np.uint8)
+            cloud = known["sensor_msgs/msg/PointCloud2"]
+            yield cloud(Header(stamp, ""), 3, 4, fields, big, 12, 48, data, True)
+
+    bag = write_messages(tmp_path / "cloud", "sensor_msgs/msg/PointCloud2", clouds)
+    loaded = load(bag, topic="/tact", field="intensity")
+    assert loaded.recordings.layout.shape == (1, 3, 4)
+    expected = points["intensity"].astype(np.float32).reshape(12, -1)
+    np.testing.assert_array_equal(loaded.recordings.frames[0], expected)
+    assert "holds x, intensity; give --field" in refusal(bag, topic="/tact", layout="3x4")
+    assert "has no array data" in refusal(bag, topic="/tact", field="data", layout="12x12")
+
+
+# One topic a pad
+
+
+def write_pads(path, values, *, rates=(10, 10), lost=(), names=("left", "right")):
+    """Write a topic a pad; ``lost``: frames of the last that did not come."""
+    store = types()
+    writer = rosbag2.Writer(path, version=8, storage_plugin=rosbag2.StoragePlugin.MCAP)
+    with writer:
+        connections = [
+            writer.add_connection(f"/tactile/{name}", MULTI, typestore=store) for name in names
+        ]
+        for i, frame in enumerate(values):
+            for pad, connection in enumerate(connections):
+                if i % (rates[0] // rates[pad]) or (pad == len(names) - 1 and i in lost):
+                    continue
+                message = multi_array(store, frame[pad].ravel(), sizes=frame[pad].shape)
+                at = 10**18 + i * 10**8 + pad * 10**6
+                writer.write(connection, at, store.serialize_cdr(message, MULTI))
+    return path
+
+
+@pytest.mark.parametrize(
+    "topic", [None, "/tactile/left,/tactile/right", "/tactile/*", "/tactile/left"]
+)
+def test_topics_are_pads_as_they_are_named_and_their_dimensions_are_the_shape(topic, tmp_path):
+    values = rng.random((30, 2, 3, 4)).astype(np.float32)
+    bag = write_pads(tmp_path / "t", values)
+    loaded = load(bag) if topic is None else load(bag, topic=topic)
+    expected = values[:, :1] if topic == "/tactile/left" else values
+    assert loaded.problems == ()
+    assert loaded.recordings.layout.shape == expected.shape[1:]
+    assert loaded.recordings.layout.rate == pytest.approx(10)
+    np.testing.assert_array_equal(loaded.recordings.frames[0], expected.reshape(30, -1))
+
+
+def test_a_pad_that_sends_more_slowly_keeps_its_reading_and_one_that_is_silent_is_missing(tmp_path):
+    values = rng.random((40, 2, 3, 4)).astype(np.float32)
+    bag = write_pads(tmp_path / "slow", values, rates=(10, 5))
+    right = load(bag).recordings.frames[0].reshape(40, 2, -1)[:, 1]
+    np.testing.assert_array_equal(right[::2], values[::2, 1].reshape(20, -1))
+    bag = write_pads(tmp_path / "silent", values, lost=range(20, 40))
+    right = load(bag).recordings.frames[0].reshape(40, 2, -1)[:, 1]
+    assert np.isfinite(right[:25]).all()
+    assert np.isnan(right[25:]).all()
+
+
+# JSON
+
+
+def write_json(path, messages, topic="/tactile"):
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("touch", "jsonschema", b'{"type": "object"}')
+        channel = writer.register_channel(topic, "json", schema)
+        for i, message in enumerate(messages):
+            at = i * 20_000_000
+            data = message if isinstance(message, bytes) else json.dumps(message).encode()
+            writer.add_message(channel, log_time=at, publish_time=at, data=data)
+        writer.finish()
+    return path
+
+
+def test_messages_of_json_are_read(tmp_path):
+    values = rng.random((30, 3, 4)).round(3)
+    messages = [{"stamp": i, "data": frame.tolist()} for i, frame in enumerate(values)]
+    messages[4]["data"][0][0] = None
+    messages[7] = b'{"data": [['
+    messages[9] = {"data": [[1.0, 2.0], [3.0]]}
+    loaded = load(write_json(tmp_path / "a.mcap", messages))
+    assert loaded.recordings.layout.shape == (1, 3, 4)
+    assert loaded.recordings.layout.rate == pytest.approx(50, rel=0.02)
+    values[4, 0, 0] = np.nan
+    expected = np.delete(values, [7, 9], axis=0).astype(np.float32).reshape(28, -1)
+    np.testing.assert_array_equal(loaded.recordings.frames[0], expected)
+    assert any("2 damaged messages left out" in problem.message for problem in loaded.problems)
+
+
+def test_what_the_viewer_writes_is_read_again(tmp_path, small_grasps, capsys):
+    from adaptfault.data.recordings import Recordings, save_npz
+
+    frames = sorted(small_grasps.frames, key=np.max)[-2:]
+    save_npz(tmp_path / "a.npz", Recordings(tuple(frames), small_grasps.layout))
+    command = ["view", str(tmp_path / "a.npz"), "--mcap", str(tmp_path / "a.mcap"), "--quiet"]
+    assert main(command) in (0, 1, 2)
+    capsys.readouterr()
+    assert "give --topic (topic=), as --topic /tactile/0/" in refusal(tmp_path / "a.mcap")
+    again = load(tmp_path / "a.mcap", topic="/tactile/*/readings").recordings
+    assert again.layout.shape == small_grasps.layout.shape
+    np.testing.assert_array_equal(np.concatenate(again.frames), np.concatenate(frames))

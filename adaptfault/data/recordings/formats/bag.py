@@ -3,8 +3,10 @@ extra "ros"."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -14,32 +16,16 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.labels import natural_key
-from adaptfault.data.recordings.formats.bag_fields import Extractor, Topic, choose
+from adaptfault.data.recordings.formats.bag_fields import Found, Topic, choose
+from adaptfault.data.recordings.formats.bag_frames import NEAR, Frames, Message
 from adaptfault.data.recordings.formats.bag_salvage import Salvage
-from adaptfault.data.recordings.formats.message_arrays import join
+from adaptfault.data.recordings.formats.datasets.features import Pads
 from adaptfault.data.recordings.recording import BLOCK, Block, Facts, Recording, Shape
 
 SUFFIXES = (".mcap", ".db3")
 
 _PAUSE = 1.0  # seconds without a message, after which another recording begins
 _PERIODS = 5  # and so many periods
-
-
-@dataclass(frozen=True, eq=False)
-class Message:
-    """The readings of one message.
-
-    Attributes:
-        time: when it was recorded, nanoseconds.
-        values: float32 ``[D]``.
-        counts: whole numbers by their type.
-        shape: ``(pads, rows, cols)`` where the message states it.
-    """
-
-    time: int
-    values: NDArray[np.float32]
-    counts: bool
-    shape: Shape | None
 
 
 def accepts(path: Path) -> bool:
@@ -50,18 +36,27 @@ def accepts(path: Path) -> bool:
 
 
 def open(
-    path: Path, *, topic: str | None = None, field: str | None = None, **stated: Any
+    path: Path,
+    *,
+    shape: Shape | None = None,
+    topic: str | None = None,
+    field: str | None = None,
+    **stated: Any,
 ) -> list[Recording]:
     """Return the recordings of a bag: one, or several where there are pauses of a second or more.
 
     The readings are an array of numbers in each message: a ``std_msgs`` MultiArray, a type named
-    after touch (TactileState, ...), or ``field`` of ``topic``. The rate comes from the times at
-    which the messages were recorded. Of a bag that was cut off, the readable messages are returned,
-    with a warning that counts them.
+    after touch (TactileState, ...), JSON on a topic named after it, or ``field`` of ``topic``.
+    Several topics are the pads of one array: a frame is a message of the one that has most, with
+    the nearest of the others. The rate comes from the times at which the messages were recorded. Of
+    a bag that was cut off, the readable messages are returned, with a warning that counts them.
 
     Args:
         path: the folder, or one of its files.
-        topic, field: where the readings are; None: found by the types of the messages.
+        shape: ``(pads, rows, cols)`` where the user states it.
+        topic: names of topics, or patterns as ``/tactile/*``, divided by commas.
+        field: of their messages; it may lead through lists of messages, as
+            ``sensors.taxels.z``. None for both: found by the types of the messages.
         stated: what other readers ask for.
 
     Raises:
@@ -73,7 +68,8 @@ def open(
     width = 0
     others = 0
     first: Message | None = None
-    for message in bag_messages(path, problems, topic=topic, field=field):
+    source = partial(bag_messages, path, shape=shape, topic=topic, field=field)
+    for message in source(problems):
         if first is None:
             first = message
             width = len(message.values)
@@ -89,10 +85,16 @@ def open(
         )
         problems.append(Problem("warning", located(path, what)))
     stamps = np.sort(np.array(times))
-    facts = Facts(path, counts=first.counts, shape=first.shape, problems=tuple(problems))
+    facts = Facts(
+        path,
+        counts=first.counts,
+        shape=first.pads.shape,
+        present=first.pads.present,
+        problems=tuple(problems),
+    )
 
     def blocks(begin: int, end: int) -> Callable[[], Iterator[Block]]:
-        return lambda: _blocks(path, topic, field, width, begin, end)
+        return lambda: _blocks(source([], begin=begin, end=end), width)
 
     return [Recording(facts, blocks(int(part[0]), int(part[-1]) + 1)) for part in _parts(stamps)]
 
@@ -105,11 +107,8 @@ def _parts(stamps: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return np.split(stamps, breaks)
 
 
-def _blocks(
-    path: Path, topic: str | None, field: str | None, width: int, begin: int, end: int
-) -> Iterator[Block]:
-    """Yield the messages of one recording in the order of their times, which are seconds."""
-    messages = bag_messages(path, [], topic=topic, field=field, begin=begin, end=end)
+def _blocks(messages: Iterator[Message], width: int) -> Iterator[Block]:
+    """Yield the messages of one recording in the order of their times."""
     while some := list(islice(messages, BLOCK)):
         whole = [message for message in some if len(message.values) == width]
         if not whole:
@@ -123,6 +122,7 @@ def bag_messages(
     path: Path,
     problems: list[Problem],
     *,
+    shape: Shape | None = None,
     topic: str | None = None,
     field: str | None = None,
     begin: int | None = None,
@@ -133,110 +133,118 @@ def bag_messages(
     Args:
         path: the bag.
         problems: missing parts are added to them.
-        topic, field: as for :func:`open`.
+        shape, topic, field: as for :func:`open`.
         begin, end: times in nanoseconds, ``begin`` included; None: all.
 
     Raises:
         InputError: as :func:`open`.
     """
     try:
-        import mcap  # noqa: F401  for bags that are damaged
+        import mcap  # noqa: F401  for bags that are damaged, and for JSON
         import rosbags  # noqa: F401
     except ImportError:
         raise InputError.at(
             path, "bags are read with rosbags; install it: pip install 'adaptfault[ros]'"
         ) from None
+    asked = _Asked(path, shape, topic, field)
     given = 0
+
+    def is_within(message: Message) -> bool:
+        return (begin is None or message.time >= begin) and (end is None or message.time < end)
+
     try:
-        for message in _whole(path, topic, field, begin, end):
+        for message in filter(is_within, _whole(asked, begin, end)):
             given += 1
             yield message
         return
     except InputError:
         raise
-    # damaged bags raise any of a dozen kinds: rosbags', sqlite's, struct's, yaml's
+    # damaged bags raise any of a dozen kinds: rosbags', sqlite's, struct's, yaml's; JSON, too
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}"
-    within = (
-        message
-        for message in _salvaged(path, topic, field, reason, problems)
-        if (begin is None or message.time >= begin) and (end is None or message.time < end)
-    )
-    yield from islice(within, given, None)
+        reason = type(error).__name__
+    yield from islice(filter(is_within, _salvaged(asked, reason, problems)), given, None)
 
 
-def _whole(
-    path: Path, topic: str | None, field: str | None, begin: int | None, end: int | None
-) -> Iterator[Message]:
+@dataclass(frozen=True)
+class _Asked:
+    """What is read of which bag, as the user says; see :func:`open`."""
+
+    path: Path
+    shape: Shape | None
+    topic: str | None
+    field: str | None
+
+    def choose(
+        self, topics: Sequence[Topic], messages: Callable[[Topic], Iterable[Found]]
+    ) -> Frames:
+        """Return what makes frames of the messages of a bag with these topics."""
+        extractors = choose(self.path, topics, messages, self.topic, self.field)
+        sizes = [one.sizes for one in extractors]
+        return Frames(extractors, Pads.of(sizes, self.shape))
+
+
+def _whole(asked: _Asked, begin: int | None, end: int | None) -> Iterator[Message]:
     from rosbags.rosbag2 import Reader
 
-    with Reader(path) as reader:
+    with Reader(asked.path) as reader:
         known = {
             Topic(c.topic, c.msgtype, c.msgdef.data or ""): c
             for c in reader.connections
             if c.msgcount
         }
-        extractor = choose(path, list(known), topic, field)
-        take = _taker(extractor)
-        for _, time, data in reader.messages(
-            connections=[known[extractor.topic]], start=begin, stop=end
-        ):
-            yield take(time, data)
+        names = {(one.name, one.msgtype): one for one in known}
+
+        def messages(
+            topics: Sequence[Topic], begin: int | None = None, end: int | None = None
+        ) -> Iterator[Found]:
+            connections = [known[one] for one in topics]
+            stored = reader.messages(connections=connections, start=begin, stop=end)
+            for connection, time, data in stored:
+                yield names[connection.topic, connection.msgtype], int(time), data
+
+        frames = asked.choose(list(known), lambda one: messages([one]))
+        counts = {one: connection.msgcount for one, connection in known.items()}
+        # the nearest message of another topic may lie just outside
+        margin = NEAR if len(frames.topics) > 1 else 0
+        first = None if begin is None else max(begin - margin, 0)
+        last = None if end is None else end + margin
+        yield from frames.of(messages(frames.topics, first, last), counts)
 
 
-def _salvaged(
-    path: Path,
-    topic: str | None,
-    field: str | None,
-    reason: str,
-    problems: list[Problem],
-) -> Iterator[Message]:
-    """Yield what a damaged bag still holds."""
+def _salvaged(asked: _Asked, reason: str, problems: list[Problem]) -> Iterator[Message]:
+    """Yield what a damaged bag still holds, and what is written as JSON, which rosbags does not
+    read."""
+    path = asked.path
     files = (
         [path]
         if path.is_file()
         else [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
     )
     parts = [Salvage(file) for file in sorted(files, key=lambda file: natural_key(file.name))]
-    topics = list(dict.fromkeys(one for part in parts for one in part.topics()))
-    if not topics:
+    counts = Counter(one for part in parts for one, _, _ in part)
+    if not counts:
         raise InputError.at(
             path, f"is damaged or cut off, and no message can be read ({reason}); record it again"
         )
-    extractor = choose(path, topics, topic, field)
-    take = _taker(extractor)
+
+    def messages(topics: Sequence[Topic]) -> Iterator[Found]:
+        return (one for part in parts for one in part if one[0] in topics)
+
+    frames = asked.choose(list(counts), lambda one: messages([one]))
     read = 0
-    bad = 0
     first = 0
     last = 0
-    for part in parts:
-        for one, time, data in part:
-            if one != extractor.topic:
-                continue
-            try:
-                message = take(time, data)
-            except Exception:  # as above: one damaged message does not end the others
-                bad += 1
-                continue
-            read += 1
-            first = min(first or time, time)
-            last = max(last, time)
-            yield message
-    what = (
-        f"damaged or cut off: {read} messages of {extractor.topic.name}, {(last - first) / 1e9:.1f}"
-        " s, could be read"
-    )
-    counts = {"chunk": sum(part.skipped for part in parts), "message": bad}
-    lost = [f"{n} damaged {what}{'s' * (n != 1)} left out" for what, n in counts.items() if n]
+    for message in frames.of(messages(frames.topics), counts, keep_on=True):
+        read += 1
+        first = min(first or message.time, message.time)
+        last = max(last, message.time)
+        yield message
+    lost = {"chunk": sum(part.skipped for part in parts), "message": frames.bad}
+    is_foreign = any(one.encoding != "cdr" for one in counts)
     ends = [f"reading ended at {part.reason}" for part in parts if part.reason]
-    problems.append(Problem("warning", located(path, "; ".join([what, *lost, *ends]))))
-
-
-def _taker(extractor: Extractor) -> Callable[[int, bytes], Message]:
-    def take(time: int, data: Any) -> Message:
-        message = extractor.deserialize(data)
-        arrays = extractor.arrays_of(message)
-        counts = all(array.dtype.kind in "iu" for array in arrays)
-        return Message(int(time), join(arrays, np.float32), counts, extractor.shape(message))
-
-    return take
+    if is_foreign and not any(lost.values()) and not ends:
+        return
+    names = ", ".join(one.name for one in frames.topics)
+    what = f"damaged or cut off: {read} messages of {names}, {(last - first) / 1e9:.1f} s, could"
+    told = [f"{n} damaged {one}{'s' * (n != 1)} left out" for one, n in lost.items() if n]
+    problems.append(Problem("warning", located(path, "; ".join([f"{what} be read", *told, *ends]))))

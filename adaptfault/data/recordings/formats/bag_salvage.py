@@ -11,10 +11,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from adaptfault.data.recordings.formats.bag_fields import Topic
-
-Found = tuple[Topic, int, bytes]
-"""Topic, time of arrival in nanoseconds, the message."""
+from adaptfault.data.recordings.formats.bag_fields import Found, Topic
 
 _MOST = 1 << 30  # bytes of one record or chunk; more is damage, and would fill the memory
 _CHUNK = 0x06  # MCAP's opcode
@@ -101,7 +98,8 @@ class Salvage:
 
 def _topic(channel: Any, schema: Any) -> Topic:
     definition = "" if schema is None else schema.data.decode("utf-8", "replace")
-    return Topic(channel.topic, "" if schema is None else schema.name, definition)
+    msgtype = "" if schema is None else schema.name
+    return Topic(channel.topic, msgtype, definition, channel.message_encoding)
 
 
 def _checked(chunk: Any, breakup: Any) -> list[Any]:

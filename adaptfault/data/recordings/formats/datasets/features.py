@@ -97,6 +97,11 @@ def is_touch(name: str) -> bool:
     return _TOUCH.search(name) is not None and _NO_TOUCH.search(name) is None
 
 
+def is_no_touch(name: str) -> bool:
+    """Return whether a feature holds something else than touch by its name, as temperatures."""
+    return _NO_TOUCH.search(name) is not None
+
+
 def _by_word(features: Mapping[str, Sizes]) -> dict[str, list[str]]:
     """Return the features of touch by the word that tells it, in natural order."""
     words: dict[str, list[str]] = {}

@@ -31,9 +31,10 @@ class Monitor:
     """Monitors a running sensor and reports faults that are new, have changed, or are gone.
 
     After each segment of 32 frames the diagnosis is updated, in small steps over the frames that
-    follow: a fault is reported at most about 50 frames after it becomes detectable. The proof of
-    life of all cells takes the frames in between, so that a dead cell that moves is reported up to
-    some 200 frames later. :meth:`diagnosis` evaluates at once.
+    follow. While a wire breaks, healthy cells beside it look faulty for an evaluation, so a change
+    is reported once the next evaluation confirms it, at most about 80 frames after it becomes
+    detectable. The proof of life of all cells takes the frames in between, so that a dead cell that
+    moves is reported up to some 200 frames later. :meth:`diagnosis` evaluates at once.
 
     Args:
         fitted: a fitted :class:`SelfDiagnosis`; an unfitted one is a cold start.
@@ -54,6 +55,7 @@ class Monitor:
         self._segments = 0  # since the last proof of life began
         self._known: dict[Key, Fault] = {}
         self._evaluated: Diagnosis | None = None
+        self._settled: Diagnosis | None = None
         self._time: float | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -138,7 +140,7 @@ class Monitor:
             if self._life is not None:
                 self._life = finished(self._diagnoser.proof(copy(self._stream)))
             steps = self._diagnoser.steps(copy(self._stream), life=self._life)
-            return self._changes(finished(steps))
+            return self._changes(finished(steps), final=True)
 
     def diagnosis(self) -> Diagnosis:
         """Return the diagnosis of all frames so far, as :meth:`SelfDiagnosis.diagnose` does.
@@ -155,26 +157,52 @@ class Monitor:
 
     @property
     def evaluated(self) -> Diagnosis | None:
-        """The diagnosis of the last evaluation that is complete, without a new one; None before
-        the first."""
-        return self._evaluated
+        """The diagnosis of the last evaluation that is complete, without a new one; of the one
+        before it where the last one says what was not told yet. None before the first."""
+        return self._settled
 
-    def _changes(self, diagnosis: Diagnosis) -> tuple[Fault, ...]:
-        now = {
-            (fault.line, fault.cells[0] if fault.line is None else -1): fault
-            for fault in diagnosis.faults
-        }
+    def _changes(self, diagnosis: Diagnosis, *, final: bool = False) -> tuple[Fault, ...]:
+        """Take in a complete evaluation; return what it says as the one before it did, and was not
+        told yet. ``final``: no further one is needed."""
+        before = diagnosis if final else self._evaluated
+        self._evaluated = diagnosis
+        if before is None:
+            self._settled = None if diagnosis.faults else diagnosis
+            return ()
+        told = dict(self._known)
         changes = []
-        for key, fault in now.items():
-            before = self._known.get(key)
-            if before is None or (before.kind, before.cells) != (fault.kind, fault.cells):
+        for fault in diagnosis.faults:
+            key = _key(fault)
+            known = told.get(key)
+            if known is not None and (known.kind, known.cells) == (fault.kind, fault.cells):
+                told[key] = fault
+            elif _is_in(fault, before):
+                told[key] = fault
                 changes.append(fault)
-        faulty = diagnosis.fault_set
+        found = {_key(fault) for fault in diagnosis.faults}
+        current = {cell for key in found & told.keys() for cell in told[key].cells}
+        faulty = set(diagnosis.fault_set | before.fault_set)
         for key, fault in self._known.items():
-            # A cell that is now part of the fault of a wire has not recovered.
-            if key not in now and not set(fault.cells) & faulty:
+            if key in found:
+                continue
+            if faulty.isdisjoint(fault.cells):
+                del told[key]
                 text = f"gone since about frame {diagnosis.n_frames}: {fault.reason}"
                 changes.append(replace(fault, probability=0.0, reason=text))
-        self._known = now
-        self._evaluated = diagnosis
+            elif current.issuperset(fault.cells):  # told with their wire: none has recovered
+                del told[key]
+        self._known = told
+        if found == told.keys() or self._settled is not before:
+            self._settled = diagnosis
         return tuple(changes)
+
+
+def _key(fault: Fault) -> Key:
+    return fault.line, fault.cells[0] if fault.line is None else -1
+
+
+def _is_in(fault: Fault, diagnosis: Diagnosis) -> bool:
+    """Return whether a diagnosis says so, too: it names the wire, or holds all cells faulty."""
+    if fault.line is not None and any(other.line == fault.line for other in diagnosis.faults):
+        return True
+    return diagnosis.fault_set.mask[list(fault.cells)].all().item()

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, overload
 
@@ -177,7 +178,8 @@ class Restorer:
             if len(self._plans) > _PLANS:
                 self._plans.popitem(last=False)
         else:
-            self._plans.move_to_end(key)
+            with suppress(KeyError):  # another thread has just dropped it
+                self._plans.move_to_end(key)
         return plan
 
     def _map(self, fault_set: FaultSet) -> _Map:

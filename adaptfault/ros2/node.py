@@ -1,9 +1,14 @@
-"""The lifecycle node: configure opens the bundle, activate subscribes. Needs rclpy."""
+"""The lifecycle node: configure opens the bundle, activate subscribes. Needs rclpy.
+
+The executor's one thread restores frames, another one monitors them: :mod:`adaptfault.ros2.watch`.
+"""
 
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +22,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from adaptfault.data.recordings.formats.message_arrays import arrays_at, join, put
 from adaptfault.ros2.messages import choose_field, diagnostics_message, message_type, stamp_of
-from adaptfault.ros2.parameters import DEFAULTS, Parameters, quoted
+from adaptfault.ros2.parameters import DEFAULTS, Parameters, quoted, unknown
+from adaptfault.ros2.rounds import Part, Rounds
 from adaptfault.ros2.sensor import Follower
 from adaptfault.ros2.watch import Watch
 
@@ -27,28 +33,35 @@ _DEPTH = 50  # frames that may wait to be restored; a longer queue would only ma
 
 
 class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
-    """Monitors a topic of tactile frames, publishes their faults on /diagnostics, and whole frames
-    on another topic.
+    """Monitors topics of tactile frames, publishes their faults on /diagnostics, and whole frames
+    on other topics.
 
     A best-effort subscription takes frames of every publisher. A reliable publisher serves every
     subscriber.
 
     Raises:
-        ValueError: a parameter has no value of its type.
+        ValueError: a parameter has no value of its type, or nearly the name of one.
     """
 
     def __init__(self) -> None:
-        super().__init__(NAME)
+        super().__init__(NAME, automatically_declare_parameters_from_overrides=True)
+        given = self.get_parameters_by_prefix("")
+        for text in unknown(given):
+            self.get_logger().warning(text)
         any_type = ParameterDescriptor(dynamic_typing=True, read_only=True)
-        values = {
-            name: self.declare_parameter(name, value, any_type).value
-            for name, value in DEFAULTS.items()
-        }
+        values = {}
+        for name, default in DEFAULTS.items():
+            if name in given:
+                values[name] = given[name].value
+                self.set_descriptor(name, any_type)
+            else:
+                values[name] = self.declare_parameter(name, default, any_type).value
         self.parameters = Parameters.from_values(values)
         self._publishers_made: list[Any] = []
-        self._subscription: Any = None
+        self._subscriptions_made: list[Any] = []
         self._timer: Any = None
-        self._taken = False  # whether a frame came in the last step
+        self._monitoring: threading.Thread | None = None
+        self._failure: Exception | None = None  # of the thread that monitors
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open the bundle, and make the publishers."""
@@ -62,7 +75,9 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
 
     def _configure(self) -> None:
         given = self.parameters
-        topic = self.resolve_topic_name(given.topic)
+        topics = [self.resolve_topic_name(topic) for topic in given.topics]
+        if len(set(topics)) < max(1, len(topics)):
+            raise ValueError(f"parameter topic {given.topic!r}: name each topic once")
         self._type = message_type(given.topic_type)
         self._field = choose_field(self._type, given.field)
         self._follower = Follower(given)
@@ -70,26 +85,31 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
         self.watch = Watch(sensor, name=given.name, hardware_id=given.hardware_id)
         self._diagnostics = self.create_lifecycle_publisher(DiagnosticArray, "/diagnostics", 1)
         self._publishers_made.append(self._diagnostics)
-        self._whole = None
-        if sensor.restorer is not None:
-            if self.resolve_topic_name(given.restored) == topic:
+        self._whole = []
+        for topic in given.restored_topics if sensor.restorer is not None else ():
+            if self.resolve_topic_name(topic) in topics:
                 raise ValueError(
-                    f"topic and restored are both {given.topic}: restored frames would come back"
+                    f"topic and restored are both {topic}: restored frames would come back"
                 )
-            self._whole = self.create_lifecycle_publisher(
-                self._type, given.restored, QoSProfile(depth=_DEPTH)
-            )
-            self._publishers_made.append(self._whole)
+            publisher = self.create_lifecycle_publisher(self._type, topic, QoSProfile(depth=_DEPTH))
+            self._whole.append(publisher)
+            self._publishers_made.append(publisher)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Subscribe."""
+        """Subscribe, and monitor in a thread of its own."""
         done = super().on_activate(state)  # from now on publishers publish
         qos = QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         self.watch.begin()
-        self._timer = self.create_timer(1.0, self._each_second)
-        self._subscription = self.create_subscription(
-            self._type, self.parameters.topic, self._take, qos
+        self._monitoring = threading.Thread(
+            target=self._monitor, name="adaptfault-monitor", daemon=True
         )
+        self._monitoring.start()
+        self._timer = self.create_timer(1.0, self._each_second)
+        topics = self.parameters.topics
+        self._rounds = Rounds(len(topics))
+        for i, topic in enumerate(topics):
+            take = partial(self._take, i)
+            self._subscriptions_made.append(self.create_subscription(self._type, topic, take, qos))
         return done
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -108,44 +128,62 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
         return self.on_cleanup(state)
 
     def _unsubscribe(self) -> None:
-        if self._subscription is not None:
-            self.destroy_subscription(self._subscription)
+        for subscription in self._subscriptions_made:
+            self.destroy_subscription(subscription)
+        self._subscriptions_made.clear()
+        if self._timer is not None:
             self.destroy_timer(self._timer)
-        self._subscription = None
         self._timer = None
+        if self._monitoring is not None:
+            self.watch.end()
+            self._monitoring.join()
+        self._monitoring = None
 
     def _remove_publishers(self) -> None:
         for publisher in self._publishers_made:
             self.destroy_lifecycle_publisher(publisher)
         self._publishers_made.clear()
 
-    def _take(self, message: Any) -> None:
+    def _take(self, topic: int, message: Any) -> None:
         try:
-            arrays = arrays_at(message, self._field)
-            received = join(arrays, np.float64)
-            whole = self.watch.restore(received)
-            if whole is not None and self._whole is not None:
-                put(arrays, whole)
-                self._whole.publish(message)
-            self.watch.put(received, stamp_of(message))
+            values = join(arrays_at(message, self._field), np.float64)
+            part = Part(values, message, stamp_of(message))
+            for frame in self._rounds.add(topic, part):
+                self._pass_on(frame)
         except ValueError as error:
             self.get_logger().warning(f"frame dropped: {error}", throttle_duration_sec=5.0)
-        self._taken = True
+
+    def _pass_on(self, frame: list[Part]) -> None:
+        """Publish a frame whole, and have it monitored."""
+        received = np.concatenate([part.values for part in frame])
+        whole = self.watch.restore(received)
+        if whole is not None and self._whole:
+            start = 0
+            for part, publisher in zip(frame, self._whole, strict=True):
+                restored = whole[start : start + part.values.size]
+                start += part.values.size
+                if part.message is not None:
+                    put(arrays_at(part.message, self._field), restored)
+                    publisher.publish(part.message)
+        stamps = [part.stamp for part in frame if part.stamp is not None]
+        self.watch.put(received, max(stamps, default=None))
+
+    def _monitor(self) -> None:
+        try:
+            self.watch.work_on(lambda fault: self.get_logger().warning(fault.reason))
+        except Exception as error:  # of a thread nobody waits for; the timer raises it
+            self._failure = error
 
     def spin(self) -> None:
-        """Restore frames as they come, and monitor them in between; raises
-        ExternalShutdownException at the end."""
+        """Restore frames as they come; raises ExternalShutdownException at the end."""
         executor = rclpy.get_global_executor()
         executor.add_node(self)
         while True:
-            waits = self._subscription is not None and self.watch.waiting
-            self._taken = False
-            executor.spin_once(timeout_sec=0.0 if waits else None)
-            if waits and not self._taken:
-                for fault in self.watch.work():
-                    self.get_logger().warning(fault.reason)
+            executor.spin_once()
 
     def _each_second(self) -> None:
+        if self._failure is not None:
+            raise self._failure
         sensor = self._follower.poll()
         if sensor is not None:
             self.watch.switch(sensor)
@@ -158,6 +196,9 @@ class TactileDiagnostics(LifecycleNode):  # type: ignore[misc]
                 " monitored"
             )
             self.get_logger().warning(what, throttle_duration_sec=10.0)
+        silent = [self.parameters.topics[i] for i in self._rounds.silent]
+        if silent:
+            self.watch.refused = f"nothing came on {', '.join(silent)}"
         now = self.get_clock().now().nanoseconds / 1e9
         self._diagnostics.publish(diagnostics_message(self.watch.diagnostics(now)))
 

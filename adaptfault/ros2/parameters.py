@@ -11,12 +11,16 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
+from difflib import get_close_matches
 from typing import Any
 
 _ASSIGNMENT = re.compile(r"((?:[^:]+:)?(\w+)):=(.*)", re.DOTALL)
+# as use_sim_time, and qos_overrides./tactile.subscription.depth
+_OF_EVERY_NODE = ("use_sim_time", "qos_overrides", "start_type_description_service")
+_OF_TOPICS = ("topic", "restored")
 _BOOLS = {"true": True, "false": False, "1": True, "0": False}
 
 
@@ -25,7 +29,8 @@ class Parameters:
     """The parameters of the node.
 
     Attributes:
-        topic: of the frames.
+        topic: of the frames; several, as "/finger/0,/finger/1" or a list, are pads of one array in
+            this order.
         topic_type: of its messages, as "sensor_msgs/msg/Image".
         field: the array of numbers in a message that holds the readings, dotted, as
             "sensors.values"; "" = the only one.
@@ -33,7 +38,8 @@ class Parameters:
             known faults, and how the active version undoes exchanged wires and replaced pads.
         trust: PEM file of the public key that must have signed the bundle; "" = signatures are not
             checked.
-        restored: topic of the restored frames; "" = none. Needs a bundle.
+        restored: topic of the restored frames, one for each ``topic``; "" = none. Needs a bundle.
+            Of several topics the default is each with "/restored" behind it.
         layout: without a bundle: a layout file, or a shape as 2x11x10.
         full_scale, unit, rate: override those of ``layout``; 0 and "" keep them.
         name: begins the name of each status, for robots with several sensors.
@@ -67,8 +73,55 @@ class Parameters:
         }
         return cls(**given)
 
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The topics of the frames."""
+        return _names(self.topic)
+
+    @property
+    def restored_topics(self) -> tuple[str, ...]:
+        """The topics of the restored frames, one for each of :attr:`topics`; none, where none is
+        restored.
+
+        Raises:
+            ValueError: another number of them.
+        """
+        if self.restored == DEFAULTS["restored"] and len(self.topics) > 1:
+            return tuple(f"{topic}/restored" for topic in self.topics)
+        names = _names(self.restored)
+        if names and len(names) != len(self.topics):
+            raise ValueError(
+                f"parameter restored names {len(names)} topics, topic {len(self.topics)}: name one"
+                " for each"
+            )
+        return names
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
 
 DEFAULTS: dict[str, Any] = {field.name: field.default for field in fields(Parameters)}
+
+
+def unknown(names: Iterable[str]) -> list[str]:
+    """Return one sentence for each name that is no parameter of the node.
+
+    Args:
+        names: of the parameters that were given; those that every ROS node has are left out.
+
+    Raises:
+        ValueError: a name that is nearly one of a parameter.
+    """
+    told = []
+    for name in sorted(names):
+        if name in DEFAULTS or name.split(".")[0] in _OF_EVERY_NODE:
+            continue
+        near = get_close_matches(name, DEFAULTS, n=1)
+        if near:
+            raise ValueError(f"parameter {name}: there is none; did you mean {near[0]}?")
+        told.append(f"parameter {name} is not used; there are {', '.join(DEFAULTS)}")
+    return told
 
 
 def quoted(arguments: Sequence[str]) -> list[str]:
@@ -127,6 +180,8 @@ def _number(name: str, value: Any) -> float:
 def _text(name: str, value: Any) -> str:
     if isinstance(value, str):
         return value
+    if name in _OF_TOPICS and isinstance(value, list) and all(isinstance(v, str) for v in value):
+        return ",".join(value)
     if name == "unit" and value is False:
         return "N"  # YAML reads no, off and false so, too; no unit has these names
     if isinstance(value, bool) or not isinstance(value, int | float):

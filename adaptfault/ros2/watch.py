@@ -1,10 +1,16 @@
-"""The work of the node: restores frames, monitors them, and states their diagnosis. Needs no
-ROS."""
+"""The work of the node: restores frames, monitors them, and states their diagnosis. Needs no ROS.
+
+The thread that receives frames calls all methods but :meth:`Watch.work`, which belongs to a thread
+of its own: to monitor a frame of a large array may take longer than the time between two frames,
+and no frame waits for it to be restored.
+"""
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from time import monotonic
 from typing import Any
 
@@ -15,15 +21,13 @@ from adaptfault.acquisition import FrameRepair
 from adaptfault.acquisition.ros import Level, diagnostic_array, stale_array
 from adaptfault.inspection.converter_range import within_range
 from adaptfault.ros2.sensor import Sensor
-from diagnostics import Diagnosis, Fault, FaultSet, Monitor
+from diagnostics import Fault, FaultSet, Monitor
 
 GRACE = 5.0  # seconds after the start in which no frame is a WARN, and STALE afterwards
 SILENCE = 2.0  # seconds without a frame, after which everything is STALE; at least so many periods:
 _PERIODS = 5
 WAITING = 1000  # most frames that wait to be monitored; fewer of large arrays:
 _BYTES = 16_000_000
-# seconds between two diagnoses of all cells; the last one is published every second
-DIAGNOSED = 10.0
 _RATED = 5.0  # seconds over which the rate is counted, at least so many frames:
 _FEWEST = 10
 
@@ -52,8 +56,9 @@ class Watch:
         self.layout = sensor.layout
         self.faulty = np.zeros(self.layout.n_cells, bool)  # as the monitor finds
         self.monitor = Monitor(sensor.diagnoser)
-        self._monitored = False  # whether the monitor has a frame
-        self.repair = self._repair()
+        self._changing = threading.Lock()  # held for moments, never while a frame is monitored
+        self._comes = threading.Event()  # set where frames wait, or the work ends
+        self.repair = self._repair_of(sensor)
         self._most_waiting = min(WAITING, max(1, _BYTES // (8 * self.layout.n_cells)))
         self._silence = max(SILENCE, _PERIODS / self.layout.rate)
         self.begin()
@@ -61,27 +66,30 @@ class Watch:
     def begin(self) -> None:
         """Wait for the first frame from now on, as after a pause in which none was asked for."""
         self.started = self.clock()
+        self._ended = False
         self.last: float | None = None  # frame of this sensor
         self.refused = ""  # why the last frame was not taken, where none was taken after it
         self.left_out = 0  # frames that were never monitored, because too many waited
         self._waiting: deque[tuple[NDArray[np.float64], float | None]] = deque()
         self._times: deque[float] = deque(maxlen=max(_FEWEST, round(_RATED * self.layout.rate)) + 1)
-        self._diagnosis: Diagnosis | None = None
-        self._diagnosed = -np.inf
 
     def switch(self, sensor: Sensor) -> None:
         """Go on with what a maintenance run wrote: known faults, and how readings reach their
         cells."""
         before = self.sensor
-        self.sensor = sensor
+        repair = self._repair_of(sensor)
         # the frames so far read otherwise
-        if before.parts != sensor.parts or before.readings != sensor.readings:
-            self.faulty[:] = False
-            self.monitor = Monitor(sensor.diagnoser)
-            self._monitored = False
-            self._diagnosis = None
-        self.repair = self._repair()
-        self._tell_repair()
+        other = before.parts != sensor.parts or before.readings != sensor.readings
+        monitor = Monitor(sensor.diagnoser) if other else self.monitor
+        with self._changing:
+            if other:
+                self.faulty[:] = False
+            self.sensor = sensor
+            self.monitor = monitor
+            self.repair = repair
+            found = self._found()
+        if repair is not None:
+            repair.found(found)
 
     def restore(self, received: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return the whole frame in the unit in which it came; None where nothing restores it.
@@ -91,7 +99,7 @@ class Watch:
         """
         if self.repair is None or received.size != self.layout.n_cells:
             return None
-        readings = within_range(self._readings(received), self.layout)[0]
+        readings = within_range(_readings(received, self.sensor), self.layout)[0]
         whole, _, _ = self.repair.in_place(
             received, readings, self.sensor.version, self.sensor.calibration
         )
@@ -114,9 +122,11 @@ class Watch:
         self.last = self.clock()
         self._times.append(self.last)
         self._waiting.append((received, time))
-        if len(self._waiting) > self._most_waiting:
-            self._waiting.popleft()
-            self.left_out += 1
+        while len(self._waiting) > self._most_waiting:
+            with suppress(IndexError):  # it was taken just now
+                self._waiting.popleft()
+                self.left_out += 1
+        self._comes.set()
 
     @property
     def waiting(self) -> bool:
@@ -126,19 +136,43 @@ class Watch:
     def work(self) -> tuple[Fault, ...]:
         """Monitor the frame that waits longest, if one waits; return the faults that are new,
         changed or gone."""
-        if not self._waiting:
+        try:
+            received, time = self._waiting.popleft()
+        except IndexError:
             return ()
-        received, time = self._waiting.popleft()
-        readings = self._readings(received)
-        version = self.sensor.version
-        faults = self.monitor.update(readings if version is None else version.undo(readings), time)
-        self._monitored = True
-        if faults:
+        with self._changing:
+            sensor = self.sensor
+            monitor = self.monitor
+        readings = _readings(received, sensor)
+        version = sensor.version
+        faults = monitor.update(readings if version is None else version.undo(readings), time)
+        if not faults:
+            return ()
+        with self._changing:
+            if monitor is not self.monitor:  # its frames read otherwise than those of today
+                return ()
             for fault in faults:
                 self.faulty[list(fault.cells)] = fault.probability != 0
-            self._tell_repair()
-            self._diagnosis = None
+            repair = self.repair
+            found = self._found()
+        if repair is not None:
+            repair.found(found)
         return faults
+
+    def work_on(self, tell: Callable[[Fault], object]) -> None:
+        """Monitor frames as they come, until :meth:`end`; ``tell`` gets each fault that is new,
+        changed or gone."""
+        while not self._ended:
+            for fault in self.work():
+                tell(fault)
+            if not self._waiting:
+                self._comes.wait()
+                self._comes.clear()
+
+    def end(self) -> None:
+        """End :meth:`work_on` after the frame that is monitored now."""
+        self._ended = True
+        self._comes.set()
 
     def diagnostics(self, stamp: float) -> dict[str, Any]:
         """Return the content of the DiagnosticArray to publish now.
@@ -156,18 +190,14 @@ class Watch:
             level = Level.WARN if waited < max(GRACE, self._silence) else Level.STALE
             return stale_array(self.layout, self.refused or "no frame yet", level=level, **about)
         if now - self.last > self._silence:
-            self._diagnosis = None
             self._times.clear()
             message = self.refused or f"no frame for {now - self.last:.0f} s"
             return stale_array(self.layout, message, **about)
-        if not self._monitored and not self._waiting:  # after a switch
-            return stale_array(self.layout, "no frame yet", level=Level.WARN, **about)
-        if not self._monitored:
-            self.work()
-        if self._diagnosis is None or now - self._diagnosed > DIAGNOSED:
-            self._diagnosis = self.monitor.diagnosis()
-            self._diagnosed = now
-        return diagnostic_array(self._diagnosis, rate=self._rate(now), **about)
+        evaluated = self.monitor.evaluated
+        if evaluated is None:
+            what = "the first frames are being evaluated"
+            return stale_array(self.layout, what, level=Level.WARN, **about)
+        return diagnostic_array(evaluated, rate=self._rate(now), **about)
 
     def _rate(self, now: float) -> float | None:
         """Return the frames a second of late; None until enough of them came."""
@@ -176,20 +206,19 @@ class Watch:
             return None
         return (len(times) - 1) / max(times[-1] - times[0], 1e-9)
 
-    def _readings(self, received: NDArray[np.float64]) -> NDArray[np.float64]:
-        calibration = self.sensor.calibration
-        return (
-            received if calibration is None else calibration.apply(received)[0].astype(np.float64)
-        )
+    def _found(self) -> FaultSet:
+        return FaultSet(tuple(np.flatnonzero(self.faulty).tolist()), self.faulty.size)
 
-    def _repair(self) -> FrameRepair | None:
-        restorer = self.sensor.restorer
-        if restorer is None:
+    @staticmethod
+    def _repair_of(sensor: Sensor) -> FrameRepair | None:
+        if sensor.restorer is None:
             return None
-        restorer.deviation(self.sensor.known)  # before the first frame
-        return FrameRepair(restorer, self.sensor.known)
+        sensor.restorer.deviation(sensor.known)  # before the first frame
+        return FrameRepair(sensor.restorer, sensor.known)
 
-    def _tell_repair(self) -> None:
-        if self.repair is not None:
-            cells = np.flatnonzero(self.faulty).tolist()
-            self.repair.found(FaultSet(tuple(cells), self.faulty.size))
+
+def _readings(received: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
+    """Return received values in the layout's unit."""
+    if sensor.calibration is None:
+        return received
+    return sensor.calibration.apply(received)[0].astype(np.float64)

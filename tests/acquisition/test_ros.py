@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+import threading
 from array import array
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,8 @@ from adaptfault.data.calibration import Calibration
 from adaptfault.data.recordings.formats.message_arrays import arrays_at, join, put
 from adaptfault.imputation.restorer import Restorer
 from adaptfault.ros2 import parameters
-from adaptfault.ros2.parameters import DEFAULTS, Parameters, quoted
+from adaptfault.ros2.parameters import DEFAULTS, Parameters, quoted, unknown
+from adaptfault.ros2.rounds import Part, Rounds
 from adaptfault.ros2.sensor import Follower, Sensor
 from adaptfault.ros2.watch import WAITING, Watch
 from diagnostics import (
@@ -255,7 +257,11 @@ def test_silence_is_a_warning_before_the_first_frame_then_stale_and_ends_with_a_
     assert watch.diagnostics(5.0)["status"][0]["message"] == "no frame yet"
     now[0] += 6
     assert set(levels(watch.diagnostics(5.0)).values()) == {Level.STALE}
-    for frame in log[:40]:
+    take(watch, log[0])
+    first = watch.diagnostics(5.0)
+    assert set(levels(first).values()) == {Level.WARN}
+    assert first["status"][0]["message"] == "the first frames are being evaluated"
+    for frame in log[1:60]:
         take(watch, frame)
         now[0] += 0.1
     assert set(levels(watch.diagnostics(5.0)).values()) == {Level.OK}
@@ -264,7 +270,7 @@ def test_silence_is_a_warning_before_the_first_frame_then_stale_and_ends_with_a_
     stale = watch.diagnostics(5.0)
     assert set(levels(stale).values()) == {Level.STALE}
     assert stale["status"][0]["message"] == "no frame for 5 s"
-    take(watch, log[40])
+    take(watch, log[60])
     assert set(levels(watch.diagnostics(5.0)).values()) == {Level.OK}
 
 
@@ -273,14 +279,14 @@ def test_frames_below_the_declared_rate_are_a_warning_of_the_stream_and_a_slow_s
 ):
     now = [1000.0]
     watch = watch_of(SelfDiagnosis(LAYOUT), clock=lambda: now[0])
-    for frame in log[:40]:
+    for frame in log[:60]:
         take(watch, frame)
         now[0] += 0.2
     found = watch.diagnostics(5.0)
     assert {name for name, level in levels(found).items() if level} == {"stream"}
     assert found["status"][-1]["message"] == "5 frames a second, 10 are declared"
     slow = watch_of(SelfDiagnosis(replace(LAYOUT, rate=0.5)), clock=lambda: now[0])
-    for frame in log[:20]:
+    for frame in log[:60]:
         take(slow, frame)
         now[0] += 2.0
     now[0] += 5.0
@@ -294,19 +300,109 @@ def test_frames_of_another_sensor_are_told_as_such():
     assert watch.diagnostics(5.0)["status"][0]["message"] == "frames of 7 values come, expected 220"
 
 
-def test_frames_that_wait_to_be_monitored_are_diagnosed_later_and_counted_where_too_many_wait(log):
+def test_frames_that_wait_to_be_monitored_are_counted_where_too_many_wait(log):
     watch = watch_of(SelfDiagnosis(LAYOUT))
-    for frame in log[:3]:
-        watch.put(frame)
-    assert watch.diagnostics(5.0)["status"][-1]["values"][0] == {"key": "frames", "value": "1"}
-    watch.work()
-    assert watch.waiting
-    watch.work()
-    assert not watch.waiting
     assert watch.work() == ()
     for frame in np.resize(log, (WAITING + 2, 220)):
         watch.put(frame)
     assert watch.left_out == 2
+
+
+def test_frames_are_restored_and_no_status_is_stale_while_the_monitor_is_busy(
+    fitted, grasps, log, monkeypatch
+):
+    now = [1000.0]
+    known = FaultSet((115,), LAYOUT.n_cells)
+    restorer = Restorer(LAYOUT).fit(grasps.frames[::7])
+    watch = watch_of(fitted, clock=lambda: now[0], known=known, restorer=restorer)
+    for frame in log[:60]:
+        take(watch, frame)
+    begun = threading.Event()
+    goes_on = threading.Event()
+    fault = Fault("short", (7,), probability=1.0)
+
+    def busy(*frame: object) -> tuple[Fault, ...]:
+        begun.set()
+        assert goes_on.wait(60)
+        return (fault,)
+
+    monkeypatch.setattr(watch.monitor, "update", busy)
+    told = []
+    thread = threading.Thread(target=watch.work_on, args=[told.append])
+    thread.start()
+    watch.put(log[60])
+    assert begun.wait(60)
+    for frame in log[61:90]:
+        now[0] += 0.5  # a diagnosis of 15 s
+        assert watch.restore(frame)[3] == frame[3]
+        watch.put(frame)
+        assert Level.STALE not in levels(watch.diagnostics(5.0)).values()
+    assert not told
+    watch.end()
+    goes_on.set()
+    thread.join(60)
+    assert told == [fault]
+    assert set(watch.repair.fault_set) == {7, 115}
+
+
+def test_a_frame_that_is_monitored_while_a_version_changes_tells_nothing_of_the_new_one(
+    fitted, log, monkeypatch
+):
+    watch = watch_of(fitted)
+    other = replace(watch.sensor, parts={"model": "other"})
+
+    def switched(*frame: object) -> tuple[Fault, ...]:
+        watch.switch(other)
+        return (Fault("short", (7,), probability=1.0),)
+
+    monkeypatch.setattr(watch.monitor, "update", switched)
+    watch.put(log[0])
+    assert watch.work() == ()
+    assert not watch.faulty.any()
+
+
+def part(*values: float, of: str) -> Part:
+    return Part(np.array(values), of)
+
+
+def of_each(frame: list[Part]) -> list[str | None]:
+    return [one.message for one in frame]
+
+
+def test_messages_of_several_topics_become_frames_and_a_topic_that_fails_is_missing_in_them():
+    rounds = Rounds(2)
+    assert rounds.silent == []
+    assert rounds.add(0, part(1, 2, of="a1")) == []
+    assert rounds.silent == [1]
+    assert rounds.add(0, part(3, 4, of="a2")) == []  # the size of the other one is unknown
+    (frame,) = rounds.add(1, part(5, of="b1"))
+    assert of_each(frame) == ["a2", "b1"]
+    assert rounds.silent == []
+    assert rounds.add(1, part(6, of="b2")) == []
+    (late,) = rounds.add(1, part(7, of="b3"))
+    assert of_each(late) == [None, "b2"]
+    np.testing.assert_array_equal(late[0].values, [np.nan, np.nan])
+    (both,) = rounds.add(0, part(8, 9, of="a3"))
+    assert of_each(both) == ["a3", "b3"]
+
+
+def test_a_misspelt_parameter_is_refused_and_a_foreign_one_is_named():
+    with pytest.raises(ValueError, match="parameter bundel: there is none; did you mean bundle"):
+        unknown(["topic", "bundel"])
+    assert unknown([*DEFAULTS, "use_sim_time", "qos_overrides./tactile.depth"]) == []
+    (told,) = unknown(["camera_info_url"])
+    assert told.startswith("parameter camera_info_url is not used; there are topic, ")
+
+
+def test_each_of_several_topics_has_its_restored_one():
+    assert Parameters(topic="/skin").restored_topics == ("/tactile/restored",)
+    several = Parameters.from_values({"topic": ["/f/0", "/f/1"]})
+    assert several == Parameters(topic="/f/0, /f/1".replace(" ", ""))
+    assert several.topics == ("/f/0", "/f/1")
+    assert several.restored_topics == ("/f/0/restored", "/f/1/restored")
+    assert replace(several, restored="").restored_topics == ()
+    with pytest.raises(ValueError, match="restored names 1 topics, topic 2: name one for each"):
+        _ = replace(several, restored="/whole").restored_topics
 
 
 def test_the_node_restores_known_faults_and_those_that_its_monitor_finds(fitted, grasps, log):

@@ -254,6 +254,29 @@ def test_frames_of_a_best_effort_driver_come_back_whole_also_after_a_new_version
     assert "Traceback" not in said
 
 
+def test_several_topics_are_one_array_and_each_comes_back_whole(bench, bundle, small_grasps):
+    frames = np.concatenate(small_grasps.frames).astype("<f4")
+    came: dict[str, list[Float32MultiArray]] = {"/a": [], "/b": []}
+    drivers = []
+    for topic, kept in came.items():
+        drivers.append(bench.node.create_publisher(Float32MultiArray, topic, RELIABLE))
+        bench.node.create_subscription(Float32MultiArray, f"{topic}/restored", kept.append, 50)
+    process = bench.start(bundle=str(bundle.path), topic="/a,/b", camera_info_url="x")
+    count = iter(range(10**9))
+
+    def send() -> None:
+        frame = frames[next(count) % len(frames)]
+        for driver, values in zip(drivers, np.split(frame, [20]), strict=True):
+            driver.publish(Float32MultiArray(data=values))
+
+    bench.until(lambda: all(came.values()) and OK in bench.levels(), send)
+    assert [len(kept[0].data) for kept in came.values()] == [20, frames.shape[1] - 20]
+    code, said = bench.end(process)
+    assert code == 0
+    assert "parameter camera_info_url is not used" in said
+    assert "Traceback" not in said
+
+
 def test_a_parameter_that_cannot_be_converted_ends_it_with_one_line(bench):
     process = bench.start(layout="2x3x3", full_scale="N")
     assert process.wait(LIMIT) == 3
@@ -261,3 +284,10 @@ def test_a_parameter_that_cannot_be_converted_ends_it_with_one_line(bench):
         bench.output()
         == "tactile_diagnostics: parameter full_scale: expected a number from 0, got False\n"
     )
+
+
+def test_a_misspelt_parameter_ends_it_with_one_line(bench):
+    process = bench.start(layout="2x3x3", trsut="key.pem")
+    assert process.wait(LIMIT) == 3
+    said = "tactile_diagnostics: parameter trsut: there is none; did you mean trust?\n"
+    assert bench.output() == said

@@ -8,6 +8,7 @@ from adaptfault.data.recordings import Recordings
 from diagnostics import (
     Fault,
     FaultKind,
+    FaultSet,
     Line,
     Monitor,
     SelfDiagnosis,
@@ -130,7 +131,7 @@ def test_a_fault_is_reported_once_soon_after_it_is_detectable(fitted, log, middl
     _, changes = watched(fitted, inject(log, [Fault("short", (cell,), onset=300)], LAYOUT))
     ((frame, fault),) = changes
     assert (fault.kind, fault.cells) == (FaultKind.SHORT, (cell,))
-    assert 300 <= frame < 300 + 2 * 32  # it looks every 32 frames
+    assert 300 <= frame < 300 + 3 * 32  # it looks every 32 frames, twice
     assert fault.probability > 0.9
 
 
@@ -170,6 +171,42 @@ def test_while_a_row_breaks_hardly_a_cell_beside_it_is_reported_and_none_for_lon
     assert set(monitor.diagnosis().fault_set) == set(row.cells)
 
 
+class Said:
+    """An evaluation that says what a test states: cells of single faults, and wires."""
+
+    def __init__(self, *faults: Fault) -> None:
+        self.faults = faults
+        self.n_frames = 100
+        self.fault_set = FaultSet.of([cell for fault in faults for cell in fault.cells], 220)
+
+
+ROW = line_fault(LAYOUT, Line(0, "row", 5), FaultKind.OPEN)
+ONE = Fault("stuck", ROW.cells[:1])
+OTHER = Fault("drift", (7,))
+
+
+@pytest.mark.parametrize(
+    ("evaluations", "told"),
+    [
+        ([(ONE,), ()], []),  # withdrawn by the next one
+        ([(), (ONE, OTHER), (ONE,)], [ONE]),
+        ([(ONE,), (ONE,), (), (ONE,)], [ONE]),  # missing once is not gone
+        ([(ONE,), (ONE,), (), ()], [ONE, "gone"]),
+        ([(ONE,), (ONE,), (ROW,), (ROW,), (ROW,)], [ONE, ROW]),
+        ([tuple(Fault("open", (c,)) for c in ROW.cells), (ROW,)], [ROW]),
+    ],
+)
+def test_a_change_is_told_once_the_next_evaluation_confirms_it(evaluations, told):
+    monitor = Monitor(COLD)
+    changes = [change for said in evaluations for change in monitor._changes(Said(*said))]
+    assert ["gone" if fault.probability == 0 else fault for fault in changes] == told
+    said = {cell for fault in evaluations[-1] for cell in fault.cells}
+    assert monitor.evaluated.fault_set == said
+    last = {cell for fault in monitor._changes(Said(OTHER), final=True) for cell in fault.cells}
+    assert 7 in last
+    assert {cell for fault in monitor.faults for cell in fault.cells} >= {7}
+
+
 def test_frames_missing_according_to_the_clock_are_counted(fitted, log):
     monitor = Monitor(fitted)
     for i, frame in enumerate(log[:200]):
@@ -207,9 +244,9 @@ def test_a_cell_that_falls_silent_is_reported_soon_and_so_is_its_return(fitted, 
     (silent, first), (back, last) = [(i, fault) for i, fault in changes if fault.cells == (cell,)]
     assert first.kind is FaultKind.OPEN
     assert "delivers no reading from frame 300 on" in first.reason
-    assert 300 + 64 <= silent < 300 + 64 + 2 * 32
+    assert 300 + 64 <= silent < 300 + 64 + 3 * 32
     assert "gone since about frame" in last.reason
-    assert 600 <= back < 600 + 2 * 32
+    assert 600 <= back < 600 + 3 * 32
     assert without_recordings(monitor.diagnosis()) == without_recordings(fitted.diagnose(frames))
 
 

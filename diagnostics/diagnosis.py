@@ -41,6 +41,7 @@ from diagnostics.evidence.stream_state import StreamState
 from diagnostics.faults import Fault, FaultKind
 from diagnostics.healthy.reference_faults import find_reference_faults, never_moved
 from diagnostics.layout import SensorLayout
+from diagnostics.preprocessing.array_likes import plain_array
 from diagnostics.preprocessing.levels import (
     CERTAIN_RATIO,
     DOUBTED,
@@ -853,7 +854,7 @@ def checked_recordings(
 
 def _checked(recording: ArrayLike, name: str, layout: SensorLayout) -> NDArray[Any]:
     """Return a recording as ``[T, D]``, in its own dtype."""
-    given = np.asarray(recording)
+    given = plain_array(recording)
     if given.dtype.kind in "fiu" and given.shape[1:] in (layout.shape, (layout.n_cells,)):
         return given.reshape(len(given), layout.n_cells)
     return layout.check_recording(recording, name)

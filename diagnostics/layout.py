@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from diagnostics.preprocessing.array_likes import is_array, plain_array
 from diagnostics.wiring import Line, LineKind, members, nested
 
 Wiring = Literal["matrix", "bus"]
@@ -356,10 +357,14 @@ class SensorLayout:
         Args:
             given: one array ``[T, D]``, ``[T, pads, rows, cols]`` or, of a layout with one pad,
                 ``[T, rows, cols]``; or a sequence of such arrays; or recordings of one length in an
-                array with one axis more, ``[n, T, ...]``.
+                array with one axis more, ``[n, T, ...]``. An array may be one of torch, pandas or
+                xarray, or a masked one.
         """
-        one = isinstance(given, np.ndarray) and (given.ndim <= 2 or given.shape[1:] in self._grids)
-        return [given] if one else list(given)
+        if not is_array(given):
+            return [plain_array(one) if is_array(one) else one for one in given]
+        array = plain_array(given)
+        one = array.ndim <= 2 or array.shape[1:] in self._grids
+        return [array] if one else list(array)
 
     def check_frame(self, frame: ArrayLike) -> NDArray[np.float64]:
         """Return one frame as float64 ``[D]``; ``[pads, rows, cols]`` and, of one pad,
@@ -368,7 +373,7 @@ class SensorLayout:
         Raises:
             ValueError: another shape.
         """
-        values = np.asarray(frame, dtype=np.float64)
+        values = np.asarray(plain_array(frame), dtype=np.float64)
         if values.shape not in ((self.n_cells,), *self._grids):
             grid = list(self._grids[-1])
             raise ValueError(
@@ -385,7 +390,7 @@ class SensorLayout:
             ValueError: not numbers, or the shape does not fit this layout.
         """
         try:
-            frames = np.asarray(recording, dtype=np.float64)
+            frames = np.asarray(plain_array(recording), dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{name}: expected numbers [T, {self.n_cells}] ({error})") from None
         if frames.shape[1:] in self._grids:

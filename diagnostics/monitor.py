@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from diagnostics.evidence.life import Life
 from diagnostics.evidence.stepping import finished
+from diagnostics.preprocessing.array_likes import plain_array
 from diagnostics.threads import one_thread
 from diagnostics.wiring import Line
 
@@ -80,7 +81,7 @@ class Monitor:
                 processed.
         """
         layout = self._diagnoser.layout
-        reading = np.asarray(frame, dtype=np.float64).reshape(-1)
+        reading = np.asarray(plain_array(frame), dtype=np.float64).reshape(-1)
         if reading.size != layout.n_cells:
             raise ValueError(
                 f"expected a frame of {layout.n_cells} readings ({layout}), got {reading.size}"

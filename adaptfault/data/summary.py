@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnostics import SensorLayout
+from diagnostics.preprocessing.array_likes import is_array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -191,7 +192,7 @@ def summarise(
     highest = np.full(width, -np.inf)
     sample: list[NDArray[np.float64]] = []
     # or read one by one
-    given = layout.recordings(recordings) if isinstance(recordings, np.ndarray) else recordings
+    given = layout.recordings(recordings) if is_array(recordings) else recordings
     for i, recording in enumerate(given):
         frames = layout.check_recording(recording, f"recording {i}")
         known = np.isfinite(frames)

@@ -500,7 +500,9 @@ class SelfDiagnosis:
             faults=causes,
             probability=probability,
             tested=(found.alive & (stream.touched & shown)[self._place]) | inferred,
-            transport=stream.transport.faults(rest + scale.near, working, self.layout.rate, moved),
+            transport=stream.transport.faults(
+                rest + scale.near, working, self.layout.rate, moved, falls=self._falls(stream)
+            ),
             evidence={name: values[self._place] for name, values in evidence.items()},
             n_frames=stream.transport.seen,
             n_recordings=n_recordings,
@@ -588,6 +590,11 @@ class SelfDiagnosis:
         spatial = yield from _stepped(stream.spatial(explained, self._misleading(stream, life)))
         yield
         return spatial, self._found(stream, spatial, explained, log_ratio, life)
+
+    def _falls(self, stream: StreamState) -> bool | None:
+        """Return whether loads, as the stream holds them, may fall; None: nothing tells."""
+        is_known = stream.load is not None or self.reference_ is not None
+        return False if is_known or self.layout.rest != "learn" else None
 
     def _diagnosed(
         self, log: RecordingBlocks, needed: NDArray[np.bool_] | None = None

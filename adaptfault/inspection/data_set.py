@@ -5,12 +5,13 @@ frames and jitter of the clock; recordings that begin in contact, where a driver
 start takes the contact out; and recordings whose readings go to the other side of rest, where one
 did.
 
-With s_i the mean of the first readings of each cell in recording i, s their median over the
-recordings, l_i(t) the mean over the cells of the readings minus s, and p the median over the
-recordings of the peak of |l_i|, a recording begins in contact where the mean of |s_i - s| exceeds
-30 % of p, and was tared in contact where l_i goes 10 % of p to the other side of rest. Not
-detected: a tare in contact whose readings are cut off at 0, and one where most recordings begin in
-contact.
+With s the median over the recordings of the mean of the first readings of each cell, l_i(t) the
+mean over the cells of the readings minus s, signed so that load rises, L the median over the
+recordings of the lowest l_i, and p that of the highest minus the lowest, a recording begins in
+contact where l_i(0) exceeds L by 30 % of p. It was tared in contact where it begins at L, and goes
+10 % of p below: of three recordings or more, most of which begin at their lowest. Recordings agree
+more in what they read without load than with it, which shows the sign. Not detected: a tare in
+contact whose readings are cut off at 0, and one where most recordings begin in contact.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ SCHEMA = "adaptfault.check/1"
 _FIRST = 3  # frames of a recording from which its begin is taken
 _IN_CONTACT = 0.3  # of the median peak, as the begin of a contact event
 _BELOW = 0.1  # of the median peak, on the other side of rest
+_RECORDINGS = 3  # that show what rest is
 _JITTER = 0.2  # of the period: times say less about lost frames from here on
 _LISTED = 5
 
@@ -156,20 +158,41 @@ def starts_and_tares(
     """
     present = layout.present.ravel()
     starts = np.array([_mean(frames[:_FIRST, present]) for frames in recordings()])
-    rest = np.nan_to_num(_median(starts))
-    sides = np.zeros((len(starts), 2))
+    origin = np.nan_to_num(_median(starts))
+    begins = np.nan_to_num(starts - origin).mean(axis=1)
+    ends = np.zeros((len(starts), 2))
+    at_zero = np.zeros((len(starts), 2))
+    usual = np.zeros(len(starts))
     for i, frames in enumerate(recordings()):
-        loads = np.nan_to_num(frames[:, present] - rest).mean(axis=1)
-        sides[i] = loads.min(), loads.max()
-    peak = float(np.median(np.abs(sides).max(axis=1)))
+        loads = np.nan_to_num(frames[:, present] - origin).mean(axis=1)
+        extremes = [int(loads.argmin()), int(loads.argmax())]
+        ends[i] = loads[extremes]
+        usual[i] = np.median(loads)
+        at_zero[i] = (frames[extremes][:, present] == 0).mean(axis=1)
+    peak = float(np.median(ends[:, 1] - ends[:, 0]))
     if not peak > 0:
         return (), ()
-    begun = np.nan_to_num(np.abs(starts - rest)).mean(axis=1) > _IN_CONTACT * peak
-    rises = np.median(sides[:, 1]) >= -np.median(sides[:, 0])
-    other_side = -sides[:, 0] if rises else sides[:, 1]
-    tared = (other_side > _BELOW * peak) & ~begun & (begun.mean() < MAJORITY)
+    if len(starts) >= _RECORDINGS:  # they agree in rest
+        from_rest = [_spread(end) for end in ends.T]
+    else:  # most frames are at rest
+        from_rest = [float(np.median(np.abs(usual - end))) for end in ends.T]
+    rests = int(np.argmin(from_rest))
+    sign = 1 - 2 * rests
+    lowest = sign * ends[:, rests]
+    rest = np.median(lowest)
+    begins = sign * begins
+    begun = begins - rest > _IN_CONTACT * peak
+    is_usual = begins - lowest <= _BELOW * peak
+    # a sensor that reads 0 is not below its rest
+    is_below = (lowest < rest - _BELOW * peak) & (at_zero[:, rests] < MAJORITY)
+    many = len(starts) >= _RECORDINGS and is_usual.mean() > MAJORITY
     every = np.array(names, dtype=object)
-    return tuple(every[begun]), tuple(every[tared])
+    return tuple(every[begun]), tuple(every[is_below & ~is_usual & ~begun & many])
+
+
+def _spread(values: NDArray[np.float64]) -> float:
+    """Return the median distance from the median."""
+    return float(np.median(np.abs(values - np.median(values))))
 
 
 def _mean(frames: NDArray[Any]) -> NDArray[np.float64]:

@@ -5,7 +5,8 @@ Detects frames without any reading, one frame repeated too often while at least 
 loaded, and readings that no converter gives. In a frozen stream every cell looks stuck, so repeated
 frames are not used as evidence. Arrays that send exact zeros repeat frames without contact: a
 repetition without load is no fault. How often healthy frames repeat is learnt from the reference,
-apart for frames with load and for all frames.
+apart for frames with load and for all frames. Where nothing tells whether readings fall with load,
+a frame in which most cells read what is their highest in most of the log is one without load.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from diagnostics.preprocessing.levels import MAJORITY
 
 _LOADED_CELLS = 3  # working cells that must be loaded in a repeated frame: fewer may be idle
 _KEPT = 16  # most recent repetitions: a size
@@ -118,6 +121,8 @@ class TransportState:
         repetitions: the repetitions beyond patience; the last may continue.
         invalid: number of readings that no converter gives.
         first_invalid: number of the frame of the first of them; -1: none.
+        highest: float ``[D]``, of each cell.
+        at_highest: int ``[D]``, in how many frames it read that.
     """
 
     seen: int = 0
@@ -129,6 +134,8 @@ class TransportState:
     repetitions: tuple[Repetition, ...] = ()
     invalid: int = 0
     first_invalid: int = -1
+    highest: NDArray[np.float64] | None = None
+    at_highest: NDArray[np.intp] | None = None
 
     def receive(
         self, frames: NDArray[np.float64], present: NDArray[np.bool_], patience: Patience
@@ -151,6 +158,7 @@ class TransportState:
         if not len(arrived_at):
             return replace(state, seen=self.seen + len(frames)), arrived_at
         received = frames[arrived_at] if missed else frames
+        highest, at_highest = self._with_highest(received)
         before = np.full_like(received[:1], np.nan) if self.last is None else self.last[None]
         again = repetitions(np.concatenate([before, received]))[1:]
         index = np.arange(len(received))
@@ -164,6 +172,8 @@ class TransportState:
             last=received[-1].copy(),
             repeats=int(repeats[-1]),
             since=int(since[-1]),
+            highest=highest,
+            at_highest=at_highest,
         )
         if repeats.max() <= patience.loaded:
             return state, arrived_at
@@ -179,6 +189,26 @@ class TransportState:
             else:
                 recorded.append(Repetition(int(since[i]), int(repeats[i]) + 1, received[i].copy()))
         return replace(state, repetitions=tuple(recorded[-_KEPT:])), arrived_at[~beyond]
+
+    def _with_highest(
+        self, received: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+        """Return the highest reading of each cell with more frames, and how often it was read."""
+        highest = np.fmax.reduce(received)
+        count = np.count_nonzero(received == highest, axis=0)
+        if self.highest is None or self.at_highest is None:
+            return highest, count
+        highest = np.fmax(highest, self.highest)
+        counts = np.where(self.highest == highest, self.at_highest, 0)
+        return highest, counts + np.count_nonzero(received == highest, axis=0)
+
+    def _rests_high(self, frame: NDArray[np.float64], working: NDArray[np.bool_]) -> bool:
+        """Return whether a frame shows what a sensor whose readings fall with load reads
+        without."""
+        if self.highest is None or self.at_highest is None or not working.any():
+            return False
+        usual = self.at_highest > MAJORITY * (self.seen - self.lost)
+        return bool((usual & (frame == self.highest))[working].mean() > MAJORITY)
 
     def dropped(self, invalid: NDArray[np.bool_]) -> TransportState:
         """Return the state with the ``invalid`` readings of the next frames, bool ``[t, D]``,
@@ -202,6 +232,8 @@ class TransportState:
         working: NDArray[np.bool_],
         rate: float,
         moved: bool = True,
+        *,
+        falls: bool | None = False,
     ) -> tuple[TransportFault, ...]:
         """Return the transport faults.
 
@@ -211,6 +243,7 @@ class TransportState:
             rate: frames per second.
             moved: whether any cell moved in the log; if none did, ``working`` are the cells not
                 known to be faulty.
+            falls: whether readings fall with load; None: unknown.
         """
         found = []
         if self.lost:
@@ -238,7 +271,8 @@ class TransportState:
         )
         for r in self.repetitions:
             loaded = int((r.frame > loaded_from)[working].sum())
-            if loaded >= _LOADED_CELLS:
+            is_rest = falls is None and moved and self._rests_high(r.frame, working)
+            if loaded >= _LOADED_CELLS and not is_rest:
                 text = (
                     f"frame {r.onset}, in which {loaded} {cells} are loaded, was received"
                     f" {r.frames} times"

@@ -4,6 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from adaptfault.cli import main
 from adaptfault.data.recordings import load
@@ -199,3 +201,33 @@ def test_the_data_set_itself_is_never_changed(data_set, tmp_path):
     main(["check", str(data_set), "--write-valid", str(tmp_path / "valid.npz")])
     assert {path: path.read_bytes() for path in data_set.iterdir()} == before
     assert len(load(data_set).recordings) == 40
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    sign=st.sampled_from([1, -1]),
+    standing=st.lists(st.booleans(), min_size=1, max_size=8),
+    rest=st.sampled_from([0.0, 0.5]),
+    seed=st.integers(0, 99),
+)
+def test_a_recording_that_begins_in_contact_was_not_tared(sign, standing, rest, seed):
+    """Steps of two feet, some recordings of which begin while both stand."""
+    rng = np.random.default_rng(seed)
+    frames = np.arange(200)
+    recordings = []
+    for stands in standing:
+        phase = rng.uniform(0, 50)
+        steps = [np.maximum(np.sin((frames + phase) / 8 + foot), 0) for foot in (0, np.pi)]
+        load = np.repeat(steps, 6, axis=0).T * rng.uniform(0.2, 0.4, 12)
+        if stands:
+            load[:20] = rng.uniform(0.1, 0.3, 12)
+        recordings.append(rest + sign * load)
+    assert starts(recordings)[1] == ()
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_recordings_that_begin_at_rest_get_no_remark_whichever_way_readings_go(sign, n):
+    idle = np.full((100, 12), 0.1)
+    recordings = [0.5 + sign * np.concatenate([idle, one]) for one in contacts(n)]
+    assert starts(recordings) == ((), ())

@@ -137,3 +137,25 @@ def test_each_frame_is_counted_how_often_it_came_again(log):
     assert repetitions(freeze_stream(log, 40, 44))[38:46].tolist() == [0, 0, 0, 1, 2, 3, 0, 0]
     assert repetitions(np.full((5, 3), np.nan)).tolist() == [0, 1, 2, 3, 4]
     assert not len(repetitions(np.empty((0, 3))))
+
+
+@pytest.mark.parametrize("size", [1, 7, 1000])
+@pytest.mark.parametrize("highest", [0.6, 5.0])
+def test_a_sensor_that_rests_high_is_not_frozen_while_nothing_touches_it(size, highest):
+    rng = np.random.default_rng(1)
+    rest = rng.uniform(0.5, 1, CELLS) * highest
+    untouched = np.tile(rest, (400, 1))
+    for first in range(100, 400, 60):  # a contact of 20 frames on some cells
+        untouched[first : first + 20] -= rng.uniform(0, 0.5, (20, CELLS)) * (
+            rng.random(CELLS) < 0.6
+        )
+    transport, _ = received(untouched, size)
+    assert [one.kind for one in transport.faults(LOADED_FROM, PRESENT, 10)] == ["frozen"] * 6
+    assert transport.faults(LOADED_FROM, PRESENT, 10, falls=None) == ()
+
+
+def test_a_frozen_stream_is_told_also_where_nothing_says_whether_readings_fall(log):
+    transport, _ = received(freeze_stream(log, 60, 160))
+    assert [one.kind for one in transport.faults(LOADED_FROM, PRESENT, 10, falls=None)] == [
+        "frozen"
+    ]

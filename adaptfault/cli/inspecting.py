@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.options import (
-    check_scale,
     fit_diagnoser,
     fitting_bar,
     load_recordings,
     open_reported,
     report_inferred,
+    report_problems,
     say,
 )
 
@@ -107,6 +107,7 @@ def _inspected(
     healthy: list[NDArray[Any]] | None,
 ) -> Inspection:
     """Inspect a log, as the version of the bundle that runs reads it."""
+    from adaptfault.data.recordings.check import check_scale
     from adaptfault.inspection.long_log import inspect_parts
     from diagnostics import SelfDiagnosis
 
@@ -117,7 +118,7 @@ def _inspected(
     def parts() -> Iterator[list[NDArray[Any]]]:
         for i, part in enumerate(log.parts()):
             if is_known and i == 0:
-                check_scale(args.recordings[0], part, log.layout)
+                report_problems(args, check_scale(args.recordings[0], part, log.layout))
             yield part if version is None else [version.undo(frames) for frames in part]
 
     say(args, f"diagnosing {len(log)} recording{'s' * (len(log) != 1)}")

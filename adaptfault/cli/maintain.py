@@ -16,6 +16,7 @@ from adaptfault.cli.options import (
     add_untested_code,
     command,
     emit,
+    report_problems,
     say,
     trust,
 )
@@ -88,8 +89,7 @@ def _maintain(args: argparse.Namespace) -> int:
     routine = None if args.after is None else Routine.read(args.after)
     bundle = Bundle.open(args.bundle, **trust(args))
     incoming = load_new_recordings(bundle, args.recordings)
-    for problem in incoming.problems:
-        print(problem, file=sys.stderr)
+    report_problems(args, incoming.problems)
     report = maintain(
         bundle,
         incoming.frames,

@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING, Any
 from adaptfault.data.printable import printable
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from adaptfault.data.recordings import Loaded, Opened, Problem, Recordings
     from adaptfault.data.summary import Summary
     from diagnostics import Diagnosis, FaultSet, SelfDiagnosis, SensorLayout
@@ -315,9 +313,7 @@ def load_reported(
 
     tables: dict[str, Any] = {name: getattr(args, name, None) for name in ("labels", "targets")}
     loaded = load(paths, frames=args.frames, **tables, **_options_of(args, layout))
-    _report(args, loaded.problems)
-    if layout is not None:
-        check_scale(paths[0], loaded.recordings, layout)
+    report_problems(args, loaded.problems)
     return loaded
 
 
@@ -344,7 +340,7 @@ def open_reported(
             progress=advance,
             **_options_of(args, layout),
         )
-    _report(args, opened.problems)
+    report_problems(args, opened.problems)
     return opened
 
 
@@ -381,7 +377,7 @@ def _options_of(args: argparse.Namespace, layout: SensorLayout | None) -> dict[s
     return {**_agreeing(args, layout), "layout": layout, "strict": True}
 
 
-def _report(args: argparse.Namespace, problems: Sequence[Problem]) -> None:
+def report_problems(args: argparse.Namespace, problems: Sequence[Problem]) -> None:
     """Print the problems; recordings that are left out make the exit code 1 at least."""
     for problem in problems:
         print(problem, file=sys.stderr)
@@ -434,44 +430,6 @@ def _agreeing(args: argparse.Namespace, layout: SensorLayout) -> dict[str, Any]:
     if args.rate is not None and not same_rate(args.rate, layout.rate):
         raise ValueError(f"--rate {args.rate:g} given, expected {layout.rate:g} Hz")
     return {name: options[name] for name in ("calibration", *_PLACES)}
-
-
-def check_scale(path: str, recordings: Iterable[NDArray[Any]], layout: SensorLayout) -> None:
-    """Refuse readings most of which exceed the full scale; warn if none comes near it.
-
-    Args:
-        path: for messages.
-        recordings: ``[T, D]`` each.
-        layout: that of a model or of a reference.
-
-    Raises:
-        ValueError: more than half of the readings above 0 exceed the full scale.
-    """
-    import numpy as np
-
-    # A cell that reads the same all the time shows no unit: it may be broken.
-    moving = [
-        frames[
-            :,
-            np.nanmin(frames, axis=0, initial=np.inf) < np.nanmax(frames, axis=0, initial=-np.inf),
-        ]
-        for frames in recordings
-    ]
-    readings = np.concatenate([frames[frames > 0] for frames in moving])
-    if not readings.size:
-        return
-    full = layout.full_scale
-    largest = float(readings.max())
-    if np.median(readings) > 1.02 * full:
-        raise ValueError(
-            f"{path}: readings reach {largest:.4g} where the full scale is {full:g} {layout.unit};"
-            " use recordings in the same unit"
-        )
-    if largest < 0.1 * full:
-        what = (
-            f"the largest reading is {largest:.4g} where the full scale is {full:g} {layout.unit}"
-        )
-        print(f"warning: {path}: {what}; is it the same unit?", file=sys.stderr)
 
 
 def refuse_missing(args: argparse.Namespace) -> None:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
-from adaptfault.cli.options import Commands, add_trust, command, emit, say, trust
+from adaptfault.cli.options import Commands, add_trust, command, emit, report_problems, say, trust
 
 _EXAMPLE = """  adaptfault restore today/ --bundle robot.bundle --out restored/
       writes restored.npz, readable by every command,
@@ -57,8 +56,7 @@ def run(args: argparse.Namespace) -> int:
         bundle.known_faults().fault_set if args.faults is None else fault_set(args.faults, layout)
     )
     incoming = load_new_recordings(bundle, args.recordings)
-    for problem in incoming.problems:
-        print(problem, file=sys.stderr)
+    report_problems(args, incoming.problems)
     say(
         args,
         f"{len(faults)} of {layout.present.sum()} cells are faulty; restoring"

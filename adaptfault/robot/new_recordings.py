@@ -35,7 +35,8 @@ def load_new_recordings(bundle: Bundle, paths: Sequence[str | PathLike[str]]) ->
     """Read files and folders of recordings for a bundle.
 
     Recordings of ``adaptfault listen`` lie beside a ``layout.json`` and are in its unit. All others
-    are raw and are converted with the bundle's calibration where it has one.
+    are raw and are converted with the bundle's calibration where it has one. What
+    ``adaptfault diagnose`` refuses for the bundle is refused: another shape, rate or scale.
 
     Raises:
         InputError: a path does not exist, or nothing could be read.
@@ -45,7 +46,7 @@ def load_new_recordings(bundle: Bundle, paths: Sequence[str | PathLike[str]]) ->
     ready = [p for p in given if ((p if p.is_dir() else p.parent) / "layout.json").exists()]
     raw = [p for p in given if p not in ready]
     parts = [
-        load(p, layout=bundle.layout, calibration=t)
+        load(p, layout=bundle.layout, calibration=t, strict=True)
         for p, t in ((ready, None), (raw, bundle.parts.calibration))
         if p
     ]

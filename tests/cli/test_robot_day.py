@@ -133,3 +133,44 @@ def test_a_day_of_a_robots_life(bundle, later_grasps, broken_row, tmp_path, caps
     assert (code, bundle.active().number) == (0, 2), out
     what = [entry["what"] for entry in json.loads(here("history", path, "--json")[1])["runs"]]
     assert what == ["deployed", "confirmed", "deployed", "refused", "rollback"]
+
+
+OF_A_BUNDLE = [
+    ("diagnose", "{log}", "--reference", "{bundle}"),
+    ("check", "{log}", "--reference", "{bundle}"),
+    ("view", "{log}", "--bundle", "{bundle}", "--mcap", "{out}"),
+    ("maintain", "{bundle}", "{log}", "--dry-run"),
+    ("predict", "{log}", "--bundle", "{bundle}"),
+    ("restore", "{log}", "--bundle", "{bundle}", "--out", "{out}"),
+    ("selftest", "{bundle}", "{log}", "--number", "2"),
+    ("evaluate", "{bundle}", "{log}"),
+]
+
+
+@pytest.mark.parametrize("arguments", OF_A_BUNDLE, ids=lambda arguments: arguments[0])
+@pytest.mark.parametrize(
+    ("stated", "said"),
+    [
+        ({"rate": 3.3}, "rate 3.3 Hz where 10 Hz is expected"),
+        ({"full_scale": 50.0}, "full scale 50 N where 5 N is expected"),
+        ({"shape": (1, 3, 10)}, "frames of 1 x 3 x 10"),
+        ({"times": 1000.0}, "use recordings in the same unit"),
+    ],
+    ids=["rate", "full scale", "shape", "unit"],
+)
+def test_every_command_refuses_what_is_of_another_sensor_than_the_bundle(
+    made_bundle, later_grasps, tmp_path, capsys, arguments, stated, said
+):
+    layout = Bundle.open(made_bundle).layout
+    frames = np.stack([one[:20] for one in later_grasps[:6]])
+    pads, rows, columns = stated.get("shape", layout.shape)
+    frames = frames[..., : pads * rows * columns].reshape(6, 20, pads, rows, columns)
+    beside = {"rate": layout.rate, "full_scale": layout.full_scale, "unit": layout.unit}
+    known = {name: stated.get(name, value) for name, value in beside.items()}
+    given = {} if "times" in stated else known
+    labels = np.arange(6) % 3
+    np.savez(tmp_path / "log.npz", frames=frames * stated.get("times", 1), labels=labels, **given)
+    places = {"log": tmp_path / "log.npz", "bundle": made_bundle, "out": tmp_path / "out.mcap"}
+    code = main([argument.format(**places) for argument in arguments])
+    assert code == 3
+    assert said in capsys.readouterr().err

@@ -4,7 +4,9 @@ ones get a warning."""
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -103,6 +105,42 @@ def _disorder(content: Content, i: int, elapsed: Elapsed) -> list[Problem]:
         what += ": the clock was reset, or the frames are not in order; kept as they stand"
         found.append(what)
     return [Problem("warning", located(content.path, what)) for what in found]
+
+
+def check_scale(
+    path: PathLike[str] | str, recordings: Iterable[NDArray[Any]], layout: SensorLayout
+) -> list[Problem]:
+    """Refuse readings most of which exceed the full scale of a model or a reference; warn if none
+    comes near it.
+
+    Args:
+        path: for messages.
+        recordings: ``[T, D]`` each.
+        layout: that of the model.
+
+    Raises:
+        InputError: more than half of the readings above 0 exceed the full scale.
+    """
+    # A cell that reads the same all the time shows no unit: it may be broken.
+    moving = [
+        frames[
+            :,
+            np.nanmin(frames, axis=0, initial=np.inf) < np.nanmax(frames, axis=0, initial=-np.inf),
+        ]
+        for frames in recordings
+    ]
+    readings = np.concatenate([frames[frames > 0] for frames in moving])
+    if not readings.size:
+        return []
+    largest = float(readings.max())
+    expected = f"where the full scale is {layout.full_scale:g} {layout.unit}"
+    if np.median(readings) > 1.02 * layout.full_scale:
+        what = f"readings reach {largest:.4g} {expected}; use recordings in the same unit"
+        raise InputError.at(Path(path), what)
+    if largest >= 0.1 * layout.full_scale:
+        return []
+    what = f"the largest reading is {largest:.4g} {expected}; is it the same unit?"
+    return [Problem("warning", located(Path(path), what))]
 
 
 def without_infinite(frames: NDArray[Any]) -> NDArray[Any]:

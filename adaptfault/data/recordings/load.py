@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from adaptfault.data.recordings.check import (
     OutOfRange,
     check_readings,
+    check_scale,
     check_width,
     other_lengths,
     without_infinite,
@@ -253,8 +254,8 @@ def load(
         frames: the number of frames that each recording must have; None = any.
         calibration: tables that turn the counts read into newtons (or the file that holds them).
         full_scale, unit, rate: override the layout and the files.
-        strict: refuse files that state another full scale or rate than ``layout``, as a model's
-            layout requires.
+        strict: refuse files that state another full scale or rate than ``layout``, and readings
+            that exceed its full scale, as a model's layout requires.
         targets: a table of the values that a regression learns, with the columns ``file``, maybe
             ``frame``, and one for each value, paths relative to it; a file has one recording, and
             one that is not in the table is left out. Labels are not read then.
@@ -277,8 +278,9 @@ def load(
         largest reading. The rate is the file's, or that of its times, or 10 Hz. Every inferred fact
         is in ``inferred``.
     """
+    given = [paths] if isinstance(paths, str | PathLike) else list(paths)
     opened = open_recordings(
-        paths,
+        given,
         layout=layout,
         shape=shape,
         labels=labels,
@@ -301,7 +303,9 @@ def load(
         opened.targets,
         opened.value_names,
     )
-    return Loaded(recordings, (*opened.problems, *opened.late_problems), opened.inferred)
+    scale = check_scale(given[0], recordings, opened.layout) if strict else []
+    problems = (*opened.problems, *opened.late_problems, *scale)
+    return Loaded(recordings, problems, opened.inferred)
 
 
 def open_recordings(

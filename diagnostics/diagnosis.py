@@ -54,6 +54,7 @@ from diagnostics.preprocessing.levels import (
 from diagnostics.preprocessing.load import LoadDirection
 from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.sensor.rewiring import Rewiring, find_rewiring
+from diagnostics.sensor.shared import Shared, measured
 from diagnostics.threads import one_thread
 
 SCHEMA = "adaptfault.diagnoser/1"
@@ -174,8 +175,9 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame with a reading.
         """
+        log = checked_recordings(recordings, self.layout)
         with one_thread():
-            return self._fit(checked_recordings(recordings, self.layout), progress)
+            return self._fit(RecordingBlocks(measured(log, self.layout)), progress)
 
     def _fit(
         self,
@@ -259,9 +261,12 @@ class SelfDiagnosis:
         Raises:
             ValueError: recordings that do not fit the layout, or hold no frame.
         """
-        log = checked_recordings(recordings, self.layout)
+        shared = Shared.of(checked_recordings(recordings, self.layout), self.layout)
+        if shared.explains_all:
+            return shared.diagnosis()
+        log = RecordingBlocks(shared.recordings)
         with one_thread():
-            return self.for_log(log.given)._diagnosed(log)
+            return shared.told(self.for_log(log.given)._diagnosed(log))
 
     def for_log(
         self,

@@ -3,7 +3,7 @@ decides."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -19,17 +19,28 @@ from adaptfault.inspection.converter_range import within_range
 from adaptfault.inspection.severity import Name, of_faults, of_finding, untested, worst
 from diagnostics import Diagnosis, SelfDiagnosis, SensorLayout
 from diagnostics.diagnosis import checked_recordings
+from diagnostics.preprocessing.readings import RecordingBlocks
 from diagnostics.sensor.common_mode import CommonMode, find_common_mode
 from diagnostics.sensor.converter_change import find_converter_change
 from diagnostics.sensor.disturbance import Disturbance, find_disturbances, find_sentinel
 from diagnostics.sensor.recalibration import Recalibration
 from diagnostics.sensor.rewiring import Rewiring
 from diagnostics.sensor.sensor_change import SensorChange
+from diagnostics.sensor.shared import Shared, measured
 
 SCHEMA = "adaptfault.inspection/1"
 
-OF_CELLS = ("fault", "wire", "static_load", "frozen", "lost_frames", "untested")
-"""Names of the findings that the diagnosis of the cells gives."""
+OF_FRAMES: Mapping[str, Name] = {
+    "frozen": "frozen",
+    "lost": "lost_frames",
+    "one_signal": "one_signal",
+    "corrupt_frame": "corrupt_frame",
+    "common_spike": "common_spike",
+}
+"""Names of the findings of each kind of transport fault."""
+
+OF_CELLS = ("fault", "wire", "static_load", *OF_FRAMES.values(), "untested")
+"""Names of the findings that a diagnosis gives."""
 
 _OF_ALL_CELLS = ("noise", "quantised", "saturated", "normalised")
 
@@ -139,13 +150,17 @@ def inspect(
         ValueError: recordings that do not fit the layout, or hold no frame.
     """
     layout = diagnoser.layout
-    given = list(checked_recordings(recordings, layout))
-    healthy = (
-        []
-        if reference is None
-        else [within_range(r, layout)[0] for r in checked_recordings(reference, layout)]
-    )
+    shared = Shared.of(checked_recordings(recordings, layout), layout)
+    given = list(RecordingBlocks(shared.recordings))
     log = [within_range(frames, layout)[0] for frames in given]
+    healthy: list[NDArray[np.float64]] = []
+    if reference is not None:
+        usable = RecordingBlocks(measured(checked_recordings(reference, layout), layout))
+        healthy = [within_range(frames, layout)[0] for frames in usable]
+    if shared.explains_all:
+        diagnosis = shared.diagnosis()
+        alone = ChangedReadings(None, None, log, diagnosis)
+        return Inspection(alone, tuple(of_diagnosis(diagnosis)))
     disturbances = _disturbances(given, log, healthy, layout)
     if any(one.name == "silent_array" for one in disturbances):
         findings = [_finding(one) for one in disturbances]
@@ -171,6 +186,7 @@ def inspect(
     change = _change(_with_offset(readings, common, log), healthy, diagnoser, disturbances)
     if change is not None:  # measures it
         disturbances = [one for one in disturbances if one.name != "offset"]
+    readings = replace(readings, diagnosis=shared.told(readings.diagnosis))
     findings = [
         *_of_readings(readings),
         *(_finding(one) for one in disturbances),
@@ -274,14 +290,19 @@ def _of_change(change: SensorChange | None) -> list[Finding]:
 def of_diagnosis(diagnosis: Diagnosis) -> list[Finding]:
     """Return the faults, wires, static loads, lost frames and what was not tested."""
     severity = of_faults(diagnosis)
+    of_frames = [
+        _told(OF_FRAMES[one.kind], one.reason)
+        for one in diagnosis.transport
+        if one.kind in OF_FRAMES
+    ]
+    told = {one.reason for one in of_frames}
     findings = [
-        Finding("fault" if f.line is None else "wire", severity, f.reason) for f in diagnosis.faults
+        Finding("fault" if f.line is None else "wire", severity, f.reason)
+        for f in diagnosis.faults
+        if f.reason not in told
     ]
     findings += [_told("static_load", load.reason) for load in diagnosis.static_loads]
-    findings += [_told("frozen", frozen.reason) for frozen in diagnosis.frozen]
-    findings += [
-        _told("lost_frames", link.reason) for link in diagnosis.transport if link.kind == "lost"
-    ]
+    findings += of_frames
     reason = untested(diagnosis)
     if reason is not None:
         findings.append(_told("untested", reason))

@@ -34,6 +34,10 @@ Name = Literal[
     "static_load",
     "untested",
     "lost_frames",
+    "one_signal",
+    "corrupt_frame",
+    "common_spike",
+    "swapped_in_part",
 ]
 NAMES: tuple[str, ...] = get_args(Name)
 """Names of findings; they never change, because programs ask for them."""
@@ -51,6 +55,8 @@ UNTESTED = 0.05
 
 _OF_FINDING: Mapping[Name, int] = {
     "rewired": 2,
+    "swapped_in_part": 2,
+    "one_signal": 2,
     "normalised": 2,
     "silent_array": 2,
     "lost_frames": 0,

@@ -190,11 +190,12 @@ class Diagnosis:
 
     @property
     def exit_code(self) -> int:
-        """0: no fault. 1: single cells, a static load or a frozen stream. 2: a wire, or a tenth of
-        the cells."""
+        """0: no fault. 1: single cells, a static load, or frames that were frozen, corrupt or
+        shifted. 2: a wire, or a tenth of the cells."""
         few = len(self.fault_set) < 0.1 * self.layout.present.sum()
         if not self.faults:
-            return 1 if self.static_loads or self.frozen else 0
+            frames = {fault.kind for fault in self.transport} - {"lost", "invalid"}
+            return 1 if self.static_loads or frames else 0
         return 1 if few and all(f.line is None for f in self.faults) else 2
 
     def map(self, count_from: int = 0) -> str:
@@ -233,7 +234,7 @@ class Diagnosis:
         reasons += [wire.reason for wire in self.possible] + [
             load.reason for load in self.static_loads
         ]
-        reasons += [fault.reason for fault in self.transport]
+        reasons += [fault.reason for fault in self.transport if fault.reason not in reasons]
         recordings = "1 recording" if self.n_recordings == 1 else f"{self.n_recordings} recordings"
         frames = "1 frame" if self.n_frames == 1 else f"{self.n_frames} frames"
         head = f"{found} in {recordings} ({frames}); {self.coverage}"

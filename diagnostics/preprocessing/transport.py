@@ -29,8 +29,9 @@ class TransportFault:
     """Frames or readings that did not arrive as they were measured.
 
     Attributes:
-        kind: ``"lost"`` (frames without any reading), ``"frozen"`` (one frame repeated) or
-            ``"invalid"`` (readings that no converter gives).
+        kind: ``"lost"`` (frames without any reading), ``"frozen"`` (one frame repeated),
+            ``"invalid"`` (readings that no converter gives), ``"corrupt_frame"``,
+            ``"common_spike"`` or ``"one_signal"`` (:mod:`diagnostics.sensor.shared`).
         onset: number of the first such frame.
         frames: how many frames; of ``"invalid"``: how many readings.
         reason: one plain sentence.

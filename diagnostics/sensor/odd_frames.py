@@ -133,11 +133,10 @@ def _candidates(
     step = max(4 * _NEAR, _BLOCK // len(present))
     for begin in range(0, len(recording), step):
         first = max(0, begin - _NEAR)
-        frames = np.asarray(recording[first : begin + step + _NEAR], dtype=np.float64)
+        frames = _finite(recording[first : begin + step + _NEAR])
         arrived = np.flatnonzero(~np.isnan(frames).all(axis=1, where=present))
         frames = frames[arrived]
         numbers = first + arrived
-        frames[~np.isfinite(frames)] = np.nan
         jumps, sizes = jumps_of(frames)
         jumped = (np.abs(jumps) > least) & present
         jumped &= ((numbers >= begin) & (numbers < begin + step))[:, None]
@@ -167,6 +166,13 @@ def without_odd_frames(
             frames[one.frame, cells] = frames[good, cells]
         cleaned[i - first] = frames
     return cleaned
+
+
+def _finite(frames: NDArray[Any]) -> Floats:
+    """Return frames ``[T, D]`` with NaN for what is infinite."""
+    finite = np.array(frames, dtype=np.float64)
+    finite[~np.isfinite(finite)] = np.nan
+    return finite
 
 
 def _nearest_good(one: OddFrame, odd: Sequence[OddFrame], n_frames: int) -> int:
@@ -231,11 +237,10 @@ class _Usual:
             return None
         step = max(1, len(recordings) // _SAMPLE)
         few = max(_SAMPLE, _MOST * step // len(recordings))
-        jumps = np.concatenate(
-            [jumps_of(np.asarray(r[:few], np.float64)) for r in recordings[::step]]
-        )
+        jumps = np.concatenate([jumps_of(_finite(r[:few]))[0] for r in recordings[::step]])
         by_cell = np.quantile(np.abs(jumps), 1 - 2 * LOW, axis=0)
-        low, high = (np.full(len(present), np.nan) for _ in range(2))
+        low = np.full(len(present), np.nan)
+        high = low.copy()
         low[present] = known_quantile(sample[:, present], LOW, axis=0)
         high[present] = known_quantile(sample[:, present], 1 - LOW, axis=0)
         return cls(low, high, np.maximum(LIGHT * (top - bottom), _USUAL * by_cell))
@@ -380,11 +385,9 @@ def evenly(
         [t for t in range(0, len(frames), step) if (i, t) not in without]
         for i, frames in enumerate(recordings)
     ]
-    sample = np.concatenate(
-        [np.asarray(r[some], np.float64) for r, some in zip(recordings, chosen, strict=True)]
+    return np.concatenate(
+        [_finite(frames[some]) for frames, some in zip(recordings, chosen, strict=True)]
     )
-    sample[~np.isfinite(sample)] = np.nan
-    return sample
 
 
 def _followers(sample: Floats) -> NDArray[np.intp]:

@@ -61,7 +61,7 @@ class Scale:
 
 
 def infer_shape(contents: Sequence[Content]) -> tuple[Shape, str]:
-    """Return the shape that a file states, or one that names in a file show, or the paper's for
+    """Return the shape that most files state, or one that names in a file show, or the paper's for
     frames of 220 readings, and the reason.
 
     The reason is empty where a file states pads, rows and columns.
@@ -69,7 +69,12 @@ def infer_shape(contents: Sequence[Content]) -> tuple[Shape, str]:
     Raises:
         InputError: no file states a shape and the frames have another width.
     """
-    for content in sorted(contents, key=lambda one: bool(one.facts.shape_reason)):
+    shapes = Counter(content.shape for content in contents)
+
+    def rank(content: Content) -> tuple[bool, int]:
+        return bool(content.facts.shape_reason), -shapes[content.shape]
+
+    for content in sorted(contents, key=rank):
         if content.shape is not None:
             if content.facts.shape_reason:
                 return content.shape, content.facts.shape_reason

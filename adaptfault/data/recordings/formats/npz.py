@@ -342,7 +342,8 @@ def _is_joined(frames: NDArray[Any], lengths: NDArray[Any]) -> bool:
     """Return whether the frames of all recordings stand one behind the other."""
     if lengths.dtype.kind not in "iu" or lengths.ndim != 1 or (lengths < 0).any():
         return False
-    return len(lengths) != len(frames) and int(lengths.sum()) == len(frames)
+    is_padded = frames.ndim > 2 and len(lengths) == len(frames)
+    return not is_padded and int(lengths.sum()) == len(frames)
 
 
 def _parted(frames: NDArray[Any], lengths: NDArray[Any]) -> tuple[NDArray[Any], ...]:

@@ -61,6 +61,7 @@ _SHOWN = 12  # arrays in a message
 _BESIDE = ("", "data", "meta")  # groups in which arrays of the whole file stand
 _ROOM = 64 << 20  # bytes of readings that are read at once
 _MOST_CELLS = 1_000_000  # of a frame; more is damage, or an attack on the memory
+_MOST_AXES = 4  # of a frame: hands, pads, rows, columns
 _LONGEST_UNIT = 16
 
 
@@ -261,6 +262,10 @@ class _Chooser:
             InputError: a frame is larger than any sensor.
         """
         sizes = tuple(self._sizes(name) for name in part.names)
+        for name, size in zip(part.names, sizes, strict=True):
+            if len(size) > _MOST_AXES:
+                what = f"{name} has {len(self.contents.arrays[name].shape)} axes; expected at most"
+                raise InputError.at(self.path, f"{what} those of [n, T, pads, rows, columns]")
         cells = sum(map(math.prod, sizes))
         if cells > _MOST_CELLS:
             what = f"{part.names[0]} declares {cells:,} numbers a frame"
@@ -288,12 +293,19 @@ class _Chooser:
 
     def readings(self, part: _Part) -> _Readings:
         """Return what is read of a recording."""
-        packings = [Packing.of(self.contents.attributes.get(name, {})) for name in part.names]
+        packings = [self._packing(name) for name in part.names]
         tick = None
         if part.clock is not None:
             units = self.contents.attributes.get(part.clock, {}).get("units")
             tick = unit_of(part.clock, units)
         return _Readings(part, tuple(packings), self._is_turned(part.names[0]), tick)
+
+    def _packing(self, name: str) -> Packing:
+        try:
+            return Packing.of(self.contents.attributes.get(name, {}))
+        except ValueError as error:
+            what = f"{name} has the attribute {error}; expected a number other than 0"
+            raise InputError.at(self.path, what) from None
 
     def facts(self, part: _Part, pads: Pads) -> Facts:
         """Return what the file states of its array, from one of its recordings."""
@@ -345,7 +357,7 @@ class _Chooser:
                 for i in range(length):
                     yield start(0, frames, outer=i, clock=None, label=label(0, frames, i, length))
                 continue
-            column = self._near(names[0], EPISODES, length) if self.ends is None else None
+            column = self._episode_column(names[0], length)
             if self.ends is not None:
                 bounds = self._bounds(self.ends, length)
             elif column is not None and not group:
@@ -357,9 +369,26 @@ class _Chooser:
                 named = label(first, last, i, len(bounds))
                 yield start(first, last, label=named, number=number)
 
+    def _episode_column(self, name: str, length: int) -> str | None:
+        """Return the array that numbers the episode of each row of a table; None without one.
+
+        Raises:
+            InputError: there is one of another shape.
+        """
+        column = self._near(name, EPISODES, length)
+        other = self._near(name, EPISODES)
+        if column is None and other is not None and self.contents.is_table:
+            what = f"{other} holds lists; expected one number a row, that of its episode"
+            raise InputError.at(self.path, what)
+        return column
+
     def _bounds(self, name: str, length: int) -> list[tuple[int | str, int, int]]:
         """Return number, first frame and the one behind the last of each episode."""
-        stored = np.asarray(self.contents.arrays[name][:]).ravel().astype(np.int64)
+        stored = np.asarray(self.contents.arrays[name][:]).ravel()
+        if stored.dtype.kind not in "iu":
+            what = f"{name} holds no whole numbers; it holds where each episode ends"
+            raise InputError.at(self.path, what)
+        stored = stored.astype(np.int64)
         ends = stored if last_part(name) == _ENDS[0] else np.cumsum(stored)
         if not len(ends) or (np.diff(ends, prepend=0) < 0).any():
             what = f"{name} does not rise; it holds where each episode ends"
@@ -522,18 +551,21 @@ def _blocks(path: Path, opened: Opened, held: _Readings, pads: Pads) -> Iterator
                 raise InputError.at(path, "is cut off; copy it again", where)
             packed = zip(held.packings, values, strict=True)
             frames = pads.frames([packing.unpacked(value) for packing, value in packed])
-            yield _block(frames, stamps, held.tick)
+            yield _block(path, frames, stamps, held)
 
 
-def _block(frames: NDArray[Any], stamps: NDArray[Any] | None, tick: str | None) -> Block:
+def _block(path: Path, frames: NDArray[Any], stamps: NDArray[Any] | None, held: _Readings) -> Block:
     """Return frames with their times; times of numpy, and written ones, count in nanoseconds."""
+    tick = held.tick
     if stamps is None:
         return Block(frames)
     if stamps.dtype.kind in TEXTS:
         try:
             stamps = np.array(texts(stamps), dtype="datetime64[ns]")
         except ValueError:
-            return Block(frames)
+            what = f"{held.part.clock} holds texts that are no times, as {texts(stamps)[0]!r}"
+            problem = Problem("warning", located(path, f"{what}: passed over"))
+            return Block(frames, problems=(problem,))
     if stamps.dtype.kind in TIMES:
         unset = np.isnat(stamps)
         kind = f"{'datetime64' if stamps.dtype.kind == 'M' else 'timedelta64'}[ns]"

@@ -18,6 +18,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.recordings.formats.datasets.features import is_touch
+
 NUMBERS = "iuf"
 TIMES = "mM"
 TEXTS = "OSUT"
@@ -77,8 +79,12 @@ class Contents:
             self.attributes.setdefault(group, {})[last] = value
         elif kind == "V":
             self.left_out[name] = "holds records of several fields; save each field as an array"
+        elif kind in NUMBERS and 0 in array.shape[1:]:
+            self.left_out[name] = "holds frames without a number"
         elif array.shape and kind in NUMBERS + TIMES + TEXTS:
             self.arrays[name] = array
+        if is_touch(name) and name not in self.arrays:
+            self.left_out.setdefault(name, f"is {array.dtype}, no array of numbers")
         if attributes:
             self.attributes.setdefault(name, {}).update(attributes)
 
@@ -136,17 +142,23 @@ class Packing:
 
     @classmethod
     def of(cls, attributes: Mapping[str, Any]) -> Packing:
-        """Return what the attributes of an array say."""
+        """Return what the attributes of an array say.
+
+        Raises:
+            ValueError: a scale of 0, or one that is no number.
+        """
         missing = [
             _number(value)
             for name in ("_FillValue", "missing_value")
             if name in attributes
             for value in np.asarray(attributes[name]).ravel().tolist()
         ]
-        scale = _number(_first(attributes.get("scale_factor", 1.0)))
-        offset = _number(_first(attributes.get("add_offset", 0.0)))
         known = tuple(value for value in missing if not math.isnan(value))
-        return cls(known, scale or math.nan, offset)
+        scale = _stated(attributes, "scale_factor", 1.0)
+        offset = _stated(attributes, "add_offset", 0.0)
+        if scale == 0:
+            raise ValueError("scale_factor 0")
+        return cls(known, scale, offset)
 
     @property
     def is_scaled(self) -> bool:
@@ -173,8 +185,13 @@ def as_readings(values: NDArray[Any]) -> NDArray[Any]:
         return values.astype(np.float32)
 
 
-def _first(value: Any) -> Any:
-    return np.asarray(value).ravel()[0] if np.size(value) else math.nan
+def _stated(attributes: Mapping[str, Any], name: str, usual: float) -> float:
+    """Return a number among attributes; the usual one where none is stated."""
+    values = np.asarray(attributes.get(name, usual)).ravel().tolist()
+    number = _number(values[0]) if values else usual
+    if not math.isfinite(number):
+        raise ValueError(f"{name} {values[0]!r}")
+    return number
 
 
 def _number(value: Any) -> float:

@@ -132,7 +132,7 @@ def _add(contents: Contents, name: str, found: Any, attributes: dict[str, Any]) 
 def _add_cells(file: Any, contents: Contents, name: str, found: Any) -> None:
     """Take in a cell array, or a field of an array of structures, of MATLAB: its elements are
     references."""
-    held = [file[reference] for reference in found[...].ravel()]
+    held = [file[reference] for reference in found[...].ravel() if reference]
     arrays = [one for one in held if hasattr(one, "shape") and _refused(one) is None]
     texts = [_matlab_text(one) for one in arrays]
     if texts and all(isinstance(text, str) for text in texts):

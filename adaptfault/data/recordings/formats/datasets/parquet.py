@@ -22,7 +22,7 @@ from adaptfault.data.recordings.facts.declared import too_large, too_much
 from adaptfault.data.recordings.formats.datasets.chooser import Stated, recordings_of
 from adaptfault.data.recordings.formats.datasets.contents import Contents
 from adaptfault.data.recordings.formats.datasets.extra import imported
-from adaptfault.data.recordings.formats.datasets.features import Sizes
+from adaptfault.data.recordings.formats.datasets.features import Sizes, is_touch
 from adaptfault.data.recordings.recording import Recording, Shape
 
 SUFFIXES = (".parquet", ".pq")
@@ -79,7 +79,10 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
                     contents.left_out[field.name] = "stands twice in the file; rename one of them"
                     continue
                 column = _Column.of(path, held, field, groups, () if names is None else wanted)
-                if column is not None:
+                if column is None:
+                    if is_touch(field.name):
+                        contents.left_out[field.name] = f"is {field.type}, no column of numbers"
+                else:
                     _add(contents, field.name, column, path.stat().st_size)
     # a damaged file raises any of pyarrow's kinds
     except Exception as error:
@@ -213,7 +216,7 @@ def _first(held: Any, name: str) -> Sizes:
     for batch in held.iter_batches(batch_size=64, columns=[name], use_threads=False):
         for value in batch.column(0):
             row = value.as_py()
-            if row is not None:
+            if row:
                 return np.shape(row)
     return (0,)
 

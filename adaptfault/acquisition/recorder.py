@@ -17,7 +17,7 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from adaptfault.data.atomic import atomic_write, make_folder, sync_folder
+from adaptfault.data.atomic import atomic_write, make_folder, sync
 from adaptfault.data.recordings.facts.layout_file import read_layout
 from diagnostics import SensorLayout
 
@@ -178,7 +178,7 @@ class Recorder:
         self._last = at
         self._frames = 0
         self._synced = time.monotonic()
-        self._syncing = self._disk.submit(sync_folder, self.folder)
+        self._syncing = self._disk.submit(sync, self.folder)
         return self._file
 
     def _sync(self, file: TextIO) -> None:

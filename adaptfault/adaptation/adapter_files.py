@@ -4,7 +4,6 @@ pickle."""
 from __future__ import annotations
 
 import zlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from adaptfault.data.windows import Windows, evenly
 from adaptfault.imputation.statistics import CellStatistics
 from adaptfault.models.any_model import network_from_config
 from adaptfault.models.builders import ModelNotAllowed
-from adaptfault.models.store import load_tensors, save_tensors
+from adaptfault.models.store import Place, load_tensors, save_tensors
 
 SCHEMA = "adaptfault.adapter/1"
 WINDOWS_SCHEMA = "adaptfault.windows/1"
@@ -30,7 +29,7 @@ _COARSEST = 1e-3  # largest error of a 16-bit float, in units of the largest of 
 _OVERHEAD = 100_000  # bytes for names, labels and JSON
 
 
-def save_adapter(path: str | Path, adapter: Adapter, *, limit: int | None = None) -> None:
+def save_adapter(path: Place, adapter: Adapter, *, limit: int | None = None) -> None:
     """Write everything an adaptation needs into a folder of at most ``limit`` bytes.
 
     Without a limit these are 20,000,000 bytes, or what a network of a large array needs with 8-bit
@@ -88,7 +87,7 @@ def save_adapter(path: str | Path, adapter: Adapter, *, limit: int | None = None
     save_tensors(path, SCHEMA, about, {**tensors, **{f"model.{k}": v for k, v in weights.items()}})
 
 
-def save_windows(path: str | Path, windows: Windows, *, limit: int = LIMIT // 4) -> None:
+def save_windows(path: Place, windows: Windows, *, limit: int = LIMIT // 4) -> None:
     """Write windows into a folder as :func:`save_adapter` does, thinned evenly to ``limit``
     bytes."""
     packed, packing = _pack_thinned(windows, None, limit)
@@ -100,7 +99,7 @@ def save_windows(path: str | Path, windows: Windows, *, limit: int = LIMIT // 4)
     )
 
 
-def load_windows(path: str | Path) -> Windows:
+def load_windows(path: Place) -> Windows:
     """Read windows written by :func:`save_windows`; raises the errors of :func:`load_adapter`."""
     about, tensors = load_tensors(path, WINDOWS_SCHEMA)
     try:
@@ -111,7 +110,7 @@ def load_windows(path: str | Path) -> Windows:
         ) from None
 
 
-def load_adapter(path: str | Path) -> Adapter:
+def load_adapter(path: Place) -> Adapter:
     """Read an adapter written by :func:`save_adapter`.
 
     Raises:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -26,6 +25,7 @@ from adaptfault.models.prediction_sets import PredictionSets
 from adaptfault.models.store import (
     ADAPTATION,
     SCHEMA,
+    Place,
     load_tensors,
     load_with_head,
     read_manifest,
@@ -208,7 +208,7 @@ class Adaptation:
         likely = self._outputs(windows).softmax(1).numpy()
         return ContactStatistics.fit(windows.x, likely, windows.y, windows.recording)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: Place) -> None:
         """Write to a folder: weights as safetensors, the rest as JSON, no pickle."""
         model = self.model
         about = {
@@ -235,7 +235,7 @@ class Adaptation:
 
     @classmethod
     def load(
-        cls, path: str | Path, *, network: nn.Module | None = None, features: Any = None
+        cls, path: Place, *, network: nn.Module | None = None, features: Any = None
     ) -> Adaptation:
         """Read an adaptation written by :meth:`save`.
 
@@ -284,7 +284,7 @@ class Adaptation:
         )
 
 
-def load_healthy(folder: str | Path) -> Adaptation:
+def load_healthy(folder: Place) -> Adaptation:
     """Read the model that :func:`~adaptfault.save_model` wrote, with its head in closed form.
 
     The result is an adaptation to the empty fault set, without scores. Raises the errors of

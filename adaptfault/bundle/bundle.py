@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from datetime import datetime, timezone
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
@@ -21,11 +20,9 @@ from adaptfault.bundle.checksummed_json import (
     Damaged,
     damage,
     decoding,
-    hash_files,
     read_with_copy,
     reading,
-    sync,
-    sync_tree,
+    write_files,
     write_with_copy,
 )
 from adaptfault.bundle.journal import Entry, Journal
@@ -36,8 +33,10 @@ from adaptfault.bundle.pointer import NAME as POINTER
 from adaptfault.bundle.pointer import SCHEMA as POINTER_SCHEMA
 from adaptfault.bundle.pointer import STARTS, Pointer
 from adaptfault.bundle.signature import verify
+from adaptfault.bundle.signing import sign_bundle, sign_versions
 from adaptfault.bundle.versions import Version, Versions
-from adaptfault.data.atomic import make_folder
+from adaptfault.data.atomic import make_folder, sync, sync_tree
+from adaptfault.models.store import InMemory
 from diagnostics import FaultSet, SelfDiagnosis, SensorLayout
 
 if TYPE_CHECKING:
@@ -121,8 +120,9 @@ class Bundle:
             self.parts = Parts(self.path / _PARTS, dict(self.about["parts"]))
         self.versions = Versions(self.path / "versions")
         self.journal = Journal(self.path)
+        self.serial = 0  # of the signature that was verified, or written here
         if keys is not None:
-            self.versions.signed = verify(self.path, self.about, keys, least_serial)
+            self.serial, self.versions.signed = verify(self.path, self.about, keys, least_serial)
 
     @classmethod
     def open(
@@ -147,6 +147,7 @@ class Bundle:
         class_names: Sequence[str] = (),
         calibration: Calibration | None = None,
         head: Literal["auto", "linear"] = "auto",
+        sign: str | os.PathLike[str] | None = None,
     ) -> Bundle:
         """Write a new bundle from a fault-free model, its adapter and a fitted diagnoser.
 
@@ -163,6 +164,8 @@ class Bundle:
             head: of version 1. "auto": fitted in closed form where it improves validation, as for a
                 repair (:attr:`~adaptfault.adaptation.adapter.Adapter.healthy`). "linear": the
                 model's own.
+            sign: PEM file of the private key that signs the bundle before it gets its name; None:
+                it is not signed.
 
         Raises:
             FileExistsError: ``path`` exists.
@@ -181,13 +184,13 @@ class Bundle:
         shutil.rmtree(new, ignore_errors=True)  # left by a crash
         if check is None:
             adapter, check = split_validation(adapter)
-        Parts.write(new / _PARTS, adapter, diagnoser, check, calibration, _graph(adapter))
+        parts = Parts.files(adapter, diagnoser, check, calibration, _graph(adapter))
         about: dict[str, Any] = {
             "schema": SCHEMA,
             "layout": model.layout.to_dict(),
             "class_names": list(class_names),
             "created": now(),
-            "parts": hash_files(new / _PARTS),
+            "parts": write_files(new / _PARTS, parts),
         }
         write_with_copy(new / _ABOUT, about)
         bundle = cls(new)
@@ -198,6 +201,8 @@ class Bundle:
             else adapter.adapt(FaultSet((), model.layout.n_cells), method="fill")
         )
         bundle.write_version(first, {"reason": "the fault-free model"})
+        if sign is not None:
+            sign_bundle(bundle, sign)
         sync_tree(new)
         os.replace(new, path)
         sync(path.parent)
@@ -274,22 +279,33 @@ class Bundle:
                 entry = Entry(now(), "confirmed", {"version": pointer.active})
                 self._switch(pointer, pointer.confirmed(), entry, patience=_IN_LOOP)
 
-    def deploy(self, number: int, entry: Entry | None = None) -> None:
+    def deploy(
+        self,
+        number: int,
+        entry: Entry | None = None,
+        *,
+        sign: str | os.PathLike[str] | None = None,
+    ) -> None:
         """Make a version the active one, on probation, and journal it: both, or neither.
 
         Args:
             number: of the version.
             entry: of the journal; None: it is not journalled.
+            sign: PEM file of the private key that signs the bundle first, so that what runs is
+                signed at every moment; None: it is not signed.
 
         Raises:
             OSError: the bundle cannot be written, or another process holds it.
         """
         with locked(self.path / _STATE_LOCK):
             pointer = Pointer.read(self.path)
+            after = pointer.deployed(number)
+            if sign is not None:
+                sign_versions(self, sign, pointer.versions | after.versions)
             if entry is None:
-                pointer.deployed(number).write(self.path)
+                after.write(self.path)
             else:
-                self._switch(pointer, pointer.deployed(number), entry)
+                self._switch(pointer, after, entry)
 
     def rollback(self) -> Version:
         """Return to the previous version. The fault set of the rejected one is not deployed again.
@@ -405,7 +421,7 @@ class Bundle:
         else:
             path = version.folder / MANIFEST
             with decoding(path):
-                measured = read_manifest(version.folder, ADAPTATION)
+                measured = read_manifest(version.files, ADAPTATION)
         with decoding(path):
             return tuple(ClassRecall.from_dict(one) for one in measured.get("classes", ()))
 
@@ -442,7 +458,7 @@ class Bundle:
     def write_version(self, adaptation: Adaptation, about: dict[str, Any]) -> Version:
         """Write an adaptation as a new version without activating it."""
         version = self.versions.write(
-            partial(_save, adaptation, self.parts.graph),
+            _files(adaptation, self.parts.graph),
             layout=self.layout,
             class_names=self.class_names,
             length=adaptation.model.network.length,
@@ -504,12 +520,15 @@ def _graph(adapter: Adapter) -> bytes | None:
     return None
 
 
-def _save(adaptation: Adaptation, graph: bytes | None, folder: Path) -> None:
-    """Write an adaptation and its ONNX file; without the ONNX file the version runs on torch."""
+def _files(adaptation: Adaptation, graph: bytes | None) -> InMemory:
+    """Return the files of an adaptation, its ONNX file included; without that the version runs on
+    torch."""
     from adaptfault.prediction.export import ExportError, add_onnx
 
-    adaptation.save(folder)
+    files = InMemory()
+    adaptation.save(files)
     try:
-        add_onnx(folder, graph)
+        add_onnx(files, graph)
     except (ImportError, ExportError) as error:
         _log.warning("no ONNX export, this version runs on torch: %s", error)
+    return files

@@ -6,9 +6,9 @@ import errno
 import hashlib
 import json
 import logging
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +49,13 @@ def reading(path: Path) -> Iterator[None]:
         raise Damaged(f"{path} cannot be read: {error.strerror or error}") from None
 
 
-def write_checksummed(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a JSON document with the SHA-256 of its content, atomically."""
+def write_checksummed(path: Path, document: Mapping[str, Any]) -> str:
+    """Write a JSON document with the SHA-256 of its content, atomically; return the SHA-256 of the
+    file."""
     checksummed = {**document, _CHECKSUM: _hash(document)}
-    atomic_write(path, json.dumps(checksummed, indent=1, allow_nan=False).encode())
+    data = json.dumps(checksummed, indent=1, allow_nan=False).encode()
+    atomic_write(path, data)
+    return hashlib.sha256(data).hexdigest()
 
 
 def read_checksummed(path: Path, schema: str) -> dict[str, Any]:
@@ -62,7 +65,14 @@ def read_checksummed(path: Path, schema: str) -> dict[str, Any]:
         FileNotFoundError: the file does not exist.
         Damaged: it cannot be read, the checksum does not match, or the schema differs.
     """
-    return _checked(path, schema)[0]
+    return read_hashed(path, schema)[0]
+
+
+def read_hashed(path: Path, schema: str) -> tuple[dict[str, Any], str]:
+    """Return a document as :func:`read_checksummed`, and the SHA-256 of the bytes that it was
+    decoded from."""
+    document, data = _checked(path, schema)
+    return document, hashlib.sha256(data).hexdigest()
 
 
 def _checked(path: Path, schema: str) -> tuple[dict[str, Any], bytes]:
@@ -168,28 +178,91 @@ def _copy(path: Path) -> Path:
     return path.with_suffix(".copy" + path.suffix)
 
 
-def hash_files(folder: Path, *, without: str = "") -> dict[str, str]:
-    """Return the SHA-256 of each file below ``folder``, by relative path, except the file
-    ``without``."""
-    files = (p for p in sorted(folder.rglob("*")) if p.is_file())
-    return {
-        name: hash_file(p) for p in files if (name := p.relative_to(folder).as_posix()) != without
-    }
-
-
-def check_files(folder: Path, hashes: Mapping[str, str]) -> None:
-    """Compare the files of a folder with recorded hashes.
-
-    Raises:
-        Damaged: one is missing, differs, or cannot be read.
-    """
-    for name, expected in hashes.items():
+def write_files(folder: Path, files: Mapping[str, bytes]) -> dict[str, str]:
+    """Write files into a new folder, by their paths below it; return the SHA-256 of each."""
+    hashes = {}
+    for name, data in files.items():
         path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(path, data)
+        hashes[name] = hashlib.sha256(data).hexdigest()
+    return hashes
+
+
+@dataclass(frozen=True)
+class Sealed:
+    """A folder of which the hash of each file was recorded: what is read is what was recorded.
+
+    Each read hashes the bytes that it returns, so that nobody can exchange a file between a check
+    and its use. A file that was not recorded is not there.
+
+    Attributes:
+        folder: on the disk.
+        hashes: SHA-256 of each file, by its path below the folder.
+    """
+
+    folder: Path
+    hashes: Mapping[str, str]
+
+    @property
+    def name(self) -> str:
+        """The name of the folder."""
+        return self.folder.name
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.hashes
+
+    def __str__(self) -> str:
+        return str(self.folder)
+
+    def below(self, name: str) -> Sealed:
+        """Return a folder in this one."""
+        inside = f"{name}/"
+        hashes = {
+            file.removeprefix(inside): digest
+            for file, digest in self.hashes.items()
+            if file.startswith(inside)
+        }
+        return Sealed(self.folder / name, hashes)
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file.
+
+        Raises:
+            FileNotFoundError: it was not recorded.
+            Damaged: it is missing, differs, or cannot be read.
+        """
+        path = self.folder / name
+        if name not in self.hashes:
+            raise FileNotFoundError(f"{path} is none of the recorded files")
         with reading(path):
             if not path.is_file():
                 raise Damaged(f"{path} is missing")
-            found = hash_file(path)
-        if found != expected:
+            data = path.read_bytes()
+        self._compare(name, hashlib.sha256(data).hexdigest())
+        return data
+
+    def check(self) -> None:
+        """Compare all files with their hashes; raises Damaged."""
+        for name in self.hashes:
+            path = self.folder / name
+            with reading(path):
+                if not path.is_file():
+                    raise Damaged(f"{path} is missing")
+                found = hash_file(path)
+            self._compare(name, found)
+
+    def write(self, name: str, data: bytes) -> None:
+        """Refuse: recorded files are written once."""
+        raise PermissionError(f"{self.folder / name} is recorded, and is not written again")
+
+    def remove(self, name: str) -> None:
+        """Refuse, as :meth:`write`."""
+        self.write(name, b"")
+
+    def _compare(self, name: str, found: str) -> None:
+        if found != self.hashes[name]:
+            path = self.folder / name
             raise Damaged(f"{path} is damaged: its SHA-256 differs from the recorded one")
 
 
@@ -200,21 +273,6 @@ def hash_file(path: Path) -> str:
         while chunk := file.read(_CHUNK):
             digest.update(chunk)
     return digest.hexdigest()
-
-
-def sync_tree(folder: Path) -> None:
-    """Flush ``folder`` and everything below it to the disk (fsync)."""
-    for path in [*folder.rglob("*"), folder]:
-        sync(path)
-
-
-def sync(path: Path) -> None:
-    """Flush a file, or the entries of a folder, to the disk (fsync)."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _hash(document: Mapping[str, Any]) -> str:

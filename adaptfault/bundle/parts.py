@@ -8,9 +8,10 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
-from adaptfault.bundle.checksummed_json import Damaged, check_files, decoding, reading
+from adaptfault.bundle.checksummed_json import Damaged, Sealed, decoding
 from adaptfault.data.atomic import atomic_write
-from adaptfault.models.store import load_arrays, save_arrays
+from adaptfault.data.recordings.formats.text import decoded
+from adaptfault.models.store import InMemory, load_arrays, save_arrays
 from diagnostics import SelfDiagnosis
 
 if TYPE_CHECKING:
@@ -28,7 +29,8 @@ _SCHEMA = "adaptfault.reference/1"
 
 
 class Parts:
-    """Reads the parts. The first use of each checks its hashes and raises Damaged on a mismatch.
+    """Reads the parts. Each read compares what it decodes with the recorded hash and raises Damaged
+    on a mismatch; a file that was not recorded is no part.
 
     Args:
         folder: of the parts.
@@ -37,20 +39,18 @@ class Parts:
 
     def __init__(self, folder: Path, hashes: Mapping[str, str]) -> None:
         self.folder = folder
-        self.hashes = hashes
-        self._whole: set[str] = set()  # parts that were checked
+        self._files = Sealed(folder, hashes)
 
     @staticmethod
-    def write(
-        folder: Path,
+    def files(
         adapter: Adapter,
         diagnoser: SelfDiagnosis,
         check: Windows,
         calibration: Calibration | None,
         graph: bytes | None,
-    ) -> None:
-        """Write the parts into a new folder; see :func:`~adaptfault.prediction.export.graph_of` for
-        ``graph``.
+    ) -> dict[str, bytes]:
+        """Return the content of the files of new parts, by path; see
+        :func:`~adaptfault.prediction.export.graph_of` for ``graph``.
 
         Raises:
             ValueError: the diagnoser is not fitted.
@@ -61,24 +61,30 @@ class Parts:
             raise ValueError(
                 "a bundle needs a diagnoser that is fitted on fault-free recordings: call fit first"
             )
-        folder.mkdir(parents=True)
-        save_adapter(folder / _ADAPTER, adapter)
-        save_windows(folder / _CHECK, check)
+        folders = {name: InMemory() for name in (_ADAPTER, _CHECK, _REFERENCE, _COPY)}
+        save_adapter(folders[_ADAPTER], adapter)
+        save_windows(folders[_CHECK], check)
         about, arrays = diagnoser.state()
         for name in (_REFERENCE, _COPY):  # prediction needs it, so there are two
-            save_arrays(folder / name, _SCHEMA, {"diagnosis": about}, arrays)
+            save_arrays(folders[name], _SCHEMA, {"diagnosis": about}, arrays)
+        files = {
+            f"{name}/{file}": data
+            for name, folder in folders.items()
+            for file, data in folder.items()
+        }
         if calibration is not None:
-            calibration.write(folder / _CALIBRATION)
+            files[_CALIBRATION] = calibration.encode()
         if graph is not None:
-            atomic_write(folder / _GRAPH, graph)
+            files[_GRAPH] = graph
+        return files
 
     def check(self, *, repair: bool = False) -> None:
         """Check all of them; ``repair`` restores the reference or its copy from the other. Raises
         Damaged."""
         problems = []
-        for name in sorted({PurePosixPath(file).parts[0] for file in self.hashes}):
+        for name in sorted({PurePosixPath(file).parts[0] for file in self._files.hashes}):
             try:
-                self._verified(name)
+                self._check(name)
             except Damaged as error:
                 problems.append(str(error))
                 if repair and name in (_REFERENCE, _COPY):
@@ -86,70 +92,69 @@ class Parts:
         if problems:
             raise Damaged("; ".join(problems))
 
-    def _verified(self, name: str) -> Path:
-        """Return the path of one part after a check of its files only; raises Damaged."""
-        if name not in self._whole:
-            check_files(
-                self.folder,
-                {f: h for f, h in self.hashes.items() if PurePosixPath(f).parts[0] == name},
-            )
-            self._whole.add(name)
-        return self.folder / name
+    def _check(self, name: str) -> None:
+        """Check one part, a file or a folder; raises Damaged."""
+        if name in self._files:
+            self._files.read(name)
+        else:
+            self._files.below(name).check()
 
     def _restore(self, name: str, source: str) -> None:
+        whole = self._files.below(source)
         with suppress(Damaged, OSError):
-            whole = self._verified(source)
-            for path in whole.iterdir():
-                atomic_write(self.folder / name / path.name, path.read_bytes())
+            for file in whole.hashes:
+                atomic_write(self.folder / name / file, whole.read(file))
 
     def diagnoser(self) -> SelfDiagnosis:
         """Return the fitted self-diagnosis, from its copy where the part is damaged. Needs no
         torch."""
         try:
-            return _diagnoser(self._verified(_REFERENCE))
+            return self._diagnoser(_REFERENCE)
         except (FileNotFoundError, Damaged):
-            if not any(PurePosixPath(file).parts[0] == _COPY for file in self.hashes):
+            if not self._files.below(_COPY).hashes:
                 raise
-        return _diagnoser(self._verified(_COPY))
+        return self._diagnoser(_COPY)
+
+    def _diagnoser(self, name: str) -> SelfDiagnosis:
+        part = self._files.below(name)
+        with decoding(part.folder):
+            about, arrays = load_arrays(part, _SCHEMA)
+            return SelfDiagnosis.from_state(about["diagnosis"], arrays)
 
     def adapter(self) -> Adapter:
         """Return the adapter, with the fault-free model and windows."""
         from adaptfault.adaptation.adapter_files import load_adapter
 
-        path = self._verified(_ADAPTER)
-        with decoding(path):
-            return load_adapter(path)
+        part = self._files.below(_ADAPTER)
+        with decoding(part.folder):
+            return load_adapter(part)
 
     def check_windows(self) -> Windows:
         """Return the held-out windows on which a candidate and the running version are compared."""
         from adaptfault.adaptation.adapter_files import load_windows
 
-        path = self._verified(_CHECK)
-        with decoding(path):
-            return load_windows(path)
+        part = self._files.below(_CHECK)
+        with decoding(part.folder):
+            return load_windows(part)
 
     @property
-    def calibration(self) -> Path | None:
-        """Path of the calibration table from raw counts to the layout's unit; None without one."""
-        path = self._verified(_CALIBRATION)
-        with reading(path):
-            return path if path.is_file() else None
+    def calibration(self) -> Calibration | None:
+        """Calibration from raw counts to the layout's unit; None without one."""
+        from adaptfault.data.calibration import Calibration
+
+        if _CALIBRATION not in self._files:
+            return None
+        path = self.folder / _CALIBRATION
+        with decoding(path):
+            return Calibration.decode(path, decoded(path, self._files.read(_CALIBRATION)))
 
     @property
     def graph(self) -> bytes | None:
         """ONNX graph of the network with a head in closed form; None without one, or where it is
         damaged."""
         with suppress(Damaged, FileNotFoundError):
-            path = self._verified(_GRAPH)
-            with reading(path):
-                return path.read_bytes()
+            return self._files.read(_GRAPH)
         return None
-
-
-def _diagnoser(path: Path) -> SelfDiagnosis:
-    with decoding(path):
-        about, arrays = load_arrays(path, _SCHEMA)
-        return SelfDiagnosis.from_state(about["diagnosis"], arrays)
 
 
 def split_validation(adapter: Adapter) -> tuple[Adapter, Windows]:

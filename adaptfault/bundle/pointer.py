@@ -39,6 +39,12 @@ class Pointer:
     rejected: tuple[tuple[int, ...], ...] = ()
     entry: str = ""
 
+    @property
+    def versions(self) -> set[int]:
+        """Numbers of the versions that may run: the active one, its fallbacks and the
+        fault-free."""
+        return {1, self.active, *self.fallbacks}
+
     @classmethod
     def read(cls, bundle: Path) -> Pointer:
         """Read the pointer, or its copy where it is damaged; raises Damaged where both are."""

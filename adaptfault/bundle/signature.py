@@ -26,8 +26,9 @@ _MISSING = "signatures need cryptography; pip install 'adaptfault[sign]'"
 
 def verify(
     folder: Path, manifest: dict[str, Any], keys: Sequence[str | PathLike[str]], least_serial: int
-) -> dict[int, str]:
-    """Return number and hash of each version that a trusted key signed.
+) -> tuple[int, dict[int, str]]:
+    """Return the serial number of the signature, and number and hash of each version that a
+    trusted key signed.
 
     Args:
         folder: of the bundle.
@@ -68,7 +69,8 @@ def verify(
         raise Untrusted(
             f"{folder} has serial number {signed['serial']}, expected {least_serial} or more"
         )
-    return {int(number): str(digest) for number, digest in signed["versions"].items()}
+    versions = {int(number): str(digest) for number, digest in signed["versions"].items()}
+    return int(signed["serial"]), versions
 
 
 def read_private_key(path: str | PathLike[str]) -> Ed25519PrivateKey:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,16 +16,14 @@ from numpy.typing import NDArray
 
 from adaptfault.bundle.checksummed_json import (
     Damaged,
-    check_files,
+    Sealed,
     decoding,
-    hash_file,
-    hash_files,
-    read_checksummed,
-    reading,
-    sync,
-    sync_tree,
+    read_hashed,
     write_checksummed,
+    write_files,
 )
+from adaptfault.data.atomic import sync, sync_tree
+from adaptfault.models.store import Place
 from diagnostics import FaultSet, SensorLayout
 from diagnostics.sensor.recalibration import recalibrated
 
@@ -50,6 +48,8 @@ class Version:
         class_names: one name for each class.
         length: frames in a window.
         fault_set: F, the cells that it does not use.
+        hashes: SHA-256 of each of its files, by name; None of a version that nobody recorded.
+        digest: SHA-256 of its description, which states the hashes.
         about: origin of the version, JSON. ``source``, where given: a permutation that undoes a
             changed wiring. ``gain`` and ``offset``, where given: of each cell of a replaced pad.
     """
@@ -61,6 +61,13 @@ class Version:
     length: int
     fault_set: FaultSet
     about: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    hashes: Mapping[str, str] | None = field(default=None, repr=False)
+    digest: str = field(default="", repr=False)
+
+    @property
+    def files(self) -> Place:
+        """Where its model is read from; each read compares a file with its recorded hash."""
+        return self.folder if self.hashes is None else Sealed(self.folder, self.hashes)
 
     @cached_property
     def source(self) -> NDArray[np.intp]:
@@ -112,7 +119,7 @@ class Version:
         from adaptfault.models.store import ADAPTATION, read_manifest
 
         with decoding(self.folder):
-            sets = read_manifest(self.folder, ADAPTATION).get("sets") or {}
+            sets = read_manifest(self.files, ADAPTATION).get("sets") or {}
             size = sets.get("size")
             return None if size is None else float(size)
 
@@ -145,13 +152,14 @@ class Version:
             FileNotFoundError: the folder holds no version.
             Damaged: a file fails its checksum, or cannot be read.
         """
-        document = read_checksummed(folder / ABOUT, SCHEMA)
+        document, digest = read_hashed(folder / ABOUT, SCHEMA)
         with decoding(folder / ABOUT):
-            return cls._decode(folder, document)
+            version = cls._decode(folder, document, digest)
+            Sealed(folder, document["files"]).check()
+            return version
 
     @classmethod
-    def _decode(cls, folder: Path, document: Mapping[str, Any]) -> Version:
-        check_files(folder, document["files"])
+    def _decode(cls, folder: Path, document: Mapping[str, Any], digest: str) -> Version:
         layout = SensorLayout.from_dict(document["layout"])
         return cls(
             number=int(document["number"]),
@@ -161,6 +169,8 @@ class Version:
             length=int(document["length"]),
             fault_set=FaultSet(tuple(document["fault_set"]), layout.n_cells),
             about=dict(document["about"]),
+            hashes={str(name): str(hashed) for name, hashed in document["files"].items()},
+            digest=digest,
         )
 
 
@@ -180,16 +190,9 @@ class Versions:
     def __getitem__(self, number: int) -> Version:
         """Read a version; raises FileNotFoundError, Damaged or Untrusted."""
         version = Version.read(self.path(number))
-        if self.signed is not None and self.signed.get(number) != self.hash(number):
+        if self.signed is not None and self.signed.get(number) != version.digest:
             raise Untrusted(f"version {number} is not signed")
         return version
-
-    def hash(self, number: int) -> str:
-        """Return the hash of the description of a version, which holds the hash of each of its
-        files."""
-        path = self.path(number) / ABOUT
-        with reading(path):
-            return hash_file(path)
 
     def path(self, number: int) -> Path:
         """Return the folder of a version."""
@@ -204,7 +207,7 @@ class Versions:
 
     def write(
         self,
-        fill: Callable[[Path], None],
+        files: Mapping[str, bytes],
         *,
         layout: SensorLayout,
         class_names: tuple[str, ...],
@@ -215,7 +218,7 @@ class Versions:
         """Write a version into a temporary folder, sync it, then rename it.
 
         Args:
-            fill: writes the model's files into the folder it is given.
+            files: of the model, by name.
             layout, class_names, length, fault_set, about: see :class:`Version`.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -225,7 +228,7 @@ class Versions:
         )
         new = self.folder / f"{_UNFINISHED}{number:04d}"
         new.mkdir()
-        fill(new)
+        hashes = write_files(new, files)
         document = {
             "schema": SCHEMA,
             "number": number,
@@ -234,14 +237,14 @@ class Versions:
             "length": length,
             "fault_set": list(fault_set),
             "about": dict(about),
-            "files": hash_files(new),
+            "files": hashes,
         }
-        write_checksummed(new / ABOUT, document)
+        digest = write_checksummed(new / ABOUT, document)
         sync_tree(new)
         os.replace(new, self.path(number))
         sync(self.folder)
         if self.signed is not None:
-            self.signed[number] = self.hash(number)
+            self.signed[number] = digest
         return self[number]
 
     def sweep(self, keep: Collection[int] | None = None) -> None:

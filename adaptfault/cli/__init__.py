@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from adaptfault import __version__
-from adaptfault.cli.options import LogAboveBars, refuse_missing
+from adaptfault.cli.options import LogAboveBars
+from adaptfault.cli.paths import check_paths
 from adaptfault.data.plugins import plugins
 from adaptfault.data.printable import printable
 
@@ -119,7 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     handler = LogAboveBars()
     log.addHandler(handler)
     try:
-        refuse_missing(args)
+        check_paths(args)
         code = int(args.run(args))
         return _with_left_out(args, code)
     except (ValueError, OSError) as error:

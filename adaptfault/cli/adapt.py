@@ -17,6 +17,7 @@ from adaptfault.cli.options import (
     progress,
     say,
 )
+from adaptfault.cli.paths import Read, Stated, WrittenFolder
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.adapter import Adapter
@@ -33,13 +34,18 @@ def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "adapt", "repair a model for a set of faulty cells", _EXAMPLE)
     parser.add_argument(
-        "model", metavar="MODEL", help="folder written by adaptfault train or --keep, or a bundle"
+        "model",
+        type=Read,
+        metavar="MODEL",
+        help="folder written by adaptfault train or --keep, or a bundle",
     )
     add_recordings(parser, least=0, targets=True)
     parser.add_argument(
-        "--faults", metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200"
+        "--faults", type=Stated, metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200"
     )
-    parser.add_argument("--out", metavar="FOLDER", help="where the adapted model goes")
+    parser.add_argument(
+        "--out", type=WrittenFolder, metavar="FOLDER", help="where the adapted model goes"
+    )
     parser.add_argument(
         "--forecast",
         action="store_true",
@@ -47,6 +53,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--keep",
+        type=WrittenFolder,
         metavar="FOLDER",
         help="store everything that later adaptations need, without recordings",
     )

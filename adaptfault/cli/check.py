@@ -21,6 +21,7 @@ from adaptfault.cli.options import (
     report_range,
     summary_of,
 )
+from adaptfault.cli.paths import Written, WrittenRecordings
 
 if TYPE_CHECKING:
     from adaptfault.data.recordings import Opened, Recordings
@@ -48,11 +49,12 @@ def add(commands: Commands) -> None:
         metavar="FIRST:LAST",
         help="recordings of the data set that are known to be healthy, as 0:20 for the first 20",
     )
-    parser.add_argument("--out", metavar="FILE", help="write the result as JSON")
-    parser.add_argument("--html", metavar="FILE", help="write a page")
-    parser.add_argument("--badge", metavar="FILE", help="write a badge as SVG")
+    parser.add_argument("--out", type=Written, metavar="FILE", help="write the result as JSON")
+    parser.add_argument("--html", type=Written, metavar="FILE", help="write a page")
+    parser.add_argument("--badge", type=Written, metavar="FILE", help="write a badge as SVG")
     parser.add_argument(
         "--write-valid",
+        type=WrittenRecordings,
         metavar="FILE",
         help="write which readings are valid: .npz, .parquet, .zarr or .h5",
     )
@@ -60,7 +62,7 @@ def add(commands: Commands) -> None:
     add_cache(parser)
     add_untested_code(parser)
     add_trust(parser)
-    parser.set_defaults(run=run, writes=("out", "html", "badge", "write_valid"))
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -68,6 +70,10 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.inspection.severity import worst
     from diagnostics.decision.numbering import Numbering
 
+    if args.write_valid:
+        from adaptfault.data.recordings.valid import refuse_foreign
+
+        refuse_foreign(args.write_valid)
     part = None if args.healthy is None else partial(_part, args.healthy)
     inspected = inspect_log(args, part)
     log = inspected.log

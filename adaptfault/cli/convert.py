@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 
 from adaptfault.cli.options import Commands, add_recordings, command, emit, load_recordings, say
+from adaptfault.cli.paths import WrittenRecordings
 from adaptfault.cli.selection import add_selection, select
 
 _EXAMPLE = """\
@@ -23,6 +24,7 @@ def add(commands: Commands) -> None:
     add_recordings(parser)
     parser.add_argument(
         "--out",
+        type=WrittenRecordings,
         required=True,
         metavar="PATH",
         help="X.npz, X.npy, X.bag (ROS 2 bag), or a folder for CSV files",
@@ -33,7 +35,7 @@ def add(commands: Commands) -> None:
         help="CSV files begin with a header and a column time_ms of whole milliseconds",
     )
     add_selection(parser)
-    parser.set_defaults(run=run, writes=("out",))
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

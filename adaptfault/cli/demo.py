@@ -8,6 +8,7 @@ from pathlib import Path
 
 from adaptfault.cli.inject_option import INJECT_HELP, parse_faults
 from adaptfault.cli.options import Commands, add_recordings, command, load_recordings, progress, say
+from adaptfault.cli.paths import WrittenFolder
 
 _EXAMPLE = """  adaptfault demo
   adaptfault demo --recordings grasps.npz --epochs 20 --inject random:5=short"""
@@ -27,7 +28,11 @@ def add(commands: Commands) -> None:
     )
     add_recordings(parser, option=True)
     parser.add_argument(
-        "--out", default="adaptfault-demo", metavar="FOLDER", help="default adaptfault-demo"
+        "--out",
+        type=WrittenFolder,
+        default="adaptfault-demo",
+        metavar="FOLDER",
+        help="default adaptfault-demo",
     )
     parser.add_argument(
         "--epochs", type=int, help="of training (default: 2 simulated, 20 on recordings)"
@@ -56,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
         faults = parse_faults(args.inject, recordings.layout, np.random.default_rng(args.seed))
     say(args, "loading torch")
 
+    from adaptfault.data.atomic import atomic_write
     from adaptfault.evaluation.demo import run_demo
     from adaptfault.evaluation.html_report import write_report
 
@@ -76,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     )
     report = write_report(out / "report.html", result)
     checkpoint.unlink(missing_ok=True)
-    (out / "result.json").write_text(json.dumps(result.to_dict(), allow_nan=False))
+    atomic_write(out / "result.json", json.dumps(result.to_dict(), allow_nan=False).encode())
     if args.json:
         print(json.dumps(result.to_dict(), indent=1, allow_nan=False))
     else:

@@ -18,6 +18,7 @@ from adaptfault.cli.options import (
     emit,
     report_range,
 )
+from adaptfault.cli.paths import Written
 
 if TYPE_CHECKING:
     from diagnostics import Diagnosis
@@ -41,14 +42,16 @@ def add(commands: Commands) -> None:
     )
     add_recordings(parser, labels=False)
     add_reference(parser)
-    parser.add_argument("--out", metavar="FILE", help="write the diagnosis as JSON")
-    parser.add_argument("--picture", metavar="FILE", help="write the verdict map as PNG")
-    parser.add_argument("--html", metavar="FILE", help="write the technician's page")
+    parser.add_argument("--out", type=Written, metavar="FILE", help="write the diagnosis as JSON")
+    parser.add_argument(
+        "--picture", type=Written, metavar="FILE", help="write the verdict map as PNG"
+    )
+    parser.add_argument("--html", type=Written, metavar="FILE", help="write the technician's page")
     add_count_from(parser)
     add_cache(parser)
     add_untested_code(parser)
     add_trust(parser)
-    parser.set_defaults(run=run, writes=("out", "picture", "html"))
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -77,11 +80,11 @@ def run(args: argparse.Namespace) -> int:
 def _write(args: argparse.Namespace, diagnosis: Diagnosis, code: int, notes: list[str]) -> None:
     """Write the files that the options ask for; the page says what the exit code and the notes
     say."""
-    from adaptfault.data.atomic import atomic_write
+    from adaptfault.data.atomic import atomic_figure, atomic_write
 
     if args.out:
         atomic_write(args.out, json.dumps(diagnosis.to_dict(), allow_nan=False).encode())
     if args.picture:
-        diagnosis.plot(count_from=args.count_from).savefig(args.picture, dpi=150)
+        atomic_figure(args.picture, diagnosis.plot(count_from=args.count_from), dpi=150)
     if args.html:
         write_page(args, diagnosis, code, notes, compared=bool(args.reference))

@@ -18,6 +18,7 @@ from adaptfault.cli.options import (
     emit,
     say,
 )
+from adaptfault.cli.paths import Read
 
 if TYPE_CHECKING:
     from adaptfault.adaptation.result import Adaptation
@@ -31,11 +32,11 @@ def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "evaluate", "score a model on the test recordings", _EXAMPLE)
     parser.add_argument(
-        "model", metavar="MODEL", help="folder written by adaptfault train, or a bundle"
+        "model", type=Read, metavar="MODEL", help="folder written by adaptfault train, or a bundle"
     )
     add_recordings(parser, targets=True)
     parser.add_argument(
-        "--adapted", metavar="FOLDER", help="score this adaptation of the model instead"
+        "--adapted", type=Read, metavar="FOLDER", help="score this adaptation of the model instead"
     )
     parser.add_argument(
         "--head",

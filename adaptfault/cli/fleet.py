@@ -16,6 +16,7 @@ from adaptfault.cli.options import (
     say,
     trust,
 )
+from adaptfault.cli.paths import Read, Written, WrittenFolder, refuse_overwriting
 
 _EXAMPLE = """  adaptfault fleet maintain FLEET.toml --jobs 8
       FLEET.toml lists robots as [[robots]] with name, bundle, recordings
@@ -44,7 +45,7 @@ def add(commands: Commands) -> None:
         "maintain all robots of a list; exit code 2, 3, 1, 0: the worst of them",
         _EXAMPLE,
     )
-    parser.add_argument("fleet", metavar="FLEET.toml", help="list of the robots")
+    parser.add_argument("fleet", type=Read, metavar="FLEET.toml", help="list of the robots")
     parser.add_argument(
         "--jobs", type=int, metavar="N", help="worker processes (default: as many as cores)"
     )
@@ -62,21 +63,26 @@ def add(commands: Commands) -> None:
         help="seconds that one robot may take; past it, it is an error (default: none)",
     )
     parser.add_argument(
-        "--out", metavar="FOLDER", help="of ledger and reports (default: FLEET.fleet)"
+        "--out",
+        type=WrittenFolder,
+        metavar="FOLDER",
+        help="of ledger and reports (default: FLEET.fleet)",
     )
     add_metrics(parser)
     add_trust(parser)
     add_sign(parser, "each bundle after its run")
-    parser.set_defaults(run=run, writes=("metrics",), continues=True)
+    parser.set_defaults(run=run, continues=True)
     parser = command(
         inner, "survival", "how long wires and cells last, and whom to service next", _SURVIVAL
     )
-    parser.add_argument("fleet", metavar="FLEET.toml", help="list of the robots")
+    parser.add_argument("fleet", type=Read, metavar="FLEET.toml", help="list of the robots")
     parser.add_argument(
         "--days", type=float, default=30.0, metavar="N", help="time ahead (default 30)"
     )
-    parser.add_argument("--picture", metavar="FILE", help="write the survival curves as PNG")
-    parser.set_defaults(run=survival, writes=("picture",))
+    parser.add_argument(
+        "--picture", type=Written, metavar="FILE", help="write the survival curves as PNG"
+    )
+    parser.set_defaults(run=survival)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -89,7 +95,10 @@ def run(args: argparse.Namespace) -> int:
     from adaptfault.fleet.run import maintain_fleet
 
     fleet = Fleet.read(args.fleet)
-    folder = Path(args.out or Path(args.fleet).with_suffix(".fleet"))
+    if not args.out:
+        args.out = WrittenFolder(Path(args.fleet).with_suffix(".fleet"))
+    refuse_overwriting(args, fleet.paths())
+    folder = Path(args.out)
     report = maintain_fleet(
         fleet,
         folder,
@@ -117,11 +126,14 @@ def run(args: argparse.Namespace) -> int:
 
 def survival(args: argparse.Namespace) -> int:
     """Tell how the sensors of a fleet age."""
+    from adaptfault.data.atomic import atomic_figure
     from adaptfault.fleet.listing import Fleet
     from adaptfault.prognosis.lifetimes import FleetSurvival
 
-    found = FleetSurvival.of(Fleet.read(args.fleet), args.days)
+    fleet = Fleet.read(args.fleet)
+    refuse_overwriting(args, fleet.paths())
+    found = FleetSurvival.of(fleet, args.days)
     if args.picture:
-        found.plot().savefig(args.picture, dpi=150)
+        atomic_figure(args.picture, found.plot(), dpi=150)
     emit(args, found.to_dict(), str(found))
     return 0

@@ -17,6 +17,7 @@ from adaptfault.cli.options import (
     fault_set,
     say,
 )
+from adaptfault.cli.paths import Read, Stated, Written
 
 _EXAMPLE = """  adaptfault forecast robot.bundle --worst --picture worst.png
       which wire, which two wires and which pad would cost most accuracy after a repair
@@ -34,12 +35,13 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "model",
+        type=Read,
         metavar="MODEL",
         help="folder written by adaptfault train or adapt --keep, or a bundle",
     )
     add_recordings(parser, least=0, targets=True)
     parser.add_argument(
-        "--faults", metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200"
+        "--faults", type=Stated, metavar="F", help="a diagnosis (JSON), or cell indices as 3,17,200"
     )
     parser.add_argument(
         "--new",
@@ -68,7 +70,7 @@ def add(commands: Commands) -> None:
         help="forecast all pairs of the N worst wires (default 5)",
     )
     parser.add_argument(
-        "--picture", metavar="PNG", help="with --worst: a map of what each wire costs"
+        "--picture", type=Written, metavar="PNG", help="with --worst: a map of what each wire costs"
     )
     add_device(parser)
     add_trust(parser)
@@ -97,7 +99,9 @@ def run(args: argparse.Namespace) -> int:
 
     worst = worst_faults(adapter, among=args.among, say=lambda text: say(args, text))
     if args.picture is not None:
-        worst.plot().savefig(args.picture, dpi=120)
+        from adaptfault.data.atomic import atomic_figure
+
+        atomic_figure(args.picture, worst.plot(), dpi=120)
     emit(args, worst.to_dict(), str(worst))
     return 0
 

@@ -7,6 +7,7 @@ import argparse
 from typing import Any
 
 from adaptfault.cli.options import Commands, add_trust, command, emit, trust
+from adaptfault.cli.paths import Read, Written
 
 _EXAMPLE = """  adaptfault history robot.bundle --last 10
   adaptfault history robot.bundle --confirm
@@ -19,7 +20,10 @@ def add(commands: Commands) -> None:
     """Add the command."""
     parser = command(commands, "history", "list maintenance runs and versions", _EXAMPLE)
     parser.add_argument(
-        "bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle"
+        "bundle",
+        type=Read,
+        metavar="BUNDLE",
+        help="folder written by adaptfault train --out X.bundle",
     )
     parser.add_argument("--last", type=int, metavar="N", help="only the last N entries")
     parser.add_argument(
@@ -29,10 +33,13 @@ def add(commands: Commands) -> None:
         "--trend", action="store_true", help="what drifts from run to run, in place of the runs"
     )
     parser.add_argument(
-        "--picture", metavar="FILE", help="with --trend: write the drifting series as PNG"
+        "--picture",
+        type=Written,
+        metavar="FILE",
+        help="with --trend: write the drifting series as PNG",
     )
     add_trust(parser)
-    parser.set_defaults(run=run, writes=("picture",))
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from adaptfault.cli.options import (
     report_range,
     summary_of,
 )
+from adaptfault.cli.paths import Written
 
 _EXAMPLE = """  adaptfault info grasps.npz --picture grasps.png
   adaptfault info today/ --shape 10x10 --full-scale 3.3 --unit V
@@ -29,13 +30,16 @@ def add(commands: Commands) -> None:
         _EXAMPLE,
     )
     add_recordings(parser)
-    parser.add_argument("--picture", metavar="FILE", help="write mean and peak of each cell as PNG")
+    parser.add_argument(
+        "--picture", type=Written, metavar="FILE", help="write mean and peak of each cell as PNG"
+    )
     parser.add_argument(
         "--write-layout",
+        type=Written,
         metavar="FILE",
         help="write what was stated and inferred of the array as TOML, for --layout",
     )
-    parser.set_defaults(run=run, writes=("picture", "write_layout"))
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,6 +52,8 @@ def run(args: argparse.Namespace) -> int:
 
         write_layout(args.write_layout, opened.layout, opened.inferred)
     if args.picture:
-        summary.plot().savefig(args.picture, dpi=150)
+        from adaptfault.data.atomic import atomic_figure
+
+        atomic_figure(args.picture, summary.plot(), dpi=150)
     emit(args, summary.to_dict(), str(summary))
     return 0

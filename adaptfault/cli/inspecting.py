@@ -16,6 +16,7 @@ from adaptfault.cli.options import (
     report_problems,
     say,
 )
+from adaptfault.cli.paths import Read
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -50,6 +51,7 @@ def add_reference(group: Any) -> None:
     """Add the option of what a log is compared with to a parser or a group of options."""
     group.add_argument(
         "--reference",
+        type=Read,
         nargs="+",
         metavar="FILE",
         help="fault-free recordings of the same array, or a bundle",

@@ -14,6 +14,7 @@ from adaptfault.cli.options import (
     layout_of,
     trust,
 )
+from adaptfault.cli.paths import Read, Written, WrittenFolder
 
 if TYPE_CHECKING:
     from adaptfault.acquisition import Station
@@ -45,7 +46,11 @@ def add(commands: Commands) -> None:
         _EXAMPLE,
     )
     parser.add_argument(
-        "bundle", nargs="?", metavar="BUNDLE", help="the robot's bundle, to classify as well"
+        "bundle",
+        type=Read,
+        nargs="?",
+        metavar="BUNDLE",
+        help="the robot's bundle, to classify as well",
     )
     parser.add_argument(
         "--port", type=int, required=True, help="UDP port; 0 takes a free one and prints it"
@@ -57,7 +62,10 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument("--device", action="append", metavar="ID", help=_DEVICE)
     parser.add_argument(
-        "--key", metavar="FILE", help="accept only packets that are authenticated with this key"
+        "--key",
+        type=Read,
+        metavar="FILE",
+        help="accept only packets that are authenticated with this key",
     )
     parser.add_argument(
         "--ticks",
@@ -78,7 +86,9 @@ def add(commands: Commands) -> None:
         help="tell the set of classes of each window, too, that holds the true one with"
         " probability 1 - ALPHA; needs BUNDLE",
     )
-    parser.add_argument("--record", metavar="FOLDER", help="record into this folder, CSV")
+    parser.add_argument(
+        "--record", type=WrittenFolder, metavar="FOLDER", help="record into this folder, CSV"
+    )
     parser.add_argument(
         "--relay",
         metavar="HOST:PORT",
@@ -86,6 +96,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--view",
+        type=Written,
         metavar="FILE",
         help="show all frames: FILE.mcap for Foxglove, FILE.rrd for Rerun, or rerun (rerun:PORT)"
         " to serve live viewers of Rerun",
@@ -96,7 +107,7 @@ def add(commands: Commands) -> None:
     add_metrics(parser)
     add_array(parser)
     add_trust(parser)
-    parser.set_defaults(run=run, writes=("metrics", "view"))
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -135,14 +146,13 @@ def _station(args: argparse.Namespace) -> Station:
     for name in ("seconds", "frames"):
         if (end := getattr(args, name)) is not None and not end > 0:
             raise ValueError(f"--{name} {end:g}: expected a number above 0")
-    if args.record == "":  # as of a shell variable that is not set: nothing would be recorded
-        raise ValueError("--record '': name a folder")
-    table = args.calibration
-    if args.bundle and not table:
+    tables = None
+    if args.calibration:
+        tables = Calibration.read(args.calibration)
+    elif args.bundle:
         from adaptfault.bundle.bundle import Bundle
 
-        table = Bundle.open(args.bundle, **trust(args)).parts.calibration
-    tables = Calibration.read(table) if table else None
+        tables = Bundle.open(args.bundle, **trust(args)).parts.calibration
     layout = (
         layout_of(args)
         if tables is None

@@ -20,6 +20,7 @@ from adaptfault.cli.options import (
     say,
     trust,
 )
+from adaptfault.cli.paths import Read, Written
 
 if TYPE_CHECKING:
     from adaptfault.bundle.bundle import Bundle
@@ -42,10 +43,17 @@ def add(commands: Commands) -> None:
         _EXAMPLE,
     )
     parser.add_argument(
-        "bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle"
+        "bundle",
+        type=Read,
+        metavar="BUNDLE",
+        help="folder written by adaptfault train --out X.bundle",
     )
     parser.add_argument(
-        "recordings", nargs="+", metavar="RECORDINGS", help="file or folder of recordings"
+        "recordings",
+        type=Read,
+        nargs="+",
+        metavar="RECORDINGS",
+        help="file or folder of recordings",
     )
     parser.add_argument("--dry-run", action="store_true", help="report only, change nothing")
     parser.add_argument(
@@ -53,17 +61,20 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--after",
+        type=Read,
         metavar="ROUTINE",
         help="the recordings are a log of this self-test (selftest --out): say what it left"
         " untested, and the next best recording",
     )
     add_untested_code(parser)
-    parser.add_argument("--report", metavar="FILE", help="write the technician's report (HTML)")
+    parser.add_argument(
+        "--report", type=Written, metavar="FILE", help="write the technician's report (HTML)"
+    )
     add_count_from(parser)
     add_metrics(parser)
     add_trust(parser)
     add_sign(parser, "the bundle after the run")
-    parser.set_defaults(run=run, writes=("report", "metrics"))
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -80,7 +91,6 @@ def _maintain(args: argparse.Namespace) -> int:
     import sys
 
     from adaptfault.bundle.bundle import Bundle
-    from adaptfault.bundle.signing import sign_bundle
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.new_recordings import load_new_recordings
     from adaptfault.robot.routine import Routine
@@ -98,11 +108,10 @@ def _maintain(args: argparse.Namespace) -> int:
         budget=args.budget,
         untested_code=args.untested_code,
         routine=routine,
+        sign=args.sign,
         say=lambda text: say(args, text),
     )
-    if args.sign and not args.dry_run:
-        sign_bundle(bundle, args.sign)
-    elif args.trust and report.decision == "deployed" and not args.dry_run:
+    if args.trust and not args.sign and report.decision == "deployed" and not args.dry_run:
         what = "runs only where no key is asked for; give maintain --sign KEY, or sign the bundle"
         print(f"warning: version {report.version} is not signed and {what}", file=sys.stderr)
     if args.report:

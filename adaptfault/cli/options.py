@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
+from adaptfault.cli.paths import Read, Written
 from adaptfault.data.printable import printable
 
 if TYPE_CHECKING:
@@ -55,15 +55,15 @@ def add_recordings(
         " HDF5, netCDF, MAT, Parquet, JSON lines"
     )
     if option:
-        parser.add_argument("--recordings", nargs="+", metavar="FILE", help=help_)
+        parser.add_argument("--recordings", type=Read, nargs="+", metavar="FILE", help=help_)
     else:
         parser.add_argument(
-            "recordings", nargs="+" if least else "*", metavar="RECORDINGS", help=help_
+            "recordings", type=Read, nargs="+" if least else "*", metavar="RECORDINGS", help=help_
         )
     group = add_array(parser)
     if labels:
         group.add_argument(
-            "--labels", metavar="TABLE", help="CSV table with the columns file,label"
+            "--labels", type=Read, metavar="TABLE", help="CSV table with the columns file,label"
         )
     group.add_argument(
         "--key",
@@ -74,6 +74,7 @@ def add_recordings(
     if targets:
         group.add_argument(
             "--targets",
+            type=Read,
             metavar="TABLE",
             help=(
                 "for a regression: CSV table with the columns file and one for each value, or"
@@ -148,11 +149,11 @@ def add_metrics(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _metrics_file(text: str) -> str:
+def _metrics_file(text: str) -> Written:
     if not text.endswith(".prom"):
         what = "expected a name that ends in .prom: node_exporter reads no other"
         raise argparse.ArgumentTypeError(f"{what}; got {text!r}")
-    return text
+    return Written(text)
 
 
 def add_trust(parser: argparse.ArgumentParser) -> None:
@@ -160,6 +161,7 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("signed bundles")
     group.add_argument(
         "--trust",
+        type=Read,
         action="append",
         metavar="KEY",
         help="PEM file of a public ed25519 key that must have signed the bundle; may be repeated",
@@ -175,7 +177,7 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
 def add_sign(parser: argparse.ArgumentParser, when: str) -> None:
     """Add the key that signs a bundle."""
     parser.add_argument(
-        "--sign", metavar="KEY", help=f"sign {when} with this private ed25519 key (PEM)"
+        "--sign", type=Read, metavar="KEY", help=f"sign {when} with this private ed25519 key (PEM)"
     )
 
 
@@ -229,6 +231,7 @@ def add_array(
     group = parser.add_argument_group("how recordings are read" if calibration else "the array")
     group.add_argument(
         "--layout",
+        type=Read,
         metavar="FILE",
         help="layout of the array, its wiring and direction of load: a JSON or TOML file",
     )
@@ -242,7 +245,10 @@ def add_array(
     group.add_argument("--rate", type=float, metavar="HZ", help="frames per second")
     if calibration:
         group.add_argument(
-            "--calibration", metavar="TABLE", help="CSV table cell,raw,force: raw counts to newtons"
+            "--calibration",
+            type=Read,
+            metavar="TABLE",
+            help="CSV table cell,raw,force: raw counts to newtons",
         )
     return group
 
@@ -430,67 +436,6 @@ def _agreeing(args: argparse.Namespace, layout: SensorLayout) -> dict[str, Any]:
     if args.rate is not None and not same_rate(args.rate, layout.rate):
         raise ValueError(f"--rate {args.rate:g} given, expected {layout.rate:g} Hz")
     return {name: options[name] for name in ("calibration", *_PLACES)}
-
-
-def refuse_missing(args: argparse.Namespace) -> None:
-    """Raise ValueError for a path that does not exist, before anything heavy is imported.
-
-    Checked are the inputs of every command, and the folders of the files that it writes.
-    """
-    many = [
-        path
-        for name in ("recordings", "reference", "trust")
-        for path in getattr(args, name, None) or []
-    ]
-    names = (
-        "labels",
-        "targets",
-        "layout",
-        "calibration",
-        "adapted",
-        "model",
-        "fleet",
-        "sign",
-        "diagnosis",
-    )
-    one = [getattr(args, name, None) for name in names]
-    for path in (path for path in (*many, *one) if path is not None):
-        # an empty path, as of a shell variable that is not set, is none either
-        if not os.path.lexists(path):
-            raise ValueError(f"{path or repr(path)}: is not there; check the path")
-    model = getattr(args, "model", None)
-    if (
-        model is not None
-        and not is_bundle(model)
-        and not os.path.isfile(os.path.join(model, "manifest.json"))
-    ):
-        raise ValueError(
-            f"{model}: expected a model, a folder with manifest.json as adaptfault train writes it,"
-            " or a bundle"
-        )
-    bundle = getattr(args, "bundle", None)
-    if bundle is not None and not is_bundle(bundle):
-        what = (
-            "expected a bundle, a folder with bundle.json; adaptfault train --out X.bundle"
-            " makes one"
-        )
-        raise ValueError(f"{bundle}: {what}")
-    for name in getattr(args, "writes", ()):
-        path = getattr(args, name)
-        if path == "":  # as of a shell variable that is not set: nothing would be written
-            raise ValueError(f"--{name.replace('_', '-')} '': name a file")
-        folder = os.path.dirname(path) if path else ""
-        if folder and not os.path.isdir(folder):
-            option = name.replace("_", "-")
-            what = f"the folder {folder} is not there; create it first"
-            raise ValueError(f"--{option} {path}: {what}")
-
-
-def is_bundle(folder: str | os.PathLike[str]) -> bool:
-    """Return whether a folder holds the document of a bundle, or its copy."""
-    return any(
-        os.path.isfile(os.path.join(folder, name)) for name in ("bundle.json", "bundle.copy.json")
-    )
 
 
 def fault_set(text: str, layout: SensorLayout) -> FaultSet:

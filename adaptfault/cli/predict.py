@@ -17,6 +17,7 @@ from adaptfault.cli.options import (
     emit,
     load_recordings,
 )
+from adaptfault.cli.paths import Read
 
 if TYPE_CHECKING:
     from adaptfault.cli.trained_model import TrainedModel
@@ -35,8 +36,10 @@ def add(commands: Commands) -> None:
     )
     add_recordings(parser)
     which = parser.add_mutually_exclusive_group(required=True)
-    which.add_argument("--model", metavar="MODEL", help="folder written by adaptfault train")
-    which.add_argument("--bundle", metavar="BUNDLE", help="the robot's bundle")
+    which.add_argument(
+        "--model", type=Read, metavar="MODEL", help="folder written by adaptfault train"
+    )
+    which.add_argument("--bundle", type=Read, metavar="BUNDLE", help="the robot's bundle")
     add_device(parser)
     add_trust(parser)
     parser.set_defaults(run=run)
@@ -53,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
     trained = TrainedModel.open(args, args.model or args.bundle)
     if args.calibration is None and trained.calibration is not None:
-        args.calibration = str(trained.calibration)
+        args.calibration = trained.calibration
     recordings = trained.rewired(
         load_recordings(args, args.recordings, layout=trained.network.layout)
     )

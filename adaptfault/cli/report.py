@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from adaptfault.cli.options import Commands, add_count_from, add_trust, command, emit, trust
+from adaptfault.cli.paths import Read, WrittenFolder
 
 
 def add(commands: Commands) -> None:
@@ -14,9 +15,18 @@ def add(commands: Commands) -> None:
         commands, "report", "write the technician's report: what is broken, what to check", example
     )
     parser.add_argument(
-        "bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle"
+        "bundle",
+        type=Read,
+        metavar="BUNDLE",
+        help="folder written by adaptfault train --out X.bundle",
     )
-    parser.add_argument("--out", default="report.html", metavar="FILE", help="default report.html")
+    parser.add_argument(
+        "--out",
+        type=WrittenFolder,
+        default="report.html",
+        metavar="FILE",
+        help="default report.html",
+    )
     parser.add_argument(
         "--name", metavar="NAME", help="of the robot (default: of the bundle or its folder)"
     )

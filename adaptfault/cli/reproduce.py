@@ -17,6 +17,7 @@ from adaptfault.cli.options import (
     progress,
     say,
 )
+from adaptfault.cli.paths import WrittenFolder
 
 _EXAMPLE = """  adaptfault reproduce --quick
   adaptfault reproduce --figure 6 --recordings grasps.npz --out real
@@ -55,7 +56,11 @@ def add(commands: Commands) -> None:
     )
     add_device(parser)
     parser.add_argument(
-        "--out", default="adaptfault-paper", metavar="FOLDER", help="default adaptfault-paper"
+        "--out",
+        type=WrittenFolder,
+        default="adaptfault-paper",
+        metavar="FOLDER",
+        help="default adaptfault-paper",
     )
     parser.set_defaults(run=run, continues=True)
 

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 from adaptfault.cli.options import Commands, add_trust, command, emit, report_problems, say, trust
+from adaptfault.cli.paths import Read, Stated, WrittenFolder
 
 _EXAMPLE = """  adaptfault restore today/ --bundle robot.bundle --out restored/
       writes restored.npz, readable by every command,
@@ -20,17 +21,25 @@ def add(commands: Commands) -> None:
         commands, "restore", "replace faulty cells by estimates from the healthy ones", _EXAMPLE
     )
     parser.add_argument(
-        "recordings", nargs="+", metavar="RECORDINGS", help="file or folder of recordings"
+        "recordings",
+        type=Read,
+        nargs="+",
+        metavar="RECORDINGS",
+        help="file or folder of recordings",
     )
     parser.add_argument(
         "--bundle",
+        type=Read,
         required=True,
         metavar="BUNDLE",
         help="folder with the healthy windows of the array",
     )
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder to write")
+    parser.add_argument(
+        "--out", type=WrittenFolder, required=True, metavar="FOLDER", help="folder to write"
+    )
     parser.add_argument(
         "--faults",
+        type=Stated,
         metavar="F",
         help=(
             "a diagnosis (JSON), or cell indices as 3,17,200 (default: the faulty cells that the"
@@ -47,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
     from adaptfault.bundle.bundle import Bundle
     from adaptfault.cli.options import fault_set
+    from adaptfault.data.atomic import atomic_write
     from adaptfault.data.recordings import Recordings, save_npz
     from adaptfault.robot.new_recordings import load_new_recordings
 
@@ -80,7 +90,8 @@ def run(args: argparse.Namespace) -> int:
         "missing_readings": missing,
         "restored": str(folder / "restored.npz"),
     }
-    (folder / "restored.json").write_text(json.dumps(result, indent=1, allow_nan=False))
+    about = json.dumps(result, indent=1, allow_nan=False)
+    atomic_write(folder / "restored.json", about.encode())
     typical = (
         f", typical deviation {np.median(deviation[list(faults)]):.3g} {layout.unit}"
         if len(faults)

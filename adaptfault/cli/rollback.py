@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from adaptfault.cli.options import Commands, add_trust, command, emit, trust
+from adaptfault.cli.paths import Read
 
 
 def add(commands: Commands) -> None:
@@ -13,7 +14,10 @@ def add(commands: Commands) -> None:
         commands, "rollback", "return to the previous version", "  adaptfault rollback robot.bundle"
     )
     parser.add_argument(
-        "bundle", metavar="BUNDLE", help="folder written by adaptfault train --out X.bundle"
+        "bundle",
+        type=Read,
+        metavar="BUNDLE",
+        help="folder written by adaptfault train --out X.bundle",
     )
     add_trust(parser)
     parser.set_defaults(run=run)

@@ -13,6 +13,7 @@ from adaptfault.cli.options import (
     emit,
     load_recordings,
 )
+from adaptfault.cli.paths import Read, Written
 
 _EXAMPLE = """\
   adaptfault selftest robot.bundle grasps/ --number 4 --out routine.json
@@ -28,15 +29,15 @@ def add(commands: Commands) -> None:
         "choose the fewest recordings whose repetition tests the cells that matter",
         _EXAMPLE,
     )
-    parser.add_argument("bundle", metavar="BUNDLE", help="folder that the robot carries")
+    parser.add_argument("bundle", type=Read, metavar="BUNDLE", help="folder that the robot carries")
     add_recordings(parser)
     parser.add_argument(
         "--number", type=int, metavar="N", help="largest number of recordings (default: as needed)"
     )
     parser.add_argument("--seconds", type=float, metavar="S", help="longest time of all of them")
-    parser.add_argument("--out", metavar="FILE", help="write the routine as JSON")
+    parser.add_argument("--out", type=Written, metavar="FILE", help="write the routine as JSON")
     add_trust(parser)
-    parser.set_defaults(run=run, writes=("out",))
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from adaptfault.cli.options import Commands, add_array, command, emit, layout_of, say
+from adaptfault.cli.paths import WrittenRecordings
 from adaptfault.cli.selection import add_selection, select
 
 _EXAMPLE = """  adaptfault simulate --out grasps.npz
@@ -19,6 +20,7 @@ def add(commands: Commands) -> None:
     )
     parser.add_argument(
         "--out",
+        type=WrittenRecordings,
         required=True,
         metavar="PATH",
         help="X.npz, X.npy, X.bag (ROS 2 bag), or a folder for CSV files",
@@ -40,7 +42,7 @@ def add(commands: Commands) -> None:
     )
     add_array(parser, calibration=False)
     add_selection(parser)
-    parser.set_defaults(run=run, writes=("out",))
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -23,6 +23,7 @@ from adaptfault.cli.options import (
     progress,
     say,
 )
+from adaptfault.cli.paths import WrittenFolder, is_bundle
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -55,7 +56,11 @@ def add(commands: Commands) -> None:
     )
     add_recordings(parser, targets=True)
     parser.add_argument(
-        "--out", required=True, metavar="FOLDER", help="where the model goes; X.bundle: a bundle"
+        "--out",
+        type=WrittenFolder,
+        required=True,
+        metavar="FOLDER",
+        help="where the model goes; X.bundle: a bundle",
     )
     parser.add_argument(
         "--epochs", type=int, default=50, help="at most so many epochs (default 50)"
@@ -109,6 +114,8 @@ def run(args: argparse.Namespace) -> int:
     """Train, evaluate on the test recordings, save."""
     out = Path(args.out)
     bundled = out.suffix == ".bundle"
+    if bundled and _was_done(args, out):
+        return 0
     _check_options(args, out, bundled)
     recordings = load_recordings(args, args.recordings, labelled=True)
     where = device(args)
@@ -140,7 +147,7 @@ def run(args: argparse.Namespace) -> int:
         model = _built(args.builder, windows, recordings.layout, n_classes, values)
     else:
         model = TactileTransformer(recordings.layout, n_classes, length=args.length, seed=args.seed)
-    folder = out.with_name(f".{out.name}.training") if bundled else out
+    folder = _training_folder(out) if bundled else out
     history = _trained(args, model.to(where), parts, folder, units)
     adapter = Adapter(model.cpu(), parts[0], parts[1])
     healthy = (
@@ -194,6 +201,29 @@ def _check_classes(path: str, recordings: Recordings) -> None:
             f"{path}: all recordings are of one class, {name!r}; a classifier needs two, one folder"
             " each"
         )
+
+
+def _training_folder(out: Path) -> Path:
+    """Return the folder of the checkpoint while a bundle is made."""
+    return out.with_name(f".{out.name}.training")
+
+
+def _was_done(args: argparse.Namespace, out: Path) -> bool:
+    """Return whether a run of this command was cut off after its bundle was whole, and end it.
+
+    Raises:
+        Untrusted: the bundle is to be signed, and is not.
+    """
+    folder = _training_folder(out)
+    if not (folder.is_dir() and is_bundle(out)):
+        return False
+    from adaptfault.bundle.bundle import Bundle
+
+    Bundle.open(out, keys=None if args.sign is None else [args.sign])
+    shutil.rmtree(folder)
+    result = {"schema": "adaptfault.train/1", "bundle": str(out)}
+    emit(args, result, f"bundle: {out}, whole; the run that made it was cut off at its end")
+    return True
 
 
 def _check_options(args: argparse.Namespace, out: Path, bundled: bool) -> None:
@@ -301,6 +331,7 @@ def _told(
     values: tuple[NDArray[Any], NDArray[Any]],
 ) -> tuple[str, ...]:
     """Draw the training, print the result, and return the signs of a failed training."""
+    from adaptfault.data.atomic import atomic_figure
     from adaptfault.evaluation.scores import ValueScores
     from adaptfault.evaluation.training_check import (
         plot_training,
@@ -319,7 +350,7 @@ def _told(
         figure = plot_training(scores, history, names)
         problems = training_problems(scores, history, names)
         told, trained = str(scores), str(history)
-    figure.savefig(picture, dpi=120)
+    atomic_figure(picture, figure, dpi=120)
     for problem in problems:
         print(f"warning: {problem}", file=sys.stderr)
     emit(
@@ -373,11 +404,10 @@ def _bundle(
     import numpy as np
 
     from adaptfault.bundle.bundle import Bundle
-    from adaptfault.bundle.signing import sign_bundle
     from adaptfault.data.calibration import Calibration
 
     training, _, test = parts
-    bundle = Bundle.create(
+    Bundle.create(
         out,
         adapter.model,
         adapter,
@@ -386,6 +416,5 @@ def _bundle(
         class_names=names,
         calibration=Calibration.read(args.calibration) if args.calibration else None,
         head=args.head,
+        sign=args.sign,
     )
-    if args.sign is not None:
-        sign_bundle(bundle, args.sign)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +13,8 @@ from numpy.typing import NDArray
 
 from adaptfault.adaptation.fault_free import Network
 from adaptfault.adaptation.result import Adaptation, load_healthy
-from adaptfault.cli.options import is_bundle, load_recordings, say, trust
+from adaptfault.cli.options import load_recordings, say, trust
+from adaptfault.cli.paths import is_bundle
 from adaptfault.data.recordings import Recordings
 from adaptfault.data.windows import Windows, make_windows, split
 from adaptfault.models.store import SCHEMA, read_manifest
@@ -22,6 +22,7 @@ from adaptfault.models.store import SCHEMA, read_manifest
 if TYPE_CHECKING:
     from adaptfault.bundle.bundle import Bundle
     from adaptfault.bundle.versions import Version
+    from adaptfault.data.calibration import Calibration
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class TrainedModel:
     class_names: tuple[str, ...]
     split_seed: int | None
     adaptation: Adaptation
-    calibration: Path | None = None
+    calibration: Calibration | None = None
     version: Version | None = None
 
     @classmethod
@@ -64,7 +65,7 @@ class TrainedModel:
             healthy = load_healthy(folder)
             return cls(healthy.model.network, tuple(manifest["class_names"]), seed, healthy)
         version = bundle.active()
-        active = Adaptation.load(version.folder)
+        active = Adaptation.load(version.files)
         return cls(
             active.model.network,
             bundle.class_names,
@@ -94,7 +95,7 @@ class TrainedModel:
                 "--targets is for a regression, and this model names classes: give --labels TABLE"
             )
         if args.calibration is None and self.calibration is not None:
-            args.calibration = str(self.calibration)
+            args.calibration = self.calibration
         recordings = load_recordings(args, paths, labelled=True, layout=self.network.layout)
         if self.is_regression:
             return self._with_values(args.targets, recordings)

@@ -20,6 +20,7 @@ from adaptfault.cli.options import (
     report_range,
     say,
 )
+from adaptfault.cli.paths import Read, Written
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -46,16 +47,23 @@ def add(commands: Commands) -> None:
     )
     add_recordings(parser, labels=False)
     given = parser.add_mutually_exclusive_group()
-    given.add_argument("--bundle", metavar="BUNDLE", help="the robot's bundle, to diagnose with")
+    given.add_argument(
+        "--bundle", type=Read, metavar="BUNDLE", help="the robot's bundle, to diagnose with"
+    )
     add_reference(given)
     given.add_argument(
-        "--diagnosis", metavar="FILE", help="a diagnosis written by adaptfault diagnose --out"
+        "--diagnosis",
+        type=Read,
+        metavar="FILE",
+        help="a diagnosis written by adaptfault diagnose --out",
     )
-    parser.add_argument("--mcap", metavar="FILE", help="write an MCAP file, for Foxglove")
-    parser.add_argument("--rrd", metavar="FILE", help="write an RRD file, for Rerun")
+    parser.add_argument(
+        "--mcap", type=Written, metavar="FILE", help="write an MCAP file, for Foxglove"
+    )
+    parser.add_argument("--rrd", type=Written, metavar="FILE", help="write an RRD file, for Rerun")
     add_cache(parser)
     add_trust(parser)
-    parser.set_defaults(run=run, writes=("mcap", "rrd"))
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

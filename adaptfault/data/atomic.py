@@ -5,10 +5,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
@@ -37,7 +40,19 @@ def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
         with contextlib.suppress(OSError):
             os.unlink(name)
         raise
-    sync_folder(path.parent)  # the rename is durable once the folder is synchronised
+    sync(path.parent)  # the rename is durable once the folder is synchronised
+
+
+def atomic_figure(path: str | os.PathLike[str], figure: Any, *, dpi: int) -> None:
+    """Write a figure of matplotlib in the format that the name ends in, as :func:`atomic_write`.
+
+    Raises:
+        OSError: the folder does not exist or cannot be written.
+        ValueError: matplotlib knows no such format.
+    """
+    picture = io.BytesIO()
+    figure.savefig(picture, format=Path(path).suffix[1:] or "png", dpi=dpi)
+    atomic_write(path, picture.getvalue())
 
 
 @contextlib.contextmanager
@@ -62,7 +77,43 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         with contextlib.suppress(OSError):
             os.unlink(name)
         raise
-    sync_folder(path.parent)
+    sync(path.parent)
+
+
+@contextlib.contextmanager
+def atomic_folder(path: str | os.PathLike[str], *, replaces: bool) -> Iterator[Path]:
+    """Yield a new folder beside ``path``, which takes its place at the end, after all of it is
+    synchronised.
+
+    Two renames replace a folder: a kill between them leaves none of this name, never a part.
+
+    Args:
+        path: of the folder.
+        replaces: whether the folder that is there goes; the caller knows that it may.
+
+    Raises:
+        OSError: the folder above does not exist or cannot be written, or ``path`` is there and may
+            not go; nothing is left behind.
+    """
+    path = Path(path)
+    new = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    old = new / "old"
+    whole = new / "new"
+    whole.mkdir()
+    try:
+        yield whole
+        sync_tree(whole)
+        if replaces and path.exists():
+            os.rename(path, old)
+        try:
+            os.rename(whole, path)
+        except OSError:
+            if old.exists():
+                os.rename(old, path)
+            raise
+        sync(path.parent)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
 
 
 def make_folder(path: str | os.PathLike[str]) -> None:
@@ -78,15 +129,21 @@ def make_folder(path: str | os.PathLike[str]) -> None:
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path))
     make_folder(path.parent)
     path.mkdir(exist_ok=True)
-    sync_folder(path.parent)
+    sync(path.parent)
 
 
-def sync_folder(path: str | os.PathLike[str]) -> None:
-    """Flush the entries of a folder to the disk."""
+def sync_tree(folder: Path) -> None:
+    """Flush ``folder`` and everything below it to the disk."""
+    for path in [*folder.rglob("*"), folder]:
+        sync(path)
+
+
+def sync(path: str | os.PathLike[str]) -> None:
+    """Flush a file, or the entries of a folder, to the disk (fsync)."""
     if os.name != "posix":
         return
-    folder = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(folder)
+        os.fsync(descriptor)
     finally:
-        os.close(folder)
+        os.close(descriptor)

@@ -168,7 +168,12 @@ class Calibration:
             InputError: the file cannot be read, or a line or a cell is wrong; named.
         """
         path = Path(path)
-        points = _read_points(path)
+        return cls.decode(path, read_text(path), layout)
+
+    @classmethod
+    def decode(cls, path: Path, text: str, layout: SensorLayout | None = None) -> Calibration:
+        """Return the table in a text; ``path`` names it in the errors of :meth:`read`."""
+        points = _points(path, text)
         highest = max(points)
         width = highest + 1 if layout is None else layout.n_cells
         if highest >= width:
@@ -198,13 +203,17 @@ class Calibration:
     def write(self, path: str | PathLike[str]) -> None:
         """Write the table so that :meth:`read` returns the same values. OSError if the file cannot
         be written."""
+        atomic_write(path, self.encode())
+
+    def encode(self) -> bytes:
+        """Return the content of the file that :meth:`write` writes."""
         lines = ["cell,raw,force"]
         for cell, raw, force in self._tables:
             lines += (
                 f"{cell},{r!r},{f!r}" for r, f in zip(raw.tolist(), force.tolist(), strict=True)
             )
         text = "\n".join(lines) + "\n"
-        atomic_write(path, text.encode())
+        return text.encode()
 
 
 _Point = tuple[float, float, int]
@@ -244,9 +253,9 @@ def _check_rows(path: Path, cell: int, rows: Sequence[_Point]) -> None:
             )
 
 
-def _read_points(path: Path) -> dict[int, list[_Point]]:
-    """Return the points of each cell named in a file, by raw count."""
-    lines, numbers = numbered_lines(read_text(path))
+def _points(path: Path, text: str) -> dict[int, list[_Point]]:
+    """Return the points of each cell that the text of a file names, by raw count."""
+    lines, numbers = numbered_lines(text)
     header = [name.strip().strip('"').casefold() for name in lines[0].split(",")] if lines else []
     if header != ["cell", "raw", "force"]:
         where = f"line {numbers[0] if numbers else 1}"

@@ -8,6 +8,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import date, datetime
 from pathlib import Path
@@ -102,6 +103,14 @@ class Fleet:
 
     def __str__(self) -> str:
         return f"{len(self.robots)} robots" + (f" of {self.source}" if self.source else "")
+
+    def paths(self) -> list[str]:
+        """Return the bundles and the recordings that are there."""
+        found = [robot.bundle for robot in self.robots]
+        for robot in self.robots:
+            with suppress(FileNotFoundError):
+                found += robot.paths()
+        return found
 
     @classmethod
     def read(cls, path: str | Path) -> Fleet:

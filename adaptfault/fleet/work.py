@@ -71,15 +71,19 @@ def _maintained(
     began: float,
 ) -> Outcome:
     from adaptfault.bundle.bundle import Bundle
-    from adaptfault.bundle.signing import sign_bundle
     from adaptfault.robot.maintenance import maintain
     from adaptfault.robot.new_recordings import load_new_recordings
 
     bundle = Bundle.open(robot.bundle, keys=keys, least_serial=least_serial)
     incoming = load_new_recordings(bundle, robot.paths())
-    report = maintain(bundle, incoming.frames, names=incoming.names, dry_run=dry_run, budget=budget)
-    if sign is not None and not dry_run:
-        sign_bundle(bundle, sign)
+    report = maintain(
+        bundle,
+        incoming.frames,
+        names=incoming.names,
+        dry_run=dry_run,
+        budget=budget,
+        sign=sign,
+    )
     notes = tuple(problem.message for problem in incoming.problems if problem.level == "error")
     return Outcome.of(robot, bundle, report, notes=notes, seconds=time.perf_counter() - began)
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
@@ -25,11 +28,82 @@ SCHEMA = "adaptfault.model/1"
 ADAPTATION = "adaptfault.adaptation/1"  # schema of an adapted model
 MANIFEST = "manifest.json"
 _BUNDLE = "bundle.json"  # a folder with one holds models, and is none
+_WEIGHTS = re.compile(r"weights-[0-9a-f]{12}\.safetensors")
 _HEAD = "closed form head."  # begins the names of its tensors; no module's name holds a space
 
 
+class Folder(Protocol):
+    """Where a model is kept: on the disk, in the memory, or on the disk with recorded hashes."""
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file; raises FileNotFoundError where there is none."""
+        ...
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write a file in one step."""
+        ...
+
+    def remove(self, name: str) -> None:
+        """Remove a file, if it is there."""
+        ...
+
+
+Place = str | PathLike[str] | Folder
+
+
+@dataclass(frozen=True)
+class _OnDisk:
+    """A folder of the file system; made where missing."""
+
+    path: Path
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file; raises FileNotFoundError."""
+        path = self.path / name
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} is missing")
+        return path.read_bytes()
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write a file in one step."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        atomic_write(self.path / name, data)
+
+    def remove(self, name: str) -> None:
+        """Remove a file, if it is there."""
+        (self.path / name).unlink(missing_ok=True)
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+
+class InMemory(dict[str, bytes]):
+    """The files of a folder that is not on the disk yet, by name."""
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file; raises FileNotFoundError."""
+        if name not in self:
+            raise FileNotFoundError(f"{name} is missing")
+        return self[name]
+
+    def write(self, name: str, data: bytes) -> None:
+        """Keep a file."""
+        self[name] = data
+
+    def remove(self, name: str) -> None:
+        """Forget a file."""
+        self.pop(name, None)
+
+    def __str__(self) -> str:
+        return "(not on the disk yet)"
+
+
+def _folder(place: Place) -> Folder:
+    return _OnDisk(Path(place)) if isinstance(place, str | PathLike) else place
+
+
 def save_tensors(
-    folder: str | Path, schema: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]
+    folder: Place, schema: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]
 ) -> None:
     """Write tensors and a manifest into a folder; the folder is created, and earlier content is
     replaced.
@@ -52,7 +126,7 @@ def save_tensors(
 
 
 def save_arrays(
-    folder: str | Path, schema: str, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+    folder: Place, schema: str, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> None:
     """Write arrays as :func:`save_tensors` writes tensors. Needs no torch.
 
@@ -69,7 +143,7 @@ def save_arrays(
     )
 
 
-def _save(folder: str | Path, schema: str, about: Mapping[str, Any], data: bytes) -> None:
+def _save(place: Place, schema: str, about: Mapping[str, Any], data: bytes) -> None:
     digest = hashlib.sha256(data).hexdigest()
     name = f"weights-{digest[:12]}.safetensors"
     manifest = {"schema": schema, **about, "weights": {"file": name, "sha256": digest}}
@@ -77,51 +151,63 @@ def _save(folder: str | Path, schema: str, about: Mapping[str, Any], data: bytes
         text = json.dumps(manifest, indent=1, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"the manifest cannot be written as JSON: {error}") from None
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    atomic_write(folder / name, data)
-    atomic_write(folder / MANIFEST, text.encode())
-    for old in folder.glob("weights-*.safetensors"):
-        if old.name != name:
-            old.unlink(missing_ok=True)
+    folder = _folder(place)
+    before = _weights_of(folder)
+    folder.write(name, data)
+    folder.write(MANIFEST, text.encode())
+    if before not in ("", name):
+        folder.remove(before)
 
 
-def schema_of(folder: str | Path) -> str:
+def _weights_of(folder: Folder) -> str:
+    """Return the name of the file of tensors that the manifest of a folder names; "" without
+    one."""
+    try:
+        name = str(_manifest(folder)["weights"]["file"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return ""
+    return name if _WEIGHTS.fullmatch(name) else ""
+
+
+def schema_of(folder: Place) -> str:
     """Return the schema of the content of a folder.
 
     Raises:
         FileNotFoundError: there is no ``manifest.json``.
         ValueError: it is not JSON with a schema.
     """
-    return str(_manifest(Path(folder))["schema"])
+    return str(_manifest(_folder(folder))["schema"])
 
 
-def read_manifest(folder: str | Path, schema: str) -> dict[str, Any]:
+def read_manifest(folder: Place, schema: str) -> dict[str, Any]:
     """Return the content of ``manifest.json``. Needs no torch.
 
     Raises:
         FileNotFoundError: there is none in the folder.
         ValueError: it is not JSON, or of another schema.
     """
-    manifest = _manifest(Path(folder))
+    manifest = _manifest(_folder(folder))
     if manifest["schema"] != schema:
         raise ValueError(
-            f"{Path(folder) / MANIFEST} has schema {manifest['schema']!r}, expected {schema!r}"
+            f"{folder}/{MANIFEST} has schema {manifest['schema']!r}, expected {schema!r}"
         )
     return manifest
 
 
-def _manifest(folder: Path) -> dict[str, Any]:
-    path = folder / MANIFEST
-    if not path.is_file():
-        if (folder / _BUNDLE).is_file():
+def _manifest(folder: Folder) -> dict[str, Any]:
+    path = f"{folder}/{MANIFEST}"
+    try:
+        data = folder.read(MANIFEST)
+    except FileNotFoundError:
+        if isinstance(folder, _OnDisk) and (folder.path / _BUNDLE).is_file():
             raise FileNotFoundError(
                 f"{folder} is a bundle, not a model: Bundle.open({str(folder)!r}).adapter() has its"
                 " model, and its healthy adaptation"
-            )
-        raise FileNotFoundError(f"{folder}: expected a folder with a {MANIFEST}, found none")
+            ) from None
+        what = f"{folder}: expected a folder with a {MANIFEST}, found none"
+        raise FileNotFoundError(what) from None
     try:
-        manifest = json.loads(path.read_bytes())
+        manifest = json.loads(data)
         manifest["schema"]
     except (ValueError, TypeError, KeyError, RecursionError):
         raise ValueError(
@@ -130,7 +216,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
     return dict(manifest)
 
 
-def load_tensors(folder: str | Path, schema: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def load_tensors(folder: Place, schema: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Read what :func:`save_tensors` wrote.
 
     Raises:
@@ -139,66 +225,66 @@ def load_tensors(folder: str | Path, schema: str) -> tuple[dict[str, Any], dict[
     """
     from safetensors.torch import load
 
-    manifest, data = _load(Path(folder), schema)
+    manifest, data = _load(folder, schema)
     return manifest, load(data)
 
 
-def load_arrays(folder: str | Path, schema: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def load_arrays(folder: Place, schema: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Read what :func:`save_arrays` wrote; raises what :func:`load_tensors` raises. Needs no
     torch."""
     from safetensors.numpy import load
 
-    manifest, data = _load(Path(folder), schema)
+    manifest, data = _load(folder, schema)
     return manifest, load(data)
 
 
-def _load(folder: Path, schema: str) -> tuple[dict[str, Any], bytes]:
+def _load(folder: Place, schema: str) -> tuple[dict[str, Any], bytes]:
     manifest = read_manifest(folder, schema)
     return manifest, read_attached(folder, manifest, "weights")
 
 
-def attach(folder: str | Path, key: str, name: str, data: bytes) -> Path:
-    """Write one more file into a folder with a manifest, add its hash to the manifest as ``key``,
-    return its path.
+def attach(place: Place, key: str, name: str, data: bytes) -> None:
+    """Write one more file into a folder with a manifest, and add its hash to the manifest as
+    ``key``.
 
     Raises:
         FileNotFoundError: there is no ``manifest.json``.
         ValueError: it is damaged.
     """
-    folder = Path(folder)
+    folder = _folder(place)
     manifest = {
         **_manifest(folder),
         key: {"file": name, "sha256": hashlib.sha256(data).hexdigest()},
     }
-    atomic_write(folder / name, data)
-    atomic_write(folder / MANIFEST, json.dumps(manifest, indent=1, allow_nan=False).encode())
-    return folder / name
+    folder.write(name, data)
+    folder.write(MANIFEST, json.dumps(manifest, indent=1, allow_nan=False).encode())
 
 
-def read_attached(folder: str | Path, manifest: Mapping[str, Any], key: str) -> bytes:
+def read_attached(place: Place, manifest: Mapping[str, Any], key: str) -> bytes:
     """Return the content of the file that a manifest lists as ``key``. Needs no torch.
 
     Raises:
         FileNotFoundError: the file is missing.
         ValueError: the hash differs, or the manifest lists no such file.
     """
-    folder = Path(folder)
+    folder = _folder(place)
     try:
-        name = manifest[key]["file"]
+        name = Path(manifest[key]["file"]).name  # a manifest cannot point outside its folder
         digest = manifest[key]["sha256"]
-        path = folder / Path(name).name  # a manifest cannot point outside its folder
     except (KeyError, TypeError) as error:
-        raise ValueError(f"{folder / MANIFEST} is damaged: {error}") from None
-    if not path.is_file():
-        raise FileNotFoundError(f"{folder / MANIFEST} names a file that is missing: {name}")
-    data = path.read_bytes()
+        raise ValueError(f"{folder}/{MANIFEST} is damaged: {error}") from None
+    try:
+        data = folder.read(name)
+    except FileNotFoundError:
+        what = f"{folder}/{MANIFEST} names a file that is missing: {name}"
+        raise FileNotFoundError(what) from None
     if hashlib.sha256(data).hexdigest() != digest:
-        raise ValueError(f"{path} is damaged: its hash is not the one in {MANIFEST}")
+        raise ValueError(f"{folder}/{name} is damaged: its hash is not the one in {MANIFEST}")
     return data
 
 
 def save_model(
-    folder: str | Path,
+    folder: Place,
     model: TactileTransformer | AnyModel,
     *,
     class_names: Sequence[str] = (),
@@ -244,7 +330,7 @@ def save_model(
     save_tensors(folder, SCHEMA, about, tensors)
 
 
-def load_model(folder: str | Path) -> TactileTransformer | AnyModel:
+def load_model(folder: Place) -> TactileTransformer | AnyModel:
     """Read the model that :func:`save_model` wrote, in eval mode, without the head in closed form.
 
     Raises:
@@ -255,7 +341,7 @@ def load_model(folder: str | Path) -> TactileTransformer | AnyModel:
     return load_with_head(folder)[0]
 
 
-def load_with_head(folder: str | Path) -> tuple[TactileTransformer | AnyModel, Head | None]:
+def load_with_head(folder: Place) -> tuple[TactileTransformer | AnyModel, Head | None]:
     """Read the model that :func:`save_model` wrote, and its head in closed form if it has one.
 
     Raises the errors of :func:`load_model`.

@@ -28,7 +28,7 @@ from adaptfault.models.builders import first_line
 from adaptfault.models.compact import CompactNetwork
 from adaptfault.models.heads import Head
 from adaptfault.models.network import TactileTransformer
-from adaptfault.models.store import attach
+from adaptfault.models.store import Place, attach
 from adaptfault.prediction.inference import ONNX_FILE, open_session, run_session
 from adaptfault.prediction.whole_windows import Masked, Selected
 from diagnostics import FaultSet
@@ -45,7 +45,7 @@ class ExportError(RuntimeError):
     model."""
 
 
-def add_onnx(folder: str | Path, graph: bytes | None = None) -> Path:
+def add_onnx(folder: Place, graph: bytes | None = None) -> Path:
     """Export the adaptation that :meth:`Adaptation.save` wrote into ``folder``, and return the new
     file's path.
 
@@ -65,12 +65,9 @@ def add_onnx(folder: str | Path, graph: bytes | None = None) -> Path:
         FileNotFoundError, ValueError: there is no whole adaptation in the folder.
     """
     adaptation = Adaptation.load(folder)
-    return attach(
-        folder,
-        "onnx",
-        ONNX_FILE,
-        to_onnx(adaptation.model, graph, values=adaptation.task == "regression"),
-    )
+    data = to_onnx(adaptation.model, graph, values=adaptation.task == "regression")
+    attach(folder, "onnx", ONNX_FILE, data)
+    return Path(str(folder), ONNX_FILE)
 
 
 def to_onnx(model: ReducedModel, graph: bytes | None = None, *, values: bool = False) -> bytes:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from adaptfault.models.accumulation import ContactStatistics
 from adaptfault.models.prediction_sets import PredictionSets
-from adaptfault.models.store import ADAPTATION, read_attached, read_manifest
+from adaptfault.models.store import ADAPTATION, Place, read_attached, read_manifest
 from diagnostics import FaultSet, SensorLayout
 
 if TYPE_CHECKING:
@@ -63,7 +62,7 @@ class Inference:
         self.task = task
 
     @classmethod
-    def load(cls, folder: str | Path, *, runtime: Runtime | None = None) -> Inference:
+    def load(cls, folder: Place, *, runtime: Runtime | None = None) -> Inference:
         """Read a folder that :meth:`Adaptation.save` wrote, with an ONNX file where ``add_onnx``
         added one.
 
@@ -202,13 +201,13 @@ def run_session(session: InferenceSession, x: NDArray[np.float32]) -> NDArray[np
 
 
 def _on_onnx(
-    folder: str | Path, manifest: dict[str, Any]
+    folder: Place, manifest: dict[str, Any]
 ) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
     session = open_session(read_attached(folder, manifest, "onnx"))
     return lambda x: run_session(session, x)
 
 
-def _on_torch(folder: str | Path) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+def _on_torch(folder: Place) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
     from adaptfault.adaptation.result import Adaptation
 
     adaptation = Adaptation.load(folder)

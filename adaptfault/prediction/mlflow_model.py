@@ -75,7 +75,7 @@ def _described(bundle: str | os.PathLike[str]) -> dict[str, Any]:
     from mlflow.models import ModelSignature
     from mlflow.types import Schema, TensorSpec
 
-    model = Inference.load(Bundle.open(Path(bundle)).active().folder)
+    model = Inference.load(Bundle.open(Path(bundle)).active().files)
     window = np.zeros((1, model.length, model.layout.n_cells), np.float32)
     result = model.predict(window)
     given = TensorSpec(window.dtype, (-1, *window.shape[1:]))

@@ -399,7 +399,7 @@ def _start(bundle: Bundle, version: Version, layout: SensorLayout) -> _Running:
         FileNotFoundError, ImportError, ValueError: the version cannot be loaded.
     """
     with decoding(version.folder):
-        model = Inference.load(version.folder)
+        model = Inference.load(version.files)
     if model.layout != layout:
         raise ValueError(f"the version is for {model.layout}, the bundle for {layout}")
     model.predict(np.zeros((1, model.length, layout.n_cells), np.float32))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adaptfault.bundle.checksummed_json import Damaged
+from adaptfault.data.atomic import atomic_figure
 from adaptfault.inspection.severity import TECHNICIAN_BELOW
 from adaptfault.prognosis.trend import COVERAGE, FALSE, Trend, Trends, trends
 from diagnostics.decision.result import Verdict
@@ -355,7 +356,7 @@ class AgeingReport:
 
     def write_picture(self, path: str | Path) -> None:
         """Write the figure as PNG; raises OSError."""
-        self.plot().savefig(path, dpi=150)
+        atomic_figure(path, self.plot(), dpi=150)
 
 
 def _median(values: Floats, share: float) -> Floats:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ from adaptfault.bundle.bundle import Bundle, now
 from adaptfault.bundle.journal import Entry
 from adaptfault.bundle.known_faults import KnownFaults
 from adaptfault.bundle.pointer import Pointer
+from adaptfault.bundle.signature import read_private_key
+from adaptfault.bundle.signing import sign_bundle
 from adaptfault.inspection.changed_readings import ChangedReadings, as_loads, find_sensor_change
 from adaptfault.inspection.incoming import IncomingRecording, incoming_recordings
 from adaptfault.inspection.inspection import Inspection, inspect
@@ -53,6 +56,7 @@ def maintain(
     budget: float | None = None,
     untested_code: int = 1,
     routine: Routine | None = None,
+    sign: str | PathLike[str] | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> MaintenanceReport:
     """Inspect new recordings and update the running version where that is needed.
@@ -72,6 +76,8 @@ def maintain(
             the cells.
         routine: of which the recordings are a log: the report says what it left untested, and the
             next best recording.
+        sign: PEM file of the private key that signs the bundle with what the run deploys; None: it
+            is not signed.
         say: receives one line of progress before each long step.
 
     Raises:
@@ -81,6 +87,8 @@ def maintain(
     """
     if routine is not None:
         routine.check(bundle.layout)
+    if sign is not None:
+        read_private_key(sign)  # before the work that it would be missing for
     began = time.perf_counter()
     with bundle.maintenance(dry_run=dry_run):
         if not dry_run:
@@ -93,12 +101,15 @@ def maintain(
             known=bundle.known_faults(),
             dry_run=dry_run,
             budget=budget,
+            sign=sign,
             say=say,
             warnings=warnings,
             left_out=tuple(text for one in fresh if (text := one.left_out(bundle.layout))),
         )
         usable = [recording for recording in fresh if recording.problem is None]
         report = _maintained(run, usable, untested_code, routine) if usable else _idle(run, fresh)
+        if sign is not None and not dry_run and report.decision != "deployed":
+            sign_bundle(bundle, sign)
     return replace(report, seconds=time.perf_counter() - began)
 
 
@@ -543,4 +554,4 @@ def _write(
     if outcome.deploys is None:
         run.robot.bundle.journal.add(entry)
     else:
-        run.robot.bundle.deploy(outcome.deploys, entry)
+        run.robot.bundle.deploy(outcome.deploys, entry, sign=run.sign)

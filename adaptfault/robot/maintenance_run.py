@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,6 +37,7 @@ class MaintenanceRun:
         known: the known faults before this run.
         dry_run: nothing is changed.
         budget: seconds that an adaptation may take; None: no limit.
+        sign: PEM file of the key that signs what is deployed; None: it is not signed.
         say: receives one line of progress before each long step.
         warnings: damage found in the bundle.
         left_out: recordings, or readings of them, that are not used, with the reason.
@@ -46,6 +48,7 @@ class MaintenanceRun:
     known: KnownFaults
     dry_run: bool
     budget: float | None
+    sign: str | PathLike[str] | None
     say: Callable[[str], None]
     warnings: tuple[str, ...]
     left_out: tuple[str, ...]
@@ -116,7 +119,7 @@ class Robot:
         """Return the model of a version; raises Damaged."""
         from adaptfault.adaptation.result import Adaptation
 
-        return Adaptation.load(version.folder)
+        return Adaptation.load(version.files)
 
     def class_name(self, number: int) -> str:
         """Return the name of a class or a value, or its number."""

@@ -88,17 +88,14 @@ class Sensor:
 
     @classmethod
     def _from_bundle(cls, bundle: Bundle, *, restores: bool) -> Sensor:
-        from adaptfault.data.calibration import Calibration
-
         version = bundle.active()
         _ = version.readings  # raises Damaged
-        table = bundle.parts.calibration
         return cls(
             bundle.diagnoser(),
             bundle.known_faults().fault_set,
             version,
             bundle.restorer() if restores else None,
-            None if table is None else Calibration.read(table),
+            bundle.parts.calibration,
             bundle.about["parts"],
         )
 

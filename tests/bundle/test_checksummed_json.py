@@ -4,13 +4,13 @@ import pytest
 
 from adaptfault.bundle.checksummed_json import (
     Damaged,
-    check_files,
+    Sealed,
     damage,
     decoding,
-    hash_files,
     read_checksummed,
     read_with_copy,
     write_checksummed,
+    write_files,
     write_with_copy,
 )
 from adaptfault.models.builders import ModelNotAllowed
@@ -85,16 +85,22 @@ def test_a_missing_document_and_two_damaged_ones_are_told_apart(tmp_path):
 
 
 def test_a_changed_or_missing_file_is_noticed(tmp_path):
-    (tmp_path / "sub").mkdir()
-    (tmp_path / "sub" / "weights").write_bytes(b"abc")
-    hashes = hash_files(tmp_path)
-    check_files(tmp_path, hashes)
+    sealed = Sealed(tmp_path, write_files(tmp_path, {"sub/weights": b"abc", "other": b"c"}))
+    sealed.check()
+    assert sealed.below("sub").read("weights") == sealed.read("sub/weights") == b"abc"
     (tmp_path / "sub" / "weights").write_bytes(b"abd")
     with pytest.raises(Damaged, match="damaged"):
-        check_files(tmp_path, hashes)
+        sealed.check()
+    with pytest.raises(Damaged, match="damaged"):
+        sealed.below("sub").read("weights")
     (tmp_path / "sub" / "weights").unlink()
     with pytest.raises(Damaged, match="missing"):
-        check_files(tmp_path, hashes)
+        sealed.check()
+    (tmp_path / "more").write_bytes(b"abc")
+    with pytest.raises(FileNotFoundError, match="none of the recorded files"):
+        sealed.read("more")
+    with pytest.raises(PermissionError, match="is not written again"):
+        sealed.write("other", b"")
 
 
 def test_a_model_that_is_not_allowed_is_not_damaged(tmp_path):

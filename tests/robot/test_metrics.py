@@ -181,7 +181,8 @@ def test_fleet_maintain_writes_the_file(monkeypatch, tmp_path, capsys):
         lambda *fleet, **options: FleetReport((outcome,), now, now),
     )
     out = tmp_path / "m.prom"
-    command = ["fleet", "maintain", str(tmp_path / "f.toml"), "--out", str(tmp_path)]
+    (tmp_path / "run").mkdir()
+    command = ["fleet", "maintain", str(tmp_path / "f.toml"), "--out", str(tmp_path / "run")]
     assert main([*command, "--metrics", str(out)]) == 0
     assert read(out.read_text())["exit_code", "a"] == 0
 

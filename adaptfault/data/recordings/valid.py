@@ -12,6 +12,7 @@ missing. No published contract of data sets has such a field; the names here are
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -20,10 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adaptfault.data.atomic import atomic_file
+from adaptfault.data.atomic import atomic_file, atomic_folder
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.formats.datasets.extra import imported
 from diagnostics import Fault, SensorLayout
+
+_SCHEMA = "adaptfault.valid/1"
+_IN_STORE = {".zgroup", ".zattrs", ".zmetadata", "data", "meta"}
 
 Masks = Iterator[NDArray[np.bool_]]
 
@@ -56,7 +60,8 @@ def write_valid(
         layout: the array.
 
     Raises:
-        InputError: another ending, or the package of the format is not installed.
+        InputError: another ending, the package of the format is not installed, or the path is a
+            folder that holds other things than masks.
         OSError: the file cannot be written.
     """
     path = Path(path)
@@ -64,7 +69,31 @@ def write_valid(
     if writer is None:
         what = f"expected a name that ends in {', '.join(_WRITERS)}"
         raise InputError.at(path, what)
+    refuse_foreign(path)
     writer(path, masks, names, layout)
+
+
+def refuse_foreign(path: str | PathLike[str]) -> None:
+    """Refuse a folder that :func:`write_valid` did not write, or that holds more than it wrote.
+
+    Raises:
+        InputError: with the folder.
+    """
+    path = Path(path)
+    if not path.is_dir() or not any(path.iterdir()) or _is_ours(path):
+        return
+    raise InputError.at(path, "is a folder that holds other things than masks; choose another name")
+
+
+def _is_ours(path: Path) -> bool:
+    """Return whether a folder is a store of masks, and holds nothing else."""
+    try:
+        about = json.loads((path / ".zattrs").read_bytes())
+        names = {entry.name for entry in path.iterdir()}
+    except (OSError, ValueError, RecursionError):
+        return False
+    ours = isinstance(about, dict) and about.get("schema") == _SCHEMA
+    return ours and names <= _IN_STORE
 
 
 def _npz(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayout) -> None:
@@ -104,12 +133,14 @@ def _parquet(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayou
 
 def _zarr(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayout) -> None:
     zarr = imported("zarr", path)
-    root = zarr.open_group(path, mode="w", zarr_format=2)
     every = list(masks)
     joined = np.concatenate(every).reshape(-1, *layout.shape)
     ends = np.cumsum([len(mask) for mask in every])
-    root.create_group("data").create_array("valid", data=joined)
-    root.create_group("meta").create_array("episode_ends", data=ends)
+    with atomic_folder(path, replaces=_is_ours(path)) as place:
+        root = zarr.open_group(place, mode="w", zarr_format=2)
+        root.attrs["schema"] = _SCHEMA
+        root.create_group("data").create_array("valid", data=joined)
+        root.create_group("meta").create_array("episode_ends", data=ends)
 
 
 def _hdf5(path: Path, masks: Masks, names: Sequence[str], layout: SensorLayout) -> None:

@@ -50,6 +50,7 @@ class StreamingPredictor(Protocol):
     def evaluated(self) -> Diagnosis | None: ...  # noqa: D102
     def stream(self, frame: NDArray[np.float64], time: float | None = None) -> StreamResult: ...  # noqa: D102
     def confirm(self) -> bool | None: ...  # noqa: D102
+    def sibling(self) -> StreamingPredictor: ...  # noqa: D102
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from functools import partial
 from operator import methodcaller
 from typing import TYPE_CHECKING
 
+from adaptfault.acquisition.newcomers import Newcomers
 from adaptfault.acquisition.ordering import Frame
 from adaptfault.acquisition.packet import TICKS
 from adaptfault.acquisition.receiver import Receiver
@@ -160,6 +161,7 @@ class Station:
             on_frame=send,
             on_trouble=self._trouble,
         )
+        self._newcomers = Newcomers(layout.rate, self.receiver.devices)
         self._sessions: dict[str, Session] = {}
         self._outside = 0  # readings outside the layout's range
         self._command: bool | None = None  # the last command, also for devices that come later
@@ -190,6 +192,7 @@ class Station:
                 looking = asyncio.create_task(self._check_silence())
                 try:
                     await self._take_all()
+                    self._watch(self._newcomers.rest())
                 finally:
                     looking.cancel()
             self.receiver.discard()  # what the number of frames left over
@@ -227,12 +230,33 @@ class Station:
 
     def _take(self, frame: Frame) -> None:
         session = self._sessions.get(frame.device)
-        if session is None:
-            # the receiver has forgotten them
-            for gone in self._sessions.keys() - self.receiver.arrivals.keys():
-                self._emit(self._sessions.pop(gone).close())
-                self._show(gone, methodcaller("forget", gone))
-            session = self._sessions[frame.device] = self._begin(frame.device)
+        if session is not None:
+            self._process(session, frame)
+            return
+        now = time.monotonic()
+        sending = self.receiver.arrivals.keys()
+        unwatched = self._newcomers.forget(sending, now)
+        if unwatched is not None:
+            self._trouble("", unwatched)
+        proven = self._newcomers.take(frame, now)
+        if proven:
+            self._forget(self._sessions.keys() - sending)
+            self._watch(proven)
+
+    def _watch(self, frames: Sequence[Frame]) -> None:
+        """Process frames of devices that may be new."""
+        for frame in frames:
+            if frame.device not in self._sessions:
+                self._sessions[frame.device] = self._begin(frame.device)
+            self._process(self._sessions[frame.device], frame)
+
+    def _forget(self, devices: Collection[str]) -> None:
+        """End the sessions of devices that the receiver has forgotten."""
+        for gone in devices:
+            self._emit(self._sessions.pop(gone).close())
+            self._show(gone, methodcaller("forget", gone))
+
+    def _process(self, session: Session, frame: Frame) -> None:
         frame, outside = self._in_unit(frame)
         self._outside += outside
         events = session.take(frame, time.monotonic())
@@ -310,19 +334,20 @@ class Station:
         return replace(frame, values=values), outside
 
     def _begin(self, device: str) -> Session:
-        watcher = (
-            self._ready.pop()
-            if self._ready
-            else self._monitor()
-            if self.bundle is None
-            else self._predictor()
-        )
         recorder = None if self.record is None else Recorder(self.record, self.layout, device)
         session = Session(
-            device, watcher, recorder=recorder, rule=self._rule, accumulate=self.accumulate
+            device, self._watcher(), recorder=recorder, rule=self._rule, accumulate=self.accumulate
         )
         session.command(self._command)
         return session
+
+    def _watcher(self) -> StreamingPredictor | Monitor:
+        """Return what watches one more device; nothing is read for it in the loop."""
+        if self._ready:
+            return self._ready.pop()
+        if isinstance(self._first, Monitor):
+            return self._monitor()
+        return self._first.sibling()
 
     def _monitor(self) -> Monitor:
         return Monitor(SelfDiagnosis(self.layout))

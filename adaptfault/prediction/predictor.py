@@ -3,6 +3,7 @@ frames."""
 
 from __future__ import annotations
 
+import copy
 import logging
 import os
 import threading
@@ -126,7 +127,8 @@ class Predictor:
         self._ready: _Running | None = None
         self._failed: int | None = None  # number of the version that could not be loaded
         self._told: set[str] = set()  # problems that were logged
-        self._monitor = Monitor(_reference(bundle))
+        self._diagnoser = _reference(bundle)
+        self._monitor = Monitor(self._diagnoser)
         self.layout = bundle.layout
         self.class_names = tuple(bundle.class_names)
         self.outside = 0  # readings outside the range so far
@@ -171,6 +173,19 @@ class Predictor:
             accumulate=accumulate,
             sets=sets,
         )
+
+    def sibling(self) -> Predictor:
+        """Return a predictor of the running version for another device; nothing is read for it."""
+        other = copy.copy(self)
+        other._monitor = Monitor(self._diagnoser)
+        other._loading = other._ready = None
+        if self._loading is not None:
+            other._stamp = None  # it looks by itself for the version that is being loaded
+        other._told = set()
+        other.outside = 0
+        other._decision = other._new_decision()
+        other.reset()
+        return other
 
     @property
     def fault_set(self) -> FaultSet:
@@ -339,7 +354,8 @@ class Predictor:
                 self._ready = None
                 # the frames so far read otherwise
                 if before.version.readings != self._running.version.readings:
-                    self._monitor = Monitor(_reference(self._running.bundle))
+                    self._diagnoser = _reference(self._running.bundle)
+                    self._monitor = Monitor(self._diagnoser)
                     self.reset()
                 self._decision = self._new_decision()
                 _log.info("version %d runs now", self.version)

@@ -259,7 +259,7 @@ def listened(capsys, once_bound):
 
 def test_what_is_sent_is_recorded_and_the_counters_come_last(tmp_path, listened):
     values = np.arange(60.0).reshape(10, 6) % 5
-    datagrams = [b"garbage", *packets(values), b"a,1,2"]
+    datagrams = [b"garbage", b"a,1,2", *packets(values)]
     lines = listened(
         datagrams,
         "--shape",
@@ -268,8 +268,7 @@ def test_what_is_sent_is_recorded_and_the_counters_come_last(tmp_path, listened)
         tmp_path,
         "--when",
         "always",
-        "--seconds",
-        2,
+        *("--frames", 10, "--seconds", 300),
         "--json",
     )
     dropped, first, *_, last = map(json.loads, lines)
@@ -296,7 +295,7 @@ def test_with_a_bundle_classes_are_told(tmp_path, listened, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "robot.bundle").mkdir()
     (tmp_path / "robot.bundle/bundle.json").touch()
-    lines = listened(packets(np.zeros((3, 6))), "robot.bundle", "--frames", 3, "--seconds", 20)
+    lines = listened(packets(np.zeros((3, 6))), "robot.bundle", "--frames", 3, "--seconds", 300)
     time_of_day = r"\d\d:\d\d:\d\d\.\d"
     assert re.fullmatch(rf"{time_of_day} a class: cup \(90%\)", lines[0])
     assert re.fullmatch(rf"{time_of_day} a class: ball \(90%\)", lines[1])
@@ -330,7 +329,7 @@ def test_counts_are_turned_into_newtons_by_a_calibration(tmp_path, listened):
         "--when",
         "always",
     )
-    listened(datagrams, *options, "--frames", 5, "--seconds", 20)
+    listened(datagrams, *options, "--frames", 5, "--seconds", 300)
     loaded = load(tmp_path / "log", layout=tmp_path / "log" / "layout.json").recordings
     assert (loaded.layout.unit, loaded.layout.full_scale) == ("N", 4.0)
     np.testing.assert_array_equal(loaded.frames[0], 2.0)
@@ -341,7 +340,7 @@ def test_a_row_that_breaks_is_told_without_any_bundle(grasps, capsys, once_bound
     values.reshape(-1, 2, 11, 10)[:, 1, 5] = 5.0
     events = []
     station = Station(
-        grasps.layout, frames=len(values), seconds=60, quiet=True, on_event=events.append
+        grasps.layout, frames=len(values), seconds=300, quiet=True, on_event=events.append
     )
     sending = once_bound(lambda port: send(port, packets(values), 0.002))
     asyncio.run(station.listen())
@@ -391,7 +390,7 @@ def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp
         env=environment,
         bufsize=1,
     )
-    watchdog = threading.Timer(20, child.kill)
+    watchdog = threading.Timer(300, child.kill)
     watchdog.start()
     with child:
         port = int(re.search(r"port (\d+)", child.stderr.readline())[1])
@@ -416,7 +415,7 @@ def test_commands_switch_the_recording_and_every_way_to_end_closes_the_files(tmp
             child.stdin.write("quit\n")
         else:
             child.send_signal(end)
-        out, err = child.communicate(timeout=30)
+        out, err = child.communicate(timeout=300)
     watchdog.cancel()
     assert (child.returncode, err) == (0, "")
     recorded, last = out.splitlines()
@@ -487,14 +486,14 @@ def test_the_unit_of_time_stamps_is_a_word_or_a_number(listened):
     datagrams = [b"a,12,1,1,1,1,1,1", b"a,12.5,1,1,1,1,1,1"]
     for ticks in ("s", "1"):
         lines = listened(
-            datagrams, "--shape", "1x2x3", "--frames", 2, "--seconds", 20, "--ticks", ticks
+            datagrams, "--shape", "1x2x3", "--frames", 2, "--seconds", 300, "--ticks", ticks
         )
         assert lines == ["end: 2 received = 2 kept; 1 device, 4 lost"]
 
 
 def test_frames_beyond_the_wanted_number_count_as_dropped(listened):
     lines = listened(
-        packets(np.zeros((4, 6))), "--shape", "1x2x3", "--frames", 1, "--seconds", 20, "--json"
+        packets(np.zeros((4, 6))), "--shape", "1x2x3", "--frames", 1, "--seconds", 300, "--json"
     )
     counters = json.loads(lines[-1])["counters"]
     assert counters["kept"] == 1

@@ -120,7 +120,7 @@ def test_two_workers_work_at_the_same_time(where, tmp_path):
             time.sleep(0.01)
         return Outcome(robot, "unchanged", 0, "met", 1, 60, 0, "2 x 6 x 5")
 
-    with engine(Task(meet, int, 20), **{"jobs": None, "dask": None, **where}) as workers:
+    with engine(Task(meet, int, 300), **{"jobs": None, "dask": None, **where}) as workers:
         assert [o.reason for o in workers(robots("a", "b"))] == ["met", "met"]
 
 

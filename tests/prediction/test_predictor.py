@@ -113,7 +113,7 @@ def stream_until(
 ) -> list[Reading]:
     """Stream the frames over and over until it is done, and for one more window."""
     readings: list[Reading] = []
-    end = time.monotonic() + 60
+    end = time.monotonic() + 300
     while not done():
         assert time.monotonic() < end, "it was never done"
         readings.append(predictor.stream(frames[len(readings) % len(frames)]))
@@ -237,7 +237,7 @@ def test_it_follows_back_and_forth_and_starts_each_version_once(carried, eager):
 def test_predicting_windows_keeps_up_too(carried, eager):
     predictor = running(carried)
     carried.deploy(2)
-    end = time.monotonic() + 60
+    end = time.monotonic() + 300
     while predictor.version == 1 and time.monotonic() < end:
         predictor.predict(small_windows(1))
     x = small_windows(9)

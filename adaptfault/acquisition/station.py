@@ -192,7 +192,6 @@ class Station:
                 looking = asyncio.create_task(self._check_silence())
                 try:
                     await self._take_all()
-                    self._watch(self._newcomers.rest())
                 finally:
                     looking.cancel()
             self.receiver.discard()  # what the number of frames left over
@@ -212,11 +211,12 @@ class Station:
             self._take(frame)
             taken += 1
             if self.frames is not None and taken >= self.frames:
-                return
+                break
             if self.receiver.closed:
                 ending = time.monotonic() if ending is None else ending
                 if time.monotonic() - ending > _DRAIN:
                     self.receiver.discard()
+        self._watch(self._newcomers.rest())
 
     async def _check_silence(self) -> None:
         while True:

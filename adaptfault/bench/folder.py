@@ -188,7 +188,7 @@ def read_json(path: Path, schema: str, mend: str) -> Json:
     """
     try:
         found = json.loads(path.read_bytes())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         what = f"expected JSON, but it is cut off or damaged ({error})"
         raise ValueError(f"{path}: {what}; {mend}") from None
     if not isinstance(found, dict) or found.get("schema") != schema:

@@ -126,7 +126,7 @@ def write_with_copy(path: Path, document: Mapping[str, Any]) -> None:
     write_checksummed(path, document)
     try:
         atomic_write(_copy(path), path.read_bytes())
-    except OSError as error:
+    except (OSError, MemoryError) as error:
         _log.warning("%s cannot be written: %s", _copy(path), error)
 
 

@@ -8,7 +8,7 @@ import os
 import sqlite3
 from base64 import b64decode, b64encode
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -128,9 +128,7 @@ class Journal:
                     if self._checksum.exists()
                     else []
                 )
-            if self._checksum.is_file() and self._checksum.read_bytes().decode(
-                "latin-1"
-            ) == hash_file(self.path):
+            if self._recorded() == hash_file(self.path):
                 return []
             try:
                 intact = self._intact()
@@ -140,14 +138,15 @@ class Journal:
                 return []
             if intact:
                 if repair:
-                    self._write_checksum()
+                    self._try_to_write_checksum()
                 return [
                     f"{self.path} differs from its checksum (other program, or a crash); it is"
                     " readable"
                 ]
             if repair:
                 self.path.replace(self.path.with_name(_ASIDE))
-                self._checksum.unlink(missing_ok=True)
+                with suppress(OSError):  # the new journal writes it anew
+                    self._checksum.unlink()
             return [
                 f"{self.path} is damaged: it is renamed to {_ASIDE} and a new journal is started"
             ]
@@ -213,7 +212,7 @@ class Journal:
             if waiting:
                 self._insert(waiting, patience)
             self._pending.unlink(missing_ok=True)
-        except (OSError, Damaged) as error:
+        except (OSError, Damaged, MemoryError) as error:
             if not self._told:
                 _log.warning(
                     "%s cannot be written; its new entries wait in %s: %s",
@@ -309,10 +308,7 @@ class Journal:
                 for entry in entries:
                     _insert(connection, entry)
                 connection.execute("COMMIT")
-            try:
-                self._write_checksum()
-            except OSError as error:  # the next check rewrites it; what counts is in the database
-                _log.warning("%s cannot be written: %s", self._checksum, error)
+            self._try_to_write_checksum()
 
     @contextmanager
     def _connect(self, patience: float = PATIENCE) -> Iterator[sqlite3.Connection]:
@@ -364,8 +360,20 @@ class Journal:
     def _checksum(self) -> Path:
         return self.bundle / _CHECKSUM
 
-    def _write_checksum(self) -> None:
-        atomic_write(self._checksum, hash_file(self.path).encode())
+    def _recorded(self) -> str:
+        """Return the SHA-256 that is recorded of the database; "" where it cannot be read."""
+        try:
+            return self._checksum.read_bytes().decode("latin-1")
+        except OSError:
+            return ""
+
+    def _try_to_write_checksum(self) -> None:
+        """Record the SHA-256 of the database; the next check does it where that fails, and what
+        counts is in the database."""
+        try:
+            atomic_write(self._checksum, hash_file(self.path).encode())
+        except (OSError, MemoryError) as error:
+            _log.warning("%s cannot be written: %s", self._checksum, error)
 
 
 def _insert(connection: sqlite3.Connection, entry: Entry) -> None:

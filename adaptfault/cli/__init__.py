@@ -14,8 +14,9 @@ from typing import Any, NoReturn
 from adaptfault import __version__
 from adaptfault.cli.options import LogAboveBars
 from adaptfault.cli.paths import check_paths
+from adaptfault.cli.streams import finish, is_unread, one_line, prepare
 from adaptfault.data.plugins import plugins
-from adaptfault.data.printable import printable
+from adaptfault.data.shortage import is_shortage
 
 GROUP = "adaptfault.commands"
 
@@ -108,9 +109,32 @@ def _with_left_out(args: argparse.Namespace, code: int) -> int:
     return max(code, 1)
 
 
+def _failed(args: argparse.Namespace, error: Exception) -> int:
+    """Tell an error in one line; return the exit code.
+
+    Python's own code for a traceback, 1, would read as "degraded but handled".
+    """
+    if is_unread(error):
+        return 0
+    if isinstance(error, ValueError | OSError) or is_shortage(error):
+        print(f"adaptfault {args.command}: error: {one_line(error)}", file=sys.stderr)
+        return BAD_INPUT
+    if isinstance(error, RecursionError):
+        what = "what it reads nests too deep; check the files that were given"
+        print(f"adaptfault {args.command}: error: {what}", file=sys.stderr)
+        return BAD_INPUT
+    traceback.print_exception(error)
+    print(
+        f"adaptfault {args.command}: internal error; please report the lines above",
+        file=sys.stderr,
+    )
+    return BAD_INPUT
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit code: 0 fine, 1 degraded but handled, 2 needs a technician, 3
     unusable input."""
+    prepare()
     parser = _parser()
     args = parser.parse_args(argv)
     if args.command is None:
@@ -122,28 +146,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         check_paths(args)
         code = int(args.run(args))
-        return _with_left_out(args, code)
-    except (ValueError, OSError) as error:
-        print(
-            f"adaptfault {args.command}: error: {printable(' '.join(str(error).split()))}",
-            file=sys.stderr,
-        )
-        return BAD_INPUT
-    except MemoryError as error:
-        print(f"adaptfault {args.command}: error: not enough memory ({error})", file=sys.stderr)
-        return BAD_INPUT
+        return finish(args, _with_left_out(args, code))
     except KeyboardInterrupt:
         further = "; run the same command to continue" if getattr(args, "continues", False) else ""
         print(f"adaptfault {args.command}: interrupted{further}", file=sys.stderr)
         return 130
-    except (
-        Exception
-    ):  # Python's own exit code for a traceback, 1, would read as "degraded but handled"
-        traceback.print_exc()
-        print(
-            f"adaptfault {args.command}: internal error; please report the lines above",
-            file=sys.stderr,
-        )
-        return BAD_INPUT
+    except Exception as error:
+        return _failed(args, error)
     finally:
         log.removeHandler(handler)

@@ -71,7 +71,7 @@ def add(commands: Commands) -> None:
     add_metrics(parser)
     add_trust(parser)
     add_sign(parser, "each bundle after its run")
-    parser.set_defaults(run=run, continues=True)
+    parser.set_defaults(run=run, decides=True, continues=True)
     parser = command(
         inner, "survival", "how long wires and cells last, and whom to service next", _SURVIVAL
     )

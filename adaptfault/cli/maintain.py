@@ -21,6 +21,7 @@ from adaptfault.cli.options import (
     trust,
 )
 from adaptfault.cli.paths import Read, Written
+from adaptfault.cli.streams import one_line
 
 if TYPE_CHECKING:
     from adaptfault.bundle.bundle import Bundle
@@ -74,7 +75,7 @@ def add(commands: Commands) -> None:
     add_metrics(parser)
     add_trust(parser)
     add_sign(parser, "the bundle after the run")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, decides=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -114,18 +115,29 @@ def _maintain(args: argparse.Namespace) -> int:
     if args.trust and not args.sign and report.decision == "deployed" and not args.dry_run:
         what = "runs only where no key is asked for; give maintain --sign KEY, or sign the bundle"
         print(f"warning: version {report.version} is not signed and {what}", file=sys.stderr)
-    if args.report:
-        from adaptfault.robot.technician_report import write_report
-
-        write_report(args.report, bundle, run=report, count_from=args.count_from)
-    if args.metrics:
-        _write_metrics(args, bundle, report)
+    code = report.exit_code
+    for write in (_write_report, _write_metrics):
+        try:
+            write(args, bundle, report)
+        except Exception as error:  # the run is done, and its code says what was decided
+            print(f"adaptfault maintain: error: {one_line(error)}", file=sys.stderr)
+            code = max(code, 1)
     numbering = Numbering.from_layout(bundle.layout, args.count_from)
     emit(args, report.to_dict(), report.text(numbering))
-    return report.exit_code
+    return code
+
+
+def _write_report(args: argparse.Namespace, bundle: Bundle, report: MaintenanceReport) -> None:
+    if not args.report:
+        return
+    from adaptfault.robot.technician_report import write_report
+
+    write_report(args.report, bundle, run=report, count_from=args.count_from)
 
 
 def _write_metrics(args: argparse.Namespace, bundle: Bundle, report: MaintenanceReport) -> None:
+    if not args.metrics:
+        return
     from adaptfault.robot.metrics import RobotMetrics, write_metrics
     from adaptfault.robot.technician_report import robot_name
 

@@ -13,6 +13,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from adaptfault.cli.paths import Read, Written
+from adaptfault.cli.streams import tell
 from adaptfault.data.printable import printable
 
 if TYPE_CHECKING:
@@ -592,4 +593,4 @@ class LogAboveBars(logging.Handler):
 
 def emit(args: argparse.Namespace, result: dict[str, Any], text: str) -> None:
     """Print the result on stdout."""
-    print(json.dumps(result, indent=1, allow_nan=False) if args.json else printable(text))
+    tell(args, json.dumps(result, indent=1, allow_nan=False) if args.json else printable(text))

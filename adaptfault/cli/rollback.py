@@ -20,7 +20,7 @@ def add(commands: Commands) -> None:
         help="folder written by adaptfault train --out X.bundle",
     )
     add_trust(parser)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, decides=True)
 
 
 def run(args: argparse.Namespace) -> int:

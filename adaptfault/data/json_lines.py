@@ -34,7 +34,7 @@ class Lines:
         for number, line in enumerate(whole.splitlines(), 1):
             try:
                 documents.append(json.loads(line))
-            except ValueError as error:
+            except (ValueError, RecursionError) as error:
                 raise ValueError(
                     f"{self.path}, line {number}: not JSON ({error}); remove the file"
                 ) from None

@@ -12,6 +12,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import date, datetime
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 if sys.version_info >= (3, 11):
@@ -201,11 +202,23 @@ def _matching(listed: Mapping[str, Any], home: Path, path: Path) -> Iterator[Rob
         name = _name(fitting, pattern)
         values = {"bundle_dir": glob.escape(os.path.dirname(bundle)), "name": glob.escape(name)}
         try:
-            filled = tuple(_pattern(home, text.format(**values)) for text in recordings)
-        except (KeyError, IndexError, ValueError):
+            filled = tuple(_pattern(home, _filled(text, values)) for text in recordings)
+        except ValueError:
             known = "expected only {bundle_dir} and {name} in braces"
             raise ValueError(f"{path}: `recordings` is {list(recordings)}; {known}") from None
         yield Robot(name, bundle, filled, _texts(listed, "tags", str(path)))
+
+
+def _filled(text: str, values: Mapping[str, str]) -> str:
+    """Return a text with the values in place of their names in braces.
+
+    Raises:
+        ValueError: other names, attributes of values, formats, or a brace alone.
+    """
+    for _, field, form, conversion in Formatter().parse(text):
+        if field is not None and (field not in values or form or conversion):
+            raise ValueError(f"{{{field}}} is no name of a value")
+    return text.format(**values)
 
 
 def _name(bundle: str, pattern: str) -> str:

@@ -7,12 +7,16 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from adaptfault.fleet.listing import Robot
+from adaptfault.fleet.rebuild import rebuilt
 from adaptfault.robot.metrics import PadCells, RobotMetrics, cells_by_pad, summed
 
 if TYPE_CHECKING:  # passing outcomes on needs no torch
     from adaptfault.bundle.bundle import Bundle
-    from adaptfault.robot.maintenance_report import Decision, MaintenanceReport
+    from adaptfault.robot.maintenance_report import Decision as Decided
+    from adaptfault.robot.maintenance_report import MaintenanceReport
     from diagnostics import Fault
+
+    Decision = Decided | Literal["error"]
 
 _NOTES = 5
 
@@ -64,7 +68,7 @@ class Outcome:
     """
 
     robot: Robot
-    decision: Decision | Literal["error"]
+    decision: Decision
     exit_code: int
     reason: str
     version: int | None = None
@@ -151,13 +155,10 @@ class Outcome:
 
     @classmethod
     def from_dict(cls, d: Mapping[str, Any]) -> Outcome:
-        """Rebuild from :meth:`to_dict`, also after JSON."""
-        robot = {
-            **d["robot"],
-            "recordings": tuple(d["robot"]["recordings"]),
-            "tags": tuple(d["robot"]["tags"]),
-        }
-        causes = tuple(Cause(**cause) for cause in d["causes"])
-        pads = tuple(PadCells(**pad) for pad in d.get("pads", ()))
-        lists = {"causes": causes, "notes": tuple(d["notes"]), "pads": pads}
-        return cls(**{**d, "robot": Robot(**robot), **lists})
+        """Rebuild from :meth:`to_dict`, also after JSON.
+
+        Raises:
+            ValueError: a field is missing or of another type.
+        """
+        outcome: Outcome = rebuilt(d, cls, {"Decision": str})
+        return outcome

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
 from functools import partial
 from pathlib import Path
@@ -97,7 +97,7 @@ def maintain_fleet(
             "sign": sign,
         }
         options["keys"] = None if keys is None else list(map(str, keys))
-        began, done = _resumed(lines.read(), fleet, options)
+        began, done = _resumed(lines, fleet, options)
         if not done:
             began = now()
             lines.begin({"schema": SCHEMA, "options": options, "began": began})
@@ -119,30 +119,83 @@ def maintain_fleet(
     )
 
 
-def _resumed(
-    documents: list[Any], fleet: Fleet, options: dict[str, Any]
-) -> tuple[str, dict[str, Outcome]]:
-    """Return the start and the outcomes of the run in the ledger; empty if a new run is due."""
+@dataclass(frozen=True)
+class _Head:
+    """The first line of a ledger: the options and the begin of the run."""
+
+    schema: str
+    options: dict[str, Any]
+    began: str
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A further line: the outcome of a robot; None: the end of the run."""
+
+    time: str
+    outcome: Outcome | None
+
+
+def _resumed(lines: Lines, fleet: Fleet, options: dict[str, Any]) -> tuple[str, dict[str, Outcome]]:
+    """Return the start and the outcomes of the run in the ledger; empty if a new run is due.
+
+    Raises:
+        ValueError: the file is no ledger, or a line of it is damaged.
+    """
+    documents = lines.read()
     if not documents:
         return "", {}
-    head, *entries = documents
-    if not isinstance(head, dict) or head.get("schema") != SCHEMA:
-        raise ValueError(
-            f"the ledger in the run's folder begins with no {SCHEMA!r}; give another folder"
-        )
-    last = datetime.fromisoformat(entries[-1]["time"] if entries else head["began"])
-    over = bool(entries) and "ended" in entries[-1]
-    if over or head["options"] != options or datetime.now(timezone.utc) - last > _OVER:
+    number = 1
+    try:
+        head = _head(documents[0])
+        last = _time(head.began)
+        entries = []
+        for document in documents[1:]:
+            number += 1
+            entries.append(_entry(document))
+            last = _time(entries[-1].time)
+    except ValueError as error:
+        what = f"no line of a ledger ({error}); remove the file, or give another --out"
+        raise ValueError(f"{lines.path}, line {number}: {what}") from None
+    over = any(entry.outcome is None for entry in entries)
+    if over or head.options != options or datetime.now(timezone.utc) - last > _OVER:
         return "", {}
-    earlier = [Outcome.from_dict(entry["outcome"]) for entry in entries]
     # A robot whose paths changed is processed again.
     listed = {_identity(robot): robot for robot in fleet.robots}
-    done = {
-        robot.name: replace(o, robot=robot)
-        for o in earlier
-        if (robot := listed.get(_identity(o.robot)))
-    }
-    return head["began"], done
+    done = {}
+    for entry in entries:
+        robot = None if entry.outcome is None else listed.get(_identity(entry.outcome.robot))
+        if entry.outcome is not None and robot is not None:
+            done[robot.name] = replace(entry.outcome, robot=robot)
+    return head.began, done
+
+
+def _head(document: Any) -> _Head:
+    """Return the first line of a ledger; raises ValueError."""
+    if not isinstance(document, dict) or document.get("schema") != SCHEMA:
+        raise ValueError(f"expected the schema {SCHEMA!r}")
+    if set(document) != {"schema", "options", "began"} or type(document["options"]) is not dict:
+        raise ValueError("expected schema, options and began")
+    return _Head(**document)
+
+
+def _entry(document: Any) -> _Entry:
+    """Return a further line of a ledger; raises ValueError."""
+    if not isinstance(document, dict) or "time" not in document:
+        raise ValueError("expected a time")
+    if document.keys() == {"time", "ended"}:
+        return _Entry(document["time"], None)
+    return _Entry(document["time"], Outcome.from_dict(document.get("outcome", {})))
+
+
+def _time(text: Any) -> datetime:
+    """Return a time with its zone; raises ValueError."""
+    if not isinstance(text, str):
+        raise ValueError(f"expected a time, got {str(text)[:60]!r}")
+    time = datetime.fromisoformat(text)
+    if time.tzinfo is None:
+        raise ValueError(f"expected a time with its zone, got {text!r}")
+    return time
 
 
 def _identity(robot: Robot) -> str:

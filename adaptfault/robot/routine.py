@@ -197,7 +197,7 @@ class Routine:
         """
         try:
             return cls.from_dict(json.loads(Path(path).read_bytes()))
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{path}: {error}") from None
 
 

@@ -142,6 +142,8 @@ def read_layout(path: str | PathLike[str]) -> SensorLayout:
         )
     try:
         return SensorLayout.from_dict(document)
+    except RecursionError:
+        raise InputError.at(path, "nests too deep for a layout; correct the file") from None
     except (ValueError, TypeError, OverflowError) as error:
         raise InputError.at(path, f"is no layout: {error}; correct the file") from None
 

@@ -1,0 +1,100 @@
+"""The standard streams: one may be closed, full, read by nobody any more, or know few characters.
+
+None of this changes what a command does. Its exit code is that of its result, where somebody could
+read it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+
+from adaptfault.data.printable import printable
+from adaptfault.data.shortage import is_shortage
+
+_STREAMS = ("stdin", "stdout", "stderr")
+_LONGEST = 2000  # characters of an error
+
+
+def prepare() -> None:
+    """Open streams that are closed, as another file would get their number, and let every
+    character be printed."""
+    for number, name in enumerate(_STREAMS):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error as one line that a terminal can show."""
+    text = printable(" ".join(str(error).split()))
+    if len(text) > _LONGEST:
+        text = f"{text[: _LONGEST // 2]} ... {text[-_LONGEST // 2 :]}"
+    if not is_shortage(error):
+        return text
+    return f"not enough memory ({text})" if text else "not enough memory"
+
+
+def tell(args: argparse.Namespace, text: str) -> None:
+    """Print on stdout; nobody may read it any more."""
+    _attempt(args, lambda: print(text, flush=True))
+
+
+def finish(args: argparse.Namespace, code: int) -> int:
+    """Return the exit code of a command whose result was printed, or could not be.
+
+    A command that decides something for a robot has done so: its code still says what, as a
+    warning.
+    """
+    with suppress(ValueError):  # closed
+        _attempt(args, sys.stdout.flush)
+    if not getattr(args, "untold", False):
+        return code
+    return max(code, 1 if getattr(args, "decides", False) else 3)
+
+
+def is_unread(error: BaseException) -> bool:
+    """Return whether an error comes from stdout, which nobody reads any more."""
+    if not isinstance(error, BrokenPipeError):
+        return False
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _discard()
+        return True
+    except (OSError, ValueError):
+        pass
+    return False
+
+
+def _attempt(args: argparse.Namespace, write: Callable[[], None]) -> None:
+    """Write on stdout; what is still printed after an error vanishes."""
+    try:
+        write()
+    except BrokenPipeError:
+        _discard()
+    except OSError as error:
+        args.untold = True
+        _discard()
+        print(
+            f"adaptfault {args.command}: error: the result could not be printed: {error.strerror}",
+            file=sys.stderr,
+        )
+
+
+def _discard() -> None:
+    """Let what is still printed on stdout vanish."""
+    with suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)

@@ -277,3 +277,114 @@ def test_complex_numbers_and_records_are_refused_by_what_they_are(tmp_path):
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file["tactile"] = np.zeros(5, [("time", "f8"), ("cells", "f4", 12)])
     assert "tactile holds records of several fields" in refusal(tmp_path / "b.h5")
+
+
+# What declares more than it holds, and what has no end
+
+
+def h5_declares(path, **options):
+    with h5py.File(path, "w") as file:
+        file.create_dataset("tactile", dtype="f4", **options)
+
+
+def zarr_declares(path, **options):
+    zarr.open_group(path, mode="w").create_array("tactile", dtype="f4", **options)
+
+
+def zarr_with(path, replace):
+    root = zarr.open_group(path, mode="w", zarr_format=2)
+    chunks = root.create_array("tactile", data=X)
+    replace(path / "tactile" / chunks.metadata.encode_chunk_key((0, 0)))
+
+
+def pipe(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
+def device(path):
+    path.unlink()
+    path.symlink_to("/dev/zero")
+
+
+def lerobot_pipe(path):
+    (path / "meta").mkdir(parents=True)
+    (path / "data").mkdir()
+    features = {"tactile": {"dtype": "int16", "shape": [12]}}
+    (path / "meta/info.json").write_text(json.dumps({"features": features}))
+    os.mkfifo(path / "data/file.parquet")
+
+
+def parquet_declares(path):
+    zeros = pa.array(np.zeros(12 * 500_000, np.int8))
+    part = pa.table({"tactile": pa.FixedSizeListArray.from_arrays(zeros, 12)})
+    with pq.ParquetWriter(path, part.schema, compression="zstd") as writer:
+        for _ in range(100):
+            writer.write_table(part)
+
+
+HOSTILE = {
+    "never_written.h5": (lambda p: h5_declares(p, shape=(10**9, 12), chunks=(99, 12)), "declares"),
+    "contiguous.h5": (lambda p: h5_declares(p, shape=(10**9, 12)), "declares"),
+    "chunk.h5": (lambda p: h5_declares(p, shape=(10**9, 12), chunks=(10**8, 6)), "chunks of"),
+    "never_written.zarr": (lambda p: zarr_declares(p, shape=(10**9, 12), chunks=(99, 12)), "decl"),
+    "chunk.zarr": (lambda p: zarr_declares(p, shape=(10**9, 12), chunks=(10**9, 12)), "chunks of"),
+    "pipe.zarr": (lambda p: zarr_with(p, pipe), "cannot be read"),
+    "device.zarr": (lambda p: zarr_with(p, device), "cannot be read"),
+    "lerobot": (lerobot_pipe, "not a regular file"),
+    "rows.parquet": (parquet_declares, "declares 600,000,000 bytes"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_what_declares_more_than_it_stores_or_has_no_end_is_left_out(name, tmp_path):
+    write, reason = HOSTILE[name]
+    write(tmp_path / name)
+    np.save(tmp_path / "good.npy", X)
+    loaded = check(tmp_path)
+    (told,) = messages(loaded, "error")
+    assert name in told
+    assert reason in told
+
+
+def test_a_mat_file_that_unpacks_to_more_than_the_limit_is_refused(tmp_path, monkeypatch):
+    from adaptfault.data.recordings.formats.datasets import mat
+
+    scipy.io.savemat(tmp_path / "a.mat", {"tactile": np.zeros((10**5, 12))}, do_compression=True)
+    monkeypatch.setattr(mat, "MOST_BYTES", 10**6)
+    assert "unpacks to more than 1,000,000 bytes" in refusal(tmp_path / "a.mat", layout=GRID)
+
+
+def test_links_in_circles_and_deep_groups_end(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        group = file
+        for _ in range(200):
+            group = group.create_group("g")
+        group["tactile"] = X
+        group["above"] = file["g"]
+    check(tmp_path / "a.h5")
+
+
+def test_the_groups_of_a_file_are_gone_through_once_each(tmp_path, monkeypatch):
+    from adaptfault.data.recordings.formats.datasets import chooser
+
+    steps = []
+    whole = chooser._is_vector
+    monkeypatch.setattr(chooser, "_is_vector", lambda *a: steps.append(0) or whole(*a))
+    for count in (20, 40):
+        with h5py.File(tmp_path / f"{count}.h5", "w") as file:
+            for i in range(count):
+                file[f"data/demo_{i}/tactile"] = X[:3]
+                file[f"data/demo_{i}/time"] = np.arange(3) / 10
+        steps.clear()
+        assert len(load(tmp_path / f"{count}.h5", layout=GRID).recordings) == count
+        assert len(steps) <= 4 * count
+
+
+def test_a_large_chunk_is_unpacked_once(tmp_path):
+    values = np.tile(X, (400, 1))
+    array = zarr.open_group(tmp_path / "a.zarr", mode="w").create_array(
+        "tactile", data=values, chunks=(len(values), 12)
+    )
+    assert array.chunks[0] > 4096
+    check(tmp_path / "a.zarr", expected=values)

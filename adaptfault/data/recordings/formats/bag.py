@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.labels import natural_key
+from adaptfault.data.recordings.facts.sizes import check_kind
 from adaptfault.data.recordings.formats.bag_fields import Found, Topic, choose
 from adaptfault.data.recordings.formats.bag_frames import NEAR, Frames, Message
 from adaptfault.data.recordings.formats.bag_salvage import Salvage
@@ -146,6 +147,8 @@ def bag_messages(
         raise InputError.at(
             path, "bags are read with rosbags; install it: pip install 'adaptfault[ros]'"
         ) from None
+    for file in _files(path):
+        check_kind(file)
     asked = _Asked(path, shape, topic, field)
     given = 0
 
@@ -163,6 +166,14 @@ def bag_messages(
     except Exception as error:
         reason = type(error).__name__
     yield from islice(filter(is_within, _salvaged(asked, reason, problems)), given, None)
+
+
+def _files(path: Path) -> list[Path]:
+    """Return the files of a bag, in order."""
+    if not path.is_dir():
+        return [path]
+    files = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
+    return sorted(files, key=lambda file: natural_key(file.name))
 
 
 @dataclass(frozen=True)
@@ -215,12 +226,7 @@ def _salvaged(asked: _Asked, reason: str, problems: list[Problem]) -> Iterator[M
     """Yield what a damaged bag still holds, and what is written as JSON, which rosbags does not
     read."""
     path = asked.path
-    files = (
-        [path]
-        if path.is_file()
-        else [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
-    )
-    parts = [Salvage(file) for file in sorted(files, key=lambda file: natural_key(file.name))]
+    parts = [Salvage(file) for file in _files(path)]
     counts = Counter(one for part in parts for one, _, _ in part)
     if not counts:
         raise InputError.at(

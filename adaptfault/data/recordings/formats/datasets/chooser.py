@@ -531,10 +531,7 @@ def _blocks(path: Path, opened: Opened, held: _Readings, pads: Pads) -> Iterator
         if part.outer is not None:
             arrays = [arrays[0][part.outer : part.outer + 1][0]]
         times = None if clock is None else Vector(contents.arrays[clock])
-        row = sum(math.prod(sizes) for sizes in pads.sizes) * 8
-        step = max(1, min(BLOCK, _ROOM // max(row, 1)))
-        for first in range(part.first, part.last, step):
-            last = min(first + step, part.last)
+        for first, last in _pieces(part, arrays, pads):
             where = f"{part.name or part.names[0]}, frames {first} to {last - 1}"
             try:
                 values = [np.asarray(array[first:last]) for array in arrays]
@@ -552,6 +549,17 @@ def _blocks(path: Path, opened: Opened, held: _Readings, pads: Pads) -> Iterator
             packed = zip(held.packings, values, strict=True)
             frames = pads.frames([packing.unpacked(value) for packing, value in packed])
             yield _block(path, frames, stamps, held)
+
+
+def _pieces(part: _Part, arrays: Sequence[Any], pads: Pads) -> Iterator[tuple[int, int]]:
+    """Yield first and last frame of what is read at once: about a block, but never a part of a
+    chunk, which would be unpacked again for each of its parts."""
+    row = sum(math.prod(sizes) for sizes in pads.sizes) * pads.steps * 8
+    step = max(1, min(BLOCK, _ROOM // max(row, 1)))
+    chunks = [getattr(array, "chunks", None) for array in arrays]
+    step = max([step, *(sizes[0] for sizes in chunks if sizes)])
+    for first in range(part.first, part.last, step):
+        yield first, min(first + step, part.last)
 
 
 def _block(path: Path, frames: NDArray[Any], stamps: NDArray[Any] | None, held: _Readings) -> Block:

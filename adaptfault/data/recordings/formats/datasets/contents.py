@@ -79,12 +79,16 @@ class Contents:
             self.attributes.setdefault(group, {})[last] = value
         elif kind == "V":
             self.left_out[name] = "holds records of several fields; save each field as an array"
-        elif kind in NUMBERS and 0 in array.shape[1:]:
+        elif kind in NUMBERS and 0 in array.shape[1:] and array.shape[0]:
             self.left_out[name] = "holds frames without a number"
         elif array.shape and kind in NUMBERS + TIMES + TEXTS:
             self.arrays[name] = array
         if is_touch(name) and name not in self.arrays:
             self.left_out.setdefault(name, f"is {array.dtype}, no array of numbers")
+        self.note(name, attributes)
+
+    def note(self, name: str, attributes: Mapping[str, Any] | None) -> None:
+        """Take in the attributes of a group or an array."""
         if attributes:
             self.attributes.setdefault(name, {}).update(attributes)
 

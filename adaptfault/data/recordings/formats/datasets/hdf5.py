@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -88,35 +88,43 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
 
 
 def _collect(file: Any, contents: Contents) -> None:
+    """Take in all groups and arrays of a file, each group once: links may lead in circles."""
     h5py = imported("h5py", file.filename)
+    groups = [("", file)]
+    seen = set()
+    while groups:
+        above, group = groups.pop()
+        place = h5py.h5o.get_info(group.id).addr
+        if place in seen:
+            continue
+        seen.add(place)
+        for last in group:
+            name = f"{above}/{last}" if above else last
+            link = group.get(last, getlink=True)
+            if isinstance(link, h5py.ExternalLink):
+                what = f"is a link into another file, {link.filename}; copy what it leads to into"
+                contents.left_out[name] = f"{what} one, with h5copy"
+            elif isinstance(link, h5py.HardLink) and not last.startswith(_HIDDEN):
+                found = group[last]
+                if isinstance(found, h5py.Group):
+                    contents.note(name, dict(found.attrs))
+                    groups.append((name, found))
+                elif isinstance(found, h5py.Dataset):
+                    _collect_array(h5py, file, contents, name, found)
 
-    def add_link(name: str, link: Any) -> None:
-        if isinstance(link, h5py.ExternalLink):
-            what = f"is a link into another file, {link.filename}; copy what it leads to into one"
-            contents.left_out[name] = f"{what}, with h5copy"
 
-    def add(name: str, found: Any) -> None:
-        if name.startswith(_HIDDEN):
-            return
-        attributes = dict(found.attrs)
-        if not isinstance(found, h5py.Dataset):
-            if attributes:
-                contents.attributes.setdefault(name, {}).update(attributes)
-            return
-        why = _refused(found)
-        if why is not None:
-            contents.left_out[name] = why
-        elif h5py.check_ref_dtype(found.dtype) is not None:
-            _add_cells(file, contents, name, found)
-        elif h5py.check_vlen_dtype(found.dtype) is not None and not h5py.check_string_dtype(
-            found.dtype
-        ):
-            contents.left_out[name] = "holds lists of different lengths; save one array a frame"
-        elif found.shape is not None:
-            _add(contents, name, found, attributes)
-
-    file.visititems_links(add_link)
-    file.visititems(add)
+def _collect_array(h5py: Any, file: Any, contents: Contents, name: str, found: Any) -> None:
+    """Take in an array, or why it is not read."""
+    why = _refused(found)
+    is_list = h5py.check_vlen_dtype(found.dtype) is not None
+    if why is not None:
+        contents.left_out[name] = why
+    elif h5py.check_ref_dtype(found.dtype) is not None:
+        _add_cells(file, contents, name, found)
+    elif is_list and h5py.check_string_dtype(found.dtype) is None:
+        contents.left_out[name] = "holds lists of different lengths; save one array a frame"
+    elif found.shape is not None:
+        _add(contents, name, found, dict(found.attrs))
 
 
 def _add(contents: Contents, name: str, found: Any, attributes: dict[str, Any]) -> None:
@@ -168,7 +176,7 @@ def _unreadable(error: str) -> str:
 
 def _found(file: Any, name: str) -> Any:
     """Return an array of a file by the name that it has among the contents."""
-    if name in file:
+    with suppress(KeyError):
         return file[name]
     group, number, last = name.rsplit("/", 2)
     holder = file[f"{group}/{last}"] if f"{group}/{last}" in file else file[group]
@@ -199,6 +207,12 @@ class Reversed:
     def shape(self) -> tuple[int, ...]:
         """Sizes of the axes as MATLAB shows them."""
         return tuple(reversed(self._stored.shape))
+
+    @property
+    def chunks(self) -> tuple[int, ...] | None:
+        """Sizes of the chunks in the same order; None: it has none."""
+        sizes = self._stored.chunks
+        return None if sizes is None else tuple(reversed(sizes))
 
     @property
     def dtype(self) -> np.dtype[Any]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError
 from adaptfault.data.recordings.facts.declared import too_large, too_much
+from adaptfault.data.recordings.facts.sizes import check_kind
 from adaptfault.data.recordings.formats.datasets.chooser import Stated, recordings_of
 from adaptfault.data.recordings.formats.datasets.contents import Contents
 from adaptfault.data.recordings.formats.datasets.extra import imported
@@ -64,6 +65,7 @@ def opened(path: Path, names: Sequence[str] | None = None) -> Iterator[Contents]
     """
     parquet = imported("pyarrow.parquet", path)
     contents = Contents(is_table=True)
+    check_kind(path)
     try:
         with builtins.open(path, "rb") as file:
             held = parquet.ParquetFile(file, pre_buffer=False)

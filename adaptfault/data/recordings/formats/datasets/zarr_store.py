@@ -61,13 +61,24 @@ def open(
     Raises:
         InputError: zarr is not installed, the store is damaged, or the arrays are not clear.
     """
+    held: dict[str, _Checked] = {}
     return recordings_of(
-        path, partial(_opened, path), shape=shape, key=key, stated=Stated(time_column, label_column)
+        path,
+        partial(_opened, path, held),
+        shape=shape,
+        key=key,
+        stated=Stated(time_column, label_column),
     )
 
 
 @contextmanager
-def _opened(path: Path, names: Sequence[str] | None) -> Iterator[Contents]:
+def _opened(
+    path: Path, held: dict[str, _Checked], names: Sequence[str] | None
+) -> Iterator[Contents]:
+    """Open a store; arrays of a folder stay open in ``held``."""
+    if names is not None and all(name in held for name in names):
+        yield Contents({name: held[name] for name in names})
+        return
     zarr = imported("zarr", path)
     archive = None
     try:
@@ -88,6 +99,8 @@ def _opened(path: Path, names: Sequence[str] | None) -> Iterator[Contents]:
     except Exception as error:
         what = f"is no Zarr store, or is damaged ({type(error).__name__}); copy it again"
         raise InputError.at(path, what) from None
+    if archive is None:
+        held.update({n: one for n, one in contents.arrays.items() if isinstance(one, _Checked)})
     try:
         yield contents
     finally:

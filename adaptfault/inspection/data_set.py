@@ -163,17 +163,21 @@ def starts_and_tares(
     ends = np.zeros((len(starts), 2))
     at_zero = np.zeros((len(starts), 2))
     usual = np.zeros(len(starts))
+    floor = np.full(int(present.sum()), np.inf)
     for i, frames in enumerate(recordings()):
         loads = np.nan_to_num(frames[:, present] - origin).mean(axis=1)
         extremes = [int(loads.argmin()), int(loads.argmax())]
         ends[i] = loads[extremes]
         usual[i] = np.median(loads)
+        floor = np.fmin(floor, np.fmin.reduce(frames[:, present]))
         at_zero[i] = (frames[extremes][:, present] == 0).mean(axis=1)
     peak = float(np.median(ends[:, 1] - ends[:, 0]))
     if not peak > 0:
         return (), ()
     if len(starts) >= _RECORDINGS:  # they agree in rest
         from_rest = [_spread(end) for end in ends.T]
+    elif (floor == 0).mean() > MAJORITY:
+        from_rest = [0.0, 1.0]
     else:  # most frames are at rest
         from_rest = [float(np.median(np.abs(usual - end))) for end in ends.T]
     rests = int(np.argmin(from_rest))

@@ -231,3 +231,11 @@ def test_recordings_that_begin_at_rest_get_no_remark_whichever_way_readings_go(s
     idle = np.full((100, 12), 0.1)
     recordings = [0.5 + sign * np.concatenate([idle, one]) for one in contacts(n)]
     assert starts(recordings) == ((), ())
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_a_walk_that_begins_while_both_feet_stand_begins_in_contact(n):
+    step = np.maximum(np.sin(np.arange(300) / 8)[:, None], 0) * np.repeat([1.0, 0.0], 6)
+    walk = step + np.maximum(np.sin(np.arange(300) / 8 + 2.6)[:, None], 0) * np.repeat([0, 1], 6)
+    walk[:40] = 0.4
+    assert starts([walk] * n) == (tuple(f"{i}" for i in range(n)), ())

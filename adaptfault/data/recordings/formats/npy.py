@@ -14,6 +14,7 @@ from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import InputError
+from adaptfault.data.recordings.formats.datasets.axes import is_time_last, time_first
 from adaptfault.data.recordings.formats.npz import as_recordings, open_numpy
 from adaptfault.data.recordings.recording import (
     BLOCK,
@@ -41,7 +42,7 @@ def open(path: Path, *, shape: Shape | None = None, **stated: Any) -> list[Recor
         InputError: the file is damaged, or the array is of another kind or shape.
     """
     stored = _Stored.read(path)
-    if stored is None:
+    if stored is None or is_time_last(path, {"the array": stored.mapped()}, shape):
         return _whole(path, shape)
     grid = grid_shape(stored.sizes, shape)
     width = math.prod(grid) if grid else stored.sizes[-1]
@@ -87,6 +88,10 @@ class _Stored:
             return None
         return cls(path, start, tuple(sizes), kind)
 
+    def mapped(self) -> NDArray[Any]:
+        """Return the array, which is read where it is looked at."""
+        return np.memmap(self.path, self.kind, "r", self.start, self.sizes)
+
     def blocks(self, first: int, length: int, width: int) -> Iterator[Block]:
         """Yield ``length`` frames from frame ``first`` on."""
         with builtins.open(self.path, "rb") as file:
@@ -101,8 +106,10 @@ def _whole(path: Path, given: Shape | None) -> list[Recording]:
     if isinstance(array, NpzFile):
         array.close()
         raise InputError.at(path, "is an archive; name it .npz")
+    array, problems = time_first(path, "the array", array, given)
     frames, shape = as_recordings(path, array, None, given)
-    facts = Facts(path, counts=array.dtype.kind in "iu", shape=shape, stored=array.shape)
+    counts = array.dtype.kind in "iu"
+    facts = Facts(path, counts=counts, shape=shape, stored=array.shape, problems=problems)
 
     def blocks(recording: NDArray[Any]) -> Callable[[], Iterator[Block]]:
         return lambda: cut(recording)

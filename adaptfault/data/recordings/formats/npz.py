@@ -23,6 +23,7 @@ from adaptfault.data.printable import printable
 from adaptfault.data.recordings.dataset import Recordings
 from adaptfault.data.recordings.errors import InputError, Problem, located
 from adaptfault.data.recordings.facts.sizes import check_archive, check_array
+from adaptfault.data.recordings.formats.datasets.axes import time_first
 from adaptfault.data.recordings.formats.text import read_bytes, read_json_object, shown
 from adaptfault.data.recordings.recording import (
     DECLARED,
@@ -126,6 +127,9 @@ def _read(path: Path, given: Shape | None) -> _Archive:
         # one recording [T, pads, rows, cols]: the mask shows the pads
         arrays["frames"] = arrays["frames"][None]
     lengths = arrays.get("lengths")
+    if lengths is None and (given is not None or arrays["frames"].ndim < 4):
+        arrays["frames"], turned = time_first(path, "frames", arrays["frames"], given)
+        problems = (*problems, *turned)
     frames, shape = as_recordings(
         path, arrays["frames"], lengths, given if lengths is None else None
     )

@@ -3,26 +3,104 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adaptfault.data.recordings.errors import InputError, Problem, located
+from adaptfault.data.recordings.facts.infer import sides
 from adaptfault.data.recordings.formats.datasets.contents import Array
 from adaptfault.data.recordings.recording import Shape
 
+TURNED = "{} has the time as its last axis: read as frames of cells"
+"""What is said of such an array."""
 
-def is_time_last(sizes: tuple[int, ...], shape: Shape | None) -> bool:
-    """Return whether the last axis of an array is the time, as MATLAB programs store it: only all
-    axes before it together hold the cells of the ``shape`` that the user states."""
-    if shape is None or len(sizes) < 2:
+_SMOOTHER = 3.0  # times, that readings change less along the time than along any other axis
+_LONGEST = 40_000_000  # numbers that are looked at to find the time
+_SAMPLE = 1_000_000  # of them, where there are more rows
+_FRAMES = 10  # fewer do not show how readings change
+
+
+def is_time_last(path: Path, arrays: Mapping[str, Array], shape: Shape | None) -> bool:
+    """Return whether the last axis of arrays, one a pad, is the time, as MATLAB programs store it:
+    only all axes before it together hold the cells of the ``shape`` that the user states.
+
+    Raises:
+        InputError: no shape is stated, and the last axis looks like the time.
+    """
+    sizes = [tuple(map(int, array.shape)) for array in arrays.values()]
+    if any(len(one) < 2 for one in sizes):
+        return False
+    if shape is None:
+        if all(map(_is_smoothest_along_last, arrays.values())):
+            raise InputError.at(path, _doubt(arrays))
         return False
     cells = math.prod(shape)
-    rest = math.prod(sizes[1:])
-    has_windows = rest % cells == 0 and sizes[1] == rest // cells
-    is_recordings = len(sizes) > 2 and math.prod(sizes[2:]) == cells
+    rest = sum(math.prod(one[1:]) for one in sizes)
+    has_windows = len(sizes) == 1 and rest % cells == 0 and sizes[0][1] == rest // cells
+    is_recordings = len(sizes[0]) > 2 and math.prod(sizes[0][2:]) == cells
     is_first = rest == cells or has_windows or is_recordings
-    return math.prod(sizes[:-1]) == cells and not is_first
+    return sum(math.prod(one[:-1]) for one in sizes) == cells and not is_first
+
+
+def _is_smoothest_along_last(array: Array) -> bool:
+    """Return whether readings change far less along the last axis, the longest one, than along any
+    other: so they do from frame to frame."""
+    sizes = tuple(map(int, array.shape))
+    row = math.prod(sizes[1:])
+    if sizes[-1] < max(_FRAMES, *sizes[:-1]) or row > _LONGEST:
+        return False
+    try:
+        values = np.asarray(array[: max(2, _SAMPLE // row)], dtype=np.float64)
+    # a damaged part raises any of a dozen kinds; it is told when it is read
+    except Exception:
+        return False
+    changes = [_change(values, axis) for axis, size in enumerate(values.shape) if size > 1]
+    *others, last = changes
+    return bool(others) and last > 0 and min(others) > _SMOOTHER * last
+
+
+def _change(values: NDArray[np.float64], axis: int) -> float:
+    """Return the mean change from one reading to the next along an axis."""
+    steps = np.abs(np.diff(values, axis=axis))
+    steps = steps[np.isfinite(steps)]
+    return float(steps.mean()) if steps.size else 0.0
+
+
+def _doubt(arrays: Mapping[str, Array]) -> str:
+    """Return the question whether the last axis is the time, with the options that answer it."""
+    name, array = next(iter(arrays.items()))
+    *others, frames = map(int, array.shape)
+    cells = math.prod(others)
+    pads = f"{len(arrays)}x" if len(arrays) > 1 else ""
+    grid = "x".join(map(str, others)) if len(others) in (2, 3) else sides(cells)
+    stored = "rows x columns x time" if len(others) > 1 else "cells x time"
+    first = math.prod(array.shape[1:])
+    along = "x".join(map(str, array.shape[1:])) if len(others) in (2, 3) else sides(first)
+    return (
+        f"{name} is {[*others, frames]}, and readings change least along the last axis: stored as"
+        f" {stored}? Then give the array, --shape {pads}{grid} for {frames} frames; if not,"
+        f" --shape {pads}{along} for {others[0]} frames"
+    )
+
+
+def time_first(
+    path: Path, name: str, frames: NDArray[Any], shape: Shape | None
+) -> tuple[NDArray[Any], tuple[Problem, ...]]:
+    """Return an array, ``[1, T, pads, rows, cols]`` where its last axis is the time, and a warning
+    that it is.
+
+    Raises:
+        InputError: as :func:`is_time_last`.
+    """
+    is_array = frames.dtype.kind in "iuf" and frames.ndim > 1 and frames.size > 0
+    if not is_array or not is_time_last(path, {name: frames}, shape) or shape is None:
+        return frames, ()
+    turned = np.moveaxis(frames, -1, 0).reshape(1, -1, *shape)
+    return turned, (Problem("warning", located(path, TURNED.format(name))),)
 
 
 class TimeLast:

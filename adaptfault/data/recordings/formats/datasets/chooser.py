@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from adaptfault.data.recordings.errors import NO_FRAMES, InputError, Problem, located
 from adaptfault.data.recordings.facts.labels import natural_key
-from adaptfault.data.recordings.formats.datasets.axes import TimeLast, Vector, is_time_last
+from adaptfault.data.recordings.formats.datasets.axes import TURNED, TimeLast, Vector, is_time_last
 from adaptfault.data.recordings.formats.datasets.contents import (
     CLASSES,
     FULL_SCALES,
@@ -190,6 +190,7 @@ class _Chooser:
         arrays = contents.arrays
         self.ends = next((name for name in arrays if last_part(name) in _ENDS), None)
         self.outer = False
+        self.is_turned = False
         aside = (*EPISODES, *CLASSES, *_given(stated))
         self._beside: dict[str, list[str]] = {}
         for name in arrays:
@@ -227,7 +228,10 @@ class _Chooser:
                 self.path, what if missing is None else f"holds no column {missing!r}"
             )
         first = found[0][1]
-        self.outer = self.ends is None and self._holds_recordings(first)
+        if not self.contents.is_table and self.known is None:
+            chosen_arrays = {name: arrays[name] for name in first}
+            self.is_turned = is_time_last(self.path, chosen_arrays, self.shape)
+        self.outer = self.ends is None and not self.is_turned and self._holds_recordings(first)
         return found
 
     def _may_be_readings(self, name: str) -> bool:
@@ -251,7 +255,7 @@ class _Chooser:
         if self.known is not None and name in self.known:
             return self.known[name]
         sizes = tuple(map(int, self.contents.arrays[name].shape))
-        if self._is_turned(name):
+        if self.is_turned:
             return sizes[:-1]
         return sizes[2:] if self.outer else sizes[1:]
 
@@ -284,12 +288,7 @@ class _Chooser:
 
     def _length(self, name: str) -> int:
         shape = self.contents.arrays[name].shape
-        return int(shape[-1] if self._is_turned(name) else shape[0])
-
-    def _is_turned(self, name: str) -> bool:
-        """Return whether the last axis of an array is the time."""
-        sizes = tuple(map(int, self.contents.arrays[name].shape))
-        return not self.contents.is_table and is_time_last(sizes, self.shape)
+        return int(shape[-1] if self.is_turned else shape[0])
 
     def readings(self, part: _Part) -> _Readings:
         """Return what is read of a recording."""
@@ -298,7 +297,7 @@ class _Chooser:
         if part.clock is not None:
             units = self.contents.attributes.get(part.clock, {}).get("units")
             tick = unit_of(part.clock, units)
-        return _Readings(part, tuple(packings), self._is_turned(part.names[0]), tick)
+        return _Readings(part, tuple(packings), self.is_turned, tick)
 
     def _packing(self, name: str) -> Packing:
         try:
@@ -332,8 +331,8 @@ class _Chooser:
     def _told(self, part: _Part, pads: Pads) -> Iterator[Problem]:
         """Yield warnings of what was left out, and of what was decided without being stated."""
         told = []
-        if self._is_turned(part.names[0]):
-            told.append(f"{part.names[0]} has the time as its last axis: read as frames of cells")
+        if self.is_turned:
+            told.append(TURNED.format(part.names[0]))
         if pads.is_guessed:
             told.append(f"{', '.join(part.names)}: {GUESSED}")
         left_out = list(self.contents.left_out.items())
